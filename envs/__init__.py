@@ -1,0 +1,38 @@
+"""Gymnasium environments: importing this package registers `rotorgram/Elevation-v0`.
+
+Gymnasium 1.0 stopped reading the entry point `gymnasium.envs`, so one of these makes the env known:
+
+    import rotorgram.envs; gym.make("rotorgram/Elevation-v0")
+    gym.make("rotorgram.envs:rotorgram/Elevation-v0")  # imports by itself
+
+Neither loads MuJoCo before an env is made.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+
+from .config import ENV_ID, TELEMETRY_NAMES, ElevationConfig
+
+if TYPE_CHECKING:
+    from .elevation import ElevationEnv
+
+__all__ = ["ENV_ID", "TELEMETRY_NAMES", "ElevationConfig", "ElevationEnv", "register"]
+
+
+def register() -> None:
+    """Add `rotorgram/Elevation-v0` to Gymnasium's registry, once."""
+    if ENV_ID not in gymnasium.registry:
+        # No max_episode_steps: the env truncates by itself, since over UDP no wrapper would.
+        gymnasium.register(id=ENV_ID, entry_point="rotorgram.envs.elevation:ElevationEnv")
+
+
+def __getattr__(name: str) -> Any:
+    if name == "ElevationEnv":
+        from .elevation import ElevationEnv
+
+        return ElevationEnv
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+register()

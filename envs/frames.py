@@ -1,0 +1,42 @@
+"""The one place where MuJoCo's frame becomes the paper's.
+
+MuJoCo: x forward, y left, z up, right-handed, quaternions scalar first.
+Paper and Unity: X right, Y up, Z forward, left-handed, degrees (paper, section 2.2, figure 4).
+
+The map is S: (x, y, z) -> (X, Y, Z) = (-y, z, x), a reflection. A rotation by angle a about axis n
+becomes one by -a about S·n. The angles are named as in the paper's nomenclature: phi about X,
+theta about Y, psi about Z. It gives no order: we take Unity's (`Transform.eulerAngles`), so that
+R = Ry(theta) · Rx(phi) · Rz(psi). Positive phi is nose down, positive theta is nose right, and
+positive psi is right side up.
+"""
+
+import math
+from collections.abc import Sequence
+
+__all__ = ["attitude_in_paper_frame", "position_in_paper_frame"]
+
+_POLE = 1 - 1e-12  # sine of phi past which (within 1e-4 degrees) the nose counts as vertical
+
+
+def position_in_paper_frame(position: Sequence[float]) -> tuple[float, float, float]:
+    """(x, y, z) in MuJoCo's world, m -> (X, Y, Z) in the paper's, m."""
+    x, y, z = position
+    return 0.0 - y, z, x  # 0 - y: no negative zeros
+
+
+def attitude_in_paper_frame(quaternion: Sequence[float]) -> tuple[float, float, float]:
+    """Unit quaternion (w, x, y, z) in MuJoCo's world -> (phi, theta, psi) about X, Y, Z, degrees.
+
+    phi lies in [-90, 90], the others in [-180, 180]. With the nose straight up or down only a sum
+    of theta and psi is defined: psi is then 0.
+    """
+    w, mx, my, mz = quaternion
+    x, y, z = my, 0.0 - mz, 0.0 - mx
+    sin_phi = 2 * (w * x - y * z)
+    if abs(sin_phi) > _POLE:
+        phi = math.copysign(90.0, sin_phi)
+        theta = 2 * math.degrees(math.atan2(y, w))
+        return phi, theta - 360.0 * round(theta / 360.0), 0.0
+    theta = math.atan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y))
+    psi = math.atan2(2 * (w * z + x * y), 1 - 2 * (x * x + z * z))
+    return math.degrees(math.asin(sin_phi)), math.degrees(theta), math.degrees(psi)

@@ -1,0 +1,112 @@
+"""The paper's frame against signs worked out by hand and against rotation matrices."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rotorgram.envs.frames import attitude_in_paper_frame, position_in_paper_frame
+from scipy.spatial.transform import Rotation
+
+# (x, y, z) -> (X, Y, Z): right is minus left, up is up, forward is forward.
+S = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("mujoco", "paper"),
+    [
+        ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),  # forward
+        ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)),  # left
+        ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),  # up
+        ((1.5, -2.5, 3.5), (2.5, 3.5, 1.5)),
+    ],
+)
+def test_position(mujoco: tuple[float, ...], paper: tuple[float, ...]) -> None:
+    assert position_in_paper_frame(mujoco) == paper
+
+
+def test_map_is_a_reflection_because_the_frames_differ_in_handedness() -> None:
+    assert np.linalg.det(S) == pytest.approx(-1.0)
+    columns = [position_in_paper_frame(axis) for axis in np.eye(3).tolist()]
+    np.testing.assert_array_equal(np.array(columns).T, S)
+
+
+def test_level_is_zero_without_negative_zeros() -> None:
+    values = (*position_in_paper_frame((0.0, 0.0, 0.0)), *attitude_in_paper_frame((1, 0, 0, 0)))
+    assert all(math.copysign(1.0, value) == 1.0 and value == 0.0 for value in values)
+
+
+# MuJoCo, right-handed: +z turns the nose left, +y puts the nose down, +x lowers the right side.
+# Unity, left-handed: +Y turns the nose right, +X puts the nose down, +Z raises the right side.
+@pytest.mark.parametrize("degrees", [-170.0, -60.0, 30.0, 89.0])
+def test_rotation_about_the_vertical_is_theta_with_the_sign_turned(degrees: float) -> None:
+    assert _attitude("z", degrees) == pytest.approx((0.0, -degrees, 0.0))
+
+
+@pytest.mark.parametrize("degrees", [-89.0, -60.0, 30.0, 89.0])
+def test_rotation_about_left_is_phi_with_its_sign(degrees: float) -> None:
+    assert _attitude("y", degrees) == pytest.approx((degrees, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("degrees", [-170.0, -60.0, 30.0, 89.0])
+def test_rotation_about_forward_is_psi_with_the_sign_turned(degrees: float) -> None:
+    assert _attitude("x", degrees) == pytest.approx((0.0, 0.0, -degrees))
+
+
+def test_a_pitch_of_30_degrees_then_a_yaw_by_hand() -> None:
+    # Nose down by 30 degrees, then the whole craft turned left by 90: the nose points to -X, and
+    # sin 30 below the horizon. Unity calls that 30 about X first and then -90 about Y.
+    attitude = Rotation.from_euler("yz", [30.0, 90.0], degrees=True)
+    assert attitude_in_paper_frame(_scalar_first(attitude)) == pytest.approx((30.0, -90.0, 0.0))
+    nose = position_in_paper_frame(attitude.apply([1.0, 0.0, 0.0]).tolist())
+    assert nose == pytest.approx((-math.sqrt(0.75), -0.5, 0.0))
+
+
+def test_random_attitudes_against_rotation_matrices() -> None:
+    for attitude in Rotation.random(500, random_state=7):
+        phi, theta, psi = attitude_in_paper_frame(_scalar_first(attitude))
+        assert -90 <= phi <= 90
+        assert -180 <= theta <= 180
+        assert -180 <= psi <= 180
+        expected = S @ attitude.as_matrix() @ S.T
+        np.testing.assert_allclose(_unity(phi, theta, psi), expected, atol=1e-9)
+
+
+@given(st.floats(-180, 180), st.floats(-89.9, 89.9), st.floats(-180, 180))
+def test_both_signs_of_a_quaternion_are_one_attitude(yaw: float, pitch: float, roll: float) -> None:
+    q = _scalar_first(Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True))
+    one = _unity(*attitude_in_paper_frame(q))
+    other = _unity(*attitude_in_paper_frame([-value for value in q]))
+    np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+@pytest.mark.parametrize("pitch", [-90.0, 90.0])
+@pytest.mark.parametrize("yaw", [-179.0, -90.0, 0.0, 45.0, 179.0])
+@pytest.mark.parametrize("roll", [0.0, 30.0, -120.0])
+def test_nose_straight_up_or_down(pitch: float, yaw: float, roll: float) -> None:
+    attitude = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
+    phi, theta, psi = attitude_in_paper_frame(_scalar_first(attitude))
+    assert (phi, psi) == (pitch, 0.0)
+    assert -180 <= theta <= 180
+    # At the pole an angle is known to the square root of the rounding only.
+    expected = S @ attitude.as_matrix() @ S.T
+    np.testing.assert_allclose(_unity(phi, theta, psi), expected, atol=1e-6)
+
+
+def _attitude(axis: str, degrees: float) -> tuple[float, float, float]:
+    return attitude_in_paper_frame(_scalar_first(Rotation.from_euler(axis, degrees, degrees=True)))
+
+
+def _scalar_first(attitude: Rotation) -> list[float]:
+    x, y, z, w = attitude.as_quat().tolist()
+    return [w, x, y, z]
+
+
+def _unity(phi: float, theta: float, psi: float) -> np.ndarray:
+    """Unity's rotation matrix: Z first, then X, then Y, about fixed axes; angles in degrees."""
+    a, b, c = np.radians([phi, theta, psi])
+    about_x = [[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]
+    about_y = [[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]]
+    about_z = [[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]]
+    return np.array(about_y) @ np.array(about_x) @ np.array(about_z)
