@@ -1,0 +1,33 @@
+"""What can go wrong on the wire: we misused it (`ValueError`), or the peer did (these)."""
+
+__all__ = ["DecodeError", "LinkError", "PeerClosed", "PeerSilent", "Refused", "VersionMismatch"]
+
+
+class DecodeError(Exception):
+    """A datagram is not a message. It is counted and dropped; it never ends a run by itself."""
+
+
+class VersionMismatch(DecodeError):
+    """An intact binary datagram of another protocol version."""
+
+    def __init__(self, *, version: int, expected: int, kind: int, session: int) -> None:
+        super().__init__(f"protocol version: expected {expected}, got {version}")
+        self.kind = kind
+        """Type byte of the datagram."""
+        self.session = session
+
+
+class LinkError(ConnectionError):
+    """The exchange with the other side cannot go on."""
+
+
+class PeerSilent(LinkError, TimeoutError):
+    """Nothing came from the other side in time."""
+
+
+class Refused(LinkError):
+    """The agent turned the simulator away."""
+
+
+class PeerClosed(LinkError):
+    """The other side ended the exchange."""
