@@ -1,0 +1,132 @@
+"""Checkpoints: one safetensors file with weights, state, config, seed and versions.
+
+Loading one runs no code from it. Writing one replaces the old file whole or not at all.
+"""
+
+import json
+import os
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from .episodes import Position
+from .policies import NetworkPolicy
+
+__all__ = ["Checkpoint", "CheckpointError", "load", "software_versions", "store"]
+
+FORMAT: Final = 1
+_ACTOR: Final = "policy/"
+_STATE: Final = "state/"
+
+
+class CheckpointError(ValueError):
+    """A file is missing, or is not a checkpoint of ours."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """A training at an update boundary."""
+
+    algorithm: str
+    config: dict[str, Any]
+    """Hyperparameters."""
+    env: dict[str, Any]
+    """Options of the env."""
+    seed: int
+    env_steps: int
+    """Env steps that the whole training is to have."""
+    model_hash: str
+    """Model of the simulator; empty where it told none."""
+    actor: Mapping[str, np.ndarray]
+    """Weights for `NetworkPolicy`."""
+    state: Mapping[str, np.ndarray]
+    """State of the agent."""
+    position: Position
+    """Where the run stands."""
+    versions: dict[str, str] = field(default_factory=lambda: software_versions())
+
+    def policy(self) -> NetworkPolicy:
+        """The policy, ready to fly."""
+        return NetworkPolicy(self.actor)
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    names = ("rotorgram", "mujoco", "gymnasium", "numpy", "torch", "stable-baselines3")
+    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+
+
+def store(checkpoint: Checkpoint, path: Path) -> None:
+    """Write a checkpoint: after a crash at any moment, `path` holds the old one or the new one."""
+    position = checkpoint.position
+    arrays = {_ACTOR + name: value for name, value in checkpoint.actor.items()}
+    arrays |= {_STATE + name: value for name, value in checkpoint.state.items()}
+    arrays |= {"episode/actions": position.actions, "episode/observation": position.observation}
+    meta = {
+        "format": FORMAT,
+        "algorithm": checkpoint.algorithm,
+        "config": checkpoint.config,
+        "env": checkpoint.env,
+        "seed": checkpoint.seed,
+        "env_steps": checkpoint.env_steps,
+        "model_hash": checkpoint.model_hash,
+        "versions": checkpoint.versions,
+        "position": {
+            k: v for k, v in asdict(position).items() if k not in ("actions", "observation")
+        },
+    }
+    data = save({k: np.asarray(v, order="C") for k, v in arrays.items()},
+                metadata={"rotorgram": json.dumps(meta)})  # fmt: skip
+    _replace(path, data)
+
+
+def load(path: Path) -> Checkpoint:
+    """Read a checkpoint.
+
+    Raises:
+        CheckpointError: There is no such file, or it is not a checkpoint of this format.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"checkpoint: no file {path}")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            meta = json.loads((file.metadata() or {})["rotorgram"])
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if meta["format"] != FORMAT:
+            raise CheckpointError(
+                f"{path}: expected checkpoint format {FORMAT}, got {meta['format']}"
+            )
+        return Checkpoint(
+            **{name: meta[name] for name in ("algorithm", "config", "env", "seed", "env_steps",
+                                             "model_hash", "versions")},
+            actor=_part(arrays, _ACTOR),
+            state=_part(arrays, _STATE),
+            position=Position(
+                **meta["position"],
+                actions=arrays["episode/actions"],
+                observation=arrays["episode/observation"],
+            ),
+        )  # fmt: skip
+    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:
+        raise CheckpointError(f"{path}: expected a rotorgram checkpoint: {error}") from None
+
+
+def _part(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+
+def _replace(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    with open(temporary, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)

@@ -1,0 +1,165 @@
+"""What the algorithms have in common: fly, update, repeat; and stop and go on at any update."""
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import nn
+
+from .episodes import EpisodeLog
+from .networks import arrays_of, load_arrays
+from .policies import NetworkPolicy
+from .rollouts import Collector, Rollout
+
+__all__ = [
+    "Agent",
+    "Learner",
+    "OnUpdate",
+    "optimizer_arrays",
+    "seeds_of",
+    "set_optimizer_arrays",
+    "sizes",
+]
+
+OnUpdate = Callable[[], bool]
+"""Called after every update; training stops where it returns False."""
+
+
+class Agent(Protocol):
+    """An algorithm in training. Its state is plain arrays, whole at every update."""
+
+    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
+        """Train until the log counts `env_steps`; the state resumes where it stood."""
+
+    def actor(self) -> dict[str, np.ndarray]:
+        """Weights for `NetworkPolicy`."""
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that the next update depends on, but for the env's position."""
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Take over a state."""
+
+
+class Learner:
+    """Base of our own algorithms: `collect` and `update` are theirs.
+
+    Args:
+        networks: By name; `actor` is one of them.
+        learning_rate: Of Adam.
+        anneal: Lower it linearly to zero over the run.
+        rng: Draws the actions.
+    """
+
+    def __init__(
+        self,
+        networks: dict[str, nn.Module],
+        *,
+        learning_rate: float,
+        anneal: bool,
+        rng: np.random.Generator,
+    ) -> None:
+        self.networks = networks
+        self._learning_rate = learning_rate
+        self._anneal = anneal
+        self._rng = rng
+        parameters = [p for network in networks.values() for p in network.parameters()]
+        # foreach: one call for all parameters instead of one for each; same arithmetic.
+        self._optimizer = torch.optim.Adam(parameters, lr=learning_rate, foreach=True)
+        self._observation: np.ndarray | None = None
+
+    def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
+        """Fly for one update, at most so many env steps."""
+        raise NotImplementedError
+
+    def loss(self, rollout: Rollout) -> torch.Tensor:
+        """What one step of Adam lowers."""
+        raise NotImplementedError
+
+    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
+        """Train until the log counts `env_steps`, or `on_update` returns False."""
+        collector = Collector(log, self._rng, self._observation)
+        while log.env_steps < env_steps:
+            policy = NetworkPolicy(self.actor())
+            rollout = self.collect(collector, policy, env_steps - log.env_steps)
+            self._observation = collector.observation
+            if self._anneal:
+                self._set_learning_rate(1 - (log.env_steps - len(rollout)) / env_steps)
+            self._optimizer.zero_grad()
+            self.loss(rollout).backward()  # type: ignore[no-untyped-call]
+            self._optimizer.step()
+            self.networks["actor"].clamp_()  # type: ignore[operator]
+            if not on_update():
+                return
+
+    def actor(self) -> dict[str, np.ndarray]:
+        """Weights of the policy."""
+        return arrays_of(self.networks["actor"])
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Weights, Adam's moments and the generator, by name."""
+        state = {
+            f"{name}.{key}": value
+            for name, network in self.networks.items()
+            for key, value in arrays_of(network).items()
+        }
+        state |= optimizer_arrays(self._optimizer)
+        state["rng"] = _text_array(json.dumps(self._rng.bit_generator.state))
+        if self._observation is not None:
+            state["observation"] = self._observation
+        return state
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Take over a state."""
+        for name, network in self.networks.items():
+            prefix = f"{name}."
+            load_arrays(network, {k[len(prefix):]: v for k, v in state.items()
+                                  if k.startswith(prefix)})  # fmt: skip
+        set_optimizer_arrays(self._optimizer, state)
+        self._rng.bit_generator.state = json.loads(state["rng"].tobytes())
+        self._observation = state.get("observation")
+
+    def _set_learning_rate(self, share: float) -> None:
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._learning_rate * share
+
+
+def optimizer_arrays(optimizer: torch.optim.Optimizer) -> dict[str, np.ndarray]:
+    """An optimizer's state as arrays named `optimizer.<parameter>.<quantity>`."""
+    return {
+        f"optimizer.{index}.{key}": value.numpy().copy()
+        for index, entries in optimizer.state_dict()["state"].items()
+        for key, value in entries.items()
+    }
+
+
+def set_optimizer_arrays(
+    optimizer: torch.optim.Optimizer, arrays: Mapping[str, np.ndarray]
+) -> None:
+    """Take over what `optimizer_arrays` gave."""
+    state: dict[int, dict[str, Any]] = {}
+    for name, value in arrays.items():
+        if name.startswith("optimizer."):
+            _, index, key = name.split(".")
+            state.setdefault(int(index), {})[key] = torch.from_numpy(value.copy())
+    groups = optimizer.state_dict()["param_groups"]
+    optimizer.load_state_dict({"state": state, "param_groups": groups})
+
+
+def _text_array(text: str) -> np.ndarray:
+    return np.frombuffer(text.encode(), np.uint8)
+
+
+def sizes(env: gym.Env[Any, Any]) -> tuple[int, Any]:
+    """Length of an observation, and the action space."""
+    assert env.observation_space.shape is not None
+    return env.observation_space.shape[0], env.action_space
+
+
+def seeds_of(seed: int) -> tuple[int, np.random.Generator]:
+    """Seed of the weights and generator of the actions, independent of each other."""
+    weights = np.random.SeedSequence(seed, spawn_key=(0,)).generate_state(1, np.uint64)[0]
+    return int(weights), np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))

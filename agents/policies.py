@@ -1,0 +1,83 @@
+"""Policies as they fly: plain NumPy, because 16 units need no tensor library."""
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+__all__ = ["NetworkPolicy", "Policy"]
+
+
+class Policy(Protocol):
+    """Whatever flies a drone: called once for each control step."""
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+
+    def act(self, observation: np.ndarray) -> Any:
+        """The action for an observation, shape (n,), as the env takes it."""
+
+
+class NetworkPolicy:
+    """The actor of `networks.Actor`, from its weights.
+
+    Args:
+        weights: `hidden.weight` (h, n), `hidden.bias` (h,), `output.weight` (k, h),
+            `output.bias` (k,), all float32, and for continuous actions `log_std` (k,).
+    """
+
+    def __init__(self, weights: Mapping[str, np.ndarray]) -> None:
+        self._w1, self._b1 = weights["hidden.weight"], weights["hidden.bias"]
+        self._w2, self._b2 = weights["output.weight"], weights["output.bias"]
+        log_std = weights.get("log_std")
+        self._std = None if log_std is None else np.exp(log_std)
+        self._hidden = np.empty_like(self._b1)
+        self.action_size = 1 if self._std is None else len(self._b2)
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+    def output(self, observation: np.ndarray) -> np.ndarray:
+        """Means, or logits, shape (k,)."""
+        hidden = self._hidden
+        np.dot(self._w1, observation, out=hidden)
+        np.add(hidden, self._b1, out=hidden)
+        np.maximum(hidden, 0.0, out=hidden)
+        mean: np.ndarray = self._w2.dot(hidden)
+        mean += self._b2
+        return mean
+
+    def act(self, observation: np.ndarray) -> Any:
+        """The most likely action, clipped to [-1, 1] if continuous."""
+        output = self.output(observation)
+        return int(output.argmax()) if self._std is None else clip(output)
+
+    def draw_noise(self, rng: np.random.Generator, steps: int) -> np.ndarray:
+        """Randomness for so many calls of `sample`, drawn at once: shape (steps, k)."""
+        if self._std is None:
+            # The Gumbel trick: the largest of logits plus Gumbel noise is a categorical draw.
+            return rng.gumbel(size=(steps, len(self._b2))).astype(np.float32)
+        noise = rng.standard_normal((steps, self.action_size), dtype=np.float32)
+        noise *= self._std
+        return noise
+
+    def sample(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """An action drawn from the policy with one row of `draw_noise`, float32, not clipped.
+
+        Shape (k,); (1,) holding a whole number if actions are discrete.
+        """
+        output = self.output(observation)
+        output += noise
+        if self._std is None:
+            return np.array((output.argmax(),), np.float32)
+        return output
+
+    def to_env(self, action: np.ndarray) -> Any:
+        """What the env gets for a drawn action."""
+        return int(action[0]) if self._std is None else clip(action)
+
+
+def clip(action: np.ndarray) -> np.ndarray:
+    """The nearest action inside [-1, 1]."""
+    clipped: np.ndarray = np.minimum(np.maximum(action, np.float32(-1.0)), np.float32(1.0))
+    return clipped

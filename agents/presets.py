@@ -1,0 +1,111 @@
+"""Hyperparameters of every algorithm: the paper's setting and ours.
+
+A preset is named `paper` or `tuned`. `docs/algorithms/` lists where they differ, and why.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+__all__ = ["PRESETS", "A2CConfig", "AlgorithmName", "PresetName", "VPGConfig", "preset"]
+
+AlgorithmName = Literal["vpg", "a2c", "sb3-a2c"]
+PresetName = Literal["paper", "tuned"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class VPGConfig:
+    """Vanilla Policy Gradient (paper, section 2.3, Algorithm 1). Defaults: the paper's setting."""
+
+    hidden: int = 16
+    """Units of the hidden layer (paper)."""
+    learning_rate: float = 0.001
+    """Of Adam (paper)."""
+    anneal: bool = False
+    """Lower the learning rate linearly to zero over the run."""
+    gamma: float = 0.99
+    """Discount. The paper names none."""
+    episodes_per_update: int = 1
+    """Episodes flown with one policy ("a set of drone data"; the paper gives no number)."""
+    baseline: Literal["none", "time"] = "none"
+    """Taken off the returns: nothing (paper), or their mean at the same step of the episode."""
+    normalize: bool = False
+    """Divide the returns of an update by their standard deviation."""
+    log_std: float = -0.5
+    """Initial logarithm of the policy's standard deviation, in units of the action."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class A2CConfig:
+    """Advantage Actor-Critic (paper, section 2.3, Algorithm 2). Defaults: the paper's setting.
+
+    Serves our A2C and Stable-Baselines3's: every field means the same for both.
+    """
+
+    hidden: int = 16
+    """Units of the hidden layer of each of the two networks (paper)."""
+    learning_rate: float = 0.001
+    """Of Adam (paper)."""
+    anneal: bool = False
+    """Lower the learning rate linearly to zero over the run."""
+    gamma: float = 0.99
+    """Discount. The paper names none."""
+    steps_per_update: int = 1
+    """Env steps between updates (paper: one)."""
+    trace: float = 0.0
+    """Lambda of generalised advantage estimation; 0 is the paper's Equation 3."""
+    normalize: bool = False
+    """Shift and scale the advantages of an update to mean 0 and standard deviation 1."""
+    value_weight: float = 0.5
+    """Weight of the squared error of the value."""
+    entropy_weight: float = 0.0
+    """Weight of the policy's entropy."""
+    log_std: float = -0.5
+    """Initial logarithm of the policy's standard deviation, in units of the action."""
+
+
+PRESETS: Final[dict[str, dict[str, VPGConfig | A2CConfig]]] = {
+    "vpg": {
+        "paper": VPGConfig(),
+        "tuned": VPGConfig(
+            learning_rate=0.01,
+            anneal=True,
+            gamma=0.98,
+            episodes_per_update=4,
+            baseline="time",
+            normalize=True,
+        ),
+    },
+    "a2c": {
+        "paper": A2CConfig(),
+        "tuned": A2CConfig(
+            learning_rate=0.01,
+            anneal=True,
+            gamma=0.98,
+            steps_per_update=256,
+            trace=0.98,
+            normalize=True,
+        ),
+    },
+}
+# The reference gets the very same settings: only the implementation differs.
+PRESETS["sb3-a2c"] = PRESETS["a2c"]
+
+
+def preset(algorithm: str, name: str, **changes: Any) -> VPGConfig | A2CConfig:
+    """A preset, with some of its fields changed.
+
+    Raises:
+        ValueError: No such algorithm, preset or field.
+    """
+    if algorithm not in PRESETS:
+        raise ValueError(f"algorithm: expected one of {sorted(PRESETS)}, got {algorithm!r}")
+    if name not in PRESETS[algorithm]:
+        raise ValueError(f"preset: expected one of {sorted(PRESETS[algorithm])}, got {name!r}")
+    base = PRESETS[algorithm][name]
+    try:
+        return type(base)(**{**vars(base), **changes})
+    except TypeError:
+        unknown = sorted(set(changes) - set(vars(base)))
+        raise ValueError(
+            f"hyperparameters: expected some of {sorted(vars(base))}, got {unknown}"
+        ) from None
