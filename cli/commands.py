@@ -1,0 +1,372 @@
+"""Commands as frozen dataclasses: a field is a flag, its docstring the help.
+
+Heavy imports stay inside `run`: a simulator starts without torch, an agent without MuJoCo.
+"""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from ..agents.presets import AlgorithmName, PresetName
+from ..envs import ElevationConfig
+
+if TYPE_CHECKING:
+    from ..agents.policies import Policy
+    from ..udp import Address, RemoteEnv
+
+__all__ = ["COMMANDS", "Command", "user_errors"]
+
+Codec = Literal["binary", "text"]
+Listen = Annotated[
+    str | None,
+    arg(metavar="HOST:PORT"),
+]
+
+
+class Command:
+    """What every command is."""
+
+    def run(self) -> int:
+        """Do it; the exit status."""
+        raise NotImplementedError
+
+
+def user_errors() -> tuple[type[Exception], ...]:
+    """Errors that are one sentence to the user. A bug of ours is not among them."""
+    from ..agents.episodes import ResumeError
+
+    return (ValueError, OSError, ResumeError)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sim(Command):
+    """Simulate a drone for an agent: the UDP client.
+
+    Waits for the agent, flies by its commands and ends when it closes.
+    """
+
+    server: str = "127.0.0.1:8001"
+    """Address of the agent, HOST:PORT."""
+    bind: str = "127.0.0.1:8000"
+    """Address of this side, HOST:PORT; port 0 takes a free one."""
+    codec: Codec = "binary"
+    """binary, or the paper's text."""
+    timeout: float = 60.0
+    """Give up when the agent has been silent for so many seconds."""
+    insecure: bool = False
+    """Allow addresses beyond this machine; nothing is authenticated."""
+    env: ElevationConfig = field(default_factory=ElevationConfig)
+
+    def run(self) -> int:
+        """Simulate until the agent closes."""
+        from ..udp import LinkConfig, Simulator
+
+        simulator = Simulator(
+            server=parse_address(self.server),
+            bind=parse_address(self.bind),
+            codec=self.codec,
+            config=LinkConfig(timeout=self.timeout),
+            insecure=self.insecure,
+            **asdict(self.env),
+        )
+        with simulator:
+            here = "{}:{}".format(*simulator.address)
+            print(f"simulating at {here} for the agent at {self.server} (Ctrl-C ends)", flush=True)
+            reason = simulator.run()
+            print(f"{reason}; {_counters(simulator.link.counters)}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(Command):
+    """Train an agent: the UDP server.
+
+    Starts a simulator process of its own, or waits for one with --listen. Ctrl-C stops at the next
+    update with everything written; --resume goes on to the same numbers.
+    """
+
+    algorithm: Positional[AlgorithmName]
+    """vpg, a2c or sb3-a2c."""
+    preset: PresetName = "tuned"
+    """Hyperparameters: the paper's, or ours."""
+    set: tuple[str, ...] = ()
+    """Changes to the preset, such as gamma=0.99 steps_per_update=64."""
+    seed: int = 0
+    """Seed of weights, actions and episodes."""
+    env_steps: int = 300_000
+    """Env steps to train for."""
+    listen: Listen = None
+    """Wait here for a simulator instead of starting one."""
+    insecure: bool = False
+    """Allow an address beyond this machine; nothing is authenticated."""
+    out: Path | None = None
+    """Folder to write to. Default: runs/ALGORITHM-seedSEED-TIME."""
+    resume: Path | None = None
+    """Folder of a training to go on with; its own settings hold."""
+    env: ElevationConfig = field(default_factory=ElevationConfig)
+
+    def run(self) -> int:
+        """Train, store, and say where."""
+        from .train import train
+
+        return train(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Serve(Command):
+    """Fly simulators that come, with a trained policy or the PID."""
+
+    policy: Positional[str]
+    """Checkpoint file, or pid."""
+    listen: Annotated[str, arg(metavar="HOST:PORT")] = "127.0.0.1:8001"
+    """Address to wait at."""
+    episodes: int | None = None
+    """End after so many episodes. Default: when the simulator leaves."""
+    insecure: bool = False
+    """Allow an address beyond this machine; nothing is authenticated."""
+    env: ElevationConfig = field(default_factory=ElevationConfig)
+
+    def run(self) -> int:
+        """Fly episode after episode."""
+        from ..experiments.evaluate import evaluation_seed, fly
+        from ..udp import PeerClosed, RemoteEnv
+
+        policy, config = load_policy(self.policy, self.env)
+        address = parse_address(self.listen)
+        with _closing(RemoteEnv(address, options=asdict(config), connect=False,
+                                insecure=self.insecure)) as env:  # fmt: skip
+            print(f"waiting for a simulator at {self.listen} (Ctrl-C ends)", flush=True)
+            env.connect()
+            episode = 0
+            while self.episodes is None or episode < self.episodes:
+                try:
+                    flight = fly(env, policy, evaluation_seed(episode))
+                except PeerClosed as error:
+                    print(error)
+                    break
+                print(
+                    f"episode {episode}: return {flight.rewards.sum():.1f}, "
+                    f"last |E| {abs(flight.errors[-1]):.3f} m",
+                    flush=True,
+                )
+                episode += 1
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Command):
+    """Measure a trained policy or the PID over episodes without exploration."""
+
+    policy: Positional[str]
+    """Checkpoint file, or pid."""
+    episodes: int = 20
+    """Episodes to fly, from seeds that no training uses."""
+    listen: Listen = None
+    """Wait here for a simulator instead of starting one."""
+    insecure: bool = False
+    """Allow an address beyond this machine; nothing is authenticated."""
+    env: ElevationConfig = field(default_factory=ElevationConfig)
+    """Default with a checkpoint: the options that it was trained with."""
+
+    def run(self) -> int:
+        """Fly and print the means."""
+        import numpy as np
+
+        from ..experiments.evaluate import evaluation_row, fly_episodes
+
+        if self.episodes < 1:
+            raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
+        policy, config = load_policy(self.policy, self.env)
+        with remote_env(config, self.listen, self.insecure) as env:
+            flights = fly_episodes(env, policy, self.episodes)
+        rows = [evaluation_row(f, k, config.control_period) for k, f in enumerate(flights)]
+        settled = [r["settling_time"] for r in rows if not np.isnan(r["settling_time"])]
+        crashes = sum(r["terminated"] for r in rows)
+        settling = f"{np.mean(settled):.2f} s" if settled else "never"
+        print(f"policy            {self.policy}")
+        print(f"episodes          {len(rows)}, {crashes} terminated")
+        print(f"return            {np.mean([r['return'] for r in rows]):.1f}")
+        print(f"steady-state |E|  {np.mean([r['steady_error'] for r in rows]):.4f} m")
+        print(f"settling to 5 cm  {settling} ({len(settled)} of {len(rows)} episodes)")
+        print(f"overshoot         {np.mean([r['overshoot'] for r in rows]):.3f} m")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare(Command):
+    """Train VPG, A2C and SB3's A2C over the same seeds and steps, and report.
+
+    Every run has a simulator process and a socket pair of its own. Writes one folder: records,
+    checkpoints, figures and report.html.
+    """
+
+    agents: tuple[AlgorithmName, ...] = ("vpg", "a2c", "sb3-a2c")
+    """Algorithms to train; the PID flies beside them."""
+    preset: PresetName = "tuned"
+    """Hyperparameters: the paper's, or ours."""
+    seeds: int = 3
+    """Seeds 0 ... SEEDS - 1, the same for every agent."""
+    env_steps: int = 100_000
+    """Env steps of each training."""
+    snapshots: int = 10
+    """Policies kept during each training, for the learning curves."""
+    episodes: int = 20
+    """Evaluation episodes of each final policy."""
+    jobs: int | None = None
+    """Runs at a time. Default: one for each core."""
+    out: Path | None = None
+    """Folder to write; it must not exist. Default: runs/compare-TIME."""
+    env: ElevationConfig = field(default_factory=ElevationConfig)
+
+    def run(self) -> int:
+        """Compare, report, print the table."""
+        from .compare import compare
+
+        return compare(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Command):
+    """Draw a comparison's figures, table and report again from its files."""
+
+    folder: Positional[Path]
+    """Folder that `rotorgram compare` wrote."""
+
+    def run(self) -> int:
+        """Write the report and print the table."""
+        from .compare import report
+
+        report(self.folder)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckModel(Command):
+    """Examine a quadcopter model: mass, inertia, hover, free fall, torques, momentum, contact."""
+
+    xml: Positional[Path | None] = None
+    """MJCF file. Default: the model that every simulation here uses."""
+
+    def run(self) -> int:
+        """Print every check; exit status 1 if one fails."""
+        import mujoco
+        from rich.console import Console
+        from rich.table import Table
+
+        from ..models import load_model
+        from ..models.checks import examine
+
+        if self.xml is not None and not self.xml.is_file():
+            raise ValueError(f"xml: no file {self.xml}")
+        model = load_model() if self.xml is None else mujoco.MjModel.from_xml_path(str(self.xml))
+        checks = examine(model)
+        table = Table("", "check", "expected", "measured - expected", "tolerance", "source")
+        for check in checks:
+            table.add_row(
+                "[green]ok" if check.passed else "[red]FAILED",
+                check.name,
+                f"{check.expected:.7g} {check.unit}",
+                f"{check.measured - check.expected:.1e}",
+                f"{check.tolerance:.0e}",
+                check.source,
+            )
+        Console().print(table)
+        failed = sum(not check.passed for check in checks)
+        print(f"{len(checks) - failed} of {len(checks)} checks passed")
+        return 1 if failed else 0
+
+
+COMMANDS: dict[str, Any] = {
+    "sim": Sim,
+    "train": Train,
+    "serve": Serve,
+    "evaluate": Evaluate,
+    "compare": Compare,
+    "report": Report,
+    "check-model": CheckModel,
+}
+
+
+def parse_address(text: str) -> "Address":
+    """HOST:PORT as a pair. Raises `ValueError`."""
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65535:
+        raise ValueError(f"address: expected HOST:PORT with a port up to 65535, got {text!r}")
+    return host, int(port)
+
+
+def parse_changes(changes: tuple[str, ...]) -> dict[str, Any]:
+    """`name=value` pairs of hyperparameters. Raises `ValueError`."""
+    result = {}
+    for change in changes:
+        name, equals, value = change.partition("=")
+        if not equals:
+            raise ValueError(f"set: expected NAME=VALUE, got {change!r}")
+        try:
+            result[name] = json.loads(value.lower() if value in ("True", "False") else value)
+        except json.JSONDecodeError:
+            result[name] = value
+    return result
+
+
+def load_policy(name: str, env: ElevationConfig) -> "tuple[Policy, ElevationConfig]":
+    """A policy by checkpoint path or as `pid`, and the options of the env that it flies."""
+    if name == "pid":
+        from ..agents.pid import PID
+
+        return PID(env), env
+    from ..agents.checkpoints import load
+
+    checkpoint = load(Path(name))
+    if env == ElevationConfig():
+        env = ElevationConfig.from_options(checkpoint.env)
+    return checkpoint.policy(), env
+
+
+@contextmanager
+def remote_env(
+    config: ElevationConfig, listen: str | None, insecure: bool
+) -> "Iterator[RemoteEnv]":
+    """A remote env with a simulator of its own, or the one that comes to `listen`."""
+    if listen is None:
+        from ..experiments.pairs import socket_pair
+
+        with socket_pair(config) as env:
+            yield env
+        return
+    from ..udp import RemoteEnv
+
+    address = parse_address(listen)
+    env = RemoteEnv(address, options=asdict(config), connect=False, insecure=insecure)
+    with _closing(env):
+        print(f"waiting for a simulator at {listen}: rotorgram sim --server {listen}", flush=True)
+        env.connect()
+        yield env
+
+
+def new_folder(out: Path | None, name: str) -> Path:
+    """The folder to write to; by default one named by the time."""
+    folder = out or Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    if folder.exists():
+        raise ValueError(f"out: {folder} is there already; choose another folder")
+    return folder
+
+
+@contextmanager
+def _closing(env: "RemoteEnv") -> "Iterator[RemoteEnv]":
+    try:
+        yield env
+    finally:
+        env.close()
+
+
+def _counters(counters: Any) -> str:
+    return (
+        ", ".join(f"{count} {name}" for name, count in sorted(counters.items())) or "no datagrams"
+    )

@@ -1,0 +1,49 @@
+"""`rotorgram compare` and `rotorgram report`."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from ..experiments.compare import CompareConfig
+from ..experiments.compare import compare as run_comparison
+from ..experiments.metrics import results_table
+from ..experiments.records import read_records
+from ..experiments.report import terminal_table, write_report
+from .commands import new_folder
+from .progress import bars
+
+if TYPE_CHECKING:
+    from .commands import Compare
+
+__all__ = ["compare", "report"]
+
+
+def compare(command: "Compare") -> int:
+    """Train, evaluate and report."""
+    config = CompareConfig(
+        agents=command.agents,
+        seeds=command.seeds,
+        env_steps=command.env_steps,
+        preset=command.preset,
+        env=command.env,
+        snapshots=command.snapshots,
+        episodes=command.episodes,
+        jobs=command.jobs,
+    )
+    folder = new_folder(command.out, "compare")
+    words = shlex.join(["rotorgram", *sys.argv[1:]])
+    with bars() as progress:
+        run_comparison(config, folder, words, progress)
+    report(folder)
+    return 0
+
+
+def report(folder: Path) -> None:
+    """Write figures and report from the folder's files, and print the table."""
+    page = write_report(folder)
+    records = read_records(folder)
+    Console(width=100).print(terminal_table(results_table(records.evaluations, records.runs)))
+    print(f"report: {page}")

@@ -1,0 +1,1 @@
+"""Training runs, evaluation, and the comparison with its figures and report."""

@@ -1,0 +1,289 @@
+"""Do the paper's claims about VPG and A2C hold in a comparison's data?
+
+Each claim of the paper's section 3 becomes one number per training run; the two agents' numbers are
+compared by the bootstrap of the difference between their interquartile means over seeds. The
+paper shows one run of each agent and gives no definitions, so the definitions here are ours, and
+every verdict states its own.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from .metrics import (
+    HOLD_THRESHOLD,
+    bootstrap_difference,
+    bootstrap_interval,
+    episode_ends,
+    final_per_run,
+    iqm,
+)
+
+__all__ = [
+    "MIN_SEEDS",
+    "Verdict",
+    "convergence_step",
+    "fluctuation",
+    "judge_claims",
+    "long_run_return",
+]
+
+MIN_SEEDS: Final = 3
+"""Seeds that each agent needs before a claim is decided: fewer show too little of the spread."""
+
+MIN_EPISODES: Final = 10
+"""Training episodes below which a run's curve says nothing."""
+
+CONVERGENCE_BAND: Final = 0.1
+"""Share of the smoothed curve's range within which it counts as converged."""
+
+SMOOTHING_SHARE: Final = 0.1
+"""Share of training over which the episode return is averaged."""
+
+FLUCTUATION_WINDOW: Final = 11
+"""Episodes in the centred moving average around which the fluctuation is measured."""
+
+_GRID: Final = 100
+
+Outcome = Literal["borne out", "not borne out", "undecided", "not tested"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What the data say about one claim of the paper."""
+
+    claim: str
+    """The claim, with the paper's words."""
+    source: str
+    """Where the paper makes it."""
+    verdict: Outcome
+    """The outcome."""
+    definition: str
+    """How the claim was measured and decided."""
+    evidence: str
+    """The numbers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Comparison:
+    """A claim that A2C's number is larger (or smaller) than VPG's."""
+
+    measure: Callable[[pd.DataFrame], float]
+    claim: str
+    source: str
+    definition: str
+    unit: str
+    larger: bool
+
+
+def _late(run: pd.DataFrame) -> npt.NDArray[np.bool_]:
+    """Which episodes of a run ended in the last quarter of its training, shape (episodes,)."""
+    ends = episode_ends(run)
+    return np.asarray(ends > 0.75 * ends.max())
+
+
+def convergence_step(run: pd.DataFrame) -> float:
+    """Env step from which one run's smoothed training return stays near its final level.
+
+    Args:
+        run: The training episodes of one run, in order.
+
+    Returns:
+        nan for fewer than `MIN_EPISODES` episodes.
+    """
+    if len(run) < MIN_EPISODES:
+        return float("nan")
+    ends = episode_ends(run)
+    total = np.concatenate([[0.0], np.cumsum(run["return"].to_numpy())])
+    grid = ends[-1] * np.arange(1, _GRID + 1) / _GRID
+    # Episodes first..last-1 ended within the window behind each grid point.
+    last = np.searchsorted(ends, grid, side="right")
+    first = np.searchsorted(ends, grid - SMOOTHING_SHARE * ends[-1], side="right")
+    filled = last > first  # no episode ended in the window: the level is unknown there
+    level = (total[last] - total[first])[filled] / (last - first)[filled]
+    away = np.abs(level - level[-1]) > CONVERGENCE_BAND * np.ptp(level)
+    start = int(away.nonzero()[0][-1]) + 1 if away.any() else 0
+    return float(grid[filled][start])
+
+
+def long_run_return(run: pd.DataFrame) -> float:
+    """Mean return of one run's episodes in the last quarter of training; nan if too few."""
+    if len(run) < MIN_EPISODES:
+        return float("nan")
+    return float(run["return"].to_numpy()[_late(run)].mean())
+
+
+def fluctuation(run: pd.DataFrame) -> float:
+    """Spread of one run's episode returns around their moving average, late in training.
+
+    The standard deviation over the episodes of the last quarter of training; nan if the run has
+    fewer than `MIN_EPISODES` episodes or fewer than two in that quarter.
+    """
+    late = _late(run) if len(run) else np.zeros(0, dtype=bool)
+    if len(run) < MIN_EPISODES or late.sum() < 2:
+        return float("nan")
+    moving = run["return"].rolling(FLUCTUATION_WINDOW, center=True, min_periods=1).mean()
+    return float((run["return"] - moving).to_numpy()[late].std(ddof=1))
+
+
+_CONVERGENCE: Final = _Comparison(
+    measure=convergence_step,
+    claim="A2C converges later than VPG: it “takes much more episodes to converge”.",
+    source="Section 3, Figure 6 (“A2C converge slower than VPG”)",
+    definition=(
+        "Convergence: the env step from which the training return, averaged over "
+        f"{100 * SMOOTHING_SHARE:.0f} % of training, stays within "
+        f"{100 * CONVERGENCE_BAND:.0f} % of its own range around its final level. Env "
+        "steps are compared, not episodes, because crashes make episodes of unequal length."
+    ),
+    unit=" env steps",
+    larger=True,
+)
+_RETURN: Final = _Comparison(
+    measure=long_run_return,
+    claim="A2C's long-run average reward is higher: it “can reach to higher average reward”.",
+    source="Section 3, Figures 6 and 7 (“A2C outperform the VPG on the long run”)",
+    definition="Long run: the mean return of the episodes in the last quarter of training.",
+    unit="",
+    larger=True,
+)
+_FLUCTUATION: Final = _Comparison(
+    measure=fluctuation,
+    claim="A2C fluctuates less than VPG: “with much more stability”, “with minimum fluctuation”.",
+    source="Section 3, Figures 6 and 8",
+    definition=(
+        "Fluctuation: the standard deviation of the episode return around its centred moving "
+        f"average over {FLUCTUATION_WINDOW} episodes, in the last quarter of training."
+    ),
+    unit="",
+    larger=False,
+)
+
+
+def judge_claims(episodes: pd.DataFrame, evaluations: pd.DataFrame) -> list[Verdict]:
+    """Judge the paper's four claims from the training episodes and the evaluations.
+
+    Args:
+        episodes: As of `records.read_episodes`.
+        evaluations: As of `records.read_evaluations`.
+    """
+    return [
+        _compare(episodes, _CONVERGENCE),
+        _compare(episodes, _RETURN),
+        _compare(episodes, _FLUCTUATION),
+        _judge_hold(evaluations, sorted(set(episodes["agent"]) & {"vpg", "a2c"})),
+    ]
+
+
+def _per_run(episodes: pd.DataFrame, agent: str, comparison: _Comparison) -> list[float]:
+    """The comparison's number for every run of an agent, shape (seeds,)."""
+    own = episodes[episodes["agent"] == agent].sort_values(["seed", "first_step"], kind="stable")
+    return [comparison.measure(run) for _, run in own.groupby("seed")]
+
+
+def _compare(episodes: pd.DataFrame, comparison: _Comparison) -> Verdict:
+    a2c, vpg = (_per_run(episodes, agent, comparison) for agent in ("a2c", "vpg"))
+    missing = [name for name, runs in (("A2C", a2c), ("VPG", vpg)) if not runs]
+    if missing:
+        return _verdict(comparison, "not tested", f"{_join(missing)} not trained.")
+    difference, low, high = bootstrap_difference(a2c, vpg)
+    counts = [int(np.isfinite(runs).sum()) for runs in (a2c, vpg)]
+    unit = comparison.unit
+    evidence = (
+        f"A2C {_number(iqm(a2c))}{unit} ({_seeds(counts[0], len(a2c))}), "
+        f"VPG {_number(iqm(vpg))}{unit} ({_seeds(counts[1], len(vpg))}); "
+    )
+    if min(counts) < MIN_SEEDS:
+        return _verdict(
+            comparison,
+            "undecided",
+            f"{evidence}fewer than {MIN_SEEDS} seeds of an agent show no dependable spread.",
+        )
+    evidence += f"difference {_number(difference)}, 95 % interval {_range(low, high)}."
+    if low <= 0.0 <= high:
+        return _verdict(comparison, "undecided", evidence)
+    as_claimed = (low > 0.0) == comparison.larger
+    return _verdict(comparison, "borne out" if as_claimed else "not borne out", evidence)
+
+
+def _verdict(comparison: _Comparison, outcome: Outcome, evidence: str) -> Verdict:
+    return Verdict(
+        claim=comparison.claim,
+        source=comparison.source,
+        verdict=outcome,
+        definition=comparison.definition,
+        evidence=evidence,
+    )
+
+
+def _judge_hold(evaluations: pd.DataFrame, trained: list[str]) -> Verdict:
+    final = final_per_run(evaluations)
+    parts: list[str] = []
+    outcomes: list[Outcome] = []
+    for agent in ("a2c", "vpg"):
+        runs = final[final["agent"] == agent]
+        if agent not in trained or runs.empty:
+            outcomes.append("not tested")
+            parts.append(f"{agent.upper()} not trained")
+        else:
+            outcome, part = _holds(runs)
+            outcomes.append(outcome)
+            parts.append(f"{agent.upper()} {part}")
+    return Verdict(
+        claim=(
+            "Both agents hold the target: “both implemented algorithms achieve high stability, "
+            "by achieving convergence to the required performance”."
+        ),
+        source="Abstract; section 3, Figure 8",
+        verdict=_together(outcomes),
+        definition=(
+            "Holding: the steady-state |E| (mean over the last quarter of each episode) of the "
+            f"final deterministic evaluation lies below {HOLD_THRESHOLD} m with the upper end of "
+            "its 95 % interval, and no episode of it crashes."
+        ),
+        evidence="; ".join(parts) + ".",
+    )
+
+
+def _together(outcomes: list[Outcome]) -> Outcome:
+    """The verdict on a claim about both agents: one that fails, fails it."""
+    order: tuple[Outcome, ...] = ("not tested", "not borne out", "undecided", "borne out")
+    return min(outcomes, key=order.index)
+
+
+def _holds(runs: pd.DataFrame) -> tuple[Outcome, str]:
+    """Whether one agent holds its target in its final evaluation, and the numbers."""
+    values = runs["steady_error"].to_numpy()
+    low, high = bootstrap_interval(values)
+    count, crashed = int(np.isfinite(values).sum()), int(runs["crashed"].sum())
+    text = f"{_number(iqm(values))} m ({_seeds(count, len(values))}"
+    text += f", 95 % interval {_range(low, high)} m)" if np.isfinite(low) else ", no interval)"
+    text += f", {crashed} of {int(runs['episodes'].sum())} episodes crashed" if crashed else ""
+    if count < MIN_SEEDS:
+        return "undecided", text
+    if low >= HOLD_THRESHOLD:
+        return "not borne out", text
+    held = high < HOLD_THRESHOLD and not crashed and count == len(values)
+    return ("borne out" if held else "undecided"), text
+
+
+def _number(value: float) -> str:
+    if not np.isfinite(value):
+        return "no value"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def _range(low: float, high: float) -> str:
+    return f"{_number(low)} to {_number(high)}"
+
+
+def _seeds(count: int, total: int) -> str:
+    return f"{count} of {total} seeds" if count < total else f"{total} seed{'s' * (total != 1)}"
+
+
+def _join(names: list[str]) -> str:
+    return f"{' and '.join(names)} {'were' if len(names) > 1 else 'was'}"

@@ -1,0 +1,170 @@
+"""One training run: an agent, an env, a seed; with snapshots, checkpoints and a way to stop."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from ..agents import A2CConfig, VPGConfig, make_agent, preset
+from ..agents.checkpoints import Checkpoint, load, store
+from ..agents.episodes import Episode, EpisodeLog
+from ..envs import ElevationConfig
+
+__all__ = ["Progress", "Run", "Snapshot", "Training"]
+
+_RECENT = 20  # episodes that a progress report averages over
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """What is trained: everything that the numbers follow from, but for the software."""
+
+    algorithm: str
+    config: VPGConfig | A2CConfig
+    env: ElevationConfig
+    seed: int
+    env_steps: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Snapshot:
+    """The policy after part of the training."""
+
+    env_steps: int
+    seconds: float
+    actor: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """Where a training stands."""
+
+    env_steps: int
+    total: int
+    seconds: float
+    mean_return: float
+    """Of the last episodes; NaN before the first has ended."""
+    mean_abs_error: float
+    """Of the last episodes, m."""
+
+    def words(self) -> str:
+        """How it goes, for a progress bar."""
+        if np.isnan(self.mean_return):
+            return ""
+        return f"return {self.mean_return:.0f}, |E| {self.mean_abs_error:.2f} m"
+
+
+@dataclass
+class Training:
+    """A run on an env, to be started, stopped, stored and resumed at update boundaries.
+
+    Args:
+        run: What to train.
+        env: Local or remote; not closed here.
+        snapshots: How many times, evenly spread, the policy is kept for later evaluation, besides
+            the untrained one.
+    """
+
+    run: Run
+    env: gym.Env[np.ndarray, Any]
+    snapshots: int = 0
+    taken: list[Snapshot] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        # Networks of 16 units: a second thread costs more than it brings.
+        torch.set_num_threads(1)
+        self.log = EpisodeLog(self.env, self.run.seed)
+        self.agent = make_agent(self.run.algorithm, self.log, self.run.config, self.run.seed)
+
+    @classmethod
+    def resume(
+        cls, path: Path, env: gym.Env[np.ndarray, Any], episodes: list[Episode]
+    ) -> "Training":
+        """Go on from a checkpoint. `episodes` are those that ended before it.
+
+        Raises:
+            CheckpointError: The file is missing, or is no checkpoint.
+            ResumeError: The env does not repeat the episode that was interrupted.
+        """
+        kept = load(path)
+        run = Run(
+            algorithm=kept.algorithm,
+            config=preset(kept.algorithm, "paper", **kept.config),
+            env=ElevationConfig.from_options(kept.env),
+            seed=kept.seed,
+            env_steps=kept.env_steps,
+        )
+        training = cls(run, env)
+        training.agent.set_state(kept.state)
+        training.log.resume(kept.position, episodes)
+        return training
+
+    def train(self, on_update: Callable[[], bool] = lambda: True) -> bool:
+        """Train to the end, or until `on_update` returns False. Whether the end was reached."""
+        if self.snapshots:
+            self._take()
+
+        def after_update() -> bool:
+            if self.snapshots and self._due():
+                self._take()
+            return on_update()
+
+        self.agent.train(self.log, self.run.env_steps, after_update)
+        if self.snapshots and self.taken[-1].env_steps < self.log.env_steps:
+            self._take()
+        return self.log.env_steps >= self._reachable
+
+    def progress(self) -> Progress:
+        """Where the training stands."""
+        recent = self.log.episodes[-_RECENT:]
+        return Progress(
+            env_steps=self.log.env_steps,
+            total=self.run.env_steps,
+            seconds=self.log.seconds,
+            mean_return=float(np.mean([e.total_reward for e in recent])) if recent else np.nan,
+            mean_abs_error=float(np.mean([e.mean_abs_error for e in recent])) if recent else np.nan,
+        )
+
+    def checkpoint(self) -> Checkpoint:
+        """Everything that resuming needs. To be taken at an update."""
+        hello = getattr(self.env, "hello", None)
+        return Checkpoint(
+            algorithm=self.run.algorithm,
+            config=asdict(self.run.config),
+            env=asdict(self.run.env),
+            seed=self.run.seed,
+            env_steps=self.run.env_steps,
+            model_hash=hello.model_hash if hello else "",
+            actor=self.agent.actor(),
+            state=self.agent.state(),
+            position=self.log.position(),
+        )
+
+    def store(self, path: Path) -> None:
+        """Write a checkpoint."""
+        store(self.checkpoint(), path)
+
+    @property
+    def _reachable(self) -> int:
+        # SB3 flies whole rollouts only.
+        if self.run.algorithm == "sb3-a2c" and isinstance(self.run.config, A2CConfig):
+            return (
+                self.run.env_steps
+                // self.run.config.steps_per_update
+                * (self.run.config.steps_per_update)
+            )
+        return self.run.env_steps
+
+    def _due(self) -> bool:
+        return self.log.env_steps * self.snapshots >= len(self.taken) * self.run.env_steps
+
+    def _take(self) -> None:
+        self.taken.append(
+            Snapshot(
+                env_steps=self.log.env_steps, seconds=self.log.seconds, actor=self.agent.actor()
+            )
+        )

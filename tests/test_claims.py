@@ -1,0 +1,181 @@
+"""Verdicts on the paper's claims, for training curves of which the answer is known."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+from rotorgram.experiments.claims import (
+    Verdict,
+    convergence_step,
+    fluctuation,
+    judge_claims,
+    long_run_return,
+)
+from rotorgram.experiments.records import EPISODE_COLUMNS, EVALUATION_COLUMNS
+
+LENGTH = 10
+COUNT = 100
+
+
+def run(returns: np.ndarray, agent: str = "a2c", seed: int = 0) -> pd.DataFrame:
+    """The training episodes of a run, of 10 steps each."""
+    number = np.arange(len(returns))
+    frame = pd.DataFrame({"episode": number, "first_step": number * LENGTH, "return": returns})
+    frame = frame.assign(agent=agent, seed=seed, length=LENGTH, mean_abs_error=0.0)
+    return frame.assign(terminated=False, truncated=True, seconds=0.0)[list(EPISODE_COLUMNS)]
+
+
+def step_at(episode: int, top: float = 1.0) -> np.ndarray:
+    return np.where(np.arange(COUNT) < episode, 0.0, top)
+
+
+def training(make: Callable[[str, int], np.ndarray], seeds: int = 5) -> pd.DataFrame:
+    return pd.concat(
+        run(make(agent, seed), agent, seed) for agent in ("a2c", "vpg") for seed in range(seeds)
+    )
+
+
+def evaluated(**errors: list[float]) -> pd.DataFrame:
+    rows = [
+        dict.fromkeys(EVALUATION_COLUMNS, 0)
+        | {"agent": agent, "seed": seed, "env_steps": 1000, "steady_error": error}
+        | {"settling_time": math.nan, "terminated": False}
+        for agent, values in errors.items()
+        for seed, error in enumerate(values)
+    ]
+    return pd.DataFrame(rows, columns=list(EVALUATION_COLUMNS))
+
+
+HELD = evaluated(a2c=[0.01] * 5, vpg=[0.02] * 5)
+
+
+def outcomes(episodes: pd.DataFrame, evaluations: pd.DataFrame = HELD) -> list[str]:
+    return [verdict.verdict for verdict in judge_claims(episodes, evaluations)]
+
+
+def test_convergence_step_of_a_step_curve():
+    # The step comes at env step 500; the mean over 100 steps is within 10 % of the new level
+    # when 9 of its 10 episodes lie behind the step.
+    assert convergence_step(run(step_at(50))) == 590.0
+    assert convergence_step(run(step_at(50, top=-3.0))) == 590.0
+    assert convergence_step(run(np.full(COUNT, 7.0))) == 10.0
+    assert math.isnan(convergence_step(run(np.ones(9))))
+
+
+def test_convergence_step_where_windows_are_empty():
+    # Ten episodes, the windows of a tenth hold one each; the return rises at the last.
+    assert convergence_step(run(step_at(9)[:10])) == 100.0
+    # Nothing ended before env step 60 of 105: the curve begins there.
+    late = run(np.ones(10)).assign(first_step=[0, *range(60, 105, 5)], length=[60, *[5] * 9])
+    assert convergence_step(late) == pytest.approx(60.9)
+
+
+def test_long_run_return_is_the_mean_of_the_last_quarter():
+    returns = np.concatenate([np.full(75, -100.0), np.arange(25.0)])
+    assert long_run_return(run(returns)) == 12.0
+    assert math.isnan(long_run_return(run(np.ones(9))))
+
+
+def test_fluctuation_ignores_trends_and_sees_alternation():
+    assert fluctuation(run(np.full(COUNT, 3.0))) == 0.0
+    # A ramp equals its centred mean but for the last five episodes, whose window is cut: they lie
+    # 2.5, 2, 1.5, 1 and 0.5 above it, in a quarter of 25 episodes.
+    ends = np.array([0.0] * 20 + [0.5, 1.0, 1.5, 2.0, 2.5])
+    assert fluctuation(run(np.arange(float(COUNT)))) == pytest.approx(ends.std(ddof=1))
+    alternating = np.resize([1.0, -1.0], COUNT)
+    # Eleven alternating values have the mean -1/11 of the middle one, so it lies 12/11 off; the
+    # last five windows are cut and differ a little.
+    assert fluctuation(run(alternating)) == pytest.approx(12 / 11, rel=0.05)
+    assert fluctuation(run(5 * alternating)) == pytest.approx(
+        5 * fluctuation(run(alternating)), rel=1e-12
+    )
+    assert math.isnan(fluctuation(run(np.ones(9))))
+
+
+def paper_like(agent: str, seed: int) -> np.ndarray:
+    noise = np.resize([1.0, -1.0], COUNT)
+    if agent == "a2c":
+        return step_at(50 + seed, top=10.0) + 0.1 * noise
+    return step_at(20 + seed, top=8.0) + 0.5 * noise
+
+
+def swapped(agent: str, seed: int) -> np.ndarray:
+    return paper_like("vpg" if agent == "a2c" else "a2c", seed)
+
+
+def test_data_as_in_the_paper_bear_its_claims_out():
+    assert outcomes(training(paper_like)) == ["borne out"] * 4
+
+
+def test_data_with_the_agents_swapped_do_not():
+    assert outcomes(training(swapped)) == ["not borne out"] * 3 + ["borne out"]
+
+
+def test_alike_agents_leave_claims_undecided():
+    def alike(agent: str, seed: int) -> np.ndarray:
+        noise = np.random.default_rng([seed, agent == "vpg"]).normal(size=COUNT)
+        return step_at(40 + 5 * seed, top=10.0) + noise
+
+    assert outcomes(training(alike))[:3] == ["undecided"] * 3
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_few_seeds_decide_nothing(seeds):
+    errors = evaluated(a2c=[0.01] * seeds, vpg=[0.01] * seeds)
+    verdicts = judge_claims(training(paper_like, seeds), errors)
+    assert [verdict.verdict for verdict in verdicts] == ["undecided"] * 4
+    assert "fewer than 3 seeds" in verdicts[0].evidence
+
+
+def test_an_agent_that_was_not_trained_is_not_tested():
+    episodes = training(paper_like)
+    only = episodes[episodes["agent"] == "a2c"]
+    verdicts = judge_claims(only, evaluated(a2c=[0.01] * 5))
+    assert [verdict.verdict for verdict in verdicts] == ["not tested"] * 4
+    assert verdicts[0].evidence == "VPG was not trained."
+    assert outcomes(episodes.iloc[:0], evaluated(pid=[0.0])) == ["not tested"] * 4
+
+
+@pytest.mark.parametrize(
+    ("vpg", "expected"),
+    [
+        ([0.02, 0.03, 0.04], "borne out"),
+        ([0.2, 0.3, 0.4], "not borne out"),
+        ([0.02, 0.03, 0.4], "undecided"),  # the interval reaches from 0.02 to 0.4
+        ([0.02, 0.03, 0.04, math.nan], "undecided"),  # a seed without a value proves nothing
+    ],
+)
+def test_holding_the_target(vpg, expected):
+    errors = evaluated(a2c=[0.01] * 3, vpg=vpg)
+    verdict = judge_claims(training(paper_like), errors)[3]
+    assert verdict.verdict == expected
+    assert "A2C 0.01 m" in verdict.evidence
+
+
+def test_a_crash_in_the_evaluation_is_not_holding():
+    errors = HELD.assign(terminated=[True, *[False] * 9])
+    verdict = judge_claims(training(paper_like), errors)[3]
+    assert verdict.verdict == "undecided"
+    assert "1 of 5 episodes crashed" in verdict.evidence
+
+
+def test_runs_that_are_too_short_are_named():
+    episodes = training(paper_like, seeds=4)
+    short = (episodes["agent"] == "vpg") & (episodes["seed"] == 3) & (episodes["episode"] >= 5)
+    verdict = judge_claims(episodes[~short], HELD)[1]
+    assert verdict.verdict == "borne out"
+    # 8, and 25 alternating halves that begin and end with -0.5.
+    assert "A2C 10 (4 seeds), VPG 7.98 (3 of 4 seeds)" in verdict.evidence
+
+
+def test_verdicts_are_frozen_and_state_their_source():
+    verdicts = judge_claims(training(paper_like), HELD)
+    for verdict in verdicts:
+        assert "ection 3" in verdict.source
+        assert verdict.definition
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        verdicts[0].verdict = "undecided"  # type: ignore[misc]
+    assert isinstance(verdicts[0], Verdict)

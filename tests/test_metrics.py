@@ -1,0 +1,186 @@
+"""Metrics against values computed by hand."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from rotorgram.experiments.metrics import (
+    Curve,
+    average_return,
+    bootstrap_difference,
+    bootstrap_interval,
+    env_steps_to_reach,
+    final_evaluations,
+    final_per_run,
+    iqm,
+    overshoot,
+    results_table,
+    seconds_to_reach,
+    settling_time,
+    spread_over_seeds,
+    steady_state_error,
+)
+from rotorgram.experiments.records import EVALUATION_COLUMNS, RUN_COLUMNS
+
+
+def evaluations(*rows: tuple[object, ...]) -> pd.DataFrame:
+    """Rows of (agent, seed, env_steps, steady_error, settling_time, terminated)."""
+    names = ["agent", "seed", "env_steps", "steady_error", "settling_time", "terminated"]
+    frame = pd.DataFrame(rows, columns=names)
+    frame["episode"] = frame.groupby(["agent", "seed", "env_steps"]).cumcount()
+    frame = frame.assign(seconds=frame["env_steps"] / 100, length=10, overshoot=0.2)
+    return frame.assign(**{"return": 5.0})[list(EVALUATION_COLUMNS)]
+
+
+def runs(*rows: tuple[object, ...]) -> pd.DataFrame:
+    return pd.DataFrame(rows, columns=list(RUN_COLUMNS))
+
+
+def test_steady_state_error_is_the_mean_magnitude_of_the_last_quarter():
+    assert steady_state_error(np.array([5, 4, 3, 2, 1, 1, 0.1, -0.3])) == pytest.approx(0.2)
+    assert steady_state_error(np.array([3.0, -2.0])) == 2.0  # at least the last step
+    assert math.isnan(steady_state_error(np.array([])))
+
+
+@pytest.mark.parametrize(
+    ("errors", "expected"),
+    [
+        ([1.0, 0.04, 0.2, 0.03, -0.04], 0.3),  # leaves the band once more at step 2
+        ([0.01, 0.02], 0.0),
+        ([1.0, 0.5, 0.05], math.nan),  # the band is open: 0.05 is not below 0.05
+        ([0.01, 0.02, 1.0], math.nan),
+        ([1.0, 0.0, math.nan], math.nan),
+        ([], math.nan),
+    ],
+)
+def test_settling_time(errors, expected):
+    value = settling_time(np.array(errors), control_period=0.1)
+    assert value == pytest.approx(expected, nan_ok=True)
+
+
+@pytest.mark.parametrize(
+    ("errors", "expected"),
+    [
+        ([2.0, 0.5, -0.3, 0.1], 0.3),
+        ([-2.0, 0.4, -0.1], 0.4),
+        ([2.0, 1.0, 0.5], 0.0),
+        ([0.0, 0.1, -0.2], 0.2),
+        ([], math.nan),
+    ],
+)
+def test_overshoot(errors, expected):
+    assert overshoot(np.array(errors)) == pytest.approx(expected, nan_ok=True)
+
+
+def test_iqm_cuts_a_quarter_from_each_end():
+    assert iqm([1.0, 2.0, 3.0, 100.0]) == 2.5
+    assert iqm([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 700.0]) == 3.5
+    assert iqm([1.0, 2.0, 6.0]) == 3.0  # nothing to cut below four
+    assert iqm([math.nan, 4.0]) == 4.0
+    assert math.isnan(iqm([]))
+
+
+def test_bootstrap_interval():
+    assert bootstrap_interval([3.0] * 5) == (3.0, 3.0)
+    assert all(math.isnan(end) for end in bootstrap_interval([3.0]))
+    assert all(math.isnan(end) for end in bootstrap_interval([3.0, math.nan]))
+    # Of two values, a quarter of the resamples holds one alone: the 95 % interval spans both.
+    assert bootstrap_interval([1.0, 2.0]) == (1.0, 2.0)
+    values = np.random.default_rng(3).normal(10.0, 1.0, size=40)
+    low, high = bootstrap_interval(values)
+    assert low < iqm(values) < high
+    # The standard error of the mean of 40 would be 0.16, and the interval 0.62 wide.
+    assert 0.4 < high - low < 1.2
+    assert bootstrap_interval(values) == (low, high)
+
+
+def test_bootstrap_difference():
+    assert bootstrap_difference([5.0] * 3, [2.0] * 4) == (3.0, 3.0, 3.0)
+    difference, low, high = bootstrap_difference([1.0, 2.0], [0.0, 4.0])
+    assert (difference, low, high) == (-0.5, -3.0, 2.0)
+    difference, low, high = bootstrap_difference([1.0], [0.0, 4.0])
+    assert difference == -1.0
+    assert math.isnan(low)
+    assert math.isnan(high)
+
+
+def test_reaching_the_target_counts_from_the_first_snapshot_that_lasts():
+    errors = {0: 2.0, 100: 0.05, 200: 0.3, 300: 0.05, 400: 0.09}
+    run = evaluations(*(("a2c", 0, steps, error, 1.0, False) for steps, error in errors.items()))
+    assert env_steps_to_reach(run) == 300.0
+    assert seconds_to_reach(run) == 3.0
+    assert env_steps_to_reach(run.iloc[::-1]) == 300.0  # whatever the rows' order
+    assert env_steps_to_reach(run, threshold=0.5) == 100.0
+    assert math.isnan(env_steps_to_reach(run, threshold=0.08))
+
+
+def test_a_snapshot_is_its_mean_and_a_crash_or_a_gap_is_a_miss():
+    good = [("a2c", 0, 100, 0.05, 1.0, False), ("a2c", 0, 100, 0.13, 1.0, False)]
+    assert env_steps_to_reach(evaluations(*good)) == 100.0  # mean 0.09
+    crash = ("a2c", 0, 100, 0.0, math.nan, True)
+    assert math.isnan(env_steps_to_reach(evaluations(*good, crash)))
+    gap = ("a2c", 0, 100, math.nan, math.nan, False)
+    assert math.isnan(env_steps_to_reach(evaluations(*good, gap)))
+
+
+def test_the_final_evaluation_is_each_runs_own_last_snapshot():
+    frame = evaluations(
+        ("a2c", 0, 100, 1.0, math.nan, False),
+        ("a2c", 0, 200, 0.1, 2.0, False),
+        ("a2c", 0, 200, 0.3, 9.0, True),
+        ("a2c", 1, 150, 0.5, math.nan, False),
+        ("pid", 0, 0, 0.0, 1.0, False),
+    )
+    assert final_evaluations(frame)["env_steps"].tolist() == [200, 200, 150, 0]
+    first = final_per_run(frame).iloc[0]
+    assert first["steady_error"] == pytest.approx(0.2)
+    assert first["settling_time"] == 2.0  # a crash has not settled, whatever its row says
+    assert (first["episodes"], first["settled"], first["crashed"]) == (2, 1, 1)
+
+
+def test_results_table():
+    frame = evaluations(
+        *(("vpg", seed, 100, 0.5, math.nan, False) for seed in range(3)),
+        *(("vpg", seed, 200, 0.02 + 0.01 * seed, 1.0 + seed, False) for seed in range(2)),
+        ("vpg", 2, 200, 0.4, math.nan, True),
+        ("pid", 0, 0, 0.01, 3.0, False),
+    )
+    table = results_table(frame, runs(*(("vpg", s, 200, 2.0, 100.0 + s) for s in range(3))))
+    assert table.index.tolist() == ["vpg", "pid"]
+    vpg, pid = table.loc["vpg"], table.loc["pid"]
+    assert vpg["steady_error"] == pytest.approx(0.15)  # (0.02 + 0.03 + 0.4) / 3
+    assert (vpg["steady_error_low"], vpg["steady_error_high"]) == pytest.approx((0.02, 0.4))
+    assert (vpg["seeds"], vpg["episodes"], vpg["settled"], vpg["crashed"]) == (3, 3, 2, 1)
+    assert vpg["settling_time"] == 1.5
+    assert (vpg["reached"], vpg["env_steps_to_reach"], vpg["seconds_to_reach"]) == (2, 200, 2)
+    assert (vpg["steps_per_second"], vpg["return"]) == (101, 5)
+    assert vpg["overshoot"] == pytest.approx(0.2)
+    assert (pid["steady_error"], pid["settling_time"]) == (0.01, 3.0)
+    assert math.isnan(pid["steady_error_low"])
+    # An agent that is not trained has reached nothing by training.
+    assert math.isnan(pid["reached"])
+    assert math.isnan(pid["env_steps_to_reach"])
+
+
+def test_average_return_is_a_mean_over_a_share_of_training():
+    run = pd.DataFrame(
+        {"first_step": [0, 10, 20, 30], "length": [10] * 4, "return": [1.0, 2.0, 4.0, 8.0]}
+    )
+    curve = average_return(run, share=0.5)  # the last 20 steps: two episodes
+    assert curve.x.tolist() == [10, 20, 30, 40]
+    assert curve.y.tolist() == [1.0, 1.5, 3.0, 6.0]
+    assert average_return(run, share=0.01).y.tolist() == [1.0, 2.0, 4.0, 8.0]
+
+
+def test_spread_over_seeds_keeps_to_what_all_seeds_reach():
+    def line(end: float, height: float) -> Curve:
+        return Curve(np.array([0.0, end]), np.array([height, height]))
+
+    grid = np.array([0.0, 5.0, 10.0])
+    three = spread_over_seeds([line(10, 1.0), line(10, 2.0), line(6, 6.0)], grid)
+    assert three.x.tolist() == [0.0, 5.0]
+    assert three.middle.tolist() == [3.0, 3.0]
+    assert (three.low.tolist(), three.high.tolist()) == ([1.0, 1.0], [6.0, 6.0])
+    five = spread_over_seeds([line(10, height) for height in (0.0, 1.0, 2.0, 3.0, 40.0)], grid)
+    assert (five.low[0], five.middle[0], five.high[0]) == (1.0, 2.0, 3.0)

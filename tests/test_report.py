@@ -1,0 +1,355 @@
+"""The files, the figures and the report of a comparison, on small synthetic folders."""
+
+import json
+import re
+from collections.abc import Sequence
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from rich.console import Console
+from rotorgram.experiments.figures import FIGURE_FILES, agent_color, agent_label, draw_figures
+from rotorgram.experiments.metrics import (
+    overshoot,
+    results_table,
+    settling_time,
+    steady_state_error,
+)
+from rotorgram.experiments.records import (
+    EPISODE_COLUMNS,
+    EVALUATION_COLUMNS,
+    RUN_COLUMNS,
+    STEP_SCHEMA,
+    RecordsError,
+    read_config,
+    read_episodes,
+    read_records,
+    read_steps,
+    sort_agents,
+)
+from rotorgram.experiments.report import result_rows, terminal_table, write_report
+
+PERIOD = 0.05
+DELAYS = {"vpg": 0.15, "a2c": 0.3, "sb3-a2c": 0.25, "my [agent]": 0.2}
+FLOORS = {"vpg": 0.06, "a2c": 0.02, "sb3-a2c": 0.015, "pid": 0.004, "my [agent]": 0.01}
+
+
+def flight(skill: float, agent: str, length: int, rng: np.random.Generator) -> np.ndarray:
+    """E over an episode of an agent of some skill (0 to 1): damped, or drifting away."""
+    time = np.arange(length) * PERIOD
+    start = rng.uniform(-4, 4)
+    damped = start * np.exp(-time * (0.3 + 1.2 * skill)) * np.cos(time * 1.3)
+    lost = (1 - skill) * rng.normal() * 2 * time / time[-1]
+    noise = rng.normal(size=length) * FLOORS[agent] * (1 + 8 * (1 - skill))
+    return damped + lost + noise
+
+
+def synthetic_folder(
+    folder: Path,
+    agents: Sequence[str] = ("vpg", "a2c", "sb3-a2c", "pid"),
+    seeds: int = 3,
+    env_steps: int = 2000,
+    length: int = 100,
+    snapshots: int = 5,
+) -> Path:
+    """Write records with the shapes of learning: `env_steps` per run, all by chance."""
+    rng = np.random.default_rng(1)
+    episodes: list[dict[str, Any]] = []
+    evaluations: list[dict[str, Any]] = []
+    steps: list[dict[str, Any]] = []
+    trained = [agent for agent in agents if agent != "pid"]
+    for agent in agents:
+        for seed in range(seeds):
+            rate = rng.uniform(0.8, 1.25)
+            if agent in trained:
+                _train(agent, seed, rate, env_steps, length, rng, episodes, steps)
+            marks = np.linspace(0, env_steps, snapshots) if agent in trained else [0]
+            for mark in marks:
+                final = mark == marks[-1]
+                skill = 1.0 if agent == "pid" else _skill(agent, rate * mark / env_steps)
+                _evaluate(agent, seed, int(mark), skill, length, rng, evaluations, steps, final)
+    runs = [
+        (agent, seed, env_steps, env_steps / 2500, 2500.0 + seed)
+        for agent in trained
+        for seed in range(seeds)
+    ]
+    _write(folder, agents, seeds, env_steps, length, episodes, evaluations, steps, runs)
+    return folder
+
+
+def _skill(agent: str, progress: float) -> float:
+    return float(1 / (1 + np.exp(-(progress - DELAYS[agent]) * 25)))
+
+
+def _train(agent, seed, rate, env_steps, length, rng, episodes, steps):  # type: ignore[no-untyped-def]
+    begin = number = 0
+    while begin < env_steps:
+        skill = _skill(agent, rate * begin / env_steps)
+        flown = min(length if rng.random() < 0.3 + skill else length // 3, env_steps - begin)
+        errors = flight(skill, agent, max(2, flown), rng)[:flown]
+        steps.append(
+            {"agent": agent, "seed": seed, "phase": "train", "episode": number}
+            | {"step": np.arange(begin, begin + flown), "error": errors}
+        )
+        begin += flown
+        episodes.append(
+            dict.fromkeys(EPISODE_COLUMNS, 0)
+            | {"agent": agent, "seed": seed, "episode": number, "first_step": begin - flown}
+            | {"length": flown, "return": float(np.sum(1 - np.minimum(np.abs(errors), 3)))}
+            | {"mean_abs_error": float(np.abs(errors).mean()), "truncated": flown == length}
+            | {"terminated": flown < length and begin < env_steps, "seconds": begin / 2500}
+        )
+        number += 1
+
+
+def _evaluate(agent, seed, mark, skill, length, rng, evaluations, steps, final):  # type: ignore[no-untyped-def]
+    for episode in range(3):
+        errors = flight(skill, agent, length, rng)
+        evaluations.append(
+            {"agent": agent, "seed": seed, "env_steps": mark, "seconds": mark / 2500}
+            | {"episode": episode, "length": length, "return": float(np.sum(1 - np.abs(errors)))}
+            | {"steady_error": steady_state_error(errors), "overshoot": overshoot(errors)}
+            | {"settling_time": settling_time(errors, PERIOD), "terminated": False}
+        )
+        if final:
+            steps.append(
+                {"agent": agent, "seed": seed, "phase": "evaluation", "episode": episode}
+                | {"step": np.arange(length), "error": errors}
+            )
+
+
+def _write(folder, agents, seeds, env_steps, length, episodes, evaluations, steps, runs):  # type: ignore[no-untyped-def]
+    folder.mkdir(parents=True, exist_ok=True)
+    config = {
+        "created": "2025-01-02T03:04:05+00:00",
+        "command": "rotorgram compare --seeds 3 <folder>",
+        "preset": "tuned",
+        "seeds": list(range(seeds)),
+        "env_steps": env_steps,
+        "env": {"target": 10.0, "control_period": PERIOD, "episode_length": length},
+        "agents": {agent: {"learning_rate": 1e-3, "hidden": [64, 64]} for agent in agents},
+        "versions": {"rotorgram": "0.1.0", "mujoco": "4.0.0"},
+        "model_hash": "0123abcd",
+        "machine": {"platform": "Linux", "processor": "some <processor>", "cores": 2},
+    }
+    (folder / "config.json").write_text(json.dumps(config))
+    pd.DataFrame(episodes, columns=list(EPISODE_COLUMNS)).to_csv(
+        folder / "episodes.csv", index=False
+    )
+    pd.DataFrame(evaluations, columns=list(EVALUATION_COLUMNS)).to_csv(
+        folder / "evaluations.csv", index=False
+    )
+    pd.DataFrame(runs, columns=list(RUN_COLUMNS)).to_csv(folder / "runs.csv", index=False)
+    frame = pd.concat([pd.DataFrame(part) for part in steps])
+    table = pa.Table.from_pandas(
+        frame.assign(reward=0.0, thrust=49.0)[STEP_SCHEMA.names], STEP_SCHEMA, preserve_index=False
+    )
+    pq.write_table(table, folder / "steps.parquet")
+
+
+@pytest.fixture(scope="module")
+def comparison(tmp_path_factory):
+    folder = synthetic_folder(tmp_path_factory.mktemp("comparison") / "records")
+    write_report(folder)
+    return folder
+
+
+def test_records_are_read_with_their_types(comparison):
+    records = read_records(comparison)
+    assert list(records.evaluations.columns) == list(EVALUATION_COLUMNS)
+    assert records.evaluations["terminated"].dtype == bool
+    assert records.runs["env_steps"].tolist() == [2000] * 9
+    assert records.config["env"]["target"] == 10.0
+    assert sort_agents(["zeta", "pid", "a2c", "vpg", "a2c"]) == ["vpg", "a2c", "pid", "zeta"]
+
+
+def test_an_episode_that_the_end_of_training_cut_is_left_out(comparison):
+    episodes = read_episodes(comparison)
+    cut = ~(episodes["terminated"] | episodes["truncated"])
+    assert cut.any()
+    assert len(read_records(comparison).episodes) == len(episodes) - cut.sum()
+
+
+def test_steps_are_read_by_phase_and_column(comparison):
+    training = read_steps(comparison, "train", ("agent", "step"))
+    assert list(training.columns) == ["agent", "step"]
+    assert len(training) == 9 * 2000
+    assert len(read_steps(comparison, "evaluation")) == 12 * 3 * 100
+    assert read_steps(comparison, "evaluation")["agent"].dtype == "category"
+    assert len(read_steps(comparison, "nothing")) == 0
+    thinned = read_steps(comparison, "train", max_rows=1000)
+    # A thousand of all 21,600 rows, hence 833 of the training's, by chance.
+    assert 700 < len(thinned) < 970
+    pd.testing.assert_frame_equal(thinned, read_steps(comparison, "train", max_rows=1000))
+
+
+@pytest.mark.parametrize(
+    "name", ["config.json", "episodes.csv", "steps.parquet", "evaluations.csv", "runs.csv"]
+)
+def test_a_missing_file_is_named(tmp_path, name):
+    folder = synthetic_folder(tmp_path, agents=("a2c",), seeds=1, env_steps=300)
+    (folder / name).unlink()
+    with pytest.raises(RecordsError, match=f"{name} is missing"):
+        write_report(folder)
+
+
+def test_what_is_wrong_in_a_file_is_named(tmp_path):
+    folder = synthetic_folder(tmp_path, agents=("a2c",), seeds=1, env_steps=300)
+    episodes = pd.read_csv(folder / "episodes.csv")
+    episodes.drop(columns=["return", "seed"]).to_csv(folder / "episodes.csv", index=False)
+    with pytest.raises(RecordsError, match=r"episodes\.csv lacks the columns seed, return"):
+        read_episodes(folder)
+    episodes.assign(length="long").to_csv(folder / "episodes.csv", index=False)
+    with pytest.raises(RecordsError, match="cannot be read"):
+        read_episodes(folder)
+    (folder / "episodes.csv").write_text("")
+    with pytest.raises(RecordsError, match="cannot be read"):
+        read_episodes(folder)
+    (folder / "config.json").write_text('{"preset": ')
+    with pytest.raises(RecordsError, match="not JSON"):
+        read_config(folder)
+    (folder / "config.json").write_text('{"preset": "tuned"}')
+    with pytest.raises(RecordsError, match="lacks the keys created, command, seeds"):
+        read_config(folder)
+    (folder / "steps.parquet").write_text("no steps")
+    with pytest.raises(RecordsError, match="not a Parquet file"):
+        read_steps(folder, "train")
+    pq.write_table(pa.table({"agent": ["a2c"]}), folder / "steps.parquet")
+    with pytest.raises(RecordsError, match="lacks the columns seed, phase"):
+        read_steps(folder, "train")
+
+
+def test_figures_are_pictures_of_modest_size(comparison):
+    paths = [comparison / "figures" / name for name in FIGURE_FILES]
+    assert draw_figures(comparison) == paths
+    for path in paths:
+        assert path.read_bytes().startswith(b"\x89PNG")
+        assert 5_000 < path.stat().st_size < 200_000
+
+
+def test_every_agent_keeps_its_colour():
+    colors = {agent_color(agent) for agent in ("vpg", "a2c", "sb3-a2c", "pid")}
+    assert len(colors) == 4
+    assert agent_color("mine") == agent_color("mine")
+    assert agent_label("sb3-a2c") == "SB3 A2C"
+    assert agent_label("mine") == "mine"
+
+
+def test_the_report_holds_everything_in_itself(comparison):
+    text = (comparison / "report.html").read_text(encoding="utf-8")
+    assert text.count('src="data:image/png;base64,') == len(FIGURE_FILES)
+    assert not re.search(r"(?:src|href)=\"(?!data:)|url\(|@import", text)
+    assert "http" not in re.sub(r"base64,[^\"]*", "", text)
+    assert "prefers-color-scheme: dark" in text
+    assert text.count('<span class="badge') == 4
+    for figure in ("Figure 6", "Figure 7", "Figure 8"):
+        assert f"The paper&#39;s {figure}" in text
+    assert "0123abcd" in text
+
+
+def test_the_report_escapes_what_it_is_given(comparison):
+    text = (comparison / "report.html").read_text(encoding="utf-8")
+    assert "rotorgram compare --seeds 3 &lt;folder&gt;" in text
+    assert "some &lt;processor&gt;" in text
+    assert "<folder>" not in text
+
+
+def test_the_table_and_the_verdicts_are_written_too(comparison):
+    records = read_records(comparison)
+    results = results_table(records.evaluations, records.runs)
+    written = pd.read_csv(comparison / "results.csv", index_col="agent")
+    pd.testing.assert_frame_equal(written, results, check_dtype=False, check_index_type=False)
+    lines = (comparison / "results.md").read_text(encoding="utf-8").splitlines()
+    # Bars inside cells are escaped: every line of the table has the same number of columns.
+    assert [len(re.findall(r"(?<!\\)\|", line)) for line in lines[:6]] == [9] * 6
+    claims = json.loads((comparison / "claims.json").read_text(encoding="utf-8"))
+    assert len(claims) == 4
+    assert set(claims[0]) == {"claim", "source", "verdict", "definition", "evidence"}
+
+
+def results_of(**changes: float) -> pd.DataFrame:
+    row = dict.fromkeys(("seeds", "episodes", "settled", "reached"), 10) | {"crashed": 0}
+    for name in ("steady_error", "settling_time", "overshoot", "return"):
+        row |= {name: 1.0, f"{name}_low": 0.5, f"{name}_high": 12.345}
+    row |= {"env_steps_to_reach": 1234567.0, "seconds_to_reach": 99.6, "steps_per_second": 2500.4}
+    table = pd.DataFrame([row | changes], index=["sb3-a2c"])
+    table.index.name = "agent"
+    return table
+
+
+def test_cells_are_honest_about_what_is_missing():
+    (row,) = result_rows(results_of(reached=3, settled=7, crashed=2))
+    assert row[0] == ("SB3 A2C", ("10 seeds",))
+    assert row[1] == ("1.00", ("0.50 to 12.3", "2 of 10 crashed"))
+    assert row[2].details == ("0.50 to 12.3", "7 of 10 settled")
+    assert row[5] == ("1,234,567", ("3 of 10 seeds",))
+    assert (row[6].value, row[7].value) == ("99.6", "2,500")
+    nothing = dict.fromkeys(("settling_time", "settling_time_low", "settling_time_high"), np.nan)
+    (row,) = result_rows(results_of(seeds=1, reached=np.nan, settled=0, **nothing))
+    assert row[2] == ("–", ("0 of 10 settled",))
+    assert row[5].details == ()
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (0.0, "0"),
+        (0.00001234, "1e-05"),
+        (0.01234, "0.012"),
+        (0.5, "0.50"),
+        (3.14159, "3.14"),
+        (-27.18, "-27.2"),
+        (12345.6, "12,346"),
+    ],
+)
+def test_numbers_are_written_with_the_digits_that_count(value, expected):
+    (row,) = result_rows(results_of(overshoot=value))
+    assert row[3].value == expected
+
+
+def test_the_terminal_table_fits_a_hundred_columns():
+    wide = {"return": -12345.0, "return_low": -12345.0, "return_high": -11234.0, "crashed": 10}
+    wide |= {"steady_error_low": 0.0123, "steady_error_high": 0.0456, "overshoot_low": 0.0123}
+    buffer = StringIO()
+    Console(file=buffer, width=100).print(terminal_table(results_of(**wide)))
+    lines = buffer.getvalue().splitlines()
+    assert max(len(line) for line in lines) <= 100
+    assert "…" not in buffer.getvalue()
+    assert any("1,234,567" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"agents": ("pid",), "seeds": 2},
+        {"agents": ("a2c",), "seeds": 1, "snapshots": 1},
+        {"agents": ("vpg", "a2c"), "seeds": 1, "env_steps": 60},
+        {"agents": ("vpg", "my [agent]", "pid"), "seeds": 2, "snapshots": 2},
+        {"agents": ("vpg", "a2c"), "seeds": 10, "env_steps": 1000},
+    ],
+    ids=lambda options: f"{len(options['agents'])}x{options['seeds']}",
+)
+def test_any_selection_gives_a_report(tmp_path, options):
+    folder = synthetic_folder(tmp_path, **options)
+    text = write_report(folder).read_text(encoding="utf-8")
+    assert text.count('src="data:image/png') == 4
+    assert ("not tested" in text) == (not {"vpg", "a2c"} <= set(options["agents"]))
+
+
+def test_missing_values_and_crashes_give_a_report(tmp_path):
+    folder = synthetic_folder(tmp_path, agents=("vpg", "a2c"), seeds=3)
+    evaluations = pd.read_csv(folder / "evaluations.csv")
+    evaluations.loc[evaluations["seed"] == 1, ["steady_error", "overshoot"]] = np.nan
+    evaluations.loc[evaluations["agent"] == "a2c", "steady_error"] = np.nan
+    evaluations.assign(settling_time=np.nan, terminated=True).to_csv(
+        folder / "evaluations.csv", index=False
+    )
+    text = write_report(folder).read_text(encoding="utf-8")
+    assert "0 of 9 settled" in text
+    assert "9 of 9 crashed" in text
+    assert "no value" in text
