@@ -55,7 +55,7 @@ class A2C(Learner):
         advantage = self.advantages(rollout, values.detach().numpy())
         targets = torch.from_numpy(advantage.astype(np.float32)) + values.detach()
         if config.normalize and len(advantage) > 1:
-            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+            advantage = (advantage - advantage.mean()) / (advantage.std(ddof=1) + 1e-8)
         log_probability, entropy = self._actor.score(
             observations, torch.from_numpy(rollout.actions)
         )

@@ -18,12 +18,15 @@ from safetensors.numpy import save
 
 from .episodes import Position
 from .policies import NetworkPolicy
+from .presets import PRESETS
 
-__all__ = ["Checkpoint", "CheckpointError", "load", "software_versions", "store"]
+__all__ = ["Checkpoint", "CheckpointError", "load", "software_versions", "store", "write_whole"]
 
 FORMAT: Final = 1
 _ACTOR: Final = "policy/"
 _STATE: Final = "state/"
+_MALFORMED: Final = (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError)
+"""What reading a file of somebody else's making can raise."""
 
 
 class CheckpointError(ValueError):
@@ -84,7 +87,7 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
     }
     data = save({k: np.asarray(v, order="C") for k, v in arrays.items()},
                 metadata={"rotorgram": json.dumps(meta)})  # fmt: skip
-    _replace(path, data)
+    write_whole(path, data)
 
 
 def load(path: Path) -> Checkpoint:
@@ -96,33 +99,51 @@ def load(path: Path) -> Checkpoint:
     if not path.is_file():
         raise CheckpointError(f"checkpoint: no file {path}")
     try:
-        with safe_open(path, framework="numpy") as file:
-            meta = json.loads((file.metadata() or {})["rotorgram"])
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        if meta["format"] != FORMAT:
-            raise CheckpointError(
-                f"{path}: expected checkpoint format {FORMAT}, got {meta['format']}"
-            )
-        return Checkpoint(
-            **{name: meta[name] for name in ("algorithm", "config", "env", "seed", "env_steps",
-                                             "model_hash", "versions")},
-            actor=_part(arrays, _ACTOR),
-            state=_part(arrays, _STATE),
-            position=Position(
-                **meta["position"],
-                actions=arrays["episode/actions"],
-                observation=arrays["episode/observation"],
-            ),
-        )  # fmt: skip
-    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:
-        raise CheckpointError(f"{path}: expected a rotorgram checkpoint: {error}") from None
+        return _read(path)
+    except OSError as error:
+        raise CheckpointError(f"checkpoint: cannot read {path}: {error.strerror}") from None
+    except (SafetensorError, *_MALFORMED) as error:
+        raise CheckpointError(f"{path}: expected a rotorgram checkpoint: {error!r:.200}") from None
+
+
+def _read(path: Path) -> Checkpoint:
+    with safe_open(path, framework="numpy") as file:
+        meta = json.loads((file.metadata() or {})["rotorgram"])
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    _expect(meta["format"] == FORMAT, f"format {FORMAT}", meta["format"])
+    position = meta["position"]
+    _expect(meta["algorithm"] in PRESETS, f"one of {sorted(PRESETS)}", meta["algorithm"])
+    for count in (meta["seed"], meta["env_steps"], position["episode"], position["env_steps"]):
+        _expect(type(count) is int and count >= 0, "a whole number, 0 or more", count)
+    seconds = position["seconds"]
+    _expect(type(seconds) is float and 0 <= seconds < float("inf"), "seconds", seconds)
+    for name, array in arrays.items():
+        finite = array.dtype.kind != "f" or bool(np.isfinite(array).all())
+        _expect(finite, f"finite numbers in {name}", "NaN or infinity")
+    fields = ("algorithm", "config", "env", "seed", "env_steps", "model_hash", "versions")
+    return Checkpoint(
+        **{name: meta[name] for name in fields},
+        actor=_part(arrays, _ACTOR),
+        state=_part(arrays, _STATE),
+        position=Position(
+            **position,
+            actions=arrays["episode/actions"],
+            observation=arrays["episode/observation"],
+        ),
+    )
+
+
+def _expect(ok: bool, expected: str, got: object) -> None:
+    if not ok:
+        raise ValueError(f"expected {expected}, got {got!r:.80}")
 
 
 def _part(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 
-def _replace(path: Path, data: bytes) -> None:
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file: after a crash at any moment, `path` holds the old one or the new one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
     with open(temporary, "wb") as file:

@@ -79,12 +79,17 @@ class EpisodeLog(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         self._episode = -1
         self._actions: list[Any] = []
         self._observation = np.empty(0, np.float32)
-        self._began = time.perf_counter()
+        self._began: float | None = None
+
+    def start_clock(self) -> None:
+        """Training begins now; after `resume` it has begun before."""
+        if self._began is None:
+            self._began = time.perf_counter()
 
     @property
     def seconds(self) -> float:
         """Wall time since training began, s."""
-        return time.perf_counter() - self._began
+        return 0.0 if self._began is None else time.perf_counter() - self._began
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -127,10 +132,14 @@ class EpisodeLog(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         self._episode = position.episode
         observation, _ = self.env.reset(seed=episode_seed(self.run_seed, position.episode))
         self._actions, self._observation = [], observation
+        ended = False
         for action in position.actions:
-            observation, reward, _, _, info = self.env.step(action)
+            if ended:
+                break
+            observation, reward, terminated, truncated, info = self.env.step(action)
             self._keep_step(action, observation, reward, info)
-        if observation.tobytes() != position.observation.tobytes():
+            ended = terminated or truncated
+        if ended or observation.tobytes() != position.observation.tobytes():
             raise ResumeError(
                 f"the simulator does not repeat episode {position.episode}: after "
                 f"{len(position.actions)} steps expected the observation {position.observation}, "

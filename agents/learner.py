@@ -34,6 +34,9 @@ class Agent(Protocol):
     def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
         """Train until the log counts `env_steps`; the state resumes where it stood."""
 
+    def last_step(self, env_steps: int) -> int:
+        """Env steps after which a training of so many ends: fewer where rollouts must be whole."""
+
     def actor(self) -> dict[str, np.ndarray]:
         """Weights for `NetworkPolicy`."""
 
@@ -95,6 +98,10 @@ class Learner:
             if not on_update():
                 return
 
+    def last_step(self, env_steps: int) -> int:
+        """Env steps after which a training of so many ends: all are flown."""
+        return env_steps
+
     def actor(self) -> dict[str, np.ndarray]:
         """Weights of the policy."""
         return arrays_of(self.networks["actor"])
@@ -145,6 +152,12 @@ def set_optimizer_arrays(
         if name.startswith("optimizer."):
             _, index, key = name.split(".")
             state.setdefault(int(index), {})[key] = torch.from_numpy(value.copy())
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    for place, entries in state.items():
+        shape = parameters[place].shape
+        for key, value in entries.items():
+            if key != "step" and value.shape != shape:
+                raise ValueError(f"optimizer.{place}.{key}: expected shape {tuple(shape)}")
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": state, "param_groups": groups})
 

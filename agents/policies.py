@@ -24,14 +24,19 @@ class NetworkPolicy:
     Args:
         weights: `hidden.weight` (h, n), `hidden.bias` (h,), `output.weight` (k, h),
             `output.bias` (k,), all float32, and for continuous actions `log_std` (k,).
+
+    Raises:
+        ValueError: A weight is missing, or has another shape.
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray]) -> None:
+        _check_shapes(weights)
         self._w1, self._b1 = weights["hidden.weight"], weights["hidden.bias"]
         self._w2, self._b2 = weights["output.weight"], weights["output.bias"]
         log_std = weights.get("log_std")
         self._std = None if log_std is None else np.exp(log_std)
         self._hidden = np.empty_like(self._b1)
+        self.observation_size = self._w1.shape[1]
         self.action_size = 1 if self._std is None else len(self._b2)
 
     def reset(self) -> None:
@@ -75,6 +80,22 @@ class NetworkPolicy:
     def to_env(self, action: np.ndarray) -> Any:
         """What the env gets for a drawn action."""
         return int(action[0]) if self._std is None else clip(action)
+
+
+def _check_shapes(weights: Mapping[str, np.ndarray]) -> None:
+    got = {name: array.shape for name, array in weights.items()}
+    units, inputs = (*got.get("hidden.weight", ()), 0, 0)[:2]
+    outputs = (*got.get("output.bias", ()), 0)[0]
+    expected = {
+        "hidden.weight": (units, inputs),
+        "hidden.bias": (units,),
+        "output.weight": (outputs, units),
+        "output.bias": (outputs,),
+    }
+    if "log_std" in got:
+        expected["log_std"] = (outputs,)
+    if got != expected or not units * inputs * outputs:
+        raise ValueError(f"policy: expected weights of shapes {expected}, got {got}")
 
 
 def clip(action: np.ndarray) -> np.ndarray:

@@ -3,7 +3,8 @@
 A preset is named `paper` or `tuned`. `docs/algorithms/` lists where they differ, and why.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 __all__ = ["PRESETS", "A2CConfig", "AlgorithmName", "PresetName", "VPGConfig", "preset"]
@@ -33,12 +34,23 @@ class VPGConfig:
     log_std: float = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""
 
+    def __post_init__(self) -> None:
+        _check(self, counts=("hidden", "episodes_per_update"), shares=("gamma",),
+               flags=("anneal", "normalize"))  # fmt: skip
+        if self.baseline not in ("none", "time"):
+            raise ValueError(f"baseline: expected 'none' or 'time', got {self.baseline!r}")
+        if self.baseline == "time" and self.episodes_per_update < 2:
+            raise ValueError(
+                "episodes_per_update: expected 2 or more with baseline 'time', where a single "
+                f"episode is its own mean, got {self.episodes_per_update}"
+            )
+
 
 @dataclass(frozen=True, kw_only=True)
 class A2CConfig:
     """Advantage Actor-Critic (paper, section 2.3, Algorithm 2). Defaults: the paper's setting.
 
-    Serves our A2C and Stable-Baselines3's: every field means the same for both.
+    Serves our A2C and Stable-Baselines3's.
     """
 
     hidden: int = 16
@@ -61,6 +73,36 @@ class A2CConfig:
     """Weight of the policy's entropy."""
     log_std: float = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""
+
+    def __post_init__(self) -> None:
+        _check(self, counts=("hidden", "steps_per_update"), shares=("gamma", "trace"),
+               flags=("anneal", "normalize"))  # fmt: skip
+        for name in ("value_weight", "entropy_weight"):
+            _expect(self, name, "a number, 0 or more", _is_number(getattr(self, name), 0.0))
+
+
+def _check(
+    config: Any, *, counts: tuple[str, ...], shares: tuple[str, ...], flags: tuple[str, ...]
+) -> None:
+    for name in counts:
+        value = getattr(config, name)
+        _expect(config, name, "a whole number, 1 or more", type(value) is int and value >= 1)
+    for name in shares:
+        _expect(config, name, "a number from 0 to 1", _is_number(getattr(config, name), 0.0, 1.0))
+    for name in flags:
+        _expect(config, name, "true or false", type(getattr(config, name)) is bool)
+    rate = config.learning_rate
+    _expect(config, "learning_rate", "a number above 0", _is_number(rate, 0.0) and rate > 0)
+    _expect(config, "log_std", "a number from -4 to 1", _is_number(config.log_std, -4.0, 1.0))
+
+
+def _is_number(value: Any, low: float, high: float = math.inf) -> bool:
+    return type(value) in (int, float) and math.isfinite(value) and low <= value <= high
+
+
+def _expect(config: Any, name: str, expected: str, ok: bool) -> None:
+    if not ok:
+        raise ValueError(f"{name}: expected {expected}, got {getattr(config, name)!r}")
 
 
 PRESETS: Final[dict[str, dict[str, VPGConfig | A2CConfig]]] = {
@@ -102,10 +144,6 @@ def preset(algorithm: str, name: str, **changes: Any) -> VPGConfig | A2CConfig:
     if name not in PRESETS[algorithm]:
         raise ValueError(f"preset: expected one of {sorted(PRESETS[algorithm])}, got {name!r}")
     base = PRESETS[algorithm][name]
-    try:
-        return type(base)(**{**vars(base), **changes})
-    except TypeError:
-        unknown = sorted(set(changes) - set(vars(base)))
-        raise ValueError(
-            f"hyperparameters: expected some of {sorted(vars(base))}, got {unknown}"
-        ) from None
+    if unknown := sorted(set(changes) - set(vars(base))):
+        raise ValueError(f"hyperparameters: expected some of {sorted(vars(base))}, got {unknown}")
+    return replace(base, **changes)

@@ -1,13 +1,13 @@
 """Stable-Baselines3's A2C: the reference, with the same networks, settings and socket."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3 import A2C
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from .episodes import EpisodeLog
@@ -34,11 +34,12 @@ class SB3A2C:
         # SB3 draws from the global generators: torch for actions, NumPy for the order of samples.
         torch.manual_seed(torch_seed)
         np.random.seed(torch_seed % 2**32)  # noqa: NPY002
-        rate = config.learning_rate
-        self._model = A2C(
+        self._config = config
+        self._ahead = 0.0
+        self._model = _A2C(
             "MlpPolicy",
             DummyVecEnv([lambda: env]),
-            learning_rate=(lambda left: rate * left) if config.anneal else rate,
+            learning_rate=self._learning_rate,
             n_steps=config.steps_per_update,
             gamma=config.gamma,
             gae_lambda=config.trace,
@@ -61,13 +62,23 @@ class SB3A2C:
 
         SB3 flies whole rollouts only: steps short of another rollout are left unflown.
         """
-        done = self._model.num_timesteps
-        whole = env_steps // self._model.n_steps * self._model.n_steps
+        model, rollout = self._model, self._config.steps_per_update
+        done, whole = model.num_timesteps, env_steps // rollout * rollout
         if done >= whole:
             return
-        callback = _AfterUpdate(on_update)
-        self._model.learn(whole - done, callback=callback, reset_num_timesteps=done == 0)
-        callback.finish()
+        self._ahead = rollout / whole
+        model.on_update = on_update
+        with suppress(_Stopped):
+            model.learn(whole - done, reset_num_timesteps=done == 0)
+
+    def last_step(self, env_steps: int) -> int:
+        """Env steps after which a training of so many ends."""
+        return env_steps // self._config.steps_per_update * self._config.steps_per_update
+
+    def _learning_rate(self, left: float) -> float:
+        # SB3 counts what is left after the rollout; ours, and so here, before it.
+        share = min(left + self._ahead, 1.0) if self._config.anneal else 1.0
+        return self._config.learning_rate * share
 
     def actor(self) -> dict[str, np.ndarray]:
         """Weights of the policy, under our names."""
@@ -109,27 +120,19 @@ class SB3A2C:
             model._last_episode_starts = state["starts"]
 
 
-class _AfterUpdate(BaseCallback):
-    """Calls back after each update: SB3 itself has a hook before the next rollout."""
+class _Stopped(Exception):
+    """Ends SB3's loop between an update and the next rollout."""
 
-    def __init__(self, on_update: OnUpdate) -> None:
-        super().__init__()
-        self._on_update = on_update
-        self._first = True
-        self._stopped = False
 
-    def _on_rollout_start(self) -> None:
-        if not self._first and not self._on_update():
-            self._stopped = True
-        self._first = False
+class _A2C(A2C):
+    """SB3's A2C, which has no callback between an update and the next rollout."""
 
-    def _on_step(self) -> bool:
-        return not self._stopped
+    on_update: OnUpdate
 
-    def finish(self) -> None:
-        """Report the last update, after which no rollout follows."""
-        if not self._stopped:
-            self._on_update()
+    def train(self) -> None:
+        super().train()
+        if not self.on_update():
+            raise _Stopped
 
 
 _NAMES = {

@@ -1,5 +1,6 @@
 """The command `rotorgram`."""
 
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -15,6 +16,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     from .commands import COMMANDS, user_errors
 
+    # To be terminated is no reason to leave the other side without a word.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     command = tyro.extras.subcommand_cli_from_dict(
         COMMANDS,
         prog="rotorgram",
@@ -30,7 +33,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except user_errors() as error:
         print(f"rotorgram: {error}", file=sys.stderr)
         return 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,30 +3,31 @@
 Heavy imports stay inside `run`: a simulator starts without torch, an agent without MuJoCo.
 """
 
-import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from ..agents.presets import AlgorithmName, PresetName
 from ..envs import ElevationConfig
-
-if TYPE_CHECKING:
-    from ..agents.policies import Policy
-    from ..udp import Address, RemoteEnv
+from .inputs import load_policy, parse_address, remote_env
 
 __all__ = ["COMMANDS", "Command", "user_errors"]
 
 Codec = Literal["binary", "text"]
-Listen = Annotated[
-    str | None,
-    arg(metavar="HOST:PORT"),
-]
+Listen = Annotated[str | None, arg(metavar="HOST:PORT")]
+
+
+class EnvOptions(ElevationConfig):
+    """Options of the task: see `docs/task.md`."""
+
+    def __post_init__(self) -> None:
+        """Take anything, so that a wrong option is told like every other wrong input."""
+
+    def checked(self) -> ElevationConfig:
+        """The options, if they can be. Raises `ValueError`."""
+        return ElevationConfig(**vars(self))
 
 
 class Command:
@@ -40,8 +41,9 @@ class Command:
 def user_errors() -> tuple[type[Exception], ...]:
     """Errors that are one sentence to the user. A bug of ours is not among them."""
     from ..agents.episodes import ResumeError
+    from ..experiments.errors import RunsFailed
 
-    return (ValueError, OSError, ResumeError)
+    return (ValueError, OSError, ResumeError, RunsFailed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +63,7 @@ class Sim(Command):
     """Give up when the agent has been silent for so many seconds."""
     insecure: bool = False
     """Allow addresses beyond this machine; nothing is authenticated."""
-    env: ElevationConfig = field(default_factory=ElevationConfig)
+    env: EnvOptions = field(default_factory=EnvOptions)
 
     def run(self) -> int:
         """Simulate until the agent closes."""
@@ -73,7 +75,7 @@ class Sim(Command):
             codec=self.codec,
             config=LinkConfig(timeout=self.timeout),
             insecure=self.insecure,
-            **asdict(self.env),
+            **asdict(self.env.checked()),
         )
         with simulator:
             here = "{}:{}".format(*simulator.address)
@@ -109,7 +111,7 @@ class Train(Command):
     """Folder to write to. Default: runs/ALGORITHM-seedSEED-TIME."""
     resume: Path | None = None
     """Folder of a training to go on with; its own settings hold."""
-    env: ElevationConfig = field(default_factory=ElevationConfig)
+    env: EnvOptions = field(default_factory=EnvOptions)
 
     def run(self) -> int:
         """Train, store, and say where."""
@@ -130,19 +132,17 @@ class Serve(Command):
     """End after so many episodes. Default: when the simulator leaves."""
     insecure: bool = False
     """Allow an address beyond this machine; nothing is authenticated."""
-    env: ElevationConfig = field(default_factory=ElevationConfig)
+    env: EnvOptions = field(default_factory=EnvOptions)
 
     def run(self) -> int:
         """Fly episode after episode."""
         from ..experiments.evaluate import evaluation_seed, fly
-        from ..udp import PeerClosed, RemoteEnv
+        from ..udp import PeerClosed
 
-        policy, config = load_policy(self.policy, self.env)
-        address = parse_address(self.listen)
-        with _closing(RemoteEnv(address, options=asdict(config), connect=False,
-                                insecure=self.insecure)) as env:  # fmt: skip
-            print(f"waiting for a simulator at {self.listen} (Ctrl-C ends)", flush=True)
-            env.connect()
+        if self.episodes is not None and self.episodes < 1:
+            raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
+        policy, config = load_policy(self.policy, self.env.checked())
+        with remote_env(config, self.listen, self.insecure) as env:
             episode = 0
             while self.episodes is None or episode < self.episodes:
                 try:
@@ -171,7 +171,7 @@ class Evaluate(Command):
     """Wait here for a simulator instead of starting one."""
     insecure: bool = False
     """Allow an address beyond this machine; nothing is authenticated."""
-    env: ElevationConfig = field(default_factory=ElevationConfig)
+    env: EnvOptions = field(default_factory=EnvOptions)
     """Default with a checkpoint: the options that it was trained with."""
 
     def run(self) -> int:
@@ -182,7 +182,9 @@ class Evaluate(Command):
 
         if self.episodes < 1:
             raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
-        policy, config = load_policy(self.policy, self.env)
+        if self.episodes is not None and self.episodes < 1:
+            raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
+        policy, config = load_policy(self.policy, self.env.checked())
         with remote_env(config, self.listen, self.insecure) as env:
             flights = fly_episodes(env, policy, self.episodes)
         rows = [evaluation_row(f, k, config.control_period) for k, f in enumerate(flights)]
@@ -222,7 +224,9 @@ class Compare(Command):
     """Runs at a time. Default: one for each core."""
     out: Path | None = None
     """Folder to write; it must not exist. Default: runs/compare-TIME."""
-    env: ElevationConfig = field(default_factory=ElevationConfig)
+    resume: Path | None = None
+    """Folder of an interrupted comparison to go on with; its own settings hold."""
+    env: EnvOptions = field(default_factory=EnvOptions)
 
     def run(self) -> int:
         """Compare, report, print the table."""
@@ -291,79 +295,6 @@ COMMANDS: dict[str, Any] = {
     "report": Report,
     "check-model": CheckModel,
 }
-
-
-def parse_address(text: str) -> "Address":
-    """HOST:PORT as a pair. Raises `ValueError`."""
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdigit() or int(port) > 65535:
-        raise ValueError(f"address: expected HOST:PORT with a port up to 65535, got {text!r}")
-    return host, int(port)
-
-
-def parse_changes(changes: tuple[str, ...]) -> dict[str, Any]:
-    """`name=value` pairs of hyperparameters. Raises `ValueError`."""
-    result = {}
-    for change in changes:
-        name, equals, value = change.partition("=")
-        if not equals:
-            raise ValueError(f"set: expected NAME=VALUE, got {change!r}")
-        try:
-            result[name] = json.loads(value.lower() if value in ("True", "False") else value)
-        except json.JSONDecodeError:
-            result[name] = value
-    return result
-
-
-def load_policy(name: str, env: ElevationConfig) -> "tuple[Policy, ElevationConfig]":
-    """A policy by checkpoint path or as `pid`, and the options of the env that it flies."""
-    if name == "pid":
-        from ..agents.pid import PID
-
-        return PID(env), env
-    from ..agents.checkpoints import load
-
-    checkpoint = load(Path(name))
-    if env == ElevationConfig():
-        env = ElevationConfig.from_options(checkpoint.env)
-    return checkpoint.policy(), env
-
-
-@contextmanager
-def remote_env(
-    config: ElevationConfig, listen: str | None, insecure: bool
-) -> "Iterator[RemoteEnv]":
-    """A remote env with a simulator of its own, or the one that comes to `listen`."""
-    if listen is None:
-        from ..experiments.pairs import socket_pair
-
-        with socket_pair(config) as env:
-            yield env
-        return
-    from ..udp import RemoteEnv
-
-    address = parse_address(listen)
-    env = RemoteEnv(address, options=asdict(config), connect=False, insecure=insecure)
-    with _closing(env):
-        print(f"waiting for a simulator at {listen}: rotorgram sim --server {listen}", flush=True)
-        env.connect()
-        yield env
-
-
-def new_folder(out: Path | None, name: str) -> Path:
-    """The folder to write to; by default one named by the time."""
-    folder = out or Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
-    if folder.exists():
-        raise ValueError(f"out: {folder} is there already; choose another folder")
-    return folder
-
-
-@contextmanager
-def _closing(env: "RemoteEnv") -> "Iterator[RemoteEnv]":
-    try:
-        yield env
-    finally:
-        env.close()
 
 
 def _counters(counters: Any) -> str:

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from ..experiments.compare import CompareConfig
+from ..experiments.compare import PARTS, CompareConfig, read_compare_config
 from ..experiments.compare import compare as run_comparison
+from ..experiments.errors import RunsFailed
 from ..experiments.metrics import results_table
 from ..experiments.records import read_records
 from ..experiments.report import terminal_table, write_report
-from .commands import new_folder
+from .inputs import new_folder
 from .progress import bars
 
 if TYPE_CHECKING:
@@ -23,20 +24,29 @@ __all__ = ["compare", "report"]
 
 def compare(command: "Compare") -> int:
     """Train, evaluate and report."""
-    config = CompareConfig(
-        agents=command.agents,
-        seeds=command.seeds,
-        env_steps=command.env_steps,
-        preset=command.preset,
-        env=command.env,
-        snapshots=command.snapshots,
-        episodes=command.episodes,
-        jobs=command.jobs,
-    )
-    folder = new_folder(command.out, "compare")
+    if command.resume:
+        folder, config = command.resume, read_compare_config(command.resume)
+        if not (folder / PARTS).is_dir():
+            raise ValueError(f"resume: expected an interrupted comparison, {folder} is finished")
+    else:
+        config = CompareConfig(
+            agents=command.agents,
+            seeds=command.seeds,
+            env_steps=command.env_steps,
+            preset=command.preset,
+            env=command.env.checked(),
+            snapshots=command.snapshots,
+            episodes=command.episodes,
+            jobs=command.jobs,
+        )
+        folder = new_folder(command.out, "compare")
     words = shlex.join(["rotorgram", *sys.argv[1:]])
-    with bars() as progress:
-        run_comparison(config, folder, words, progress)
+    try:
+        with bars() as progress:
+            run_comparison(config, folder, words, progress)
+    except (KeyboardInterrupt, RunsFailed):
+        print(f"go on with: rotorgram compare --resume {folder}")
+        raise
     report(folder)
     return 0
 

@@ -15,7 +15,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from ..experiments.compare import OnProgress
+from ..experiments.progress import OnProgress
 
 __all__ = ["bars"]
 
@@ -43,6 +43,9 @@ def bars() -> Iterator[OnProgress]:
             if name not in tasks:
                 tasks[name] = progress.add_task(name, total=total, words=words)
             progress.update(tasks[name], completed=done, total=total, words=words)
+            if words == "done":  # more runs than lines: what is done makes room
+                progress.update(tasks[name], visible=False)
+                progress.print(f"{name:14} done")
 
         yield show
 

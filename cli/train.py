@@ -16,7 +16,7 @@ from ..agents.checkpoints import load, software_versions
 from ..agents.episodes import Episode
 from ..envs import ElevationConfig
 from ..experiments.training import Run, Training
-from .commands import new_folder, parse_changes, remote_env
+from .inputs import new_folder, parse_changes, remote_env
 from .progress import bars
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def train(command: "Train") -> int:
     run = Run(
         algorithm=command.algorithm,
         config=preset(command.algorithm, command.preset, **parse_changes(command.set)),
-        env=command.env,
+        env=command.env.checked(),
         seed=command.seed,
         env_steps=command.env_steps,
     )
@@ -95,9 +95,11 @@ def _store(training: Training, folder: Path) -> None:
 def _read_episodes(path: Path) -> list[Episode]:
     try:
         rows = pd.read_csv(path).to_dict("records")
+        return [Episode(**{str(k): v for k, v in row.items()}) for row in rows]
     except (FileNotFoundError, pd.errors.EmptyDataError):
         return []
-    return [Episode(**{str(k): v for k, v in row.items()}) for row in rows]
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected the episodes of a training: {error}") from None
 
 
 def _write_config(training: Training, folder: Path) -> None:

@@ -1,34 +1,38 @@
 """The comparison: every agent, over the same seeds and env steps, each through a socket pair."""
 
 import json
-import os
 import platform
-import time
-from collections.abc import Callable
+import shutil
+import signal
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from multiprocessing import Manager
 from pathlib import Path
-from threading import Thread
 from typing import Any, Final
 
-from joblib import Parallel, delayed
+from joblib import Parallel, cpu_count, delayed
+from joblib.externals.loky import get_reusable_executor
 
 from ..agents import preset
-from ..agents.checkpoints import software_versions
+from ..agents.checkpoints import software_versions, write_whole
 from ..agents.pid import PID
 from ..agents.policies import NetworkPolicy
 from ..envs import ElevationConfig
+from ..models import model_hash
 from ..models.constants import PHYSICS_TIMESTEP
+from .errors import RunsFailed
 from .evaluate import Flight, evaluation_row, fly_episodes
 from .pairs import socket_pair
-from .records import CONFIG_FILE
+from .progress import OnProgress, ProgressListener, ProgressSender
+from .records import CONFIG_FILE, RecordsError, read_config
 from .training import Run, Training
-from .writing import RecordWriter, RunRecord, episode_row, flight_steps, training_steps
+from .writing import RunRecord, episode_row, flight_steps, join_parts, training_steps
 
-__all__ = ["CompareConfig", "OnProgress", "compare"]
+__all__ = ["PARTS", "CompareConfig", "compare", "read_compare_config"]
 
 AGENTS: Final = ("vpg", "a2c", "sb3-a2c")
+PARTS: Final = "parts"
+"""Folder of what the runs of an unfinished comparison left behind."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +51,7 @@ class CompareConfig:
     """The task."""
     snapshots: int = 10
     """Policies kept during each training, for the learning curves."""
-    curve_episodes: int = 5
+    curve_episodes: int = 10
     """Evaluation episodes of each of them."""
     episodes: int = 20
     """Evaluation episodes of the final policies."""
@@ -60,10 +64,11 @@ class CompareConfig:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
         if self.jobs is not None and self.jobs < 1:
             raise ValueError(f"jobs: expected at least 1, got {self.jobs}")
-        for agent in self.agents:
-            preset(agent, self.preset)
+        if not self.agents:
+            raise ValueError("agents: expected at least one")
         if len(set(self.agents)) != len(self.agents):
             raise ValueError(f"agents: expected each once, got {', '.join(self.agents)}")
+        self.runs()  # wrong names and numbers are told before anything is trained
 
     def runs(self) -> list[Run]:
         """Every training, in the order in which they start: all agents of a seed together."""
@@ -80,69 +85,97 @@ class CompareConfig:
         ]
 
 
-OnProgress = Callable[[str, int, int, str], None]
-"""Called with a run's name, what is done, what there is to do, and a word on how it goes."""
-
-
 def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnProgress) -> None:
-    """Train and evaluate everything, and write the records into `folder`, which is made.
+    """Train and evaluate everything, and write the records into `folder`.
 
-    Figures, table and verdicts are drawn from these files: see `report.write_report`.
+    Each run leaves a part behind when it is done, so that a comparison that was interrupted, or of
+    which a run failed, goes on where it was: call it again with the same folder (and the config of
+    `read_compare_config`). Figures, table and verdicts are drawn from the joined parts: see
+    `report.write_report`.
+
+    Raises:
+        RunsFailed: Some runs failed; the others are done, and their parts kept.
     """
-    folder.mkdir(parents=True)
-    writer = RecordWriter(folder)
-    jobs = config.jobs or os.cpu_count() or 1
-    with Manager() as manager:
-        queue = manager.Queue()
-        work = [delayed(_run)(run, config, folder, queue) for run in config.runs()]
-        if _pid_flies(config.env):
-            work.append(delayed(_fly_pid)(config, queue))
-        parallel = Parallel(n_jobs=jobs, return_as="generator_unordered", pre_dispatch="all")
-        results = parallel(work)
-        with _Listener(queue, on_progress):
-            for result in results:
-                writer.add(result)
-    writer.finish()
-    _write_config(config, folder, command, writer.model_hash)
+    parts = folder / PARTS
+    parts.mkdir(parents=True, exist_ok=True)
+    if not (folder / CONFIG_FILE).exists():
+        _write_config(config, folder, command)
+    for unfinished in parts.glob(".*"):
+        shutil.rmtree(unfinished)
+    with ProgressListener(on_progress) as listener:
+        work = [
+            delayed(_run)(run, config, folder, listener.port)
+            for run in config.runs()
+            if not (parts / f"{run.algorithm}-seed{run.seed}").exists()
+        ]
+        if _pid_flies(config.env) and not (parts / "pid-seed0").exists():
+            work.append(delayed(_fly_pid)(config, folder, listener.port))
+        failures = [sentence for sentence in _in_parallel(work, config.jobs) if sentence]
+    if failures:
+        raise RunsFailed(f"{len(failures)} of {len(work)} runs failed: {'; '.join(failures)}")
+    join_parts(parts, folder)
 
 
-def _run(run: Run, config: CompareConfig, folder: Path, queue: Any) -> RunRecord:
-    """Train one agent on one seed, then evaluate its snapshots (in a worker process)."""
-    name = f"{run.algorithm} seed {run.seed}"
-    last = 0.0
+def _in_parallel(work: list[Any], jobs: int | None) -> Iterator[str]:
+    parallel = Parallel(n_jobs=jobs or cpu_count(), return_as="generator_unordered")
+    try:
+        yield from parallel(work)
+    except BaseException:
+        # Their simulators end with the workers.
+        get_reusable_executor().shutdown(wait=False, kill_workers=True)
+        raise
+
+
+def _run(run: Run, config: CompareConfig, folder: Path, port: int) -> str:
+    """Train and evaluate one agent on one seed; why it failed, or "" (in a worker process)."""
+    progress = ProgressSender(f"{run.algorithm} seed {run.seed}", port)
+    return _part(folder, progress, lambda: _train(run, config, folder, progress))
+
+
+def _fly_pid(config: CompareConfig, folder: Path, port: int) -> str:
+    """Evaluate the PID, which needs no training and has no seeds (in a worker process)."""
+    progress = ProgressSender("pid", port)
+    return _part(folder, progress, lambda: _evaluate_pid(config))
+
+
+def _part(folder: Path, progress: ProgressSender, run: Callable[[], RunRecord]) -> str:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's affair
+    try:
+        run().write(folder / PARTS)
+    except Exception as error:
+        progress(0, 1, "failed")
+        return f"{progress.name}: {error}"
+    progress(1, 1, "done")
+    return ""
+
+
+def _train(run: Run, config: CompareConfig, folder: Path, progress: ProgressSender) -> RunRecord:
     with socket_pair(run.env) as env:
         training = Training(run, env, snapshots=config.snapshots)
 
-        def report() -> bool:
-            nonlocal last
-            now = time.monotonic()
-            if now - last > 0.2:
-                last = now
-                state = training.progress()
-                queue.put((name, state.env_steps, state.total, state.words()))
+        def on_update() -> bool:
+            progress.rarely(training.progress)
             return True
 
-        training.train(report)
+        training.train(on_update)
         training.store(folder / "checkpoints" / f"{run.algorithm}-seed{run.seed}.safetensors")
         seconds = training.log.seconds
-        queue.put((name, run.env_steps, run.env_steps, "evaluating"))
+        progress(run.env_steps, run.env_steps, "evaluating")
         rows, flights = _evaluate(training, config, env)
-        assert env.hello is not None
-        model_hash = env.hello.model_hash
-    queue.put((name, run.env_steps, run.env_steps, "done"))
     log = training.log
     return RunRecord(
         agent=run.algorithm,
         seed=run.seed,
         episodes=[episode_row(episode) for episode in log.episodes],
         evaluations=rows,
-        run={
-            "env_steps": log.env_steps,
-            "seconds": seconds,
-            "steps_per_second": log.env_steps / seconds,
-        },
+        runs=[
+            {
+                "env_steps": log.env_steps,
+                "seconds": seconds,
+                "steps_per_second": log.env_steps / seconds,
+            }
+        ],
         steps=[training_steps(run.algorithm, log), *flight_steps(run.algorithm, run.seed, flights)],
-        model_hash=model_hash,
     )
 
 
@@ -163,13 +196,9 @@ def _evaluate(
     return rows, flights
 
 
-def _fly_pid(config: CompareConfig, queue: Any) -> RunRecord:
-    """Evaluate the PID, which needs no training and has no seeds."""
+def _evaluate_pid(config: CompareConfig) -> RunRecord:
     with socket_pair(config.env) as env:
         flights = fly_episodes(env, PID(config.env), config.episodes)
-        assert env.hello is not None
-        model_hash = env.hello.model_hash
-    queue.put(("pid", 1, 1, "done"))
     behind = {"env_steps": 0, "seconds": 0.0}
     return RunRecord(
         agent="pid",
@@ -179,30 +208,9 @@ def _fly_pid(config: CompareConfig, queue: Any) -> RunRecord:
             {**behind, **evaluation_row(flight, episode, config.env.control_period)}
             for episode, flight in enumerate(flights)
         ],
-        run=None,
+        runs=[],
         steps=flight_steps("pid", 0, flights),
-        model_hash=model_hash,
     )
-
-
-class _Listener:
-    """Hands on what the workers put into the queue, while results are waited for."""
-
-    def __init__(self, queue: Any, on_progress: OnProgress) -> None:
-        self._queue = queue
-        self._on_progress = on_progress
-        self._thread = Thread(target=self._listen, daemon=True)
-
-    def __enter__(self) -> None:
-        self._thread.start()
-
-    def __exit__(self, *_: object) -> None:
-        self._queue.put(None)
-        self._thread.join()
-
-    def _listen(self) -> None:
-        while (item := self._queue.get()) is not None:
-            self._on_progress(*item)
 
 
 def _pid_flies(env: ElevationConfig) -> bool:
@@ -213,7 +221,24 @@ def _pid_flies(env: ElevationConfig) -> bool:
     return True
 
 
-def _write_config(config: CompareConfig, folder: Path, command: str, model_hash: str) -> None:
+def read_compare_config(folder: Path) -> CompareConfig:
+    """What a comparison was to compare, from its `config.json`. Raises `RecordsError`."""
+    content = read_config(folder)
+    try:
+        options = {k: v for k, v in content["env"].items() if k != "physics_timestep"}
+        return CompareConfig(
+            agents=tuple(content["agents"]),
+            seeds=len(content["seeds"]),
+            env_steps=content["env_steps"],
+            preset=content["preset"],
+            env=ElevationConfig.from_options(options),
+            **content["evaluation"],
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordsError(f"{folder / CONFIG_FILE}: expected a comparison's: {error!r}") from None
+
+
+def _write_config(config: CompareConfig, folder: Path, command: str) -> None:
     content = {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": command,
@@ -228,11 +253,11 @@ def _write_config(config: CompareConfig, folder: Path, command: str, model_hash:
             "episodes": config.episodes,
         },
         "versions": software_versions(),
-        "model_hash": model_hash,
+        "model_hash": model_hash(config.env.linear_drag),
         "machine": {
             "platform": platform.platform(),
             "processor": platform.machine(),
-            "cores": os.cpu_count(),
+            "cores": cpu_count(),
         },
     }
-    (folder / CONFIG_FILE).write_text(json.dumps(content, indent=2) + "\n")
+    write_whole(folder / CONFIG_FILE, (json.dumps(content, indent=2) + "\n").encode())

@@ -7,53 +7,60 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from tempfile import TemporaryFile
 from typing import Final
 
 from ..envs import ElevationConfig
-from ..udp import PeerSilent, RemoteEnv
+from ..udp import PeerClosed, PeerSilent, RemoteEnv
 
 __all__ = ["socket_pair"]
 
 _START_TIMEOUT: Final = 60.0
+_ANSWER_TIMEOUT: Final = 10.0
 _STOP_TIMEOUT: Final = 5.0
 _POLL: Final = 0.5
 
 
 @contextmanager
-def socket_pair(config: ElevationConfig, codec: str = "binary") -> Iterator[RemoteEnv]:
+def socket_pair(config: ElevationConfig) -> Iterator[RemoteEnv]:
     """A connected remote env, on free ports of the loopback interface.
 
+    The simulator ends with this process, however this one ends.
+
     Raises:
-        PeerSilent: The simulator did not come; the sentence holds what it said.
+        PeerClosed: The simulator did not start, or ended; the sentence holds what it said.
+        PeerSilent: The simulator runs and does not answer.
     """
     options = asdict(config)
-    env = RemoteEnv(("127.0.0.1", 0), options=options, connect=False, connect_timeout=_POLL)
-    arguments = {
-        "server": env.address,
-        "bind": ("127.0.0.1", 0),
-        "codec": codec,
-        **options,
-    }
-    process = subprocess.Popen(
-        [sys.executable, "-m", "rotorgram.udp", json.dumps(arguments)],
-        stderr=subprocess.PIPE,
-        text=True,
+    env = RemoteEnv(
+        ("127.0.0.1", 0),
+        options=options,
+        connect=False,
+        connect_timeout=_POLL,
+        timeout=_ANSWER_TIMEOUT,
     )
-    try:
-        _connect(env, process)
-        yield env
-    finally:
-        env.close()
+    arguments = {"server": env.address, "bind": ("127.0.0.1", 0), **options}
+    command = [sys.executable, "-m", "rotorgram.udp", json.dumps(arguments)]
+    with TemporaryFile("w+") as said:
+        process = subprocess.Popen(
+            [*command, "--until-stdin-closes"], stdin=subprocess.PIPE, stderr=said
+        )
         try:
-            process.wait(_STOP_TIMEOUT)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        assert process.stderr is not None
-        process.stderr.close()
+            _connect(env, process)
+            yield env
+        except PeerSilent as error:
+            if process.poll() is None:
+                raise
+            said.seek(0)
+            words = said.read().strip() or "it said nothing"
+            status = process.returncode
+            raise PeerClosed(f"the simulator ended with status {status}: {words}") from error
+        finally:
+            env.close()
+            _end(process)
 
 
-def _connect(env: RemoteEnv, process: subprocess.Popen[str]) -> None:
+def _connect(env: RemoteEnv, process: subprocess.Popen[bytes]) -> None:
     """Wait for the simulator, as long as it lives."""
     deadline = time.monotonic() + _START_TIMEOUT
     while True:
@@ -61,6 +68,15 @@ def _connect(env: RemoteEnv, process: subprocess.Popen[str]) -> None:
             return env.connect()
         except PeerSilent:
             if process.poll() is not None or time.monotonic() > deadline:
-                process.kill()
-                said = process.communicate()[1].strip()
-                raise PeerSilent(f"the simulator did not start: {said or 'no message'}") from None
+                raise
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """It was told to end; close the way back and take its exit status."""
+    assert process.stdin is not None
+    process.stdin.close()
+    try:
+        process.wait(_STOP_TIMEOUT)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

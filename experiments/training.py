@@ -10,11 +10,12 @@ import numpy as np
 import torch
 
 from ..agents import A2CConfig, VPGConfig, make_agent, preset
-from ..agents.checkpoints import Checkpoint, load, store
-from ..agents.episodes import Episode, EpisodeLog
+from ..agents.checkpoints import Checkpoint, CheckpointError, load, store
+from ..agents.episodes import Episode, EpisodeLog, ResumeError
 from ..envs import ElevationConfig
+from .progress import Progress
 
-__all__ = ["Progress", "Run", "Snapshot", "Training"]
+__all__ = ["Run", "Snapshot", "Training"]
 
 _RECENT = 20  # episodes that a progress report averages over
 
@@ -29,6 +30,13 @@ class Run:
     seed: int
     env_steps: int
 
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ValueError(f"seed: expected 0 or more, got {self.seed}")
+        least = self.config.steps_per_update if isinstance(self.config, A2CConfig) else 1
+        if self.env_steps < least:
+            raise ValueError(f"env_steps: expected at least {least}, got {self.env_steps}")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Snapshot:
@@ -37,25 +45,6 @@ class Snapshot:
     env_steps: int
     seconds: float
     actor: dict[str, np.ndarray]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Progress:
-    """Where a training stands."""
-
-    env_steps: int
-    total: int
-    seconds: float
-    mean_return: float
-    """Of the last episodes; NaN before the first has ended."""
-    mean_abs_error: float
-    """Of the last episodes, m."""
-
-    def words(self) -> str:
-        """How it goes, for a progress bar."""
-        if np.isnan(self.mean_return):
-            return ""
-        return f"return {self.mean_return:.0f}, |E| {self.mean_abs_error:.2f} m"
 
 
 @dataclass
@@ -87,24 +76,35 @@ class Training:
         """Go on from a checkpoint. `episodes` are those that ended before it.
 
         Raises:
-            CheckpointError: The file is missing, or is no checkpoint.
+            CheckpointError: The file is missing, is no checkpoint, or does not fit together.
             ResumeError: The env does not repeat the episode that was interrupted.
         """
         kept = load(path)
-        run = Run(
-            algorithm=kept.algorithm,
-            config=preset(kept.algorithm, "paper", **kept.config),
-            env=ElevationConfig.from_options(kept.env),
-            seed=kept.seed,
-            env_steps=kept.env_steps,
-        )
-        training = cls(run, env)
-        training.agent.set_state(kept.state)
+        try:
+            run = Run(
+                algorithm=kept.algorithm,
+                config=preset(kept.algorithm, "paper", **kept.config),
+                env=ElevationConfig.from_options(kept.env),
+                seed=kept.seed,
+                env_steps=kept.env_steps,
+            )
+            training = cls(run, env)
+            training.agent.set_state(kept.state)
+        except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
+            reason = " ".join(f"{error!r:.300}".split())
+            raise CheckpointError(f"{path}: the parts do not fit together: {reason}") from None
+        hello = getattr(env, "hello", None)
+        if kept.model_hash and hello and hello.model_hash != kept.model_hash:
+            raise ResumeError(
+                f"resume: expected a simulator of the model {kept.model_hash}, "
+                f"got one of {hello.model_hash}"
+            )
         training.log.resume(kept.position, episodes)
         return training
 
     def train(self, on_update: Callable[[], bool] = lambda: True) -> bool:
         """Train to the end, or until `on_update` returns False. Whether the end was reached."""
+        self.log.start_clock()
         if self.snapshots:
             self._take()
 
@@ -116,7 +116,7 @@ class Training:
         self.agent.train(self.log, self.run.env_steps, after_update)
         if self.snapshots and self.taken[-1].env_steps < self.log.env_steps:
             self._take()
-        return self.log.env_steps >= self._reachable
+        return self.log.env_steps >= self.agent.last_step(self.run.env_steps)
 
     def progress(self) -> Progress:
         """Where the training stands."""
@@ -147,17 +147,6 @@ class Training:
     def store(self, path: Path) -> None:
         """Write a checkpoint."""
         store(self.checkpoint(), path)
-
-    @property
-    def _reachable(self) -> int:
-        # SB3 flies whole rollouts only.
-        if self.run.algorithm == "sb3-a2c" and isinstance(self.run.config, A2CConfig):
-            return (
-                self.run.env_steps
-                // self.run.config.steps_per_update
-                * (self.run.config.steps_per_update)
-            )
-        return self.run.env_steps
 
     def _due(self) -> bool:
         return self.log.env_steps * self.snapshots >= len(self.taken) * self.run.env_steps

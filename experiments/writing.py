@@ -1,8 +1,9 @@
 """Writing the records of a comparison: see `records` for the files and their columns."""
 
+import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
@@ -22,7 +23,13 @@ from .records import (
     STEPS_FILE,
 )
 
-__all__ = ["RecordWriter", "RunRecord", "episode_row", "flight_steps", "training_steps"]
+__all__ = ["RunRecord", "episode_row", "flight_steps", "join_parts", "training_steps"]
+
+_TABLES: Final = {
+    EPISODES_FILE: EPISODE_COLUMNS,
+    EVALUATIONS_FILE: EVALUATION_COLUMNS,
+    RUNS_FILE: RUN_COLUMNS,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,58 +38,40 @@ class RunRecord:
 
     agent: str
     seed: int
-
     episodes: list[dict[str, Any]]
     """Rows of `episodes.csv`, without agent and seed."""
     evaluations: list[dict[str, Any]]
     """Rows of `evaluations.csv`, without agent and seed."""
-    run: dict[str, Any] | None
-    """Row of `runs.csv`, without agent and seed; None if nothing was trained."""
+    runs: list[dict[str, Any]]
+    """Its row of `runs.csv`, without agent and seed; none if nothing was trained."""
     steps: list[pa.Table]
     """Tables of `steps.parquet`."""
-    model_hash: str
+
+    def write(self, parts: Path) -> None:
+        """Write a part: a folder that is there whole or not at all."""
+        part = parts / f"{self.agent}-seed{self.seed}"
+        unfinished = part.with_name(f".{part.name}")
+        unfinished.mkdir(parents=True)
+        label = {"agent": self.agent, "seed": self.seed}
+        for name, columns in _TABLES.items():
+            rows = [{**label, **row} for row in getattr(self, name.removesuffix(".csv"))]
+            table = pd.DataFrame(rows, columns=list(columns))
+            table.to_csv(unfinished / name, index=False)
+        pq.write_table(pa.concat_tables(self.steps), unfinished / STEPS_FILE, compression="zstd")
+        unfinished.rename(part)
 
 
-class RecordWriter:
-    """Collects what runs leave behind; the step rows go to disk as they come."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._steps = pq.ParquetWriter(folder / STEPS_FILE, STEP_SCHEMA, compression="zstd")
-        self._records: list[RunRecord] = []
-        self.model_hash = ""
-
-    def add(self, record: RunRecord) -> None:
-        """Take a run."""
-        for table in record.steps:
-            self._steps.write_table(table)
-        record.steps.clear()
-        self._records.append(record)
-        self.model_hash = record.model_hash
-
-    def finish(self) -> None:
-        """Write the tables, sorted, whatever the order in which the runs ended."""
-        self._steps.close()
-        records = sorted(self._records, key=lambda r: (r.agent, r.seed))
-        rows: dict[str, list[dict[str, Any]]] = {
-            EPISODES_FILE: [],
-            EVALUATIONS_FILE: [],
-            RUNS_FILE: [],
-        }
-        for record in records:
-            label = {"agent": record.agent, "seed": record.seed}
-            rows[EPISODES_FILE] += [{**label, **row} for row in record.episodes]
-            rows[EVALUATIONS_FILE] += [{**label, **row} for row in record.evaluations]
-            if record.run:
-                rows[RUNS_FILE].append({**label, **record.run})
-        columns = {
-            EPISODES_FILE: EPISODE_COLUMNS,
-            EVALUATIONS_FILE: EVALUATION_COLUMNS,
-            RUNS_FILE: RUN_COLUMNS,
-        }
-        for name, content in rows.items():
-            frame = pd.DataFrame(content, columns=list(columns[name]))
-            frame.to_csv(self._folder / name, index=False)
+def join_parts(parts: Path, folder: Path) -> None:
+    """Make the tables of a comparison out of the parts of its runs, and remove these."""
+    names = sorted(p.name for p in parts.iterdir() if not p.name.startswith("."))
+    for table in _TABLES:
+        lines = [(parts / name / table).read_text().splitlines(keepends=True) for name in names]
+        body = [line for part in lines for line in part[1:]]
+        (folder / table).write_text("".join([lines[0][0], *body]))
+    with pq.ParquetWriter(folder / STEPS_FILE, STEP_SCHEMA, compression="zstd") as writer:
+        for name in names:
+            writer.write_table(pq.read_table(parts / name / STEPS_FILE, schema=STEP_SCHEMA))
+    shutil.rmtree(parts)
 
 
 def episode_row(episode: Episode) -> dict[str, Any]:

@@ -133,7 +133,7 @@ def test_critic_bootstraps_through_the_limit_and_not_through_the_end(
 
 
 def test_time_baseline_leaves_nothing_of_a_reward_that_no_action_changes() -> None:
-    agent = VPG(Constant("limit"), VPGConfig(baseline="time"), seed=0)
+    agent = VPG(Constant("limit"), VPGConfig(baseline="time", episodes_per_update=4), seed=0)
     log = EpisodeLog(Constant("limit"), seed=0)
     collector = Collector(log, np.random.default_rng(0))
     data = collector.episodes(NetworkPolicy(agent.actor()), 4, 10_000)

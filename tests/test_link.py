@@ -577,3 +577,19 @@ def test_junk_changes_nothing_but_counters() -> None:
     assert link.take_outgoing() == client.take_outgoing() == []
     assert link.counters["malformed"] == 30
     assert client.counters["malformed"] == 15
+
+
+def test_the_last_error_is_one_line_whatever_was_dropped() -> None:
+    whole = binary.encode(state(1, value=0.25, size=100))
+    body = whole[8:].replace(np.float32(0.25).tobytes(), np.float32(np.nan).tobytes())
+    crc = zlib.crc32(body, zlib.crc32(whole[:4]))
+    link, client = agent(), simulator()
+    for receive in (
+        lambda datagram: link.receive(datagram, HERE),
+        lambda datagram: client.receive(datagram, 0.0),
+    ):
+        assert receive(whole[:4] + crc.to_bytes(4, "little") + body) is None
+    for error in (link.last_error, client.last_error):
+        assert "observations: expected finite numbers, got [[nan nan" in error
+        assert "\n" not in error
+        assert len(error) <= 512

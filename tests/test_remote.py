@@ -1,6 +1,8 @@
 """Both sides over real sockets: parity, strangers, silence, and peers that others wrote."""
 
+import errno
 import gc
+import json
 import re
 import signal
 import socket
@@ -30,7 +32,9 @@ from rotorgram.udp import (
     RemoteEnv,
     Simulator,
     binary,
+    sockets,
 )
+from rotorgram.udp.__main__ import parse_arguments
 from rotorgram.udp.messages import Close, Command, Hello, Refuse, State, Welcome
 from rotorgram.udp.simulator import describe
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
@@ -327,6 +331,91 @@ def test_a_flood_of_junk_does_not_extend_either_wait() -> None:
         remote.close()
 
 
+def test_a_wait_may_be_longer_than_the_system_waits_in_one_go(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sockets, "_LONGEST", 0.02)
+    start = time.monotonic()
+    with pytest.raises(PeerSilent, match=r"for 0\.2 s"):
+        RemoteEnv(ANY, connect_timeout=0.2)
+    assert 0.2 <= time.monotonic() - start < 2
+    with sockets.open_socket(ANY, insecure=False) as sock, pytest.raises(TimeoutError):
+        sockets.receive(sock, 1e300)
+
+
+class Interrupted(socket.socket):
+    def settimeout(self, value: float | None) -> None:
+        super().settimeout(value)
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_wait_leaves_the_socket_as_it_was() -> None:
+    with Interrupted(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(ANY)
+        sock.setblocking(False)
+        with pytest.raises(KeyboardInterrupt):
+            sockets.receive(sock, 0.1)
+        assert sock.gettimeout() == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_signals_neither_end_nor_extend_a_wait() -> None:
+    before = signal.signal(signal.SIGALRM, lambda *_: None)
+    try:
+        with sockets.open_socket(ANY, insecure=False) as sock:
+            signal.setitimer(signal.ITIMER_REAL, 0.005, 0.005)
+            start = time.monotonic()
+            with pytest.raises(TimeoutError):
+                sockets.receive(sock, 0.1)
+            assert 0.1 <= time.monotonic() - start < 1
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_empty_and_largest_datagrams_are_counted_and_dropped() -> None:
+    with RemoteEnv(ANY, connect=False, connect_timeout=0.1) as remote, plain_socket() as sock:
+        for datagram in (b"", bytes(65507)):
+            sock.sendto(datagram, remote.address)
+            with pytest.raises(PeerSilent, match="last datagram dropped: malformed"):
+                remote.connect()
+        assert remote.link.counters == {"received": 2, "malformed": 2}
+
+
+def test_no_way_to_the_agent_is_like_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = [OSError(errno.EHOSTUNREACH, "No route to host")]  # a firewall rejects, for example
+
+    def receive(sock: socket.socket, timeout: float) -> Any:
+        if errors:
+            raise errors.pop()
+        return sockets.receive(sock, timeout)
+
+    monkeypatch.setattr("rotorgram.udp.simulator.receive", receive)
+    with plain_socket() as sock:
+        address = sock.getsockname()
+        with Simulator(server=address, bind=ANY, config=LinkConfig(timeout=0.3)) as simulator:
+            sentence = r"Hello sent \d times; receiving failed: No route to host"
+            with pytest.raises(PeerSilent, match=sentence):
+                simulator.run()
+
+
+def test_closed_by_another_thread_while_it_waits() -> None:
+    remote = RemoteEnv(ANY, connect=False, connect_timeout=0.3)
+    closing = threading.Timer(0.05, remote.close)
+    closing.start()
+    with pytest.raises(gym.error.ClosedEnvironmentError, match="expected an open RemoteEnv"):
+        remote.connect()
+    closing.join()
+    with plain_socket() as sock:
+        simulator = Simulator(server=sock.getsockname(), bind=ANY, config=QUICK)
+        closing = threading.Timer(0.05, simulator.close)
+        closing.start()
+        with pytest.raises(OSError) as caught:
+            simulator.run()
+        assert caught.value.errno == errno.EBADF
+        closing.join()
+
+
 def test_a_killed_simulator() -> None:
     with RemoteEnv(ANY, connect=False, connect_timeout=20, timeout=0.5) as remote:
         process = launch(SIMULATE, remote.address[1], "binary")
@@ -356,6 +445,20 @@ def test_ctrl_c_at_the_simulator_tells_the_agent() -> None:
         for _ in range(2):  # and it stays so
             with pytest.raises(PeerClosed, match="closed: the simulator was stopped"):
                 remote.reset()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_the_simulator_program_ends_on_sigterm_and_tells_the_agent() -> None:
+    with RemoteEnv(ANY, connect=False, connect_timeout=20, timeout=10) as remote:
+        arguments = json.dumps({"server": remote.address, "bind": ANY})
+        process = subprocess.Popen([sys.executable, "-m", "rotorgram.udp", arguments])
+        remote.reset(seed=0)
+        process.send_signal(signal.SIGINT)  # Ctrl-C is for the agent
+        remote.step(np.zeros(1))
+        process.send_signal(signal.SIGTERM)
+        with pytest.raises(PeerClosed, match="closed: the simulator was stopped"):
+            remote.reset()
+        assert process.wait(10) == 128 + signal.SIGTERM
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
@@ -478,6 +581,8 @@ def test_a_port_in_use() -> None:
         (("192.0.2.1", 0), "192.0.2.1 is not a loopback address"),
         (("127.0.0.1", 65536), r"address: expected \(host, port from 0 to 65535\), got"),
         (("127.0.0.1", "8001"), "address: expected"),
+        (("127.0.0.1", True), "address: expected"),
+        (("127.0.0.1", 0.5), "address: expected"),
         ("127.0.0.1:8001", "address: expected"),
         (("no host", 1), "host: expected a name or IPv4 address, got 'no host'"),
     ],
@@ -505,6 +610,12 @@ def test_wrong_options() -> None:
         Simulator(codec="json")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="env: expected a registered id, got 'rotorgram/No-v0'"):
         Simulator("rotorgram/No-v0")
+    with pytest.raises(ValueError, match="env: expected a registered id, got 'nowhere:No-v0'"):
+        Simulator("nowhere:No-v0")
+    with pytest.raises(ValueError, match=r"options of CartPole-v1: .*'wind'"):
+        Simulator("CartPole-v1", wind=1)
+    with pytest.raises(ValueError, match=r"options: expected some of target, .*, got 'wind'"):
+        RemoteEnv(ANY, options={"wind": 1})
     with pytest.raises(ValueError, match="observation space: expected a flat Box of float32"):
         Simulator("FrozenLake-v1")
     with pytest.raises(ValueError, match=r"options \['target'\]: expected none with an env"):
@@ -514,6 +625,38 @@ def test_wrong_options() -> None:
     for name in ("timeout", "connect_timeout"):
         with pytest.raises(ValueError, match=f"{name}: expected seconds > 0, got 0"):
             RemoteEnv(ANY, **{name: 0})
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "expected one argument, a JSON object, got 0"),
+        (["{}", "{}"], "expected one argument, a JSON object, got 2"),
+        (["server"], "expected a JSON object: Expecting value"),
+        (["[" * 100_000], "expected a JSON object: maximum recursion depth"),
+        (["[1]"], r"expected a JSON object, got \[1\]"),
+        (['{"server": 5}'], r"server: expected \[host, port\], got 5"),
+        (['{"env": 5}'], "env: expected an id, got 5"),
+        (['{"insecure": "false"}'], "insecure: expected true or false, got 'false'"),
+        (['{"config": {"timeout": 1}}'], "config: expected none"),
+    ],
+)
+def test_wrong_arguments_of_the_simulator_program(words: list[str], sentence: str) -> None:
+    with pytest.raises(ValueError, match=f"^{sentence}"):
+        parse_arguments(words)
+
+
+def test_the_simulator_program_says_what_is_wrong_in_one_sentence() -> None:
+    for words, sentence in (
+        ([], "expected one argument, a JSON object, got 0"),
+        (['{"bind": ["127.0.0.1", 0], "target": NaN}'],
+         "target: expected an elevation in m, or a pair (low, high) with low <= high, got nan"),
+    ):  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, "-m", "rotorgram.udp", *words], capture_output=True, text=True
+        )
+        assert (done.returncode, done.stdout) == (1, "")
+        assert done.stderr == f"rotorgram simulator: {sentence}\n"
 
 
 @pytest.mark.parametrize(

@@ -222,7 +222,7 @@ class SimulatorLink:
     def _drop(self, cause: str, reason: str = "") -> None:
         self.counters[cause] += 1
         if reason:
-            self.last_error = f"{cause}: {reason}"
+            self.last_error = one_line(f"{cause}: {reason}")
 
 
 _AGENT: Final = {
@@ -387,4 +387,4 @@ class AgentLink:
     def _drop(self, cause: str, reason: str, address: Address) -> None:
         self.counters[cause] += 1
         if reason:
-            self.last_error = f"{cause} from {address[0]}:{address[1]}: {reason}"
+            self.last_error = one_line(f"{cause} from {address[0]}:{address[1]}: {reason}")

@@ -101,7 +101,7 @@ class RemoteEnv(gym.Env[np.ndarray, Any]):
     def connect(self) -> None:
         """Wait until it is the agent's turn: for the simulator's first State, if none has come."""
         if not self._leave.alive:
-            raise gym.error.ClosedEnvironmentError("expected an open RemoteEnv, got a closed one")
+            raise gym.error.ClosedEnvironmentError(_CLOSED)
         if self.link.state != "deciding":
             self._receive(self.connect_timeout if self.link.peer is None else self.timeout)
 
@@ -171,10 +171,10 @@ class RemoteEnv(gym.Env[np.ndarray, Any]):
             _flush(self.link, self._socket)
             try:
                 message = self.link.receive(*receive(self._socket, left))
-            except TimeoutError:
-                raise PeerSilent(self._silence(timeout)) from None
-            except ConnectionError:
-                message = None  # Windows: an earlier datagram found nobody
+            except OSError:
+                if not self._leave.alive:
+                    raise gym.error.ClosedEnvironmentError(_CLOSED) from None
+                message = None  # nothing came; or (Windows) an earlier datagram found nobody
             if isinstance(message, State):
                 return message
             if isinstance(message, Close):
@@ -210,6 +210,7 @@ class RemoteEnv(gym.Env[np.ndarray, Any]):
         return dict(zip(self._names, state.telemetry[0].tolist(), strict=True))
 
 
+_CLOSED = "expected an open RemoteEnv, got a closed one"
 _RESET = np.array([True])
 _NO_RESET = np.array([False])
 
@@ -242,7 +243,7 @@ def _announced(hello: Hello) -> _Interface:
 def _known(env_id: str, options: dict[str, Any]) -> _Interface:
     """What follows from an env id, without MuJoCo where the env is ours."""
     if env_id == ENV_ID:
-        config = ElevationConfig(**options)
+        config = ElevationConfig.from_options(options)
         return _Interface(
             observation=observation_space(config),
             action=action_space(config),

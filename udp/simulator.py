@@ -175,6 +175,11 @@ class Simulator:
             except ConnectionError:  # nothing listens there yet: the timer says when to ask again
                 self._trouble = "nothing listens on that port"
                 continue
+            except OSError as error:  # no way there, a firewall says: the same
+                if sock.fileno() < 0:  # closed by another thread
+                    raise
+                self._trouble = f"receiving failed: {error.strerror}"
+                continue
             if isinstance(message, Refuse):
                 raise Refused(f"the agent at {address_text(self.server)} refused: {message.reason}")
             if message is not None:
@@ -207,8 +212,10 @@ def make_env(env: str | gym.Env[Any, Any], options: dict[str, Any]) -> gym.Env[A
         return env
     try:
         return gym.make(env, disable_env_checker=True, **options)
-    except gym.error.Error as error:
+    except (gym.error.Error, ImportError) as error:
         raise ValueError(f"env: expected a registered id, got {env!r}: {error}") from None
+    except TypeError as error:
+        raise ValueError(f"options of {env}: {error}") from None
 
 
 def describe(env: gym.Env[Any, Any]) -> Hello:

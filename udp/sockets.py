@@ -15,6 +15,8 @@ __all__ = ["address_text", "open_socket", "receive", "resolve"]
 
 _ATTENTION: Final = 300e-6
 """How long a wait looks again and again before it sleeps, s."""
+_LONGEST: Final = 3600.0
+"""Longest wait in one go, s: the system counts milliseconds in an int, and longer ones wrap."""
 _give_way: Final[Callable[[], None]] = getattr(os, "sched_yield", lambda: time.sleep(0))
 
 
@@ -31,7 +33,7 @@ def resolve(address: Address, *, insecure: bool) -> Address:
     """
     try:
         host, port = address
-        valid = isinstance(host, str) and 0 <= port <= 65535
+        valid = isinstance(host, str) and type(port) is int and 0 <= port <= 65535
     except (TypeError, ValueError):
         valid = False
     if not valid:
@@ -92,16 +94,18 @@ def receive(sock: socket.socket, timeout: float) -> tuple[bytes, Address]:
     way to whoever else wants the processor, before it sleeps.
 
     Raises:
-        TimeoutError: Nothing came within `timeout`, s.
+        TimeoutError: Nothing came within `timeout`, s, or an hour: look at the clock.
+        OSError: An earlier datagram came back, or the socket is closed.
     """
-    until = time.monotonic() + min(timeout, _ATTENTION)
-    while time.monotonic() < until:
+    # Not time.monotonic, which ticks every 16 ms on Windows.
+    until = time.perf_counter() + min(timeout, _ATTENTION)
+    while time.perf_counter() < until:
         try:
             return sock.recvfrom(MAX_DATAGRAM)
         except BlockingIOError:
             _give_way()
-    sock.settimeout(max(timeout - _ATTENTION, _ATTENTION))
     try:
+        sock.settimeout(min(max(timeout - _ATTENTION, _ATTENTION), _LONGEST))
         return sock.recvfrom(MAX_DATAGRAM)
     finally:
         sock.setblocking(False)

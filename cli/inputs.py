@@ -1,0 +1,89 @@
+"""What the commands make of their flags: addresses, policies, envs, folders."""
+
+import json
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..envs import ElevationConfig
+
+if TYPE_CHECKING:
+    from ..agents.policies import Policy
+    from ..udp import Address, RemoteEnv
+
+__all__ = ["load_policy", "new_folder", "parse_address", "parse_changes", "remote_env"]
+
+
+def parse_address(text: str) -> "Address":
+    """HOST:PORT as a pair. Raises `ValueError`."""
+    host, _, port = text.rpartition(":")
+    if not (host and port.isascii() and port.isdecimal() and int(port) <= 65535):
+        raise ValueError(f"address: expected HOST:PORT with a port up to 65535, got {text!r}")
+    return host, int(port)
+
+
+def parse_changes(changes: tuple[str, ...]) -> dict[str, Any]:
+    """`name=value` pairs of hyperparameters. Raises `ValueError`."""
+    result = {}
+    for change in changes:
+        name, equals, value = change.partition("=")
+        if not equals:
+            raise ValueError(f"set: expected NAME=VALUE, got {change!r}")
+        try:
+            result[name] = json.loads(value.lower() if value in ("True", "False") else value)
+        except json.JSONDecodeError:
+            result[name] = value
+    return result
+
+
+def load_policy(name: str, env: ElevationConfig) -> "tuple[Policy, ElevationConfig]":
+    """A policy by checkpoint path or as `pid`, and the options of the env that it flies."""
+    if name == "pid":
+        from ..agents.pid import PID
+
+        return PID(env), env
+    from ..agents.checkpoints import load
+
+    checkpoint = load(Path(name))
+    if env == ElevationConfig():
+        env = ElevationConfig.from_options(checkpoint.env)
+    policy, size = checkpoint.policy(), 3 if env.observation == "full" else 1
+    if policy.observation_size != size:
+        raise ValueError(
+            f"{name}: expected a policy for {size} observations (--env.observation "
+            f"{env.observation}), got one for {policy.observation_size}"
+        )
+    return policy, env
+
+
+@contextmanager
+def remote_env(
+    config: ElevationConfig, listen: str | None, insecure: bool
+) -> "Iterator[RemoteEnv]":
+    """A remote env with a simulator of its own, or the one that comes to `listen`."""
+    if listen is None:
+        from ..experiments.pairs import socket_pair
+
+        with socket_pair(config) as env:
+            yield env
+        return
+    from ..udp import RemoteEnv
+
+    address = parse_address(listen)
+    env = RemoteEnv(address, options=asdict(config), connect=False, insecure=insecure)
+    with closing(env):
+        here = "{}:{}".format(*env.address)
+        print(f"waiting for a simulator at {here}: rotorgram sim --server {here}", flush=True)
+        env.connect()
+        yield env
+
+
+def new_folder(out: Path | None, name: str) -> Path:
+    """The folder to write to; by default one named by the time."""
+    folder = out or Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    if folder.exists():
+        raise ValueError(f"out: {folder} is there already; choose another folder")
+    return folder

@@ -1,0 +1,95 @@
+"""Progress of runs in other processes: one small datagram now and then, to whoever shows it.
+
+A lost one matters nothing: the next tells the same. No process, pipe or lock has to be shared, and
+a run goes on where nobody listens any more.
+"""
+
+import contextlib
+import json
+import math
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import Thread
+from typing import Final
+
+__all__ = ["OnProgress", "Progress", "ProgressListener", "ProgressSender"]
+
+OnProgress = Callable[[str, int, int, str], None]
+"""Called with a run's name, what is done, what there is to do, and a word on how it goes."""
+
+_EVERY: Final = 0.2  # s
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """Where a training stands."""
+
+    env_steps: int
+    total: int
+    seconds: float
+    mean_return: float
+    """Of the last episodes; NaN before the first has ended."""
+    mean_abs_error: float
+    """Of the last episodes, m."""
+
+    def words(self) -> str:
+        """How it goes, for a progress bar."""
+        if math.isnan(self.mean_return):
+            return ""
+        return f"return {self.mean_return:.0f}, |E| {self.mean_abs_error:.2f} m"
+
+
+class ProgressSender:
+    """Tells the progress of one run to a `ProgressListener` on this machine."""
+
+    def __init__(self, name: str, port: int) -> None:
+        self.name = name
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._to = ("127.0.0.1", port)
+        self._last = 0.0
+
+    def __call__(self, done: int, total: int, words: str) -> None:
+        """Tell it now."""
+        with contextlib.suppress(OSError):  # nobody listens
+            self._socket.sendto(json.dumps([self.name, done, total, words]).encode(), self._to)
+
+    def rarely(self, state: Callable[[], Progress]) -> None:
+        """Tell it, unless it was told a moment ago."""
+        now = time.monotonic()
+        if now - self._last >= _EVERY:
+            self._last = now
+            now_at = state()
+            self(now_at.env_steps, now_at.total, now_at.words())
+
+
+class ProgressListener:
+    """Hands on what runs tell, from a thread of its own, until its block ends."""
+
+    def __init__(self, on_progress: OnProgress) -> None:
+        self._on_progress = on_progress
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self.port: int = self._socket.getsockname()[1]
+        self._thread = Thread(target=self._listen, daemon=True)
+
+    def __enter__(self) -> "ProgressListener":
+        """Begin to listen."""
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Hand on what has come, and end."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.sendto(b"", ("127.0.0.1", self.port))
+        self._thread.join()
+        self._socket.close()
+
+    def _listen(self) -> None:
+        while datagram := self._socket.recv(4096):
+            try:
+                name, done, total, words = json.loads(datagram)
+            except ValueError:
+                continue
+            self._on_progress(str(name), int(done), int(total), str(words))

@@ -1,0 +1,204 @@
+"""The command line as a user meets it: good input, wrong input, Ctrl-C, a missing peer."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from rotorgram.agents.checkpoints import load
+from rotorgram.cli import main
+from rotorgram.experiments.records import read_records, read_steps
+
+COMMANDS = ["sim", "train", "serve", "evaluate", "compare", "report", "check-model"]
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    """Exit status, standard output and standard error of a command."""
+    try:
+        status = main([str(a) for a in arguments])
+    except SystemExit as end:
+        status = int(end.code or 0)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    """A command in a process of its own, in a terminal's process group of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "rotorgram.cli", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+@pytest.mark.parametrize("command", [[], *[[c] for c in COMMANDS]], ids=["rotorgram", *COMMANDS])
+def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, *command, "--help")
+    assert status == 0
+    assert "usage: rotorgram" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["evaluate", "nowhere.safetensors"], "checkpoint: no file nowhere.safetensors"),
+        (["evaluate", "pid", "--episodes", "0"], "episodes: expected at least 1, got 0"),
+        (["evaluate", "pid", "--env.observation", "error"], "pid: expected observation='full'"),
+        (["train", "a2c", "--set", "gamma"], "set: expected NAME=VALUE, got 'gamma'"),
+        (["train", "a2c", "--set", "speed=1"], "hyperparameters: expected some of"),
+        (["train", "vpg", "--listen", "8001"], "address: expected HOST:PORT"),
+        (["train", "vpg", "--listen", "192.0.2.1:8001"], "is not a loopback address"),
+        (["train", "vpg", "--resume", "nowhere"], "checkpoint: no file"),
+        (["sim", "--server", "127.0.0.1:99999"], "address: expected HOST:PORT"),
+        (["sim", "--bind", "127.0.0.1:0", "--env.target", "1"], "target: expected"),
+        (["compare", "--seeds", "0"], "seeds: expected at least 1, got 0"),
+        (["compare", "--agents", "vpg", "vpg"], "agents: expected each once"),
+        (["compare", "--out", "."], "is there already"),
+        (["report", "nowhere"], "nowhere"),
+        (["check-model", "nowhere.xml"], "xml: no file nowhere.xml"),
+    ],
+)
+def test_wrong_input_is_one_sentence(
+    arguments: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, _, err = run(capsys, *arguments)
+    assert status == 1
+    assert err.startswith("rotorgram: ")
+    assert sentence in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments", [["train", "ppo"], ["sim", "--speed", "2"], ["fly"], ["compare", "--seeds", "x"]]
+)
+def test_wrong_flags_name_what_was_expected(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = run(capsys, *arguments)
+    assert status == 2
+    assert "Traceback" not in out + err
+    assert arguments[-1] in out + err or arguments[-2] in out + err
+
+
+def test_port_in_use(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{sock.getsockname()[1]}"
+        for command in (["serve", "pid", "--listen", address], ["sim", "--bind", address]):
+            status, _, err = run(capsys, *command)
+            assert status == 1
+            assert f"cannot bind {address}: the port is in use" in err
+
+
+def test_unreachable_agent(capsys: pytest.CaptureFixture[str]) -> None:
+    server = f"127.0.0.1:{free_port()}"
+    status, _, err = run(
+        capsys, "sim", "--server", server, "--bind", "127.0.0.1:0", "--timeout", 0.5
+    )
+    assert status == 1
+    assert f"no answer from the agent at {server} for 0.5 s" in err
+
+
+def test_check_model(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "check-model")
+    assert status == 0
+    passed, checks = re.search(r"(\d+) of (\d+) checks passed", out).groups()  # type: ignore[union-attr]
+    assert passed == checks
+
+
+def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    settings = ("--env-steps", 1200, "--set", "steps_per_update=100", "--env.episode-length", 60)
+    status, out, _ = run(capsys, "train", "a2c", "--out", folder, *settings)
+    assert status == 0
+    assert "trained 1,200 env steps" in out
+    kept = load(folder / "checkpoint.safetensors")
+    assert (kept.algorithm, kept.config["steps_per_update"]) == ("a2c", 100)
+    assert kept.env["episode_length"] == 60
+    assert len(kept.model_hash) == 32
+    assert json.loads((folder / "config.json").read_text())["seed"] == 0
+    assert len(pd.read_csv(folder / "episodes.csv")) >= 20
+    status, out, _ = run(capsys, "evaluate", folder / "checkpoint.safetensors", "--episodes", 3)
+    assert status == 0
+    assert "episodes          3" in out
+    status, _, err = run(capsys, "train", "vpg", "--resume", folder)
+    assert status == 1
+    assert "resume: expected a training of vpg" in err
+
+
+def test_ctrl_c_stops_a_training_that_resumes_to_the_numbers_of_an_unbroken_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ("--env-steps", 12_000, "--set", "steps_per_update=100")
+    process = start("train", "a2c", "--out", tmp_path / "broken", *settings)
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("a2c seed 0"), "the first update is reported"
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert "stopped after" in out
+    assert f"go on with: rotorgram train a2c --resume {tmp_path / 'broken'}" in out
+    assert err == ""
+    stopped = load(tmp_path / "broken" / "checkpoint.safetensors").position.env_steps
+    assert 0 < stopped < 12_000
+    assert run(capsys, "train", "a2c", "--resume", tmp_path / "broken")[0] == 0
+    assert run(capsys, "train", "a2c", "--out", tmp_path / "whole", *settings)[0] == 0
+    broken, whole = (load(tmp_path / f / "checkpoint.safetensors") for f in ("broken", "whole"))
+    assert broken.state.keys() == whole.state.keys()
+    for name, array in whole.state.items():
+        assert array.tobytes() == broken.state[name].tobytes(), name
+    columns = ["episode", "first_step", "length", "total_reward"]
+    episodes = [pd.read_csv(tmp_path / f / "episodes.csv")[columns] for f in ("broken", "whole")]
+    pd.testing.assert_frame_equal(*episodes)
+
+
+def test_sim_and_serve_meet(tmp_path: Path) -> None:
+    address = f"127.0.0.1:{free_port()}"
+    simulator = start("sim", "--server", address, "--bind", "127.0.0.1:0", "--codec", "text")
+    agent = start("serve", "pid", "--listen", address, "--episodes", 2)
+    out, err = agent.communicate(timeout=30)
+    assert (agent.returncode, err) == (0, "")
+    assert "episode 1: return" in out
+    out, err = simulator.communicate(timeout=10)
+    assert (simulator.returncode, err) == (0, "")
+    assert "the agent closed" in out
+
+
+def test_compare_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "out"
+    status, out, _ = run(
+        capsys, "compare", "--out", folder, "--seeds", 1, "--env-steps", 1100,
+        "--snapshots", 2, "--episodes", 2, "--env.episode-length", 50,
+    )  # fmt: skip
+    assert status == 0
+    assert f"report: {folder / 'report.html'}" in out.replace("\n", "")
+    records = read_records(folder)
+    assert sorted(set(records.runs.agent)) == ["a2c", "sb3-a2c", "vpg"]
+    assert sorted(set(records.evaluations.agent)) == ["a2c", "pid", "sb3-a2c", "vpg"]
+    steps = read_steps(folder, "train", columns=("agent", "step", "error"))
+    assert (steps.agent == "a2c").sum() == 1100
+    assert steps[steps.agent == "vpg"].step.tolist() == list(range(1, 1101))
+    names = {p.name for p in (folder / "checkpoints").iterdir()}
+    assert names == {f"{a}-seed0.safetensors" for a in ("vpg", "a2c", "sb3-a2c")}
+    page = (folder / "report.html").read_text()
+    assert page.count("data:image/png;base64,") >= 4
+    assert (folder / "results.csv").exists()
+    config = json.loads((folder / "config.json").read_text())
+    assert config["env"]["episode_length"] == 50
+    assert len(config["model_hash"]) == 32
+    assert run(capsys, "report", folder)[0] == 0
