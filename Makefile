@@ -17,7 +17,8 @@ install: .venv/.installed
 	@for p in $(PACKAGES); do ln -sfn ../../../$$p .venv/types/rotorgram/$$p; done
 	@touch $@
 
-# A short comparison: three agents, three seeds; about three minutes on two cores.
+# A short comparison: three agents, three seeds; about three minutes on two cores. Too short and too
+# few seeds to decide the paper's claims: docs/results.md has the long one.
 demo: install
 	$(BIN)/rotorgram compare --seeds 3 --env-steps 80000 --episodes 10
 

@@ -124,6 +124,8 @@ class EpisodeLog(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
     def resume(self, position: Position, episodes: list[Episode]) -> None:
         """Bring the env to where another run stood, and go on from there.
 
+        `errors`, `rewards` and `thrusts` begin with the episode that was running.
+
         Raises:
             ResumeError: The env does not repeat what it did then: another model, another version
                 of MuJoCo, or other options.

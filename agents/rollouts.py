@@ -63,7 +63,7 @@ class Collector:
         return self._collect(policy, count, lambda steps, _: steps == count)
 
     def episodes(self, policy: NetworkPolicy, count: int, most_steps: int) -> Rollout:
-        """So many whole episodes; the last is left off where `most_steps` are flown before."""
+        """So many whole episodes; the last is broken off where `most_steps` are flown before."""
         return self._collect(
             policy, 256, lambda steps, ended: ended == count or steps == most_steps
         )

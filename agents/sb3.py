@@ -21,7 +21,7 @@ class SB3A2C:
     """SB3's A2C behind the same interface as our own algorithms.
 
     Adam instead of SB3's RMSprop, no clipping of gradients, and every other setting from the same
-    `A2CConfig`, so that what differs is the implementation alone.
+    `A2CConfig`: given the same experience, it makes the same updates as ours.
 
     Args:
         env: The env to train on: SB3 wants it at construction.

@@ -1,5 +1,6 @@
 """The command `rotorgram`."""
 
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -10,26 +11,37 @@ __all__ = ["main"]
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; its exit status.
 
-    What the user or the other side did wrong is one sentence on standard error, without traceback.
+    What the user or the other side did wrong is one sentence on standard error, without traceback;
+    with ROTORGRAM_TRACEBACK set, for whoever looks for a bug of ours, with it.
     """
-    import tyro
-
-    from .commands import COMMANDS, user_errors
-
     # To be terminated is no reason to leave the other side without a word.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    command = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS,
-        prog="rotorgram",
-        description="A MuJoCo quadcopter that reinforcement-learning agents fly over UDP.",
-        args=arguments,
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
+        import tyro
+
+        from .commands import COMMANDS
+
+        command = tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="rotorgram",
+            description="A MuJoCo quadcopter that reinforcement-learning agents fly over UDP.",
+            args=arguments,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
         return int(command.run())
     except KeyboardInterrupt:
         print("rotorgram: interrupted", file=sys.stderr)
-        return 130
-    except user_errors() as error:
-        print(f"rotorgram: {error}", file=sys.stderr)
+        return 128 + signal.SIGINT
+    except Exception as error:
+        from .commands import user_errors
+
+        if not isinstance(error, user_errors()) or "ROTORGRAM_TRACEBACK" in os.environ:
+            raise
+        print(f"rotorgram: {_sentence(error)}", file=sys.stderr)
         return 1
+
+
+def _sentence(error: Exception) -> str:
+    if not (isinstance(error, OSError) and error.strerror):
+        return str(error)
+    return f"{error.filename}: {error.strerror}" if error.filename else error.strerror

@@ -3,6 +3,8 @@
 Heavy imports stay inside `run`: a simulator starts without torch, an agent without MuJoCo.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -122,14 +124,14 @@ class Train(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Serve(Command):
-    """Fly simulators that come, with a trained policy or the PID."""
+    """Fly simulators that come, one after the other, with a trained policy or the PID."""
 
     policy: Positional[str]
-    """Checkpoint file, or pid."""
+    """Checkpoint, folder of a training, or pid."""
     listen: Annotated[str, arg(metavar="HOST:PORT")] = "127.0.0.1:8001"
     """Address to wait at."""
     episodes: int | None = None
-    """End after so many episodes. Default: when the simulator leaves."""
+    """End after so many episodes. Default: go on until Ctrl-C."""
     insecure: bool = False
     """Allow an address beyond this machine; nothing is authenticated."""
     env: EnvOptions = field(default_factory=EnvOptions)
@@ -137,26 +139,33 @@ class Serve(Command):
     def run(self) -> int:
         """Fly episode after episode."""
         from ..experiments.evaluate import evaluation_seed, fly
-        from ..udp import PeerClosed
 
         if self.episodes is not None and self.episodes < 1:
             raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
         policy, config = load_policy(self.policy, self.env.checked())
-        with remote_env(config, self.listen, self.insecure) as env:
-            episode = 0
-            while self.episodes is None or episode < self.episodes:
-                try:
+        episode = 0
+        while self.episodes is None or episode < self.episodes:
+            with remote_env(config, self.listen, self.insecure) as env, _until_it_leaves():
+                while self.episodes is None or episode < self.episodes:
                     flight = fly(env, policy, evaluation_seed(episode))
-                except PeerClosed as error:
-                    print(error)
-                    break
-                print(
-                    f"episode {episode}: return {flight.rewards.sum():.1f}, "
-                    f"last |E| {abs(flight.errors[-1]):.3f} m",
-                    flush=True,
-                )
-                episode += 1
+                    print(
+                        f"episode {episode}: return {flight.rewards.sum():.1f}, "
+                        f"last |E| {abs(flight.errors[-1]):.3f} m",
+                        flush=True,
+                    )
+                    episode += 1
         return 0
+
+
+@contextmanager
+def _until_it_leaves() -> Iterator[None]:
+    """A simulator that leaves is no error to an agent that waits for the next."""
+    from ..udp import LinkError
+
+    try:
+        yield
+    except LinkError as error:
+        print(error, flush=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +173,7 @@ class Evaluate(Command):
     """Measure a trained policy or the PID over episodes without exploration."""
 
     policy: Positional[str]
-    """Checkpoint file, or pid."""
+    """Checkpoint, folder of a training, or pid."""
     episodes: int = 20
     """Episodes to fly, from seeds that no training uses."""
     listen: Listen = None
@@ -172,7 +181,7 @@ class Evaluate(Command):
     insecure: bool = False
     """Allow an address beyond this machine; nothing is authenticated."""
     env: EnvOptions = field(default_factory=EnvOptions)
-    """Default with a checkpoint: the options that it was trained with."""
+    """With a checkpoint: changes to the options that it was trained with."""
 
     def run(self) -> int:
         """Fly and print the means."""
@@ -212,8 +221,8 @@ class Compare(Command):
     """Algorithms to train; the PID flies beside them."""
     preset: PresetName = "tuned"
     """Hyperparameters: the paper's, or ours."""
-    seeds: int = 3
-    """Seeds 0 ... SEEDS - 1, the same for every agent."""
+    seeds: int = 5
+    """Seeds 0 ... SEEDS - 1, the same for every agent. Fewer than 5 decide no claim."""
     env_steps: int = 100_000
     """Env steps of each training."""
     snapshots: int = 10

@@ -53,7 +53,8 @@ def compare(command: "Compare") -> int:
 
 def report(folder: Path) -> None:
     """Write figures and report from the folder's files, and print the table."""
-    page = write_report(folder)
     records = read_records(folder)
-    Console(width=100).print(terminal_table(results_table(records.evaluations, records.runs)))
+    results = results_table(records.evaluations, records.runs)
+    page = write_report(folder, records, results)
+    Console(width=100).print(terminal_table(results))
     print(f"report: {page}")

@@ -6,7 +6,7 @@ from contextlib import closing, contextmanager
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from ..envs import ElevationConfig
 
@@ -14,7 +14,17 @@ if TYPE_CHECKING:
     from ..agents.policies import Policy
     from ..udp import Address, RemoteEnv
 
-__all__ = ["load_policy", "new_folder", "parse_address", "parse_changes", "remote_env"]
+__all__ = [
+    "CHECKPOINT",
+    "load_policy",
+    "new_folder",
+    "parse_address",
+    "parse_changes",
+    "remote_env",
+]
+
+CHECKPOINT: Final = "checkpoint.safetensors"
+_PATIENCE: Final = 30 * 24 * 3600.0  # s: who waits for a simulator is told to press Ctrl-C
 
 
 def parse_address(text: str) -> "Address":
@@ -40,16 +50,21 @@ def parse_changes(changes: tuple[str, ...]) -> dict[str, Any]:
 
 
 def load_policy(name: str, env: ElevationConfig) -> "tuple[Policy, ElevationConfig]":
-    """A policy by checkpoint path or as `pid`, and the options of the env that it flies."""
+    """A policy by its checkpoint, its training's folder, or as `pid`; and the env that it flies.
+
+    With a checkpoint, options that are not the default replace those that it was trained with.
+    """
     if name == "pid":
         from ..agents.pid import PID
 
         return PID(env), env
     from ..agents.checkpoints import load
 
-    checkpoint = load(Path(name))
-    if env == ElevationConfig():
-        env = ElevationConfig.from_options(checkpoint.env)
+    path = Path(name)
+    checkpoint = load(path / CHECKPOINT if path.is_dir() else path)
+    plain = asdict(ElevationConfig())
+    changed = {k: v for k, v in asdict(env).items() if v != plain[k]}
+    env = ElevationConfig.from_options({**checkpoint.env, **changed})
     policy, size = checkpoint.policy(), 3 if env.observation == "full" else 1
     if policy.observation_size != size:
         raise ValueError(
@@ -73,10 +88,16 @@ def remote_env(
     from ..udp import RemoteEnv
 
     address = parse_address(listen)
-    env = RemoteEnv(address, options=asdict(config), connect=False, insecure=insecure)
+    env = RemoteEnv(
+        address,
+        options=asdict(config),
+        connect=False,
+        connect_timeout=_PATIENCE,
+        insecure=insecure,
+    )
     with closing(env):
         here = "{}:{}".format(*env.address)
-        print(f"waiting for a simulator at {here}: rotorgram sim --server {here}", flush=True)
+        print(f"waiting for a simulator at {here} (Ctrl-C ends)", flush=True)
         env.connect()
         yield env
 

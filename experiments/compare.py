@@ -41,7 +41,7 @@ class CompareConfig:
 
     agents: tuple[str, ...] = AGENTS
     """Agents to train. The PID is always evaluated beside them, where the env allows it."""
-    seeds: int = 3
+    seeds: int = 5
     """Seeds 0 ... seeds - 1, the same for every agent."""
     env_steps: int = 100_000
     """Env steps of each training."""

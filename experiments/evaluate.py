@@ -1,6 +1,5 @@
 """Flying a policy without exploration, and what the flights were like."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -12,11 +11,15 @@ from .metrics import overshoot, settling_time, steady_state_error
 
 __all__ = ["Flight", "evaluation_row", "evaluation_seed", "fly", "fly_episodes"]
 
-_EVALUATION: Final = 20230324  # the day the paper appeared: no training run has this seed
+_EVALUATION: Final = 20230324  # the day the paper appeared
 
 
 def evaluation_seed(episode: int) -> int:
-    """Seed of an evaluation episode: the same for every agent, apart from all training seeds."""
+    """Seed of an evaluation episode: the same for every agent.
+
+    Training seeds are spawned from two numbers (`episodes.episode_seed`), these from one, so that
+    no run's seed can make them meet.
+    """
     sequence = np.random.SeedSequence(_EVALUATION, spawn_key=(episode,))
     return int(sequence.generate_state(1, np.uint64)[0])
 
@@ -57,18 +60,9 @@ def fly(env: gym.Env[np.ndarray, Any], policy: Policy, seed: int) -> Flight:
     )
 
 
-def fly_episodes(
-    env: gym.Env[np.ndarray, Any],
-    policy: Policy,
-    episodes: int,
-    on_episode: Callable[[], None] = lambda: None,
-) -> list[Flight]:
+def fly_episodes(env: gym.Env[np.ndarray, Any], policy: Policy, episodes: int) -> list[Flight]:
     """The first so many evaluation episodes."""
-    flights = []
-    for episode in range(episodes):
-        flights.append(fly(env, policy, evaluation_seed(episode)))
-        on_episode()
-    return flights
+    return [fly(env, policy, evaluation_seed(episode)) for episode in range(episodes)]
 
 
 def evaluation_row(flight: Flight, episode: int, control_period: float) -> dict[str, Any]:

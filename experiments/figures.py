@@ -26,6 +26,7 @@ from .metrics import (
     episode_ends,
     iqm,
     spread_over_seeds,
+    training_runs,
 )
 from .records import (
     Records,
@@ -92,15 +93,19 @@ def agent_color(agent: str) -> str:
     return _COLORS.get(agent, spare)
 
 
-def draw_figures(folder: Path | str) -> list[Path]:
+def draw_figures(folder: Path | str, records: Records | None = None) -> list[Path]:
     """Draw all figures of a comparison into `figures/` inside its folder.
 
     Agents or runs that are missing are left out of the figures; a panel with nothing in it says so.
 
+    Args:
+        folder: Where `rotorgram compare` wrote its records.
+        records: What `read_records(folder)` gave, where it is at hand.
+
     Returns:
         The PNG files, in the order of `FIGURE_FILES`.
     """
-    records = read_records(folder)
+    records = records or read_records(folder)
     target = Path(folder) / "figures"
     target.mkdir(exist_ok=True)
     # Bound to the folder here, so that the step rows are in memory only while they are drawn.
@@ -125,7 +130,7 @@ def _draw_reward(episodes: pd.DataFrame) -> Figure:
     figure, axes = _panels(panels)
     everything = axes[-1] if len(agents) > 1 else None
     for axis, agent in zip(axes, agents, strict=False):
-        runs = _runs(episodes, agent)
+        runs = training_runs(episodes, agent)
         spread = spread_over_seeds([average_return(run, AVERAGING_SHARE) for run in runs])
         _scatter_episodes(axis, pd.concat(runs), agent)
         _plot(axis, spread, agent, label="average reward")
@@ -150,7 +155,7 @@ def _draw_cumulative(episodes: pd.DataFrame) -> Figure:
     """Draw figure 7: the cumulative reward over env steps and over episodes."""
     figure, axes = _panels(2)
     for agent in sort_agents(episodes["agent"]):
-        runs = _runs(episodes, agent)
+        runs = training_runs(episodes, agent)
         totals = [run["return"].cumsum().to_numpy() for run in runs]
         by_step = [Curve(episode_ends(run), total) for run, total in zip(runs, totals, strict=True)]
         by_episode = [Curve(np.arange(1.0, len(total) + 1), total) for total in totals]
@@ -274,12 +279,6 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
     for unused in axes[count:]:
         unused.remove()
     return figure, axes[:count]
-
-
-def _runs(episodes: pd.DataFrame, agent: str) -> list[pd.DataFrame]:
-    """Split an agent's training episodes into one frame per seed, in order."""
-    own = episodes[episodes["agent"] == agent].sort_values(["seed", "first_step"], kind="stable")
-    return [run for _, run in own.groupby("seed")]
 
 
 def _plot(

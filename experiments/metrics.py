@@ -39,6 +39,7 @@ __all__ = [
     "settling_time",
     "spread_over_seeds",
     "steady_state_error",
+    "training_runs",
 ]
 
 SETTLING_TOLERANCE: Final = 0.05
@@ -168,8 +169,9 @@ def bootstrap_difference(
 ) -> tuple[float, float, float]:
     """Difference between two interquartile means over seeds, with its bootstrap interval.
 
-    The runs of the two agents are resampled independently: sharing a seed couples nothing but
-    their starting states.
+    The runs of the two agents are resampled independently, although runs of one seed share their
+    starting states, and VPG's and A2C's also the actor's first weights and the stream of noise. As
+    far as this makes the runs of a seed alike, the interval is wider than it need be.
 
     Returns:
         (iqm(first) - iqm(second), low, high); the ends are nan where either side has fewer than
@@ -186,6 +188,12 @@ def bootstrap_difference(
 def _ends(means: npt.NDArray[np.float64], confidence: float) -> tuple[float, float]:
     low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
     return float(low), float(high)
+
+
+def training_runs(episodes: pd.DataFrame, agent: str) -> list[pd.DataFrame]:
+    """Split an agent's training episodes into one frame per seed, in order."""
+    own = episodes[episodes["agent"] == agent].sort_values(["seed", "first_step"], kind="stable")
+    return [run for _, run in own.groupby("seed")]
 
 
 def episode_ends(episodes: pd.DataFrame) -> npt.NDArray[np.float64]:
@@ -237,6 +245,9 @@ def spread_over_seeds(
 
 def env_steps_to_reach(evaluations: pd.DataFrame, threshold: float = HOLD_THRESHOLD) -> float:
     """Training after which one run holds its target for good, env steps.
+
+    A snapshot is judged by few episodes, in which even an untrained network can pass by luck:
+    hence a snapshot counts only if none after it fails.
 
     Args:
         evaluations: The evaluation episodes of one run (one agent, one seed).

@@ -128,7 +128,7 @@ class Records:
     config: dict[str, Any]
     """`config.json`."""
     episodes: pd.DataFrame
-    """Training episodes that came to an end, `EPISODE_COLUMNS`."""
+    """Training episodes, `EPISODE_COLUMNS`; one that the end of training cut is not recorded."""
     evaluations: pd.DataFrame
     """Evaluation episodes, `EVALUATION_COLUMNS`."""
     runs: pd.DataFrame
@@ -142,16 +142,10 @@ def sort_agents(names: Iterable[str]) -> list[str]:
 
 
 def read_records(folder: Path | str) -> Records:
-    """Read all files of a comparison but the step rows.
-
-    An episode that neither terminated nor was truncated is one that the end of training cut off:
-    its return is that of a piece, so it is left out.
-    """
-    episodes = read_episodes(folder)
-    ended = episodes["terminated"] | episodes["truncated"]
+    """Read all files of a comparison but the step rows."""
     return Records(
         config=read_config(folder),
-        episodes=episodes[ended].reset_index(drop=True),
+        episodes=read_episodes(folder),
         evaluations=read_evaluations(folder),
         runs=read_runs(folder),
     )

@@ -105,11 +105,15 @@ class Cell(NamedTuple):
     details: tuple[str, ...] = ()
 
 
-def write_report(folder: Path | str) -> Path:
+def write_report(
+    folder: Path | str, records: Records | None = None, results: pd.DataFrame | None = None
+) -> Path:
     """Draw the figures and write the report, the table and the verdicts into the folder.
 
     Args:
         folder: Where `rotorgram compare` wrote its records.
+        records: What `records.read_records(folder)` gave, where it is at hand.
+        results: What `metrics.results_table` made of them, where it is at hand.
 
     Returns:
         The path of the HTML report.
@@ -118,10 +122,11 @@ def write_report(folder: Path | str) -> Path:
         RecordsError: If a file or a column of the records is missing.
     """
     folder = Path(folder)
-    records = read_records(folder)
-    results = results_table(records.evaluations, records.runs)
-    verdicts = judge_claims(records.episodes, records.evaluations)
-    figures = draw_figures(folder)
+    records = records or read_records(folder)
+    if results is None:
+        results = results_table(records.evaluations, records.runs)
+    verdicts = judge_claims(records.episodes, records.evaluations, records.config["preset"])
+    figures = draw_figures(folder, records)
     results.to_csv(folder / RESULTS_CSV)
     (folder / RESULTS_MARKDOWN).write_text(_markdown(results), encoding="utf-8")
     claims = json.dumps([asdict(verdict) for verdict in verdicts], indent=2, ensure_ascii=False)
@@ -237,6 +242,7 @@ def _html(
         rows=list(zip((agent_color(agent) for agent in agents), result_rows(results), strict=True)),
         note=TABLE_NOTE,
         verdicts=verdicts,
+        schedule=_schedule(config["agents"]),
         figures=_embedded(figures),
         sections=_sections(config),
     )
@@ -249,6 +255,17 @@ def _summary(config: Mapping[str, Any]) -> str:
         duration = env["episode_length"] * env["control_period"]
         text += f" per run, episodes of {duration:g} s at {env['control_period']:g} s per step"
     return text
+
+
+def _schedule(agents: Mapping[str, Mapping[str, Any]]) -> str:
+    """What an annealed learning rate means for the claims; "" if the judged agents have none."""
+    annealed = [agent_label(name) for name in ("vpg", "a2c") if agents.get(name, {}).get("anneal")]
+    if not annealed:
+        return ""
+    return (
+        f"Here the learning rate of {' and '.join(annealed)} falls to 0 over the run, which fixes "
+        "roughly when a curve settles and damps its late fluctuation; the paper's rate is constant."
+    )
 
 
 def _embedded(figures: list[Path]) -> list[tuple[str, str, str, str]]:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..agents import A2CConfig, VPGConfig, make_agent, preset
-from ..agents.checkpoints import Checkpoint, CheckpointError, load, store
+from ..agents.checkpoints import Checkpoint, CheckpointError, store
 from ..agents.episodes import Episode, EpisodeLog, ResumeError
 from ..envs import ElevationConfig
 from .progress import Progress
@@ -71,15 +71,14 @@ class Training:
 
     @classmethod
     def resume(
-        cls, path: Path, env: gym.Env[np.ndarray, Any], episodes: list[Episode]
+        cls, kept: Checkpoint, env: gym.Env[np.ndarray, Any], episodes: list[Episode]
     ) -> "Training":
         """Go on from a checkpoint. `episodes` are those that ended before it.
 
         Raises:
-            CheckpointError: The file is missing, is no checkpoint, or does not fit together.
+            CheckpointError: The checkpoint's parts do not fit together.
             ResumeError: The env does not repeat the episode that was interrupted.
         """
-        kept = load(path)
         try:
             run = Run(
                 algorithm=kept.algorithm,
@@ -92,7 +91,7 @@ class Training:
             training.agent.set_state(kept.state)
         except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
             reason = " ".join(f"{error!r:.300}".split())
-            raise CheckpointError(f"{path}: the parts do not fit together: {reason}") from None
+            raise CheckpointError(f"checkpoint: its parts do not fit together: {reason}") from None
         hello = getattr(env, "hello", None)
         if kept.model_hash and hello and hello.model_hash != kept.model_hash:
             raise ResumeError(

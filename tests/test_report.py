@@ -97,12 +97,14 @@ def _train(agent, seed, rate, env_steps, length, rng, episodes, steps):  # type:
             | {"step": np.arange(begin, begin + flown), "error": errors}
         )
         begin += flown
+        if flown < length and begin >= env_steps:
+            break  # the end of training cut the episode: it is not recorded
         episodes.append(
             dict.fromkeys(EPISODE_COLUMNS, 0)
             | {"agent": agent, "seed": seed, "episode": number, "first_step": begin - flown}
             | {"length": flown, "return": float(np.sum(1 - np.minimum(np.abs(errors), 3)))}
             | {"mean_abs_error": float(np.abs(errors).mean()), "truncated": flown == length}
-            | {"terminated": flown < length and begin < env_steps, "seconds": begin / 2500}
+            | {"terminated": flown < length, "seconds": begin / 2500}
         )
         number += 1
 
@@ -125,6 +127,7 @@ def _evaluate(agent, seed, mark, skill, length, rng, evaluations, steps, final):
 
 def _write(folder, agents, seeds, env_steps, length, episodes, evaluations, steps, runs):  # type: ignore[no-untyped-def]
     folder.mkdir(parents=True, exist_ok=True)
+    settings = {"learning_rate": 1e-3, "anneal": True, "hidden": [64, 64]}
     config = {
         "created": "2025-01-02T03:04:05+00:00",
         "command": "rotorgram compare --seeds 3 <folder>",
@@ -132,7 +135,7 @@ def _write(folder, agents, seeds, env_steps, length, episodes, evaluations, step
         "seeds": list(range(seeds)),
         "env_steps": env_steps,
         "env": {"target": 10.0, "control_period": PERIOD, "episode_length": length},
-        "agents": {agent: {"learning_rate": 1e-3, "hidden": [64, 64]} for agent in agents},
+        "agents": dict.fromkeys(agents, settings),
         "versions": {"rotorgram": "0.1.0", "mujoco": "4.0.0"},
         "model_hash": "0123abcd",
         "machine": {"platform": "Linux", "processor": "some <processor>", "cores": 2},
@@ -166,13 +169,6 @@ def test_records_are_read_with_their_types(comparison):
     assert records.runs["env_steps"].tolist() == [2000] * 9
     assert records.config["env"]["target"] == 10.0
     assert sort_agents(["zeta", "pid", "a2c", "vpg", "a2c"]) == ["vpg", "a2c", "pid", "zeta"]
-
-
-def test_an_episode_that_the_end_of_training_cut_is_left_out(comparison):
-    episodes = read_episodes(comparison)
-    cut = ~(episodes["terminated"] | episodes["truncated"])
-    assert cut.any()
-    assert len(read_records(comparison).episodes) == len(episodes) - cut.sum()
 
 
 def test_steps_are_read_by_phase_and_column(comparison):
@@ -227,6 +223,9 @@ def test_what_is_wrong_in_a_file_is_named(tmp_path):
 def test_figures_are_pictures_of_modest_size(comparison):
     paths = [comparison / "figures" / name for name in FIGURE_FILES]
     assert draw_figures(comparison) == paths
+    written = [path.read_bytes() for path in paths]
+    assert draw_figures(comparison, read_records(comparison)) == paths
+    assert [path.read_bytes() for path in paths] == written
     for path in paths:
         assert path.read_bytes().startswith(b"\x89PNG")
         assert 5_000 < path.stat().st_size < 200_000
@@ -269,7 +268,39 @@ def test_the_table_and_the_verdicts_are_written_too(comparison):
     assert [len(re.findall(r"(?<!\\)\|", line)) for line in lines[:6]] == [9] * 6
     claims = json.loads((comparison / "claims.json").read_text(encoding="utf-8"))
     assert len(claims) == 4
-    assert set(claims[0]) == {"claim", "source", "verdict", "definition", "evidence"}
+    assert set(claims[0]) == {"claim", "source", "preset", "verdict", "definition", "evidence"}
+    assert [claim["preset"] for claim in claims] == ["tuned"] * 4
+
+
+def test_a_report_from_records_at_hand_is_the_same(comparison):
+    records = read_records(comparison)
+    page = comparison / "report.html"
+    before = page.read_bytes()
+    results = results_table(records.evaluations, records.runs)
+    assert write_report(comparison, records, results) == page
+    assert page.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("annealed", "sentence"),
+    [
+        (("vpg", "a2c"), "the learning rate of VPG and A2C falls to 0 over the run"),
+        (("a2c",), "the learning rate of A2C falls to 0 over the run"),
+        ((), None),
+    ],
+)
+def test_the_report_names_the_preset_and_an_annealed_learning_rate(tmp_path, annealed, sentence):
+    folder = synthetic_folder(tmp_path, agents=("vpg", "a2c"), seeds=1, env_steps=300)
+    config = read_config(folder)
+    for name, settings in config["agents"].items():
+        settings["anneal"] = name in annealed
+    (folder / "config.json").write_text(json.dumps(config | {"preset": "mine"}))
+    text = write_report(folder).read_text(encoding="utf-8")
+    assert text.count("Judged with the preset “mine”.") == 4
+    if sentence is None:
+        assert "falls to 0" not in text
+    else:
+        assert sentence in text
 
 
 def results_of(**changes: float) -> pd.DataFrame:

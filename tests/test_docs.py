@@ -1,0 +1,43 @@
+"""What the pages quote is what the files hold that the commands wrote."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "docs" / "results"
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/results.md"])
+def test_the_table_is_the_one_of_the_comparison(page: str) -> None:
+    table = (RESULTS / "tuned" / "results.md").read_text().split("\n\n")[0]
+    assert table in (ROOT / page).read_text()
+
+
+@pytest.mark.parametrize("preset", ["tuned", "paper"])
+def test_the_verdicts_are_those_of_the_comparison(preset: str) -> None:
+    page = (ROOT / "docs" / "results.md").read_text()
+    for verdict in json.loads((RESULTS / preset / "claims.json").read_text()):
+        row = f"| **{verdict['verdict']}** | {verdict['evidence']} |"
+        assert row in page
+
+
+@pytest.mark.parametrize("preset", ["tuned", "paper"])
+def test_the_command_is_the_one_that_was_given(preset: str) -> None:
+    command = json.loads((RESULTS / preset / "config.json").read_text())["command"]
+    settings = re.sub(r" --out \S+", "", command)
+    assert settings in (ROOT / "docs" / "results.md").read_text()
+
+
+def test_the_speeds_are_those_of_the_benchmark() -> None:
+    speed = json.loads((RESULTS / "training_speed.json").read_text())
+    page = (ROOT / "docs" / "results.md").read_text()
+    for agent, median in speed["medians"].items():
+        assert f"| `{agent}` | {median:,.0f} | {speed['ratio_to_sb3'][agent]:.2f} |" in page
+
+
+def test_committed_results_are_small() -> None:
+    sizes = {p: p.stat().st_size for p in RESULTS.rglob("*") if p.is_file()}
+    assert {str(p): s for p, s in sizes.items() if s > 300_000} == {}
