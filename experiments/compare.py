@@ -7,6 +7,7 @@ import signal
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from multiprocessing import current_process
 from pathlib import Path
 from typing import Any, Final
 
@@ -71,7 +72,7 @@ class CompareConfig:
         self.runs()  # wrong names and numbers are told before anything is trained
 
     def runs(self) -> list[Run]:
-        """Every training, in the order in which they start: all agents of a seed together."""
+        """Every training, in the order in which they start: SB3's first, which take longest."""
         return [
             Run(
                 algorithm=agent,
@@ -80,8 +81,8 @@ class CompareConfig:
                 seed=seed,
                 env_steps=self.env_steps,
             )
+            for agent in sorted(self.agents, key=lambda agent: agent != "sb3-a2c")
             for seed in range(self.seeds)
-            for agent in self.agents
         ]
 
 
@@ -139,7 +140,8 @@ def _fly_pid(config: CompareConfig, folder: Path, port: int) -> str:
 
 
 def _part(folder: Path, progress: ProgressSender, run: Callable[[], RunRecord]) -> str:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's affair
+    if current_process().name != "MainProcess":  # one job at a time runs in this one
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's affair
     try:
         run().write(folder / PARTS)
     except Exception as error:

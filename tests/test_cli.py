@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pandas as pd
@@ -136,9 +137,22 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     status, out, _ = run(capsys, "evaluate", folder / "checkpoint.safetensors", "--episodes", 3)
     assert status == 0
     assert "episodes          3" in out
-    status, _, err = run(capsys, "train", "vpg", "--resume", folder)
+    assert run(capsys, "evaluate", folder, "--episodes", 1, "--env.linear-drag", 0.5)[0] == 0
+    for changes, sentence in (
+        (["vpg"], "resume: expected a training of vpg"),
+        (["a2c", "--seed", 3, "--set", "gamma=0.5"], "got others by --set, --seed"),
+    ):
+        status, _, err = run(capsys, "train", *changes, "--resume", folder)
+        assert status == 1
+        assert sentence in err
+    status, _, err = run(capsys, "evaluate", folder, "--env.observation", "error")
     assert status == 1
-    assert "resume: expected a training of vpg" in err
+    assert "expected a policy for 1 observations" in err
+    episodes = (folder / "episodes.csv").read_text()
+    (folder / "episodes.csv").write_text(episodes[: len(episodes) // 2])
+    status, _, err = run(capsys, "train", "a2c", "--resume", folder)
+    assert status == 1
+    assert "episodes before the checkpoint" in err
 
 
 def test_ctrl_c_stops_a_training_that_resumes_to_the_numbers_of_an_unbroken_one(
@@ -202,3 +216,47 @@ def test_compare_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture
     assert config["env"]["episode_length"] == 50
     assert len(config["model_hash"]) == 32
     assert run(capsys, "report", folder)[0] == 0
+
+
+def test_an_interrupted_comparison_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "out"
+    process = start(
+        "compare", "--out", folder, "--agents", "vpg", "--seeds", 3, "--env-steps", 20_000,
+        "--snapshots", 1, "--episodes", 1, "--jobs", 2,
+    )  # fmt: skip
+    deadline = time.monotonic() + 60
+    while not list((folder / "parts").glob("vpg-seed*")):
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert f"go on with: rotorgram compare --resume {folder}" in out
+    assert err == "rotorgram: interrupted\n"
+    (part, *_) = (folder / "parts").glob("vpg-seed*")
+    first = (part / "evaluations.csv").read_text()
+    assert run(capsys, "compare", "--resume", folder)[0] == 0
+    assert read_records(folder).runs.seed.tolist() == [0, 1, 2]
+    assert first.splitlines()[1] in (folder / "evaluations.csv").read_text()
+    assert not (folder / "parts").exists()
+    status, _, err = run(capsys, "compare", "--resume", folder)
+    assert status == 1
+    assert "is finished" in err
+
+
+def test_a_killed_simulator_ends_a_training_with_a_sentence(tmp_path: Path) -> None:
+    process = start("train", "a2c", "--out", tmp_path / "run", "--env-steps", 10_000_000)
+    assert process.stdout is not None
+    process.stdout.readline()
+    children = subprocess.run(
+        ["pgrep", "-P", str(process.pid)], capture_output=True, text=True, check=True
+    )
+    (simulator,) = children.stdout.split()
+    os.kill(int(simulator), signal.SIGKILL)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert err == "rotorgram: the simulator ended with status -9: it said nothing\n"
+    assert f"go on with: rotorgram train a2c --resume {tmp_path / 'run'}" in out
