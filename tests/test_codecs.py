@@ -88,6 +88,7 @@ def hellos(draw: st.DrawFn) -> Hello:
         control_period=draw(st.floats(1e-6, 1e6)),
         model_hash=draw(st.binary(min_size=16, max_size=16)).hex(),
         telemetry_names=draw(names),
+        options=draw(texts),
     )
 
 
@@ -146,6 +147,7 @@ def one_hello(**changes: object) -> Hello:
         "control_period": 0.02,
         "model_hash": "00112233445566778899aabbccddeeff",
         "telemetry_names": ("X", "F1"),
+        "options": '{"a":1}',
     }
     return Hello(**{**fields, **changes})  # type: ignore[arg-type]
 
@@ -153,9 +155,9 @@ def one_hello(**changes: object) -> Hello:
 # Written by hand from the byte tables of docs/protocol.md, which shows the same lines.
 GOLDEN = {
     "Hello": """
-        a752 01 01 f63c0f9a efcdab8967452301 0000000000000000
+        a752 01 01 58b32434 efcdab8967452301 0000000000000000
         01000000 0100 0100 0300 0000 7b14ae47e17a943f 00112233445566778899aabbccddeeff
-        000080bf 0000803f 00000000 00000040 0600 612f422d7630 0400 582c4631""",
+        000080bf 0000803f 00000000 00000040 0600 612f422d7630 0400 582c4631 0700 7b2261223a317d""",
     "Welcome": """
         a752 01 02 e876b641 efcdab8967452301 0000000000000000
         01 00000000000000 0700000000000000""",

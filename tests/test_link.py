@@ -29,6 +29,7 @@ def hello(**changes: object) -> Hello:
         "control_period": 0.02,
         "model_hash": "0" * 32,
         "telemetry_names": (),
+        "options": "",
     }
     return Hello(**{**fields, **changes})  # type: ignore[arg-type]
 

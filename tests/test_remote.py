@@ -663,10 +663,11 @@ def test_the_simulator_program_says_what_is_wrong_in_one_sentence() -> None:
     ("options", "env", "sentence"),
     [
         ({}, "CartPole-v1", f"refused: expected a simulator of {ENV_ID}, got one of CartPole-v1"),
+        ({"observation": "error"}, ENV_ID, "refused: expected observation 'error', got 'full'"),
         (
-            {"observation": "error"},
+            {"action_mode": "offset", "linear_drag": 0.5},
             ENV_ID,
-            r"refused: expected Box\(.* as the options say, got Box",
+            "expected action_mode 'offset', got 'increment'; expected linear_drag 0.5, got 0.0",
         ),
     ],
 )

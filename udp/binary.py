@@ -143,6 +143,7 @@ def _encode_hello(m: Hello) -> bytes:
             *(b.astype(_F4).tobytes() for b in bounds),
             _text(m.env_id),
             _text(",".join(m.telemetry_names)),
+            _text(m.options),
         )
     )  # fmt: skip
 
@@ -156,6 +157,7 @@ def _decode_hello(data: bytes, session: int, sequence: int) -> Hello:
     bounds = np.frombuffer(data, _F4, 2 * (n + k), at)
     env_id, end = _take_text(data, end)
     names, end = _take_text(data, end)
+    options, end = _take_text(data, end)
     _expect_size(data, end)
     return Hello(
         session=session,
@@ -169,6 +171,7 @@ def _decode_hello(data: bytes, session: int, sequence: int) -> Hello:
         control_period=period,
         model_hash=model_hash.hex(),
         telemetry_names=tuple(names.split(",")) if names else (),
+        options=options,
     )
 
 

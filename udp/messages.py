@@ -104,6 +104,8 @@ class Hello:
     model_hash: str
     """32 lower-case hexadecimal digits; the same model, the same hash; zeros if it has none."""
     telemetry_names: tuple[str, ...]
+    options: str
+    """Options of the env as a JSON object; empty where the env tells none."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_drones <= MAX_DRONES:
@@ -119,6 +121,7 @@ class Hello:
             raise ValueError(f"model_hash: expected 32 hex digits, got {self.model_hash!r}")
         _check_text("env_id", self.env_id)
         _check_text("telemetry_names", ",".join(self.telemetry_names))
+        _check_text("options", self.options)
         if not all(name and "," not in name for name in self.telemetry_names):
             raise ValueError(
                 f"telemetry_names: expected names without commas, got {self.telemetry_names}"

@@ -1,5 +1,6 @@
 """The agent's side: a UDP server that is a Gymnasium env. Needs no MuJoCo."""
 
+import json
 import math
 import socket
 import time
@@ -19,7 +20,7 @@ from ..envs.config import action_space, observation_space
 from .errors import PeerClosed, PeerSilent
 from .link import Address, AgentLink
 from .messages import MAX_UINT64, Close, Command, Hello, State
-from .simulator import DEFAULT_AGENT, describe, make_env
+from .simulator import DEFAULT_AGENT, describe, make_env, options_text
 from .sockets import address_text, open_socket, receive
 
 __all__ = ["RemoteEnv"]
@@ -223,6 +224,8 @@ class _Interface:
     action: spaces.Space[Any]
     telemetry: tuple[str, ...]
     control_period: float
+    options: str
+    """As `Hello.options`."""
 
 
 def _announced(hello: Hello) -> _Interface:
@@ -237,6 +240,7 @@ def _announced(hello: Hello) -> _Interface:
         action=action,
         telemetry=hello.telemetry_names,
         control_period=hello.control_period,
+        options=hello.options,
     )
 
 
@@ -249,6 +253,7 @@ def _known(env_id: str, options: dict[str, Any]) -> _Interface:
             action=action_space(config),
             telemetry=TELEMETRY_NAMES,
             control_period=config.control_period,
+            options=options_text(config),
         )
     with closing(make_env(env_id, options)) as env:
         return _announced(describe(env))
@@ -261,12 +266,30 @@ def _refusal(env_id: str, expected: _Interface | None, hello: Hello) -> str:
     if hello.num_drones != 1:
         return f"expected a simulator of one drone, got one of {hello.num_drones}"
     got = _announced(hello)
+    if expected and (differences := _differences(expected.options, got.options)):
+        return differences
     if expected and (got.observation, got.action) != (expected.observation, expected.action):
         return (
             f"expected {expected.observation} and {expected.action} as the options say, "
             f"got {got.observation} and {got.action}"
         )
     return ""
+
+
+def _differences(expected: str, got: str) -> str:
+    """In which options two envs differ, in a sentence; "" if in none, or if one tells none."""
+    if not (expected and got):
+        return ""
+    try:
+        ours, theirs = json.loads(expected), dict(json.loads(got))
+    except (ValueError, TypeError):
+        return f"options: expected a JSON object, got {got[:80]}"
+    differing = [
+        f"{name} {value!r}, got {theirs.get(name)!r}"
+        for name, value in ours.items()
+        if theirs.get(name) != value
+    ]
+    return f"expected {'; expected '.join(differing)}" if differing else ""
 
 
 def _seconds(name: str, seconds: float) -> float:

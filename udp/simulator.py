@@ -1,7 +1,9 @@
 """The simulator's side: a UDP client that steps a Gymnasium env by the commands of an agent."""
 
+import json
 import secrets
 import time
+from dataclasses import asdict, is_dataclass
 from typing import Any, Final, Literal, TypeGuard
 
 import gymnasium as gym
@@ -14,7 +16,14 @@ from .link import Address, LinkConfig, SimulatorLink
 from .messages import Close, Command, Hello, Message, Refuse, State, Welcome
 from .sockets import address_text, open_socket, receive, resolve
 
-__all__ = ["DEFAULT_AGENT", "DEFAULT_SIMULATOR", "Simulator", "describe", "make_env"]
+__all__ = [
+    "DEFAULT_AGENT",
+    "DEFAULT_SIMULATOR",
+    "Simulator",
+    "describe",
+    "make_env",
+    "options_text",
+]
 
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
@@ -246,7 +255,15 @@ def describe(env: gym.Env[Any, Any]) -> Hello:
         control_period=getattr(base, "control_period", 1 / (env.metadata.get("render_fps") or 50)),
         model_hash=getattr(base, "model_hash", "0" * 32),
         telemetry_names=tuple(getattr(base, "telemetry_names", ())),
+        options=options_text(getattr(base, "config", None)),
     )
+
+
+def options_text(config: Any) -> str:
+    """An env's options as a Hello tells them: JSON, or "" if they are no dataclass."""
+    if not is_dataclass(config) or isinstance(config, type):
+        return ""
+    return json.dumps(asdict(config), sort_keys=True, separators=(",", ":"))
 
 
 def _is_flat(space: Any) -> TypeGuard[spaces.Box]:
