@@ -14,9 +14,9 @@ PROPORTIONAL: Final = 9.0
 DERIVATIVE: Final = 5.4
 """1/s: damping ratio 0.9."""
 INTEGRAL: Final = 1.0
-"""1/s³: there is no steady load to remove; it is what makes the controller a PID."""
-INTEGRAL_LIMIT: Final = 0.2
-"""m·s: the integral stops here, so that a large first error does not wind it up."""
+"""1/s³: there is no steady load to remove here; an unknown mass would be one."""
+INTEGRAL_BAND: Final = 0.02
+"""m: the integral grows only this near the target, so that the way there does not wind it up."""
 
 
 class PID:
@@ -47,8 +47,8 @@ class PID:
     def act(self, observation: np.ndarray) -> Any:
         """Change of thrust, or thrust over hover, as the env's action, float32, shape (1,)."""
         error, rate, thrust = observation.tolist()
-        step = error * self._config.control_period
-        self._integral = min(max(self._integral + step, -INTEGRAL_LIMIT), INTEGRAL_LIMIT)
+        if abs(error) < INTEGRAL_BAND:
+            self._integral += error * self._config.control_period
         acceleration = PROPORTIONAL * error + DERIVATIVE * rate + INTEGRAL * self._integral
         wanted = acceleration * MASS / NUM_ROTORS
         if self._config.action_mode == "increment":

@@ -103,7 +103,7 @@ class Train(Command):
     """Changes to the preset, such as gamma=0.99 steps_per_update=64."""
     seed: int = 0
     """Seed of weights, actions and episodes."""
-    env_steps: int = 300_000
+    env_steps: int = 200_000
     """Env steps to train for."""
     listen: Listen = None
     """Wait here for a simulator instead of starting one."""
@@ -223,8 +223,8 @@ class Compare(Command):
     """Hyperparameters: the paper's, or ours."""
     seeds: int = 5
     """Seeds 0 ... SEEDS - 1, the same for every agent. Fewer than 5 decide no claim."""
-    env_steps: int = 100_000
-    """Env steps of each training."""
+    env_steps: int = 200_000
+    """Env steps of each training; a learning rate that falls, falls over all of them."""
     snapshots: int = 10
     """Policies kept during each training, for the learning curves."""
     episodes: int = 20

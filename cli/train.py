@@ -93,7 +93,8 @@ def _train(training: Training, folder: Path) -> int:
             print(go_on)
         raise
     flown = training.log.env_steps - before
-    print(f"{'trained' if finished else 'stopped after'} {training.log.env_steps:,} env steps")
+    what = ("trained" if flown else "already trained") if finished else "stopped after"
+    print(f"{what} {training.log.env_steps:,} of {training.run.env_steps:,} env steps")
     if flown:
         print(f"{training.log.env_steps / training.log.seconds:,.0f} env steps per second")
     print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)

@@ -44,7 +44,7 @@ class CompareConfig:
     """Agents to train. The PID is always evaluated beside them, where the env allows it."""
     seeds: int = 5
     """Seeds 0 ... seeds - 1, the same for every agent."""
-    env_steps: int = 100_000
+    env_steps: int = 200_000
     """Env steps of each training."""
     preset: str = "tuned"
     """`paper` or `tuned`."""

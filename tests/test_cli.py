@@ -127,7 +127,7 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     settings = ("--env-steps", 1200, "--set", "steps_per_update=100", "--env.episode-length", 60)
     status, out, _ = run(capsys, "train", "a2c", "--out", folder, *settings)
     assert status == 0
-    assert "trained 1,200 env steps" in out
+    assert "trained 1,200 of 1,200 env steps" in out
     kept = load(folder / "checkpoint.safetensors")
     assert (kept.algorithm, kept.config["steps_per_update"]) == ("a2c", 100)
     assert kept.env["episode_length"] == 60
