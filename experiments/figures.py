@@ -219,7 +219,9 @@ def _flown_error(axis: Axes, steps: pd.DataFrame, agent: str, period: float) -> 
         _say(axis, "not evaluated")
         return
     flights = [flight for _, flight in steps.groupby(["seed", "episode"], sort=True)]
-    chosen = flights[:: -(-len(flights) // 40)]
+    # At random: every n-th would be the same few start positions for every seed.
+    order = np.random.default_rng(0).permutation(len(flights))[:40]
+    chosen = [flights[index] for index in order]
     for flight in chosen:
         time = flight["step"].to_numpy() * period
         axis.plot(time, flight["error"].to_numpy(), color=agent_color(agent), lw=0.8, alpha=0.45)
