@@ -48,7 +48,7 @@ class Agent(Protocol):
 
 
 class Learner:
-    """Base of our own algorithms: `collect` and `update` are theirs.
+    """Base of our own algorithms: `collect` and `loss` are theirs.
 
     Args:
         networks: By name; `actor` is one of them.

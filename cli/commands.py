@@ -191,8 +191,6 @@ class Evaluate(Command):
 
         if self.episodes < 1:
             raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
-        if self.episodes is not None and self.episodes < 1:
-            raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
         policy, config = load_policy(self.policy, self.env.checked())
         with remote_env(config, self.listen, self.insecure) as env:
             flights = fly_episodes(env, policy, self.episodes)

@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from ..experiments.errors import RunsFailed
 from ..experiments.metrics import results_table
 from ..experiments.records import read_records
 from ..experiments.report import terminal_table, write_report
-from .inputs import new_folder
+from .inputs import new_folder, refuse_settings
 from .progress import bars
 
 if TYPE_CHECKING:
@@ -25,9 +26,14 @@ __all__ = ["compare", "report"]
 def compare(command: "Compare") -> int:
     """Train, evaluate and report."""
     if command.resume:
-        folder, config = command.resume, read_compare_config(command.resume)
+        folder = command.resume
+        refuse_settings(command, folder, free=("resume", "jobs"))
+        config = replace(read_compare_config(folder), jobs=command.jobs)
         if not (folder / PARTS).is_dir():
-            raise ValueError(f"resume: expected an interrupted comparison, {folder} is finished")
+            raise ValueError(
+                f"resume: expected an interrupted comparison, {folder} is finished; "
+                f"draw its report with: rotorgram report {folder}"
+            )
     else:
         config = CompareConfig(
             agents=command.agents,

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -20,6 +20,7 @@ __all__ = [
     "new_folder",
     "parse_address",
     "parse_changes",
+    "refuse_settings",
     "remote_env",
 ]
 
@@ -100,6 +101,15 @@ def remote_env(
         print(f"waiting for a simulator at {here} (Ctrl-C ends)", flush=True)
         env.connect()
         yield env
+
+
+def refuse_settings(command: Any, folder: Path, *, free: tuple[str, ...]) -> None:
+    """Whoever resumes keeps the settings: `ValueError` if any field but the free ones was set."""
+    plain = type(command)(**{name: getattr(command, name) for name in free})
+    names = [f.name for f in fields(command)]
+    if changed := [n for n in names if getattr(command, n) != getattr(plain, n)]:
+        flags = ", ".join("--" + n.replace("_", "-") for n in changed)
+        raise ValueError(f"resume: expected the settings of {folder}, got others by {flags}")
 
 
 def new_folder(out: Path | None, name: str) -> Path:

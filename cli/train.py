@@ -18,7 +18,7 @@ from ..agents.episodes import Episode
 from ..envs import ElevationConfig
 from ..experiments.training import Run, Training
 from ..udp import LinkError
-from .inputs import CHECKPOINT, new_folder, parse_changes, remote_env
+from .inputs import CHECKPOINT, new_folder, parse_changes, refuse_settings, remote_env
 from .progress import bars
 
 if TYPE_CHECKING:
@@ -56,16 +56,7 @@ def _resume(command: "Train", folder: Path) -> int:
             f"resume: expected a training of {command.algorithm}, "
             f"{folder} holds one of {kept.algorithm}"
         )
-    plain = type(command)(
-        algorithm=command.algorithm,
-        resume=command.resume,
-        listen=command.listen,
-        insecure=command.insecure,
-    )
-    names = [f.name for f in fields(command)]
-    if changed := [n for n in names if getattr(command, n) != getattr(plain, n)]:
-        flags = ", ".join("--" + n.replace("_", "-") for n in changed)
-        raise ValueError(f"resume: expected the settings of {folder}, got others by {flags}")
+    refuse_settings(command, folder, free=("algorithm", "resume", "listen", "insecure"))
     episodes = _read_episodes(folder / EPISODES, kept.position.episode)
     options = ElevationConfig.from_options(kept.env)
     with remote_env(options, command.listen, command.insecure) as env:

@@ -129,14 +129,14 @@ def _in_parallel(work: list[Any], jobs: int | None) -> Iterator[str]:
 
 def _run(run: Run, config: CompareConfig, folder: Path, port: int) -> str:
     """Train and evaluate one agent on one seed; why it failed, or "" (in a worker process)."""
-    progress = ProgressSender(f"{run.algorithm} seed {run.seed}", port)
-    return _part(folder, progress, lambda: _train(run, config, folder, progress))
+    with ProgressSender(f"{run.algorithm} seed {run.seed}", port) as progress:
+        return _part(folder, progress, lambda: _train(run, config, folder, progress))
 
 
 def _fly_pid(config: CompareConfig, folder: Path, port: int) -> str:
     """Evaluate the PID, which needs no training and has no seeds (in a worker process)."""
-    progress = ProgressSender("pid", port)
-    return _part(folder, progress, lambda: _evaluate_pid(config))
+    with ProgressSender("pid", port) as progress:
+        return _part(folder, progress, lambda: _evaluate_pid(config))
 
 
 def _part(folder: Path, progress: ProgressSender, run: Callable[[], RunRecord]) -> str:
@@ -146,7 +146,7 @@ def _part(folder: Path, progress: ProgressSender, run: Callable[[], RunRecord]) 
         run().write(folder / PARTS)
     except Exception as error:
         progress(0, 1, "failed")
-        return f"{progress.name}: {error}"
+        return f"{progress.name}: {type(error).__name__}: {error}"
     progress(1, 1, "done")
     return ""
 

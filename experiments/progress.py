@@ -55,6 +55,14 @@ class ProgressSender:
         with contextlib.suppress(OSError):  # nobody listens
             self._socket.sendto(json.dumps([self.name, done, total, words]).encode(), self._to)
 
+    def __enter__(self) -> "ProgressSender":
+        """Return the sender, to be closed at the end of the block."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close its socket."""
+        self._socket.close()
+
     def rarely(self, state: Callable[[], Progress]) -> None:
         """Tell it, unless it was told a moment ago."""
         now = time.monotonic()

@@ -71,7 +71,8 @@ def join_parts(parts: Path, folder: Path) -> None:
     with pq.ParquetWriter(folder / STEPS_FILE, STEP_SCHEMA, compression="zstd") as writer:
         for name in names:
             writer.write_table(pq.read_table(parts / name / STEPS_FILE, schema=STEP_SCHEMA))
-    shutil.rmtree(parts)
+    # Whole or not at all: a half-removed part would look like one to go on with.
+    shutil.rmtree(parts.rename(parts.with_name(f".{parts.name}")))
 
 
 def episode_row(episode: Episode) -> dict[str, Any]:

@@ -238,7 +238,10 @@ def test_an_interrupted_comparison_goes_on(
     assert err == "rotorgram: interrupted\n"
     (part, *_) = (folder / "parts").glob("vpg-seed*")
     first = (part / "evaluations.csv").read_text()
-    assert run(capsys, "compare", "--resume", folder)[0] == 0
+    status, _, err = run(capsys, "compare", "--resume", folder, "--seeds", 4)
+    assert status == 1
+    assert "got others by --seeds" in err
+    assert run(capsys, "compare", "--resume", folder, "--jobs", 1)[0] == 0
     assert read_records(folder).runs.seed.tolist() == [0, 1, 2]
     assert first.splitlines()[1] in (folder / "evaluations.csv").read_text()
     assert not (folder / "parts").exists()
