@@ -13,6 +13,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..udp import LOST
+
 __all__ = ["Episode", "EpisodeLog", "Position", "ResumeError", "episode_seed"]
 
 
@@ -132,15 +134,9 @@ class EpisodeLog(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         """
         self.episodes = list(episodes)
         self._episode = position.episode
-        observation, _ = self.env.reset(seed=episode_seed(self.run_seed, position.episode))
-        self._actions, self._observation = [], observation
-        ended = False
-        for action in position.actions:
-            if ended:
-                break
-            observation, reward, terminated, truncated, info = self.env.step(action)
-            self._keep_step(action, observation, reward, info)
-            ended = terminated or truncated
+        observation, ended, lost = self._repeat(position)
+        while lost:  # by a simulator that another one has replaced: once more, with that one
+            observation, ended, lost = self._repeat(position)
         if ended or observation.tobytes() != position.observation.tobytes():
             raise ResumeError(
                 f"the simulator does not repeat episode {position.episode}: after "
@@ -149,6 +145,21 @@ class EpisodeLog(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
             )
         self.env_steps = position.env_steps
         self._began = time.perf_counter() - position.seconds
+
+    def _repeat(self, position: Position) -> tuple[np.ndarray, bool, bool]:
+        """Fly the actions of a position; the last observation, and whether all ended before."""
+        del self.errors[:], self.rewards[:], self.thrusts[:]
+        observation, _ = self.env.reset(seed=episode_seed(self.run_seed, position.episode))
+        self._actions, self._observation = [], observation
+        ended = False
+        info: dict[str, Any] = {}
+        for action in position.actions:
+            if ended:
+                break
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            self._keep_step(action, observation, reward, info)
+            ended = terminated or truncated
+        return observation, ended, LOST in info
 
     def _keep_step(
         self, action: Any, observation: np.ndarray, reward: Any, info: dict[str, Any]

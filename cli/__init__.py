@@ -1,5 +1,8 @@
 """The command `rotorgram`."""
 
+import atexit
+import gc
+import logging
 import os
 import signal
 import sys
@@ -16,6 +19,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     # To be terminated is no reason to leave the other side without a word.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    _show_log()
+    # At the end Python looks through everything for garbage: with torch half a second for nothing.
+    atexit.register(gc.freeze)
     try:
         import tyro
 
@@ -39,6 +45,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"rotorgram: {_sentence(error)}", file=sys.stderr)
         return 1
+
+
+class _ToStandardError(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        print(f"rotorgram: {record.getMessage()}", file=sys.stderr, flush=True)
+
+
+def _show_log() -> None:
+    """Our own log goes to standard error, in lines like our other sentences."""
+    log = logging.getLogger("rotorgram")
+    log.setLevel(logging.INFO)
+    log.handlers = [_ToStandardError()]
 
 
 def _sentence(error: Exception) -> str:

@@ -5,39 +5,18 @@ Heavy imports stay inside `run`: a simulator starts without torch, an agent with
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
 from ..agents.presets import AlgorithmName, PresetName
-from ..envs import ElevationConfig
-from .inputs import load_policy, parse_address, remote_env
+from .base import AgentCommand, Command, EnvOptions
+from .inputs import load_policy, remote_env
+from .wire import MakeKey, RelayFaults, Replay, Sim
 
-__all__ = ["COMMANDS", "Command", "user_errors"]
-
-Codec = Literal["binary", "text"]
-Listen = Annotated[str | None, arg(metavar="HOST:PORT")]
-
-
-class EnvOptions(ElevationConfig):
-    """Options of the task: see `docs/task.md`."""
-
-    def __post_init__(self) -> None:
-        """Take anything, so that a wrong option is told like every other wrong input."""
-
-    def checked(self) -> ElevationConfig:
-        """The options, if they can be. Raises `ValueError`."""
-        return ElevationConfig(**vars(self))
-
-
-class Command:
-    """What every command is."""
-
-    def run(self) -> int:
-        """Do it; the exit status."""
-        raise NotImplementedError
+__all__ = ["COMMANDS", "user_errors"]
 
 
 def user_errors() -> tuple[type[Exception], ...]:
@@ -49,46 +28,7 @@ def user_errors() -> tuple[type[Exception], ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sim(Command):
-    """Simulate a drone for an agent: the UDP client.
-
-    Waits for the agent, flies by its commands and ends when it closes.
-    """
-
-    server: str = "127.0.0.1:8001"
-    """Address of the agent, HOST:PORT."""
-    bind: str = "127.0.0.1:8000"
-    """Address of this side, HOST:PORT; port 0 takes a free one."""
-    codec: Codec = "binary"
-    """binary, or the paper's text."""
-    timeout: float = 60.0
-    """Give up when the agent has been silent for so many seconds."""
-    insecure: bool = False
-    """Allow addresses beyond this machine; nothing is authenticated."""
-    env: EnvOptions = field(default_factory=EnvOptions)
-
-    def run(self) -> int:
-        """Simulate until the agent closes."""
-        from ..udp import LinkConfig, Simulator
-
-        simulator = Simulator(
-            server=parse_address(self.server),
-            bind=parse_address(self.bind),
-            codec=self.codec,
-            config=LinkConfig(timeout=self.timeout),
-            insecure=self.insecure,
-            **asdict(self.env.checked()),
-        )
-        with simulator:
-            here = "{}:{}".format(*simulator.address)
-            print(f"simulating at {here} for the agent at {self.server} (Ctrl-C ends)", flush=True)
-            reason = simulator.run()
-            print(f"{reason}; {_counters(simulator.link.counters)}")
-        return 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Train(Command):
+class Train(AgentCommand):
     """Train an agent: the UDP server.
 
     Starts a simulator process of its own, or waits for one with --listen. Ctrl-C stops at the next
@@ -105,14 +45,12 @@ class Train(Command):
     """Seed of weights, actions and episodes."""
     env_steps: int = 200_000
     """Env steps to train for."""
-    listen: Listen = None
-    """Wait here for a simulator instead of starting one."""
-    insecure: bool = False
-    """Allow an address beyond this machine; nothing is authenticated."""
     out: Path | None = None
     """Folder to write to. Default: runs/ALGORITHM-seedSEED-TIME."""
     resume: Path | None = None
     """Folder of a training to go on with; its own settings hold."""
+    store_every: float = 10.0
+    """Seconds between two checkpoints; what is flown after the last one is flown again."""
     env: EnvOptions = field(default_factory=EnvOptions)
 
     def run(self) -> int:
@@ -123,17 +61,15 @@ class Train(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Serve(Command):
+class Serve(AgentCommand):
     """Fly simulators that come, one after the other, with a trained policy or the PID."""
 
     policy: Positional[str]
     """Checkpoint, folder of a training, or pid."""
-    listen: Annotated[str, arg(metavar="HOST:PORT")] = "127.0.0.1:8001"
+    listen: Annotated[str | None, arg(metavar="HOST:PORT")] = "127.0.0.1:8001"
     """Address to wait at."""
     episodes: int | None = None
     """End after so many episodes. Default: go on until Ctrl-C."""
-    insecure: bool = False
-    """Allow an address beyond this machine; nothing is authenticated."""
     env: EnvOptions = field(default_factory=EnvOptions)
 
     def run(self) -> int:
@@ -145,7 +81,7 @@ class Serve(Command):
         policy, config = load_policy(self.policy, self.env.checked())
         episode = 0
         while self.episodes is None or episode < self.episodes:
-            with remote_env(config, self.listen, self.insecure) as env, _until_it_leaves():
+            with remote_env(config, self) as env, _until_it_leaves():
                 while self.episodes is None or episode < self.episodes:
                     flight = fly(env, policy, evaluation_seed(episode))
                     print(
@@ -169,17 +105,13 @@ def _until_it_leaves() -> Iterator[None]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(Command):
+class Evaluate(AgentCommand):
     """Measure a trained policy or the PID over episodes without exploration."""
 
     policy: Positional[str]
     """Checkpoint, folder of a training, or pid."""
     episodes: int = 20
     """Episodes to fly, from seeds that no training uses."""
-    listen: Listen = None
-    """Wait here for a simulator instead of starting one."""
-    insecure: bool = False
-    """Allow an address beyond this machine; nothing is authenticated."""
     env: EnvOptions = field(default_factory=EnvOptions)
     """With a checkpoint: changes to the options that it was trained with."""
 
@@ -192,7 +124,7 @@ class Evaluate(Command):
         if self.episodes < 1:
             raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
         policy, config = load_policy(self.policy, self.env.checked())
-        with remote_env(config, self.listen, self.insecure) as env:
+        with remote_env(config, self) as env:
             flights = fly_episodes(env, policy, self.episodes)
         rows = [evaluation_row(f, k, config.control_period) for k, f in enumerate(flights)]
         settled = [r["settling_time"] for r in rows if not np.isnan(r["settling_time"])]
@@ -301,10 +233,7 @@ COMMANDS: dict[str, Any] = {
     "compare": Compare,
     "report": Report,
     "check-model": CheckModel,
+    "key": MakeKey,
+    "relay": RelayFaults,
+    "replay": Replay,
 }
-
-
-def _counters(counters: Any) -> str:
-    return (
-        ", ".join(f"{count} {name}" for name, count in sorted(counters.items())) or "no datagrams"
-    )

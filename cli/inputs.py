@@ -13,6 +13,7 @@ from ..envs import ElevationConfig
 if TYPE_CHECKING:
     from ..agents.policies import Policy
     from ..udp import Address, RemoteEnv
+    from .base import AgentCommand
 
 __all__ = [
     "CHECKPOINT",
@@ -76,25 +77,41 @@ def load_policy(name: str, env: ElevationConfig) -> "tuple[Policy, ElevationConf
 
 
 @contextmanager
-def remote_env(
-    config: ElevationConfig, listen: str | None, insecure: bool
-) -> "Iterator[RemoteEnv]":
-    """A remote env with a simulator of its own, or the one that comes to `listen`."""
-    if listen is None:
+def remote_env(config: ElevationConfig, command: "AgentCommand") -> "Iterator[RemoteEnv]":
+    """A remote env with a simulator of its own, or the one that comes to `command.listen`.
+
+    At the end it tells what the wire was like.
+    """
+    with _connected(config, command) as env:
+        try:
+            yield env
+        finally:
+            print(f"wire: {env.statistics}", flush=True)
+
+
+@contextmanager
+def _connected(config: ElevationConfig, command: "AgentCommand") -> "Iterator[RemoteEnv]":
+    if command.listen is None:
         from ..experiments.pairs import socket_pair
 
-        with socket_pair(config) as env:
+        if command.key_file or command.insecure:
+            raise ValueError(
+                "key-file, insecure: expected them with --listen, got them for a simulator of "
+                "our own on this machine"
+            )
+        with socket_pair(config, record=command.record) as env:
             yield env
         return
     from ..udp import RemoteEnv
 
-    address = parse_address(listen)
     env = RemoteEnv(
-        address,
+        parse_address(command.listen),
         options=asdict(config),
         connect=False,
         connect_timeout=_PATIENCE,
-        insecure=insecure,
+        key_file=command.key_file,
+        insecure=command.insecure,
+        record=command.record,
     )
     with closing(env):
         here = "{}:{}".format(*env.address)

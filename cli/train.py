@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import pandas as pd
+from torch.utils.tensorboard import SummaryWriter
 
 from ..agents import preset
 from ..agents.checkpoints import load, software_versions, write_whole
@@ -27,12 +29,15 @@ if TYPE_CHECKING:
 __all__ = ["train"]
 
 EPISODES: Final = "episodes.csv"
-_STORE_EVERY: Final = 10.0  # s
+_NOT_KEPT: Final = ("listen", "key_file", "insecure", "record", "store_every")
+_UPDATE_WITHIN: Final = 0.7  # s
 _SHOW_EVERY: Final = 0.2  # s
 
 
 def train(command: "Train") -> int:
     """Train by the command's settings, or by those of the folder to resume."""
+    if not (math.isfinite(command.store_every) and command.store_every > 0):
+        raise ValueError(f"store-every: expected seconds > 0, got {command.store_every}")
     if command.resume:
         return _resume(command, command.resume)
     run = Run(
@@ -43,10 +48,10 @@ def train(command: "Train") -> int:
         env_steps=command.env_steps,
     )
     folder = new_folder(command.out, f"{run.algorithm}-seed{run.seed}")
-    with remote_env(run.env, command.listen, command.insecure) as env:
+    with remote_env(run.env, command) as env:
         training = Training(run, env)
         _write_config(training, folder)
-        return _train(training, folder)
+        return _train(training, folder, command.store_every)
 
 
 def _resume(command: "Train", folder: Path) -> int:
@@ -56,19 +61,19 @@ def _resume(command: "Train", folder: Path) -> int:
             f"resume: expected a training of {command.algorithm}, "
             f"{folder} holds one of {kept.algorithm}"
         )
-    refuse_settings(command, folder, free=("algorithm", "resume", "listen", "insecure"))
+    refuse_settings(command, folder, free=("algorithm", "resume", *_NOT_KEPT))
     episodes = _read_episodes(folder / EPISODES, kept.position.episode)
     options = ElevationConfig.from_options(kept.env)
-    with remote_env(options, command.listen, command.insecure) as env:
-        return _train(Training.resume(kept, env, episodes), folder)
+    with remote_env(options, command) as env:
+        return _train(Training.resume(kept, env, episodes), folder, command.store_every)
 
 
-def _train(training: Training, folder: Path) -> int:
+def _train(training: Training, folder: Path, store_every: float) -> int:
     before = training.log.env_steps
     go_on = f"go on with: rotorgram train {training.run.algorithm} --resume {folder}"
+    keeper = _Keeper(training, folder, store_every)
     try:
         with _stop_at_update() as stop, _showing(training) as show:
-            keeper = _Keeper(training, folder)
 
             def on_update() -> bool:
                 show()
@@ -79,10 +84,12 @@ def _train(training: Training, folder: Path) -> int:
             finished = training.train(on_update)
             if finished:
                 keeper.keep(now=True)
-    except LinkError:
+    except (LinkError, KeyboardInterrupt):
+        keeper.close()
         if (folder / CHECKPOINT).exists():
             print(go_on)
         raise
+    keeper.close()
     flown = training.log.env_steps - before
     what = ("trained" if flown else "already trained") if finished else "stopped after"
     print(f"{what} {training.log.env_steps:,} of {training.run.env_steps:,} env steps")
@@ -93,21 +100,51 @@ def _train(training: Training, folder: Path) -> int:
 
 
 class _Keeper:
-    """Stores a training at its first update, then every ten seconds, and when told to."""
+    """Stores a training at its first update, then every so many seconds, and when told to.
 
-    def __init__(self, training: Training, folder: Path) -> None:
+    The numbers for TensorBoard are written along with it, under the names that SB3 gives them.
+    """
+
+    def __init__(self, training: Training, folder: Path, every: float) -> None:
         self._training = training
         self._folder = folder
+        self._every = every
         self._due = 0.0
+        self._board = SummaryWriter(str(folder / "tensorboard"))
 
     def keep(self, *, now: bool) -> None:
         if now or time.monotonic() >= self._due:
-            rows = [asdict(episode) for episode in self._training.log.episodes]
-            table = pd.DataFrame(rows, columns=[f.name for f in fields(Episode)])
             # First the episodes: a checkpoint takes those that ended before it.
-            write_whole(self._folder / EPISODES, table.to_csv(index=False).encode())
+            self._write_episodes()
             self._training.store(self._folder / CHECKPOINT)
-            self._due = time.monotonic() + _STORE_EVERY
+            self._write_scalars()
+            self._due = time.monotonic() + self._every
+
+    def close(self) -> None:
+        """Write what does not need an update to be whole."""
+        self._write_episodes()
+        self._write_scalars()
+        self._board.close()
+
+    def _write_episodes(self) -> None:
+        rows = [asdict(episode) for episode in self._training.log.episodes]
+        table = pd.DataFrame(rows, columns=[f.name for f in fields(Episode)])
+        write_whole(self._folder / EPISODES, table.to_csv(index=False).encode())
+
+    def _write_scalars(self) -> None:
+        state = self._training.progress()
+        scalars = {
+            "rollout/ep_rew_mean": state.mean_return,
+            "rollout/ep_error_mean": state.mean_abs_error,
+            "time/fps": state.env_steps / state.seconds if state.seconds else math.nan,
+        }
+        statistics = getattr(self._training.env, "statistics", None)
+        if statistics is not None:
+            scalars |= {f"wire/{name}": value for name, value in statistics.numbers().items()}
+        for name, value in scalars.items():
+            if math.isfinite(value):
+                self._board.add_scalar(name, value, state.env_steps)
+        self._board.flush()
 
 
 def _read_episodes(path: Path, count: int) -> list[Episode]:
@@ -156,12 +193,20 @@ def _showing(training: Training) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def _stop_at_update() -> "Iterator[_Stop]":
-    """Ctrl-C and termination ask to stop at the next update; asked again, it stops at once."""
+    """Ctrl-C and termination ask to stop at the next update.
+
+    If none comes soon, since no simulator answers for example, or if asked again, it stops at once.
+    """
     stop = _Stop()
-    before = {number: signal.signal(number, stop.ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {signal.SIGINT: stop.ask, signal.SIGTERM: stop.ask}
+    if hasattr(signal, "setitimer"):
+        handlers[signal.SIGALRM] = stop.ask
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield stop
     finally:
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in before.items():
             signal.signal(number, handler)
 
@@ -175,3 +220,5 @@ class _Stop:
             raise KeyboardInterrupt
         self.asked = True
         print("stopping at the next update; Ctrl-C again stops now", flush=True)
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, _UPDATE_WITHIN)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Final
 
@@ -22,10 +23,14 @@ _POLL: Final = 0.5
 
 
 @contextmanager
-def socket_pair(config: ElevationConfig) -> Iterator[RemoteEnv]:
+def socket_pair(config: ElevationConfig, *, record: Path | None = None) -> Iterator[RemoteEnv]:
     """A connected remote env, on free ports of the loopback interface.
 
     The simulator ends with this process, however this one ends.
+
+    Args:
+        config: Options of the env.
+        record: MCAP file for the agent's journal.
 
     Raises:
         PeerClosed: The simulator did not start, or ended; the sentence holds what it said.
@@ -38,6 +43,7 @@ def socket_pair(config: ElevationConfig) -> Iterator[RemoteEnv]:
         connect=False,
         connect_timeout=_POLL,
         timeout=_ANSWER_TIMEOUT,
+        record=record,
     )
     arguments = {"server": env.address, "bind": ("127.0.0.1", 0), **options}
     command = [sys.executable, "-m", "rotorgram.udp", json.dumps(arguments)]

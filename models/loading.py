@@ -9,7 +9,7 @@ import mujoco
 
 from . import SCENE_XML
 
-__all__ = ["apply_linear_drag", "load_model", "model_hash"]
+__all__ = ["apply_linear_drag", "load_model", "model_hash", "model_xml"]
 
 _HASH_BYTES: Final = 16
 
@@ -47,8 +47,12 @@ def model_hash(linear_drag: float = 0.0) -> str:
     the six digits that MuJoCo writes. Another version of MuJoCo may write the MJCF differently.
     """
     drag = struct.pack("<d", _checked_drag(linear_drag))
-    mjcf = mujoco.MjSpec.from_file(str(SCENE_XML)).to_xml()
-    return blake2b(mjcf.encode() + b"\0" + drag, digest_size=_HASH_BYTES).hexdigest()
+    return blake2b(model_xml().encode() + b"\0" + drag, digest_size=_HASH_BYTES).hexdigest()
+
+
+def model_xml() -> str:
+    """The whole MJCF of the scene with its includes resolved, as `MjSpec.to_xml()` writes it."""
+    return str(mujoco.MjSpec.from_file(str(SCENE_XML)).to_xml())
 
 
 def _checked_drag(linear_drag: float) -> float:

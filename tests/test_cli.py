@@ -15,8 +15,12 @@ import pytest
 from rotorgram.agents.checkpoints import load
 from rotorgram.cli import main
 from rotorgram.experiments.records import read_records, read_steps
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-COMMANDS = ["sim", "train", "serve", "evaluate", "compare", "report", "check-model"]
+COMMANDS = [
+    "sim", "train", "serve", "evaluate", "compare", "report", "check-model",
+    "key", "relay", "replay",
+]  # fmt: skip
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -72,6 +76,15 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["compare", "--out", "."], "is there already"),
         (["report", "nowhere"], "nowhere"),
         (["check-model", "nowhere.xml"], "xml: no file nowhere.xml"),
+        (["sim", "--num-envs", "0", "--bind", "127.0.0.1:0"], "num_envs: expected 1 to 65536"),
+        (["sim", "--num-envs", "2", "--codec", "text"], "codec: expected 'binary' for 2 drones"),
+        (["sim", "--key-file", "nowhere"], "key file: cannot read nowhere"),
+        (["train", "a2c", "--key-file", "nowhere"], "key-file, insecure: expected them with"),
+        (["train", "a2c", "--store-every", "0"], "store-every: expected seconds > 0, got 0"),
+        (["serve", "pid", "--listen", "0.0.0.0:0"], "--key-file), or insecure=True (--insecure)"),
+        (["relay", "--drop", "2"], "drop: expected a probability from 0 to 1, got 2"),
+        (["relay", "--listen", "0.0.0.0:0"], "is not a loopback address"),
+        (["replay", "nowhere.mcap"], "nowhere.mcap"),
     ],
 )
 def test_wrong_input_is_one_sentence(
@@ -193,6 +206,84 @@ def test_sim_and_serve_meet(tmp_path: Path) -> None:
     assert "the agent closed" in out
 
 
+def test_a_key_a_relay_and_a_journal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What a user does who flies over a bad network that others share."""
+    key, journal = tmp_path / "key", tmp_path / "flight.mcap"
+    assert run(capsys, "key", key)[0] == 0
+    assert key.stat().st_mode & 0o777 == 0o600
+    assert run(capsys, "key", key)[0] == 1, "a key is never replaced"
+    agent_port, relay_port = free_port(), free_port()
+    relay = start(
+        "relay", "--listen", f"127.0.0.1:{relay_port}", "--server", f"127.0.0.1:{agent_port}",
+        "--drop", 0.2, "--duplicate", 0.1, "--corrupt", 0.05,
+    )  # fmt: skip
+    agent = start(
+        "serve", "pid", "--listen", f"0.0.0.0:{agent_port}", "--episodes", 1, "--key-file", key,
+        "--record", journal,
+    )  # fmt: skip
+    simulator = start(
+        "sim", "--server", f"127.0.0.1:{relay_port}", "--bind", "127.0.0.1:0", "--key-file", key
+    )
+    out, _ = agent.communicate(timeout=60)
+    assert agent.returncode == 0
+    assert "episode 0: return" in out
+    assert re.search(r"wire: .*duplicate.*forged.*resent.*round trip p50 \d", out)
+    out, _ = simulator.communicate(timeout=10)
+    assert simulator.returncode == 0
+    assert re.search(r"wire: .*forged.*round trip p50 \d", out)
+    relay.send_signal(signal.SIGINT)
+    out, err = relay.communicate(timeout=10)
+    assert (relay.returncode, err) == (0, "")
+    assert re.search(r"\d+ dropped, \d+ duplicated", out)
+    status, out, _ = run(capsys, "replay", journal, "--verify")
+    assert status == 0, out
+    data = bytearray(journal.read_bytes())
+    journal.write_bytes(data[: len(data) // 2])
+    assert run(capsys, "replay", journal)[0] == 0
+
+
+def test_ctrl_c_while_nobody_answers(tmp_path: Path) -> None:
+    """No update comes any more, for the simulator is stopped: it ends all the same."""
+    address = f"127.0.0.1:{free_port()}"
+    simulator = start("sim", "--server", address, "--bind", "127.0.0.1:0")
+    folder = tmp_path / "run"
+    agent = start("train", "a2c", "--out", folder, "--listen", address, "--env-steps", 10**7)
+    deadline = time.monotonic() + 60
+    while not (folder / "checkpoint.safetensors").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    simulator.send_signal(signal.SIGSTOP)
+    time.sleep(0.5)
+    began = time.monotonic()
+    agent.send_signal(signal.SIGINT)
+    out, _ = agent.communicate(timeout=20)
+    assert time.monotonic() - began < 5, "one second on a machine that has nothing else to do"
+    assert agent.returncode == 130
+    assert f"go on with: rotorgram train a2c --resume {folder}" in out
+    episodes = pd.read_csv(folder / "episodes.csv")
+    assert episodes.episode.tolist() == list(range(len(episodes)))
+    simulator.kill()
+    simulator.communicate()
+
+
+def test_tensorboard_has_the_training_and_the_wire(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ("--env-steps", 1200, "--env.episode-length", 60)
+    assert run(capsys, "train", "a2c", "--out", tmp_path / "run", *settings)[0] == 0
+    board = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    board.Reload()
+    names = board.Tags()["scalars"]
+    assert {"rollout/ep_rew_mean", "time/fps", "wire/received", "wire/round_trip_p99_ms"} <= {
+        *names
+    }
+    last = board.Scalars("rollout/ep_rew_mean")[-1]
+    episodes = pd.read_csv(tmp_path / "run" / "episodes.csv")
+    assert last.step == 1200
+    assert last.value == pytest.approx(episodes.total_reward[-20:].mean(), rel=1e-5)
+    assert board.Scalars("wire/received")[-1].value >= 1200
+
+
 def test_compare_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "out"
     status, out, _ = run(
@@ -261,5 +352,7 @@ def test_a_killed_simulator_ends_a_training_with_a_sentence(tmp_path: Path) -> N
     os.kill(int(simulator), signal.SIGKILL)
     out, err = process.communicate(timeout=30)
     assert process.returncode == 1
-    assert err == "rotorgram: the simulator ended with status -9: it said nothing\n"
+    assert err.splitlines()[-1] == (
+        "rotorgram: the simulator ended with status -9: it said nothing"
+    )
     assert f"go on with: rotorgram train a2c --resume {tmp_path / 'run'}" in out

@@ -2,7 +2,9 @@
 
 import contextlib
 import dataclasses
+import re
 import struct
+import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -21,6 +23,8 @@ from rotorgram.udp.messages import (
     Message,
     Refuse,
     State,
+    Unknown,
+    Wait,
     Welcome,
     one_line,
 )
@@ -28,11 +32,10 @@ from rotorgram.udp.messages import (
 PAGE = Path(__file__).parent.parent / "docs" / "protocol.md"
 
 uint64 = st.integers(0, 2**64 - 1)
-seeds = st.none() | uint64
 texts = st.text(st.characters(exclude_categories=["Cs", "Cc"]), max_size=MAX_TEXT // 4)
 names = st.lists(
     st.text(st.characters(exclude_categories=["Cs", "Cc"], exclude_characters=","), min_size=1,
-            max_size=8), max_size=8
+            max_size=8), max_size=8, unique=True
 ).map(tuple)  # fmt: skip
 float32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
 float64 = st.floats(allow_nan=False, allow_infinity=False)
@@ -65,7 +68,7 @@ def commands(draw: st.DrawFn, most: int = 5) -> Command:
         sequence=draw(uint64),
         actions=draw(rows(drones, draw(st.integers(1, 4)), np.float32, float32)),
         resets=draw(arrays(bool, drones)),
-        seed=draw(seeds),
+        seeds=draw(st.none() | arrays(np.uint64, drones, elements=uint64)),
     )
 
 
@@ -94,8 +97,10 @@ def hellos(draw: st.DrawFn) -> Hello:
 
 messages = st.one_of(
     hellos(),
-    st.builds(Welcome, session=uint64, seed=seeds),
+    st.builds(Welcome, session=uint64, nonce=uint64, seed=st.none() | uint64),
     st.builds(Refuse, session=uint64, reason=texts),
+    st.builds(Wait, session=uint64),
+    st.builds(Unknown, session=uint64, sequence=uint64),
     states(),
     commands(),
     st.builds(Close, session=uint64, sequence=uint64, reason=texts),
@@ -128,8 +133,8 @@ def one_command(**changes: object) -> Command:
         "session": 0x0123456789ABCDEF,
         "sequence": 1,
         "actions": np.array([[0.5], [-1.0]], np.float32),
-        "resets": np.array([False, True]),
-        "seed": 2**64 - 1,
+        "resets": np.array([True, False]),
+        "seeds": np.array([2**64 - 1, 5], np.uint64),
     }
     return Command(**{**fields, **changes})  # type: ignore[arg-type]
 
@@ -155,42 +160,50 @@ def one_hello(**changes: object) -> Hello:
 # Written by hand from the byte tables of docs/protocol.md, which shows the same lines.
 GOLDEN = {
     "Hello": """
-        a752 01 01 58b32434 efcdab8967452301 0000000000000000
+        a752 02 01 739d76c6 efcdab8967452301 0000000000000000
         01000000 0100 0100 0300 0000 7b14ae47e17a943f 00112233445566778899aabbccddeeff
         000080bf 0000803f 00000000 00000040 0600 612f422d7630 0400 582c4631 0700 7b2261223a317d""",
     "Welcome": """
-        a752 01 02 e876b641 efcdab8967452301 0000000000000000
-        01 00000000000000 0700000000000000""",
+        a752 02 02 6e55e9fe efcdab8967452301 0000000000000000
+        1032547698badcfe 01 00000000000000 0700000000000000""",
     "Refuse": """
-        a752 01 03 8968e5cb efcdab8967452301 0000000000000000
+        a752 02 03 a1c1fb93 efcdab8967452301 0000000000000000
         0400 62757379""",
     "State": """
-        a752 01 04 e96b9c5f efcdab8967452301 0100000000000000
+        a752 02 04 171bb215 efcdab8967452301 0100000000000000
         01000000 0300 0200 000000000000e03f 000000000000f03f 00000000000000c0
         0000803e 00000080 0000c03f 00 01""",
     "Command": """
-        a752 01 05 7c4d8a41 efcdab8967452301 0100000000000000
-        02000000 0100 01 00 ffffffffffffffff 0000003f 000080bf 00 01""",
+        a752 02 05 02d64849 efcdab8967452301 0100000000000000
+        02000000 0100 000000000000 02000000 ffffffffffffffff 0500000000000000
+        0000003f 000080bf 01 00""",
     "Close": """
-        a752 01 06 918b7212 efcdab8967452301 0100000000000000
+        a752 02 06 b9226c4a efcdab8967452301 0100000000000000
         0400 646f6e65""",
+    "Wait": """
+        a752 02 07 330a146d efcdab8967452301 0000000000000000""",
+    "Unknown": """
+        a752 02 08 78393c67 efcdab8967452301 0100000000000000""",
 }
 GOLDEN_MESSAGES = {
     "Hello": one_hello(),
-    "Welcome": Welcome(session=0x0123456789ABCDEF, seed=7),
+    "Welcome": Welcome(session=0x0123456789ABCDEF, nonce=0xFEDCBA9876543210, seed=7),
     "Refuse": Refuse(session=0x0123456789ABCDEF, reason="busy"),
     "State": one_state(),
     "Command": one_command(),
     "Close": Close(session=0x0123456789ABCDEF, sequence=1, reason="done"),
+    "Wait": Wait(session=0x0123456789ABCDEF),
+    "Unknown": Unknown(session=0x0123456789ABCDEF, sequence=1),
 }
 GOLDEN_LINES = {
     "1,0.5,0,1,0.25,-0.0,1.5,1.0,-2.0": one_state(session=0),
-    "1,0.5": one_command(session=5, actions=np.array([[0.5]], np.float32), seed=None,
+    "1,0.5": one_command(session=5, actions=np.array([[0.5]], np.float32), seeds=None,
                          resets=np.array([False])),
-    "1,reset": one_command(session=5, actions=np.zeros((1, 1), np.float32), seed=None,
+    "1,reset": one_command(session=5, actions=np.zeros((1, 1), np.float32), seeds=None,
                            resets=np.array([True])),
     "1,reset,18446744073709551615": one_command(
-        session=5, actions=np.zeros((1, 1), np.float32), resets=np.array([True])),
+        session=5, actions=np.zeros((1, 1), np.float32), resets=np.array([True]),
+        seeds=np.array([2**64 - 1], np.uint64)),
     "1,close": Close(session=5, sequence=1, reason="the agent closed"),
 }  # fmt: skip
 
@@ -282,7 +295,7 @@ def test_hostile_bytes_give_a_message_or_a_decode_error(name: str, at: int, junk
 @example(b"")
 @example(b"\xa7R")
 def test_random_bytes(junk: bytes) -> None:
-    for body in (junk, *(sealed(b"\xa7R\x01" + bytes([t]) + b"\0" * 20 + junk) for t in range(8))):
+    for body in (junk, *(sealed(b"\xa7R\x02" + bytes([t]) + b"\0" * 20 + junk) for t in range(10))):
         with contextlib.suppress(DecodeError):
             assert isinstance(binary.decode(body), Message)
 
@@ -293,27 +306,42 @@ def test_random_bytes(junk: bytes) -> None:
         (4, struct.pack("<IHH", 2**32 - 1, 65535, 65535)),
         (4, struct.pack("<IHH", 0, 3, 2)),
         (4, struct.pack("<IHH", 65537, 0, 0) + b"\0" * 65537 * 10),
-        (5, struct.pack("<IHBxQ", 2**32 - 1, 65535, 0, 0)),
-        (5, struct.pack("<IHBxQ", 0, 1, 0, 0)),
-        (5, struct.pack("<IHBxQfB", 1, 1, 2, 0, 0.0, 0)),
-        (5, struct.pack("<IHBxQfB", 1, 1, 0, 0, 0.0, 2)),
+        (2, struct.pack("<QB7xQ", 0, 2, 0)),
+        (5, struct.pack("<IH6xI", 2**32 - 1, 65535, 0)),
+        (5, struct.pack("<IH6xI", 2**32 - 1, 65535, 2**32 - 1)),
+        (5, struct.pack("<IH6xI", 0, 1, 0)),
+        (5, struct.pack("<IH6xIQfB", 1, 1, 2, 0, 0.0, 0)),
+        (5, struct.pack("<IH6xIQfffBB", 2, 1, 1, 0, 0.0, 0.0, 0.0, 0, 0)),
+        (5, struct.pack("<IH6xIfB", 1, 1, 0, 0.0, 2)),
         (1, struct.pack("<IHHHxxd16s", 1, 65535, 65535, 0, 0.02, b"")),
         (6, struct.pack("<H", 65535)),
         (6, struct.pack("<H", 2) + b"\xff\xff"),
         (6, struct.pack("<H", 4) + b"\x1b[2J"),
         (6, struct.pack("<H", 513) + b"a" * 513),
         (0, b""),
-        (7, b""),
+        (7, b"\0"),
+        (8, b"\0"),
+        (9, b""),
         (255, b""),
     ],
 )
 def test_declared_sizes_and_values_are_checked(kind: int, body: bytes) -> None:
-    header = struct.pack("<2sBBIQQ", b"\xa7R", 1, kind, 0, 1, 1)
+    header = struct.pack("<2sBBIQQ", b"\xa7R", 2, kind, 0, 1, 1)
     with pytest.raises(DecodeError):
         binary.decode(sealed(header + body))
 
 
-@pytest.mark.parametrize("bad", [0x7FC00000, 0x7F800000, 0xFF800000, 0xFFFFFFFF])
+@pytest.mark.parametrize(
+    ("name", "reserved"),
+    [("Hello", range(34, 36)), ("Welcome", range(33, 40)), ("Command", range(30, 36))],
+)
+def test_reserved_bytes_are_ignored(name: str, reserved: range) -> None:
+    datagram = bytearray(golden(name))
+    datagram[reserved.start : reserved.stop] = b"\xff" * len(reserved)
+    assert content(binary.decode(sealed(bytes(datagram)))) == content(GOLDEN_MESSAGES[name])
+
+
+@pytest.mark.parametrize("bad", [0x7FC00000, 0x7FA00000, 0x7F800000, 0xFF800000, 0xFFFFFFFF])
 def test_not_a_number_is_refused_in_every_float_of_the_wire(bad: int) -> None:
     narrow = struct.pack("<I", bad)
     wide = struct.pack("<d", struct.unpack("<f", narrow)[0])
@@ -323,8 +351,8 @@ def test_not_a_number_is_refused_in_every_float_of_the_wire(bad: int) -> None:
         ("State", 48, wide),
         ("State", 56, narrow),
         ("State", 64, narrow),
-        ("Command", 40, narrow),
-        ("Command", 44, narrow),
+        ("Command", 56, narrow),
+        ("Command", 60, narrow),
         ("Hello", 36, wide),
     ]:
         datagram = golden(name)
@@ -333,12 +361,36 @@ def test_not_a_number_is_refused_in_every_float_of_the_wire(bad: int) -> None:
             binary.decode(hostile)
 
 
+@pytest.mark.parametrize(
+    ("kind", "body"),
+    [
+        (4, struct.pack("<IHH", 2**32 - 1, 65535, 65535)),
+        (5, struct.pack("<IH6xI", 2**32 - 1, 65535, 2**32 - 1)),
+        (1, struct.pack("<IHHHxxd16s", 2**32 - 1, 65535, 65535, 0, 0.02, b"")),
+        (6, struct.pack("<H", 65535)),
+    ],
+)
+def test_nothing_is_allocated_for_a_length_that_is_only_claimed(kind: int, body: bytes) -> None:
+    header = struct.pack("<2sBBIQQ", b"\xa7R", 2, kind, 0, 1, 1)
+    hostile = sealed(header + body + bytes(65489 - 24 - len(body)))
+    with pytest.raises(DecodeError):  # once before: what Python keeps for itself
+        binary.decode(hostile)
+    tracemalloc.start()
+    try:
+        with pytest.raises(DecodeError):
+            binary.decode(hostile)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 2 * len(hostile)  # 2^32 drones would be 2^50 bytes
+
+
 def test_another_version_is_told_apart_but_refuse_is_always_read() -> None:
     hello = bytearray(golden("Hello"))
-    hello[2] = 2
+    hello[2] = 3
     with pytest.raises(DecodeError, match="checksum"):
         binary.decode(bytes(hello))
-    with pytest.raises(VersionMismatch, match="protocol version: expected 1, got 2") as caught:
+    with pytest.raises(VersionMismatch, match="protocol version: expected 2, got 3") as caught:
         binary.decode(sealed(bytes(hello)))
     assert caught.value.session == 0x0123456789ABCDEF
     refuse = bytearray(golden("Refuse"))
@@ -348,8 +400,10 @@ def test_another_version_is_told_apart_but_refuse_is_always_read() -> None:
 
 def test_too_many_drones_for_one_datagram() -> None:
     drones = 10_000
-    with pytest.raises(ValueError, match=r"expected at most 65507 bytes in one datagram, got \d+"):
-        binary.encode(one_command(actions=np.zeros((drones, 2)), resets=np.zeros(drones, bool)))
+    with pytest.raises(ValueError, match=r"expected at most 65489 bytes in one datagram, got \d+"):
+        binary.encode(
+            one_command(actions=np.zeros((drones, 2)), resets=np.zeros(drones, bool), seeds=None)
+        )
 
 
 def test_a_large_datagram() -> None:
@@ -387,11 +441,13 @@ def test_messages_hold_no_nan(bad: float, drones: int) -> None:
     one_state(**fields)
     for name in ("observations", "rewards", "telemetry"):
         wrong = fields[name].copy()
-        wrong[-1] = bad
-        with pytest.raises(ValueError, match=f"{name}: expected finite numbers, got"):
+        wrong[(-1,) * wrong.ndim] = bad
+        first = [size - 1 for size in wrong.shape]
+        sentence = f"{name}: expected finite numbers, got {bad} at {first}"
+        with pytest.raises(ValueError, match=re.escape(sentence)):
             one_state(**{**fields, name: wrong})
     with pytest.raises(ValueError, match="action: expected finite numbers"):
-        one_command(actions=np.full((drones, 1), bad), resets=flags)
+        one_command(actions=np.full((drones, 1), bad), resets=flags, seeds=None)
 
 
 @pytest.mark.parametrize(
@@ -414,8 +470,9 @@ def test_messages_hold_no_nan(bad: float, drones: int) -> None:
         ({"control_period": float("nan")}, "control_period: expected 1e-6 to 1e6 s, got nan"),
         ({"control_period": 0.0}, "control_period: expected 1e-6 to 1e6 s, got 0"),
         ({"model_hash": "12"}, "model_hash: expected 32 hex digits, got '12'"),
-        ({"telemetry_names": ("a,b",)}, "telemetry_names: expected names without commas"),
-        ({"telemetry_names": ("",)}, "telemetry_names: expected names without commas"),
+        ({"telemetry_names": ("a,b",)}, "telemetry_names: expected names, each once, without"),
+        ({"telemetry_names": ("",)}, "telemetry_names: expected names, each once, without commas"),
+        ({"telemetry_names": ("a", "a")}, "telemetry_names: expected names, each once"),
         ({"env_id": "x" * 513}, "env_id: expected at most 512 bytes of UTF-8, got 513"),
         ({"env_id": "a\nb"}, "env_id: expected no control characters"),
     ],
@@ -440,9 +497,12 @@ def test_shapes_must_fit_together() -> None:
             one_state(**changes)
     with pytest.raises(ValueError, match=r"resets: expected shape \(2,\), got \(1,\)"):
         one_command(resets=np.zeros(1, bool))
-    for seed in (-1, 2**64):
-        with pytest.raises(ValueError, match=f"seed: expected 0 to .* got {seed}"):
-            one_command(seed=seed)
+    with pytest.raises(ValueError, match=r"seeds: expected shape \(2,\), got \(1,\)"):
+        one_command(seeds=np.zeros(1, np.uint64))
+    for number in (-1, 2**64):
+        for name in ("seed", "nonce"):
+            with pytest.raises(ValueError, match=f"{name}: expected 0 to .* got {number}"):
+                Welcome(session=1, **{name: number})
 
 
 @given(st.text())
@@ -474,7 +534,8 @@ def test_text_command_round_trip_keeps_every_bit(message: Command) -> None:
     assert (back.session, back.sequence) == (message.session, message.sequence)
     assert back.resets.tolist() == message.resets.tolist()
     if message.resets[0]:
-        assert back.seed == message.seed
+        assert (back.seeds is None) == (message.seeds is None)
+        assert message.seeds is None or back.seeds.tolist() == message.seeds.tolist()  # type: ignore[union-attr]
     else:
         assert back.actions.tobytes() == message.actions.tobytes()
 
@@ -489,6 +550,13 @@ def test_golden_line(line: str) -> None:
         back = text.decode_command(line.encode(), 1, 5)
     assert content(back) == content(message)
     assert f"\n{line}\n" in PAGE.read_text(encoding="utf-8")
+
+
+def test_an_underflow_is_zero_whatever_the_program_has_set() -> None:
+    with np.errstate(all="raise"):
+        command = text.decode_command(b"3,1e-300", 1, 0)
+    assert isinstance(command, Command)
+    assert command.actions.tolist() == [[0.0]]
 
 
 def test_a_line_may_end_like_a_line() -> None:

@@ -1,19 +1,38 @@
-"""Both state machines without sockets: a lossy channel between them and a clock that is moved."""
+"""Both state machines without sockets: every pair of state and datagram, and a clock moved by hand.
 
-import random
+`test_link_world.py` joins the two by a bad network, `test_link_hostile.py` has the attackers.
+"""
+
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 import pytest
 from rotorgram.udp import LinkConfig, binary, text
-from rotorgram.udp.link import CLOSE_COPIES, AgentLink, SimulatorLink
-from rotorgram.udp.messages import Close, Command, Hello, Message, Refuse, State, Welcome
+from rotorgram.udp.agent_link import AgentLink, Event
+from rotorgram.udp.keys import Key
+from rotorgram.udp.link import Address
+from rotorgram.udp.messages import (
+    Close,
+    Command,
+    Hello,
+    Message,
+    Refuse,
+    State,
+    Unknown,
+    Wait,
+    Welcome,
+)
+from rotorgram.udp.simulator_link import SimulatorLink, new_session
 
-SESSION = 77
+SESSION, OTHER, NONCE = 77, 78, 99
 HERE, STRANGER = ("127.0.0.1", 8000), ("127.0.0.1", 9999)
 CONFIG = LinkConfig(timeout=10, first_resend=0.2, min_resend=0.01, max_resend=1.0)
+SECRET = bytes(range(32))
+CAUSES = {"malformed", "forged", "foreign", "refused", "duplicate", "stale"}
+SHARED = {Hello, Welcome, Refuse, Wait, Unknown}
+"""Sealed with the shared key; all else with that of the session."""
 
 
 def hello(**changes: object) -> Hello:
@@ -55,260 +74,389 @@ def command(sequence: int, session: int = SESSION, value: float = 0.0, size: int
     )
 
 
-def simulator(config: LinkConfig = CONFIG, **changes: object) -> SimulatorLink:
-    return SimulatorLink(hello(**changes), config)
+def close(sequence: int, session: int = SESSION, reason: str = "bye") -> Close:
+    return Close(session=session, sequence=sequence, reason=reason)
 
 
-def agent(refusal: str = "") -> AgentLink:
-    return AgentLink(lambda hello: refusal, (1, 0))
+def unknown(sequence: int, session: int = SESSION) -> Unknown:
+    return Unknown(session=session, sequence=sequence)
 
 
-# ---- the two joined
-
-
-@dataclass
-class World:
-    """A physics that only counts, an agent that answers with how often it was asked."""
-
-    fate: Callable[[int, bytes], list[float]]
-    """Delays with which datagram number i arrives: [] is lost, two are a duplicate, s."""
-    text_codec: bool = False
-    steps: list[float] = field(default_factory=list)
-    policy_calls: int = 0
-    commands: dict[int, set[bytes]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.simulator = SimulatorLink(hello(), CONFIG, text_codec=self.text_codec)
-        self.agent = agent()
-        self.now = 1000.0
-        self.number = 0
-        self.flying: list[tuple[float, int, str, bytes]] = []
-
-    def send(self) -> None:
-        for datagram in self.simulator.take_outgoing():
-            self.put("agent", datagram)
-        for datagram, address in self.agent.take_outgoing():
-            assert address == HERE
-            message = decode_reply(datagram, self.text_codec)
-            if isinstance(message, Command):
-                self.commands.setdefault(message.sequence, set()).add(datagram)
-            self.put("simulator", datagram)
-
-    def put(self, to: str, datagram: bytes) -> None:
-        self.number += 1
-        for delay in self.fate(self.number, datagram):
-            self.flying.append((self.now + delay, self.number, to, datagram))
-        self.flying.sort()
-
-    def run(self, steps: int) -> None:
-        self.simulator.connect(self.now)
-        if self.text_codec:
-            self.simulator.send_state(state(1), self.now)
-        while len(self.steps) < steps:
-            self.send()
-            timer = self.simulator.next_timer()
-            assert timer is not None
-            if self.flying and self.flying[0][0] <= timer:
-                arrival, _, to, datagram = self.flying.pop(0)
-                self.now = max(self.now, arrival)
-                (self.to_agent if to == "agent" else self.to_simulator)(datagram)
-            else:
-                self.now = timer
-                assert self.simulator.handle_timer(self.now), "the channel was too bad"
-
-    def to_agent(self, datagram: bytes) -> None:
-        if isinstance(self.agent.receive(datagram, HERE), State):
-            self.policy_calls += 1
-            value = 1 / self.policy_calls
-            self.agent.send_command(command(self.agent.sequence, self.agent.session, value))
-
-    def to_simulator(self, datagram: bytes) -> None:
-        message = self.simulator.receive(datagram, self.now)
-        if isinstance(message, Command):
-            self.steps.append(message.actions.item())
-        if isinstance(message, Command | Welcome):
-            self.simulator.send_state(state(self.simulator.sequence + 1), self.now)
-
-
-def decode_reply(datagram: bytes, text_codec: bool) -> Message:
-    return text.decode_command(datagram, 1, 0) if text_codec else binary.decode(datagram)
-
-
-def lossy(seed: int) -> Callable[[int, bytes], list[float]]:
-    dice = random.Random(seed)
-
-    def fate(number: int, datagram: bytes) -> list[float]:
-        copies = dice.choices([0, 1, 2, 3], [0.3, 0.5, 0.15, 0.05])[0]
-        return [dice.choice([0.001, 0.004, 0.3, 2.0]) for _ in range(copies)]
-
-    return fate
-
-
-@pytest.mark.parametrize("text_codec", [False, True])
-@pytest.mark.parametrize("seed", range(5))
-def test_each_command_is_stepped_once_whatever_the_channel(seed: int, text_codec: bool) -> None:
-    world = World(lossy(seed), text_codec=text_codec)
-    world.run(300)
-    assert world.steps == [float(np.float32(1 / n)) for n in range(1, 301)]
-    assert world.policy_calls in (300, 301)
-    assert all(len(datagrams) == 1 for datagrams in world.commands.values())
-    assert world.simulator.counters["resent"] > 50
-    assert world.agent.counters["duplicate"] > 50
-
-
-@pytest.mark.parametrize("lost", [{1}, {2}, {3}, {4}, {1, 2, 3}, {5, 6, 7, 8}, {2, 5, 9}])
-def test_chosen_losses(lost: set[int]) -> None:
-    world = World(lambda number, _: [] if number in lost else [0.001])
-    world.run(5)
-    assert world.steps == [float(np.float32(1 / n)) for n in range(1, 6)]
-    assert world.simulator.counters["resent"] == len(lost)
-
-
-def test_a_clean_channel_repeats_nothing() -> None:
-    world = World(lambda number, datagram: [0.001])
-    world.run(100)
-    assert world.now == pytest.approx(1000.0 + 0.002 * 101)
-    assert world.simulator.counters == {"sent": 102, "received": 101}
-    assert world.agent.counters == {"sent": 101, "received": 101}
-
-
-# ---- tables of (state, event) -> (state, output)
-
-
-def encoded(*messages: Message) -> list[bytes]:
-    return [binary.encode(message) for message in messages]
-
-
-SIMULATOR_STATES = {
-    "hello": (0, [lambda link: link.connect(0.0)]),
-    "ready": (0, [lambda link: link.connect(0.0), lambda link: answer(link, WELCOME)]),
-    "waiting": (
-        1,
-        [
-            lambda link: link.connect(0.0),
-            lambda link: answer(link, WELCOME),
-            lambda link: link.send_state(state(1), 0.0),
-        ],
-    ),
-    "closed": (0, [lambda link: link.connect(0.0), lambda link: link.close("bye")]),
-}
-WELCOME = Welcome(session=SESSION, seed=0)
+WELCOME = Welcome(session=SESSION, nonce=NONCE)
 REFUSE = Refuse(session=SESSION, reason="busy")
+WAIT = Wait(session=SESSION)
+ENDED = "the agent has closed"
 
 
-def answer(link: SimulatorLink, message: Message) -> object:
-    return link.receive(binary.encode(message), 0.0)
+def simulator(*, key: Key | None = None, **changes: object) -> SimulatorLink:
+    return SimulatorLink(hello(**changes), CONFIG, key=key, draw_session=lambda: OTHER)
 
 
-def close(sequence: int, session: int = SESSION) -> Close:
-    return Close(session=session, sequence=sequence, reason="bye")
+def agent(refusal: str = "", *, places: int = 1, key: Key | None = None) -> AgentLink:
+    return AgentLink(lambda _: refusal, (1, 0), places=places, key=key, draw_nonce=lambda: NONCE)
 
 
-SIMULATOR_TABLE = [
-    # state, event, state after, counter ("": the message is taken)
-    ("hello", WELCOME, "ready", ""),
-    ("hello", REFUSE, "closed", ""),
-    ("hello", close(0), "closed", ""),
-    ("hello", command(0), "hello", "stale"),
-    ("hello", command(1), "hello", "stale"),
-    ("hello", hello(), "hello", "stale"),
-    ("hello", Welcome(session=78), "hello", "foreign"),
-    ("ready", WELCOME, "ready", "stale"),
-    ("ready", REFUSE, "ready", "stale"),
-    ("ready", command(1), "ready", "stale"),
-    ("ready", close(0), "closed", ""),
-    ("waiting", command(1), "ready", ""),
-    ("waiting", command(0), "waiting", "stale"),
-    ("waiting", command(2), "waiting", "stale"),
-    ("waiting", command(1, session=78), "waiting", "foreign"),
-    ("waiting", command(1, size=2), "waiting", "malformed"),
-    ("waiting", WELCOME, "waiting", "stale"),
-    ("waiting", REFUSE, "waiting", "stale"),
-    ("waiting", state(1), "waiting", "stale"),
-    ("waiting", close(1), "closed", ""),
-    ("waiting", close(0), "closed", ""),
-    ("waiting", close(2), "waiting", "stale"),
-    ("waiting", close(1, session=78), "waiting", "foreign"),
-    ("closed", WELCOME, "closed", "stale"),
-    ("closed", command(0), "closed", "stale"),
-    ("closed", close(0), "closed", "stale"),
-]
+class Wire:
+    """Makes the datagrams of one side as they travel: sealed or not."""
+
+    def __init__(self, side: Any, sealed: bool) -> None:
+        self.key = Key(SECRET, side) if sealed else None
+
+    def __call__(self, message: Message, asked: bytes = b"") -> bytes:
+        """As an answer to a State, if it is an Unknown."""
+        datagram = binary.encode(message)
+        if self.key is None:
+            return datagram
+        if type(message) in SHARED:
+            return self.key.seal(datagram, asked if isinstance(message, Unknown) else b"")
+        return self.key.for_session(message.session, NONCE).seal(datagram)
 
 
-@pytest.mark.parametrize(("before", "event", "after", "counter"), SIMULATOR_TABLE)
-def test_simulator_table(before: str, event: Message, after: str, counter: str) -> None:
-    link = simulator()
-    sequence, steps = SIMULATOR_STATES[before]
-    for step in steps:
-        step(link)
-    assert (link.state, link.sequence) == (before, sequence)
-    link.take_outgoing()
-    message = answer(link, event)
-    assert link.state == after
-    assert type(message) is (type(None) if counter else type(event))
-    dropped = {"stale", "foreign", "malformed"} & set(link.counters)
-    assert dropped == ({counter} if counter else set())
-    assert link.take_outgoing() == []
+def dropped(link: SimulatorLink | AgentLink) -> dict[str, int]:
+    return {cause: n for cause, n in link.statistics.counters.items() if cause in CAUSES and n}
 
 
-AGENT_STATES = {
-    "listening": [],
-    "expecting": [hello()],
-    "deciding": [hello(), state(1)],
-    "answered": [hello(), state(1), command(1)],
-    "closed": [hello(), state(1), close(1)],
+# ---- the simulator's table
+
+
+def to_hello(link: SimulatorLink, wire: Wire) -> None:
+    link.connect(0.0)
+
+
+def to_ready(link: SimulatorLink, wire: Wire) -> None:
+    to_hello(link, wire)
+    link.receive(wire(WELCOME), 0.0)
+
+
+def to_waiting(link: SimulatorLink, wire: Wire) -> None:
+    to_ready(link, wire)
+    link.send_state(state(1), 0.0)
+
+
+def to_ready_again(link: SimulatorLink, wire: Wire) -> None:
+    to_waiting(link, wire)
+    link.receive(wire(command(1)), 0.0)
+
+
+def to_closing(link: SimulatorLink, wire: Wire) -> None:
+    to_waiting(link, wire)
+    link.close("bye", 0.0)
+
+
+def to_closed(link: SimulatorLink, wire: Wire) -> None:
+    to_waiting(link, wire)
+    link.receive(wire(close(1)), 0.0)
+
+
+SIMULATOR_STATES: dict[str, Callable[[SimulatorLink, Wire], None]] = {
+    "hello": to_hello,
+    "ready": to_ready,
+    "waiting": to_waiting,
+    "ready 1": to_ready_again,
+    "closing": to_closing,
+    "closed": to_closed,
 }
-AGENT_TABLE = [
-    # state, event, state after, counter, answer
-    ("listening", hello(), "expecting", "", [Welcome(session=SESSION)]),
-    ("listening", state(1), "listening", "foreign", []),
-    ("listening", close(0), "listening", "foreign", []),
-    ("listening", command(1), "listening", "foreign", []),
-    ("expecting", hello(), "expecting", "duplicate", [Welcome(session=SESSION)]),
-    ("expecting", hello(session=5), "expecting", "refused",
-     [Refuse(session=5, reason="the agent already flies the simulator at 127.0.0.1:8000")]),
-    ("expecting", state(1), "deciding", "", []),
-    ("expecting", state(2), "expecting", "stale", []),
-    ("expecting", state(1, session=5), "expecting", "foreign", []),
-    ("expecting", state(1, size=2), "expecting", "malformed", []),
-    ("expecting", close(0), "closed", "", []),
-    ("expecting", close(1), "closed", "", []),
-    ("expecting", close(2), "expecting", "stale", []),
-    ("deciding", state(1), "deciding", "duplicate", []),
-    ("deciding", state(2), "deciding", "stale", []),
-    ("deciding", hello(), "deciding", "stale", []),
-    ("deciding", close(1), "closed", "", []),
-    ("answered", state(1), "expecting", "duplicate", [command(1)]),
-    ("answered", state(2), "deciding", "", []),
-    ("answered", state(0), "expecting", "stale", []),
-    ("answered", state(3), "expecting", "stale", []),
-    ("answered", hello(), "expecting", "stale", []),
-    ("answered", command(1), "expecting", "stale", []),
-    ("closed", state(2), "closed", "stale", []),
-    ("closed", close(1), "closed", "stale", []),
-    ("closed", hello(session=5), "closed", "refused",
-     [Refuse(session=5, reason="the agent already flies the simulator at 127.0.0.1:8000")]),
-]  # fmt: skip
+SIMULATOR_EVENTS: dict[str, Message] = {
+    "Welcome": WELCOME,
+    "Refuse": REFUSE,
+    "Wait": WAIT,
+    "Unknown 0": unknown(0),
+    "Unknown 1": unknown(1),
+    "Unknown 2": unknown(2),
+    "Command 0": command(0),
+    "Command 1": command(1),
+    "Command 2": command(2),
+    "Command 1, two numbers": command(1, size=2),
+    "Close 0": close(0),
+    "Close 1": close(1),
+    "Close 2": close(2),
+    "Hello": hello(),
+    "State 1": state(1),
+    "Welcome of another": Welcome(session=OTHER, nonce=NONCE),
+    "Command 1 of another": command(1, session=OTHER),
+    "Close 1 of another": close(1, session=OTHER),
+    "Unknown 1 of another": unknown(1, session=OTHER),
+}
+SIMULATOR_TABLE: dict[tuple[str, str], tuple[str, list[Message], str]] = {
+    # (state, event): (state after, sent, counter); "": it counts. All others: dropped as stale.
+    ("hello", "Welcome"): ("ready", [], ""),
+    ("hello", "Refuse"): ("closed", [], ""),
+    ("hello", "Wait"): ("hello", [], ""),
+    ("ready", "Close 0"): ("closed", [close(0, reason="")], ""),
+    ("waiting", "Command 1"): ("ready", [], ""),
+    ("waiting", "Command 1, two numbers"): ("waiting", [], "malformed"),
+    ("waiting", "Unknown 1"): ("hello", [hello(session=OTHER)], ""),
+    ("waiting", "Close 0"): ("closed", [close(1, reason="")], ""),
+    ("waiting", "Close 1"): ("closed", [close(1, reason="")], ""),
+    ("ready 1", "Close 0"): ("closed", [close(1, reason="")], ""),
+    ("ready 1", "Close 1"): ("closed", [close(1, reason="")], ""),
+    ("closing", "Close 0"): ("closed", [], ""),
+    ("closing", "Close 1"): ("closed", [], ""),
+}
 
 
-@pytest.mark.parametrize(("before", "event", "after", "counter", "answers"), AGENT_TABLE)
-def test_agent_table(
-    before: str, event: Message, after: str, counter: str, answers: list[Message]
-) -> None:
-    link = agent()
-    for message in AGENT_STATES[before]:
-        if isinstance(message, Command):
-            link.send_command(message)
-        else:
-            link.receive(binary.encode(message), HERE)
-    assert link.state == {"answered": "expecting"}.get(before, before)
+@pytest.mark.parametrize("sealed", [False, True], ids=["open", "sealed"])
+@pytest.mark.parametrize("event", SIMULATOR_EVENTS)
+@pytest.mark.parametrize("before", SIMULATOR_STATES)
+def test_simulator_table(before: str, event: str, sealed: bool) -> None:
+    ours, theirs = Wire("simulator", sealed), Wire("agent", sealed)
+    link, message = simulator(key=ours.key), SIMULATOR_EVENTS[event]
+    SIMULATOR_STATES[before](link, theirs)
+    assert link.state == before.split()[0]
+    assert not dropped(link)
     link.take_outgoing()
-    message = link.receive(binary.encode(event), HERE)
+    after, sent, counter = SIMULATOR_TABLE.get((before, event), (link.state, [], "stale"))
+    if "another" in event:
+        counter = "foreign"
+    if sealed and type(message) not in SHARED and ("another" in event or before == "hello"):
+        counter = "forged"  # no such session here, so no key to tell what it is
+    taken = link.receive(theirs(message, link._outstanding), 1.0)
     assert link.state == after
-    assert type(message) is (type(None) if counter else type(event))
-    dropped = {"stale", "foreign", "malformed", "duplicate", "refused"} & set(link.counters)
-    assert dropped == ({counter} if counter else set())
-    assert [datagram for datagram, _ in link.take_outgoing()] == encoded(*answers)
+    assert dropped(link) == ({counter: 1} if counter else {})
+    assert link.take_outgoing() == [ours(m) for m in sent]
+    quiet = counter or isinstance(message, Wait | Unknown)
+    assert type(taken) is (type(None) if quiet else type(message))
+
+
+# ---- the agent's table
+
+AGENT_STATES: dict[str, list[Any]] = {
+    "free": [],
+    "welcomed": [hello()],
+    "deciding": [hello(), state(1)],
+    "expecting": [hello(), state(1), command(1)],
+    "closing": [hello(), state(1), command(1), "close"],
+    "ended": [hello(), state(1), close(1)],
+    "silent": [hello(), state(1), command(1), "free"],
+    "full": ["other"],
+    "full, waits": ["other", hello()],
+    "closed": ["close"],
+    "welcomed, closed": [hello(), "close"],
+    "refusing": ["refuse"],
+    "welcomed, refusing": [hello(), "refuse"],
+}
+AGENT_EVENTS: dict[str, Message] = {
+    "Hello": hello(),
+    "new Hello": hello(session=OTHER),
+    "State 0": state(0),
+    "State 1": state(1),
+    "State 1, two numbers": state(1, size=2),
+    "State 2": state(2),
+    "State 3": state(3),
+    "new State 1": state(1, session=OTHER),
+    "Close 0": close(0),
+    "Close 1": close(1),
+    "Close 2": close(2),
+    "Close 3": close(3),
+    "Close 1 of another": close(1, session=OTHER),
+    "Command 1": command(1),
+    "Command 1 of another": command(1, session=OTHER),
+    "Welcome": WELCOME,
+    "Wait of another": Wait(session=OTHER),
+}
+WELCOMED = [WELCOME]
+NEW = [Welcome(session=OTHER, nonce=NONCE)]
+UNREFUSED = {"Hello": ("", WELCOMED, ""), "new Hello": ("", NEW, "")}
+NO_SESSION: dict[str, tuple[str, list[Message], str]] = {
+    "State 0": ("", [unknown(0)], "foreign"),
+    "State 1": ("", [unknown(1)], "foreign"),
+    "State 1, two numbers": ("", [unknown(1)], "foreign"),
+    "State 2": ("", [unknown(2)], "foreign"),
+    "State 3": ("", [unknown(3)], "foreign"),
+    "new State 1": ("", [unknown(1, session=OTHER)], "foreign"),
+}
+NOTHING = {event: ("", [], "foreign") for event in AGENT_EVENTS}
+AGENT_TABLE: dict[str, dict[str, tuple[str, list[Message], str]]] = {
+    # state: event: (state after, "" if it is the same; sent; counter, "" if it counts)
+    "free": {**NOTHING, **NO_SESSION, **UNREFUSED},
+    "welcomed": {
+        **NOTHING,
+        **NO_SESSION,
+        "Hello": ("", WELCOMED, "duplicate"),
+        "new Hello": ("", NEW, ""),
+        "State 1": ("deciding", [], ""),
+        "State 1, two numbers": ("", [], "malformed"),
+    },
+    "deciding": {
+        "new Hello": ("", NEW, ""),
+        "State 1": ("", [], "duplicate"),
+        "State 1, two numbers": ("", [], "duplicate"),
+        "State 3": ("", [unknown(3)], "foreign"),
+        "new State 1": ("", [unknown(1, session=OTHER)], "foreign"),
+        "Close 1": ("free", [close(1, reason="")], ""),
+    },
+    "expecting": {
+        "new Hello": ("", NEW, ""),
+        "State 1": ("", [command(1)], "duplicate"),
+        "State 1, two numbers": ("", [command(1)], "duplicate"),
+        "State 2": ("deciding", [], ""),
+        "State 3": ("", [unknown(3)], "foreign"),  # it has gone on with another agent
+        "new State 1": ("", [unknown(1, session=OTHER)], "foreign"),
+        "Close 1": ("free", [close(1, reason="")], ""),
+        "Close 2": ("free", [close(1, reason="")], ""),
+    },
+    "closing": {
+        "State 3": ("", [], "foreign"),
+        "new State 1": ("", [], "foreign"),
+        "new Hello": ("", [Refuse(session=OTHER, reason=ENDED)], "refused"),
+        "State 1": ("", [close(1)], "duplicate"),
+        "State 1, two numbers": ("", [close(1)], "duplicate"),
+        "Close 1": ("free", [], ""),
+        "Close 2": ("free", [], ""),
+    },
+    "ended": {**NOTHING, **NO_SESSION, "Hello": ("", [], "stale"), "new Hello": ("", NEW, "")},
+    "silent": {**NOTHING, **NO_SESSION, "Hello": ("", [], "stale"), "new Hello": ("", NEW, "")},
+    "full": {
+        **NOTHING,
+        **NO_SESSION,
+        "Hello": ("", [WAIT], ""),
+        "new Hello": ("", [Wait(session=OTHER)], ""),
+    },
+    "full, waits": {
+        **NOTHING,
+        **NO_SESSION,
+        "Hello": ("", [WAIT], ""),
+        "new Hello": ("", [Wait(session=OTHER)], ""),
+    },
+    "closed": {
+        **NOTHING,
+        "Hello": ("", [Refuse(session=SESSION, reason=ENDED)], "refused"),
+        "new Hello": ("", [Refuse(session=OTHER, reason=ENDED)], "refused"),
+    },
+    "welcomed, closed": {
+        **NOTHING,
+        "Hello": ("", [Refuse(session=SESSION, reason=ENDED)], "refused"),
+        "new Hello": ("", [Refuse(session=OTHER, reason=ENDED)], "refused"),
+        "State 1": ("", [close(1, reason=ENDED)], "refused"),
+        "State 1, two numbers": ("", [], "malformed"),
+    },
+    "refusing": {
+        **NOTHING,
+        **NO_SESSION,
+        "Hello": ("", [REFUSE], "refused"),
+        "new Hello": ("", [Refuse(session=OTHER, reason="busy")], "refused"),
+    },
+    "welcomed, refusing": {
+        **NOTHING,
+        **NO_SESSION,
+        "Hello": ("", WELCOMED, "duplicate"),
+        "new Hello": ("", [Refuse(session=OTHER, reason="busy")], "refused"),
+        "State 1": ("", [close(1, reason="busy")], "refused"),
+        "State 1, two numbers": ("", [], "malformed"),
+    },
+}
+
+
+def drive(link: AgentLink, steps: Iterable[Any], wire: Wire, address: Address = HERE) -> None:
+    """Bring an agent into a state by what a simulator at that address sends, and what it does."""
+    for step in steps:
+        if isinstance(step, Command):
+            link.send_command(0, step, 0.0)
+        elif step == "close":
+            link.close("bye", 0.0)
+        elif step == "free":
+            link.free(0)
+        elif step == "other":
+            drive(link, [hello(session=5), state(1, session=5)], wire, STRANGER)
+        elif step == "refuse":
+            link._accept = lambda _: "busy"
+        else:
+            link.receive(wire(step), address, 0.0)
+
+
+def state_of(link: AgentLink, address: Address = HERE) -> str:
+    return next((s.state for s in link.places if s and s.peer == address), "free")
+
+
+@pytest.mark.parametrize("sealed", [False, True], ids=["open", "sealed"])
+@pytest.mark.parametrize("event", AGENT_EVENTS)
+@pytest.mark.parametrize("before", AGENT_STATES)
+def test_agent_table(before: str, event: str, sealed: bool) -> None:
+    ours, theirs = Wire("agent", sealed), Wire("simulator", sealed)
+    link, message = agent(key=ours.key), AGENT_EVENTS[event]
+    drive(link, AGENT_STATES[before], theirs)
+    begun = state_of(link)
+    assert begun == before or begun == "free"
+    assert not dropped(link)
+    link.take_outgoing()
+    default = ("", [], "foreign" if "another" in event else "stale")
+    after, sent, counter = AGENT_TABLE[before].get(event, default)
+    taken = link.receive(theirs(message), HERE, 1.0)
+    assert state_of(link) == (after or begun)
+    assert link.take_outgoing() == [(ours(m, theirs(message)), HERE) for m in sent]
+    assert dropped(link) == ({counter: 1} if counter else {})
+    if counter or isinstance(message, Hello):
+        assert taken is None
+    else:
+        assert isinstance(taken, Event)
+        assert (taken.place, type(taken.message)) == (0, type(message))
+        assert taken.joined == (before == "welcomed")
+
+
+# ---- the agent's table by text
+
+LINE, COMMAND_LINE = b"1,0.0,0,0,0.0", b"1,0.0"
+TEXT_STATES: dict[str, list[Any]] = {
+    "free": [],
+    "deciding": [LINE],
+    "expecting": [LINE, command(1, session=0)],
+    "closing": [LINE, "close"],
+    "ended": [LINE, b"1,close"],
+    "full": ["other"],
+    "closed": ["close"],
+    "binary": [hello(), state(1)],
+}
+TEXT_EVENTS = [LINE, b"0,0.0,0,0,0.0", b"2,0.0,0,0,0.0", b"3,0,0,0,0", b"0,close", b"1,close",
+               b"2,close", b"1,0.0", b"x"]  # fmt: skip
+JOINS = {line: ("deciding", [], "") for line in TEXT_EVENTS[:4]}
+NO_ROOM = {line: ("", [line[:2] + b"close"], "refused") for line in TEXT_EVENTS[:4]}
+STRANGE = {b"1,0.0": ("", [], "malformed"), b"x": ("", [], "malformed")}
+FOREIGN = {line: ("", [], "foreign") for line in TEXT_EVENTS[4:7]}
+TEXT_TABLE: dict[str, dict[bytes, tuple[str, list[bytes], str]]] = {
+    "free": {**JOINS, **FOREIGN},
+    "deciding": {LINE: ("", [], "duplicate"), b"1,close": ("free", [b"1,close"], "")},
+    "expecting": {
+        LINE: ("", [COMMAND_LINE], "duplicate"),
+        b"2,0.0,0,0,0.0": ("deciding", [], ""),
+        b"1,close": ("free", [b"1,close"], ""),
+        b"2,close": ("free", [b"1,close"], ""),
+    },
+    "closing": {
+        LINE: ("", [b"1,close"], "duplicate"),
+        b"1,close": ("free", [], ""),
+        b"2,close": ("free", [], ""),
+    },
+    "ended": {**JOINS, **FOREIGN},
+    "full": {**NO_ROOM, **FOREIGN},
+    "closed": {**NO_ROOM, **FOREIGN},
+    "binary": {**NO_ROOM, **FOREIGN},
+}
+
+
+@pytest.mark.parametrize("event", TEXT_EVENTS)
+@pytest.mark.parametrize("before", TEXT_STATES)
+def test_agent_table_by_text(before: str, event: bytes) -> None:
+    link = agent()
+    drive(link, TEXT_STATES[before], lambda m: m if isinstance(m, bytes) else binary.encode(m))
+    begun = state_of(link)
+    link.take_outgoing()
+    row = {**STRANGE, **TEXT_TABLE[before]}
+    after, sent, counter = row.get(event, ("", [], "stale"))
+    taken = link.receive(event, HERE, 1.0)
+    assert state_of(link) == (after or begun)
+    assert link.take_outgoing() == [(line, HERE) for line in sent]
+    assert dropped(link) == ({counter: 1} if counter else {})
+    assert (taken is None) == bool(counter)
+
+
+@pytest.mark.parametrize("line", TEXT_EVENTS)
+def test_an_agent_with_a_key_closes_text_states_and_answers_nothing_else(line: bytes) -> None:
+    link = agent(key=Wire("agent", True).key)
+    assert link.receive(line, HERE, 0.0) is None
+    # An answer to a Close would be answered by another agent with a key, and so on for ever.
+    answers = [(line[:2] + b"close", HERE)] if line in TEXT_EVENTS[:4] else []
+    assert link.take_outgoing() == answers
+    assert dropped(link) == {"forged": 1}
 
 
 # ---- what we may not do
@@ -318,19 +466,35 @@ def test_misuse_says_what_was_expected() -> None:
     link = simulator()
     with pytest.raises(ValueError, match="expected link state 'ready' and sequence 1, got 'hello'"):
         link.send_state(state(1), 0.0)
-    answer(link, WELCOME)
+    link.connect(0.0)
+    link.receive(binary.encode(WELCOME), 0.0)
     with pytest.raises(ValueError, match="sequence 1, got 'ready' and 2"):
         link.send_state(state(2), 0.0)
     server = agent()
-    with pytest.raises(ValueError, match="expected link state 'deciding' and sequence 0"):
-        server.send_command(command(0))
-    server.receive(binary.encode(hello()), HERE)
-    server.receive(binary.encode(state(1)), HERE)
-    with pytest.raises(ValueError, match="sequence 1, got 'deciding' and 2"):
-        server.send_command(command(2))
-    server.send_command(command(1))
-    with pytest.raises(ValueError, match="got 'expecting' and 1"):
-        server.send_command(command(1))
+    with pytest.raises(ValueError, match="'deciding' on State 0, got a free place"):
+        server.send_command(0, command(0), 0.0)
+    server.receive(binary.encode(hello()), HERE, 0.0)
+    server.receive(binary.encode(state(1)), HERE, 0.0)
+    with pytest.raises(ValueError, match=r"'deciding' on State 2, got \('deciding', 1\)"):
+        server.send_command(0, command(2), 0.0)
+    server.send_command(0, command(1), 0.0)
+    with pytest.raises(ValueError, match=r"got \('expecting', 1\)"):
+        server.send_command(0, command(1), 0.0)
+
+
+def test_a_message_that_does_not_fit_into_a_datagram_changes_nothing() -> None:
+    link = simulator()
+    to_ready(link, Wire("agent", False))
+    link.take_outgoing()
+    with pytest.raises(ValueError, match="State: expected at most 65489 bytes"):
+        link.send_state(state(1, size=20_000), 0.0)
+    assert (link.state, link.sequence, link.take_outgoing()) == ("ready", 0, [])
+    server = agent()
+    drive(server, [hello(), state(1)], Wire("simulator", False))
+    server.take_outgoing()
+    with pytest.raises(ValueError, match="Command: expected at most 65489 bytes"):
+        server.send_command(0, command(1, size=20_000), 0.0)
+    assert (state_of(server), server.take_outgoing()) == ("deciding", [])
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf")])
@@ -342,60 +506,85 @@ def test_times_are_positive_and_finite(name: str, bad: float) -> None:
         LinkConfig(min_resend=2.0)
 
 
+def test_text_cannot_be_sealed() -> None:
+    with pytest.raises(ValueError, match="text codec: expected no key, got one"):
+        SimulatorLink(hello(), CONFIG, text_codec=True, key=Key(SECRET, "simulator"))
+
+
+def test_session_numbers_are_random_and_not_0() -> None:
+    numbers = {new_session() for _ in range(1000)}
+    assert len(numbers) == 1000
+    assert all(0 < number < 2**64 for number in numbers)
+
+
 # ---- timers
 
 
 def resend_times(link: SimulatorLink, now: float) -> list[float]:
+    """When it resent, and at last gave up, after `now`."""
     times = []
     while True:
         timer = link.next_timer()
         assert timer is not None
-        if not link.handle_timer(timer):
-            return [*times, timer - now]
         times.append(timer - now)
+        if not link.handle_timer(timer):
+            return times
 
 
 def test_resends_back_off_within_bounds_until_the_timeout() -> None:
     link = simulator()
     link.connect(50.0)
-    first = link.take_outgoing()
     times = resend_times(link, 50.0)
     assert times[:3] == pytest.approx([0.2, 0.6, 1.4])
     assert np.diff(times[2:-1]) == pytest.approx(1.0)
     assert times[-1] == pytest.approx(10.0)
-    outgoing = link.take_outgoing()
+    assert link.take_outgoing() == [binary.encode(hello())] * len(times)  # no Close: nobody knows
     assert link.sends == len(times)
-    assert link.state == "closed"
-    assert link.next_timer() is None
-    goodbye = Close(session=SESSION, sequence=0, reason="no answer from the agent for 10 s")
-    assert outgoing == encoded(goodbye) * CLOSE_COPIES  # instead of one more Hello
-    assert first == encoded(hello())
+    assert link.statistics.counters == {"sent": 1, "resent": len(times) - 1}
+    assert (link.state, link.next_timer()) == ("closed", None)
+
+
+def test_a_silent_agent_is_told_when_the_simulator_gives_up() -> None:
+    link = simulator()
+    to_waiting(link, Wire("agent", False))
+    link.take_outgoing()
+    times = resend_times(link, 0.0)
+    assert times[-1] == pytest.approx(10.0)
+    goodbye = binary.encode(close(1, reason="no answer from the agent for 10 s"))
+    outgoing = link.take_outgoing()
+    assert outgoing == [binary.encode(state(1))] * (len(times) - 1) + [goodbye]
+    assert link.state == "closing"
 
 
 def test_every_resend_is_byte_identical() -> None:
     link = simulator()
-    link.connect(0.0)
-    answer(link, WELCOME)
+    to_ready(link, Wire("agent", False))
     link.take_outgoing()
     link.send_state(state(1, value=0.1), 0.0)
     for _ in range(5):
         timer = link.next_timer()
         assert timer is not None
-        assert link.take_outgoing() == encoded(state(1, value=0.1))
+        assert link.take_outgoing() == [binary.encode(state(1, value=0.1))]
         assert link.handle_timer(timer)
+
+
+def fly(link: SimulatorLink, sequence: int, now: float, trip: float) -> float:
+    """One State and its Command; the time afterwards."""
+    link.send_state(state(sequence), now)
+    link.receive(binary.encode(command(sequence)), now + trip)
+    return now + trip
 
 
 def test_the_wait_follows_the_round_trips() -> None:
     link = simulator()
-    link.connect(0.0)
-    now = 0.05  # the first round trip: mean 50 ms, variation 25 ms
-    link.receive(binary.encode(WELCOME), now)
-    for sequence in range(1, 200):
-        link.send_state(state(sequence), now)
-        if sequence == 1:
-            assert link.next_timer() == pytest.approx(now + 0.05 + 4 * 0.025)
-        now += 0.05
-        link.receive(binary.encode(command(sequence)), now)
+    to_ready(link, Wire("agent", False))
+    now = fly(link, 1, 0.0, 0.05)  # the first round trip: mean 50 ms, variation 25 ms
+    link.send_state(state(2), now)
+    assert link.next_timer() == pytest.approx(now + 0.05 + 4 * 0.025)
+    now += 0.05
+    link.receive(binary.encode(command(2)), now)
+    for sequence in range(3, 200):
+        now = fly(link, sequence, now, 0.05)
     link.send_state(state(200), now)
     assert link.next_timer() == pytest.approx(now + 0.05, abs=1e-3)
     now += 30.0  # the agent learnt: a long pause must not stretch the wait past its bound
@@ -404,193 +593,401 @@ def test_the_wait_follows_the_round_trips() -> None:
     assert link.next_timer() == pytest.approx(now + 1.0)
 
 
-def test_an_ambiguous_round_trip_is_not_measured() -> None:
+def test_an_ambiguous_round_trip_does_not_change_the_wait() -> None:
     link = simulator()
-    link.connect(0.0)
+    to_ready(link, Wire("agent", False))
+    link.send_state(state(1), 0.0)
     assert link.handle_timer(0.2)
-    link.receive(binary.encode(WELCOME), 0.2001)
-    link.send_state(state(1), 1.0)
+    link.receive(binary.encode(command(1)), 0.2001)
+    link.send_state(state(2), 1.0)
     assert link.next_timer() == pytest.approx(1.2)  # still the first wait
+    # Statistics have it, from the first sending: that is what the flight waited for.
+    assert link.statistics.round_trips.longest == pytest.approx(0.2001)
 
 
 def test_fast_round_trips_keep_the_shortest_wait() -> None:
     link = simulator()
-    link.connect(0.0)
-    link.receive(binary.encode(WELCOME), 1e-6)
-    link.send_state(state(1), 1.0)
-    assert link.next_timer() == pytest.approx(1.01)
+    to_ready(link, Wire("agent", False))
+    now = fly(link, 1, 0.0, 1e-6)
+    link.send_state(state(2), now)
+    assert link.next_timer() == pytest.approx(now + 0.01)
 
 
 def test_the_timer_does_nothing_before_its_time() -> None:
-    link = simulator()
-    assert link.next_timer() is None
+    link, server = simulator(), agent()
+    assert (link.next_timer(), server.next_timer()) == (None, None)
     link.connect(0.0)
     link.take_outgoing()
     assert link.handle_timer(0.1)
+    server.handle_timer(0.1)
+    assert link.take_outgoing() == server.take_outgoing() == []
+
+
+def test_nothing_but_the_awaited_datagram_extends_the_wait() -> None:
+    link, wire = simulator(), Wire("agent", False)
+    to_waiting(link, wire)
+    now = 0.0
+    while (timer := link.next_timer()) is not None and link.handle_timer(timer):
+        now = timer
+        for junk in (b"", b"junk", wire(command(0)), wire(WELCOME), wire(WAIT), wire(REFUSE)):
+            link.receive(junk, now)
+    assert timer == pytest.approx(10.0)
+    assert link.state == "closing"
+
+
+def test_while_wait_comes_the_timeout_does_not_run() -> None:
+    link, wire = simulator(), Wire("agent", False)
+    link.connect(0.0)
+    now = 0.0
+    for _ in range(100):  # ten times the timeout
+        timer = link.next_timer()
+        assert timer is not None
+        assert link.handle_timer(timer)
+        now = timer
+        link.receive(wire(WAIT), now)
+    assert now > 90
+    assert link.state == "hello"
+    assert link.statistics.take_notices() == [
+        "every place at the agent is taken; waiting for a free one"
+    ]
+    assert not dropped(link)
+    assert resend_times(link, now)[-1] == pytest.approx(10.0)  # then it does
+    assert link.state == "closed"
+
+
+@pytest.mark.parametrize("side", ["simulator", "agent"])
+def test_a_lost_close_is_repeated_until_nobody_will_answer(side: str) -> None:
+    link: Any
+    if side == "simulator":
+        link = simulator()
+        to_waiting(link, Wire("agent", False))
+    else:
+        link = agent(places=2)
+        drive(link, ["other", hello(), state(1)], Wire("simulator", False))
+    link.take_outgoing()
+    link.close("done", 7.0)
+    link.close("again", 7.0)
+    times = []
+    while (timer := link.next_timer()) is not None:
+        times.append(timer - 7.0)
+        link.handle_timer(timer)
+    # Every 25 ms; the tenth time would be the end.
+    assert times[:9] == pytest.approx([0.025 * n for n in range(1, 10)])
+    assert times[-1] == pytest.approx(0.25)
+    goodbye = binary.encode(close(1, reason="done"))
+    if side == "simulator":
+        assert link.state == "closed"
+        assert set(link.take_outgoing()) == {goodbye}
+    else:
+        assert link.places == [None, None]
+        other = binary.encode(close(1, session=5, reason="done"))
+        assert set(link.take_outgoing()) == {(goodbye, HERE), (other, STRANGER)}
+    assert 9 <= link.statistics.counters["resent"] / (1 + (side == "agent")) <= 10
+
+
+def test_an_agent_that_closes_waits_only_for_those_who_have_not_answered() -> None:
+    link, wire = agent(places=2), Wire("simulator", False)
+    drive(link, ["other", hello(), state(1)], wire)
+    link.close("done", 0.0)
+    assert isinstance(link.receive(wire(close(1)), HERE, 0.01), Event)
+    link.take_outgoing()
+    link.handle_timer(0.025)
+    again = binary.encode(close(1, session=5, reason="done"))
+    assert link.take_outgoing() == [(again, STRANGER)]
+    link.receive(wire(close(1, session=5)), STRANGER, 0.03)
+    assert link.next_timer() is None
     assert link.take_outgoing() == []
 
 
-# ---- strangers, other codecs, other versions
-
-
-def test_a_stranger_with_the_right_session_is_foreign() -> None:
-    link = agent()
-    link.receive(binary.encode(hello()), HERE)
-    for message in (state(1), close(0)):
-        assert link.receive(binary.encode(message), STRANGER) is None
-    assert link.counters["foreign"] == 2
-    assert link.state == "expecting"
-    assert isinstance(link.receive(binary.encode(state(1)), HERE), State)
-
-
-def test_a_second_simulator_is_refused_with_a_sentence() -> None:
-    link = agent()
-    link.receive(binary.encode(hello()), HERE)
+@pytest.mark.parametrize("sealed", [False, True], ids=["open", "sealed"])
+def test_an_agent_that_closes_refuses_those_who_wait(sealed: bool) -> None:
+    ours, theirs = Wire("agent", sealed), Wire("simulator", sealed)
+    link = agent(key=ours.key)
+    drive(link, ["other", hello()], theirs)
     link.take_outgoing()
-    link.receive(binary.encode(hello(session=5)), STRANGER)
-    link.receive(b"1,0.0,0,0,1.0", STRANGER)
-    link.receive(b"nonsense", STRANGER)
-    reason = "the agent already flies the simulator at 127.0.0.1:8000"
+    link.close("done", 0.0)
+    goodbye = close(1, session=5, reason="done")
     assert link.take_outgoing() == [
-        (binary.encode(Refuse(session=5, reason=reason)), STRANGER),
-        (b"1,close", STRANGER),
+        (ours(goodbye), STRANGER),
+        (ours(Refuse(session=SESSION, reason="done")), HERE),
     ]
-    assert link.counters["refused"] == 2
-    assert link.counters["malformed"] == 1
 
 
-def test_a_refused_hello_leaves_the_agent_listening() -> None:
-    link = agent("expected another one " + "x" * 600)
-    assert link.receive(binary.encode(hello()), HERE) is None
+def test_closing_before_anybody_knows_says_nothing() -> None:
+    link = simulator()
+    link.connect(0.0)
+    link.take_outgoing()
+    link.close("bye", 0.0)
+    server = agent()
+    server.close("nobody was there", 0.0)
+    assert link.take_outgoing() == server.take_outgoing() == []
+    assert link.next_timer() is server.next_timer() is None
+
+
+def test_a_reason_becomes_one_line() -> None:
+    link = simulator()
+    to_ready(link, Wire("agent", False))
+    link.take_outgoing()
+    link.close("line one\nline two", 0.0)
+    assert link.take_outgoing() == [binary.encode(close(0, reason="line one line two"))]
+
+
+# ---- what is measured and seen
+
+
+@pytest.mark.parametrize("sealed", [False, True], ids=["open", "sealed"])
+def test_what_comes_out_is_what_was_counted_as_sent_or_resent(sealed: bool) -> None:
+    ours, theirs = Wire("agent", sealed), Wire("simulator", sealed)
+    for before in AGENT_STATES:
+        for event in AGENT_EVENTS.values():
+            link = agent(key=ours.key)
+            drive(link, AGENT_STATES[before], theirs)
+            link.receive(theirs(event), HERE, 1.0)
+            link.handle_timer(2.0)
+            counters = link.statistics.counters
+            assert counters["sent"] + counters["resent"] == len(link.take_outgoing())
+    for before in SIMULATOR_STATES:
+        for event in SIMULATOR_EVENTS.values():
+            client = simulator(key=theirs.key)
+            SIMULATOR_STATES[before](client, ours)
+            client.receive(ours(event), 1.0)
+            client.handle_timer(2.0)
+            counters = client.statistics.counters
+            assert counters["sent"] + counters["resent"] == len(client.take_outgoing())
+
+
+@pytest.mark.parametrize("sealed", [False, True], ids=["open", "sealed"])
+def test_taps_see_every_message_once_and_not_sealed(sealed: bool) -> None:
+    ours, theirs = Wire("agent", sealed), Wire("simulator", sealed)
+    seen: list[tuple[int, Message, bytes]] = []
+    link = AgentLink(lambda _: "", (1, 0), places=2, key=ours.key, draw_nonce=lambda: NONCE,
+                     tap=lambda *all_of_it: seen.append(all_of_it))  # fmt: skip
+    drive(link, ["other"], theirs)
+    for _ in range(3):
+        for message in (hello(), WELCOME, state(1), state(2), state(0)):
+            link.receive(theirs(message), HERE, 0.0)
+    link.send_command(1, command(1), 0.0)
+    for _ in range(3):
+        for message in (state(1), state(2), close(2)):
+            link.receive(theirs(message), HERE, 0.0)
+    flight = [hello(), WELCOME, state(1), command(1), state(2), close(2), close(2, reason="")]
+    assert [(p, d) for p, _, d in seen if p == 1] == [(1, binary.encode(m)) for m in flight]
+    assert [type(m) for p, m, _ in seen if p == 1] == [type(m) for m in flight]
+
+
+def test_the_agent_measures_from_its_command_to_the_next_state() -> None:
+    link, wire = agent(), Wire("simulator", False)
+    drive(link, [hello(), state(1)], wire)
+    assert link.statistics.round_trips.count == 0
+    link.send_command(0, command(1), 5.0)
+    link.receive(wire(state(1)), HERE, 5.1)
+    link.receive(wire(state(2)), HERE, 5.25)
+    assert link.statistics.round_trips.count == 1
+    assert link.statistics.round_trips.longest == pytest.approx(0.25)
+
+
+# ---- other codecs, other versions, one with a key and one without
+
+
+def of_version(datagram: bytes, version: int) -> bytes:
+    raw = bytearray(datagram)
+    raw[2] = version
+    raw[4:8] = zlib.crc32(raw[8:], zlib.crc32(raw[:4])).to_bytes(4, "little")
+    return bytes(raw)
+
+
+@pytest.mark.parametrize("sealed", [False, True], ids=["open", "sealed"])
+def test_a_hello_of_another_version_is_refused(sealed: bool) -> None:
+    ours, theirs = Wire("agent", sealed), Wire("simulator", sealed)
+    raw = of_version(binary.encode(hello()), 3)
+    link = agent(key=ours.key)
+    assert link.receive(theirs.key.seal(raw) if theirs.key else raw, HERE, 0.0) is None
+    sentence = "protocol version: expected 2, got 3"
+    assert link.take_outgoing() == [(ours(Refuse(session=SESSION, reason=sentence)), HERE)]
+    assert sentence in link.statistics.last_error
+    # Whatever else it says is dropped.
+    raw = of_version(binary.encode(WAIT), 3)
+    link.receive(theirs.key.seal(raw) if theirs.key else raw, HERE, 0.0)
+    assert link.take_outgoing() == []
+
+
+def test_a_refusal_of_another_version_is_read() -> None:
+    link = simulator()
+    link.connect(0.0)
+    for message, version in [(WELCOME, 1), (REFUSE, 1)]:
+        taken = link.receive(of_version(binary.encode(message), version), 0.0)
+    assert taken == REFUSE
+    assert link.state == "closed"
+
+
+@pytest.mark.parametrize("who", ["agent", "simulator"])
+def test_who_forgot_the_key_is_told(who: str) -> None:
+    """The Refuse is unsealed, since the other one could not open it; who has a key drops it."""
+    link = agent(key=Wire("agent", who == "simulator").key)
+    client = simulator(key=Wire("simulator", who == "agent").key)
+    client.connect(0.0)
+    link.receive(client.take_outgoing()[0], HERE, 0.0)
     ((datagram, _),) = link.take_outgoing()
     refuse = binary.decode(datagram)
     assert isinstance(refuse, Refuse)
-    assert len(refuse.reason) == 512
-    assert link.state == "listening"
-    assert link.last_error.startswith("refused from 127.0.0.1:8000: expected another one")
+    assert "(--key-file)" in refuse.reason
+    taken = client.receive(datagram, 0.0)
+    if who == "simulator":
+        assert (type(taken), client.state) == (Refuse, "closed")
+    else:
+        assert (taken, client.state) == (None, "hello")
+        (notice,) = client.statistics.take_notices()
+        assert "not sealed, a Refuse that says: key: this agent has none" in notice
 
 
-def test_a_hello_of_another_version_is_refused() -> None:
-    raw = bytearray(binary.encode(hello()))
-    raw[2] = 2
-    raw[4:8] = zlib.crc32(raw[8:], zlib.crc32(raw[:4])).to_bytes(4, "little")
-    link = agent()
-    assert link.receive(bytes(raw), HERE) is None
-    ((datagram, address),) = link.take_outgoing()
-    assert address == HERE
-    sentence = "protocol version: expected 1, got 2"
-    assert binary.decode(datagram) == Refuse(session=SESSION, reason=sentence)
-    assert sentence in link.last_error
-    assert link.state == "listening"
+def test_with_a_key_nothing_unsealed_is_taken() -> None:
+    ours, theirs = Wire("agent", True), Wire("simulator", True)
+    for before in AGENT_STATES:
+        for event in AGENT_EVENTS.values():
+            link = agent(key=ours.key)
+            drive(link, AGENT_STATES[before], theirs)
+            begun = state_of(link)
+            link.take_outgoing()
+            assert link.receive(binary.encode(event), HERE, 1.0) is None
+            assert state_of(link) == begun
+            assert dropped(link) == {"forged": 1}
+            assert len(link.take_outgoing()) == isinstance(event, Hello)
+    for before in SIMULATOR_STATES:
+        for event in SIMULATOR_EVENTS.values():
+            client = simulator(key=theirs.key)
+            SIMULATOR_STATES[before](client, ours)
+            begun = client.state
+            client.take_outgoing()
+            assert client.receive(binary.encode(event), 1.0) is None
+            assert (client.state, client.take_outgoing()) == (begun, [])
+            assert dropped(client) == {"forged": 1}
 
 
 def test_text_in_a_binary_session_and_binary_in_a_text_session() -> None:
-    link = agent()
-    link.receive(binary.encode(hello()), HERE)
-    link.take_outgoing()
-    assert link.receive(b"1,0.0,0,0,1.0", HERE) is None
-    assert link.receive(b"0,close", HERE) is None
-    assert link.state == "expecting"
-    link = agent()
-    assert isinstance(link.receive(b"1,0.0,0,0,1.0", HERE), State)
-    for message in (hello(session=0), hello(), state(2, session=0), close(1, session=0)):
-        assert link.receive(binary.encode(message), HERE) is None
-    assert (link.state, link.sequence) == ("deciding", 1)
-    assert link.counters["refused"] == 2
-    assert link.counters["foreign"] == 2
+    link, wire = agent(), Wire("simulator", False)
+    drive(link, [LINE], lambda line: line)  # type: ignore[arg-type]
+    for message in (hello(session=0), state(2, session=0), close(1, session=0)):
+        assert link.receive(wire(message), HERE, 0.0) is None
+    assert state_of(link) == "deciding"
+    # A binary simulator at the same address takes its place, at its State 1.
+    link.receive(wire(hello()), HERE, 0.0)
+    event = link.receive(wire(state(1)), HERE, 0.0)
+    assert event is not None
+    assert (event.place, event.joined) == (0, True)
     client = SimulatorLink(hello(), CONFIG, text_codec=True)
     client.send_state(state(1), 0.0)
     assert client.receive(binary.encode(command(1)), 0.0) is None
-    assert client.counters["malformed"] == 1
+    assert dropped(client) == {"malformed": 1}
     assert isinstance(client.receive(b"1,0.5", 0.0), Command)
 
 
 def test_a_text_session_from_first_line_to_close() -> None:
     link = agent()
-    first = link.receive(b"41,0.0,0,0,1.0\n", HERE)  # any first number
-    assert isinstance(first, State)
-    link.send_command(command(41, session=0, value=0.5))
-    assert link.receive(b"41,0.0,0,0,1.0", HERE) is None
+    first = link.receive(b"41,0.0,0,0,1.0\n", HERE, 0.0)  # any first number
+    assert first is not None
+    assert (first.joined, first.message.sequence) == (True, 41)
+    link.send_command(0, command(41, session=0, value=0.5), 0.0)
+    assert link.receive(b"41,0.0,0,0,1.0", HERE, 0.0) is None
     assert link.take_outgoing() == [(b"41,0.5", HERE)] * 2
-    assert isinstance(link.receive(b"42,close", HERE), Close)
-    assert link.state == "closed"
+    last = link.receive(b"42,close", HERE, 0.0)
+    assert last is not None
+    assert isinstance(last.message, Close)
+    assert link.take_outgoing() == [(b"41,close", HERE)]
+    assert link.places == [None]
+
+
+@pytest.mark.parametrize("answer", [b"1,close", b"0,close"])
+def test_a_text_simulator_answers_a_close(answer: bytes) -> None:
+    client = SimulatorLink(hello(), CONFIG, text_codec=True)
+    client.connect(0.0)
+    client.send_state(state(1), 0.0)
+    assert client.take_outgoing() == [text.encode(state(1))]
+    assert isinstance(client.receive(answer, 0.0), Close)
+    assert (client.state, client.take_outgoing()) == ("closed", [b"1,close"])
 
 
 def test_discrete_actions_are_whole_and_in_range() -> None:
-    link = simulator(discrete_actions=3)
-    link.connect(0.0)
-    answer(link, WELCOME)
-    link.send_state(state(1), 0.0)
-    for value in (-1.0, 3.0, 0.5):
-        assert answer(link, command(1, value=value)) is None
-    assert link.counters["malformed"] == 3
-    assert "expected whole actions 0 to 2" in link.last_error
-    assert isinstance(answer(link, command(1, value=2.0)), Command)
+    link, wire = simulator(discrete_actions=3), Wire("agent", False)
+    to_waiting(link, wire)
+    for value in (-1.0, 3.0, 0.5, 3.4e38):
+        assert link.receive(wire(command(1, value=value)), 0.0) is None
+    assert dropped(link) == {"malformed": 4}
+    assert "expected whole actions 0 to 2" in link.statistics.last_error
+    assert isinstance(link.receive(wire(command(1, value=2.0)), 0.0), Command)
 
 
-@pytest.mark.parametrize("sent", [state(1), None])
-def test_closing_tells_the_other_side_and_is_final(sent: State | None) -> None:
-    link = simulator()
-    link.connect(0.0)
-    answer(link, WELCOME)
-    if sent is not None:
-        link.send_state(sent, 0.0)
+def test_the_action_of_a_drone_that_is_reset_is_ignored() -> None:
+    link, wire = simulator(discrete_actions=3), Wire("agent", False)
+    to_waiting(link, wire)
+    reset = Command(session=SESSION, sequence=1, actions=np.full((1, 1), 7.5, np.float32),
+                    resets=np.ones(1, bool))  # fmt: skip
+    assert isinstance(link.receive(wire(reset), 0.0), Command)
+
+
+# ---- strangers
+
+
+def test_a_stranger_with_the_right_session_changes_nothing_and_is_not_answered() -> None:
+    link, wire = agent(places=2), Wire("simulator", False)
+    drive(link, [hello(), state(1), command(1)], wire)
     link.take_outgoing()
-    link.close("line one\nline two")
-    link.close("again")
-    sequence = 1 if sent is not None else 0
-    goodbye = Close(session=SESSION, sequence=sequence, reason="line one line two")
-    assert link.take_outgoing() == encoded(goodbye) * CLOSE_COPIES
-    server = agent()
-    server.close("nobody was there")
-    assert server.take_outgoing() == []
-    server.receive(binary.encode(hello()), HERE)
-    ((refusal, _),) = server.take_outgoing()
-    assert binary.decode(refusal) == Refuse(session=SESSION, reason="the agent has closed")
+    for message in (state(1), state(2), close(1), close(2)):
+        assert link.receive(wire(message), STRANGER, 0.0) is None
+    assert link.take_outgoing() == []
+    assert dropped(link) == {"foreign": 4}
+    assert state_of(link) == "expecting"
+    assert link.receive(wire(state(2)), HERE, 0.0) is not None
 
 
-def test_a_lost_close_of_the_agent_is_repeated_for_a_repeated_state() -> None:
-    link = agent()
-    link.receive(binary.encode(hello()), HERE)
-    link.receive(binary.encode(state(1)), HERE)
-    link.take_outgoing()
-    link.close("done")
-    goodbye = binary.encode(Close(session=SESSION, sequence=1, reason="done"))
-    assert link.take_outgoing() == [(goodbye, HERE)] * CLOSE_COPIES
-    link.receive(binary.encode(state(1)), HERE)
-    assert link.take_outgoing() == [(goodbye, HERE)]
+def test_no_word_ends_a_session_that_waits_or_was_welcomed() -> None:
+    """Else a stranger could ask for an Unknown now, and send it to the simulator later."""
+    for places in ([], ["other"]):
+        link, wire = agent(), Wire("simulator", False)
+        drive(link, [*places, hello()], wire)
+        link.take_outgoing()
+        for sequence in range(3):
+            link.receive(wire(state(sequence)), ("127.0.0.1", 7777), 0.0)
+        assert link.take_outgoing() == []
+        assert dropped(link) == {"foreign": 3}
 
 
-def test_junk_changes_nothing_but_counters() -> None:
-    dice = random.Random(3)
-    link, client = agent(), simulator()
-    client.connect(0.0)
-    link.receive(binary.encode(hello()), HERE)
-    link.take_outgoing()
-    client.take_outgoing()
-    for size in (0, 1, 24, 100, 65507):
-        for first in (b"", b"\xa7R\x01\x04", b"1,"):
-            junk = (first + dice.randbytes(size))[:65507]
-            assert link.receive(junk, HERE) is None
-            assert link.receive(junk, STRANGER) is None
-            assert client.receive(junk, 0.0) is None
-    assert (link.state, client.state) == ("expecting", "hello")
-    assert link.take_outgoing() == client.take_outgoing() == []
-    assert link.counters["malformed"] == 30
-    assert client.counters["malformed"] == 15
+def test_a_refused_hello_leaves_the_place_free() -> None:
+    link = agent("expected another one " + "x" * 600)
+    assert link.receive(binary.encode(hello()), HERE, 0.0) is None
+    ((datagram, _),) = link.take_outgoing()
+    refuse = binary.decode(datagram)
+    assert isinstance(refuse, Refuse)
+    assert refuse.reason.startswith("expected another one xxx")
+    assert len(datagram) == len(binary.encode(hello()))  # no more than came
+    assert link.places == [None]
+    assert link.statistics.last_error.startswith(
+        "refused from 127.0.0.1:8000: expected another one"
+    )
+
+
+def test_a_hello_that_no_longer_fits_at_its_first_state_is_closed() -> None:
+    reasons = [""]
+    link = AgentLink(lambda _: reasons[0], (1, 0), places=2)
+    wire = Wire("simulator", False)
+    drive(link, [hello()], wire)
+    reasons[0] = "another one has come " + "x" * 600
+    drive(link, [state(1)], wire)
+    (_, _), (datagram, _) = link.take_outgoing()
+    message = binary.decode(datagram)
+    assert isinstance(message, Close)
+    assert message.reason.startswith("another one")
+    assert len(datagram) <= len(binary.encode(state(1)))
+    assert dropped(link) == {"refused": 1}
 
 
 def test_the_last_error_is_one_line_whatever_was_dropped() -> None:
     whole = binary.encode(state(1, value=0.25, size=100))
     body = whole[8:].replace(np.float32(0.25).tobytes(), np.float32(np.nan).tobytes())
     crc = zlib.crc32(body, zlib.crc32(whole[:4]))
+    hostile = whole[:4] + crc.to_bytes(4, "little") + body
     link, client = agent(), simulator()
-    for receive in (
-        lambda datagram: link.receive(datagram, HERE),
-        lambda datagram: client.receive(datagram, 0.0),
-    ):
-        assert receive(whole[:4] + crc.to_bytes(4, "little") + body) is None
-    for error in (link.last_error, client.last_error):
-        assert "observations: expected finite numbers, got [[nan nan" in error
+    assert link.receive(hostile, HERE, 0.0) is client.receive(hostile, 0.0) is None
+    for error in (link.statistics.last_error, client.statistics.last_error):
+        assert "observations: expected finite numbers, got nan at [0, 0]" in error
         assert "\n" not in error
-        assert len(error) <= 512
+        assert len(error.encode()) <= 512

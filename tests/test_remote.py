@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import textwrap
 import threading
 import time
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ import pytest
 import rotorgram.envs  # noqa: F401
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
+from peers import ANY, ENV_ID, Running, launch, plain_socket
 from rotorgram.udp import (
     LinkConfig,
     LinkError,
@@ -35,36 +35,24 @@ from rotorgram.udp import (
     sockets,
 )
 from rotorgram.udp.__main__ import parse_arguments
+from rotorgram.udp.fleet import describe
 from rotorgram.udp.messages import Close, Command, Hello, Refuse, State, Welcome
-from rotorgram.udp.simulator import describe
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-ANY = ("127.0.0.1", 0)
-ENV_ID = "rotorgram/Elevation-v0"
 PAGE = Path(__file__).parent.parent / "docs" / "protocol.md"
 QUICK = LinkConfig(timeout=5)
-
-
-class Running:
-    """A simulator in a thread, and how it ended."""
-
-    def __init__(self, simulator: Simulator) -> None:
-        self.simulator = simulator
-        self.result: str | BaseException | None = None
-        self.thread = threading.Thread(target=self._run)
-        self.thread.start()
-
-    def _run(self) -> None:
-        try:
-            self.result = self.simulator.run()
-        except Exception as error:
-            self.result = error
-        self.simulator.close()
-
-    def join(self) -> str | BaseException | None:
-        self.thread.join(10)
-        assert not self.thread.is_alive()
-        return self.result
+WAYS_OUT = (
+    r"0\.0\.0\.0 is not a loopback address: expected 127\.0\.0\.1, or a key that both sides share "
+    r"\(key_file, --key-file\), or insecure=True \(--insecure\)"
+)
+SIMULATE = """
+    import sys
+    from rotorgram.udp import LinkConfig, Simulator
+    port, codec = int(sys.argv[1]), sys.argv[2]
+    with Simulator(server=("127.0.0.1", port), bind=("127.0.0.1", 0), codec=codec,
+                   config=LinkConfig(timeout=20)) as simulator:
+        print("over:", simulator.run())
+"""
 
 
 @contextmanager
@@ -81,29 +69,6 @@ def flying(env: Any = ENV_ID, codec: Any = "binary", **options: Any) -> Iterator
     finally:
         remote.close()
         running.join()
-
-
-@contextmanager
-def plain_socket() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(ANY)
-        sock.settimeout(5)
-        yield sock
-
-
-def launch(code: str, *arguments: object) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-SIMULATE = """
-    import sys
-    from rotorgram.udp import LinkConfig, Simulator
-    port, codec = int(sys.argv[1]), sys.argv[2]
-    with Simulator(server=("127.0.0.1", port), bind=("127.0.0.1", 0), codec=codec,
-                   config=LinkConfig(timeout=20)) as simulator:
-        print("over:", simulator.run())
-"""
 
 
 # ---- parity
@@ -196,7 +161,7 @@ def test_what_the_simulator_says_of_itself() -> None:
         assert hello is not None
         assert hello.env_id == ENV_ID
         assert hello.control_period == 0.04
-        assert hello.model_hash == pair.simulator.env.unwrapped.model_hash
+        assert hello.model_hash == pair.simulator.fleet.envs[0].unwrapped.model_hash
         assert set(hello.model_hash) != {"0"}
         assert pair.remote.metadata == {"render_modes": [], "render_fps": 25}
         assert pair.remote.observation_space.shape == (1,)
@@ -214,7 +179,7 @@ def test_step_before_reset_and_after_the_end_and_after_close() -> None:
             remote.step(action)
         remote.close()
         remote.close()
-        with pytest.raises(gym.error.ClosedEnvironmentError, match="expected an open RemoteEnv"):
+        with pytest.raises(gym.error.ClosedEnvironmentError, match="expected an open env"):
             remote.reset()
 
 
@@ -222,7 +187,7 @@ def test_wrong_actions_and_seeds_raise_and_nothing_has_happened() -> None:
     with flying() as pair:
         remote = pair.remote
         remote.reset(seed=1)
-        sent = remote.link.counters["sent"]
+        sent = remote.statistics.counters["sent"]
         for action, sentence in [
             (np.array([np.nan]), "action: expected finite numbers"),
             (np.array([np.inf]), "action: expected finite numbers"),
@@ -236,7 +201,7 @@ def test_wrong_actions_and_seeds_raise_and_nothing_has_happened() -> None:
                 remote.reset(seed=seed)
         with pytest.raises(ValueError, match="options: expected none over UDP"):
             remote.reset(options={"start": 1})
-        assert remote.link.counters["sent"] == sent
+        assert remote.statistics.counters["sent"] == sent
         remote.step(np.zeros(1))
     with flying(action_type="discrete") as pair:
         pair.remote.reset()
@@ -291,9 +256,30 @@ def test_an_agent_that_hears_but_never_answers() -> None:
         error = running.join()
         assert isinstance(error, PeerSilent)
         sends = int(re.findall(r"for 0.3 s, Hello sent (\d+) times", str(error))[0])
-        datagrams = [sock.recv(65507) for _ in range(sends + 3)]
-    assert len(set(datagrams[:sends])) == len(set(datagrams[sends:])) == 1
-    goodbye = binary.decode(datagrams[-1])
+        datagrams = [sock.recv(65507) for _ in range(sends)]
+        sock.setblocking(False)
+        with pytest.raises(BlockingIOError):  # who was not welcome does not take leave
+            sock.recv(65507)
+    assert len(set(datagrams)) == 1
+    assert isinstance(binary.decode(datagrams[0]), Hello)
+
+
+def test_an_agent_that_falls_silent_is_told() -> None:
+    with plain_socket() as sock:
+        simulator = Simulator(
+            server=sock.getsockname(), bind=ANY, config=LinkConfig(timeout=0.3, first_resend=0.1)
+        )
+        running = Running(simulator)
+        hello, address = sock.recvfrom(65507)
+        welcome = Welcome(session=binary.decode(hello).session)
+        sock.sendto(binary.encode(welcome), address)
+        error = running.join()
+        assert isinstance(error, PeerSilent)
+        sends = int(re.findall(r"for 0.3 s, State 1 sent (\d+) times", str(error))[0])
+        states = [sock.recv(65507) for _ in range(sends)]
+        goodbyes = [sock.recv(65507) for _ in range(5)]  # of ten: nobody answers
+    assert len(set(states)) == len(set(goodbyes)) == 1
+    goodbye = binary.decode(goodbyes[0])
     assert isinstance(goodbye, Close)
     assert goodbye.reason == "no answer from the agent for 0.3 s"
 
@@ -326,7 +312,7 @@ def test_a_flood_of_junk_does_not_extend_either_wait() -> None:
             for thread in threads:
                 thread.join()
         assert time.monotonic() - start < 4
-        assert simulator.link.counters["malformed"] > 10
+        assert simulator.link.statistics.counters["malformed"] > 10
         simulator.close()
         remote.close()
 
@@ -379,7 +365,7 @@ def test_empty_and_largest_datagrams_are_counted_and_dropped() -> None:
             sock.sendto(datagram, remote.address)
             with pytest.raises(PeerSilent, match="last datagram dropped: malformed"):
                 remote.connect()
-        assert remote.link.counters == {"received": 2, "malformed": 2}
+        assert remote.statistics.counters == {"received": 2, "malformed": 2}
 
 
 def test_no_way_to_the_agent_is_like_silence(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -403,7 +389,7 @@ def test_closed_by_another_thread_while_it_waits() -> None:
     remote = RemoteEnv(ANY, connect=False, connect_timeout=0.3)
     closing = threading.Timer(0.05, remote.close)
     closing.start()
-    with pytest.raises(gym.error.ClosedEnvironmentError, match="expected an open RemoteEnv"):
+    with pytest.raises(gym.error.ClosedEnvironmentError, match="the env was closed"):
         remote.connect()
     closing.join()
     with plain_socket() as sock:
@@ -416,35 +402,92 @@ def test_closed_by_another_thread_while_it_waits() -> None:
         closing.join()
 
 
-def test_a_killed_simulator() -> None:
-    with RemoteEnv(ANY, connect=False, connect_timeout=20, timeout=0.5) as remote:
-        process = launch(SIMULATE, remote.address[1], "binary")
-        remote.connect()
-        remote.timeout = 5
+def test_a_simulator_that_falls_silent() -> None:
+    with RemoteEnv(ANY, connect=False, connect_timeout=1, timeout=0.5) as remote:
+        running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))
         remote.reset(seed=0)
-        remote.timeout = 0.5
-        process.kill()
-        process.communicate()
-        sentence = (
+        running.cut()
+        gone = (
             r"no datagram from the simulator at 127.0.0.1:\d+ for 0.5 s, "
             r"waiting at 127.0.0.1:\d+ for State 3"
         )
-        with pytest.raises(PeerSilent, match=sentence):
+        start = time.monotonic()
+        with pytest.raises(PeerSilent, match=rf"^{gone}; no other came to 127.0.0.1:\d+ for 1 s$"):
             remote.step(np.zeros(1))
-        with pytest.raises(PeerSilent, match=sentence):  # a reset waits for it again
+        assert 1.5 <= time.monotonic() - start < 2.5
+        with pytest.raises(gym.error.ResetNeeded):
+            remote.step(np.zeros(1))
+        with pytest.raises(PeerSilent, match=f"^{gone}; no other came"):  # a reset waits again
+            remote.reset()
+        running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))
+        local = gym.make(ENV_ID)
+        assert remote.reset(seed=3)[0].tobytes() == local.reset(seed=3)[0].tobytes()
+    assert running.join() == "the agent closed"
+
+
+def test_a_reset_after_a_close_waits_for_another_simulator() -> None:
+    with RemoteEnv(ANY, connect=False, connect_timeout=0.5) as remote:
+        for _ in range(2):
+            running = Running(Simulator(Broken(None), server=remote.address, bind=ANY))
+            remote.reset()
+            remote.step(np.zeros(1))
+            remote.step(np.zeros(1))
+            with pytest.raises(PeerClosed, match="RuntimeError: bad state"):
+                remote.step(np.zeros(1))
+            with pytest.raises(gym.error.ResetNeeded):
+                remote.step(np.zeros(1))
+            running.join()
+        sentence = r"closed: RuntimeError: bad state x+; no other came to 127.0.0.1:\d+ for 0.5 s$"
+        with pytest.raises(PeerSilent, match=sentence):
             remote.reset()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
-def test_ctrl_c_at_the_simulator_tells_the_agent() -> None:
-    with RemoteEnv(ANY, connect=False, connect_timeout=20, timeout=10) as remote:
-        process = launch(SIMULATE, remote.address[1], "binary")
+def test_a_simulator_that_is_started_anew_at_the_same_address() -> None:
+    with RemoteEnv(ANY, connect=False, timeout=10) as remote:
+        running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))
         remote.reset(seed=0)
-        process.send_signal(signal.SIGINT)
-        process.communicate()
-        for _ in range(2):  # and it stays so
-            with pytest.raises(PeerClosed, match="closed: the simulator was stopped"):
-                remote.reset()
+        before = remote.step(np.ones(1))
+        here = running.simulator.address
+        running.cut()
+        running = Running(Simulator(server=remote.address, bind=here, config=QUICK))
+        after = remote.step(np.ones(1))
+        assert after[0].tobytes() == before[0].tobytes()
+        assert after[1:4] == (0.0, False, True)
+        reason = f"the simulator at 127.0.0.1:{here[1]} was started anew"
+        assert after[4] == {**before[4], "simulator_lost": reason}
+        with pytest.raises(gym.error.ResetNeeded):
+            remote.step(np.ones(1))
+        local = gym.make(ENV_ID)
+        assert_parity(remote, local, 300, [5])
+        running.cut()  # the next reset meets the new one
+        running = Running(Simulator(server=remote.address, bind=here, config=QUICK))
+        assert_parity(remote, local, 300, [6])
+        assert remote.statistics.counters["sessions"] == 3
+    assert running.join() == "the agent closed"
+
+
+def test_a_second_simulator_waits_until_the_first_has_left(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with RemoteEnv(ANY, connect=False, timeout=5) as remote:
+        first = Running(Simulator(Broken(None), server=remote.address, bind=ANY, config=QUICK))
+        remote.reset()
+        # Its timeout is shorter than the wait: it does not run while the agent says Wait.
+        config = LinkConfig(timeout=0.6, first_resend=0.05, max_resend=0.2)
+        second = Running(Simulator(Broken(0.0), server=remote.address, bind=ANY, config=config))
+        until = time.monotonic() + 1.2
+        while time.monotonic() < until:
+            remote.reset()
+            time.sleep(0.02)
+        with pytest.raises(PeerClosed, match="bad state"):
+            for _ in range(3):
+                remote.step(np.zeros(1))
+        remote.reset()
+        remote.step(np.zeros(1))
+        assert remote.statistics.counters["refused"] == 0
+        first.join()
+    assert second.join() == "the agent closed"
+    assert "every place at the agent is taken; waiting for a free one" in caplog.text
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
@@ -558,7 +601,7 @@ def test_an_agent_that_flies_on_after_the_end() -> None:
         assert sock.recv(1024) == b"2,close"
     error = running.join()
     assert isinstance(error, LinkError)
-    assert "sent an action after the end of the episode: expected a reset" in str(error)
+    assert "an action came for drone 0 after the end of its episode: expected a reset" in str(error)
 
 
 # ---- addresses and options
@@ -577,7 +620,7 @@ def test_a_port_in_use() -> None:
 @pytest.mark.parametrize(
     ("address", "sentence"),
     [
-        (("0.0.0.0", 0), "0.0.0.0 is not a loopback address: expected 127.0.0.1, or insecure=True"),
+        (("0.0.0.0", 0), WAYS_OUT),
         (("192.0.2.1", 0), "192.0.2.1 is not a loopback address"),
         (("127.0.0.1", 65536), r"address: expected \(host, port from 0 to 65535\), got"),
         (("127.0.0.1", "8001"), "address: expected"),
@@ -705,7 +748,7 @@ def test_strangers_change_nothing_but_counters() -> None:
             b"",
             b"1,0.5,0,0,1,1,1",
             b"1,close",
-            b"3," + b"0.0," * 3 + b"1,1,1," + b"0," * 9 + b"0",
+            b"3,0.0,0,0,1,1,1," + b"0," * 9 + b"0",
             dice.bytes(65507),
             binary.encode(hello),
             binary.encode(Close(session=hello.session, sequence=2, reason="forged")),
@@ -716,14 +759,16 @@ def test_strangers_change_nothing_but_counters() -> None:
             for datagram in forged:
                 stranger.sendto(datagram, pair.remote.address)
                 stranger.sendto(datagram, pair.simulator.address)
+            time.sleep(0.01)  # strangers are looked at so often
             action = dice.uniform(-0.1, 0.1, 1).astype(np.float32)
             here, there = pair.remote.step(action), local.step(action)
             assert here[0].tobytes() == there[0].tobytes()
             assert here[1:4] == there[1:4]
-        counters = pair.remote.link.counters
-        assert min(counters[name] for name in ("malformed", "foreign", "refused")) > 10
+        counters = pair.remote.statistics.counters
+        assert min(counters[name] for name in ("malformed", "foreign", "refused")) > 2
         assert pair.simulator.link.sequence == 52
-        assert set(pair.simulator.link.counters) <= {"sent", "received", "resent", "stale"}
+        counters = pair.simulator.link.statistics.counters
+        assert set(counters) <= {"sent", "received", "resent", "stale"}
         pair.remote.close()
         assert pair.running.join() == "the agent closed"
 
@@ -757,7 +802,7 @@ def test_the_text_agent_of_the_page(capsys: pytest.CaptureFixture[str]) -> None:
     with Simulator(
         server=names["agent"].getsockname(), bind=ANY, codec="text", config=QUICK
     ) as simulator:
-        simulator.env.reset(seed=1)
+        simulator.fleet.envs[0].reset(seed=1)
         assert simulator.run() == "the agent closed"
     agent.join(10)
     names["agent"].close()

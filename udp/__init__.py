@@ -1,16 +1,19 @@
-"""The wire: a simulator (UDP client) and an agent (UDP server) in lock-step.
+"""The wire: simulators (UDP clients) and an agent (UDP server) in lock-step.
 
-`messages`, `binary`, `text` and `link` are the protocol, free of sockets, clocks and simulators.
+`messages`, `binary`, `text`, `keys` and the links are the protocol, free of sockets, clocks and
+simulators.
 """
 
 from .errors import DecodeError, LinkError, PeerClosed, PeerSilent, Refused
 from .link import Address, LinkConfig
-from .remote import RemoteEnv
+from .remote import LOST, RemoteEnv
+from .remote_vector import RemoteVectorEnv
 from .simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, Simulator
 
 __all__ = [
     "DEFAULT_AGENT",
     "DEFAULT_SIMULATOR",
+    "LOST",
     "Address",
     "DecodeError",
     "LinkConfig",
@@ -19,5 +22,6 @@ __all__ = [
     "PeerSilent",
     "Refused",
     "RemoteEnv",
+    "RemoteVectorEnv",
     "Simulator",
 ]

@@ -13,30 +13,66 @@ from typing import Any, Final
 import numpy as np
 
 from .errors import DecodeError, VersionMismatch
-from .messages import MAX_TEXT, Close, Command, Hello, Message, Refuse, State, Welcome
+from .messages import (
+    MAX_TEXT,
+    Close,
+    Command,
+    Hello,
+    Message,
+    Refuse,
+    State,
+    Unknown,
+    Wait,
+    Welcome,
+)
 
-__all__ = ["HELLO", "MAGIC", "MAX_DATAGRAM", "VERSION", "decode", "encode"]
+__all__ = [
+    "HEADER_SIZE",
+    "HELLO",
+    "MAGIC",
+    "MAX_DATAGRAM",
+    "MAX_MESSAGE",
+    "OF_SESSION",
+    "STATE",
+    "UNKNOWN",
+    "VERSION",
+    "decode",
+    "encode",
+    "peek",
+]
 
 MAGIC: Final = b"\xa7R"
 """Not UTF-8, so that no text datagram begins with it."""
-VERSION: Final = 1
+VERSION: Final = 2
 MAX_DATAGRAM: Final = 65507
 """Largest payload of a UDP datagram over IPv4, bytes."""
+MAX_MESSAGE: Final = MAX_DATAGRAM - 18
+"""Largest message, bytes: room is left for the envelope of `keys`."""
+HEADER_SIZE: Final = 24
 
 HELLO: Final = 1
+STATE: Final = 4
+UNKNOWN: Final = 8
 _REFUSE: Final = 3
 """Hello's and Refuse's types, and the layouts of header and Refuse, are those of every version."""
+
+OF_SESSION: Final = frozenset({STATE, 5, 6})
+"""Types that belong to an open session: State, Command, Close. The others open one."""
+
+_NUMBERED: Final = OF_SESSION | {UNKNOWN}
+"""Types that have a sequence number."""
 
 _HEADER: Final = struct.Struct("<2sBBIQQ")
 _NUMBERS: Final = struct.Struct("<QQ")  # session, sequence: the end of the header
 _STATE: Final = struct.Struct("<IHH")  # drones, observation size, telemetry size
-_COMMAND: Final = struct.Struct("<IHBxQ")  # drones, action size, has seed, seed
-_WELCOME: Final = struct.Struct("<B7xQ")  # has seed, seed
+_COMMAND: Final = struct.Struct("<IH6xI")  # drones, action size, number of seeds
+_WELCOME: Final = struct.Struct("<QB7xQ")  # nonce, has seed, seed
 _HELLO: Final = struct.Struct("<IHHHxxd16s")  # drones, sizes, discrete actions, period, model hash
 _LENGTH: Final = struct.Struct("<H")
 _FLAGS: Final = b"\0\1"
 _F4: Final = np.dtype("<f4")
 _F8: Final = np.dtype("<f8")
+_U8: Final = np.dtype("<u8")
 
 
 def encode(message: Message) -> bytes:
@@ -49,9 +85,9 @@ def encode(message: Message) -> bytes:
     except struct.error as error:
         raise ValueError(f"{kind.__name__}: {error}") from None
     size = len(rest) + 8
-    if size > MAX_DATAGRAM:
+    if size > MAX_MESSAGE:
         raise ValueError(
-            f"{kind.__name__}: expected at most {MAX_DATAGRAM} bytes in one datagram, "
+            f"{kind.__name__}: expected at most {MAX_MESSAGE} bytes in one datagram, "
             f"got {size}: use fewer drones"
         )
     return start + zlib.crc32(rest, crc).to_bytes(4, "little") + rest
@@ -68,6 +104,8 @@ def decode(datagram: bytes) -> Message:
         raise DecodeError("checksum: the datagram was changed on its way")
     if version != VERSION and kind != _REFUSE:
         raise VersionMismatch(version=version, expected=VERSION, kind=kind, session=session)
+    if sequence and kind not in _NUMBERED:
+        raise DecodeError(f"sequence: expected 0 in type {kind}, got {sequence}")
     decoder = _DECODERS.get(kind)
     if decoder is None:
         raise DecodeError(f"type: expected 1 to {len(_DECODERS)}, got {kind}")
@@ -75,6 +113,14 @@ def decode(datagram: bytes) -> Message:
         return decoder(datagram, session, sequence)
     except (ValueError, struct.error) as error:
         raise DecodeError(f"{decoder.__name__[8:]}: {error}") from None
+
+
+def peek(datagram: bytes) -> tuple[int, int, int]:
+    """Type, session and sequence that a datagram claims, nothing verified; zeros if it has none."""
+    if len(datagram) < HEADER_SIZE or datagram[:2] != MAGIC:
+        return 0, 0, 0
+    _, _, kind, _, session, sequence = _HEADER.unpack_from(datagram)
+    return kind, session, sequence
 
 
 def _encode_state(m: State) -> bytes:
@@ -110,9 +156,11 @@ def _decode_state(data: bytes, session: int, sequence: int) -> State:
 
 def _encode_command(m: Command) -> bytes:
     drones, size = m.actions.shape
+    seeds = b"" if m.seeds is None else m.seeds.astype(_U8, copy=False).tobytes()
     return b"".join(
         (
-            _COMMAND.pack(drones, size, m.seed is not None, m.seed or 0),
+            _COMMAND.pack(drones, size, len(seeds) // 8),
+            seeds,
             m.actions.astype(_F4, copy=False).tobytes(),
             m.resets.astype(bool, copy=False).tobytes(),
         )
@@ -120,16 +168,19 @@ def _encode_command(m: Command) -> bytes:
 
 
 def _decode_command(data: bytes, session: int, sequence: int) -> Command:
-    drones, k, has_seed, seed = _COMMAND.unpack_from(data, 24)
-    flags = 40 + 4 * drones * k
+    drones, k, count = _COMMAND.unpack_from(data, 24)
+    if count not in (0, drones):
+        raise ValueError(f"seeds: expected 0 or {drones}, got {count}")
+    at = 40 + 8 * count
+    flags = at + 4 * drones * k
     _expect_size(data, flags + drones)
     _expect_flags(data[flags:])
     return Command(
         session=session,
         sequence=sequence,
-        actions=np.ndarray((drones, k), _F4, data, 40),
+        actions=np.ndarray((drones, k), _F4, data, at),
         resets=np.ndarray((drones,), bool, data, flags),
-        seed=_seed(has_seed, seed),
+        seeds=np.ndarray((drones,), _U8, data, 40) if count else None,
     )
 
 
@@ -176,12 +227,29 @@ def _decode_hello(data: bytes, session: int, sequence: int) -> Hello:
 
 
 def _encode_welcome(m: Welcome) -> bytes:
-    return _WELCOME.pack(m.seed is not None, m.seed or 0)
+    return _WELCOME.pack(m.nonce, m.seed is not None, m.seed or 0)
 
 
 def _decode_welcome(data: bytes, session: int, sequence: int) -> Welcome:
     _expect_size(data, 24 + _WELCOME.size)
-    return Welcome(session=session, seed=_seed(*_WELCOME.unpack_from(data, 24)))
+    nonce, has_seed, seed = _WELCOME.unpack_from(data, 24)
+    if has_seed > 1:
+        raise ValueError(f"has seed: expected 0 or 1, got {has_seed}")
+    return Welcome(session=session, nonce=nonce, seed=seed if has_seed else None)
+
+
+def _encode_nothing(m: Wait | Unknown) -> bytes:
+    return b""
+
+
+def _decode_wait(data: bytes, session: int, sequence: int) -> Wait:
+    _expect_size(data, 24)
+    return Wait(session=session)
+
+
+def _decode_unknown(data: bytes, session: int, sequence: int) -> Unknown:
+    _expect_size(data, 24)
+    return Unknown(session=session, sequence=sequence)
 
 
 def _encode_reason(m: Refuse | Close) -> bytes:
@@ -216,12 +284,6 @@ def _only_text(data: bytes) -> str:
     return text
 
 
-def _seed(has_seed: int, seed: int) -> int | None:
-    if has_seed > 1:
-        raise ValueError(f"has seed: expected 0 or 1, got {has_seed}")
-    return seed if has_seed else None
-
-
 def _expect_size(data: bytes, size: int) -> None:
     if len(data) != size:
         raise ValueError(f"expected {size} bytes, got {len(data)}")
@@ -243,9 +305,11 @@ _ENCODERS: Final[dict[type, tuple[bytes, int, Callable[[Any], bytes]]]] = {
     Hello: _entry(HELLO, _encode_hello),
     Welcome: _entry(2, _encode_welcome),
     Refuse: _entry(_REFUSE, _encode_reason),
-    State: _entry(4, _encode_state),
+    State: _entry(STATE, _encode_state),
     Command: _entry(5, _encode_command),
     Close: _entry(6, _encode_reason),
+    Wait: _entry(7, _encode_nothing),
+    Unknown: _entry(UNKNOWN, _encode_nothing),
 }
 """First four bytes of a datagram, their CRC-32, and the function for the rest."""
 
@@ -253,7 +317,9 @@ _DECODERS: Final[dict[int, Callable[[bytes, int, int], Message]]] = {
     HELLO: _decode_hello,
     2: _decode_welcome,
     _REFUSE: _decode_refuse,
-    4: _decode_state,
+    STATE: _decode_state,
     5: _decode_command,
     6: _decode_close,
+    7: _decode_wait,
+    UNKNOWN: _decode_unknown,
 }

@@ -23,6 +23,8 @@ __all__ = [
     "Message",
     "Refuse",
     "State",
+    "Unknown",
+    "Wait",
     "Welcome",
     "one_line",
 ]
@@ -65,7 +67,8 @@ def _check_finite(name: str, array: np.ndarray) -> None:
     else:
         finite = bool(np.isfinite(array).all())
     if not finite:
-        raise ValueError(f"{name}: expected finite numbers, got {array}")
+        first = np.argwhere(~np.isfinite(array))[0].tolist()
+        raise ValueError(f"{name}: expected finite numbers, got {array[*first]} at {first}")
 
 
 def _check_text(name: str, text: str) -> None:
@@ -76,9 +79,9 @@ def _check_text(name: str, text: str) -> None:
         raise ValueError(f"{name}: expected no control characters, got {text!r}")
 
 
-def _check_seed(seed: int | None) -> None:
-    if seed is not None and not 0 <= seed <= MAX_UINT64:
-        raise ValueError(f"seed: expected 0 to 2^64 - 1, got {seed}")
+def _check_uint64(name: str, number: int) -> None:
+    if not 0 <= number <= MAX_UINT64:
+        raise ValueError(f"{name}: expected 0 to 2^64 - 1, got {number}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -86,7 +89,7 @@ class Hello:
     """Simulator to agent, first: what it simulates."""
 
     session: int
-    """Random 64-bit number, new at every start of a simulator."""
+    """Random 64-bit number, new at every start of a simulator and of its agent."""
     env_id: str
     num_drones: int
     observation_low: np.ndarray
@@ -122,10 +125,9 @@ class Hello:
         _check_text("env_id", self.env_id)
         _check_text("telemetry_names", ",".join(self.telemetry_names))
         _check_text("options", self.options)
-        if not all(name and "," not in name for name in self.telemetry_names):
-            raise ValueError(
-                f"telemetry_names: expected names without commas, got {self.telemetry_names}"
-            )
+        names = self.telemetry_names
+        if len(set(names)) < len(names) or not all(name and "," not in name for name in names):
+            raise ValueError(f"telemetry_names: expected names, each once, without commas: {names}")
 
     @staticmethod
     def _check_bounds(name: str, low: np.ndarray, high: np.ndarray) -> None:
@@ -133,8 +135,11 @@ class Hello:
             raise ValueError(f"{name}_low: expected 1 to {MAX_SIZE} numbers, got {low.shape}")
         _check_shape(f"{name}_high", high, low.shape)
         # NaN compares as false; a bound may be infinite, but not on the wrong side.
-        if not ((low <= high) & (low < np.inf) & (high > -np.inf)).all():
-            raise ValueError(f"{name}: expected low <= high, got {low} and {high}")
+        fits = (low <= high) & (low < np.inf) & (high > -np.inf)
+        if not fits.all():
+            first = int(fits.argmin())
+            got = f"{low[first]} and {high[first]} at [{first}]"
+            raise ValueError(f"{name}: expected low <= high, got {got}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -142,11 +147,16 @@ class Welcome:
     """Agent to simulator: the session is open."""
 
     session: int
+    nonce: int = 0
+    """Random 64-bit number, new for every session: the agent's part of the session's key."""
     seed: int | None = None
-    """Seed for the simulator's own first reset, where the agent sets one."""
+    """Seed for the simulator's own first reset, where the agent sets one: drone i takes seed + i
+    (mod 2^64). Otherwise the session's number is the seed."""
 
     def __post_init__(self) -> None:
-        _check_seed(self.seed)
+        _check_uint64("nonce", self.nonce)
+        if self.seed is not None:
+            _check_uint64("seed", self.seed)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -158,6 +168,22 @@ class Refuse:
 
     def __post_init__(self) -> None:
         _check_text("reason", self.reason)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Wait:
+    """Agent to simulator: every place is taken; go on saying Hello."""
+
+    session: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Unknown:
+    """Agent to simulator: the session of this State is not known here; say Hello again."""
+
+    session: int
+    sequence: int
+    """Number of that State."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -198,13 +224,16 @@ class Command:
     """float32, shape (N, k). Ignored for a drone that is reset."""
     resets: np.ndarray
     """bool, shape (N,): reset instead of step."""
-    seed: int | None = None
-    """Seed of the resets in this command, 0 ... 2^64 - 1; None leaves the generator as it is."""
+    seeds: np.ndarray | None = None
+    """uint64, shape (N,): seeds of the resets in this command; a drone that is not reset ignores
+    its own. None leaves the generators as they are."""
 
     def __post_init__(self) -> None:
-        _check_shape("resets", self.resets, (_check_rows("actions", self.actions),))
+        drones = _check_rows("actions", self.actions)
+        _check_shape("resets", self.resets, (drones,))
         _check_finite("action", self.actions)
-        _check_seed(self.seed)
+        if self.seeds is not None:
+            _check_shape("seeds", self.seeds, (drones,))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -220,4 +249,4 @@ class Close:
         _check_text("reason", self.reason)
 
 
-Message = Hello | Welcome | Refuse | State | Command | Close
+Message = Hello | Welcome | Refuse | Wait | Unknown | State | Command | Close

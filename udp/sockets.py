@@ -2,19 +2,27 @@
 
 import errno
 import ipaddress
+import logging
 import os
+import selectors
 import socket
+import sys
 import time
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from typing import Any, Final
 
 from .binary import MAX_DATAGRAM
 from .link import Address
+from .statistics import Statistics
 
-__all__ = ["address_text", "open_socket", "receive", "resolve"]
+__all__ = ["Port", "address_text", "log_notices", "open_socket", "receive", "resolve"]
 
+_log: Final = logging.getLogger("rotorgram.udp")
 _ATTENTION: Final = 300e-6
 """How long a wait looks again and again before it sleeps, s."""
+_STRANGERS_EVERY: Final = 0.01
+"""While every place is taken, a datagram of a stranger is looked at so often, s."""
 _LONGEST: Final = 3600.0
 """Longest wait in one go, s: the system counts milliseconds in an int, and longer ones wrap."""
 _give_way: Final[Callable[[], None]] = getattr(os, "sched_yield", lambda: time.sleep(0))
@@ -27,6 +35,9 @@ def address_text(address: Address) -> str:
 
 def resolve(address: Address, *, insecure: bool) -> Address:
     """The IPv4 address and port of a host name and port.
+
+    Args:
+        insecure: Allow any address; otherwise loopback ones only. Set where a key protects.
 
     Raises:
         ValueError: It is not an address, or not a loopback one and `insecure` is not set.
@@ -45,8 +56,9 @@ def resolve(address: Address, *, insecure: bool) -> Address:
     number = str(found[0][4][0])
     if not insecure and not ipaddress.ip_address(number).is_loopback:
         raise ValueError(
-            f"{host} is not a loopback address: expected 127.0.0.1, or insecure=True "
-            "(--insecure) where everybody who reaches this port may fly the drone"
+            f"{host} is not a loopback address: expected 127.0.0.1, or a key that both sides share "
+            "(key_file, --key-file), or insecure=True (--insecure) where everybody who reaches "
+            "this port may fly the drone"
         )
     return number, port
 
@@ -58,7 +70,7 @@ def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -
 
     Raises:
         ValueError: The address is not one of this machine's, or is not loopback and `insecure` is
-            not set: datagrams are not authenticated.
+            not set.
         OSError: The port is taken or may not be bound, or the peer cannot be reached from here.
     """
     address = resolve(bind, insecure=insecure)
@@ -109,3 +121,122 @@ def receive(sock: socket.socket, timeout: float) -> tuple[bytes, Address]:
         return sock.recvfrom(MAX_DATAGRAM)
     finally:
         sock.setblocking(False)
+
+
+class Port:
+    """The agent's port: a socket for everybody and, where the system can, one for each simulator.
+
+    Those are connected, so that the system sorts the datagrams, each socket has a buffer of its
+    own, and nobody else can fill the one of a simulator, however fast he sends.
+
+    Raises:
+        ValueError, OSError: As `open_socket`.
+    """
+
+    def __init__(self, address: Address, *, insecure: bool) -> None:
+        self._everybody = open_socket(address, insecure=insecure)
+        self._own: dict[Address, socket.socket] = {}
+        self._simulators = selectors.DefaultSelector()
+        self._all = selectors.DefaultSelector()
+        self._all.register(self._everybody, selectors.EVENT_READ)
+        self._next_look = 0.0
+
+    @property
+    def address(self) -> Address:
+        """Address that is listened on."""
+        host, port = self._everybody.getsockname()
+        return host, port
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._everybody.fileno() < 0
+
+    def keep(self, peers: Collection[Address]) -> None:
+        """Have a socket for each of these, and for nobody else."""
+        for peer in self._own.keys() - set(peers):
+            sock = self._own.pop(peer)
+            for selector in (self._simulators, self._all):
+                selector.unregister(sock)
+            sock.close()
+        if sys.platform == "linux":  # others sort the datagrams of one port by other rules
+            for peer in set(peers) - self._own.keys():
+                self._add(peer)
+
+    def receive(self, timeout: float, *, strangers: bool) -> tuple[bytes, Address]:
+        """The next datagram and where it came from.
+
+        Args:
+            timeout: Longest wait, s.
+            strangers: Whether one from anybody is as welcome as one of a simulator. Otherwise they
+                are looked at only now and then.
+
+        Raises:
+            TimeoutError, OSError: As the function `receive`; a wait may end early.
+        """
+        if not self._own:
+            return receive(self._everybody, timeout)
+        if strangers:
+            return _receive_any(self._all, timeout)
+        now = time.perf_counter()
+        if now >= self._next_look:
+            self._next_look = now + _STRANGERS_EVERY
+            with suppress(BlockingIOError):
+                return self._everybody.recvfrom(MAX_DATAGRAM)
+        timeout = min(timeout, _STRANGERS_EVERY)
+        if len(self._own) > 1:
+            return _receive_any(self._simulators, timeout)
+        (only,) = self._own.values()
+        return receive(only, timeout)
+
+    def send(self, datagram: bytes, address: Address) -> None:
+        """Send a datagram. Raises `OSError`."""
+        self._everybody.sendto(datagram, address)
+
+    def close(self) -> None:
+        """Close every socket."""
+        self.keep(())
+        self._simulators.close()
+        self._all.close()
+        self._everybody.close()
+
+    def _add(self, peer: Address) -> None:
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            # Only for this moment: the port is nobody else's.
+            for one in (self._everybody, sock):
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind(self._everybody.getsockname())
+            sock.connect(peer)
+        except OSError:  # then its datagrams come to the socket for everybody
+            sock.close()
+            return
+        finally:
+            self._everybody.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+        sock.setblocking(False)
+        self._own[peer] = sock
+        for selector in (self._simulators, self._all):
+            selector.register(sock, selectors.EVENT_READ)
+
+
+def _receive_any(selector: selectors.BaseSelector, timeout: float) -> tuple[bytes, Address]:
+    """As `receive`, from any of several sockets."""
+    until = time.perf_counter() + min(timeout, _ATTENTION)
+    ready = selector.select(0)
+    while not ready and time.perf_counter() < until:
+        _give_way()
+        ready = selector.select(0)
+    ready = ready or selector.select(min(max(timeout - _ATTENTION, _ATTENTION), _LONGEST))
+    for key, _ in ready:
+        sock: Any = key.fileobj
+        datagram, address = sock.recvfrom(MAX_DATAGRAM)
+        return datagram, address
+    raise TimeoutError
+
+
+def log_notices(statistics: Statistics, now: float) -> None:
+    """Write to the log `rotorgram.udp` what there is to say: warnings, and a report each minute."""
+    for notice in statistics.take_notices():
+        _log.warning("%s", notice)
+    if statistics.report_due(now):
+        _log.info("wire: %s", statistics)

@@ -63,7 +63,7 @@ def _state_fields(message: State) -> list[str]:
 
 def _command_fields(message: Command) -> list[str]:
     if message.resets.item():
-        return ["reset"] if message.seed is None else ["reset", str(message.seed)]
+        return ["reset"] if message.seeds is None else ["reset", str(message.seeds.item())]
     return [repr(action) for action in message.actions[0].tolist()]
 
 
@@ -104,12 +104,13 @@ def decode_command(datagram: bytes, action_size: int, session: int) -> Command |
     if len(fields) > 2 if reset else len(fields) != action_size:
         raise DecodeError(f"command: expected {expected}, got {datagram[:80]!r}")
     try:
+        seed = [_whole("seed", fields[1])] if reset and len(fields) == 2 else None
         return Command(
             session=session,
             sequence=sequence,
             actions=np.zeros((1, action_size), _F4) if reset else _float32("action", fields),
             resets=np.array([reset]),
-            seed=_whole("seed", fields[1]) if reset and len(fields) == 2 else None,
+            seeds=None if seed is None else np.array(seed, np.uint64),
         )
     except ValueError as error:
         raise DecodeError(f"command: {error}") from None
@@ -119,7 +120,7 @@ def _split(datagram: bytes) -> tuple[int, list[str]]:
     if len(datagram) > MAX_LINE:
         raise DecodeError(f"text line: expected at most {MAX_LINE} bytes, got {len(datagram)}")
     try:
-        line = datagram.decode("ascii").rstrip("\r\n")
+        line = datagram.decode("ascii").removesuffix("\n").removesuffix("\r")
     except UnicodeDecodeError:
         raise DecodeError("text line: expected ASCII") from None
     sequence, _, rest = line.partition(",")
@@ -152,5 +153,5 @@ def _floats(name: str, fields: list[str]) -> list[float]:
 
 def _float32(name: str, fields: list[str]) -> np.ndarray:
     """Numbers of one drone, float32, shape (1, len(fields)); infinite where they do not fit."""
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", under="ignore"):  # whatever the program has set
         return np.array([_floats(name, fields)]).astype(_F4)

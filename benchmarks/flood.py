@@ -1,0 +1,136 @@
+"""A stranger floods the agent's port with garbage at full speed while an agent trains.
+
+    python benchmarks/flood.py [--seconds 30] [--env-steps 200000] [--out FILE.json]
+
+The garbage: random bytes, with a valid magic and without, Hellos of an env that is not flown and of
+the one that is, States of sessions that do not exist, lines of text. The training has to end with
+the very weights, optimizer's state and episodes of one that nobody disturbs.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rotorgram.agents import preset
+from rotorgram.agents.checkpoints import software_versions
+from rotorgram.envs import ElevationConfig
+from rotorgram.experiments.pairs import socket_pair
+from rotorgram.experiments.training import Run, Training
+
+FLOOD = """
+import json, random, socket, sys, time
+import gymnasium as gym, numpy as np, rotorgram.envs
+from dataclasses import replace
+from rotorgram.udp import binary
+from rotorgram.udp.fleet import Fleet
+from rotorgram.udp.messages import Hello
+port, seconds = int(sys.argv[1]), float(sys.argv[2])
+dice = random.Random(0)
+fleet = Fleet("rotorgram/Elevation-v0", 1, {})
+fleet.reset(0)
+kinds = []
+for _ in range(200):
+    kinds += [
+        dice.randbytes(dice.randrange(1400)),
+        b"\\xa7R\\x02\\x05" + dice.randbytes(60),
+        binary.encode(fleet.state(dice.getrandbits(64), 1)),
+        binary.encode(replace(fleet.hello, session=dice.getrandbits(64), env_id="other/Env-v0")),
+        binary.encode(replace(fleet.hello, session=dice.getrandbits(64))),
+        b"1,0.5,0,0,1,2,3" + b",0" * 10,
+    ]
+sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+sock.connect(("127.0.0.1", port))
+until, sent = time.monotonic() + seconds, 0
+while time.monotonic() < until:
+    for datagram in kinds:
+        try:
+            sock.send(datagram)
+            sent += 1
+        except OSError:
+            pass
+print(json.dumps({"sent": sent, "datagrams_per_second": round(sent / seconds)}))
+"""
+
+
+def train(run: Run, flood_seconds: float) -> dict[str, Any]:
+    with socket_pair(run.env) as env:
+        training = Training(run, env)
+        flood, marks = None, []
+
+        def on_update() -> bool:
+            nonlocal flood
+            now = time.monotonic()
+            if flood_seconds and flood is None and training.log.env_steps >= run.env_steps // 10:
+                flood = subprocess.Popen(
+                    [sys.executable, "-c", FLOOD, str(env.address[1]), str(flood_seconds)],
+                    stdout=subprocess.PIPE,
+                )
+            if flood and flood.poll() is None:
+                marks.append((now, training.log.env_steps))
+            return True
+
+        training.train(on_update)
+        said = json.loads(flood.communicate()[0]) if flood else {}
+        result = {
+            "state": training.agent.state(),
+            "episodes": [
+                {k: v for k, v in asdict(e).items() if k != "seconds"}
+                for e in training.log.episodes
+            ],
+            "steps_per_second": training.log.env_steps / training.log.seconds,
+            "flood": said,
+            "agent": env.statistics.numbers(),
+        }
+    if len(marks) > 1:
+        (began, first), (ended, last) = marks[0], marks[-1]
+        result["flooded_seconds"] = round(ended - began, 1)
+        result["flooded_steps_per_second"] = round((last - first) / (ended - began))
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=30)
+    parser.add_argument("--env-steps", type=int, default=200_000)
+    parser.add_argument("--out", type=Path, default=Path("docs/results/reliability/flood.json"))
+    args = parser.parse_args()
+    run = Run(
+        algorithm="a2c",
+        config=preset("a2c", "tuned"),
+        env=ElevationConfig(),
+        seed=0,
+        env_steps=args.env_steps,
+    )
+    calm, flooded = train(run, 0), train(run, args.seconds)
+    same = calm["episodes"] == flooded["episodes"] and all(
+        calm["state"][name].tobytes() == flooded["state"][name].tobytes() for name in calm["state"]
+    )
+    result = {
+        "env_steps": args.env_steps,
+        "episodes": len(calm["episodes"]),
+        "identical": same,
+        "steps_per_second": {
+            "calm": round(calm["steps_per_second"]),
+            "during the flood": flooded.get("flooded_steps_per_second"),
+        },
+        "flooded_seconds": flooded.get("flooded_seconds"),
+        "flood": flooded["flood"],
+        "agent": flooded["agent"],
+        "versions": software_versions(),
+        "machine": {"cores": os.cpu_count()},
+    }
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    print(json.dumps(result, indent=2))
+    if not same:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

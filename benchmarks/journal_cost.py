@@ -1,0 +1,159 @@
+"""What a journal costs: lock-step rates with one on no side, either side and both.
+
+    python benchmarks/journal_cost.py [--rounds 80] [--seconds 0.25] [--out FILE.json]
+
+Four pairs of an agent (here) and a simulator (a process each) are open at the same time; one drone,
+binary codec, loopback. They take turns to fly for a moment, in an order that changes from round to
+round. Within a round each rate is compared to that without a journal; the medians of these ratios
+count, so that a machine that slows down for a while slows all alike.
+
+Beside it the journal alone: the time of a State and a Command in it, chunks and writing included.
+"""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import numpy as np
+from rotorgram.udp import RemoteEnv
+from rotorgram.udp.journal import Journal, software
+from rotorgram.udp.messages import Command, Hello, State
+from rotorgram.udp.recording import read_journal, summarize
+from rotorgram.udp.statistics import Statistics
+
+SIDES: dict[str, tuple[str, ...]] = {
+    "none": (),
+    "simulator": ("simulator",),
+    "agent": ("agent",),
+    "both": ("simulator", "agent"),
+}
+
+
+class Flight:
+    """A pair that flies for a moment at a time."""
+
+    def __init__(self, env: RemoteEnv) -> None:
+        self.env = env
+        self.actions = np.random.default_rng(0).uniform(-0.1, 0.1, (4096, 1)).astype(np.float32)
+        self.steps = 0
+        env.reset(seed=0)
+
+    def fly(self, seconds: float) -> float:
+        """Steps per second."""
+        start, before = time.perf_counter(), self.steps
+        while time.perf_counter() - start < seconds:
+            _, _, terminated, truncated, _ = self.env.step(self.actions[self.steps % 4096])
+            self.steps += 1
+            if terminated or truncated:
+                self.env.reset()
+        return (self.steps - before) / (time.perf_counter() - start)
+
+
+@contextmanager
+def flight(name: str, folder: Path) -> Iterator[Flight]:
+    record = folder / f"{name}-agent.mcap" if "agent" in SIDES[name] else None
+    with RemoteEnv(("127.0.0.1", 0), connect=False, record=record) as env:
+        arguments = {"server": env.address, "bind": ("127.0.0.1", 0)}
+        if "simulator" in SIDES[name]:
+            arguments["record"] = str(folder / f"{name}-simulator.mcap")
+        words = [sys.executable, "-m", "rotorgram.udp", json.dumps(arguments)]
+        with subprocess.Popen(words) as process:
+            yield Flight(env)
+            env.close()
+            process.wait()
+
+
+def measure(rounds: int, seconds: float, folder: Path) -> dict[str, list[float]]:
+    names = list(SIDES)
+    rates: dict[str, list[float]] = {name: [] for name in names}
+    with ExitStack() as stack:
+        flights = {name: stack.enter_context(flight(name, folder)) for name in names}
+        for one in flights.values():
+            one.fly(seconds)
+        for number in range(rounds):
+            turn = number % len(names)
+            for name in names[turn:] + names[:turn]:
+                rates[name].append(round(flights[name].fly(seconds), 1))
+    return rates
+
+
+def compare(without: list[float], with_it: list[float]) -> dict[str, object]:
+    """Ratios of rates, and time per step more, of the same rounds."""
+    pairs = list(zip(with_it, without, strict=True))
+    ratios = [a / b for a, b in pairs]
+    low, _, high = statistics.quantiles(ratios, n=4)
+    return {
+        "ratio": round(statistics.median(ratios), 4),
+        "quartiles": [round(low, 4), round(high, 4)],
+        "microseconds_per_step": round(statistics.median(1e6 / a - 1e6 / b for a, b in pairs), 2),
+    }
+
+
+def journal_alone(source: Path, target: Path, repeats: int = 9) -> float:
+    """Shortest time of a State and its Command in the journal, µs."""
+    items = list(read_journal(source))
+    hello = next(item for item in items if isinstance(item.message, Hello))
+    flown = [(i.message, i.datagram) for i in items if isinstance(i.message, State | Command)]
+    flown = flown[:40_000]
+    times = []
+    for number in range(repeats):
+        journal = Journal(target / f"{number}.mcap", about={}, attachments={})
+        journal.start(Statistics())
+        journal.tap(0, hello.message, hello.datagram)
+        start = time.perf_counter()
+        for message, datagram in flown:
+            journal.tap(0, message, datagram)
+        times.append(time.perf_counter() - start)
+        journal.close()
+    return 1e6 * min(times) / (len(flown) / 2)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=80)
+    parser.add_argument("--seconds", type=float, default=0.25)
+    default = Path("docs/results/reliability/journal.json")
+    parser.add_argument("--out", type=Path, default=default)
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rates = measure(args.rounds, args.seconds, folder)
+        files = {side: folder / f"both-{side}.mcap" for side in ("agent", "simulator")}
+        states = {side: summarize(file).sessions[0].states for side, file in files.items()}
+        sizes = {side: round(files[side].stat().st_size / states[side], 1) for side in files}
+        alone = journal_alone(files["agent"], folder)
+    result = {
+        "rounds": args.rounds,
+        "seconds": args.seconds,
+        "steps_per_second": {name: statistics.median(numbers) for name, numbers in rates.items()},
+        "journal": {name: compare(rates["none"], rates[name]) for name in list(SIDES)[1:]},
+        "journal_alone_microseconds_per_step": round(alone, 2),
+        "bytes_per_step": sizes,
+        "rates": rates,
+        "versions": software(),
+        "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
+    }
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    print(f"without a journal: {statistics.median(rates['none']):,.0f} steps/s (median)")
+    print("| journal on | rate, of that without | quartiles | µs per step |")
+    print("|---|---|---|---|")
+    for name, numbers in result["journal"].items():
+        low, high = numbers["quartiles"]
+        print(f"| {name} | {numbers['ratio']:.3f} | {low:.3f} … {high:.3f} | "
+              f"{numbers['microseconds_per_step']:.1f} |")  # fmt: skip
+    print(f"the journal alone: {alone:.2f} µs per step")
+    print(f"bytes per step: {sizes}")
+
+
+if __name__ == "__main__":
+    main()

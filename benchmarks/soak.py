@@ -1,0 +1,191 @@
+"""A million control steps through a bad network, compared bit for bit with flights in process.
+
+    python benchmarks/soak.py [--steps 1000000] [--jobs 4] [--out FILE.json]
+
+Every job is an agent, a relay that loses 30 % of the datagrams, doubles 10 %, reorders 20 %, spoils
+7 %, and a simulator, each a process of its own. The agent flies the same seeds and random actions
+on a local env beside it and compares every bit of every answer. The last job flies 64 drones, the
+one before it with a key. One bit that differs ends the soak with the step's number.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import rotorgram.envs  # noqa: F401
+from joblib import Parallel, delayed
+from rotorgram.agents.checkpoints import software_versions
+from rotorgram.udp import RemoteVectorEnv
+from rotorgram.udp.keys import write_key
+
+FAULTS = {"drop": 0.3, "duplicate": 0.1, "reorder": 0.2, "corrupt": 0.05, "truncate": 0.02}
+PERIOD = 0.005  # s: one physics step for each control step, so that the wire is what is soaked
+
+RELAY = """
+import json, sys
+from rotorgram.udp.faults import FaultConfig, Relay
+settings = json.loads(sys.argv[1])
+with Relay(("127.0.0.1", 0), tuple(settings["server"]), FaultConfig(**settings["faults"])) as relay:
+    print(relay.address[1], flush=True)
+    try:
+        relay.run()
+    except KeyboardInterrupt:
+        print(json.dumps(relay.counters), flush=True)
+"""
+
+SIMULATE = """
+import json, sys
+from rotorgram.udp import LinkConfig, Simulator
+settings = json.loads(sys.argv[1])
+quick = LinkConfig(first_resend=0.002, min_resend=0.0005, max_resend=0.004)
+with Simulator(server=("127.0.0.1", settings["port"]), bind=("127.0.0.1", 0), config=quick,
+               num_envs=settings["drones"], key_file=settings["key"],
+               control_period=settings["period"]) as simulator:
+    simulator.run()
+    print(json.dumps(simulator.link.statistics.numbers()), flush=True)
+"""
+
+
+def launch(code: str, settings: dict[str, Any]) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", code, json.dumps(settings)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+
+def said(process: subprocess.Popen[str]) -> Any:
+    assert process.stdout is not None
+    return json.loads(process.stdout.readline())
+
+
+class Local:
+    """Drones in process, with the autoreset of the remote ones."""
+
+    def __init__(self, drones: int) -> None:
+        self.envs = [
+            gym.make("rotorgram/Elevation-v0", control_period=PERIOD, disable_env_checker=True)
+            for _ in range(drones)
+        ]
+        self.over = [False] * drones
+
+    def reset(self, seed: int) -> list[tuple[Any, ...]]:
+        return [
+            (*self.result(env.reset(seed=seed + i)), 0.0, False, False)
+            for i, env in enumerate(self.envs)
+        ]
+
+    def step(self, actions: np.ndarray) -> list[tuple[Any, ...]]:
+        rows = []
+        for i, env in enumerate(self.envs):
+            if self.over[i]:
+                rows.append((*self.result(env.reset()), 0.0, False, False))
+                self.over[i] = False
+                continue
+            observation, reward, terminated, truncated, info = env.step(actions[i])
+            rows.append((*self.result((observation, info)), reward, terminated, truncated))
+            self.over[i] = terminated or truncated
+        return rows
+
+    def result(self, answer: tuple[Any, Any]) -> tuple[bytes, bytes]:
+        observation, info = answer
+        names = self.envs[0].unwrapped.telemetry_names
+        return observation.tobytes(), np.array([info[name] for name in names]).tobytes()
+
+
+def remote_rows(names: list[str], answer: tuple[Any, ...]) -> list[tuple[Any, ...]]:
+    observations, rewards, terminated, truncated, info = answer
+    telemetry = np.stack([info[name] for name in names], axis=1)
+    return [
+        (o.tobytes(), t.tobytes(), *flags)
+        for o, t, *flags in zip(
+            observations, telemetry, rewards.tolist(), terminated.tolist(), truncated.tolist(),
+            strict=True,
+        )
+    ]  # fmt: skip
+
+
+def soak(job: int, steps: int, drones: int, keyed: bool) -> dict[str, Any]:
+    folder = Path(tempfile.mkdtemp())
+    key = str(folder / "key") if keyed else None
+    if key:
+        write_key(Path(key))
+    options = {"control_period": PERIOD}
+    remote = RemoteVectorEnv(
+        ("127.0.0.1", 0), num_envs=drones, options=options, key_file=key, connect=False
+    )
+    relay = launch(RELAY, {"server": remote.address, "faults": {**FAULTS, "seed": job}})
+    settings = {"port": said(relay), "drones": drones, "key": key, "period": PERIOD}
+    simulator = launch(SIMULATE, settings)
+    local, dice = Local(drones), np.random.default_rng(job)
+    observations, info = remote.reset(seed=job)
+    names = [name for name in info if not name.startswith("_")]
+    nothing = np.zeros(drones), np.zeros(drones, bool), np.zeros(drones, bool)
+    assert remote_rows(names, (observations, *nothing, info)) == local.reset(job)
+    began, different, ended = time.perf_counter(), None, 0
+    for step in range(1, steps + 1):
+        actions = dice.uniform(-1.2, 1.2, (drones, 1)).astype(np.float32)
+        rows = remote_rows(names, remote.step(actions))
+        if rows != local.step(actions):
+            different = step
+            break
+        ended += sum(local.over)
+    seconds = time.perf_counter() - began
+    agent = remote.statistics.numbers()
+    remote.close()
+    there = said(simulator)
+    simulator.wait()
+    relay.send_signal(2)
+    network = said(relay)
+    relay.wait()
+    return {
+        "drones": drones, "key": keyed, "steps": step, "seconds": round(seconds, 1),
+        "episodes": ended, "first_step_that_differs": different,
+        "network": network, "agent": agent, "simulator": there,
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=1_000_000)
+    parser.add_argument("--jobs", type=int, default=4)
+    parser.add_argument("--out", type=Path, default=Path("docs/results/reliability/soak.json"))
+    args = parser.parse_args()
+    # 64 drones: a twentieth of the exchanges, more than half of the drones' steps.
+    many = args.steps // 20
+    each = -(-(args.steps - many) // (args.jobs - 1))
+    kinds = [(each, 1, job == args.jobs - 2) for job in range(args.jobs - 1)] + [(many, 64, False)]
+    jobs = Parallel(n_jobs=args.jobs)(delayed(soak)(job, *kind) for job, kind in enumerate(kinds))
+    network: Counter[str] = Counter()
+    for job in jobs:
+        network.update(job["network"])
+    result = {
+        "faults": FAULTS,
+        "control_steps": sum(job["steps"] for job in jobs),
+        "drone_steps": sum(job["steps"] * job["drones"] for job in jobs),
+        "episodes": sum(job["episodes"] for job in jobs),
+        "bits_that_differ": sum(job["first_step_that_differs"] is not None for job in jobs),
+        "network": dict(network),
+        "jobs": jobs,
+        "versions": software_versions(),
+        "machine": {"cores": os.cpu_count()},
+    }
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    for job in jobs:
+        rate = job["steps"] / job["seconds"]
+        print(f"{job['drones']:3} drones {job['steps']:9,} steps, {rate:6.0f} steps/s, "
+              f"first that differs: {job['first_step_that_differs']}")  # fmt: skip
+    print(f"{result['control_steps']:,} control steps, {result['drone_steps']:,} drone steps")
+    if result["bits_that_differ"]:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,278 @@
+// The binary codec of rotorgram's protocol (docs/protocol.md): bytes, no socket and no clock.
+
+using System;
+using System.Runtime.InteropServices;
+using System.Text;
+
+namespace Rotorgram
+{
+    public enum MessageType : byte
+    {
+        Hello = 1, Welcome, Refuse, State, Command, Close, Wait, Unknown
+    }
+
+    /// <summary>What Hello says of an env. The arrays have one entry for each number.</summary>
+    public sealed class RotorgramSpec
+    {
+        public string EnvId = "";
+        public string Telemetry = ""; // names, joined by commas
+        public string Options = "";
+        public int Drones = 1;
+        public int DiscreteActions; // 0: continuous
+        public double Period;
+        public byte[] Model = new byte[16];
+        public float[] ObservationLow, ObservationHigh, ActionLow, ActionHigh;
+
+        public int Observations { get { return ObservationLow.Length; } }
+        public int Actions { get { return ActionLow.Length; } }
+        public int Channels { get { return Telemetry == "" ? 0 : Telemetry.Split(',').Length; } }
+    }
+
+    /// <summary>What the drones tell after a step or a reset, drone by drone.</summary>
+    public sealed class RotorgramState
+    {
+        public readonly double[] Rewards, Telemetry;
+        public readonly float[] Observations;
+        public readonly bool[] Terminated, Truncated;
+
+        public RotorgramState(RotorgramSpec spec)
+        {
+            Rewards = new double[spec.Drones];
+            Telemetry = new double[spec.Drones * spec.Channels];
+            Observations = new float[spec.Drones * spec.Observations];
+            Terminated = new bool[spec.Drones];
+            Truncated = new bool[spec.Drones];
+        }
+    }
+
+    /// <summary>What the drones shall do: each is reset or stepped.</summary>
+    public sealed class RotorgramCommand
+    {
+        public readonly float[] Actions;
+        public readonly bool[] Reset;
+        public readonly ulong[] Seeds; // of those that are reset, if HasSeeds
+        public bool HasSeeds;
+
+        public RotorgramCommand(RotorgramSpec spec)
+        {
+            Actions = new float[spec.Drones * spec.Actions];
+            Reset = new bool[spec.Drones];
+            Seeds = new ulong[spec.Drones];
+        }
+    }
+
+    /// <summary>One datagram, in a buffer that is used again and again: nothing is allocated but
+    /// the strings of Hello, Refuse and Close.</summary>
+    public sealed class Datagram
+    {
+        public const int HeaderSize = 24, LongestText = 512, LongestDatagram = 65489, Version = 2;
+
+        public readonly byte[] Bytes = new byte[65536];
+        public int Length;
+
+        static readonly UTF8Encoding Utf8 = new UTF8Encoding(false, true);
+        static readonly uint[] CrcTable = MakeCrcTable();
+        int at;
+
+        [StructLayout(LayoutKind.Explicit)]
+        struct FloatBits // the bits of a float, without the array of BitConverter.GetBytes
+        {
+            [FieldOffset(0)] public float Value;
+            [FieldOffset(0)] public uint Bits;
+        }
+
+        // Writing.
+
+        public void WriteHello(ulong session, RotorgramSpec spec)
+        {
+            Begin(MessageType.Hello, session, 0);
+            Put((ulong)spec.Drones, 4);
+            Put((ulong)spec.Observations, 2);
+            Put((ulong)spec.Actions, 2);
+            Put((ulong)spec.DiscreteActions, 2);
+            Put(0, 2);
+            Put(spec.Period);
+            foreach (byte b in spec.Model) Put(b, 1);
+            foreach (float f in spec.ObservationLow) Put(f);
+            foreach (float f in spec.ObservationHigh) Put(f);
+            foreach (float f in spec.ActionLow) Put(f);
+            foreach (float f in spec.ActionHigh) Put(f);
+            Put(spec.EnvId);
+            Put(spec.Telemetry);
+            Put(spec.Options);
+            End();
+        }
+
+        public void WriteState(ulong session, ulong sequence, RotorgramSpec spec, RotorgramState s)
+        {
+            Begin(MessageType.State, session, sequence);
+            Put((ulong)s.Rewards.Length, 4);
+            Put((ulong)spec.Observations, 2);
+            Put((ulong)(s.Telemetry.Length / s.Rewards.Length), 2);
+            foreach (double d in s.Rewards) Put(d);
+            foreach (double d in s.Telemetry) Put(d);
+            foreach (float f in s.Observations) Put(f);
+            foreach (bool b in s.Terminated) Put(b ? 1u : 0u, 1);
+            foreach (bool b in s.Truncated) Put(b ? 1u : 0u, 1);
+            End();
+        }
+
+        /// <summary>A reason that does not fit is cut, and its control characters go.</summary>
+        public void WriteClose(ulong session, ulong sequence, string reason)
+        {
+            var kept = new StringBuilder();
+            foreach (char c in reason) kept.Append(char.IsControl(c) || char.IsSurrogate(c) ? ' ' : c);
+            while (Utf8.GetByteCount(kept.ToString()) > LongestText) kept.Length--;
+            Begin(MessageType.Close, session, sequence);
+            Put(kept.ToString());
+            End();
+        }
+
+        void Begin(MessageType type, ulong session, ulong sequence)
+        {
+            at = 0;
+            Put(0xa7, 1);
+            Put(0x52, 1);
+            Put(Version, 1);
+            Put((ulong)type, 1);
+            Put(0, 4);
+            Put(session, 8);
+            Put(sequence, 8);
+        }
+
+        void End()
+        {
+            Length = at;
+            if (Length > LongestDatagram) throw new InvalidOperationException(
+                "a datagram of " + Length + " bytes is too long: fly fewer drones");
+            at = 4;
+            Put(Crc(), 4);
+        }
+
+        void Put(ulong value, int size)
+        {
+            for (int i = 0; i < size; i++) Bytes[at++] = (byte)(value >> (8 * i));
+        }
+
+        void Put(double value) { Put((ulong)BitConverter.DoubleToInt64Bits(value), 8); }
+
+        void Put(float value) { Put(new FloatBits { Value = value }.Bits, 4); }
+
+        void Put(string text)
+        {
+            int size = Utf8.GetBytes(text, 0, text.Length, Bytes, at + 2);
+            if (size > LongestText) throw new ArgumentException(
+                "a text of " + size + " bytes: at most " + LongestText + " are allowed");
+            Put((ulong)size, 2);
+            at += size;
+        }
+
+        // Reading. Header first: nothing else of a datagram is looked at if that is wrong.
+
+        public MessageType Type { get { return (MessageType)Bytes[3]; } }
+        public ulong Session { get { at = 8; return Take(8); } }
+        public ulong Sequence { get { at = 16; return Take(8); } }
+
+        /// <summary>Whether magic, version and CRC are right. Refuse is the same in all versions.</summary>
+        public bool HeaderIsRight()
+        {
+            if (Length < HeaderSize || Length > LongestDatagram) return false;
+            if (Bytes[0] != 0xa7 || Bytes[1] != 0x52) return false;
+            if (Bytes[2] != Version && Type != MessageType.Refuse) return false;
+            at = 4;
+            return Take(4) == Crc();
+        }
+
+        public bool IsHeaderAlone() { return Length == HeaderSize; }
+
+        public bool ReadWelcome(out ulong nonce, out bool hasSeed, out ulong seed)
+        {
+            at = HeaderSize;
+            nonce = seed = 0;
+            hasSeed = false;
+            if (Length != 48 || Sequence != 0 || Bytes[32] > 1) return false;
+            at = 24;
+            nonce = Take(8);
+            hasSeed = Bytes[32] == 1;
+            at = 40;
+            seed = Take(8);
+            return true;
+        }
+
+        /// <summary>False leaves the command half read: it is of no use then.</summary>
+        public bool ReadCommand(RotorgramSpec spec, RotorgramCommand c)
+        {
+            int drones = c.Reset.Length, actions = c.Actions.Length;
+            if (Length < 40) return false;
+            at = 24;
+            if (Take(4) != (ulong)drones || Take(2) != (ulong)(actions / drones)) return false;
+            at = 36;
+            ulong seeds = Take(4);
+            c.HasSeeds = seeds > 0;
+            if (c.HasSeeds && seeds != (ulong)drones) return false;
+            if (Length != 40 + (c.HasSeeds ? 8 * drones : 0) + 4 * actions + drones) return false;
+            for (int i = 0; i < drones; i++) c.Seeds[i] = c.HasSeeds ? Take(8) : 0;
+            for (int i = 0; i < actions; i++)
+            {
+                float a = c.Actions[i] = new FloatBits { Bits = (uint)Take(4) }.Value;
+                if (float.IsNaN(a) || float.IsInfinity(a)) return false;
+                if (spec.DiscreteActions > 0 && !(a >= 0 && a < spec.DiscreteActions && a == (int)a))
+                    return false;
+            }
+            for (int i = 0; i < drones; i++)
+            {
+                if (Bytes[at] > 1) return false;
+                c.Reset[i] = Bytes[at++] == 1;
+            }
+            return true;
+        }
+
+        /// <summary>The reason of a Refuse or Close, or null if it is malformed.</summary>
+        public string ReadReason()
+        {
+            if (Length < HeaderSize + 2) return null;
+            at = HeaderSize;
+            int size = (int)Take(2);
+            if (size > LongestText || Length != at + size) return null;
+            try
+            {
+                string reason = Utf8.GetString(Bytes, at, size);
+                foreach (char c in reason) if (char.IsControl(c)) return null;
+                return reason;
+            }
+            catch (ArgumentException)
+            {
+                return null;
+            }
+        }
+
+        ulong Take(int size)
+        {
+            ulong value = 0;
+            for (int i = 0; i < size; i++) value |= (ulong)Bytes[at++] << (8 * i);
+            return value;
+        }
+
+        // CRC-32 of zlib and PNG, of everything but its own four bytes.
+
+        uint Crc()
+        {
+            uint crc = 0xffffffff;
+            for (int i = 0; i < Length; i++)
+                if (i < 4 || i >= 8) crc = CrcTable[(crc ^ Bytes[i]) & 0xff] ^ (crc >> 8);
+            return ~crc;
+        }
+
+        static uint[] MakeCrcTable()
+        {
+            var table = new uint[256];
+            for (uint i = 0; i < 256; i++)
+            {
+                uint c = i;
+                for (int bit = 0; bit < 8; bit++) c = (c & 1) != 0 ? 0xedb88320 ^ (c >> 1) : c >> 1;
+                table[i] = c;
+            }
+            return table;
+        }
+    }
+}

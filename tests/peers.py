@@ -1,0 +1,70 @@
+"""Peers for the tests of the wire: simulators in threads and processes, relays between them."""
+
+import socket
+import subprocess
+import sys
+import textwrap
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rotorgram.udp import Simulator
+from rotorgram.udp.faults import FaultConfig, Relay
+
+ANY = ("127.0.0.1", 0)
+ENV_ID = "rotorgram/Elevation-v0"
+
+
+class Running:
+    """A simulator in a thread, and how it ended."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.simulator = simulator
+        self.result: str | BaseException | None = None
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.result = self.simulator.run()
+        except Exception as error:
+            self.result = error
+        self.simulator.close()
+
+    def join(self) -> str | BaseException | None:
+        self.thread.join(10)
+        assert not self.thread.is_alive()
+        return self.result
+
+    def cut(self) -> None:
+        """End it without a word to the agent, as if it had been killed."""
+        self.simulator.close()
+        assert isinstance(self.join(), OSError)
+
+
+def launch(code: str, *arguments: object) -> subprocess.Popen[str]:
+    """A Python program in a process of its own."""
+    command = [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@contextmanager
+def plain_socket(bind: tuple[str, int] = ANY) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(bind)
+        sock.settimeout(5)
+        yield sock
+
+
+@contextmanager
+def relaying(server: tuple[str, int], config: FaultConfig) -> Iterator[Relay]:
+    """A relay in a thread, which ends with the block."""
+    with Relay(ANY, server, config) as relay:
+        thread = threading.Thread(target=relay.run)
+        thread.start()
+        try:
+            yield relay
+        finally:
+            relay.stop()
+            thread.join(5)
+    assert not thread.is_alive()

@@ -1,0 +1,276 @@
+"""A third of all datagrams is lost, others come twice, late, cut or changed: the same flight.
+
+Simulators run in processes of their own and speak through `Relay`. Each State and Command counts
+once: every observation, reward, flag and telemetry value is that of the env without a wire.
+"""
+
+import json
+import multiprocessing
+import subprocess
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from hashlib import blake2b
+from math import sqrt
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import rotorgram.envs
+from peers import ANY, ENV_ID, launch, relaying
+from rotorgram.udp import RemoteEnv, RemoteVectorEnv
+from rotorgram.udp.faults import FaultConfig, Relay
+from rotorgram.udp.keys import write_key
+
+BAD = FaultConfig(
+    drop=0.3, duplicate=0.1, reorder=0.2, corrupt=0.05, truncate=0.02, reorder_by=0.0006, seed=1
+)
+OPTIONS = {"control_period": 0.005, "target": (4.0, 6.0)}
+NAMES = rotorgram.envs.TELEMETRY_NAMES
+
+SIMULATE = """
+    import json, select, sys
+    from rotorgram.udp import LinkConfig, Simulator, simulator
+    address, arguments, options, fine = map(json.loads, sys.argv[1:])
+
+    def receive(sock, timeout):
+        if select.select([sock], [], [], timeout)[0]:
+            return sock.recvfrom(65507)
+        raise TimeoutError
+
+    if fine:  # wakes up in time for a resend; the shipped one counts whole milliseconds
+        simulator.receive = receive
+    times = LinkConfig(timeout=20, first_resend=3e-4, min_resend=2e-4, max_resend=3e-4)
+    with Simulator(server=tuple(address), bind=("127.0.0.1", 0), config=times, **arguments,
+                   **options) as simulator:
+        reason = simulator.run()
+        link = simulator.link
+        print(json.dumps([reason, link.sequence, link.statistics.counters]))
+"""
+
+
+@contextmanager
+def simulating(
+    address: tuple[str, int], *, fine: bool = True, **arguments: Any
+) -> Iterator[subprocess.Popen[str]]:
+    words = (address, arguments, OPTIONS, fine)
+    process = launch(SIMULATE, *map(json.dumps, words))
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def its_end(process: subprocess.Popen[str]) -> tuple[int, Counter[str]]:
+    """Number of the simulator's last State, and its counts."""
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 0, err
+    reason, states, counters = json.loads(out)
+    assert reason == "the agent closed"
+    return states, Counter(counters)
+
+
+def assert_bad(relay: Relay, agent: Counter[str], simulator: Counter[str]) -> None:
+    """The faults did happen, and both sides saw them."""
+    got, config = relay.counters, relay.config
+    total = got["received"]
+    for name, share in (
+        ("dropped", config.drop),
+        ("duplicated", (1 - config.drop) * config.duplicate),
+        ("reordered", (1 - config.drop) * config.reorder),
+        ("truncated", (1 - config.drop) * config.truncate),
+        ("corrupted", (1 - config.drop) * config.corrupt),
+    ):
+        spread = 5 * sqrt(total * share * (1 - share)) + 1
+        assert abs(got[name] - total * share) <= spread, (name, got)
+    for counters in (agent, simulator):
+        assert counters["resent"] > 0.1 * counters["sent"]
+        changed = counters["malformed"] + counters["forged"]
+        assert (changed > 0.01 * counters["received"]) is (config.corrupt > 0)
+    assert agent["duplicate"] > 0.1 * agent["sent"]
+    assert simulator["stale"] > 0.01 * simulator["sent"]
+
+
+# ---- one drone
+
+
+def assert_same_flight(remote: gym.Env, steps: int) -> int:
+    """Fly a RemoteEnv and the env itself; the number of States that this takes."""
+    local = gym.make(ENV_ID, **OPTIONS)
+    dice = np.random.default_rng(8)
+
+    def same(here: tuple, there: tuple) -> None:
+        assert here[0].tobytes() == there[0].tobytes()
+        assert here[1:-1] == there[1:-1]
+        assert here[-1] == {name: there[-1][name] for name in NAMES}
+
+    same(remote.reset(seed=1), local.reset(seed=1))
+    states = 2  # its own reset, and ours
+    for _ in range(steps):
+        action = dice.uniform(-1.1, 1.1, 1).astype(np.float32)
+        here, there = remote.step(action), local.step(action)
+        same(here, there)
+        states += 1
+        if here[2] or here[3]:
+            seed = int(dice.integers(2**63)) if states % 2 else None
+            same(remote.reset(seed=seed), local.reset(seed=seed))
+            states += 1
+    assert states > steps + 2
+    return states
+
+
+@pytest.mark.timeout(300)
+def test_one_drone() -> None:
+    with RemoteEnv(ANY, connect=False) as remote:
+        with relaying(remote.address, BAD) as relay, simulating(relay.address) as process:
+            states = assert_same_flight(remote, 20_000)
+            remote.close()
+            last, counters = its_end(process)
+        assert last == states
+        assert_bad(relay, remote.statistics.counters, counters)
+        assert remote.statistics.counters["sessions"] == 1
+
+
+def test_one_drone_by_text() -> None:
+    # A changed text is another text: against that there is UDP's own checksum, and nothing more.
+    lossy = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.2, reorder_by=0.001)
+    with RemoteEnv(ANY, connect=False, options=OPTIONS) as remote:
+        with (
+            relaying(remote.address, lossy) as relay,
+            simulating(relay.address, fine=False, codec="text") as process,
+        ):
+            states = assert_same_flight(remote, 2000)
+            remote.close()
+            last, counters = its_end(process)
+        assert last == states
+        assert_bad(relay, remote.statistics.counters, counters)
+
+
+def test_one_drone_with_a_key(tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    write_key(key)
+    with RemoteEnv(ANY, connect=False, key_file=key) as remote:
+        with (
+            relaying(remote.address, BAD) as relay,
+            simulating(relay.address, fine=False, key_file=str(key)) as process,
+        ):
+            states = assert_same_flight(remote, 2000)
+            remote.close()
+            last, counters = its_end(process)
+        assert last == states
+        assert_bad(relay, remote.statistics.counters, counters)
+        assert min(counters["forged"], remote.statistics.counters["forged"]) > 0
+
+
+# ---- many
+
+
+def actions(drones: int) -> Iterator[np.ndarray]:
+    """float32, shape (drones, 1): the same ones in every process."""
+    dice = np.random.default_rng(9)
+    while True:
+        yield dice.uniform(-1.1, 1.1, (drones, 1)).astype(np.float32)
+
+
+def digest(*arrays: np.ndarray) -> bytes:
+    fingerprint = blake2b(digest_size=16)
+    for array in arrays:
+        fingerprint.update(np.ascontiguousarray(array))
+    return fingerprint.digest()
+
+
+def local_flight(seeds: list[int], steps: int) -> list[bytes]:
+    """Digests of each step of so many envs, stepped and reset by hand."""
+    envs = [gym.make(ENV_ID, disable_env_checker=True, **OPTIONS).unwrapped for _ in seeds]
+    dice = actions(len(envs))
+    rows: list[Any] = [
+        (observation, 0.0, False, False, info)
+        for observation, info in (env.reset(seed=s) for env, s in zip(envs, seeds, strict=True))
+    ]
+    digests = []
+    for _ in range(steps):
+        digests.append(digest_of(rows))
+        for i, action in enumerate(next(dice)):
+            if rows[i][2] or rows[i][3]:
+                observation, info = envs[i].reset()
+                rows[i] = (observation, 0.0, False, False, info)
+            else:
+                rows[i] = envs[i].step(action)
+    return [*digests, digest_of(rows)]
+
+
+def digest_of(rows: list[Any]) -> bytes:
+    observations, rewards, terminated, truncated, infos = zip(*rows, strict=True)
+    telemetry = np.array([[info[name] for name in NAMES] for info in infos])
+    return digest(
+        np.array(observations), np.array(rewards), np.array(terminated), np.array(truncated),
+        telemetry,
+    )  # fmt: skip
+
+
+def remote_flight(env: RemoteVectorEnv, seeds: list[int], steps: int) -> list[bytes]:
+    """The same of a RemoteVectorEnv."""
+    dice = actions(env.num_envs)
+    observations, info = env.reset(seed=seeds)
+    none = np.zeros(env.num_envs)
+    flags = np.zeros(env.num_envs, bool)
+    telemetry = np.column_stack([info[name] for name in NAMES])
+    digests = [digest(observations, none, flags, flags, telemetry)]
+    for _ in range(steps):
+        *arrays, info = env.step(next(dice))
+        digests.append(digest(*arrays, np.column_stack([info[name] for name in NAMES])))
+    return digests
+
+
+def assert_same_digests(remote: list[bytes], local: list[bytes]) -> None:
+    differing = [step for step, (a, b) in enumerate(zip(remote, local, strict=True)) if a != b]
+    assert not differing, f"{len(differing)} steps differ, the first is {differing[0]}"
+
+
+@contextmanager
+def flying_locally(seeds: list[int], steps: int) -> Iterator[Any]:
+    """`local_flight` in another process at the same time."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        yield pool.submit(local_flight, seeds, steps)
+
+
+@pytest.mark.timeout(300)
+def test_64_drones() -> None:
+    steps, seeds = 20_000, list(range(1000, 1064))
+    env = RemoteVectorEnv(ANY, num_envs=64, connect=False)
+    with (
+        flying_locally(seeds, steps) as local,
+        relaying(env.address, BAD) as relay,
+        simulating(relay.address, num_envs=64) as process,
+    ):
+        remote = remote_flight(env, seeds, steps)
+        env.close()
+        last, counters = its_end(process)
+        assert_same_digests(remote, local.result())
+    assert last == steps + 2
+    assert_bad(relay, env.statistics.counters, counters)
+    assert env.statistics.counters["sessions"] == 1
+
+
+def test_three_simulators_of_two_drones() -> None:
+    steps, seeds = 1000, list(range(2000, 2006))
+    env = RemoteVectorEnv(ANY, num_simulators=3, num_envs=6, connect=False)
+    with (
+        flying_locally(seeds, steps) as local,
+        relaying(env.address, BAD) as relay,
+        simulating(relay.address, num_envs=2) as one,
+        simulating(relay.address, num_envs=2) as two,
+        simulating(relay.address, num_envs=2) as three,
+    ):
+        remote = remote_flight(env, seeds, steps)
+        env.close()
+        ends = [its_end(process) for process in (one, two, three)]
+        assert_same_digests(remote, local.result())
+    assert [last for last, _ in ends] == [steps + 2] * 3
+    assert_bad(relay, env.statistics.counters, sum((counters for _, counters in ends), Counter()))
+    assert env.statistics.counters["sessions"] == 3

@@ -1,0 +1,915 @@
+"""The journal: what is in it, that it can be repeated, and that no end of a program spoils it."""
+
+import gc
+import io
+import json
+import logging
+import os
+import re
+import signal
+import struct
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from hashlib import blake2b
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rotorgram.envs  # noqa: F401
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rotorgram.models import QUAD_XML, SCENE_XML
+from rotorgram.udp import (
+    LinkConfig,
+    PeerClosed,
+    PeerSilent,
+    Refused,
+    RemoteEnv,
+    RemoteVectorEnv,
+    Simulator,
+    binary,
+)
+from rotorgram.udp import journal as journal_module
+from rotorgram.udp._mcap import McapFile
+from rotorgram.udp._schemas import field_names
+from rotorgram.udp.faults import FaultConfig, Relay
+from rotorgram.udp.journal import Journal
+from rotorgram.udp.keys import write_key
+from rotorgram.udp.messages import Close, Command, Hello, Message, State, Welcome
+from rotorgram.udp.replay import read_journal, summarize, verify
+from rotorgram.udp.statistics import Statistics
+
+ANY = ("127.0.0.1", 0)
+ENV_ID = "rotorgram/Elevation-v0"
+PAGE = Path(__file__).parent.parent / "docs" / "journal.md"
+QUICK = LinkConfig(timeout=5)
+TIMES: dict[str, Any] = {"timeout": 5, "connect_timeout": 5}
+
+
+class Running:
+    """A simulator in a thread, and how it ended."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.simulator = simulator
+        self.result: str | BaseException | None = None
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.result = self.simulator.run()
+        except Exception as error:
+            self.result = error
+        self.simulator.close()
+
+    def join(self) -> str | BaseException | None:
+        self.thread.join(20)
+        assert not self.thread.is_alive()
+        return self.result
+
+
+def fly(remote: Any, steps: int, seed: int | None = 7) -> SimpleNamespace:
+    """Fly at random; steps, episodes and returns as the agent sees them."""
+    remote.action_space.seed(steps)
+    drones = getattr(remote, "num_envs", 1)
+    remote.reset(seed=seed)
+    flown, episodes, total, running = 0, 0, 0.0, np.zeros(drones)
+    ended = np.zeros(drones, bool)
+    for _ in range(steps):
+        _, reward, terminated, truncated, _ = remote.step(remote.action_space.sample())
+        running = np.where(ended, 0.0, running + reward)
+        flown += int((~ended).sum())
+        ended = np.atleast_1d(terminated) | np.atleast_1d(truncated)
+        episodes += int(ended.sum())
+        total += float(running[ended].sum())
+        if drones == 1 and ended[0]:
+            remote.reset()
+            running, ended = np.zeros(1), np.zeros(1, bool)
+    return SimpleNamespace(steps=flown, episodes=episodes, returns=total)
+
+
+@contextmanager
+def pair(
+    folder: Path, codec: Any = "binary", drones: int = 1, key: bool = False, **options: Any
+) -> Iterator[SimpleNamespace]:
+    """An agent and a simulator in a thread that both keep a journal."""
+    files = {side: folder / f"{side}.mcap" for side in ("agent", "simulator")}
+    key_file = folder / "key" if key else None
+    if key_file:
+        write_key(key_file)
+    known = options if codec == "text" else None
+    common: dict[str, Any] = {"options": known, "connect": False, "key_file": key_file, **TIMES}
+    remote: Any
+    if drones == 1:
+        remote = RemoteEnv(ANY, record=files["agent"], **common)
+    else:
+        remote = RemoteVectorEnv(ANY, num_envs=drones, record=files["agent"], **common)
+    simulator = Simulator(
+        server=remote.address, bind=ANY, num_envs=drones, codec=codec, config=QUICK,
+        key_file=key_file, record=files["simulator"], **options,
+    )  # fmt: skip
+    running = Running(simulator)
+    try:
+        yield SimpleNamespace(remote=remote, **files)
+    finally:
+        remote.close()
+        running.join()
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """The files of a flight of 3 drones, 600 steps, and what it came to."""
+    with pair(tmp_path_factory.mktemp("flight"), drones=3) as both:
+        seen = fly(both.remote, 600)
+    return SimpleNamespace(agent=both.agent, simulator=both.simulator, seen=seen)
+
+
+def datagrams(path: Path, *kinds: type) -> list[bytes]:
+    """Those of States and Commands, or of the messages asked for, in order."""
+    wanted = kinds or (State, Command)
+    return [item.datagram for item in read_journal(path) if isinstance(item.message, wanted)]
+
+
+def rewrite(source: Path, target: Path, change: Callable[[Message], Message]) -> None:
+    """Write a journal again, by other means, with changed messages."""
+    with source.open("rb") as old, target.open("wb") as new:
+        reader, writer = make_reader(old), Writer(new)
+        writer.start()
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            assert schema is not None
+            if channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number
+                )
+            data = message.data
+            if channel.topic.endswith("events"):
+                words = json.loads(data)
+                changed = change(binary.decode(bytes.fromhex(words["datagram"])))
+                data = json.dumps(words | {"datagram": binary.encode(changed).hex()}).encode()
+            elif channel.message_encoding == "ros1":
+                data = binary.encode(change(binary.decode(data)))
+            writer.add_message(channels[channel.id], message.log_time, data, message.publish_time)
+        writer.finish()
+
+
+def flip(array: np.ndarray, *index: int) -> np.ndarray:
+    """A copy with the last bit of one number flipped."""
+    copy = array.copy()
+    kind = {1: np.uint8, 4: np.uint32, 8: np.uint64}[copy.itemsize]
+    copy.view(kind)[index] ^= 1
+    return copy
+
+
+# ---- repeating
+
+
+@pytest.mark.parametrize(
+    ("arrangement", "options"),
+    [
+        ({}, {}),
+        ({"codec": "text"}, {"target": (4.0, 6.0), "episode_length": 40}),
+        ({"drones": 3, "key": True}, {"action_type": "discrete", "observation": "error"}),
+    ],
+)
+def test_both_sides_can_be_repeated_bit_for_bit(
+    arrangement: dict[str, Any], options: dict[str, Any], tmp_path: Path
+) -> None:
+    with pair(tmp_path, **arrangement, **options) as both:
+        seen = fly(both.remote, 500)
+    assert seen.episodes > 1
+    for side in ("agent", "simulator"):
+        path = getattr(both, side)
+        summary, verdict = summarize(path), verify(path)
+        assert (summary.side, summary.complete, summary.ending) == (side, True, "complete")
+        assert (summary.steps, summary.episodes) == (seen.steps, seen.episodes)
+        assert summary.mean_return == pytest.approx(seen.returns / seen.episodes, rel=1e-12)
+        (session,) = summary.sessions
+        assert session.flight.hello.num_drones == arrangement.get("drones", 1)
+        assert session.flight.codec == arrangement.get("codec", "binary")
+        assert session.ending.startswith("closed: the ")
+        assert 0 < session.seconds < 60
+        (compared,) = verdict.sessions
+        blind = int(side == "agent" and session.flight.codec == "text")
+        assert (compared.same, compared.unchecked) == (session.states - blind, blind)
+        assert compared.notes == verdict.notes == []
+        assert verdict.identical
+        assert str(verdict).endswith(f"identical: {compared.same} States in 1 session")
+    assert datagrams(both.agent, State)[1][24:] == datagrams(both.simulator, State)[1][24:]
+
+
+def test_both_sides_write_the_same_datagrams(flight: SimpleNamespace) -> None:
+    everything = State, Command, Hello, Welcome
+    ours, theirs = datagrams(flight.agent, *everything), datagrams(flight.simulator, *everything)
+    assert ours == theirs
+    assert len(ours) == 2 * 602 + 1  # Hello, Welcome, State 1 and its reset; the last has no answer
+
+
+def test_a_flight_of_another_env_can_be_repeated(tmp_path: Path) -> None:
+    path = tmp_path / "pole.mcap"
+    remote = RemoteEnv(ANY, env_id="CartPole-v1", connect=False, **TIMES)
+    simulator = Simulator("CartPole-v1", server=remote.address, bind=ANY, config=QUICK,
+                          record=path, sutton_barto_reward=True)  # fmt: skip
+    running = Running(simulator)
+    with remote:
+        fly(remote, 60)
+    running.join()
+    assert verify(path).identical  # with the option, of which its Hello says nothing
+    assert read_journal(path).attachments == {}
+
+
+def test_a_flight_that_never_began(tmp_path: Path) -> None:
+    path = tmp_path / "alone.mcap"
+    config = LinkConfig(timeout=0.1)
+    with Simulator(server=("127.0.0.1", 9), bind=ANY, record=path, config=config) as simulator:
+        with pytest.raises(PeerSilent):
+            simulator.run()
+        (session,) = summarize(path).sessions  # finished by the end of `run`
+    assert (session.ending, session.steps) == ("not closed", 0)
+    assert str(verify(path)).endswith("nothing to compare")
+    assert not verify(path).identical
+
+
+def test_a_refused_simulator(tmp_path: Path) -> None:
+    path = tmp_path / "refused.mcap"
+    with RemoteEnv(ANY, connect=False, timeout=5, connect_timeout=1) as remote:
+        simulator = Simulator("CartPole-v1", server=remote.address, bind=ANY, record=path)
+        running = Running(simulator)
+        with pytest.raises(PeerSilent):
+            remote.connect()
+        assert isinstance(running.join(), Refused)
+    (session,) = summarize(path).sessions
+    assert session.ending == f"refused: expected a simulator of {ENV_ID}, got one of CartPole-v1"
+
+
+CHANGES = {
+    "reward": lambda s: replace(s, rewards=flip(s.rewards, 2)),
+    "telemetry theta": lambda s: replace(s, telemetry=flip(s.telemetry, 2, 4)),
+    "observation 1": lambda s: replace(s, observations=flip(s.observations, 2, 1)),
+    "terminated": lambda s: replace(s, terminated=flip(s.terminated, 2)),
+    "truncated": lambda s: replace(s, truncated=flip(s.truncated, 2)),
+}
+
+
+@pytest.mark.parametrize("field", CHANGES)
+def test_one_flipped_bit_is_found(field: str, flight: SimpleNamespace, tmp_path: Path) -> None:
+    path = tmp_path / "flipped.mcap"
+
+    def change(message: Message) -> Message:
+        chosen = isinstance(message, State) and message.sequence == 123
+        return CHANGES[field](message) if chosen else message
+
+    rewrite(flight.simulator, path, lambda message: message)
+    assert verify(path).identical
+    rewrite(flight.simulator, path, change)
+    verdict = verify(path)
+    assert not verdict.identical
+    (session,) = verdict.sessions
+    found = session.difference
+    assert found is not None
+    assert (found.sequence, found.drone, found.field) == (123, 2, field)
+    assert (session.differing, session.same) == (1, 601)
+    assert found.recorded != found.replayed
+    if field == "reward":
+        was, now = (float.fromhex(text.split()[0]) for text in (found.recorded, found.replayed))
+        assert abs(was - now) == pytest.approx(np.spacing(now), rel=0.5)
+        assert f"State 123, drone 2, reward: recorded {found.recorded}" in str(verdict)
+
+
+def test_other_options_and_another_model_are_noticed(
+    flight: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def other(**values: str) -> Path:
+        path = tmp_path / "other.mcap"
+        rewrite(flight.simulator, path,
+                lambda m: replace(m, **values) if isinstance(m, Hello) else m)  # fmt: skip
+        return path
+
+    options = next(iter(read_journal(flight.simulator))).flight.hello.options
+    verdict = verify(other(options=options.replace('"linear_drag":0.0', '"linear_drag":0.5')))
+    found = verdict.sessions[0].difference
+    assert found is not None
+    assert found.sequence == 3  # the resets are at rest; drag slows what moves
+    assert re.match("the model was [0-9a-f]{32}, and is", verdict.sessions[0].notes[0])
+    verdict = verify(other(model_hash="1" * 32))
+    assert verdict.identical
+    assert verdict.sessions[0].notes[0].startswith(f"the model was {'1' * 32}, and is ")
+    verdict = verify(other(options=options.replace('"full"', '"error"')))
+    assert "State 1 cannot be repeated: expected (observations, " in verdict.sessions[0].problem
+    verdict = verify(other(env_id="rotorgram/No-v0"))
+    assert "expected a registered id, got 'rotorgram/No-v0'" in verdict.sessions[0].problem
+    assert str(verdict).endswith("not identical")
+    monkeypatch.setattr("rotorgram.udp.replay.software", lambda: {"mujoco": "9.9"})
+    assert re.match(
+        "recorded with mujoco [0-9.]+, repeated with 9.9", verify(flight.simulator).notes[0]
+    )
+    assert verify(flight.agent).notes == []  # those of the agent have no part in the numbers
+
+
+def test_a_missing_command_is_noticed(flight: SimpleNamespace, tmp_path: Path) -> None:
+    path = tmp_path / "gap.mcap"
+
+    def change(message: Message) -> Message:
+        if isinstance(message, Command) and message.sequence == 50:
+            return replace(message, sequence=51)
+        return message
+
+    rewrite(flight.agent, path, change)
+    (session,) = verify(path).sessions
+    assert session.same == 50
+    assert session.problem == "State 51 cannot be repeated: expected Command 50 before it, got 51"
+
+
+# ---- sessions
+
+
+def test_simulators_that_come_and_go(tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    remote = RemoteEnv(ANY, connect=False, record=path, **TIMES)
+    own = []
+    for number in range(3):
+        own.append(tmp_path / f"{number}.mcap")
+        simulator = Simulator(server=remote.address, bind=ANY, config=QUICK, record=own[-1])
+        running = Running(simulator)
+        fly(remote, 30, seed=number)
+        simulator.link.close("enough", time.monotonic())
+        with pytest.raises(PeerClosed):
+            fly(remote, 1)
+        running.join()
+    remote.close()
+    summary = summarize(path)
+    assert [s.steps for s in summary.sessions] == [30, 30, 30]
+    assert len({s.flight.hello.session for s in summary.sessions}) == 3
+    assert all(s.ending.startswith("closed") for s in summary.sessions)
+    assert verify(path).identical
+    assert all(verify(file).identical for file in own)
+
+
+def test_text_simulators_one_after_another_are_sessions_of_their_own(tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    with RemoteEnv(ANY, connect=False, record=path, timeout=0.3, connect_timeout=1) as remote:
+        for seed in (1, 2):
+            simulator = Simulator(server=remote.address, bind=ANY, codec="text", config=QUICK)
+            running = Running(simulator)
+            fly(remote, 20, seed=seed)
+            simulator._socket.close()  # gone without a word
+            running.join()
+            if seed == 1:
+                with pytest.raises(PeerSilent):
+                    remote.reset()
+    summary = summarize(path)
+    assert len(summary.sessions) == 2
+    assert [s.flight.codec for s in summary.sessions] == ["text", "text"]
+    assert verify(path).identical
+
+
+def test_several_simulators_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=4, connect=False, record=path, **TIMES)
+    running = [
+        Running(Simulator(server=remote.address, bind=ANY, num_envs=2, config=QUICK))
+        for _ in range(2)
+    ]
+    seen = fly(remote, 300)
+    remote.close()
+    for one in running:
+        one.join()
+    summary = summarize(path)
+    assert [s.flight.place for s in summary.sessions] == [0, 1]
+    assert (summary.steps, summary.episodes) == (seen.steps, seen.episodes)
+    assert verify(path).identical
+    with path.open("rb") as file:
+        topics = {c.topic for c in make_reader(file).get_summary().channels.values()}
+    assert topics == {
+        "/statistics",
+        *(f"/place{p}/{name}" for p in (0, 1) for name in ("state", "command", "events")),
+    }
+
+
+def test_an_agent_that_was_started_anew(tmp_path: Path) -> None:
+    path = tmp_path / "simulator.mcap"
+    first = RemoteEnv(ANY, connect=False, **TIMES)
+    address = first.address
+    running = Running(Simulator(server=address, bind=ANY, config=QUICK, record=path))
+    fly(first, 20)
+    first._server.close.detach()  # as if it were killed
+    first._server._port.close()
+    with RemoteEnv(address, connect=False, **TIMES) as second:
+        fly(second, 20)
+    running.join()
+    summary = summarize(path)
+    assert [s.ending for s in summary.sessions] == [
+        "the agent was started anew",
+        "closed: the agent closed",
+    ]
+    assert [s.steps for s in summary.sessions] == [20, 20]
+    assert verify(path).identical
+
+
+def test_loss_and_repetition_do_not_enter(tmp_path: Path) -> None:
+    ours, theirs = tmp_path / "agent.mcap", tmp_path / "simulator.mcap"
+    faults = FaultConfig(drop=0.1, duplicate=0.1, reorder=0.1, corrupt=0.05, seed=3)
+    remote = RemoteEnv(ANY, connect=False, record=ours, **TIMES)
+    with Relay(ANY, remote.address, faults) as relay:
+        thread = threading.Thread(target=relay.run)
+        thread.start()
+        config = LinkConfig(timeout=5, first_resend=0.01)
+        running = Running(Simulator(server=relay.address, bind=ANY, config=config, record=theirs))
+        fly(remote, 200)
+        remote.close()
+        running.join()
+        relay.stop()
+        thread.join()
+    assert relay.counters["dropped"] > 10
+    assert datagrams(ours)[:-1] == datagrams(theirs)[: len(datagrams(ours)) - 1]
+    numbers = [binary.peek(datagram)[::2] for datagram in datagrams(theirs)]
+    assert numbers[:-1] == [(kind, n) for n in range(1, len(numbers) // 2 + 1) for kind in (4, 5)]
+    assert verify(ours).identical
+    assert verify(theirs).identical
+
+
+# ---- the file
+
+
+def test_it_is_valid_mcap_with_checksums_and_summary(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_module, "_CHUNK", 5000)
+    with pair(tmp_path) as both:
+        fly(both.remote, 300)
+    for path in (both.agent, both.simulator):
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            summary = reader.get_summary()
+            messages = [(c.topic, m) for _, c, m in reader.iter_messages()]
+            some = [c.topic for _, c, _ in reader.iter_messages(topics=["/place0/command"])]
+            assert reader.get_header().library == "rotorgram 0.1.0"
+        assert summary is not None
+        counts = summary.statistics
+        assert counts.message_count == len(messages)
+        assert counts.chunk_count == len(summary.chunk_indexes) > 10
+        assert len(some) == sum(topic == "/place0/command" for topic, _ in messages) > 300
+        assert counts.message_start_time == min(m.log_time for _, m in messages)
+        assert counts.message_end_time == max(m.log_time for _, m in messages)
+        times = [m.log_time for topic, m in messages]
+        assert abs(times[-1] - time.time_ns()) < 60e9
+        states = [m for topic, m in messages if topic == "/place0/state"]
+        assert [m.sequence for m in states] == list(range(1, len(states) + 1))
+        assert crc_of_the_summary(path)
+        indexed = set()
+        for index in summary.chunk_indexes:
+            indexed |= set(index.message_index_offsets)
+            assert index.message_index_length > 0
+        assert indexed == set(summary.channels)
+
+
+def crc_of_the_summary(path: Path) -> bool:
+    """The mcap package writes that sum but does not check it."""
+    import zlib
+
+    data = path.read_bytes()
+    opcode, size, start, offsets, crc = struct.unpack("<BQQQI", data[-37:-8])
+    assert (opcode, size) == (2, 20)
+    assert 0 < start < offsets < len(data)
+    return crc == zlib.crc32(data[start:-12])
+
+
+def test_message_indexes_point_at_the_messages(flight: SimpleNamespace) -> None:
+    from mcap.records import Chunk, MessageIndex
+    from mcap.stream_reader import StreamReader, get_chunk_data_stream
+
+    checked = 0
+    with flight.agent.open("rb") as file:
+        raw = b""
+        for record in StreamReader(file, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                stream, size = get_chunk_data_stream(record, validate_crc=True)
+                raw = stream.read(size)
+            elif isinstance(record, MessageIndex):
+                for when, offset in record.records:
+                    opcode, _, channel, _, log_time = struct.unpack_from("<BQHIQ", raw, offset)
+                    assert (opcode, channel, log_time) == (5, record.channel_id, when)
+                    checked += 1
+    assert checked == sum(1 for _ in read_journal(flight.agent)) + 1  # and the statistics
+
+
+def test_states_and_commands_are_ros_messages(flight: SimpleNamespace) -> None:
+    with flight.simulator.open("rb") as file:
+        messages = list(make_reader(file).iter_messages())
+    stores: dict[int, Any] = {}
+    seen = 0
+    for schema, channel, message in messages:
+        assert schema is not None
+        if channel.message_encoding != "ros1":
+            json.loads(message.data)
+            continue
+        assert schema.encoding == "ros1msg"
+        if schema.id not in stores:
+            stores[schema.id] = get_typestore(Stores.EMPTY)
+            name = schema.name.replace("/", "/msg/")
+            types = get_types_from_msg(schema.data.decode(), name)
+            stores[schema.id].register(types)
+        name = schema.name.replace("/", "/msg/")
+        ros, true = (
+            stores[schema.id].deserialize_ros1(message.data, name),
+            binary.decode(message.data),
+        )
+        assert (bytes(ros.magic), ros.version) == (binary.MAGIC, binary.VERSION)
+        assert (ros.session, ros.sequence) == (true.session, true.sequence)
+        if isinstance(true, State):
+            assert (ros.drones, ros.observation_size, ros.telemetry_size) == (3, 3, 10)
+            assert ros.rewards.tolist() == true.rewards.tolist()
+            assert ros.observations.tolist() == true.observations.ravel().tolist()
+            rows = [[getattr(t, n) for n in ("X", "Y", "F4")] for t in ros.telemetry]
+            assert rows == true.telemetry[:, [0, 1, 9]].tolist()
+            assert ros.terminated.tolist() == true.terminated.tolist()
+            assert ros.truncated.tolist() == true.truncated.tolist()
+        else:
+            assert isinstance(true, Command)
+            seeds = [] if true.seeds is None else true.seeds.tolist()
+            assert ros.seeds.tolist() == seeds
+            assert ros.actions.tolist() == true.actions.ravel().tolist()
+            assert ros.resets.tolist() == true.resets.tolist()
+        assert stores[schema.id].serialize_ros1(ros, name) == message.data
+        seen += 1
+    assert seen == 2 * 602 - 1
+
+
+def test_names_that_ros_does_not_allow() -> None:
+    names = ("X", "x y", "x-y", "1st", "_a", "θ", "X")
+    assert field_names(names) == ["X", "x_y", "x_y_", "t1st", "t_a", "t_", "X_"]
+
+
+def test_what_else_is_in_it(flight: SimpleNamespace) -> None:
+    ours, theirs = read_journal(flight.agent), read_journal(flight.simulator)
+    assert ours.attachments == {f.name: f.read_bytes() for f in (QUAD_XML, SCENE_XML)}
+    hello = next(iter(theirs)).flight.hello
+    (model,) = theirs.attachments.values()
+    tag = blake2b(model + b"\0" + struct.pack("<d", 0.0), digest_size=16).hexdigest()
+    assert tag == hello.model_hash
+    assert ours.about["side"] == "agent"
+    assert theirs.about["version of mujoco"][0].isdigit()
+    with flight.agent.open("rb") as file:
+        reader = make_reader(file)
+        sessions = [m.metadata for m in reader.iter_metadata() if m.name == "session"]
+        counts = [json.loads(m.data) for _, _, m in reader.iter_messages(topics="/statistics")]
+    assert [s["drones"] for s in sessions] == ["3"]
+    assert sessions[0]["session"] == f"{hello.session:016x}"
+    assert json.loads(sessions[0]["options"])["control_period"] == 0.02
+    assert [c["sessions"] for c in counts] == [1]
+    assert counts[0]["sent"] >= 602
+
+
+def test_statistics_every_ten_seconds_and_a_clock_that_is_set_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [10**18]
+    monkeypatch.setattr(time, "time_ns", lambda: now[0])
+    path = tmp_path / "j.mcap"
+    sizes = []
+    journal = Journal(path, about={}, attachments={})
+    journal.start(Statistics())
+    close = Close(session=1, sequence=1, reason="x" * 500)
+    hello = Simulator(bind=ANY, config=QUICK)
+    with hello:
+        journal.tap(0, hello.link.hello, binary.encode(hello.link.hello))
+    session = hello.link.hello.session
+    close = replace(close, session=session)
+    for _ in range(50):
+        now[0] += 5 * 10**8
+        journal.tap(0, close, binary.encode(close))
+        sizes.append(path.stat().st_size)
+    now[0] -= 3600 * 10**9
+    journal.tap(0, close, binary.encode(close))
+    assert path.stat().st_size > sizes[-1]  # written at once
+    journal.close()
+    journal.close()
+    journal.tap(0, close, binary.encode(close))
+    assert sum(b > a for a, b in pairwise(sizes)) in (24, 25)
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        assert len(list(reader.iter_messages(topics="/statistics"))) == 4
+        assert len(list(reader.iter_messages(topics="/place0/events"))) == 52
+
+
+def test_a_file_that_is_there_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "old.mcap"
+    path.write_bytes(b"precious")
+    sentence = "record: expected a file that does not exist yet, got "
+    with pytest.raises(FileExistsError, match=sentence):
+        Simulator(bind=ANY, record=path)
+    with pytest.raises(FileExistsError, match=sentence):
+        RemoteEnv(ANY, connect=False, record=path)
+    assert path.read_bytes() == b"precious"
+    with pytest.raises(FileNotFoundError):
+        RemoteEnv(ANY, connect=False, record=tmp_path / "no" / "where.mcap")
+    gc.collect()
+
+
+def test_what_is_no_journal(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(b"not at all an mcap file")
+    with pytest.raises(ValueError, match="expected an MCAP file, got another"):
+        summarize(path)
+    buffer = io.BytesIO()
+    writer = Writer(buffer)
+    writer.start()
+    writer.finish()
+    path.write_bytes(buffer.getvalue())
+    with pytest.raises(ValueError, match="expected a journal of format 1, got another MCAP file"):
+        verify(path)
+    with pytest.raises(FileNotFoundError):
+        verify(tmp_path / "none")
+
+
+# ---- ends that nobody wished for
+
+
+def test_a_file_that_was_cut_is_read_up_to_the_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_module, "_CHUNK", 10_000)
+    with pair(tmp_path) as both:
+        fly(both.remote, 500)
+    for path in (both.agent, both.simulator):
+        whole, data = datagrams(path, object), path.read_bytes()
+        cut = tmp_path / "cut.mcap"
+        sizes = []
+        for tenth in range(10):
+            for size in (len(data) * tenth // 10, len(data) * tenth // 10 + 3):
+                cut.write_bytes(data[:size])
+                part = datagrams(cut, object)
+                assert part == whole[: len(part)]
+                summary, verdict = summarize(cut), verify(cut)
+                assert not summary.complete
+                assert summary.ending.startswith("cut off")
+                assert all(session.identical for session in verdict.sessions)
+                assert verdict.identical == bool(part)
+                sizes.append(len(part))
+        assert sizes == sorted(sizes)
+        assert sizes[-1] > 0.8 * len(whole)
+        cut.write_bytes(data[:-1])  # no message is missing, and yet it is not complete
+        assert datagrams(cut, object) == whole
+        assert not summarize(cut).complete
+
+
+def test_a_damaged_file_is_read_up_to_the_damage(flight: SimpleNamespace, tmp_path: Path) -> None:
+    data = bytearray(flight.simulator.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(data)
+    summary = summarize(path)
+    assert not summary.complete
+    assert summary.ending.startswith("damaged (")
+    assert all(session.identical for session in verify(path).sessions)
+
+
+RECORD = """
+    import sys, time, numpy as np
+    from rotorgram.udp import RemoteEnv
+    remote = RemoteEnv(("127.0.0.1", int(sys.argv[1])), record=sys.argv[2], connect=False)
+    print(remote.address[1], flush=True)
+    remote.reset(seed=1)
+    for step in range(int(sys.argv[3])):
+        if any(remote.step(np.zeros(1, np.float32))[2:4]):
+            remote.reset()
+        if step % 50 == 0:
+            print("step", time.time_ns(), flush=True)
+"""
+
+
+def launch(code: str, *arguments: object) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_sigkill_costs_at_most_a_second(tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    process = launch(RECORD, 0, path, 10**9)
+    assert process.stdout is not None
+    port = int(process.stdout.readline())
+    simulator = Simulator(
+        server=("127.0.0.1", port), bind=ANY, config=LinkConfig(timeout=1), record=None
+    )
+    running = Running(simulator)
+    start = time.monotonic()
+    last = ""
+    while time.monotonic() - start < 2.5:
+        last = process.stdout.readline()
+    process.kill()
+    process.communicate()
+    assert isinstance(running.join(), PeerSilent)
+    items = list(read_journal(path))
+    lost = int(last.split()[1]) - items[-1].time
+    assert lost < 1.1e9
+    assert len(items) > 1000
+    verdict = verify(path)
+    assert verdict.identical
+    assert not verdict.complete
+    assert "note: the file is cut off" in str(verdict)
+
+
+@pytest.mark.parametrize("goodbye", ["", "import os; os.kill(os.getpid(), 2)", "1 / 0"])
+def test_the_end_of_the_program_finishes_the_file(goodbye: str, tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    process = launch(textwrap.dedent(RECORD) + goodbye + "\n", 0, path, 100)
+    assert process.stdout is not None
+    port = int(process.stdout.readline())
+    running = Running(Simulator(server=("127.0.0.1", port), bind=ANY, config=QUICK))
+    _, errors = process.communicate(timeout=30)
+    assert bool(errors) == bool(goodbye)
+    assert running.join() == "the agent closed"
+    summary = summarize(path)
+    assert (summary.complete, summary.steps) == (True, 100)
+
+
+def test_garbage_finishes_the_file(tmp_path: Path) -> None:
+    ours, theirs = tmp_path / "agent.mcap", tmp_path / "simulator.mcap"
+    remote = RemoteEnv(ANY, connect=False, record=ours, **TIMES)
+    running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK, record=theirs))
+    fly(remote, 10)
+    del remote
+    gc.collect()
+    assert running.join() == "the agent closed"
+    assert summarize(ours).complete
+    assert summarize(theirs).complete
+    journal = Journal(tmp_path / "j", about={"side": "x"}, attachments={})
+    journal.start(Statistics())
+    del journal
+    assert read_journal(tmp_path / "j").complete
+
+
+def test_a_full_device_ends_the_record_and_not_the_flight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(journal_module, "_CHUNK", 10_000)
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with caplog.at_level(logging.WARNING, "rotorgram.udp"), pair(tmp_path) as both:
+        both.remote.reset(seed=1)
+        fly(both.remote, 100)
+        room = 8192 + max(p.stat().st_size for p in (both.agent, both.simulator))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
+        try:
+            seen = fly(both.remote, 400)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert seen.steps == 400
+    warnings = [record.getMessage() for record in caplog.records]
+    assert len(warnings) == 2  # one for each file
+    for warning in warnings:
+        assert re.fullmatch(
+            r"record: writing .*\.mcap failed \(File too large\): the flight goes on, its journal "
+            "ends here",
+            warning,
+        )
+    for path in (both.agent, both.simulator):
+        assert path.stat().st_size <= room
+        assert not summarize(path).complete
+        assert summarize(path).steps > 100
+        assert verify(path).identical
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
+def test_a_device_that_is_full_from_the_beginning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "full.mcap"
+    opened = Path.open
+
+    def full(self: Path, *arguments: Any, **words: Any) -> Any:
+        file = opened(self, *arguments, **words)
+        if self != path:
+            return file
+        file.close()
+        return open("/dev/full", "wb", buffering=0)
+
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(OSError, match="No space left on device"):
+        RemoteEnv(ANY, connect=False, record=path)
+    assert not path.exists()
+
+
+class Interrupted(McapFile):
+    """Ctrl-C comes in the midst of each write, the first time."""
+
+    def __init__(self, *arguments: Any) -> None:
+        self.interrupted = True
+        super().__init__(*arguments)
+        self.interrupted = False
+
+    def _put(self, data: bytes) -> None:
+        self.interrupted = not self.interrupted
+        if self.interrupted:
+            super()._put(data[: len(data) * 2 // 3] + b"garbage" * 100)
+            raise KeyboardInterrupt
+        super()._put(data)
+
+
+def test_an_interrupted_write_is_undone_by_the_next(tmp_path: Path) -> None:
+    def insist(action: Callable[..., Any], *arguments: Any) -> Any:
+        while True:
+            with suppress(KeyboardInterrupt):
+                return action(*arguments)
+
+    file = Interrupted(tmp_path / "i.mcap", "test")
+    schema = insist(file.add_schema, "s", "jsonschema", "{}")
+    channel = insist(file.add_channel, "/t", "json", schema)
+    insist(file.add_metadata, "name", {"a": "b"})
+    for number in range(100):
+        file.pending.append((channel, number, number, b"%d" % number))
+        if number % 7 == 0:
+            insist(file.flush)
+    insist(file.add_attachment, "a", "b", b"c", 5)
+    insist(file.finish)
+    with (tmp_path / "i.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert [m.data for _, _, m in reader.iter_messages()] == [b"%d" % n for n in range(100)]
+        assert [a.data for a in reader.iter_attachments()] == [b"c"]
+        assert [m.metadata for m in reader.iter_metadata()] == [{"a": "b"}]
+    assert crc_of_the_summary(tmp_path / "i.mcap")
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no interval timer here")
+def test_interrupts_at_any_moment(
+    tmp_path: Path, flight: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_module, "_CHUNK", 10_000)
+    items = list(read_journal(flight.agent))
+    hello, state = items[0], next(i for i in items if isinstance(i.message, State)).message
+    journal = Journal(tmp_path / "j", about={"side": "agent"}, attachments={})
+    journal.start(Statistics())
+    journal.tap(0, hello.message, hello.datagram)
+    armed, returned, interrupts = False, [], 0
+
+    def interrupt(*_: Any) -> None:
+        if armed:
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, 1e-4, 1e-4)
+    try:
+        for number in range(1, 20_001):
+            message = replace(state, sequence=number)
+            datagram = binary.encode(message)
+            try:
+                armed = True
+                journal.tap(0, message, datagram)
+                armed = False
+                returned.append(number)
+            except KeyboardInterrupt:
+                armed = False
+                interrupts += 1
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    journal.close()
+    with (tmp_path / "j").open("rb") as file:
+        messages = list(make_reader(file, validate_crcs=True).iter_messages(log_time_order=False))
+    written = [m.sequence for _, channel, m in messages if channel.topic == "/place0/state"]
+    assert interrupts > 20
+    assert written == sorted(set(written))
+    assert set(returned) <= set(written)
+    assert read_journal(tmp_path / "j").complete
+
+
+def test_what_a_message_costs(tmp_path: Path, flight: SimpleNamespace) -> None:
+    items = list(read_journal(flight.agent))
+    journal = Journal(tmp_path / "j", about={}, attachments={})
+    journal.start(Statistics())
+    start = time.perf_counter()
+    for _ in range(10):
+        for item in items:
+            journal.tap(0, item.message, item.datagram)
+    each = (time.perf_counter() - start) / (10 * len(items))
+    journal.close()
+    print(f"{1e6 * each:.2f} µs for each message of 3 drones")
+    assert each < 100e-6
+
+
+# ---- the page
+
+
+def test_the_snippet_of_the_page(
+    flight: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
+    assert len(code.splitlines()) <= 12
+    exec(code.replace("flight.mcap", str(flight.simulator)), {})
+    lines = capsys.readouterr().out.splitlines()
+    states = list(map(binary.decode, datagrams(flight.simulator, State)))
+    assert len(lines) == len(states)
+    assert float(lines[-1].split()[-1]) == states[-1].telemetry[0, 1]

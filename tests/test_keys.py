@@ -1,0 +1,228 @@
+"""Sealed datagrams, and the files that hold a key."""
+
+import os
+import stat
+from hashlib import blake2b
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from rotorgram.udp import DecodeError, binary
+from rotorgram.udp.keys import OVERHEAD, Key, is_sealed, message_of, read_key, write_key
+from test_codecs import PAGE, golden
+
+SECRET = bytes(range(32))
+SESSION, NONCE = 0x0123456789ABCDEF, 0xFEDCBA9876543210
+SIMULATOR, AGENT = Key(SECRET, "simulator"), Key(SECRET, "agent")
+
+# Written by hand from docs/protocol.md, which shows the same lines.
+SEALED_HELLO = "a753 deef7a739e9eb7cb2cfc01d1a99c88b4"
+SESSION_KEY = "d5a4efb6dad70e8145c07c522e609a9abcdd4d4b83fd7f8afaef2db5fbb16b66"
+SEALED_COMMAND = "a753 91996406f0b41349d176d6c4a299783c"
+
+posix = pytest.mark.skipif(os.name != "posix", reason="modes of files are those of POSIX")
+
+
+# ---- the page
+
+
+@pytest.mark.parametrize("line", [SEALED_HELLO, SESSION_KEY, SEALED_COMMAND])
+def test_the_page_shows_the_golden_bytes(line: str) -> None:
+    assert f"\n{line}\n" in PAGE.read_text(encoding="utf-8")
+
+
+def test_the_golden_bytes_are_those_of_blake2_as_the_page_says() -> None:
+    def tag(name: str, key: bytes, person: bytes) -> str:
+        filled = person + bytes(16 - len(person))
+        return "a753 " + blake2b(golden(name), digest_size=16, key=key, person=filled).hexdigest()
+
+    numbers = SESSION.to_bytes(8, "little") + NONCE.to_bytes(8, "little")
+    person = b"session" + bytes(9)
+    session_key = blake2b(numbers, digest_size=32, key=SECRET, person=person).digest()
+    assert session_key.hex() == SESSION_KEY
+    assert tag("Hello", SECRET, b"simulator") == SEALED_HELLO
+    assert tag("Command", session_key, b"agent") == SEALED_COMMAND
+
+
+def test_an_unknown_is_sealed_together_with_the_state_that_it_answers() -> None:
+    state = SIMULATOR.for_session(SESSION, NONCE).seal(golden("State"))
+    both = golden("Unknown") + state
+    tag = blake2b(both, digest_size=16, key=SECRET, person=b"agent" + bytes(11)).digest()
+    datagram = AGENT.seal(golden("Unknown"), state)
+    assert datagram == b"\xa7S" + tag + golden("Unknown")
+    assert SIMULATOR.open(datagram, state) == golden("Unknown")
+    for other in (b"", state[:-1], state[:2] + bytes(16) + state[18:]):
+        with pytest.raises(DecodeError):
+            SIMULATOR.open(datagram, other)
+
+
+def test_golden_hello_and_command() -> None:
+    for name, line, sender, receiver in [
+        ("Hello", SEALED_HELLO, SIMULATOR, AGENT),
+        (
+            "Command",
+            SEALED_COMMAND,
+            AGENT.for_session(SESSION, NONCE),
+            SIMULATOR.for_session(SESSION, NONCE),
+        ),
+    ]:
+        datagram = sender.seal(golden(name))
+        assert datagram.hex() == line.replace(" ", "") + golden(name).hex()
+        assert receiver.open(datagram) == golden(name)
+
+
+# ---- what is not opened
+
+
+def test_another_key_another_side_another_session() -> None:
+    datagram = AGENT.for_session(SESSION, NONCE).seal(golden("Command"))
+    for key in (
+        SIMULATOR,  # the shared key
+        Key(bytes(32), "simulator").for_session(SESSION, NONCE),
+        Key(SECRET[:-1] + b"\0", "simulator").for_session(SESSION, NONCE),
+        AGENT.for_session(SESSION, NONCE),  # sent back to who sealed it
+        SIMULATOR.for_session(SESSION + 1, NONCE),
+        SIMULATOR.for_session(SESSION, NONCE + 1),
+        SIMULATOR.for_session(NONCE, SESSION),
+        Key(bytes.fromhex(SESSION_KEY), "simulator").for_session(SESSION, NONCE),
+    ):
+        with pytest.raises(DecodeError, match="key: the tag is not of this key and session"):
+            key.open(datagram)
+
+
+def test_every_flipped_bit_of_a_sealed_datagram_is_seen() -> None:
+    datagram = SIMULATOR.seal(golden("Hello"))
+    for bit in range(8 * len(datagram)):
+        flipped = bytearray(datagram)
+        flipped[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(DecodeError):
+            AGENT.open(bytes(flipped))
+
+
+def test_a_sealed_datagram_that_was_cut_or_made_longer() -> None:
+    datagram = SIMULATOR.seal(golden("Hello"))
+    for size in range(len(datagram)):
+        with pytest.raises(DecodeError):
+            AGENT.open(datagram[:size])
+    with pytest.raises(DecodeError):
+        AGENT.open(datagram + b"\0")
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.binary(max_size=100), st.binary(min_size=32, max_size=32))
+@example(b"", SECRET)
+def test_any_bytes_are_sealed_and_opened(message: bytes, secret: bytes) -> None:
+    datagram = Key(secret, "agent").seal(message)
+    assert is_sealed(datagram)
+    assert len(datagram) == len(message) + OVERHEAD
+    assert message_of(datagram) == message
+    assert Key(secret, "simulator").open(datagram) == message
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.binary(max_size=100))
+@example(b"\xa7S")
+@example(b"\xa7S" + bytes(16))
+def test_bytes_that_nobody_sealed_are_not_opened(junk: bytes) -> None:
+    for datagram in (junk, b"\xa7S" + junk):
+        with pytest.raises(DecodeError):
+            SIMULATOR.open(datagram)
+
+
+def test_a_sealed_datagram_is_neither_text_nor_a_message() -> None:
+    datagram = SIMULATOR.seal(golden("Hello"))
+    assert not is_sealed(golden("Hello"))
+    assert binary.peek(datagram) == (0, 0, 0)
+    with pytest.raises(DecodeError, match="magic: expected a752, got a753"):
+        binary.decode(datagram)
+
+
+def test_keys_of_a_session_are_no_two_alike() -> None:
+    tags = {
+        Key(SECRET, side).for_session(session, nonce).seal(b"")
+        for side in ("simulator", "agent")
+        for session in range(8)
+        for nonce in range(8)
+    }
+    assert len(tags) == 128
+
+
+@pytest.mark.parametrize("size", [0, 16, 31, 33, 64])
+def test_a_key_has_32_bytes(size: int) -> None:
+    with pytest.raises(ValueError, match=f"key: expected 32 bytes, got {size}"):
+        Key(bytes(size), "agent")
+
+
+# ---- files
+
+
+def test_a_key_is_written_and_read(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    write_key(first)
+    write_key(second)
+    secret = read_key(first)
+    assert len(secret) == 32
+    assert first.read_text() == secret.hex() + "\n"
+    assert secret != read_key(second)
+
+
+@posix
+def test_only_its_owner_may_read_a_key(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    before = os.umask(0)
+    try:
+        write_key(path)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    for mode in (0o640, 0o604, 0o620, 0o601, 0o666):
+        path.chmod(mode)
+        with pytest.raises(ValueError, match=rf"\(chmod 600\), got mode {mode:o}"):
+            read_key(path)
+    path.chmod(0o400)
+    assert len(read_key(path)) == 32
+
+
+def test_a_key_is_never_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    write_key(path)
+    secret = path.read_text()
+    with pytest.raises(FileExistsError):
+        write_key(path)
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(FileExistsError):
+        write_key(link)
+    assert path.read_text() == secret
+    assert not (tmp_path / "elsewhere").exists()
+
+
+def test_a_key_that_cannot_be_read_or_written(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"key file: cannot read .*nowhere: No such file"):
+        read_key(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="key file: cannot read"):
+        read_key(tmp_path)
+    with pytest.raises(OSError):
+        write_key(tmp_path / "no folder" / "key")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"", b"\n", b"00" * 31, b"00" * 33, b"0" * 63, b"zz" * 32, b"\xff" * 64, b"00" * 500,
+     "٠".encode() * 64],
+)  # fmt: skip
+def test_a_file_that_holds_no_key(tmp_path: Path, text: bytes) -> None:
+    path = tmp_path / "key"
+    path.touch(0o600)
+    path.write_bytes(text)
+    with pytest.raises(ValueError, match="key file: expected 64 hexadecimal digits in"):
+        read_key(path)
+
+
+@pytest.mark.parametrize("end", [b"", b"\n", b"\r\n"])
+def test_a_key_that_somebody_else_wrote(tmp_path: Path, end: bytes) -> None:
+    path = tmp_path / "key"
+    path.touch(0o600)
+    path.write_bytes(SECRET.hex().upper().encode() + end)
+    assert read_key(path) == SECRET

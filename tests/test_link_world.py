@@ -1,0 +1,487 @@
+"""Simulators and an agent joined by a bad network, with a clock of its own; either side restarts.
+
+The physics only counts its steps, and the agent answers with how often it was asked: so both show
+whether every command was chosen once and stepped once.
+"""
+
+import itertools
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+
+import numpy as np
+import pytest
+from rotorgram.udp import LinkConfig
+from rotorgram.udp.agent_link import AgentLink
+from rotorgram.udp.keys import Key
+from rotorgram.udp.link import Address
+from rotorgram.udp.messages import Close, Command, Refuse, State, Welcome
+from rotorgram.udp.simulator_link import SimulatorLink
+from test_link import SECRET, command, hello, state
+
+Fate = Callable[[bytes], list[tuple[float, bytes]]]
+"""What becomes of a datagram: delays, s, and bytes."""
+
+SILENCE = 30.0
+"""After so long the agent frees the place of a simulator, s."""
+
+
+def clean(datagram: bytes) -> list[tuple[float, bytes]]:
+    return [(0.001, datagram)]
+
+
+def bad(seed: int, *, flips: bool = True) -> Fate:
+    """Loses 30 %, copies 20 %, reorders, and damages 10 % (not by text, which has no checksum)."""
+    dice = random.Random(seed)
+
+    def fate(datagram: bytes) -> list[tuple[float, bytes]]:
+        copies = dice.choices([0, 1, 2, 3], [0.3, 0.5, 0.15, 0.05])[0]
+        return [(dice.choice([0.001, 0.004, 0.3, 2.0]), damaged(datagram)) for _ in range(copies)]
+
+    def damaged(datagram: bytes) -> bytes:
+        if not flips or dice.random() > 0.1:
+            return datagram
+        raw = bytearray(datagram)
+        raw[dice.randrange(len(raw))] ^= 1 << dice.randrange(8)
+        return bytes(raw)[: dice.choice([len(raw), dice.randrange(len(raw))])]
+
+    return fate
+
+
+@dataclass
+class Physics:
+    """A simulator: its link, and the steps of each of its sessions."""
+
+    address: Address
+    link: SimulatorLink
+    steps: dict[int, list[float]] = field(default_factory=dict)
+    """Actions of each session, in the order of its steps."""
+    ended: str = ""
+
+    @property
+    def session(self) -> int:
+        return self.link.hello.session
+
+    def send_state(self, now: float) -> None:
+        """The observation is the number of steps, modulo what float32 holds."""
+        steps = self.steps.setdefault(self.session, [])
+        self.link.send_state(state(self.link.sequence + 1, self.session, len(steps)), now)
+
+    def receive(self, datagram: bytes, now: float) -> None:
+        message = self.link.receive(datagram, now)
+        if isinstance(message, Command):
+            assert message.session == self.session
+            self.steps[self.session].append(message.actions.item())
+            assert len(self.steps[self.session]) == message.sequence
+        if isinstance(message, Command | Welcome):
+            self.send_state(now)
+        if isinstance(message, Close | Refuse):
+            self.ended = message.reason or "closed"
+
+
+class World:
+    """All of it. Time passes from one event to the next: an arrival or a timer."""
+
+    def __init__(
+        self, fate: Fate, *, codec: str = "binary", simulators: int = 1, places: int | None = None
+    ) -> None:
+        self.fate = fate
+        self.text = codec == "text"
+        self.sealed = codec == "sealed"
+        self.places = simulators if places is None else places
+        self.now = 1000.0
+        self.chosen: dict[tuple[Address, int], list[list[float]]] = {}
+        """Actions that each agent chose in each session, in the order of its States."""
+        self.asked = 0
+        self.joined: list[int] = []
+        """Sessions that took a place."""
+        self.closes: list[str] = []
+        self.physics: list[Physics] = []
+        self._numbers = itertools.count(1)
+        self._order = itertools.count()
+        self._flying: list[tuple[float, int, Physics, str, bytes]] = []
+        self.start_agent()
+        for number in range(simulators):
+            self.start_simulator(("10.0.0.1", number))
+
+    # ---- who there is
+
+    def start_agent(self) -> None:
+        """A new one at the same address: it knows nothing of what was."""
+        key = Key(SECRET, "agent") if self.sealed else None
+        self.agent = AgentLink(lambda _: "", (1, 0), places=self.places, key=key)
+        self.heard: list[float] = [self.now] * self.places
+
+    def start_simulator(self, address: Address) -> Physics:
+        """Another one, in place of that at the same address, which is dead at once."""
+        self.physics = [p for p in self.physics if p.address != address]
+        key = Key(SECRET, "simulator") if self.sealed else None
+        link = SimulatorLink(
+            hello(session=next(self._numbers)),
+            LinkConfig(),
+            text_codec=self.text,
+            key=key,
+            draw_session=lambda: next(self._numbers),
+        )
+        self.physics.append(Physics(address, link))
+        link.connect(self.now)
+        if self.text:
+            self.physics[-1].send_state(self.now)
+        return self.physics[-1]
+
+    def of(self, address: Address) -> Physics | None:
+        return next((p for p in self.physics if p.address == address), None)
+
+    # ---- what happens
+
+    def run(self, until: Callable[[], bool], most: float = 1e9) -> None:
+        """Let time pass until something is so; at most that many seconds."""
+        end = self.now + most
+        while not until():
+            self._send()
+            assert self.now < end, f"not in {most} s"
+            timers = [(t, p) for p in self.physics if (t := p.link.next_timer()) is not None]
+            first = min((timer for timer, _ in timers), default=float("inf"))
+            first = min(first, self.agent.next_timer() or float("inf"))
+            if self._flying and self._flying[0][0] <= first:
+                self._arrive()
+            else:
+                assert first < float("inf"), "nothing will ever happen"
+                self.now = max(self.now, first)
+                self.agent.handle_timer(self.now)
+                for _, physics in timers:
+                    if not physics.link.handle_timer(self.now):
+                        physics.ended = "silent"
+            self._free_the_silent()
+
+    def run_steps(self, count: int, most: float = 1e9) -> None:
+        """Until each simulator has made so many more steps in one session."""
+        begun = [(p, s, len(p.steps.get(s, []))) for p in self.physics for s in [p.session]]
+
+        def done() -> bool:
+            return all(
+                len(p.steps.get(p.session, [])) >= count + (at if p.session == s else 0)
+                for p, s, at in begun
+                if p in self.physics
+            )
+
+        self.run(done, most)
+
+    def _send(self) -> None:
+        for physics in self.physics:
+            for datagram in physics.link.take_outgoing():
+                self._put(physics, "agent", datagram)
+        for datagram, address in self.agent.take_outgoing():
+            if physics := self.of(address):
+                self._put(physics, "simulator", datagram)
+
+    def _put(self, physics: Physics, to: str, datagram: bytes) -> None:
+        for delay, arriving in self.fate(datagram):
+            item = (self.now + delay, next(self._order), physics, to, arriving)
+            heappush(self._flying, item)
+
+    def _arrive(self) -> None:
+        arrival, _, physics, to, datagram = heappop(self._flying)
+        self.now = max(self.now, arrival)
+        if to == "simulator":
+            # Who is at that address now: a process that was killed reads nothing.
+            if there := self.of(physics.address):
+                there.receive(datagram, self.now)
+            return
+        event = self.agent.receive(datagram, physics.address, self.now)
+        if event is None:
+            return
+        self.heard[event.place] = self.now
+        if isinstance(event.message, Close):
+            self.closes.append(event.message.reason)
+            return
+        self._choose(event.place, event.message, event.joined)
+
+    def _choose(self, place: int, message: State, joined: bool) -> None:
+        session = self.agent.places[place]
+        assert session is not None
+        by_agents = self.chosen.setdefault((session.peer, message.session), [])
+        if joined:
+            self.joined.append(message.session)
+            by_agents.append([])
+            # With a key no agent takes up what another began, not even from late datagrams.
+            assert len(by_agents) == 1 or not self.sealed
+        if not self.text:
+            # The State shows every command that was chosen before it, each stepped once.
+            assert message.observations.item() == len(by_agents[-1]) == message.sequence - 1
+        self.asked += 1
+        value = float(np.float32(1 / self.asked))
+        by_agents[-1].append(value)
+        self.agent.send_command(place, command(message.sequence, session.number, value), self.now)
+
+    def _free_the_silent(self) -> None:
+        for place, session in enumerate(self.agent.places):
+            if session and not self.agent.closed and self.now - self.heard[place] > SILENCE:
+                self.agent.free(place)
+
+    def check(self) -> None:
+        """Every step was chosen, in that order; of what was chosen all but the last was stepped."""
+        for physics in self.physics:
+            for session, steps in physics.steps.items():
+                number = 0 if self.text else session
+                agents = self.chosen.get((physics.address, number), [[]])
+                # Without a key an agent may take up, from late datagrams, what another began.
+                for step, action in enumerate(steps):
+                    assert action in [chosen[step] for chosen in agents if step < len(chosen)]
+                if len(agents) == 1 and session == physics.session:
+                    assert len(steps) <= len(agents[0]) <= len(steps) + 1
+
+
+# ---- exactly once
+
+
+@pytest.mark.parametrize("simulators", [1, 3])
+@pytest.mark.parametrize("codec", ["binary", "text", "sealed"])
+@pytest.mark.parametrize("seed", range(3))
+def test_each_command_is_stepped_once_whatever_the_network(
+    seed: int, codec: str, simulators: int
+) -> None:
+    world = World(bad(seed, flips=codec != "text"), codec=codec, simulators=simulators)
+    world.run_steps(150)
+    world.check()
+    assert all(len(p.steps[p.session]) >= 150 for p in world.physics)
+    counters = world.agent.statistics.counters
+    assert counters["sessions"] == simulators
+    assert counters["duplicate"] > 50
+    assert all(p.link.statistics.counters["resent"] > 25 for p in world.physics)
+    if codec != "text":
+        assert counters["malformed"] + counters["forged"] > 5
+
+
+@pytest.mark.parametrize("lost", [{1}, {2}, {3}, {4}, {1, 2, 3}, {5, 6, 7, 8}, {2, 5, 9}])
+def test_chosen_losses(lost: set[int]) -> None:
+    numbers = itertools.count(1)
+    world = World(lambda datagram: [] if next(numbers) in lost else [(0.001, datagram)])
+    world.run_steps(5)
+    world.check()
+    assert world.physics[0].link.statistics.counters["resent"] == len(lost)
+
+
+def test_a_clean_network_repeats_nothing() -> None:
+    world = World(clean)
+    world.run_steps(100)
+    world.check()
+    assert world.now == pytest.approx(1000.0 + 0.002 * 101)
+    physics = world.physics[0]
+    assert physics.link.statistics.counters == {"sent": 102, "received": 101}
+    assert world.agent.statistics.counters == {"sent": 101, "received": 101, "sessions": 1}
+    assert physics.link.statistics.round_trips.count == 100
+    assert physics.link.statistics.round_trips.longest == pytest.approx(0.002)
+
+
+# ---- restarts
+
+
+@pytest.mark.parametrize("codec", ["binary", "sealed"])
+@pytest.mark.parametrize("seed", range(4))
+def test_an_agent_that_is_started_again_goes_on(seed: int, codec: str) -> None:
+    world = World(bad(seed), codec=codec, simulators=3)
+    dice = random.Random(seed)
+    for _ in range(4):
+        world.run_steps(dice.randrange(12))
+        before = {p.address: p.session for p in world.physics}
+        told = [p.link.statistics.take_notices() for p in world.physics]
+        world.start_agent()
+        world.run_steps(10, most=200)
+        world.check()
+        told = [p.link.statistics.take_notices() for p in world.physics]
+        for physics, notices in zip(world.physics, told, strict=True):
+            if physics.session != before[physics.address]:
+                assert any("the agent was started anew" in notice for notice in notices)
+    assert all(len(p.steps) > 1 for p in world.physics)
+    assert not any(p.ended for p in world.physics)
+
+
+def test_a_clean_restart_of_the_agent_costs_one_message_more() -> None:
+    world = World(clean, codec="sealed")
+    world.run_steps(10)
+    physics = world.physics[0]
+    world.run(lambda: physics.link.state == "waiting")
+    world._send()
+    world._flying.clear()  # what was on its way to the one that was killed
+    old = physics.session
+    world.start_agent()
+    world.run_steps(10)
+    assert physics.session != old
+    world.check()
+    # The resent State brings an Unknown, then comes the Hello; the tenth Command is on its way.
+    counters = world.agent.statistics.counters
+    assert counters == {"received": 12, "sent": 12, "foreign": 1, "sessions": 1}
+    assert len(physics.steps[old]) == 10
+
+
+@pytest.mark.parametrize("codec", ["binary", "sealed"])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_simulator_that_is_started_again_has_its_place_back(seed: int, codec: str) -> None:
+    world = World(bad(seed), codec=codec, simulators=3)
+    dice = random.Random(seed)
+    for _ in range(4):
+        world.run_steps(dice.randrange(12))
+        again = dice.choice(world.physics)
+        begun, others = world.now, [p for p in world.physics if p is not again]
+        sessions = [p.session for p in others]
+        physics = world.start_simulator(again.address)
+        world.run_steps(10, most=200)
+        world.check()
+        assert not physics.ended
+        assert [p.session for p in others] == sessions  # it is nobody else's business
+        assert begun < world.now
+    assert not any(p.ended for p in world.physics)
+
+
+def test_a_clean_restart_of_the_simulator_takes_its_place_at_state_1() -> None:
+    world = World(clean, codec="sealed")
+    world.run_steps(10)
+    (old,) = world.joined
+    world.start_simulator(world.physics[0].address)
+
+    def superseded() -> bool:
+        session = world.agent.places[0]
+        assert session is not None
+        return session.number != old
+
+    begun = world.now
+    world.run(superseded, most=1.0)
+    assert world.now - begun == pytest.approx(0.003)  # Hello, Welcome, State 1
+    assert len(world.joined) == 2
+    world.run_steps(10)
+    world.check()
+
+
+@pytest.mark.parametrize("fate", [clean, bad(1)], ids=["clean", "bad"])
+@pytest.mark.parametrize("codec", ["binary", "sealed"])
+def test_a_simulator_at_another_address_waits_until_the_place_is_free(
+    codec: str, fate: Fate
+) -> None:
+    world = World(fate, codec=codec)
+    world.run_steps(10)
+    world.physics.clear()
+    physics, begun = world.start_simulator(("10.0.0.2", 5)), world.now
+    world.run(lambda: bool(world.joined[1:]), most=60)
+    assert world.now - begun > SILENCE - 5
+    assert "every place" in physics.link.statistics.take_notices()[0]
+    world.run_steps(10, most=200)
+    world.check()
+
+
+@pytest.mark.parametrize("codec", ["binary", "sealed"])
+@pytest.mark.parametrize("seed", range(2))
+def test_more_simulators_than_places_take_turns(seed: int, codec: str) -> None:
+    world = World(bad(seed), codec=codec, simulators=4, places=2)
+    flown: set[Address] = set()
+    while len(flown) < 4:
+        world.run(
+            lambda: any(len(p.steps.get(p.session, [])) >= 10 for p in world.physics), most=100
+        )
+        for physics in [p for p in world.physics if len(p.steps.get(p.session, [])) >= 10]:
+            physics.link.close("enough", world.now)
+            world.run(lambda p=physics: p.link.state == "closed", most=1)  # type: ignore[misc]
+            flown.add(physics.address)
+            world.check()
+            world.physics.remove(physics)
+    assert not any(p.ended for p in world.physics)
+
+
+@pytest.mark.parametrize("codec", ["binary", "sealed"])
+@pytest.mark.parametrize("seed", range(6))
+def test_after_any_trouble_all_fly_again(seed: int, codec: str) -> None:
+    """Whatever was lost, late or restarted: once the network is good, nobody hangs."""
+    world, dice = World(bad(seed), codec=codec, simulators=3), random.Random(seed)
+    for _ in range(12):
+        end = world.now + dice.choice([0.005, 0.3, 1.0, 4.0])
+        world.run(lambda end=end: world.now >= end)  # type: ignore[misc]
+        if dice.random() < 0.4:
+            world.start_agent()
+        elif dice.random() < 0.7:
+            world.start_simulator(dice.choice(world.physics).address)
+    world.fate = clean
+    assert not any(p.ended for p in world.physics)
+    world.run_steps(20, most=10)
+    world.check()
+
+
+def test_a_text_agent_that_is_started_again_takes_up_the_session() -> None:
+    world = World(bad(5, flips=False), codec="text")
+    world.run_steps(20)
+    physics = world.physics[0]
+    world.start_agent()
+    world.run_steps(20, most=200)
+    assert world.joined == [0, 0]
+    assert physics.link.sequence > 40
+    assert len(physics.steps[physics.session]) == physics.link.sequence - 1
+
+
+def test_a_text_simulator_that_is_started_again_is_taken_in_after_the_silence() -> None:
+    world = World(clean, codec="text")
+    world.run_steps(20)
+    begun = world.now
+    world.start_simulator(world.physics[0].address)  # its numbers are old ones
+    world.run(lambda: bool(world.joined[1:]), most=100)
+    assert world.now - begun == pytest.approx(SILENCE, abs=1)
+    assert world.agent.statistics.counters["stale"] > 20
+    world.run_steps(20)
+
+
+# ---- the end
+
+
+@pytest.mark.parametrize("codec", ["binary", "text", "sealed"])
+@pytest.mark.parametrize("side", ["simulator", "agent"])
+def test_a_close_is_answered_by_a_close(side: str, codec: str) -> None:
+    world = World(clean, codec=codec, simulators=2)
+    world.run_steps(5)
+    begun = world.now
+    if side == "simulator":
+        for physics in world.physics:
+            physics.link.close("enough", world.now)
+    else:
+        world.agent.close("enough", world.now)
+    world.run(lambda: all(p.link.state == "closed" for p in world.physics), most=1)
+    world.run(lambda: world.agent.places == [None, None], most=1)
+    assert world.now - begun == pytest.approx(0.002, abs=1e-6)
+    if side == "simulator":
+        assert world.closes == ["the simulator closed" if codec == "text" else "enough"] * 2
+    else:
+        reason = "the agent closed" if codec == "text" else "enough"
+        assert [p.ended for p in world.physics] == [reason] * 2
+    sent = sum(p.link.statistics.counters["resent"] for p in world.physics)
+    assert sent == world.agent.statistics.counters["resent"] == 0
+
+
+@pytest.mark.parametrize("codec", ["binary", "text", "sealed"])
+@pytest.mark.parametrize("side", ["simulator", "agent", "both"])
+@pytest.mark.parametrize("seed", range(5))
+def test_closes_that_are_lost_are_repeated(seed: int, side: str, codec: str) -> None:
+    dice = random.Random(seed)
+    world = World(clean, codec=codec)
+    world.run_steps(5)
+    world.fate = lambda datagram: [(0.001, datagram)] if dice.random() < 0.6 else []
+    physics = world.physics[0]
+    if side != "agent":
+        physics.link.close("enough", world.now)
+    if side != "simulator":
+        world.agent.close("enough", world.now)
+    begun = world.now
+    world.run(lambda: physics.link.state == "closed" and world.agent.places == [None], most=1)
+    assert world.now - begun < 0.26
+    # None of it was left to the linger alone: ten tries each way.
+    assert physics.ended or world.closes
+
+
+def test_nobody_answers_a_close() -> None:
+    world = World(clean)
+    world.run_steps(5)
+    world.fate = lambda datagram: []
+    world.physics[0].link.close("enough", world.now)
+    world.agent.close("enough", world.now)
+    begun = world.now
+    world.run(lambda: world.physics[0].link.state == "closed", most=1)
+    assert world.now - begun == pytest.approx(0.25)
+    world.run(lambda: world.agent.places == [None], most=1)
+    assert world.now - begun == pytest.approx(0.25)

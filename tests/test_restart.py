@@ -1,0 +1,571 @@
+"""Either side is killed, interrupted, frozen or an impostor: the other goes on, or says why not."""
+
+import json
+import re
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import rotorgram.envs  # noqa: F401
+from peers import ANY, ENV_ID, Running, launch, plain_socket, relaying
+from rotorgram.udp import (
+    LinkConfig,
+    PeerClosed,
+    PeerSilent,
+    Refused,
+    RemoteEnv,
+    RemoteVectorEnv,
+    Simulator,
+    binary,
+)
+from rotorgram.udp.faults import FaultConfig
+from rotorgram.udp.keys import OVERHEAD, write_key
+from rotorgram.udp.messages import Close, Command, Hello, State
+
+LOSSY = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.2, seed=2)
+QUICK = LinkConfig(timeout=10, first_resend=0.02, max_resend=0.2)
+posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+
+SIMULATE = """
+    import json, sys
+    from rotorgram.udp import LinkConfig, Simulator
+    arguments = json.loads(sys.argv[1])
+    for name in ("server", "bind"):
+        arguments[name] = tuple(arguments[name])
+    config = LinkConfig(timeout=30, first_resend=0.05, max_resend=0.01)
+    with Simulator(config=config, **arguments) as simulator:
+        print(simulator.address[1], flush=True)
+        print(simulator.run())
+"""
+
+AGENT = """
+    import json, sys
+    from rotorgram.udp import RemoteVectorEnv
+    arguments = json.loads(sys.argv[1])
+    number = arguments.pop("num_envs", 1)
+    arguments["address"] = tuple(arguments["address"])
+    env = RemoteVectorEnv(connect=False, num_envs=number, **arguments)
+    print(env.address[1], flush=True)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    print("flying", flush=True)
+    while True:
+        env.step(env.action_space.sample())
+"""
+
+
+@contextmanager
+def program(code: str, **arguments: Any) -> Iterator[Any]:
+    """A simulator or an agent in a process of its own, and the port that it has."""
+    process: Any = launch(code, json.dumps(arguments))
+    try:
+        process.port = int(process.stdout.readline() or 0)
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def simulating(server: tuple[str, int], bind: tuple[str, int] = ANY, **arguments: Any) -> Any:
+    return program(SIMULATE, server=server, bind=bind, **arguments)
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.wait()
+
+
+@pytest.fixture(params=[False, True], ids=["clean", "lossy"])
+def network(request: pytest.FixtureRequest) -> Iterator[Any]:
+    """Gives the address that leads to an agent's: its own, or that of a bad relay before it."""
+    with ExitStack() as stack:
+
+        def towards(address: tuple[str, int]) -> tuple[str, int]:
+            if not request.param:
+                return address
+            return stack.enter_context(relaying(address, LOSSY)).address
+
+        yield towards
+
+
+@pytest.fixture
+def key_file(tmp_path: Path) -> str:
+    write_key(tmp_path / "key")
+    return str(tmp_path / "key")
+
+
+def assert_flies(remote: gym.Env, seed: int, steps: int = 150) -> None:
+    """As the env itself does."""
+    local = gym.make(ENV_ID)
+    dice = np.random.default_rng(seed)
+    assert remote.reset(seed=seed)[0].tobytes() == local.reset(seed=seed)[0].tobytes()
+    for _ in range(steps):
+        action = dice.uniform(-1, 1, 1).astype(np.float32)
+        here, there = remote.step(action), local.step(action)
+        assert here[0].tobytes() == there[0].tobytes()
+        assert here[1:4] == there[1:4]
+        if here[2] or here[3]:
+            assert remote.reset()[0].tobytes() == local.reset()[0].tobytes()
+
+
+def ends(process: subprocess.Popen[str]) -> str:
+    """What a simulator that ended in order says at last; its log is empty or on `stderr`."""
+    out, err = process.communicate(timeout=10)
+    assert process.returncode == 0, err
+    return out.splitlines()[-1]
+
+
+# ---- the simulator is killed
+
+
+@posix
+@pytest.mark.parametrize("where", ["same port", "another port"])
+@pytest.mark.parametrize("secret", [False, True], ids=["no key", "key"])
+def test_a_killed_simulator_is_replaced(
+    network: Any, where: str, secret: bool, key_file: str
+) -> None:
+    keys = {"key_file": key_file} if secret else {}
+    same = where == "same port"
+    with RemoteEnv(ANY, connect=False, timeout=20 if same else 0.7, **keys) as remote:
+        address = network(remote.address)
+        with simulating(address, **keys) as first:
+            observation, _ = remote.reset(seed=1)
+            for _ in range(20):
+                observation, *_, info = remote.step(np.zeros(1))
+            kill(first)
+        with simulating(address, ("127.0.0.1", first.port) if same else ANY, **keys) as second:
+            start = time.monotonic()
+            after, reward, terminated, truncated, lost = remote.step(np.zeros(1))
+            assert time.monotonic() - start < 4
+            assert after.tobytes() == observation.tobytes()
+            assert (reward, terminated, truncated) == (0.0, False, True)
+            reason = lost.pop("simulator_lost")
+            assert lost == info
+            if same:
+                assert re.fullmatch(r"the simulator at 127.0.0.1:\d+ was started anew", reason)
+            else:
+                sentence = r"no datagram from the simulator at .* for 0.7 s, waiting at .*"
+                assert re.fullmatch(sentence, reason)
+            assert_flies(remote, 3)
+            assert remote.statistics.counters["sessions"] == 2
+            remote.close()
+            assert ends(second) == "the agent closed"
+
+
+@posix
+def test_a_simulator_that_is_killed_at_any_time(network: Any) -> None:
+    """Whoever watches over it starts it again at its port; between, every flight is the same."""
+    with plain_socket() as sock:
+        bind = sock.getsockname()
+    landed = threading.Event()
+
+    def watch_over(address: tuple[str, int]) -> None:
+        for life in range(4):
+            with simulating(address, bind) as process:
+                landed.wait(20 if life == 3 else 0.3)
+                kill(process)
+
+    with RemoteEnv(ANY, connect=False, timeout=20) as remote:
+        address = network(remote.address)
+        watcher = threading.Thread(target=watch_over, args=[address])
+        watcher.start()
+        local = gym.make(ENV_ID)
+        lost = steps = 0
+        while lost < 3:
+            here, there = remote.reset(seed=steps), local.reset(seed=steps)
+            while here[0].tobytes() == there[0].tobytes():
+                before, here = here, remote.step(np.zeros(1))
+                steps += 1
+                if "simulator_lost" in here[-1]:
+                    assert here[0].tobytes() == before[0].tobytes()
+                    assert here[1:4] == (0.0, False, True)
+                    lost += 1
+                    break
+                there = local.step(np.zeros(1))
+                assert here[1:4] == there[1:4]
+                if here[3]:
+                    break
+            else:
+                pytest.fail("other observations")
+        assert_flies(remote, 3, 100)
+        assert remote.statistics.counters["sessions"] == 4
+        landed.set()
+        watcher.join()
+
+
+@posix
+def test_a_simulator_that_was_frozen_begins_anew() -> None:
+    """Its place was given up: the session is over, and is not taken up where it was."""
+    with RemoteEnv(ANY, connect=False, timeout=0.5) as remote:
+        with simulating(remote.address) as process:
+            remote.reset(seed=0)
+            before = remote.step(np.ones(1))
+            process.send_signal(signal.SIGSTOP)
+            thaw = threading.Timer(1.0, process.send_signal, [signal.SIGCONT])
+            thaw.start()
+            after = remote.step(np.ones(1))
+            thaw.join()
+            assert after[0].tobytes() == before[0].tobytes()
+            assert after[3]
+            assert "for 0.5 s" in after[4]["simulator_lost"]
+            assert_flies(remote, 2)
+            remote.close()
+            assert ends(process) == "the agent closed"
+        assert remote.statistics.counters["sessions"] == 2
+
+
+# ---- the agent is killed
+
+
+@posix
+@pytest.mark.parametrize(
+    "options", [{}, {"codec": "text"}, {"key_file": "yes"}], ids=["binary", "text", "key"]
+)
+def test_a_killed_agent_is_replaced(network: Any, options: dict[str, str], key_file: str) -> None:
+    """The same simulator process serves one agent after the other, at the same port."""
+    keys = {"key_file": key_file} if "key_file" in options else {}
+    with plain_socket() as sock:
+        address = sock.getsockname()
+    with simulating(network(address), **{**options, **keys}) as simulator:
+        for _ in range(2):
+            with program(AGENT, address=address, **keys) as agent:
+                assert agent.stdout.readline() == "flying\n"
+                time.sleep(0.05)
+                kill(agent)
+                assert simulator.poll() is None
+        with RemoteEnv(address, connect=False, **keys) as remote:
+            start = time.monotonic()
+            assert_flies(remote, 4)
+            assert time.monotonic() - start < 8
+        out, err = simulator.communicate(timeout=10)
+    assert (simulator.returncode, out) == (0, "the agent closed\n")
+    anew = err.count("the agent was started anew; beginning a new session with it")
+    assert anew == (0 if "codec" in options else 2)
+
+
+@posix
+def test_a_killed_agent_of_many_is_replaced() -> None:
+    with plain_socket() as sock:
+        address = sock.getsockname()
+    with simulating(address, num_envs=2) as one, simulating(address, num_envs=2) as two:
+        with program(AGENT, address=address, num_simulators=2, num_envs=4) as agent:
+            assert agent.stdout.readline() == "flying\n"
+            kill(agent)
+        remote = RemoteVectorEnv(address, num_simulators=2)
+        local = gym.make_vec(ENV_ID, num_envs=4, vectorization_mode="sync")
+        assert remote.reset(seed=1)[0].tobytes() == local.reset(seed=1)[0].tobytes()
+        for _ in range(100):
+            actions = remote.action_space.sample()
+            for here, there in zip(remote.step(actions)[:4], local.step(actions)[:4], strict=True):
+                assert here.tobytes() == there.tobytes()
+        remote.close()
+        assert ends(one) == ends(two) == "the agent closed"
+
+
+# ---- Ctrl-C
+
+
+def seconds_until_both_end(signalled: Any, other: Any) -> float:
+    """Interrupt one program; how long both take to be gone, s."""
+    start = time.monotonic()
+    signalled.send_signal(signal.SIGINT)
+    for process in (signalled, other):
+        process.wait(10)
+    return time.monotonic() - start
+
+
+@posix
+@pytest.mark.parametrize("codec", ["binary", "text"])
+def test_ctrl_c_at_the_simulator_ends_both_within_a_second(network: Any, codec: str) -> None:
+    with program(AGENT, address=ANY) as agent:
+        address = network(("127.0.0.1", agent.port))
+        with simulating(address, codec=codec) as simulator:
+            assert agent.stdout.readline() == "flying\n"
+            assert seconds_until_both_end(simulator, agent) < 1
+            assert "KeyboardInterrupt" in simulator.stderr.read()
+            reason = "the simulator closed" if codec == "text" else "the simulator was stopped"
+            assert re.search(rf"PeerClosed: the simulator at .* closed: {reason}",
+                             agent.stderr.read())  # fmt: skip
+
+
+@posix
+@pytest.mark.parametrize("codec", ["binary", "text"])
+def test_ctrl_c_at_the_agent_ends_both_within_a_second(network: Any, codec: str) -> None:
+    with program(AGENT, address=ANY) as agent:
+        address = network(("127.0.0.1", agent.port))
+        with simulating(address, codec=codec) as simulator:
+            assert agent.stdout.readline() == "flying\n"
+            assert seconds_until_both_end(agent, simulator) < 1
+            assert "KeyboardInterrupt" in agent.stderr.read()
+            assert ends(simulator) == "the agent closed"
+
+
+@posix
+def test_ctrl_c_at_the_agent_of_three_ends_all_within_a_second() -> None:
+    with program(AGENT, address=ANY, num_simulators=3, num_envs=3) as agent, ExitStack() as stack:
+        server = ("127.0.0.1", agent.port)
+        simulators = [stack.enter_context(simulating(server)) for _ in range(3)]
+        assert agent.stdout.readline() == "flying\n"
+        start = time.monotonic()
+        agent.send_signal(signal.SIGINT)
+        for process in (agent, *simulators):
+            process.wait(10)
+        assert time.monotonic() - start < 1
+        assert [ends(process) for process in simulators] == ["the agent closed"] * 3
+
+
+@posix
+def test_ctrl_c_with_nobody_there_ends_within_a_second() -> None:
+    with plain_socket() as sock, simulating(sock.getsockname()) as simulator:
+        sock.recv(65507)  # its Hello
+        with program(AGENT, address=ANY) as agent:
+            time.sleep(0.1)
+            assert seconds_until_both_end(agent, agent) < 1
+            assert seconds_until_both_end(simulator, simulator) < 1
+            for process in (agent, simulator):
+                assert "KeyboardInterrupt" in process.stderr.read()
+
+
+# ---- keys
+
+
+@contextmanager
+def keyed(
+    agent_key: str | None, simulator_key: str | None, codec: Any = "binary"
+) -> Iterator[tuple[RemoteEnv, Running]]:
+    remote = RemoteEnv(ANY, connect=False, connect_timeout=0.6, key_file=agent_key)
+    config = LinkConfig(timeout=0.5, first_resend=0.1)
+    simulator = Simulator(
+        server=remote.address, bind=ANY, codec=codec, config=config, key_file=simulator_key
+    )
+    running = Running(simulator)
+    try:
+        yield remote, running
+    finally:
+        remote.close()
+        running.join()
+
+
+def test_both_have_the_key(key_file: str) -> None:
+    with keyed(key_file, key_file) as (remote, running):
+        assert_flies(remote, 6)
+        remote.close()
+        assert running.join() == "the agent closed"
+        for statistics in (remote.statistics, running.simulator.link.statistics):
+            assert statistics.counters["forged"] == statistics.counters["malformed"] == 0
+
+
+def test_only_the_agent_has_a_key(key_file: str, caplog: pytest.LogCaptureFixture) -> None:
+    with keyed(key_file, None) as (remote, running):
+        sentence = "key: this agent has one (--key-file), and the simulator has none"
+        with pytest.raises(PeerSilent, match=re.escape(sentence)):
+            remote.connect()
+        error = running.join()
+        assert isinstance(error, Refused)
+        assert str(error) == f"the agent at 127.0.0.1:{remote.address[1]} refused: {sentence}"
+        assert sentence in caplog.text
+
+
+def test_only_the_simulator_has_a_key(key_file: str, caplog: pytest.LogCaptureFixture) -> None:
+    with keyed(None, key_file) as (remote, running):
+        sentence = "key: this agent has none (--key-file), and the simulator has"
+        with pytest.raises(PeerSilent, match=re.escape(sentence)):
+            remote.connect()
+        error = running.join()
+        # An unsealed Refuse may be anybody's: it is told, and not believed.
+        assert isinstance(error, PeerSilent)
+        assert f"not sealed, a Refuse that says: {sentence}" in str(error)
+        assert caplog.text.count(sentence) == 2
+
+
+def test_different_keys(key_file: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_key(tmp_path / "another")
+    with keyed(key_file, str(tmp_path / "another")) as (remote, running):
+        sentence = "forged from 127.0.0.1:.* the tag is not of this key"
+        with pytest.raises(PeerSilent, match=f"last datagram dropped: {sentence}"):
+            remote.connect()
+        assert remote.statistics.counters["sent"] == 0  # no answer to a forgery
+        assert isinstance(running.join(), PeerSilent)
+        assert re.search(f"dropped a datagram: {sentence}", caplog.text)
+
+
+def test_text_and_a_key(key_file: str) -> None:
+    with pytest.raises(ValueError, match="text codec: expected no key, got one"):
+        Simulator(bind=ANY, codec="text", key_file=key_file)
+    with keyed(key_file, None, codec="text") as (remote, running):
+        with pytest.raises(PeerSilent, match="last datagram dropped: forged"):
+            remote.connect()
+        assert running.join() == "the agent closed"
+
+
+def test_a_key_allows_every_address(key_file: str) -> None:
+    for kind, arguments in ((RemoteEnv, {}), (RemoteVectorEnv, {"num_envs": 1})):
+        with pytest.raises(ValueError) as caught:
+            kind(("0.0.0.0", 0), connect=False, **arguments)
+        assert str(caught.value) == (
+            "0.0.0.0 is not a loopback address: expected 127.0.0.1, or a key that both sides share "
+            "(key_file, --key-file), or insecure=True (--insecure) where everybody who reaches "
+            "this port may fly the drone"
+        )
+    with RemoteEnv(("0.0.0.0", 0), connect=False, key_file=key_file) as remote:
+        simulator = Simulator(
+            server=("127.0.0.1", remote.address[1]),
+            bind=("0.0.0.0", 0),
+            config=QUICK,
+            key_file=key_file,
+        )
+        running = Running(simulator)
+        assert_flies(remote, 1)
+        remote.close()
+        assert running.join() == "the agent closed"
+
+
+# ---- what was recorded
+
+
+class Wiretap:
+    """Carries datagrams between a simulator and an agent, keeps them, and can send its own.
+
+    To the agent it is the simulator, at one address for all its life.
+    """
+
+    def __init__(self, agent: tuple[str, int]) -> None:
+        self.down, self.up = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in "du")
+        self.down.bind(ANY)
+        self.up.bind(ANY)
+        self.up.connect(agent)
+        self.simulator: Any = None
+        self.upward: list[bytes] = []
+        self.downward: list[bytes] = []
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def __enter__(self) -> "Wiretap":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+        self.down.close()
+        self.up.close()
+
+    @property
+    def address(self) -> Any:
+        return self.down.getsockname()
+
+    def again(self, upward: list[bytes], downward: list[bytes]) -> None:
+        for datagram in upward:
+            self.up.send(datagram)
+        for datagram in downward:
+            self.down.sendto(datagram, self.simulator)
+
+    def _run(self) -> None:
+        while not self._over.is_set():
+            for sock in select.select([self.down, self.up], [], [], 0.02)[0]:
+                try:
+                    datagram, address = sock.recvfrom(65507)
+                except ConnectionError:
+                    continue
+                if sock is self.down:
+                    self.simulator = address
+                    self.upward.append(datagram)
+                    self.up.send(datagram)
+                else:
+                    self.downward.append(datagram)
+                    self.down.sendto(datagram, self.simulator)
+
+
+@pytest.mark.parametrize("secret", [False, True], ids=["no key", "key"])
+def test_a_recorded_flight_sent_again_changes_nothing(secret: bool, key_file: str) -> None:
+    """All of an earlier session, from the same address, again and again during the next one."""
+    keys: Any = {"key_file": key_file} if secret else {}
+    remote = RemoteEnv(ANY, connect=False, timeout=5, connect_timeout=5, **keys)
+    with remote, Wiretap(remote.address) as tap:
+
+        def simulate() -> Running:
+            return Running(Simulator(server=tap.address, bind=ANY, config=QUICK, **keys))
+
+        first = simulate()
+        assert_flies(remote, 1, 30)
+        first.simulator.fleet.step = None  # type: ignore[assignment]
+        with pytest.raises(PeerClosed, match="TypeError: 'NoneType' object is not callable"):
+            remote.step(np.zeros(1))
+        assert isinstance(first.join(), TypeError)
+        upward, downward = list(tap.upward), list(tap.downward)
+        assert min(len(upward), len(downward)) > 30
+        second = simulate()
+        local = gym.make(ENV_ID)
+        assert remote.reset(seed=1)[0].tobytes() == local.reset(seed=1)[0].tobytes()
+        dice = np.random.default_rng(0)
+        for step in range(60):
+            tap.again(upward[step % 20 :], downward[step % 20 :])
+            action = dice.uniform(-1, 1, 1).astype(np.float32)
+            here, there = remote.step(action), local.step(action)
+            assert here[0].tobytes() == there[0].tobytes()
+            assert here[1:4] == there[1:4]
+        counters = remote.statistics.counters
+        assert counters["sessions"] == 2
+        assert second.simulator.link.sequence == 62
+        cause = "forged" if secret else "foreign"
+        assert second.simulator.link.statistics.counters[cause] > 100
+        assert counters["foreign"] + counters["forged"] + counters["stale"] > 100
+        remote.close()
+        assert second.join() == "the agent closed"
+
+
+def test_recorded_datagrams_open_nothing_at_an_agent_that_was_started_anew(key_file: str) -> None:
+    keys: Any = {"key_file": key_file}
+    with RemoteEnv(ANY, connect=False, **keys) as remote, Wiretap(remote.address) as tap:
+        address = remote.address
+        running = Running(Simulator(server=tap.address, bind=ANY, config=QUICK, **keys))
+        assert_flies(remote, 1, 30)
+        remote.close()
+        running.join()
+        recorded = list(tap.upward)
+        kinds = {type(binary.decode(datagram[OVERHEAD:])) for datagram in recorded}
+        assert kinds == {Hello, State, Close}
+        with RemoteEnv(address, connect=False, connect_timeout=0.5, **keys) as remote:
+            for _ in range(3):
+                tap.again(recorded, [])
+                with pytest.raises(PeerSilent, match="no simulator came"):
+                    remote.connect()
+            counters = remote.statistics.counters
+            assert counters["sessions"] == 0  # the Hello is welcome, its State 1 is another's
+            assert counters["foreign"] + counters["forged"] > 90
+            # A real one, from the same address, is welcome.
+            running = Running(Simulator(server=tap.address, bind=ANY, config=QUICK, **keys))
+            assert_flies(remote, 2, 50)
+            assert counters["sessions"] == 1
+        assert running.join() == "the agent closed"
+
+
+def test_a_state_of_this_session_sent_again_gets_the_same_answer(key_file: str) -> None:
+    keys: Any = {"key_file": key_file}
+    with RemoteEnv(ANY, connect=False, **keys) as remote, Wiretap(remote.address) as tap:
+        running = Running(Simulator(server=tap.address, bind=ANY, config=QUICK, **keys))
+        remote.reset(seed=0)
+        for _ in range(5):
+            remote.step(np.ones(1))
+        last = tap.upward[-2]
+        assert binary.decode(last[OVERHEAD:]).sequence == 6
+        before = len(tap.downward)
+        tap.again([*tap.upward[:-2], last, last], [])
+        remote.step(np.zeros(1))
+        time.sleep(0.1)
+        got = [binary.decode(datagram[OVERHEAD:]) for datagram in tap.downward[before:]]
+        assert {type(message) for message in got} == {Command}
+        assert len(set(tap.downward[before:])) == len({message.sequence for message in got})
+        remote.close()
+        assert running.join() == "the agent closed"

@@ -1,0 +1,87 @@
+"""The agent's port: strangers cannot fill a simulator's buffer, nor take the port."""
+
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+
+import pytest
+from rotorgram.udp.sockets import Port, open_socket
+
+ANY = ("127.0.0.1", 0)
+
+
+@pytest.fixture
+def port() -> Iterator[Port]:
+    port = Port(ANY, insecure=False)
+    yield port
+    port.close()
+
+
+@pytest.fixture
+def others() -> Iterator[list[socket.socket]]:
+    socks = [open_socket(ANY, insecure=False) for _ in range(3)]
+    yield socks
+    for sock in socks:
+        sock.close()
+
+
+def test_each_simulator_and_everybody_else(port: Port, others: list[socket.socket]) -> None:
+    one, two, _ = others
+    port.keep([one.getsockname(), two.getsockname()])
+    for sock in others:
+        sock.sendto(b"%d" % sock.getsockname()[1], port.address)
+    seen = set()
+    for _ in others:
+        datagram, address = port.receive(1.0, strangers=True)
+        assert int(datagram) == address[1]
+        seen.add(address)
+    assert seen == {sock.getsockname() for sock in others}
+    port.send(b"back", one.getsockname())
+    one.settimeout(1)
+    assert one.recvfrom(100) == (b"back", port.address)
+    with pytest.raises(TimeoutError):
+        port.receive(0.01, strangers=True)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="one socket for all elsewhere")
+@pytest.mark.parametrize("simulators", [1, 2])
+def test_a_flood_leaves_the_simulators_their_buffer(
+    port: Port, others: list[socket.socket], simulators: int
+) -> None:
+    *known, stranger = others
+    port.keep([sock.getsockname() for sock in known[:simulators]])
+    for _ in range(20_000):  # far more than a buffer holds
+        stranger.sendto(bytes(500), port.address)
+    for sock in known[:simulators]:
+        sock.sendto(b"state", port.address)
+    got = []
+    for _ in range(10):
+        with suppress(TimeoutError):
+            got.append(port.receive(0.1, strangers=False)[0])
+    assert got.count(b"state") == simulators
+    assert got.count(bytes(500)) <= 10
+
+
+def test_a_simulator_that_has_left_is_a_stranger_again(
+    port: Port, others: list[socket.socket]
+) -> None:
+    one = others[0]
+    for _ in range(3):
+        port.keep([one.getsockname()])
+        one.sendto(b"own", port.address)
+        assert port.receive(1.0, strangers=False)[0] == b"own"
+        port.keep([])
+        one.sendto(b"any", port.address)
+        assert port.receive(1.0, strangers=True)[0] == b"any"
+
+
+def test_the_port_is_nobody_elses(port: Port, others: list[socket.socket]) -> None:
+    for peers in ([], [others[0].getsockname()]):
+        port.keep(peers)
+        with pytest.raises(OSError, match="the port is in use"):
+            open_socket(port.address, insecure=False)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as thief:
+            thief.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            with pytest.raises(OSError, match="in use"):
+                thief.bind(port.address)

@@ -1,0 +1,489 @@
+"""The agent's side of the exchange (UDP server), free of sockets and clocks: see `link`.
+
+It has places, one for each simulator that it flies. A Hello that fits is welcomed, and takes a
+place only when its first State has come: a Hello that was recorded and sent again takes none.
+"""
+
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from . import binary, text
+from .errors import DecodeError, VersionMismatch
+from .keys import OVERHEAD, Key, is_sealed, message_of
+from .link import CLOSE_INTERVAL, CLOSE_LINGER, Address, Tap, encode, sealed
+from .messages import (
+    Close,
+    Command,
+    Hello,
+    Message,
+    Refuse,
+    State,
+    Unknown,
+    Wait,
+    Welcome,
+    one_line,
+)
+from .statistics import Statistics
+
+__all__ = ["AgentLink", "Event", "Session"]
+
+_MOST: Final = 1024
+"""Simulators that are remembered between Hello and first State, while they wait, and after."""
+_REASON_AT: Final = binary.HEADER_SIZE + 2
+"""Bytes of a Refuse or a Close before its reason."""
+
+_NEXT: Final = {
+    ("expecting", State): "deciding",
+    ("expecting", Close): "closed",
+    ("deciding", Close): "closed",
+    ("closing", Close): "closed",
+}
+"""What a message of the welcome simulator does to its session; any other pair is dropped."""
+
+
+@dataclass(eq=False)
+class Session:
+    """An open exchange with one simulator, pinned to its address and codec.
+
+    `state` is one of `expecting` (a State), `deciding` (a State waits for its Command), `closing`
+    (for the answer to a Close) and `closed`.
+    """
+
+    peer: Address
+    hello: Hello | None
+    """None if it speaks text."""
+    number: int
+    """Session number; 0 with the text codec."""
+    key: Key | None = None
+    welcome: Welcome | None = None
+    reply: bytes = b""
+    """The answer to the last State, or the Welcome."""
+    state: str = "expecting"
+    sequence: int = 0
+    """Number of the State that came last."""
+    asked_at: float | None = None
+    """When the Command was sent whose State is expected."""
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it speaks the text codec."""
+        return self.hello is None
+
+
+class Event(NamedTuple):
+    """What a datagram brought."""
+
+    place: int
+    message: State | Close
+    joined: bool = False
+    """The State is the first of a new session, which may have taken the place of another."""
+
+
+class AgentLink:
+    """Welcomes simulators and answers each of their States once.
+
+    Args:
+        accept: Looks at a Hello and gives the reason to refuse it, or "".
+        text_sizes: Numbers of observation and of telemetry. A text simulator says no Hello: its
+            first line opens the session, and these say how to read it.
+        places: Simulators to fly at the same time. Others wait until a place is free.
+        key: Shared with the simulators. Then nothing unsealed is taken.
+        tap: Sees every message once.
+        draw_nonce: Gives a random 64-bit number for each Welcome.
+    """
+
+    def __init__(
+        self,
+        accept: Callable[[Hello], str],
+        text_sizes: tuple[int, int],
+        *,
+        places: int = 1,
+        key: Key | None = None,
+        tap: Tap | None = None,
+        draw_nonce: Callable[[], int] = lambda: secrets.randbits(64),
+    ) -> None:
+        self.places: list[Session | None] = [None] * places
+        self.closed = False
+        self.takes_text = True
+        """Whether a text simulator may take a free place."""
+        self.statistics = Statistics()
+        self._accept = accept
+        self._text_sizes = text_sizes
+        self._key = key
+        self._tap = tap
+        self._draw_nonce = draw_nonce
+        self._seats: dict[Address, int] = {}
+        self._openings: OrderedDict[tuple[Address, int], Session] = OrderedDict()
+        self._waiting: OrderedDict[Address, tuple[int, int]] = OrderedDict()  # session, room
+        self._ended: OrderedDict[int, None] = OrderedDict()
+        self._outgoing: list[tuple[bytes, Address]] = []
+        self._resend_at = self._deadline = 0.0
+
+    def receive(self, datagram: bytes, address: Address, now: float) -> Event | None:
+        """Take a datagram; what it brought, if it moves an exchange on."""
+        self.statistics.counters["received"] += 1
+        place = self._seats.get(address, -1)
+        session = self.places[place] if place >= 0 else None
+        try:
+            is_text = self._key is None and text.is_text(datagram)
+            plain = datagram if is_text else self._open(datagram, address, session)
+            message = self._decode(plain, is_text)
+        except DecodeError as error:
+            self._refuse_undecoded(datagram, address, error, now)
+            return None
+        if session and (message.session, is_text) == (session.number, session.is_text):
+            return self._receive_known(place, session, message, plain, datagram, now)
+        if isinstance(message, Hello):
+            self._receive_hello(message, address, len(datagram), now)
+        elif isinstance(message, State) and is_text:
+            return self._join_by_text(message, address, session, now)
+        elif isinstance(message, State):
+            return self._join(message, address, plain, datagram, now)
+        else:
+            self._drop("foreign", type(message).__name__, address, now)
+        return None
+
+    def send_command(self, place: int, command: Command, now: float) -> None:
+        """Answer the State of the same number. Its bytes are kept for a repeated State."""
+        session = self.places[place]
+        if session is None or (session.state, session.sequence) != ("deciding", command.sequence):
+            got = (session.state, session.sequence) if session else "a free place"
+            raise ValueError(
+                f"send_command: expected a session that is 'deciding' on State "
+                f"{command.sequence}, got {got}"
+            )
+        self._answer(place, session, command)
+        session.state, session.asked_at = "expecting", now
+
+    def free(self, place: int) -> None:
+        """Give the place of a simulator that has fallen silent to the next that comes."""
+        session, self.places[place] = self.places[place], None
+        if session:
+            del self._seats[session.peer]
+            _keep(self._ended, session.number, None)
+
+    def close(self, reason: str, now: float) -> None:
+        """End every exchange and tell the simulators, until they answer."""
+        if self.closed:
+            return
+        self.closed = True
+        for place, session in enumerate(self.places):
+            if session:
+                close = Close(
+                    session=session.number, sequence=session.sequence, reason=one_line(reason)
+                )
+                self._answer(place, session, close)
+                session.state = "closing"
+        for address, (number, room) in self._waiting.items():
+            self._refuse(number, reason, address, room, sealed=self._key is not None)
+        self._resend_at, self._deadline = now + CLOSE_INTERVAL, now + CLOSE_LINGER
+
+    def next_timer(self) -> float | None:
+        """When `handle_timer` wants to be called; None if never."""
+        if self.closed and any(self.places):
+            return min(self._resend_at, self._deadline)
+        return None
+
+    def handle_timer(self, now: float) -> None:
+        """Repeat what is due: a Close that nobody has answered, until nobody will."""
+        timer = self.next_timer()
+        if timer is None or now < timer:
+            return
+        for place, session in enumerate(self.places):
+            if session and now >= self._deadline:
+                self.free(place)
+            elif session:
+                self._outgoing.append((session.reply, session.peer))
+                self.statistics.counters["resent"] += 1
+        self._resend_at = now + CLOSE_INTERVAL
+
+    def take_outgoing(self) -> list[tuple[bytes, Address]]:
+        """Datagrams to send and where to, each once."""
+        outgoing, self._outgoing = self._outgoing, []
+        return outgoing
+
+    # ---- a simulator that comes
+
+    def _receive_hello(self, hello: Hello, address: Address, size: int, now: float) -> None:
+        opening = self._openings.get((address, hello.session))
+        if hello.session in self._ended:
+            self._drop("stale", "", address, now)
+        elif opening and not self.closed:
+            self._outgoing.append((opening.reply, address))
+            self.statistics.counters["resent"] += 1
+            self._drop("duplicate", "", address, now)
+        elif reason := "the agent has closed" if self.closed else self._accept(hello):
+            self._refuse(hello.session, reason, address, size, sealed=self._key is not None)
+            self._drop("refused", reason, address, now)
+        elif None in self.places or address in self._seats:
+            self._welcome(hello, address)
+        else:
+            wait = self._send(Wait(session=hello.session), address, self._key)
+            _keep(self._waiting, address, (hello.session, size - len(wait)))
+
+    def _welcome(self, hello: Hello, address: Address) -> None:
+        welcome = Welcome(session=hello.session, nonce=self._draw_nonce())
+        key = self._key.for_session(hello.session, welcome.nonce) if self._key else None
+        reply = self._send(welcome, address, self._key)
+        opening = Session(
+            peer=address, hello=hello, number=hello.session, key=key, welcome=welcome, reply=reply
+        )
+        _keep(self._openings, (address, hello.session), opening)
+        self._waiting.pop(address, None)
+
+    def _join(
+        self, state: State, address: Address, plain: bytes, datagram: bytes, now: float
+    ) -> Event | None:
+        """A State from an address that has no such session: the first of one, or of none here."""
+        opening = self._openings.get((address, state.session))
+        if opening and state.sequence != 1:  # its Hello was an old one: another agent knew it
+            del self._openings[address, state.session]
+            opening = None
+        if opening is None:
+            self._disown(datagram, address, now)
+            return None
+        if reason := _misfit(opening, state):
+            self._drop("malformed", reason, address, now)
+            return None
+        self._forget(opening)
+        assert opening.hello is not None
+        # Another one may have come since its Hello.
+        if reason := "the agent has closed" if self.closed else self._accept(opening.hello):
+            words = _cut(reason, len(datagram) - _REASON_AT - (OVERHEAD if self._key else 0))
+            close = Close(session=state.session, sequence=1, reason=words)
+            self._put(sealed(encode(close), opening.key), address)
+            self._drop("refused", reason, address, now)
+            return None
+        place = self._seats.get(address, -1)
+        if place < 0 and None not in self.places:  # another one was quicker
+            self._disown(datagram, address, now)
+            return None
+        return self._seat(place, opening, state, plain)
+
+    def _forget(self, opening: Session) -> None:
+        """The opening of a State 1, and what the same address began before it."""
+        for address, number in list(self._openings):
+            if address == opening.peer:
+                del self._openings[address, number]
+                if number == opening.number:
+                    return
+
+    def _join_by_text(
+        self, state: State, address: Address, session: Session | None, now: float
+    ) -> Event | None:
+        """A line from an address that has no text session: the first of one, if there is room."""
+        if self.takes_text and session is None and None in self.places and not self.closed:
+            newcomer = Session(peer=address, hello=None, number=0)
+            return self._seat(-1, newcomer, state, b"")
+        self._close_text(state.sequence, address)
+        self._drop("refused", "every place is taken", address, now)
+        return None
+
+    def _seat(self, place: int, session: Session, state: State, plain: bytes) -> Event:
+        """Give a session its place: the first free one, or that of an earlier session."""
+        if place < 0:
+            place = self.places.index(None)
+        else:
+            self.free(place)
+        self.places[place] = session
+        self._seats[session.peer] = place
+        session.sequence, session.state = state.sequence, "deciding"
+        self.statistics.counters["sessions"] += 1
+        if session.hello and session.welcome:
+            self._record(place, session.hello, encode(session.hello))
+            self._record(place, session.welcome, encode(session.welcome))
+        self._record(place, state, plain, is_text=session.is_text)
+        return Event(place, state, joined=True)
+
+    def _disown(self, datagram: bytes, address: Address, now: float) -> None:
+        """A State of a session that is none here: its simulator is to begin another."""
+        _, number, sequence = binary.peek(message_of(datagram) if self._key else datagram)
+        self._drop("foreign", f"session {number:016x}", address, now)
+        held = {(s.peer, s.number) for s in self.places if s}
+        if self._key is None:  # else an Unknown is of use to him alone who has sent this State
+            held.update(self._openings)
+            held.update((there, waits) for there, (waits, _) in self._waiting.items())
+        if self.closed or any(n == number and there != address for there, n in held):
+            return  # somebody else holds it, elsewhere: no word of ours shall end it
+        reply = encode(Unknown(session=number, sequence=sequence))
+        if self._key:
+            reply = self._key.seal(reply, datagram)
+        if len(reply) <= len(datagram):
+            self._put(reply, address)
+
+    # ---- a simulator that has its place
+
+    def _receive_known(
+        self,
+        place: int,
+        session: Session,
+        message: Message,
+        plain: bytes,
+        datagram: bytes,
+        now: float,
+    ) -> Event | None:
+        address = session.peer
+        if isinstance(message, State) and message.sequence == session.sequence:
+            if session.state != "deciding":  # else the answer is still being thought of
+                self._outgoing.append((session.reply, address))
+                self.statistics.counters["resent"] += 1
+            self._drop("duplicate", "", address, now)
+            return None
+        if isinstance(message, State) and session.hello and message.sequence > session.sequence + 1:
+            # It went on with another agent: what opened it here came late, from before a restart.
+            self._disown(datagram, address, now)
+            return None
+        state = _NEXT.get((session.state, type(message)))
+        if (
+            state is None
+            or not isinstance(message, State | Close)
+            or not _is_next(session, message)
+        ):
+            self._drop("stale", "", address, now)
+            return None
+        if isinstance(message, State) and (reason := _misfit(session, message)):
+            self._drop("malformed", reason, address, now)
+            return None
+        before, session.state = session.state, state
+        self._record(place, message, plain, is_text=session.is_text)
+        if isinstance(message, Close):
+            if before != "closing":
+                close = Close(session=session.number, sequence=session.sequence, reason="")
+                self._answer(place, session, close)
+            self.free(place)
+        else:
+            session.sequence = message.sequence
+            if session.asked_at is not None:
+                self.statistics.round_trips.add(now - session.asked_at)
+        return Event(place, message)
+
+    def _answer(self, place: int, session: Session, message: Command | Close) -> None:
+        datagram = encode(message, as_text=session.is_text)
+        self._record(place, message, datagram, is_text=session.is_text)
+        session.reply = sealed(datagram, session.key)
+        self._put(session.reply, session.peer)
+
+    # ---- strangers
+
+    def _open(self, datagram: bytes, address: Address, session: Session | None) -> bytes:
+        """A binary datagram without its seal. Raises `DecodeError`."""
+        if self._key is None:
+            if is_sealed(datagram):
+                raise _KeyMismatch("key: this agent has none (--key-file), and the simulator has")
+            return datagram
+        if not is_sealed(datagram):
+            raise _KeyMismatch("key: this agent has one (--key-file), and the simulator has none")
+        kind, number, _ = binary.peek(message_of(datagram))
+        if kind not in binary.OF_SESSION:
+            return self._key.open(datagram)
+        if session and session.key and session.number == number:
+            return session.key.open(datagram)
+        # If the Welcome was not for this one, but for an old copy of its Hello, it is as good as
+        # none.
+        opening = self._openings.get((address, number))
+        if opening and opening.key:
+            with suppress(DecodeError):
+                return opening.key.open(datagram)
+        raise _NoSuchSession(f"session {number:016x}")
+
+    def _decode(self, datagram: bytes, is_text: bool) -> Message:
+        if is_text:
+            return text.decode_state(datagram, *self._text_sizes)
+        return binary.decode(datagram)
+
+    def _refuse_undecoded(
+        self, datagram: bytes, address: Address, error: DecodeError, now: float
+    ) -> None:
+        """Count it, and answer an opening that whoever sent it can only mend when told."""
+        sealed, size = is_sealed(datagram), len(datagram)
+        kind, number, _ = binary.peek(message_of(datagram) if sealed else datagram)
+        if isinstance(error, _NoSuchSession):
+            if kind == binary.STATE:
+                self._disown(datagram, address, now)
+            else:
+                self._drop("foreign", str(error), address, now)
+            return
+        if isinstance(error, _KeyMismatch | VersionMismatch) and kind == binary.HELLO:
+            trusted = sealed and not isinstance(error, _KeyMismatch)
+            self._refuse(number, str(error), address, size, sealed=trusted)
+        elif isinstance(error, _KeyMismatch) and text.is_text(datagram):
+            with suppress(DecodeError):
+                line = text.decode_state(datagram, *self._text_sizes)
+                if isinstance(line, State):  # two agents would answer each other's Closes for ever
+                    self._close_text(line.sequence, address)
+        self._drop("forged" if self._key else "malformed", str(error), address, now)
+
+    def _refuse(
+        self, number: int, reason: str, address: Address, size: int, *, sealed: bool
+    ) -> None:
+        """Refuse a Hello of so many bytes, with no more than it had."""
+        room = size - _REASON_AT - (OVERHEAD if sealed else 0)
+        if room >= 0:
+            refuse = Refuse(session=number, reason=_cut(reason, room))
+            self._send(refuse, address, self._key if sealed else None)
+
+    def _close_text(self, sequence: int, address: Address) -> None:
+        close = Close(session=0, sequence=sequence, reason="")
+        self._put(text.encode(close), address)
+
+    def _send(self, message: Message, address: Address, key: Key | None) -> bytes:
+        datagram = sealed(encode(message), key)
+        self._put(datagram, address)
+        return datagram
+
+    def _put(self, datagram: bytes, address: Address) -> None:
+        self._outgoing.append((datagram, address))
+        self.statistics.counters["sent"] += 1
+
+    def _record(
+        self, place: int, message: Message, datagram: bytes, *, is_text: bool = False
+    ) -> None:
+        if self._tap:
+            self._tap(place, message, binary.encode(message) if is_text else datagram)
+
+    def _drop(self, cause: str, reason: str, address: Address, now: float) -> None:
+        self.statistics.drop(cause, f"from {address[0]}:{address[1]}: {reason}", now)
+
+
+class _KeyMismatch(DecodeError):
+    """One side has a key, the other has none."""
+
+
+class _NoSuchSession(DecodeError):
+    """A sealed message of a session whose key is not here."""
+
+
+def _keep(table: "OrderedDict[Any, Any]", key: Any, value: Any) -> None:
+    """Put into a table that forgets its oldest entries."""
+    table[key] = value
+    table.move_to_end(key)
+    if len(table) > _MOST:
+        table.popitem(last=False)
+
+
+def _cut(reason: str, room: int) -> str:
+    """A reason that takes at most so many bytes."""
+    return one_line(reason).encode()[:room].decode(errors="ignore")
+
+
+def _is_next(session: Session, message: State | Close) -> bool:
+    ahead = message.sequence - session.sequence
+    # The State before a Close may have been lost, but not while it is answered.
+    if isinstance(message, Close):
+        return ahead == 0 or (ahead == 1 and session.state != "deciding")
+    return ahead == 1
+
+
+def _misfit(session: Session, state: State) -> str:
+    if session.hello is None:
+        return ""  # a text line was read by `text_sizes`
+    hello = session.hello
+    expected = (hello.num_drones, hello.observation_low.size, len(hello.telemetry_names))
+    got = (*state.observations.shape, state.telemetry.shape[1])
+    if got == expected:
+        return ""
+    return f"State: expected (drones, observations, telemetry) = {expected}, got {got}"

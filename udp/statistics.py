@@ -1,0 +1,120 @@
+"""What a side sees of the wire: counts, round trips, and notices at a bounded rate."""
+
+from collections import Counter
+from math import frexp
+from typing import Final
+
+from .messages import one_line
+
+__all__ = ["Durations", "Statistics"]
+
+NOTICE_INTERVAL: Final = 10.0
+"""Shortest time between two notices of the same cause, s."""
+REPORT_INTERVAL: Final = 60.0
+"""Time between two reports of all numbers, s."""
+
+_STEPS: Final = 32
+"""Buckets for each doubling: a quantile is right to 3 %."""
+_QUIET: Final = frozenset({"duplicate", "stale"})
+"""What every network that loses datagrams makes: counted, not worth a notice."""
+
+
+class Durations:
+    """Quantiles of any number of durations in a bounded table of logarithmic buckets."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.longest = 0.0
+        """s; 0 while there is none."""
+        self._buckets: Counter[int] = Counter()
+
+    def add(self, seconds: float) -> None:
+        """Count one. Below a nanosecond is a nanosecond: clocks may stand still."""
+        seconds = max(seconds, 1e-9)
+        mantissa, exponent = frexp(seconds)  # mantissa in [0.5, 1)
+        self._buckets[exponent * _STEPS + int((mantissa - 0.5) * (2 * _STEPS))] += 1
+        self.count += 1
+        self.longest = max(self.longest, seconds)
+
+    def quantile(self, share: float) -> float:
+        """Duration that the given share of all does not exceed, s; 0 if there is none."""
+        wanted, seen = share * self.count, 0
+        for bucket in sorted(self._buckets):
+            seen += self._buckets[bucket]
+            if seen >= wanted:
+                exponent, part = divmod(bucket, _STEPS)
+                upper: float = (0.5 + (part + 1) / (2 * _STEPS)) * 2.0**exponent
+                return min(upper, self.longest)
+        return 0.0
+
+
+class Statistics:
+    """Counts and times of one side. Everything else about dropped datagrams is forgotten."""
+
+    def __init__(self) -> None:
+        self.counters: Counter[str] = Counter()
+        """`sent`, `received`, `resent`, `unsent`, `sessions`, and what was dropped, by cause:
+        `malformed`, `forged`, `foreign`, `refused`, `duplicate`, `stale`."""
+        self.round_trips = Durations()
+        """From the first sending of a message to the answer that counts."""
+        self._last = ""
+        self._notices: list[str] = []
+        self._next_notice: dict[str, float] = {}
+        self._unsaid: Counter[str] = Counter()
+        self._next_report: float | None = None
+
+    def drop(self, cause: str, reason: str, now: float) -> None:
+        """Count a datagram that changes nothing; say so if it is time to."""
+        self.counters[cause] += 1
+        if cause in _QUIET:
+            return
+        self._last = f"{cause} {reason}"
+        if now >= self._next_notice.get(cause, now):
+            more = f" ({self._unsaid.pop(cause)} more before)" if self._unsaid[cause] else ""
+            self._notices.append(f"dropped a datagram: {self.last_error}{more}")
+            self._next_notice[cause] = now + NOTICE_INTERVAL
+        else:
+            self._unsaid[cause] += 1
+
+    @property
+    def last_error(self) -> str:
+        """Why the last datagram was dropped that should not have come; "" if none was."""
+        return one_line(self._last)
+
+    def notice(self, sentence: str) -> None:
+        """Something that whoever watches wants to know."""
+        self._notices.append(one_line(sentence))
+
+    def take_notices(self) -> list[str]:
+        """Sentences for the log, each once."""
+        notices, self._notices = self._notices, []
+        return notices
+
+    def report_due(self, now: float) -> bool:
+        """Whether a minute has passed since the last report, or since the first call."""
+        if self._next_report is None:
+            self._next_report = now + REPORT_INTERVAL
+        if now < self._next_report:
+            return False
+        self._next_report = now + REPORT_INTERVAL
+        return True
+
+    def numbers(self) -> dict[str, float]:
+        """All of it as numbers by name, round trips in milliseconds: for logs of training."""
+        trips = self.round_trips
+        return {
+            **self.counters,
+            "round_trip_p50_ms": 1e3 * trips.quantile(0.5),
+            "round_trip_p99_ms": 1e3 * trips.quantile(0.99),
+            "round_trip_max_ms": 1e3 * trips.longest,
+        }
+
+    def __str__(self) -> str:
+        if not self.counters:
+            return "no datagrams"
+        counts = ", ".join(f"{count} {name}" for name, count in sorted(self.counters.items()))
+        if not self.round_trips.count:
+            return counts
+        numbers = self.numbers()
+        p50, p99, most = (numbers[f"round_trip_{name}_ms"] for name in ("p50", "p99", "max"))
+        return f"{counts}; round trip p50 {p50:.3f} ms, p99 {p99:.3f} ms, max {most:.3f} ms"
