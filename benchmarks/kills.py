@@ -27,7 +27,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pandas as pd
 from rotorgram.agents.checkpoints import load, software_versions
@@ -46,7 +46,10 @@ def free_port() -> int:
 class Pair:
     """The two sides, and what they have written so far."""
 
+    living: ClassVar[list["Pair"]] = []
+
     def __init__(self, folder: Path, env_steps: int) -> None:
+        self.living.append(self)
         self.folder = folder
         self.env_steps = env_steps
         self.agent_port, self.simulator_port = free_port(), free_port()
@@ -101,7 +104,8 @@ class Pair:
 
     def wait_for_progress(self, beyond: int) -> float:
         began = time.monotonic()
-        while self.done() <= beyond and self.agent.poll() is None:
+        while self.done() <= beyond and self.agent.poll() != 0:
+            assert self.agent.poll() is None, f"the agent failed: {self.agent.poll()}"
             assert time.monotonic() - began < HANG, f"no progress beyond {beyond} env steps"
             time.sleep(0.05)
         return time.monotonic() - began
@@ -185,10 +189,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--interrupts", type=int, default=20)
-    parser.add_argument("--env-steps", type=int, default=2_000_000)
+    parser.add_argument("--env-steps", type=int, default=300_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("docs/results/reliability/kills.json"))
     args = parser.parse_args()
+    # In a shell's background it is ignored, by the children too.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     dice, root = random.Random(args.seed), Path(tempfile.mkdtemp())
     half = args.kills // 2
     agent = kill_often(root / "agent", args.env_steps, half, ["a"], dice)
@@ -217,9 +223,16 @@ def main() -> None:
     args.out.write_text(json.dumps(result, indent=2) + "\n")
     print(json.dumps(result, indent=2))
     shutil.rmtree(root)
-    if not agent["identical_to_unbroken"]:
+    late = [t for times in interrupts.values() for t in times if t > 1.0]
+    if late or not agent["identical_to_unbroken"]:
         sys.exit(1)
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    finally:
+        for pair in Pair.living:
+            for process in (pair.agent, pair.simulator):
+                if process:
+                    process.kill()

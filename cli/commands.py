@@ -80,9 +80,9 @@ class Serve(AgentCommand):
             raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
         policy, config = load_policy(self.policy, self.env.checked())
         episode = 0
-        while self.episodes is None or episode < self.episodes:
-            with remote_env(config, self) as env, _until_it_leaves():
-                while self.episodes is None or episode < self.episodes:
+        with remote_env(config, self) as env:
+            while self.episodes is None or episode < self.episodes:
+                with _until_it_leaves():
                     flight = fly(env, policy, evaluation_seed(episode))
                     print(
                         f"episode {episode}: return {flight.rewards.sum():.1f}, "

@@ -77,12 +77,13 @@ def _train(training: Training, folder: Path, store_every: float) -> int:
 
             def on_update() -> bool:
                 show()
-                stopping = stop.asked
+                stopping = stop.reached()
                 keeper.keep(now=stopping)
                 return not stopping
 
             finished = training.train(on_update)
             if finished:
+                stop.reached()
                 keeper.keep(now=True)
     except (LinkError, KeyboardInterrupt):
         keeper.close()
@@ -214,6 +215,12 @@ def _stop_at_update() -> "Iterator[_Stop]":
 class _Stop:
     def __init__(self) -> None:
         self.asked = False
+
+    def reached(self) -> bool:
+        """Whether to stop at this update. There is time to write then."""
+        if self.asked and hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        return self.asked
 
     def ask(self, *_: object) -> None:
         if self.asked:

@@ -29,7 +29,7 @@ class Sim(Command):
     """Drones."""
     codec: Literal["binary", "text"] = "binary"
     """binary, or the paper's text."""
-    timeout: float = 60.0
+    timeout: float = 120.0
     """Give up when the agent has been silent for so many seconds."""
     key_file: Path | None = None
     """Key that the agent has too (rotorgram key): needed beyond this machine."""

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 
 from ..agents.policies import Policy
+from ..udp import LOST
 from .metrics import overshoot, settling_time, steady_state_error
 
 __all__ = ["Flight", "evaluation_row", "evaluation_seed", "fly", "fly_episodes"]
@@ -40,7 +41,13 @@ class Flight:
 
 
 def fly(env: gym.Env[np.ndarray, Any], policy: Policy, seed: int) -> Flight:
-    """One episode of a policy, from a seed."""
+    """One episode of a policy, from a seed; once more, if its simulator was lost."""
+    while (flight := _fly(env, policy, seed)) is None:
+        pass
+    return flight
+
+
+def _fly(env: gym.Env[np.ndarray, Any], policy: Policy, seed: int) -> Flight | None:
     policy.reset()
     observation, _ = env.reset(seed=seed)
     start = float(observation[0])
@@ -48,6 +55,8 @@ def fly(env: gym.Env[np.ndarray, Any], policy: Policy, seed: int) -> Flight:
     terminated = truncated = False
     while not (terminated or truncated):
         observation, reward, terminated, truncated, info = env.step(policy.act(observation))
+        if LOST in info:
+            return None
         errors.append(observation[0])
         rewards.append(float(reward))
         thrusts.append(info.get("F1", np.nan))

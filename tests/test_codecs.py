@@ -311,7 +311,7 @@ def test_random_bytes(junk: bytes) -> None:
         (5, struct.pack("<IH6xI", 2**32 - 1, 65535, 2**32 - 1)),
         (5, struct.pack("<IH6xI", 0, 1, 0)),
         (5, struct.pack("<IH6xIQfB", 1, 1, 2, 0, 0.0, 0)),
-        (5, struct.pack("<IH6xIQfffBB", 2, 1, 1, 0, 0.0, 0.0, 0.0, 0, 0)),
+        (5, struct.pack("<IH6xIQffBB", 2, 1, 1, 0, 0.0, 0.0, 0, 0)),
         (5, struct.pack("<IH6xIfB", 1, 1, 0, 0.0, 2)),
         (1, struct.pack("<IHHHxxd16s", 1, 65535, 65535, 0, 0.02, b"")),
         (6, struct.pack("<H", 65535)),
@@ -390,9 +390,8 @@ def test_another_version_is_told_apart_but_refuse_is_always_read() -> None:
     hello[2] = 3
     with pytest.raises(DecodeError, match="checksum"):
         binary.decode(bytes(hello))
-    with pytest.raises(VersionMismatch, match="protocol version: expected 2, got 3") as caught:
+    with pytest.raises(VersionMismatch, match="protocol version: expected 2, got 3"):
         binary.decode(sealed(bytes(hello)))
-    assert caught.value.session == 0x0123456789ABCDEF
     refuse = bytearray(golden("Refuse"))
     refuse[2] = 9
     assert binary.decode(sealed(bytes(refuse))) == GOLDEN_MESSAGES["Refuse"]

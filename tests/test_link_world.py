@@ -269,7 +269,7 @@ def test_a_clean_network_repeats_nothing() -> None:
     world.check()
     assert world.now == pytest.approx(1000.0 + 0.002 * 101)
     physics = world.physics[0]
-    assert physics.link.statistics.counters == {"sent": 102, "received": 101}
+    assert physics.link.statistics.counters == {"sent": 102, "received": 101, "sessions": 1}
     assert world.agent.statistics.counters == {"sent": 101, "received": 101, "sessions": 1}
     assert physics.link.statistics.round_trips.count == 100
     assert physics.link.statistics.round_trips.longest == pytest.approx(0.002)
@@ -293,7 +293,7 @@ def test_an_agent_that_is_started_again_goes_on(seed: int, codec: str) -> None:
         told = [p.link.statistics.take_notices() for p in world.physics]
         for physics, notices in zip(world.physics, told, strict=True):
             if physics.session != before[physics.address]:
-                assert any("the agent was started anew" in notice for notice in notices)
+                assert any("the agent does not know this session" in notice for notice in notices)
     assert all(len(p.steps) > 1 for p in world.physics)
     assert not any(p.ended for p in world.physics)
 

@@ -479,9 +479,10 @@ def test_a_second_simulator_waits_until_the_first_has_left(
         while time.monotonic() < until:
             remote.reset()
             time.sleep(0.02)
+        remote.step(np.zeros(1))
+        remote.step(np.zeros(1))
         with pytest.raises(PeerClosed, match="bad state"):
-            for _ in range(3):
-                remote.step(np.zeros(1))
+            remote.step(np.zeros(1))
         remote.reset()
         remote.step(np.zeros(1))
         assert remote.statistics.counters["refused"] == 0
@@ -534,6 +535,20 @@ def test_a_forgotten_env_tells_the_simulator() -> None:
     del remote
     gc.collect()
     assert running.join() == "the agent closed"
+
+
+def test_a_simulator_that_waits_is_told_when_the_agent_closes() -> None:
+    with flying() as pair:
+        pair.remote.reset()
+        waiting = Running(Simulator(server=pair.remote.address, bind=ANY, config=QUICK))
+        until = time.monotonic() + 5
+        while not waiting.simulator.link.statistics.counters["received"]:
+            assert time.monotonic() < until
+            pair.remote.reset()
+        pair.remote.close()
+        error = waiting.join()
+        assert isinstance(error, Refused)
+        assert str(error).endswith(" refused: the agent closed")
 
 
 class Broken(gym.Env[np.ndarray, np.ndarray]):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from . import binary, text
-from .errors import DecodeError, VersionMismatch
+from .errors import DecodeError, Forged, VersionMismatch
 from .keys import OVERHEAD, Key, is_sealed, message_of
 from .link import CLOSE_INTERVAL, CLOSE_LINGER, Address, Tap, encode, sealed
 from .messages import (
@@ -143,6 +143,8 @@ class AgentLink:
             return self._join_by_text(message, address, session, now)
         elif isinstance(message, State):
             return self._join(message, address, plain, datagram, now)
+        elif isinstance(message, Close):  # the answer to one of ours, mostly: not worth a word
+            self.statistics.counters["foreign"] += 1
         else:
             self._drop("foreign", type(message).__name__, address, now)
         return None
@@ -164,7 +166,8 @@ class AgentLink:
         session, self.places[place] = self.places[place], None
         if session:
             del self._seats[session.peer]
-            _keep(self._ended, session.number, None)
+            if session.hello:
+                _keep(self._ended, session.number, None)
 
     def close(self, reason: str, now: float) -> None:
         """End every exchange and tell the simulators, until they answer."""
@@ -179,7 +182,7 @@ class AgentLink:
                 self._answer(place, session, close)
                 session.state = "closing"
         for address, (number, room) in self._waiting.items():
-            self._refuse(number, reason, address, room, sealed=self._key is not None)
+            self._refuse(number, reason, address, room, key=self._key)
         self._resend_at, self._deadline = now + CLOSE_INTERVAL, now + CLOSE_LINGER
 
     def next_timer(self) -> float | None:
@@ -217,7 +220,7 @@ class AgentLink:
             self.statistics.counters["resent"] += 1
             self._drop("duplicate", "", address, now)
         elif reason := "the agent has closed" if self.closed else self._accept(hello):
-            self._refuse(hello.session, reason, address, size, sealed=self._key is not None)
+            self._refuse(hello.session, reason, address, size, key=self._key)
             self._drop("refused", reason, address, now)
         elif None in self.places or address in self._seats:
             self._welcome(hello, address)
@@ -265,7 +268,10 @@ class AgentLink:
         return self._seat(place, opening, state, plain)
 
     def _forget(self, opening: Session) -> None:
-        """The opening of a State 1, and what the same address began before it."""
+        """The opening of a State 1, and what the same address began before it.
+
+        That has not ended: if this State came late, a simulator may still say that Hello.
+        """
         for address, number in list(self._openings):
             if address == opening.peer:
                 del self._openings[address, number]
@@ -280,7 +286,11 @@ class AgentLink:
             newcomer = Session(peer=address, hello=None, number=0)
             return self._seat(-1, newcomer, state, b"")
         self._close_text(state.sequence, address)
-        self._drop("refused", "every place is taken", address, now)
+        if self.closed:
+            reason = "the agent has closed"
+        else:
+            reason = "every place is taken" if self.takes_text else "text is not flown here"
+        self._drop("refused", reason, address, now)
         return None
 
     def _seat(self, place: int, session: Session, state: State, plain: bytes) -> Event:
@@ -312,8 +322,7 @@ class AgentLink:
         reply = encode(Unknown(session=number, sequence=sequence))
         if self._key:
             reply = self._key.seal(reply, datagram)
-        if len(reply) <= len(datagram):
-            self._put(reply, address)
+        self._put(reply, address)
 
     # ---- a simulator that has its place
 
@@ -399,8 +408,8 @@ class AgentLink:
         self, datagram: bytes, address: Address, error: DecodeError, now: float
     ) -> None:
         """Count it, and answer an opening that whoever sent it can only mend when told."""
-        sealed, size = is_sealed(datagram), len(datagram)
-        kind, number, _ = binary.peek(message_of(datagram) if sealed else datagram)
+        under_seal, size = is_sealed(datagram), len(datagram)
+        kind, number, _ = binary.peek(message_of(datagram) if under_seal else datagram)
         if isinstance(error, _NoSuchSession):
             if kind == binary.STATE:
                 self._disown(datagram, address, now)
@@ -408,23 +417,23 @@ class AgentLink:
                 self._drop("foreign", str(error), address, now)
             return
         if isinstance(error, _KeyMismatch | VersionMismatch) and kind == binary.HELLO:
-            trusted = sealed and not isinstance(error, _KeyMismatch)
-            self._refuse(number, str(error), address, size, sealed=trusted)
+            trusted = under_seal and not isinstance(error, _KeyMismatch)
+            self._refuse(number, str(error), address, size, key=self._key if trusted else None)
         elif isinstance(error, _KeyMismatch) and text.is_text(datagram):
             with suppress(DecodeError):
                 line = text.decode_state(datagram, *self._text_sizes)
                 if isinstance(line, State):  # two agents would answer each other's Closes for ever
                     self._close_text(line.sequence, address)
-        self._drop("forged" if self._key else "malformed", str(error), address, now)
+        cause = "forged" if isinstance(error, Forged) else "malformed"
+        self._drop(cause, str(error), address, now)
 
     def _refuse(
-        self, number: int, reason: str, address: Address, size: int, *, sealed: bool
+        self, number: int, reason: str, address: Address, size: int, *, key: Key | None
     ) -> None:
         """Refuse a Hello of so many bytes, with no more than it had."""
-        room = size - _REASON_AT - (OVERHEAD if sealed else 0)
+        room = size - _REASON_AT - (OVERHEAD if key else 0)
         if room >= 0:
-            refuse = Refuse(session=number, reason=_cut(reason, room))
-            self._send(refuse, address, self._key if sealed else None)
+            self._send(Refuse(session=number, reason=_cut(reason, room)), address, key)
 
     def _close_text(self, sequence: int, address: Address) -> None:
         close = Close(session=0, sequence=sequence, reason="")
@@ -449,7 +458,7 @@ class AgentLink:
         self.statistics.drop(cause, f"from {address[0]}:{address[1]}: {reason}", now)
 
 
-class _KeyMismatch(DecodeError):
+class _KeyMismatch(Forged):
     """One side has a key, the other has none."""
 
 

@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from .errors import DecodeError, VersionMismatch
+from .keys import OVERHEAD
 from .messages import (
     MAX_TEXT,
     Close,
@@ -46,7 +47,7 @@ MAGIC: Final = b"\xa7R"
 VERSION: Final = 2
 MAX_DATAGRAM: Final = 65507
 """Largest payload of a UDP datagram over IPv4, bytes."""
-MAX_MESSAGE: Final = MAX_DATAGRAM - 18
+MAX_MESSAGE: Final = MAX_DATAGRAM - OVERHEAD
 """Largest message, bytes: room is left for the envelope of `keys`."""
 HEADER_SIZE: Final = 24
 
@@ -103,7 +104,7 @@ def decode(datagram: bytes) -> Message:
     if zlib.crc32(datagram[8:], zlib.crc32(datagram[:4])) != crc:
         raise DecodeError("checksum: the datagram was changed on its way")
     if version != VERSION and kind != _REFUSE:
-        raise VersionMismatch(version=version, expected=VERSION, kind=kind, session=session)
+        raise VersionMismatch(f"protocol version: expected {VERSION}, got {version}")
     if sequence and kind not in _NUMBERED:
         raise DecodeError(f"sequence: expected 0 in type {kind}, got {sequence}")
     decoder = _DECODERS.get(kind)

@@ -10,11 +10,9 @@ class DecodeError(Exception):
 class VersionMismatch(DecodeError):
     """An intact binary datagram of another protocol version."""
 
-    def __init__(self, *, version: int, expected: int, kind: int, session: int) -> None:
-        super().__init__(f"protocol version: expected {expected}, got {version}")
-        self.kind = kind
-        """Type byte of the datagram."""
-        self.session = session
+
+class Forged(DecodeError):
+    """A datagram is not sealed with the key of this side and session, or not at all."""
 
 
 class LinkError(ConnectionError):

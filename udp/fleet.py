@@ -35,7 +35,11 @@ class Fleet:
         if num_envs > 1 and not isinstance(env, str):
             raise ValueError(f"num_envs: expected 1 with an env already made, got {num_envs}")
         self.envs = [make_env(env, options) for _ in range(num_envs)]
-        self.hello = describe(self.envs[0], num_envs)
+        try:
+            self.hello = describe(self.envs[0], num_envs)
+        except BaseException:
+            self.close()
+            raise
         self._discrete = bool(self.hello.discrete_actions)
         self._names = self.hello.telemetry_names
         self._over = np.zeros(num_envs, bool)
@@ -108,6 +112,12 @@ class Fleet:
         truncated: bool,
         info: dict[str, Any],
     ) -> None:
+        observation = np.asarray(observation)
+        if observation.shape != self._observations.shape[1:] or observation.dtype != np.float32:
+            raise ValueError(
+                f"observation: expected float32 of shape {self._observations.shape[1:]}, "
+                f"got {observation.dtype} of shape {observation.shape}"
+            )
         self._observations[drone] = observation
         self._rewards[drone] = reward
         self._terminated[drone] = terminated

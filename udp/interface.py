@@ -2,7 +2,7 @@
 
 import json
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from ..envs.config import action_space, observation_space
 from .fleet import describe, make_env, options_text
 from .messages import Hello
 
-__all__ = ["Interface", "announced", "known", "refusal"]
+__all__ = ["Interface", "announced", "known", "refusal", "same_space"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ def known(env_id: str, options: dict[str, Any]) -> Interface:
             options=options_text(config),
         )
     with closing(make_env(env_id, options)) as env:
-        return announced(describe(env))
+        return replace(announced(describe(env)), drones=None, model_hash="")
 
 
 def refusal(env_id: str, expected: Interface | None, drones: int | None, hello: Hello) -> str:
@@ -79,14 +79,27 @@ def refusal(env_id: str, expected: Interface | None, drones: int | None, hello: 
         return ""
     if differences := _differences(_options(expected.options) or {}, theirs):
         return differences
-    if (got.observation, got.action) != (expected.observation, expected.action):
+    if not (
+        same_space(got.observation, expected.observation)
+        and same_space(got.action, expected.action)
+    ):
         return (
             f"expected {expected.observation} and {expected.action} as the options say, "
             f"got {got.observation} and {got.action}"
         )
+    if expected.telemetry and got.telemetry != expected.telemetry:
+        return f"expected the telemetry {expected.telemetry}, got {got.telemetry}"
     if expected.model_hash and got.model_hash != expected.model_hash:
         return f"expected a simulator of the model {expected.model_hash}, got {got.model_hash}"
     return ""
+
+
+def same_space(one: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
+    """Whether two spaces are equal in every bit; Gymnasium takes bounds for equal that are near."""
+    if isinstance(one, spaces.Box) and isinstance(other, spaces.Box):
+        bounds = [(space.low.tobytes(), space.high.tobytes()) for space in (one, other)]
+        return bounds[0] == bounds[1]
+    return one == other
 
 
 def _drones(count: int) -> str:

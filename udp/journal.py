@@ -38,7 +38,7 @@ FORMAT: Final = "1"
 MODEL: Final = "model.xml"
 """Name of the attachment that is the whole model of the simulator."""
 
-_CHUNK: Final = 1 << 18  # bytes; 1 ms to write
+_CHUNK: Final = 1 << 16  # bytes; 2 ms to write
 _SECOND: Final = 10**9
 _STATISTICS: Final = 10 * _SECOND
 _COMMAND: Final = 5
@@ -116,7 +116,7 @@ class Journal:
         self._open = True
 
     def tap(self, place: int, message: Message, datagram: bytes) -> None:
-        """Write a message. See `link.Tap`."""
+        """Take note of a message. See `link.Tap`. What it costs to write it is paid in `write`."""
         now = time.time_ns()
         if not self._open:
             return
@@ -129,6 +129,18 @@ class Journal:
             else:
                 self._tell(place, message, datagram, now)
             self._size += len(datagram)
+            if self._size > 4 * _CHUNK:  # nobody calls `write`
+                self._flush(now)
+        except OSError as error:
+            self._give_up(error)
+
+    def write(self) -> None:
+        """Write what there is. To be called when there is time: while the other side is at work."""
+        if not self._open:
+            return
+        now = time.time_ns()
+        try:
+            self._file.encode()
             # Clocks are set back at times.
             if self._size > _CHUNK or not 0 <= now - self._flushed < _SECOND:
                 self._flush(now)

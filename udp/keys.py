@@ -13,7 +13,7 @@ from hmac import compare_digest
 from pathlib import Path
 from typing import Final, Literal
 
-from .errors import DecodeError
+from .errors import Forged
 
 __all__ = ["KEY_SIZE", "OVERHEAD", "Key", "is_sealed", "message_of", "read_key", "write_key"]
 
@@ -59,12 +59,12 @@ class Key:
         return _MAGIC + tag.digest() + message
 
     def open(self, datagram: bytes, asked: bytes = b"") -> bytes:
-        """The message in a sealed datagram. Raises `DecodeError` if the key is another one."""
+        """The message in a sealed datagram. Raises `Forged` if the key is another one."""
         message = message_of(datagram)
         tag = self._theirs.copy()
         tag.update(message + asked)
         if not (is_sealed(datagram) and compare_digest(tag.digest(), datagram[2:OVERHEAD])):
-            raise DecodeError("key: the tag is not of this key and session")
+            raise Forged("key: the tag is not of this key and session")
         return message
 
 

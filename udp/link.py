@@ -38,8 +38,9 @@ CLOSE_LINGER: Final = 0.25
 class LinkConfig:
     """Times of the exchange, s."""
 
-    timeout: float = 60.0
-    """The simulator gives up when nothing has answered for this long."""
+    timeout: float = 120.0
+    """The simulator gives up when nothing has answered for this long: longer than an agent waits
+    for one to replace another that it has lost."""
     first_resend: float = 0.2
     """Wait before the first resend, while no round trip has been measured."""
     min_resend: float = 0.005

@@ -260,7 +260,7 @@ class _Tally:
             case Refuse(reason=reason):
                 summary.ending = f"refused: {reason}"
             case Unknown():
-                summary.ending = "the agent was started anew"
+                summary.ending = "the agent does not know this session"
 
     def _take_state(self, state: State) -> None:
         summary, command = self.summary, self._command

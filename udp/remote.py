@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ..envs import ENV_ID
+from .interface import same_space
 from .link import Address
 from .messages import MAX_UINT64, Hello, State
 from .server import Server, ServerConfig
@@ -128,6 +129,7 @@ class RemoteEnv(gym.Env[np.ndarray, Any]):
         self._server.exchange(_ONLY, self._no_action, _RESET, seeds)
         while self._server.lost[0]:  # the simulator that has come instead was not reset
             self._server.exchange(_ONLY, self._no_action, _RESET, seeds)
+        self._take_interface()
         self._flying = True
         self._state = self._take_state()
         return self._state.observations[0].copy(), self._info(self._state)
@@ -163,7 +165,8 @@ class RemoteEnv(gym.Env[np.ndarray, Any]):
                 last = int(self.action_space.n) - 1
                 raise ValueError(f"action: expected a whole number 0 to {last}, got {action!r}")
             return np.array([[[action]]], np.float32)
-        with np.errstate(over="ignore"):  # what overflows is infinite, and refused as such
+        # Whatever the program has set; what overflows is infinite, and refused as such.
+        with np.errstate(over="ignore", under="ignore"):
             array = np.asarray(action, dtype=np.float32)
         if array.shape != self.action_space.shape:
             raise ValueError(
@@ -191,7 +194,7 @@ class RemoteEnv(gym.Env[np.ndarray, Any]):
 
 def keep_space(env: Any, name: str, space: spaces.Space[Any]) -> None:
     """Give an env a space, unless it has that one already: its generator may have been seeded."""
-    if vars(env).get(name) != space:
+    if name not in vars(env) or not same_space(vars(env)[name], space):
         setattr(env, name, space)
 
 

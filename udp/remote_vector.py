@@ -155,12 +155,11 @@ class RemoteVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
         sent = self._sent(actions)
         resets = self._ended.reshape(self._shape)
+        self._flying = False  # until the answers are there
         try:
             self._server.exchange(range(self.num_simulators), sent, resets)
         except ValueError:  # an action that is wrong, and nothing has happened
-            raise
-        except BaseException:
-            self._flying = False
+            self._flying = True
             raise
         observations, rewards = self._joined("observations"), self._joined("rewards")
         terminated, truncated = self._joined("terminated"), self._joined("truncated")
@@ -179,6 +178,7 @@ class RemoteVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if broken.any():
             reasons[~broken] = None
             info[LOST], info[f"_{LOST}"] = reasons, broken
+        self._flying = True
         return observations.copy(), rewards, terminated, truncated, info
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -229,7 +229,8 @@ class RemoteVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             choices = int(self.single_action_space.n)
             if not ((array >= 0) & (array < choices) & (array % 1 == 0)).all():
                 raise ValueError(f"actions: expected whole numbers 0 to {choices - 1}, got {array}")
-        with np.errstate(over="ignore"):  # what overflows is infinite, and refused as such
+        # Whatever the program has set; what overflows is infinite, and refused as such.
+        with np.errstate(over="ignore", under="ignore"):
             return array.astype(np.float32).reshape(*self._shape, self._size)
 
     def _joined(self, name: str) -> np.ndarray:

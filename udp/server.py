@@ -6,7 +6,7 @@ import time
 import weakref
 from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,6 +25,7 @@ from .sockets import Port, address_text, log_notices
 __all__ = ["Server", "ServerConfig"]
 
 _log: Final = logging.getLogger("rotorgram.udp")
+_LONGEST_WAIT: Final = 0.5  # s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,9 +77,10 @@ class Server:
         self._hello: Hello | None = None
         key = Key(read_key(Path(config.key_file)), "agent") if config.key_file else None
         sizes = self.interface.observation.shape[0], len(self.interface.telemetry)
-        journal = None
+        journal: Journal | None = None
         if config.record:
             journal = of_agent(config.record, config.env_id, config.options, self.interface)
+        self._journal = journal
         self.link = AgentLink(
             self._wanted.refusal,
             sizes,
@@ -172,13 +174,17 @@ class Server:
             self._deadlines[place] = now + wait
         while waiting := [p for p, s in enumerate(link.places) if not s or s.state != "deciding"]:
             _flush(link, self._port)
+            if self._journal:
+                self._journal.write()
             left = min(self._deadlines[place] for place in waiting) - time.monotonic()
             if left <= 0:
                 self._give_up(waiting)
                 continue
             try:
-                datagram, address = self._port.receive(left, strangers=None in link.places)
-            except OSError:
+                # Not for long: another thread may have closed the env.
+                wait = min(left, _LONGEST_WAIT)
+                datagram, address = self._port.receive(wait, strangers=None in link.places)
+            except (OSError, ValueError):
                 if not self.close.alive:
                     raise gym.error.ClosedEnvironmentError("the env was closed") from None
                 continue  # nothing came; or (Windows) an earlier datagram found nobody
@@ -204,7 +210,10 @@ class Server:
             self._hello = session.hello
             if session.hello:
                 self.link.takes_text = False
-                self.interface = announced(session.hello)
+                # One that tells no options had to have those that were asked for.
+                told, asked = announced(session.hello), self._wanted.interface
+                options = told.options or (asked.options if asked else "")
+                self.interface = replace(told, options=options)
             self._wanted.interface, self._wanted.drones = self.interface, len(message.rewards)
             if self.states[place] is not None and not self.lost[place]:
                 self._lose(place, f"the simulator at {here} was started anew")

@@ -1,6 +1,7 @@
 """The simulator's side: a UDP client that steps Gymnasium envs by the commands of an agent."""
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -11,7 +12,7 @@ from .errors import PeerSilent, Refused
 from .fleet import Fleet
 from .journal import of_simulator
 from .keys import Key, read_key
-from .link import Address, LinkConfig
+from .link import Address, LinkConfig, encode
 from .messages import Close, Command, Message, Refuse, Welcome
 from .simulator_link import SimulatorLink
 from .sockets import address_text, log_notices, open_socket, receive, resolve
@@ -70,22 +71,21 @@ class Simulator:
             raise ValueError("server: expected the port of the agent, 1 to 65535, got 0")
         self.config = config or LinkConfig()
         self.fleet = Fleet(env, num_envs, options)
-        self._journal = of_simulator(record, self.fleet, options) if record else None
-        self.link = SimulatorLink(
-            self.fleet.hello,
-            self.config,
-            text_codec=codec == "text",
-            key=key,
-            tap=self._journal.tap if self._journal else None,
-        )
         self._trouble = ""
-        self._socket = open_socket(bind, insecure=anywhere, peer=self.server)
-        if self._journal:
-            try:
+        with ExitStack() as failing:  # what is open, should a later step fail
+            failing.callback(self.fleet.close)
+            by_text = codec == "text"
+            encode(self.fleet.state(1, 1), as_text=by_text)  # raises if it is more than a datagram
+            self._journal = of_simulator(record, self.fleet, options) if record else None
+            tap = self._journal.tap if self._journal else None
+            self.link = SimulatorLink(
+                self.fleet.hello, self.config, text_codec=by_text, key=key, tap=tap
+            )
+            self._socket = open_socket(bind, insecure=anywhere, peer=self.server)
+            failing.callback(self._socket.close)
+            if self._journal:
                 self._journal.start(self.link.statistics)
-            except BaseException:
-                self._socket.close()
-                raise
+            failing.pop_all()
 
     @property
     def address(self) -> Address:
@@ -157,6 +157,8 @@ class Simulator:
         link = self.link
         while True:
             self._flush()
+            if self._journal:
+                self._journal.write()
             timer = link.next_timer()
             assert timer is not None
             left = timer - time.monotonic()
@@ -184,7 +186,10 @@ class Simulator:
                 raise
             self._trouble = f"receiving failed: {error.strerror}"
             return None
-        return self.link.receive(datagram, time.monotonic())
+        message = self.link.receive(datagram, time.monotonic())
+        if message is not None:
+            self._trouble = ""
+        return message
 
     def _exchange_until_closed(self) -> None:
         """Until the agent has answered our Close, or will not."""
@@ -204,8 +209,10 @@ class Simulator:
             try:
                 self._socket.send(datagram)
             except ConnectionError:
+                self.link.statistics.counters["unsent"] += 1
                 self._trouble = "nothing listens on that port"
             except OSError as error:  # a full buffer or a network that is down: as good as lost
+                self.link.statistics.counters["unsent"] += 1
                 self._trouble = f"sending failed: {error.strerror}"
         log_notices(self.link.statistics, time.monotonic())
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 from . import binary, text
-from .errors import DecodeError
+from .errors import DecodeError, Forged
 from .keys import Key, is_sealed, message_of
 from .link import CLOSE_INTERVAL, CLOSE_LINGER, LinkConfig, Tap, encode, sealed
 from .messages import (
@@ -36,6 +36,9 @@ _NEXT: Final[dict[tuple[str, type], str]] = {
     ("closing", Close): "closed",
 }
 """What a message of the agent does to the simulator; any other pair is dropped."""
+
+_UNCLEAR: Final = 8
+"""After so many round trips in a row that cannot be measured, resends become rarer."""
 
 
 def new_session() -> int:
@@ -91,6 +94,7 @@ class SimulatorLink:
         self._sent_at = self._resend_at = self._deadline = 0.0
         self._smoothed: float | None = None
         self._variation = 0.0
+        self._unclear = 0
 
     def connect(self, now: float) -> None:
         """Say Hello, until a Welcome or a Refuse comes. With the text codec there is none."""
@@ -125,7 +129,7 @@ class SimulatorLink:
         try:
             message, plain = self._decode(datagram)
         except DecodeError as error:
-            cause = "forged" if self._key else "malformed"
+            cause = "forged" if isinstance(error, Forged) else "malformed"
             self._drop(cause, str(error), now)
             return None
         if message.session != self.hello.session:
@@ -146,8 +150,10 @@ class SimulatorLink:
         if isinstance(message, Unknown):
             self._begin_again(now)
             return None
-        if isinstance(message, Welcome) and self._key:
-            self._session_key = self._key.for_session(message.session, message.nonce)
+        if isinstance(message, Welcome):
+            self.statistics.counters["sessions"] += 1
+            if self._key:
+                self._session_key = self._key.for_session(message.session, message.nonce)
         if isinstance(message, Close) and before != "closing":
             self._answer_close()
         if isinstance(message, Command):
@@ -191,7 +197,7 @@ class SimulatorLink:
         if self._key:
             datagram = self._open(datagram, self._key)
         elif is_sealed(datagram):
-            raise DecodeError("key: the agent has one, this simulator has none (--key-file)")
+            raise Forged("key: the agent has one, this simulator has none (--key-file)")
         return binary.decode(datagram), datagram
 
     def _open(self, datagram: bytes, key: Key) -> bytes:
@@ -199,13 +205,13 @@ class SimulatorLink:
         if not is_sealed(datagram):
             message = binary.decode(datagram)
             words = f" that says: {message.reason}" if isinstance(message, Refuse) else ""
-            raise DecodeError(f"not sealed, a {type(message).__name__}{words}")
+            raise Forged(f"not sealed, a {type(message).__name__}{words}")
         kind, _, _ = binary.peek(message_of(datagram))
         if kind == binary.UNKNOWN:  # answers this very State, not one that somebody made up
             return key.open(datagram, self._outstanding)
         if kind in binary.OF_SESSION:
             if self._session_key is None:
-                raise DecodeError("a message of a session, and there is none")
+                raise Forged("a message of a session, and there is none")
             key = self._session_key
         return key.open(datagram)
 
@@ -241,7 +247,9 @@ class SimulatorLink:
 
     def _begin_again(self, now: float) -> None:
         """Say Hello to an agent that knows nothing of the session."""
-        self.statistics.notice("the agent was started anew; beginning a new session with it")
+        self.statistics.notice(
+            "the agent does not know this session (any more); beginning a new one"
+        )
         self.hello = replace(self.hello, session=self._draw_session())
         self.sequence, self._session_key, self._waits = 0, None, False
         self._send(self.hello, now)
@@ -273,7 +281,11 @@ class SimulatorLink:
     def _measure(self, round_trip: float) -> None:
         self.statistics.round_trips.add(round_trip)
         if self.sends > 1:  # after a resend nobody knows which of the two was answered
+            self._unclear += 1
+            if self._unclear % _UNCLEAR == 0 and self._smoothed is not None:
+                self._smoothed *= 2  # maybe it is that much longer by now
             return
+        self._unclear = 0
         # Smoothed mean and variation as TCP keeps them (RFC 6298).
         if self._smoothed is None:
             self._smoothed, self._variation = round_trip, round_trip / 2

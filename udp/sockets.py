@@ -139,6 +139,7 @@ class Port:
         self._simulators = selectors.DefaultSelector()
         self._all = selectors.DefaultSelector()
         self._all.register(self._everybody, selectors.EVENT_READ)
+        self._missing = False  # whether a simulator's datagrams come to the socket for everybody
         self._next_look = 0.0
 
     @property
@@ -146,11 +147,6 @@ class Port:
         """Address that is listened on."""
         host, port = self._everybody.getsockname()
         return host, port
-
-    @property
-    def closed(self) -> bool:
-        """Whether `close` was called."""
-        return self._everybody.fileno() < 0
 
     def keep(self, peers: Collection[Address]) -> None:
         """Have a socket for each of these, and for nobody else."""
@@ -162,6 +158,7 @@ class Port:
         if sys.platform == "linux":  # others sort the datagrams of one port by other rules
             for peer in set(peers) - self._own.keys():
                 self._add(peer)
+        self._missing = len(self._own) < len(set(peers))
 
     def receive(self, timeout: float, *, strangers: bool) -> tuple[bytes, Address]:
         """The next datagram and where it came from.
@@ -176,7 +173,7 @@ class Port:
         """
         if not self._own:
             return receive(self._everybody, timeout)
-        if strangers:
+        if strangers or self._missing:
             return _receive_any(self._all, timeout)
         now = time.perf_counter()
         if now >= self._next_look:
@@ -201,7 +198,10 @@ class Port:
         self._everybody.close()
 
     def _add(self, peer: Address) -> None:
-        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        except OSError:  # too many open files
+            return
         try:
             # Only for this moment: the port is nobody else's.
             for one in (self._everybody, sock):
