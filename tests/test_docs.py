@@ -41,3 +41,38 @@ def test_the_speeds_are_those_of_the_benchmark() -> None:
 def test_committed_results_are_small() -> None:
     sizes = {p: p.stat().st_size for p in RESULTS.rglob("*") if p.is_file()}
     assert {str(p): s for p, s in sizes.items() if s > 300_000} == {}
+
+
+def test_the_reliability_page_tells_what_the_benchmarks_wrote() -> None:
+    page = (ROOT / "docs" / "reliability.md").read_text()
+    soak, kills, flood, fuzz, journal = (
+        json.loads((RESULTS / "reliability" / f"{name}.json").read_text())
+        for name in ("soak", "kills", "flood", "fuzz", "journal")
+    )
+    told = [
+        f"{soak['control_steps']:,} control steps, {soak['drone_steps']:,} drone steps: "
+        f"{soak['bits_that_differ']} differ",
+        f"| finished episodes | {kills['agent_killed']['finished_episodes']:,} "
+        f"| {kills['either_killed']['finished_episodes']:,} |",
+        f"{flood['flood']['sent']:,} datagrams of garbage in {flood['flooded_seconds']:.0f} s",
+        f"{fuzz['executions']:,} executions",
+        f"recording leaves {journal['journal_on']['simulator']['ratio']:.3f} of the step rate",
+    ]
+    for sentence in told:
+        assert sentence in page
+    assert soak["bits_that_differ"] == fuzz["findings"] == 0
+    assert kills["agent_killed"]["identical_to_unbroken"]
+    assert flood["identical"]
+    assert soak["control_steps"] >= 1_000_000
+
+
+def test_the_journal_page_tells_what_the_benchmark_wrote() -> None:
+    journal = json.loads((RESULTS / "reliability" / "journal.json").read_text())
+    page = (ROOT / "docs" / "journal.md").read_text()
+    for name, side in (
+        ("simulator", "the simulator's side"),
+        ("agent", "the agent's side"),
+        ("both", "both sides"),
+    ):
+        cost = journal["journal_on"][name]
+        assert f"| {side} | {cost['ratio']:.3f} | {cost['microseconds']:.1f} |" in page
