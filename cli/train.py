@@ -51,7 +51,7 @@ def train(command: "Train") -> int:
     with remote_env(run.env, command) as env:
         training = Training(run, env)
         _write_config(training, folder)
-        return _train(training, folder, command.store_every)
+        return _train(training, folder, command)
 
 
 def _resume(command: "Train", folder: Path) -> int:
@@ -65,13 +65,17 @@ def _resume(command: "Train", folder: Path) -> int:
     episodes = _read_episodes(folder / EPISODES, kept.position.episode)
     options = ElevationConfig.from_options(kept.env)
     with remote_env(options, command) as env:
-        return _train(Training.resume(kept, env, episodes), folder, command.store_every)
+        return _train(Training.resume(kept, env, episodes), folder, command)
 
 
-def _train(training: Training, folder: Path, store_every: float) -> int:
+def _train(training: Training, folder: Path, command: "Train") -> int:
     before = training.log.env_steps
     go_on = f"go on with: rotorgram train {training.run.algorithm} --resume {folder}"
-    keeper = _Keeper(training, folder, store_every)
+    if command.listen:
+        go_on += f" --listen {command.listen}"
+        go_on += f" --key-file {command.key_file}" if command.key_file else ""
+        go_on += " --insecure" if command.insecure else ""
+    keeper = _Keeper(training, folder, command.store_every)
     try:
         with _stop_at_update() as stop, _showing(training) as show:
 

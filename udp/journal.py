@@ -167,8 +167,8 @@ class Journal:
 
     def _give_up(self, error: OSError) -> None:
         self._open = False
-        self._finalizer.detach()
         _abandon(self._file, self._path, error)
+        self._finalizer.detach()  # not before: Ctrl-C may have come in between
 
     # ---- what is not a State or a Command
 

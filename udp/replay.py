@@ -98,7 +98,9 @@ class Verification:
             lines.append(f"note: the file is {self.ending}")
         compared = sum(session.same + session.differing for session in self.sessions)
         if self.identical:
-            verdict = f"identical: {compared} States in {count_of(len(self.sessions), 'session')}"
+            read = "" if self.complete else " as far as it can be read"
+            sessions = count_of(len(self.sessions), "session")
+            verdict = f"identical{read}: {compared} States in {sessions}"
         elif compared or any(session.problem for session in self.sessions):
             verdict = "not identical"
         else:

@@ -186,10 +186,8 @@ class Simulator:
                 raise
             self._trouble = f"receiving failed: {error.strerror}"
             return None
-        message = self.link.receive(datagram, time.monotonic())
-        if message is not None:
-            self._trouble = ""
-        return message
+        self._trouble = ""
+        return self.link.receive(datagram, time.monotonic())
 
     def _exchange_until_closed(self) -> None:
         """Until the agent has answered our Close, or will not."""

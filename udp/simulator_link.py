@@ -283,7 +283,8 @@ class SimulatorLink:
         if self.sends > 1:  # after a resend nobody knows which of the two was answered
             self._unclear += 1
             if self._unclear % _UNCLEAR == 0 and self._smoothed is not None:
-                self._smoothed *= 2  # maybe it is that much longer by now
+                # Maybe it is that much longer by now.
+                self._smoothed = min(2 * self._smoothed, self._config.max_resend)
             return
         self._unclear = 0
         # Smoothed mean and variation as TCP keeps them (RFC 6298).
