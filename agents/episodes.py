@@ -45,6 +45,8 @@ class Episode:
     truncated: bool
     seconds: float
     """Wall time since training began, s."""
+    simulator_lost: bool = False
+    """Whether it was truncated since its simulator was lost, not since its time was over."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +112,7 @@ class EpisodeLog(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         self._keep_step(action, observation, reward, info)
         self.env_steps += 1
         if terminated or truncated:
-            self._keep_episode(terminated, truncated)
+            self._keep_episode(terminated, truncated, lost=LOST in info)
         return result
 
     def position(self) -> Position:
@@ -170,7 +172,7 @@ class EpisodeLog(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         self.rewards.append(reward)
         self.thrusts.append(info.get("F1", np.nan))
 
-    def _keep_episode(self, terminated: bool, truncated: bool) -> None:
+    def _keep_episode(self, terminated: bool, truncated: bool, *, lost: bool) -> None:
         length = len(self._actions)
         self.episodes.append(
             Episode(
@@ -182,5 +184,6 @@ class EpisodeLog(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
                 terminated=terminated,
                 truncated=truncated,
                 seconds=self.seconds,
+                simulator_lost=lost,
             )
         )

@@ -189,7 +189,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--interrupts", type=int, default=20)
-    parser.add_argument("--env-steps", type=int, default=300_000)
+    parser.add_argument("--env-steps", type=int, default=500_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("docs/results/reliability/kills.json"))
     args = parser.parse_args()

@@ -18,7 +18,7 @@ from ..agents import preset
 from ..agents.checkpoints import load, software_versions, write_whole
 from ..agents.episodes import Episode
 from ..envs import ElevationConfig
-from ..experiments.training import Run, Training
+from ..experiments.training import Run, Training, is_finished
 from ..udp import LinkError
 from .inputs import CHECKPOINT, new_folder, parse_changes, refuse_settings, remote_env
 from .progress import bars
@@ -63,6 +63,10 @@ def _resume(command: "Train", folder: Path) -> int:
         )
     refuse_settings(command, folder, free=("algorithm", "resume", *_NOT_KEPT))
     episodes = _read_episodes(folder / EPISODES, kept.position.episode)
+    if is_finished(kept):
+        print(f"already trained {kept.position.env_steps:,} of {kept.env_steps:,} env steps")
+        print(f"checkpoint: {folder / CHECKPOINT}")
+        return 0
     options = ElevationConfig.from_options(kept.env)
     with remote_env(options, command) as env:
         return _train(Training.resume(kept, env, episodes), folder, command)

@@ -3,10 +3,12 @@
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
+from ..udp.faults import FaultConfig
+from ..udp.link import LinkConfig
 from .base import Command, EnvOptions
 from .inputs import parse_address
 
@@ -29,8 +31,10 @@ class Sim(Command):
     """Drones."""
     codec: Literal["binary", "text"] = "binary"
     """binary, or the paper's text."""
-    timeout: float = 120.0
+    timeout: float = LinkConfig.timeout
     """Give up when the agent has been silent for so many seconds."""
+    max_resend: float = LinkConfig.max_resend
+    """Longest wait before what was not answered is sent again, s: less where much is lost."""
     key_file: Path | None = None
     """Key that the agent has too (rotorgram key): needed beyond this machine."""
     insecure: bool = False
@@ -41,14 +45,18 @@ class Sim(Command):
 
     def run(self) -> int:
         """Simulate until the agent closes."""
-        from ..udp import LinkConfig, Simulator
+        from ..udp import Simulator
 
         simulator = Simulator(
             server=parse_address(self.server),
             num_envs=self.num_envs,
             bind=parse_address(self.bind),
             codec=self.codec,
-            config=LinkConfig(timeout=self.timeout),
+            config=LinkConfig(
+                timeout=self.timeout,
+                min_resend=min(self.max_resend, LinkConfig.min_resend),
+                max_resend=self.max_resend,
+            ),
             key_file=self.key_file,
             insecure=self.insecure,
             record=self.record,
@@ -80,6 +88,17 @@ class MakeKey(Command):
         return 0
 
 
+class FaultOptions(FaultConfig):
+    """What happens to datagrams."""
+
+    def __post_init__(self) -> None:
+        """Take anything, so that a wrong number is told like every other wrong input."""
+
+    def checked(self) -> FaultConfig:
+        """The faults, if they can be. Raises `ValueError`."""
+        return FaultConfig(**vars(self))
+
+
 @dataclass(frozen=True, kw_only=True)
 class RelayFaults(Command):
     """Stand between simulators and an agent, and lose, double, reorder, delay and spoil datagrams.
@@ -91,31 +110,15 @@ class RelayFaults(Command):
     """Address for the simulators, HOST:PORT."""
     server: str = "127.0.0.1:8001"
     """Address of the agent, HOST:PORT."""
-    drop: float = 0.0
-    """Probability of a datagram to be lost, in each direction; so the others."""
-    duplicate: float = 0.0
-    """Probability to come twice."""
-    reorder: float = 0.0
-    """Probability to be held back, so that later ones overtake it."""
-    truncate: float = 0.0
-    """Probability to be cut short."""
-    corrupt: float = 0.0
-    """Probability that bits of it are flipped."""
-    delay: float = 0.0
-    """Every datagram is held for so many seconds,"""
-    jitter: float = 0.0
-    """and for up to so many more."""
-    seed: int = 0
-    """Seed of the faults."""
+    faults: Annotated[FaultOptions, OmitArgPrefixes] = field(default_factory=FaultOptions)
     insecure: bool = False
     """Allow addresses beyond this machine."""
 
     def run(self) -> int:
         """Relay until Ctrl-C."""
-        from ..udp.faults import FaultConfig, Relay
+        from ..udp.faults import Relay
 
-        names = ("drop", "duplicate", "reorder", "truncate", "corrupt", "delay", "jitter", "seed")
-        config = FaultConfig(**{name: getattr(self, name) for name in names})
+        config = self.faults.checked()
         listen, server = parse_address(self.listen), parse_address(self.server)
         with Relay(listen, server, config, insecure=self.insecure) as relay:
             here = "{}:{}".format(*relay.address)

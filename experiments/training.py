@@ -15,7 +15,7 @@ from ..agents.episodes import Episode, EpisodeLog, ResumeError
 from ..envs import ElevationConfig
 from .progress import Progress
 
-__all__ = ["Run", "Snapshot", "Training"]
+__all__ = ["Run", "Snapshot", "Training", "is_finished"]
 
 _RECENT = 20  # episodes that a progress report averages over
 
@@ -45,6 +45,12 @@ class Snapshot:
     env_steps: int
     seconds: float
     actor: dict[str, np.ndarray]
+
+
+def is_finished(kept: Checkpoint) -> bool:
+    """Whether a training has flown all that it was to. SB3 flies whole rollouts only."""
+    least = kept.config["steps_per_update"] if kept.algorithm == "sb3-a2c" else 1
+    return bool(kept.env_steps - kept.position.env_steps < least)
 
 
 @dataclass

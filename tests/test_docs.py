@@ -45,9 +45,9 @@ def test_committed_results_are_small() -> None:
 
 def test_the_reliability_page_tells_what_the_benchmarks_wrote() -> None:
     page = (ROOT / "docs" / "reliability.md").read_text()
-    soak, kills, flood, fuzz = (
+    soak, kills, flood, fuzz, journal = (
         json.loads((RESULTS / "reliability" / f"{name}.json").read_text())
-        for name in ("soak", "kills", "flood", "fuzz")
+        for name in ("soak", "kills", "flood", "fuzz", "journal")
     )
     told = [
         f"{soak['control_steps']:,} control steps, {soak['drone_steps']:,} drone steps: "
@@ -55,7 +55,9 @@ def test_the_reliability_page_tells_what_the_benchmarks_wrote() -> None:
         f"| finished episodes | {kills['agent_killed']['finished_episodes']:,} "
         f"| {kills['either_killed']['finished_episodes']:,} |",
         f"{flood['flood']['sent']:,} datagrams of garbage in {flood['flooded_seconds']:.0f} s",
+        f"| steps per second, calm | {flood['steps_per_second']['calm']:,} |",
         f"{fuzz['executions']:,} executions",
+        f"{journal['journal_on']['simulator']['ratio']:.3f} of the rate",
     ]
     for sentence in told:
         assert sentence in page

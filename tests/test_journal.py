@@ -30,6 +30,7 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
+from peers import ANY, ENV_ID, Running
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rotorgram.models import QUAD_XML, SCENE_XML
 from rotorgram.udp import (
@@ -52,33 +53,9 @@ from rotorgram.udp.messages import Close, Command, Hello, Message, State, Welcom
 from rotorgram.udp.replay import read_journal, summarize, verify
 from rotorgram.udp.statistics import Statistics
 
-ANY = ("127.0.0.1", 0)
-ENV_ID = "rotorgram/Elevation-v0"
 PAGE = Path(__file__).parent.parent / "docs" / "journal.md"
 QUICK = LinkConfig(timeout=5)
 TIMES: dict[str, Any] = {"timeout": 5, "connect_timeout": 5}
-
-
-class Running:
-    """A simulator in a thread, and how it ended."""
-
-    def __init__(self, simulator: Simulator) -> None:
-        self.simulator = simulator
-        self.result: str | BaseException | None = None
-        self.thread = threading.Thread(target=self._run)
-        self.thread.start()
-
-    def _run(self) -> None:
-        try:
-            self.result = self.simulator.run()
-        except Exception as error:
-            self.result = error
-        self.simulator.close()
-
-    def join(self) -> str | BaseException | None:
-        self.thread.join(20)
-        assert not self.thread.is_alive()
-        return self.result
 
 
 def fly(remote: Any, steps: int, seed: int | None = 7) -> SimpleNamespace:

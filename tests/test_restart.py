@@ -261,7 +261,7 @@ def test_a_killed_agent_is_replaced(network: Any, options: dict[str, str], key_f
             assert time.monotonic() - start < 8
         out, err = simulator.communicate(timeout=10)
     assert (simulator.returncode, out) == (0, "the agent closed\n")
-    anew = err.count("the agent does not know this session; beginning a new session with it")
+    anew = err.count("the agent does not know this session (any more); beginning a new one")
     assert anew == (0 if "codec" in options else 2)
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Final
 
-from .sockets import open_socket, resolve
+from .sockets import is_loopback, open_socket, resolve
 
 __all__ = ["FaultConfig", "Faults", "Relay"]
 
@@ -126,6 +126,16 @@ def _flip(datagram: bytes, places: list[float]) -> bytes:
     return bytes(flipped)
 
 
+def _reachable(address: tuple[str, int], insecure: bool) -> tuple[str, int]:
+    found = resolve(address, insecure=True)
+    if not (insecure or is_loopback(found)):
+        raise ValueError(
+            f"{address[0]} is not a loopback address: expected 127.0.0.1, or insecure=True "
+            "(--insecure) where everybody who reaches the relay may send through it"
+        )
+    return found
+
+
 @dataclass(eq=False, slots=True)
 class _Client:
     address: tuple[str, int]
@@ -167,10 +177,10 @@ class Relay:
     ) -> None:
         self.config = config or FaultConfig()
         self.counters: Counter[str] = Counter()
-        self.server = resolve(server, insecure=insecure)
+        self.server = _reachable(server, insecure)
         if self.server[1] == 0:
             raise ValueError("server: expected the port of the agent, 1 to 65535, got 0")
-        if self.server == resolve(listen, insecure=insecure):
+        if self.server == _reachable(listen, insecure):
             raise ValueError(f"listen: expected another address than the server's, got {listen}")
         self._any = ("0.0.0.0" if insecure else "127.0.0.1", 0)
         self._clients: OrderedDict[tuple[str, int], _Client] = OrderedDict()

@@ -112,5 +112,10 @@ def write_key(path: Path) -> None:
         OSError: It cannot be written.
     """
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-    with open(os.open(path, flags, 0o600), "w", encoding="ascii") as file:
+    try:
+        descriptor = os.open(path, flags, 0o600)
+    except FileExistsError as error:
+        sentence = "expected a new file, got one that is there; a key is never replaced"
+        raise FileExistsError(error.errno, sentence, str(path)) from None
+    with open(descriptor, "w", encoding="ascii") as file:
         file.write(secrets.token_hex(KEY_SIZE) + "\n")

@@ -70,6 +70,7 @@ class Simulator:
         if self.server[1] == 0:
             raise ValueError("server: expected the port of the agent, 1 to 65535, got 0")
         self.config = config or LinkConfig()
+        self._keyed, self._text = key is not None, codec == "text"
         self.fleet = Fleet(env, num_envs, options)
         self._trouble = ""
         with ExitStack() as failing:  # what is open, should a later step fail
@@ -141,6 +142,11 @@ class Simulator:
         while True:
             message = self._wait()
             if isinstance(message, Close):
+                if self._text and not link.statistics.round_trips.count:
+                    raise Refused(
+                        f"the agent at {address_text(self.server)} closed before its first "
+                        "command: it has no free place, has a key, or flies no text"
+                    )
                 return message.reason or "the agent closed"
             if isinstance(message, Welcome):
                 fleet.reset(message.session if message.seed is None else message.seed)
@@ -216,10 +222,13 @@ class Simulator:
 
     def _silence(self, sends: int) -> str:
         what = "Hello" if self.link.sequence == 0 else f"State {self.link.sequence}"
+        key = ""
+        if self._keyed and what == "Hello":
+            key = "; an agent with another key does not answer"
         why = f"; {self._trouble}" if self._trouble else ""
         last = self.link.statistics.last_error
         dropped = f"; last datagram dropped: {last}" if last else ""
         return (
             f"no answer from the agent at {address_text(self.server)} "
-            f"for {self.config.timeout:g} s, {what} sent {sends} times{why}{dropped}"
+            f"for {self.config.timeout:g} s, {what} sent {sends} times{why}{key}{dropped}"
         )

@@ -16,13 +16,23 @@ from .binary import MAX_DATAGRAM
 from .link import Address
 from .statistics import Statistics
 
-__all__ = ["Port", "address_text", "log_notices", "open_socket", "receive", "resolve"]
+__all__ = [
+    "Port",
+    "address_text",
+    "is_loopback",
+    "log_notices",
+    "open_socket",
+    "receive",
+    "resolve",
+]
 
 _log: Final = logging.getLogger("rotorgram.udp")
 _ATTENTION: Final = 300e-6
 """How long a wait looks again and again before it sleeps, s."""
 _STRANGERS_EVERY: Final = 0.01
 """While every place is taken, a datagram of a stranger is looked at so often, s."""
+_BUFFER: Final = 1 << 22
+"""Bytes of datagrams that a socket may hold until they are looked at."""
 _LONGEST: Final = 3600.0
 """Longest wait in one go, s: the system counts milliseconds in an int, and longer ones wrap."""
 _give_way: Final[Callable[[], None]] = getattr(os, "sched_yield", lambda: time.sleep(0))
@@ -31,6 +41,11 @@ _give_way: Final[Callable[[], None]] = getattr(os, "sched_yield", lambda: time.s
 def address_text(address: Address) -> str:
     """An address as it is written: host:port."""
     return f"{address[0]}:{address[1]}"
+
+
+def is_loopback(address: Address) -> bool:
+    """Whether a resolved address reaches this machine only."""
+    return ipaddress.ip_address(address[0]).is_loopback
 
 
 def resolve(address: Address, *, insecure: bool) -> Address:
@@ -54,7 +69,7 @@ def resolve(address: Address, *, insecure: bool) -> Address:
     except (socket.gaierror, UnicodeError):
         raise ValueError(f"host: expected a name or IPv4 address, got {host!r}") from None
     number = str(found[0][4][0])
-    if not insecure and not ipaddress.ip_address(number).is_loopback:
+    if not insecure and not is_loopback((number, port)):
         raise ValueError(
             f"{host} is not a loopback address: expected 127.0.0.1, or a key that both sides share "
             "(key_file, --key-file), or insecure=True (--insecure) where everybody who reaches "
@@ -84,8 +99,15 @@ def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -
     except OSError as error:
         sock.close()
         raise OSError(error.errno, f"cannot {what}: {_explain(error)}") from None
+    _enlarge_buffer(sock)
     sock.setblocking(False)
     return sock
+
+
+def _enlarge_buffer(sock: socket.socket) -> None:
+    """Ask for room for the parts of a large message; the system gives what it allows."""
+    with suppress(OSError):
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
 
 
 def _explain(error: OSError) -> str:
@@ -213,6 +235,7 @@ class Port:
             return
         finally:
             self._everybody.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+        _enlarge_buffer(sock)
         sock.setblocking(False)
         self._own[peer] = sock
         for selector in (self._simulators, self._all):
