@@ -16,15 +16,27 @@ from .config import ENV_ID, TELEMETRY_NAMES, ElevationConfig
 
 if TYPE_CHECKING:
     from .elevation import ElevationEnv
+    from .vector import ElevationVectorEnv
 
-__all__ = ["ENV_ID", "TELEMETRY_NAMES", "ElevationConfig", "ElevationEnv", "register"]
+__all__ = [
+    "ENV_ID",
+    "TELEMETRY_NAMES",
+    "ElevationConfig",
+    "ElevationEnv",
+    "ElevationVectorEnv",
+    "register",
+]
 
 
 def register() -> None:
     """Add `rotorgram/Elevation-v0` to Gymnasium's registry, once."""
     if ENV_ID not in gymnasium.registry:
         # No max_episode_steps: the env truncates by itself, since over UDP no wrapper would.
-        gymnasium.register(id=ENV_ID, entry_point="rotorgram.envs.elevation:ElevationEnv")
+        gymnasium.register(
+            id=ENV_ID,
+            entry_point="rotorgram.envs.elevation:ElevationEnv",
+            vector_entry_point="rotorgram.envs.vector:ElevationVectorEnv",
+        )
 
 
 def __getattr__(name: str) -> Any:
@@ -32,6 +44,10 @@ def __getattr__(name: str) -> Any:
         from .elevation import ElevationEnv
 
         return ElevationEnv
+    if name == "ElevationVectorEnv":
+        from .vector import ElevationVectorEnv
+
+        return ElevationVectorEnv
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -115,10 +115,7 @@ class ElevationEnv(gym.Env[np.ndarray, Any]):
         if options:
             raise ValueError(f"reset: expected no options, got {options!r}")
         super().reset(seed=seed)
-        low, high = self.config.target_range
-        band = self.config.start_band
-        self._target = float(self.np_random.uniform(low, high))
-        start = self._target + float(self.np_random.uniform(-band, band))
+        self._target, start = self._task.draw(self.np_random)
         self._thrust = HOVER_THRUST
         self._physics.reset(start, self._thrust)
         self._steps = 0

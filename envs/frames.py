@@ -13,7 +13,14 @@ positive psi is right side up.
 import math
 from collections.abc import Sequence
 
-__all__ = ["attitude_in_paper_frame", "position_in_paper_frame"]
+import numpy as np
+
+__all__ = [
+    "attitude_in_paper_frame",
+    "attitudes_in_paper_frame",
+    "position_in_paper_frame",
+    "positions_in_paper_frame",
+]
 
 _POLE = 1 - 1e-12  # sine of phi past which (within 1e-4 degrees) the nose counts as vertical
 
@@ -40,3 +47,21 @@ def attitude_in_paper_frame(quaternion: Sequence[float]) -> tuple[float, float, 
     theta = math.atan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y))
     psi = math.atan2(2 * (w * z + x * y), 1 - 2 * (x * x + z * z))
     return math.degrees(math.asin(sin_phi)), math.degrees(theta), math.degrees(psi)
+
+
+def positions_in_paper_frame(positions: np.ndarray, out: np.ndarray) -> None:
+    """`position_in_paper_frame` of every row: float64, shapes (N, 3)."""
+    np.subtract(0.0, positions[:, 1], out=out[:, 0])
+    out[:, 1], out[:, 2] = positions[:, 2], positions[:, 0]
+
+
+def attitudes_in_paper_frame(quaternions: np.ndarray, out: np.ndarray) -> None:
+    """`attitude_in_paper_frame` of every row, bit for bit: float64, shapes (N, 4) and (N, 3).
+
+    NumPy's inverse functions round otherwise than Python's. So a craft that is turned goes through
+    those; one that is not, and the elevation task turns none in the air, has zeros.
+    """
+    out.fill(0.0)
+    turned = np.flatnonzero(quaternions[:, 1:].any(axis=1) | np.signbit(quaternions).any(axis=1))
+    if turned.size:
+        out[turned] = [attitude_in_paper_frame(q) for q in quaternions[turned].tolist()]

@@ -1,6 +1,6 @@
 """The craft in MuJoCo, read and driven through named quantities. Knows nothing of the task."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import mujoco
@@ -8,8 +8,7 @@ import mujoco
 from ..models import load_model
 from .frames import attitude_in_paper_frame, position_in_paper_frame
 
-__all__ = ["Physics", "PhysicsError"]
-
+__all__ = ["CONTACT_CHECK", "Physics", "PhysicsError", "switch_off_log_file", "warning_names"]
 
 CONTACT_CHECK: Final = 4
 """Contact is looked for after at most this many physics steps (0.02 s). A bounce at full thrust
@@ -32,7 +31,7 @@ class Physics:
     """
 
     def __init__(self, linear_drag: float = 0.0) -> None:
-        _switch_off_log_file()
+        switch_off_log_file()
         self.model = load_model(linear_drag=linear_drag)
         self.data = mujoco.MjData(self.model)
         # Live views of simulator memory, made once; nothing hands them on.
@@ -67,9 +66,9 @@ class Physics:
 
     def _describe_warnings(self) -> str:
         # Take the warnings off, so that a reset gives a usable craft again.
-        seen = [mujoco.mjtWarning(i).name for i, n in enumerate(self._warnings.tolist()) if n]
+        seen = ", ".join(warning_names(self._warnings))
         self._warnings.fill(0)
-        return f"MuJoCo warned of {', '.join(seen)} at t = {self.data.time:.3f} s: reset the env"
+        return f"MuJoCo warned of {seen} at t = {self.data.time:.3f} s: reset the env"
 
     @property
     def elevation(self) -> float:
@@ -100,7 +99,13 @@ class Physics:
         )
 
 
-def _switch_off_log_file() -> None:
+def warning_names(counts: Iterable[int]) -> list[str]:
+    """MuJoCo's names of the warnings whose counts are not 0."""
+    return [mujoco.mjtWarning(i).name for i, count in enumerate(counts) if count]
+
+
+def switch_off_log_file() -> None:
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT; a log file of another name stays on."""
     config = mujoco.MjLogConfig.get()
     if config.logto_file and config.logfile == "MUJOCO_LOG.TXT":
         config.logto_file = False

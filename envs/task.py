@@ -40,6 +40,13 @@ class ElevationTask:
         self._increment = config.action_mode == "increment"
         self._scale = config.newtons_per_action
 
+    def draw(self, random: np.random.Generator) -> tuple[float, float]:
+        """Target and start elevation of an episode, m."""
+        low, high = self.config.target_range
+        band = self.config.start_band
+        target = float(random.uniform(low, high))
+        return target, target + float(random.uniform(-band, band))
+
     def thrust(self, action: Number, thrust: Number) -> tuple[Number, bool | np.ndarray]:
         """Thrust of each rotor after an action in [-1, 1], N, and whether it had to be clipped.
 

@@ -1,0 +1,328 @@
+"""`rotorgram/Elevation-v0` for many drones at once, stepped by `mujoco.batch`."""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any, Final
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils.seeding import np_random
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from ..models import model_hash
+from ..models.constants import HOVER_THRUST
+from .batch import BatchPhysics
+from .config import (
+    FURTHEST,
+    LOWEST_START,
+    TELEMETRY_NAMES,
+    ElevationConfig,
+    action_space,
+    observation_space,
+)
+from .task import ElevationTask
+
+__all__ = ["ElevationVectorEnv"]
+
+Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
+Seeds = Sequence[int | None] | np.ndarray
+
+_OPTIONS: Final = ("reset_mask", "target", "start")
+
+
+class ElevationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """N drones with a target each: the task of `ElevationEnv`, bit for bit that of N single ones.
+
+    Spaces, reward, start, termination and truncation are those of `ElevationEnv`, with the drone as
+    the first axis: observations float32 of shape (N, 3) or (N, 1), actions float32 of shape (N, 1)
+    or int64 of shape (N,), rewards float64 of shape (N,). `info` holds an array of shape (N,) for
+    each of its names.
+
+    Autoreset is Gymnasium's NEXT_STEP (the default), SAME_STEP or DISABLED, and `metadata` says
+    which. With NEXT_STEP the step after an episode's end resets that drone, ignores its action and
+    gives reward 0. With SAME_STEP the observation is that of the next episode, and `info` has
+    `final_obs` and `final_info` where one ended. With DISABLED a reset with a mask begins the next.
+
+    Args:
+        num_envs: N.
+        render_mode: None.
+        autoreset_mode: `AutoresetMode`, or its value.
+        num_threads: Threads that step the physics; 0 takes one for each processor.
+        options: Every field of `ElevationConfig`, by name.
+
+    Attributes:
+        observations, rewards, terminated, truncated: As `step` gives them; written anew each time.
+        telemetry: float64, shape (N, 10): what `info` has under `telemetry_names`.
+
+    Raises:
+        ValueError: An option, seed or action is not what it should be; the envs are as before.
+        PhysicsError: MuJoCo warned of a bad state; `reset` makes the envs usable again.
+        gymnasium.error.ResetNeeded: A step before a reset, or (DISABLED) after an episode's end.
+    """
+
+    telemetry_names = TELEMETRY_NAMES
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        render_mode: str | None = None,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        num_threads: int = 0,
+        **options: Any,
+    ) -> None:
+        self.closed = True  # nothing is open yet
+        if num_envs < 1:
+            raise ValueError(f"num_envs: expected 1 or more, got {num_envs}")
+        if num_threads < 0:
+            raise ValueError(f"num_threads: expected 0 or more, got {num_threads}")
+        if render_mode is not None:
+            raise ValueError(f"render_mode: expected None, got {render_mode!r}")
+        self.render_mode = None
+        self.num_envs = num_envs
+        self.config = config = ElevationConfig.from_options(options)
+        self.control_period = config.control_period
+        self.metadata = {
+            "render_modes": [],
+            "render_fps": round(1 / config.control_period),
+            "autoreset_mode": _mode(autoreset_mode),
+        }
+        self.single_observation_space = observation_space(config)
+        self.single_action_space = action_space(config)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._task = ElevationTask(config)
+        self._physics = BatchPhysics(num_envs, config.linear_drag, num_threads)
+        self._discrete = config.action_type == "discrete"
+        self._generators: list[np.random.Generator | None] = [None] * num_envs
+        self._target, self._thrust = np.zeros(num_envs), np.zeros(num_envs)
+        self._steps = np.full(num_envs, -1)  # flown in this episode; -1: not to be stepped
+        size = self.single_observation_space.shape[0]
+        self.observations = np.zeros((num_envs, size), np.float32)
+        self.telemetry = np.zeros((num_envs, len(TELEMETRY_NAMES)))
+        self.rewards = np.zeros(num_envs)
+        self.terminated, self.truncated = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
+        self._clipped = np.zeros(num_envs, bool)
+        self._nobody = np.zeros(num_envs, bool)
+        self.closed = False
+
+    @cached_property
+    def model_hash(self) -> str:
+        """Name of the vehicle's model with its drag: 32 hexadecimal characters."""
+        return model_hash(self.config.linear_drag)
+
+    def reset(
+        self,
+        *,
+        seed: int | Seeds | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode, for all drones or some.
+
+        Args:
+            seed: Drone i gets seed + i, or the i-th of N seeds; None leaves its generator as it is.
+            options: `reset_mask`: bool, shape (N,): which drones; the others stay where they are.
+                `target`, `start`: target and start elevations, m, a number or shape (N,), in place
+                of those that the seed gives. Without `start` it gives how far from the target.
+        """
+        options = options or {}
+        if unknown := [name for name in options if name not in _OPTIONS]:
+            raise ValueError(f"options: expected some of {', '.join(_OPTIONS)}, got {unknown[0]!r}")
+        mask = self._mask(options.get("reset_mask"))
+        chosen = self._elevations(options)
+        self._begin(np.flatnonzero(mask), self._seeds(seed), chosen)
+        self._observe()
+        return self.observations.copy(), self._info(mask)
+
+    def step(self, actions: np.ndarray) -> Step:
+        """Fly every drone for one control period. See the class for what follows an episode."""
+        array = np.asarray(actions)
+        if array.shape != self.action_space.shape:
+            raise ValueError(
+                f"actions: expected an array of shape {self.action_space.shape}, "
+                f"got shape {array.shape}"
+            )
+        mode = self.metadata["autoreset_mode"]
+        ended = self.terminated | self.truncated
+        resets = ended if mode == AutoresetMode.NEXT_STEP else self._nobody
+        self.advance(array.reshape(self.num_envs, 1), resets)
+        rewards, terminated, truncated = self.rewards, self.terminated, self.truncated
+        info = self._info(np.ones(self.num_envs, bool))
+        if mode == AutoresetMode.SAME_STEP and (ended := terminated | truncated).any():
+            info = self._begin_next(ended, info)
+        return self.observations.copy(), rewards, terminated, truncated, info
+
+    def advance(
+        self, actions: np.ndarray, resets: np.ndarray, seeds: np.ndarray | None = None
+    ) -> None:
+        """Reset some drones and fly the others for one control period: a step of the wire.
+
+        What came of it is in the attributes; rewards of a reset are 0.
+
+        Args:
+            actions: Shape (N, 1), a choice by its number; ignored where a drone is reset.
+            resets: bool, shape (N,).
+            seeds: uint64, shape (N,), of those that are reset; None leaves the generators.
+        """
+        flown = ~resets
+        if (waiting := flown & (self._steps < 0)).any():
+            first = int(waiting.argmax())
+            raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
+        values = self._action_values(actions, flown)
+        thrust, clipped = self._task.thrust(values, self._thrust)
+        self._thrust = np.where(flown, thrust, self._thrust)
+        self._clipped = flown & clipped
+        steps, ids = self._steps + 1, np.flatnonzero(flown)
+        self._steps[ids] = -1  # a physics error leaves them to be reset
+        if ids.size:
+            every = ids.size == self.num_envs
+            self._physics.step(None if every else ids, self._thrust, self.config.substeps)
+        if resets.any():
+            self._begin(np.flatnonzero(resets), seeds)
+        error = self._observe()
+        physics, length = self._physics, self.config.episode_length
+        ending = self._task.terminated(error, physics.tilt_cosine, physics.touching)
+        self.terminated = ending & flown
+        self.truncated = (steps >= length) & ~self.terminated & flown
+        self.rewards = np.where(flown, sum(self._task.reward_terms(error, self.terminated)), 0.0)
+        going_on = flown & ~(self.terminated | self.truncated)
+        self._steps[going_on] = steps[going_on]
+
+    def _begin(
+        self,
+        ids: np.ndarray,
+        seeds: Seeds | None,
+        chosen: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """Start the episodes of these drones."""
+        targets, starts = self._target.copy(), np.zeros(self.num_envs)
+        for i in ids.tolist():
+            seed = None if seeds is None else seeds[i]
+            generator = self._generators[i]
+            if seed is not None or generator is None:
+                generator, _ = np_random(None if seed is None else int(seed))
+                self._generators[i] = generator
+            targets[i], starts[i] = self._task.draw(generator)
+        if chosen:
+            self._target[ids] = chosen.get("target", targets)[ids]
+            starts = chosen.get("start", starts - targets + self._target)
+        else:
+            self._target[ids] = targets[ids]
+        self._thrust[ids] = HOVER_THRUST
+        self._physics.reset(ids, starts[ids], HOVER_THRUST)
+        self._steps[ids] = 0
+        self._clipped[ids] = False
+        # Not in place: what `step` gave away stays as it was.
+        kept = np.ones(self.num_envs, bool)
+        kept[ids] = False
+        self.terminated, self.truncated = self.terminated & kept, self.truncated & kept
+
+    def _begin_next(self, ended: np.ndarray, info: dict[str, Any]) -> dict[str, Any]:
+        """SAME_STEP: reset those whose episode ended; the info, with that of their last step."""
+        last, last_info = self.observations.copy(), info
+        last_info.update({f"_{name}": ended for name in info if not name.startswith("_")})
+        self._begin(np.flatnonzero(ended), None)
+        self._observe()
+        info = self._info(np.ones(self.num_envs, bool))
+        info |= {"final_obs": last, "_final_obs": ended}
+        info |= {"final_info": last_info, "_final_info": ended}
+        return info
+
+    def _observe(self) -> np.ndarray:
+        """Take down what every drone sees; the elevation errors, m."""
+        physics = self._physics
+        error: np.ndarray = self._target - physics.elevation
+        self.observations[:, 0] = error
+        if self.observations.shape[1] > 1:
+            self.observations[:, 1] = 0.0 - physics.climb_rate
+            self.observations[:, 2] = self._thrust / HOVER_THRUST - 1.0
+        physics.telemetry(self.telemetry)
+        return error
+
+    def _info(self, mask: np.ndarray) -> dict[str, Any]:
+        error = self._target - self._physics.elevation
+        elevation, termination = self._task.reward_terms(error, self.terminated)
+        info: dict[str, Any] = dict(zip(TELEMETRY_NAMES, self.telemetry.T.copy(), strict=True))
+        info |= {"reward_elevation": elevation, "reward_termination": termination}
+        info["thrust_clipped"] = self._clipped.copy()
+        return info | {f"_{name}": mask for name in info}
+
+    def _action_values(self, actions: np.ndarray, flown: np.ndarray) -> np.ndarray:
+        """Actions as ElevationTask takes them: float64, shape (N,)."""
+        try:
+            with np.errstate(over="ignore"):  # what overflows is infinite, and refused as such
+                kind = np.float64 if self._discrete else np.float32
+                values: np.ndarray = actions[:, 0].astype(kind, casting="same_kind", copy=False)
+        except TypeError:
+            raise ValueError(f"actions: expected real numbers, got {actions.dtype}") from None
+        right = np.isin(values, (0, 1, 2)) if self._discrete else np.isfinite(values)
+        if not (right | ~flown).all():
+            first = int((~right & flown).argmax())
+            expected = "0, 1 or 2" if self._discrete else "finite numbers"
+            raise ValueError(f"actions: expected {expected}, got {values[first]} for env {first}")
+        values = np.where(flown, values, 0.0).astype(np.float64)
+        if self._discrete:
+            values -= 1.0
+        return values
+
+    def _mask(self, mask: Any) -> np.ndarray:
+        if mask is None:
+            return np.ones(self.num_envs, bool)
+        if (
+            not isinstance(mask, np.ndarray)
+            or (mask.dtype, mask.shape) != (bool, (self.num_envs,))
+            or not mask.any()
+        ):
+            raise ValueError(
+                f"reset_mask: expected an array of {self.num_envs} bool, one of them True, "
+                f"got {mask!r}"
+            )
+        return mask.copy()
+
+    def _seeds(self, seed: Any) -> Seeds | None:
+        if seed is None:
+            return None
+        if isinstance(seed, int | np.integer):
+            seed = range(int(seed), int(seed) + self.num_envs)
+        if (
+            not isinstance(seed, Sequence | np.ndarray)
+            or len(seed) != self.num_envs
+            or not all(s is None or (isinstance(s, int | np.integer) and s >= 0) for s in seed)
+        ):
+            raise ValueError(
+                f"seed: expected a whole number from 0 on, or {self.num_envs} of them, got {seed!r}"
+            )
+        return seed
+
+    def _elevations(self, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Targets and starts that were chosen, float64, shape (N,)."""
+        least = LOWEST_START + (0.0 if "start" in options else self.config.start_band)
+        lowest = {"target": least, "start": LOWEST_START}
+        chosen = {}
+        for name in lowest:
+            if name in options:
+                values = np.asarray(options[name], np.float64)
+                fits = (values >= lowest[name]) & (values <= FURTHEST)
+                if values.shape not in ((), (self.num_envs,)) or not fits.all():
+                    raise ValueError(
+                        f"{name}: expected elevations of {lowest[name]:g} to {FURTHEST:g} m, a "
+                        f"number or shape ({self.num_envs},), got {options[name]!r}"
+                    )
+                chosen[name] = np.broadcast_to(values, self.num_envs)
+        if "start" in chosen:
+            for target in (chosen["target"],) if "target" in chosen else self.config.target_range:
+                if (abs(chosen["start"] - target) > self.config.flight_band).any():
+                    raise ValueError(
+                        f"start: expected at most flight_band = {self.config.flight_band:g} m "
+                        f"from the target, got {options['start']!r}"
+                    )
+        return chosen
+
+
+def _mode(mode: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        expected = " or ".join(repr(m.value) for m in AutoresetMode)
+        raise ValueError(f"autoreset_mode: expected {expected}, got {mode!r}") from None
