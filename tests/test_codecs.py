@@ -6,6 +6,7 @@ import re
 import struct
 import tracemalloc
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -397,12 +398,16 @@ def test_another_version_is_told_apart_but_refuse_is_always_read() -> None:
     assert binary.decode(sealed(bytes(refuse))) == GOLDEN_MESSAGES["Refuse"]
 
 
-def test_too_many_drones_for_one_datagram() -> None:
-    drones = 10_000
-    with pytest.raises(ValueError, match=r"expected at most 65489 bytes in one datagram, got \d+"):
+def test_too_many_numbers_for_one_message() -> None:
+    drones = 60_000
+    with pytest.raises(ValueError, match=r"Command: expected at most 16777216 bytes, got \d+"):
         binary.encode(
-            one_command(actions=np.zeros((drones, 2)), resets=np.zeros(drones, bool), seeds=None)
+            one_command(actions=np.zeros((drones, 80)), resets=np.zeros(drones, bool), seeds=None)
         )
+    many = np.zeros(10_000, np.float32)
+    large = replace(GOLDEN_MESSAGES["Hello"], observation_low=many, observation_high=many)
+    with pytest.raises(ValueError, match=r"Hello: expected at most 65489 bytes, got \d+"):
+        binary.encode(large)
 
 
 def test_a_large_datagram() -> None:

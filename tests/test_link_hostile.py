@@ -331,7 +331,7 @@ def test_messages_do_not_return_to_their_sender() -> None:
     before = of_agent(agent), of_simulator(link)
     for datagram in (greeting, first, second):
         assert link.receive(datagram, 0.0) is None
-    assert agent.receive(agent.places[0].reply, HERE, 0.0) is None
+    assert agent.receive(agent.places[0].reply[0], HERE, 0.0) is None
     assert (of_agent(agent), of_simulator(link)) == before
 
 

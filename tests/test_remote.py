@@ -161,7 +161,7 @@ def test_what_the_simulator_says_of_itself() -> None:
         assert hello is not None
         assert hello.env_id == ENV_ID
         assert hello.control_period == 0.04
-        assert hello.model_hash == pair.simulator.fleet.envs[0].unwrapped.model_hash
+        assert hello.model_hash == pair.simulator.fleet.env.unwrapped.model_hash
         assert set(hello.model_hash) != {"0"}
         assert pair.remote.metadata == {"render_modes": [], "render_fps": 25}
         assert pair.remote.observation_space.shape == (1,)
@@ -783,7 +783,7 @@ def test_strangers_change_nothing_but_counters() -> None:
         assert min(counters[name] for name in ("malformed", "foreign", "refused")) > 2
         assert pair.simulator.link.sequence == 52
         counters = pair.simulator.link.statistics.counters
-        assert set(counters) <= {"sent", "received", "resent", "stale"}
+        assert set(counters) <= {"sessions", "sent", "received", "resent", "stale"}
         pair.remote.close()
         assert pair.running.join() == "the agent closed"
 
@@ -817,7 +817,7 @@ def test_the_text_agent_of_the_page(capsys: pytest.CaptureFixture[str]) -> None:
     with Simulator(
         server=names["agent"].getsockname(), bind=ANY, codec="text", config=QUICK
     ) as simulator:
-        simulator.fleet.envs[0].reset(seed=1)
+        simulator.fleet.env.reset(seed=1)
         assert simulator.run() == "the agent closed"
     agent.join(10)
     names["agent"].close()

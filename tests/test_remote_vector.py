@@ -331,11 +331,6 @@ def test_wrong_arguments(arguments: dict[str, Any], sentence: str) -> None:
         RemoteVectorEnv(**{"address": ANY, **arguments})
 
 
-def test_too_many_drones_for_a_datagram() -> None:
-    with pytest.raises(ValueError, match="State: expected at most 65489 bytes in one datagram"):
-        Simulator("CartPole-v1", bind=ANY, num_envs=3000)
-
-
 # ---- places
 
 

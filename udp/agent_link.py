@@ -8,13 +8,13 @@ import secrets
 from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 from . import binary, text
 from .errors import DecodeError, Forged, VersionMismatch
 from .keys import OVERHEAD, Key, is_sealed, message_of
-from .link import CLOSE_INTERVAL, CLOSE_LINGER, Address, Tap, encode, sealed
+from .link import CLOSE_INTERVAL, CLOSE_LINGER, Address, Tap, encode, packed
 from .messages import (
     Close,
     Command,
@@ -27,12 +27,15 @@ from .messages import (
     Welcome,
     one_line,
 )
+from .parts import Assembler, is_first, is_part
 from .statistics import Statistics
 
 __all__ = ["AgentLink", "Event", "Session"]
 
 _MOST: Final = 1024
 """Simulators that are remembered between Hello and first State, while they wait, and after."""
+_MOST_ASSEMBLING: Final = 16
+"""Sessions without a place for which parts of a first State are kept."""
 _REASON_AT: Final = binary.HEADER_SIZE + 2
 """Bytes of a Refuse or a Close before its reason."""
 
@@ -60,8 +63,10 @@ class Session:
     """Session number; 0 with the text codec."""
     key: Key | None = None
     welcome: Welcome | None = None
-    reply: bytes = b""
-    """The answer to the last State, or the Welcome."""
+    reply: list[bytes] = field(default_factory=list)
+    """The answer to the last State, or the Welcome: one datagram or its parts."""
+    parts: Assembler | None = None
+    """Of the State that is coming in parts."""
     state: str = "expecting"
     sequence: int = 0
     """Number of the State that came last."""
@@ -120,6 +125,7 @@ class AgentLink:
         self._openings: OrderedDict[tuple[Address, int], Session] = OrderedDict()
         self._waiting: OrderedDict[Address, tuple[int, int]] = OrderedDict()  # session, room
         self._ended: OrderedDict[int, None] = OrderedDict()
+        self._assembling: list[Session] = []
         self._outgoing: list[tuple[bytes, Address]] = []
         self._resend_at = self._deadline = 0.0
 
@@ -131,6 +137,11 @@ class AgentLink:
         try:
             is_text = self._key is None and text.is_text(datagram)
             plain = datagram if is_text else self._open(datagram, address, session)
+            if not is_text and is_part(plain):
+                whole = self._assemble(plain, datagram, address, session, now)
+                if whole is None:
+                    return None
+                plain = whole
             message = self._decode(plain, is_text)
         except DecodeError as error:
             self._refuse_undecoded(datagram, address, error, now)
@@ -200,8 +211,7 @@ class AgentLink:
             if session and now >= self._deadline:
                 self.free(place)
             elif session:
-                self._outgoing.append((session.reply, session.peer))
-                self.statistics.counters["resent"] += 1
+                self._repeat(session)
         self._resend_at = now + CLOSE_INTERVAL
 
     def take_outgoing(self) -> list[tuple[bytes, Address]]:
@@ -216,8 +226,7 @@ class AgentLink:
         if hello.session in self._ended:
             self._drop("stale", "", address, now)
         elif opening and not self.closed:
-            self._outgoing.append((opening.reply, address))
-            self.statistics.counters["resent"] += 1
+            self._repeat(opening)
             self._drop("duplicate", "", address, now)
         elif reason := "the agent has closed" if self.closed else self._accept(hello):
             self._refuse(hello.session, reason, address, size, key=self._key)
@@ -231,7 +240,7 @@ class AgentLink:
     def _welcome(self, hello: Hello, address: Address) -> None:
         welcome = Welcome(session=hello.session, nonce=self._draw_nonce())
         key = self._key.for_session(hello.session, welcome.nonce) if self._key else None
-        reply = self._send(welcome, address, self._key)
+        reply = [self._send(welcome, address, self._key)]
         opening = Session(
             peer=address, hello=hello, number=hello.session, key=key, welcome=welcome, reply=reply
         )
@@ -258,7 +267,7 @@ class AgentLink:
         if reason := "the agent has closed" if self.closed else self._accept(opening.hello):
             words = _cut(reason, len(datagram) - _REASON_AT - (OVERHEAD if self._key else 0))
             close = Close(session=state.session, sequence=1, reason=words)
-            self._put(sealed(encode(close), opening.key), address)
+            self._send(close, address, opening.key)
             self._drop("refused", reason, address, now)
             return None
         place = self._seats.get(address, -1)
@@ -301,6 +310,8 @@ class AgentLink:
             self.free(place)
         self.places[place] = session
         self._seats[session.peer] = place
+        if session in self._assembling:
+            self._assembling.remove(session)
         session.sequence, session.state = state.sequence, "deciding"
         self.statistics.counters["sessions"] += 1
         if session.hello and session.welcome:
@@ -311,14 +322,19 @@ class AgentLink:
 
     def _disown(self, datagram: bytes, address: Address, now: float) -> None:
         """A State of a session that is none here: its simulator is to begin another."""
-        _, number, sequence = binary.peek(message_of(datagram) if self._key else datagram)
-        self._drop("foreign", f"session {number:016x}", address, now)
+        plain = message_of(datagram) if self._key else datagram
+        _, number, sequence = binary.peek(plain)
+        if not is_first(plain):
+            return  # one answer will do
         held = {(s.peer, s.number) for s in self.places if s}
         if self._key is None:  # else an Unknown is of use to him alone who has sent this State
             held.update(self._openings)
             held.update((there, waits) for there, (waits, _) in self._waiting.items())
         if self.closed or any(n == number and there != address for there, n in held):
-            return  # somebody else holds it, elsewhere: no word of ours shall end it
+            # Somebody else holds it, elsewhere: no word of ours shall end it.
+            self._drop("foreign", f"session {number:016x}", address, now)
+            return
+        self.statistics.counters["foreign"] += 1  # after a restart of ours, mostly: no word of it
         reply = encode(Unknown(session=number, sequence=sequence))
         if self._key:
             reply = self._key.seal(reply, datagram)
@@ -338,8 +354,7 @@ class AgentLink:
         address = session.peer
         if isinstance(message, State) and message.sequence == session.sequence:
             if session.state != "deciding":  # else the answer is still being thought of
-                self._outgoing.append((session.reply, address))
-                self.statistics.counters["resent"] += 1
+                self._repeat(session)
             self._drop("duplicate", "", address, now)
             return None
         if isinstance(message, State) and session.hello and message.sequence > session.sequence + 1:
@@ -373,8 +388,43 @@ class AgentLink:
     def _answer(self, place: int, session: Session, message: Command | Close) -> None:
         datagram = encode(message, as_text=session.is_text)
         self._record(place, message, datagram, is_text=session.is_text)
-        session.reply = sealed(datagram, session.key)
-        self._put(session.reply, session.peer)
+        session.reply = packed(datagram, session.key)
+        self._outgoing += [(part, session.peer) for part in session.reply]
+        self.statistics.counters["sent"] += 1
+
+    def _repeat(self, session: Session) -> None:
+        """Send its last answer again, the same bytes."""
+        self._outgoing += [(part, session.peer) for part in session.reply]
+        self.statistics.counters["resent"] += 1
+
+    # ---- a State in parts
+
+    def _assemble(
+        self, part: bytes, datagram: bytes, address: Address, session: Session | None, now: float
+    ) -> bytes | None:
+        """The State, once all its parts are there, of a session that may send it now."""
+        kind, number, sequence = binary.check(part)
+        if session is None or session.number != number:
+            session = self._openings.get((address, number))
+        if kind & ~binary.PART != binary.STATE:
+            self._drop("foreign", f"a part of type {kind}", address, now)
+        elif session is None or session.hello is None or sequence > session.sequence + 1:
+            self._disown(datagram, address, now)
+        elif sequence < session.sequence:
+            self._drop("stale", "", address, now)
+        else:
+            if session.parts is None:
+                session.parts = Assembler(binary.state_size(session.hello))
+                if (address, number) in self._openings:
+                    self._limit_assembling(session)
+            return session.parts.take(sequence, part)
+        return None
+
+    def _limit_assembling(self, opening: Session) -> None:
+        """Keep parts for the last few that want a place: anybody may say Hello and send parts."""
+        self._assembling.append(opening)
+        if len(self._assembling) > _MOST_ASSEMBLING:
+            self._assembling.pop(0).parts = None
 
     # ---- strangers
 
@@ -440,7 +490,7 @@ class AgentLink:
         self._put(text.encode(close), address)
 
     def _send(self, message: Message, address: Address, key: Key | None) -> bytes:
-        datagram = sealed(encode(message), key)
+        (datagram,) = packed(encode(message), key)
         self._put(datagram, address)
         return datagram
 

@@ -28,18 +28,25 @@ from .messages import (
 )
 
 __all__ = [
+    "COMMAND",
     "HEADER_SIZE",
     "HELLO",
     "MAGIC",
     "MAX_DATAGRAM",
     "MAX_MESSAGE",
+    "MAX_WHOLE",
     "OF_SESSION",
+    "PART",
     "STATE",
     "UNKNOWN",
     "VERSION",
+    "check",
+    "command_size",
     "decode",
     "encode",
+    "frame",
     "peek",
+    "state_size",
 ]
 
 MAGIC: Final = b"\xa7R"
@@ -48,20 +55,27 @@ VERSION: Final = 2
 MAX_DATAGRAM: Final = 65507
 """Largest payload of a UDP datagram over IPv4, bytes."""
 MAX_MESSAGE: Final = MAX_DATAGRAM - OVERHEAD
-"""Largest message, bytes: room is left for the envelope of `keys`."""
+"""Largest message in one datagram, bytes: room is left for the envelope of `keys`."""
+MAX_WHOLE: Final = 1 << 24
+"""Largest State or Command in all its parts, bytes."""
 HEADER_SIZE: Final = 24
 
 HELLO: Final = 1
 STATE: Final = 4
+COMMAND: Final = 5
 UNKNOWN: Final = 8
 _REFUSE: Final = 3
 """Hello's and Refuse's types, and the layouts of header and Refuse, are those of every version."""
 
-OF_SESSION: Final = frozenset({STATE, 5, 6})
+PART: Final = 0x80
+"""Set in the type of a part of a message: see `parts`."""
+
+OF_SESSION: Final = frozenset({STATE, COMMAND, 6})
 """Types that belong to an open session: State, Command, Close. The others open one."""
 
 _NUMBERED: Final = OF_SESSION | {UNKNOWN}
 """Types that have a sequence number."""
+_MAY_BE_CUT: Final = (State, Command)
 
 _HEADER: Final = struct.Struct("<2sBBIQQ")
 _NUMBERS: Final = struct.Struct("<QQ")  # session, sequence: the end of the header
@@ -77,7 +91,10 @@ _U8: Final = np.dtype("<u8")
 
 
 def encode(message: Message) -> bytes:
-    """One datagram. Raises `ValueError` if a number or the whole does not fit."""
+    """The bytes of a message: one datagram, or more than fit into one, to be cut by `parts`.
+
+    Raises `ValueError` if a number or the whole does not fit.
+    """
     kind = type(message)
     start, crc, encoder = _ENCODERS[kind]
     try:
@@ -85,17 +102,24 @@ def encode(message: Message) -> bytes:
         rest = numbers + encoder(message)
     except struct.error as error:
         raise ValueError(f"{kind.__name__}: {error}") from None
-    size = len(rest) + 8
-    if size > MAX_MESSAGE:
-        raise ValueError(
-            f"{kind.__name__}: expected at most {MAX_MESSAGE} bytes in one datagram, "
-            f"got {size}: use fewer drones"
-        )
+    size, most = len(rest) + 8, MAX_WHOLE if kind in _MAY_BE_CUT else MAX_MESSAGE
+    if size > most:
+        raise ValueError(f"{kind.__name__}: expected at most {most} bytes, got {size}")
     return start + zlib.crc32(rest, crc).to_bytes(4, "little") + rest
 
 
-def decode(datagram: bytes) -> Message:
-    """The message in a datagram. Raises `DecodeError`, and nothing else, for any other bytes."""
+def frame(kind: int, session: int, sequence: int, body: bytes) -> bytes:
+    """A datagram: header and body."""
+    start, numbers = MAGIC + bytes((VERSION, kind)), _NUMBERS.pack(session, sequence)
+    crc = zlib.crc32(body, zlib.crc32(numbers, zlib.crc32(start)))
+    return b"".join((start, crc.to_bytes(4, "little"), numbers, body))
+
+
+def check(datagram: bytes) -> tuple[int, int, int]:
+    """Type, session and sequence of a datagram whose header is as it should be.
+
+    Raises `DecodeError` otherwise.
+    """
     if len(datagram) < _HEADER.size:
         raise DecodeError(f"header: expected {_HEADER.size} bytes, got {len(datagram)}")
     magic, version, kind, crc, session, sequence = _HEADER.unpack_from(datagram)
@@ -105,8 +129,14 @@ def decode(datagram: bytes) -> Message:
         raise DecodeError("checksum: the datagram was changed on its way")
     if version != VERSION and kind != _REFUSE:
         raise VersionMismatch(f"protocol version: expected {VERSION}, got {version}")
-    if sequence and kind not in _NUMBERED:
+    if sequence and kind & ~PART not in _NUMBERED:
         raise DecodeError(f"sequence: expected 0 in type {kind}, got {sequence}")
+    return kind, session, sequence
+
+
+def decode(datagram: bytes) -> Message:
+    """The message in these bytes. Raises `DecodeError`, and nothing else, for any other bytes."""
+    kind, session, sequence = check(datagram)
     decoder = _DECODERS.get(kind)
     if decoder is None:
         raise DecodeError(f"type: expected 1 to {len(_DECODERS)}, got {kind}")
@@ -117,11 +147,25 @@ def decode(datagram: bytes) -> Message:
 
 
 def peek(datagram: bytes) -> tuple[int, int, int]:
-    """Type, session and sequence that a datagram claims, nothing verified; zeros if it has none."""
+    """Type, session and sequence that a datagram claims, nothing verified; zeros if it has none.
+
+    The type of a part is that of its message.
+    """
     if len(datagram) < HEADER_SIZE or datagram[:2] != MAGIC:
         return 0, 0, 0
     _, _, kind, _, session, sequence = _HEADER.unpack_from(datagram)
-    return kind, session, sequence
+    return kind & ~PART, session, sequence
+
+
+def state_size(hello: Hello) -> int:
+    """Bytes of a State of the drones of a Hello."""
+    n, m = hello.observation_low.size, len(hello.telemetry_names)
+    return 32 + hello.num_drones * (8 * (1 + m) + 4 * n + 2)
+
+
+def command_size(hello: Hello) -> int:
+    """Bytes of a Command, with seeds, for the drones of a Hello."""
+    return 40 + hello.num_drones * (8 + 4 * hello.action_low.size + 1)
 
 
 def _encode_state(m: State) -> bytes:
@@ -307,7 +351,7 @@ _ENCODERS: Final[dict[type, tuple[bytes, int, Callable[[Any], bytes]]]] = {
     Welcome: _entry(2, _encode_welcome),
     Refuse: _entry(_REFUSE, _encode_reason),
     State: _entry(STATE, _encode_state),
-    Command: _entry(5, _encode_command),
+    Command: _entry(COMMAND, _encode_command),
     Close: _entry(6, _encode_reason),
     Wait: _entry(7, _encode_nothing),
     Unknown: _entry(UNKNOWN, _encode_nothing),
@@ -319,7 +363,7 @@ _DECODERS: Final[dict[int, Callable[[bytes, int, int], Message]]] = {
     2: _decode_welcome,
     _REFUSE: _decode_refuse,
     STATE: _decode_state,
-    5: _decode_command,
+    COMMAND: _decode_command,
     6: _decode_close,
     7: _decode_wait,
     UNKNOWN: _decode_unknown,

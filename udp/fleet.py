@@ -1,12 +1,14 @@
-"""The drones of a simulator: one env or many, reset and stepped by the arrays of a Command."""
+"""The drones of a simulator, reset and stepped by the arrays of a Command."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, is_dataclass
-from typing import Any, TypeGuard
+from typing import Any, Protocol, TypeGuard
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import load_env_creator
 
 from .errors import LinkError
 from .messages import MAX_DRONES, MAX_UINT64, Hello, State
@@ -15,13 +17,41 @@ from .simulator_link import new_session
 __all__ = ["Fleet", "describe", "make_env", "options_text"]
 
 
+class Drones(Protocol):
+    """N drones that take a step of the wire together. A vector env that does is used as it is."""
+
+    observations: np.ndarray
+    """float32, shape (N, n)."""
+    rewards: np.ndarray
+    """float64, shape (N,)."""
+    terminated: np.ndarray
+    """bool, shape (N,)."""
+    truncated: np.ndarray
+    """bool, shape (N,)."""
+    telemetry: np.ndarray
+    """float64, shape (N, m)."""
+
+    def advance(self, actions: np.ndarray, resets: np.ndarray, seeds: np.ndarray | None) -> None:
+        """Reset the flagged drones, with their seeds if there are any, and step the others."""
+
+    def close(self) -> None:
+        """Close the env."""
+
+
 class Fleet:
-    """N independent copies of one env.
+    """N independent drones of one env.
+
+    An env whose registered vector env has a method `advance`, as ours, is stepped by that one;
+    any other is made N times.
 
     Args:
         env: Id of a registered env, or one env itself.
         num_envs: N.
         options: Options of the env, by name.
+
+    Attributes:
+        env: The vector env, or the first of the single ones.
+        hello: What there is to say of it, with a new session.
 
     Raises:
         ValueError: An option, the number or the env's spaces are not what they should be.
@@ -34,25 +64,22 @@ class Fleet:
             raise ValueError(f"num_envs: expected 1 to {MAX_DRONES}, got {num_envs!r}")
         if num_envs > 1 and not isinstance(env, str):
             raise ValueError(f"num_envs: expected 1 with an env already made, got {num_envs}")
-        self.envs = [make_env(env, options) for _ in range(num_envs)]
-        try:
-            self.hello = describe(self.envs[0], num_envs)
-        except BaseException:
-            self.close()
-            raise
-        self._discrete = bool(self.hello.discrete_actions)
-        self._names = self.hello.telemetry_names
+        self.env: Any
+        self._drones: Drones
+        if num_envs > 1 and isinstance(env, str) and _is_stepped_as_one(env):
+            self.env = self._drones = make_env(env, options, num_envs)
+            self.hello = describe(self.env, num_envs)
+        else:
+            self._drones = drones = _Singles([make_env(env, options) for _ in range(num_envs)])
+            self.env, self.hello = drones.envs[0], drones.hello
         self._over = np.zeros(num_envs, bool)
-        self._observations = np.zeros((num_envs, self.hello.observation_low.size), np.float32)
-        self._rewards = np.zeros(num_envs)
-        self._terminated = np.zeros(num_envs, bool)
-        self._truncated = np.zeros(num_envs, bool)
-        self._telemetry = np.zeros((num_envs, len(self._names)))
 
     def reset(self, seed: int) -> None:
         """Reset every drone: drone i with seed + i, modulo 2^64."""
-        for drone in range(len(self.envs)):
-            self._reset(drone, (seed + drone) & MAX_UINT64)
+        count = self.hello.num_drones
+        seeds = np.array([(seed + i) & MAX_UINT64 for i in range(count)], np.uint64)
+        actions = np.zeros((count, self.hello.action_low.size), np.float32)
+        self._advance(actions, np.ones(count, bool), seeds)
 
     def step(self, actions: np.ndarray, resets: np.ndarray, seeds: np.ndarray | None) -> None:
         """Reset the flagged drones, with their seeds if there are any, and step the others.
@@ -71,37 +98,62 @@ class Fleet:
                 f"an action came for drone {flown_on[0]} after the end of its episode: "
                 "expected a reset"
             )
-        for drone, reset in enumerate(resets.tolist()):
-            if reset:
-                self._reset(drone, None if seeds is None else int(seeds[drone]))
-            else:
-                self._step(drone, actions[drone])
+        self._advance(actions, resets, seeds)
 
     def state(self, session: int, sequence: int) -> State:
-        """What every drone sees now. Its arrays are those of the next one too."""
+        """What every drone sees now. Its arrays may be those of the next one too."""
+        drones = self._drones
         return State(
             session=session,
             sequence=sequence,
-            observations=self._observations,
-            rewards=self._rewards,
-            terminated=self._terminated,
-            truncated=self._truncated,
-            telemetry=self._telemetry,
+            observations=drones.observations,
+            rewards=drones.rewards,
+            terminated=drones.terminated,
+            truncated=drones.truncated,
+            telemetry=drones.telemetry,
         )
 
     def close(self) -> None:
         """Close the envs."""
+        self._drones.close()
+
+    def _advance(self, actions: np.ndarray, resets: np.ndarray, seeds: np.ndarray | None) -> None:
+        self._drones.advance(actions, resets, seeds)
+        self._over = self._drones.terminated | self._drones.truncated
+
+
+class _Singles:
+    """Single envs, one after the other: `Drones`."""
+
+    def __init__(self, envs: Sequence[gym.Env[Any, Any]]) -> None:
+        self.envs = envs
+        count = len(envs)
+        try:
+            self.hello = describe(envs[0], count)
+        except BaseException:
+            self.close()
+            raise
+        self._discrete = bool(self.hello.discrete_actions)
+        self._names = self.hello.telemetry_names
+        self.observations = np.zeros((count, self.hello.observation_low.size), np.float32)
+        self.rewards = np.zeros(count)
+        self.terminated, self.truncated = np.zeros(count, bool), np.zeros(count, bool)
+        self.telemetry = np.zeros((count, len(self._names)))
+
+    def advance(self, actions: np.ndarray, resets: np.ndarray, seeds: np.ndarray | None) -> None:
+        for drone, reset in enumerate(resets.tolist()):
+            env = self.envs[drone]
+            if reset:
+                seed = None if seeds is None else int(seeds[drone])
+                observation, info = env.reset(seed=seed)
+                self._keep(drone, observation, 0.0, False, False, info)
+            else:
+                action = actions[drone]
+                self._keep(drone, *env.step(int(action[0]) if self._discrete else action))
+
+    def close(self) -> None:
         for env in self.envs:
             env.close()
-
-    def _reset(self, drone: int, seed: int | None) -> None:
-        observation, info = self.envs[drone].reset(seed=seed)
-        self._keep(drone, observation, 0.0, False, False, info)
-
-    def _step(self, drone: int, action: Any) -> None:
-        if self._discrete:
-            action = int(action[0])
-        self._keep(drone, *self.envs[drone].step(action))
 
     def _keep(
         self,
@@ -113,37 +165,59 @@ class Fleet:
         info: dict[str, Any],
     ) -> None:
         observation = np.asarray(observation)
-        if observation.shape != self._observations.shape[1:] or observation.dtype != np.float32:
+        if observation.shape != self.observations.shape[1:] or observation.dtype != np.float32:
             raise ValueError(
-                f"observation: expected float32 of shape {self._observations.shape[1:]}, "
+                f"observation: expected float32 of shape {self.observations.shape[1:]}, "
                 f"got {observation.dtype} of shape {observation.shape}"
             )
-        self._observations[drone] = observation
-        self._rewards[drone] = reward
-        self._terminated[drone] = terminated
-        self._truncated[drone] = truncated
-        self._over[drone] = terminated or truncated
+        self.observations[drone] = observation
+        self.rewards[drone] = reward
+        self.terminated[drone] = terminated
+        self.truncated[drone] = truncated
         if self._names:
-            self._telemetry[drone] = [info[name] for name in self._names]
+            self.telemetry[drone] = [info[name] for name in self._names]
 
 
-def make_env(env: str | gym.Env[Any, Any], options: dict[str, Any]) -> gym.Env[Any, Any]:
-    """The env of an id and options, or the env itself. Raises `ValueError`."""
+def make_env(
+    env: str | gym.Env[Any, Any], options: dict[str, Any], num_envs: int | None = None
+) -> Any:
+    """The env of an id and options, or the env itself; with a number, the vector env of the id.
+
+    Raises `ValueError`.
+    """
     if not isinstance(env, str):
         if options:
             raise ValueError(f"options {sorted(options)}: expected none with an env already made")
         return env
     try:
-        return gym.make(env, disable_env_checker=True, **options)
+        if num_envs is None:
+            return gym.make(env, disable_env_checker=True, **options)
+        mode = gym.VectorizeMode.VECTOR_ENTRY_POINT
+        return gym.make_vec(env, num_envs, vectorization_mode=mode, **options)
     except (gym.error.Error, ImportError) as error:
         raise ValueError(f"env: expected a registered id, got {env!r}: {error}") from None
     except TypeError as error:
         raise ValueError(f"options of {env}: {error}") from None
 
 
-def describe(env: gym.Env[Any, Any], num_envs: int = 1) -> Hello:
-    """The Hello of so many envs, with a new session. Raises `ValueError` if spaces do not fit."""
-    observation, action = env.observation_space, env.action_space
+def _is_stepped_as_one(env_id: str) -> bool:
+    """Whether an env has a vector env that takes a step of the wire."""
+    try:
+        entry = gym.spec(env_id).vector_entry_point
+        return hasattr(load_env_creator(entry) if isinstance(entry, str) else entry, "advance")
+    except (gym.error.Error, ImportError):
+        return False  # `make_env` says what is wrong
+
+
+def describe(env: Any, num_envs: int = 1) -> Hello:
+    """The Hello of so many envs, with a new session. Raises `ValueError` if spaces do not fit.
+
+    Args:
+        env: One of them, or the vector env of all.
+        num_envs: How many.
+    """
+    observation = getattr(env, "single_observation_space", env.observation_space)
+    action = getattr(env, "single_action_space", env.action_space)
     low: np.ndarray
     high: np.ndarray
     if not _is_flat(observation):

@@ -310,7 +310,7 @@ def _model_of(fleet: Fleet) -> str:
 
         return model_xml()
     # As the envs of Gymnasium have it. What MuJoCo saves by itself is the last model loaded.
-    path = getattr(fleet.envs[0].unwrapped, "fullpath", None)
+    path = getattr(fleet.env.unwrapped, "fullpath", None)
     if not isinstance(path, str):
         return ""
     try:

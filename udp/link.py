@@ -19,14 +19,15 @@ from typing import Final
 from . import binary, text
 from .keys import Key
 from .messages import Close, Command, Message, State
+from .parts import cut
 
-__all__ = ["CLOSE_INTERVAL", "CLOSE_LINGER", "Address", "LinkConfig", "Tap", "encode", "sealed"]
+__all__ = ["CLOSE_INTERVAL", "CLOSE_LINGER", "Address", "LinkConfig", "Tap", "encode", "packed"]
 
 Address = tuple[str, int]
 
 Tap = Callable[[int, Message, bytes], None]
 """Sees every message once, when it is first sent or taken: the number of its place (0 at the
-simulator), the message, and its binary datagram, not sealed."""
+simulator), the message, and its bytes in the binary codec, not cut and not sealed."""
 
 CLOSE_INTERVAL: Final = 0.025
 """A Close is repeated after so long, s, until the other side has answered it with its own."""
@@ -61,12 +62,12 @@ class LinkConfig:
 
 
 def encode(message: Message, *, as_text: bool = False) -> bytes:
-    """The datagram of a message, not sealed. Raises `ValueError` if it does not fit into one."""
+    """The bytes of a message, not cut and not sealed. Raises `ValueError` if they are too many."""
     if as_text and isinstance(message, State | Command | Close):
         return text.encode(message)
     return binary.encode(message)
 
 
-def sealed(datagram: bytes, key: Key | None) -> bytes:
-    """The datagram as it travels: sealed if there is a key."""
-    return key.seal(datagram) if key else datagram
+def packed(message: bytes, key: Key | None) -> list[bytes]:
+    """The datagrams of a message as they travel: it or its parts, each sealed if there is a key."""
+    return [key.seal(datagram) if key else datagram for datagram in cut(message)]

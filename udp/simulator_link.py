@@ -2,13 +2,14 @@
 
 import secrets
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import Final
 
 from . import binary, text
 from .errors import DecodeError, Forged
 from .keys import Key, is_sealed, message_of
-from .link import CLOSE_INTERVAL, CLOSE_LINGER, LinkConfig, Tap, encode, sealed
+from .link import CLOSE_INTERVAL, CLOSE_LINGER, LinkConfig, Tap, encode, packed
 from .messages import (
     Close,
     Command,
@@ -21,6 +22,7 @@ from .messages import (
     Welcome,
     one_line,
 )
+from .parts import Assembler, is_part
 from .statistics import Statistics
 
 __all__ = ["SimulatorLink", "new_session"]
@@ -89,7 +91,8 @@ class SimulatorLink:
         self._tap = tap
         self._draw_session = draw_session
         self._waits = False
-        self._outstanding = b""
+        self._parts = Assembler(binary.command_size(hello))
+        self._outstanding: list[bytes] = []
         self._outgoing: list[bytes] = []
         self._sent_at = self._resend_at = self._deadline = 0.0
         self._smoothed: float | None = None
@@ -127,7 +130,13 @@ class SimulatorLink:
         """Take a datagram from the agent; the message, if it moves the exchange on."""
         self.statistics.counters["received"] += 1
         try:
-            message, plain = self._decode(datagram)
+            plain = self._open(datagram)
+            if not self._text and is_part(plain):
+                whole = self._assemble(plain, now)
+                if whole is None:
+                    return None
+                plain = whole
+            message = self._decode(plain)
         except DecodeError as error:
             cause = "forged" if isinstance(error, Forged) else "malformed"
             self._drop(cause, str(error), now)
@@ -177,7 +186,7 @@ class SimulatorLink:
                 return True
             self.close(f"no answer from the agent for {self._config.timeout:g} s", now)
             return False
-        self._outgoing.append(self._outstanding)
+        self._outgoing += self._outstanding
         self.statistics.counters["resent"] += 1
         wait = min(self._resend_interval() * 2 ** min(self.sends, 16), self._config.max_resend)
         self._resend_at = now + (CLOSE_INTERVAL if self.state == "closing" else wait)
@@ -189,31 +198,57 @@ class SimulatorLink:
         outgoing, self._outgoing = self._outgoing, []
         return outgoing
 
-    def _decode(self, datagram: bytes) -> tuple[Message, bytes]:
-        """The message and what carried it, without its seal."""
+    def _decode(self, plain: bytes) -> Message:
         if self._text:
-            size = self.hello.action_low.size
-            return text.decode_command(datagram, size, self.hello.session), datagram
-        if self._key:
-            datagram = self._open(datagram, self._key)
-        elif is_sealed(datagram):
-            raise Forged("key: the agent has one, this simulator has none (--key-file)")
-        return binary.decode(datagram), datagram
+            return text.decode_command(plain, self.hello.action_low.size, self.hello.session)
+        return binary.decode(plain)
 
-    def _open(self, datagram: bytes, key: Key) -> bytes:
-        """Commands and Closes are sealed with the session's key, all else with the shared one."""
+    def _assemble(self, part: bytes, now: float) -> bytes | None:
+        """The Command that is waited for, once all its parts are there."""
+        kind, session, sequence = binary.check(part)
+        if session != self.hello.session:
+            self._drop("foreign", f"session {session:016x}", now)
+            return None
+        if (self.state, kind & ~binary.PART, sequence) != (
+            "waiting",
+            binary.COMMAND,
+            self.sequence,
+        ):
+            self._drop("stale", "", now)
+            return None
+        return self._parts.take(sequence, part)
+
+    def _open(self, datagram: bytes) -> bytes:
+        """A datagram without its seal.
+
+        Commands and Closes are sealed with the session's key, all else with the shared one.
+        """
+        key = self._key
+        if self._text:
+            return datagram
+        if key is None:
+            if is_sealed(datagram):
+                raise Forged("key: the agent has one, this simulator has none (--key-file)")
+            return datagram
         if not is_sealed(datagram):
             message = binary.decode(datagram)
             words = f" that says: {message.reason}" if isinstance(message, Refuse) else ""
             raise Forged(f"not sealed, a {type(message).__name__}{words}")
         kind, _, _ = binary.peek(message_of(datagram))
         if kind == binary.UNKNOWN:  # answers this very State, not one that somebody made up
-            return key.open(datagram, self._outstanding)
+            return self._open_answer(datagram, key)
         if kind in binary.OF_SESSION:
             if self._session_key is None:
                 raise Forged("a message of a session, and there is none")
             key = self._session_key
         return key.open(datagram)
+
+    def _open_answer(self, datagram: bytes, key: Key) -> bytes:
+        """An answer to one of the datagrams that were sent last."""
+        for asked in self._outstanding:
+            with suppress(Forged):
+                return key.open(datagram, asked)
+        raise Forged("key: the tag is not of this key and State")
 
     def _is_current(self, message: Message) -> bool:
         number = getattr(message, "sequence", None)
@@ -252,12 +287,13 @@ class SimulatorLink:
         )
         self.hello = replace(self.hello, session=self._draw_session())
         self.sequence, self._session_key, self._waits = 0, None, False
+        self._parts = Assembler(binary.command_size(self.hello))
         self._send(self.hello, now)
 
     def _answer_close(self) -> None:
         close = Close(session=self.hello.session, sequence=self.sequence, reason="")
         datagram = encode(close, as_text=self._text)
-        self._outgoing.append(sealed(datagram, self._session_key))
+        self._outgoing += packed(datagram, self._session_key)
         self.statistics.counters["sent"] += 1
         self._record(close, datagram)
 
@@ -265,8 +301,8 @@ class SimulatorLink:
         key = self._key if isinstance(message, Hello) else self._session_key
         datagram = encode(message, as_text=self._text)
         self._record(message, datagram)
-        self._outstanding = sealed(datagram, key)
-        self._outgoing.append(self._outstanding)
+        self._outstanding = packed(datagram, key)
+        self._outgoing += self._outstanding
         self.statistics.counters["sent"] += 1
         self.sends = 1
         self._sent_at = now
