@@ -1,17 +1,19 @@
 """`rotorgram/Elevation-v0` for many drones at once, stepped by `mujoco.batch`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils.seeding import np_random
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from ..models import model_hash
 from ..models.constants import HOVER_THRUST
+from . import autoreset
+from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
 from .batch import BatchPhysics
 from .config import (
     FURTHEST,
@@ -25,13 +27,10 @@ from .task import ElevationTask
 
 __all__ = ["ElevationVectorEnv"]
 
-Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
-Seeds = Sequence[int | None] | np.ndarray
-
 _OPTIONS: Final = ("reset_mask", "target", "start")
 
 
-class ElevationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class ElevationVectorEnv(AdvancingVectorEnv):
     """N drones with a target each: the task of `ElevationEnv`, bit for bit that of N single ones.
 
     Spaces, reward, start, termination and truncation are those of `ElevationEnv`, with the drone as
@@ -86,7 +85,7 @@ class ElevationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.metadata = {
             "render_modes": [],
             "render_fps": round(1 / config.control_period),
-            "autoreset_mode": _mode(autoreset_mode),
+            "autoreset_mode": autoreset.autoreset_mode(autoreset_mode),
         }
         self.single_observation_space = observation_space(config)
         self.single_action_space = action_space(config)
@@ -104,7 +103,6 @@ class ElevationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.rewards = np.zeros(num_envs)
         self.terminated, self.truncated = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
         self._clipped = np.zeros(num_envs, bool)
-        self._nobody = np.zeros(num_envs, bool)
         self.closed = False
 
     @cached_property
@@ -129,50 +127,28 @@ class ElevationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         options = options or {}
         if unknown := [name for name in options if name not in _OPTIONS]:
             raise ValueError(f"options: expected some of {', '.join(_OPTIONS)}, got {unknown[0]!r}")
-        mask = self._mask(options.get("reset_mask"))
+        mask = checked_mask(options.get("reset_mask"), self.num_envs)
         chosen = self._elevations(options)
-        self._begin(np.flatnonzero(mask), self._seeds(seed), chosen)
+        self._begin(np.flatnonzero(mask), checked_seeds(seed, self.num_envs), chosen)
         self._observe()
         return self.observations.copy(), self._info(mask)
 
-    def step(self, actions: np.ndarray) -> Step:
-        """Fly every drone for one control period. See the class for what follows an episode."""
-        array = np.asarray(actions)
-        if array.shape != self.action_space.shape:
-            raise ValueError(
-                f"actions: expected an array of shape {self.action_space.shape}, "
-                f"got shape {array.shape}"
-            )
-        mode = self.metadata["autoreset_mode"]
-        ended = self.terminated | self.truncated
-        resets = ended if mode == AutoresetMode.NEXT_STEP else self._nobody
-        self.advance(array.reshape(self.num_envs, 1), resets)
-        rewards, terminated, truncated = self.rewards, self.terminated, self.truncated
-        info = self._info(np.ones(self.num_envs, bool))
-        if mode == AutoresetMode.SAME_STEP and (ended := terminated | truncated).any():
-            info = self._begin_next(ended, info)
-        return self.observations.copy(), rewards, terminated, truncated, info
-
     def advance(
-        self, actions: np.ndarray, resets: np.ndarray, seeds: np.ndarray | None = None
+        self,
+        actions: np.ndarray,
+        resets: np.ndarray,
+        seeds: np.ndarray | None = None,
+        holds: np.ndarray | None = None,
     ) -> None:
-        """Reset some drones and fly the others for one control period: a step of the wire.
-
-        What came of it is in the attributes; rewards of a reset are 0.
-
-        Args:
-            actions: Shape (N, 1), a choice by its number; ignored where a drone is reset.
-            resets: bool, shape (N,).
-            seeds: uint64, shape (N,), of those that are reset; None leaves the generators.
-        """
-        flown = ~resets
+        """Reset some drones, hold some, and fly the others: see `AdvancingVectorEnv`."""
+        flown = ~resets if holds is None else ~(resets | holds)
         if (waiting := flown & (self._steps < 0)).any():
             first = int(waiting.argmax())
             raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
         values = self._action_values(actions, flown)
         thrust, clipped = self._task.thrust(values, self._thrust)
         self._thrust = np.where(flown, thrust, self._thrust)
-        self._clipped = flown & clipped
+        self._clipped = np.where(flown, clipped, self._clipped & ~resets)
         steps, ids = self._steps + 1, np.flatnonzero(flown)
         self._steps[ids] = -1  # a physics error leaves them to be reset
         if ids.size:
@@ -218,17 +194,6 @@ class ElevationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         kept[ids] = False
         self.terminated, self.truncated = self.terminated & kept, self.truncated & kept
 
-    def _begin_next(self, ended: np.ndarray, info: dict[str, Any]) -> dict[str, Any]:
-        """SAME_STEP: reset those whose episode ended; the info, with that of their last step."""
-        last, last_info = self.observations.copy(), info
-        last_info.update({f"_{name}": ended for name in info if not name.startswith("_")})
-        self._begin(np.flatnonzero(ended), None)
-        self._observe()
-        info = self._info(np.ones(self.num_envs, bool))
-        info |= {"final_obs": last, "_final_obs": ended}
-        info |= {"final_info": last_info, "_final_info": ended}
-        return info
-
     def _observe(self) -> np.ndarray:
         """Take down what every drone sees; the elevation errors, m."""
         physics = self._physics
@@ -266,35 +231,6 @@ class ElevationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             values -= 1.0
         return values
 
-    def _mask(self, mask: Any) -> np.ndarray:
-        if mask is None:
-            return np.ones(self.num_envs, bool)
-        if (
-            not isinstance(mask, np.ndarray)
-            or (mask.dtype, mask.shape) != (bool, (self.num_envs,))
-            or not mask.any()
-        ):
-            raise ValueError(
-                f"reset_mask: expected an array of {self.num_envs} bool, one of them True, "
-                f"got {mask!r}"
-            )
-        return mask.copy()
-
-    def _seeds(self, seed: Any) -> Seeds | None:
-        if seed is None:
-            return None
-        if isinstance(seed, int | np.integer):
-            seed = range(int(seed), int(seed) + self.num_envs)
-        if (
-            not isinstance(seed, Sequence | np.ndarray)
-            or len(seed) != self.num_envs
-            or not all(s is None or (isinstance(s, int | np.integer) and s >= 0) for s in seed)
-        ):
-            raise ValueError(
-                f"seed: expected a whole number from 0 on, or {self.num_envs} of them, got {seed!r}"
-            )
-        return seed
-
     def _elevations(self, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Targets and starts that were chosen, float64, shape (N,)."""
         least = LOWEST_START + (0.0 if "start" in options else self.config.start_band)
@@ -318,11 +254,3 @@ class ElevationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                         f"from the target, got {options['start']!r}"
                     )
         return chosen
-
-
-def _mode(mode: AutoresetMode | str) -> AutoresetMode:
-    try:
-        return AutoresetMode(mode)
-    except ValueError:
-        expected = " or ".join(repr(m.value) for m in AutoresetMode)
-        raise ValueError(f"autoreset_mode: expected {expected}, got {mode!r}") from None

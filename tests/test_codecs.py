@@ -64,11 +64,14 @@ def states(draw: st.DrawFn, most: int = 5, session: int | None = None) -> State:
 @st.composite
 def commands(draw: st.DrawFn, most: int = 5) -> Command:
     drones = draw(st.integers(1, most))
+    resets = draw(arrays(bool, drones))
+    holds = draw(arrays(bool, drones)) & ~resets if most > 1 else resets & False
     return Command(
         session=draw(uint64),
         sequence=draw(uint64),
         actions=draw(rows(drones, draw(st.integers(1, 4)), np.float32, float32)),
-        resets=draw(arrays(bool, drones)),
+        resets=resets,
+        holds=holds if holds.any() else None,
         seeds=draw(st.none() | arrays(np.uint64, drones, elements=uint64)),
     )
 
@@ -313,7 +316,7 @@ def test_random_bytes(junk: bytes) -> None:
         (5, struct.pack("<IH6xI", 0, 1, 0)),
         (5, struct.pack("<IH6xIQfB", 1, 1, 2, 0, 0.0, 0)),
         (5, struct.pack("<IH6xIQffBB", 2, 1, 1, 0, 0.0, 0.0, 0, 0)),
-        (5, struct.pack("<IH6xIfB", 1, 1, 0, 0.0, 2)),
+        (5, struct.pack("<IH6xIfB", 1, 1, 0, 0.0, 3)),
         (1, struct.pack("<IHHHxxd16s", 1, 65535, 65535, 0, 0.02, b"")),
         (6, struct.pack("<H", 65535)),
         (6, struct.pack("<H", 2) + b"\xff\xff"),
@@ -610,3 +613,16 @@ def test_text_is_for_one_drone() -> None:
 @settings(deadline=None, max_examples=30)
 def test_codecs_are_told_apart_by_the_first_byte(message: Message) -> None:
     assert not text.is_text(binary.encode(message))
+
+
+def test_a_drone_is_reset_or_held() -> None:
+    datagram = binary.encode(one_command(holds=np.array([False, True])))
+    assert datagram[-2:] == b"\1\2"
+    command = binary.decode(datagram)
+    assert isinstance(command, Command)
+    assert command.holds is not None
+    assert (command.resets.tolist(), command.holds.tolist()) == ([True, False], [False, True])
+    with pytest.raises(ValueError, match="expected a reset or a hold, got both for drone 0"):
+        one_command(holds=np.array([True, True]))
+    with pytest.raises(ValueError, match=r"holds: expected shape \(2,\), got \(3,\)"):
+        one_command(holds=np.zeros(3, bool))

@@ -522,7 +522,7 @@ def test_states_and_commands_are_ros_messages(flight: SimpleNamespace) -> None:
             seeds = [] if true.seeds is None else true.seeds.tolist()
             assert ros.seeds.tolist() == seeds
             assert ros.actions.tolist() == true.actions.ravel().tolist()
-            assert ros.resets.tolist() == true.resets.tolist()
+            assert ros.orders.tolist() == true.resets.tolist()
         assert stores[schema.id].serialize_ros1(ros, name) == message.data
         seen += 1
     assert seen == 2 * 602 - 1

@@ -17,6 +17,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from peers import ANY, ENV_ID, Running, launch, plain_socket
+from rotorgram.envs import ElevationVectorEnv
 from rotorgram.udp import (
     LinkConfig,
     PeerClosed,
@@ -47,11 +48,16 @@ SIMULATE = """
 
 @contextmanager
 def flying(
-    simulators: int, drones: int, env: str = ENV_ID, **options: Any
+    simulators: int, drones: int, env: str = ENV_ID, autoreset: str = "NextStep", **options: Any
 ) -> Iterator[tuple[RemoteVectorEnv, list[Running]]]:
     """A RemoteVectorEnv, and simulators for it in threads."""
     remote = RemoteVectorEnv(
-        ANY, num_simulators=simulators, num_envs=simulators * drones, env_id=env, connect=False
+        ANY,
+        num_simulators=simulators,
+        num_envs=simulators * drones,
+        env_id=env,
+        autoreset_mode=autoreset,
+        connect=False,
     )
     running = [simulate(remote, num_envs=drones, env=env, **options) for _ in range(simulators)]
     try:
@@ -301,11 +307,13 @@ def test_wrong_seeds(seed: Any) -> None:
     with flying(2, 2) as (remote, _):
         remote.reset(seed=[0, 2**64 - 1, 5, 5])
         sent = remote.statistics.counters["sent"]
-        sentence = r"seed: expected a whole number, or 4 of them, up to 2\^64 - 1, got"
+        sentence = r"seed: expected a whole number from 0 to 2\^64 - 1, or 4 of them, got"
         with pytest.raises(ValueError, match=sentence):
             remote.reset(seed=seed)
-        with pytest.raises(ValueError, match="options: expected none over UDP"):
-            remote.reset(options={"reset_mask": np.ones(4, bool)})
+        with pytest.raises(
+            ValueError, match="options: expected reset_mask or none over UDP, got 'target'"
+        ):
+            remote.reset(options={"target": 5.0})
         assert remote.statistics.counters["sent"] == sent
         remote.reset(seed=2**64 - 4)
 
@@ -329,6 +337,67 @@ def test_wrong_seeds(seed: Any) -> None:
 def test_wrong_arguments(arguments: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=f"^{sentence}"):
         RemoteVectorEnv(**{"address": ANY, **arguments})
+
+
+# ---- autoreset
+
+
+@pytest.mark.parametrize("drones", [1, 3])
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_autoreset_is_that_of_the_local_env(mode: str, drones: int) -> None:
+    options: dict[str, Any] = {"episode_length": 12, "flight_band": 1.3}
+    local = ElevationVectorEnv(2 * drones, autoreset_mode=mode, **options)
+    with flying(2, drones, autoreset=mode, **options) as (remote, _):
+        assert remote.metadata["autoreset_mode"] == local.metadata["autoreset_mode"]
+        assert_same(remote.reset(seed=4), local.reset(seed=4))
+        dice, ended = np.random.default_rng(2), 0
+        for _ in range(80):
+            actions = dice.uniform(-1, 1, (2 * drones, 1)).astype(np.float32)
+            here, there = remote.step(actions), local.step(actions)
+            assert_same(here, there)
+            assert ("final_obs" in here[4]) == ("final_obs" in there[4])
+            if "final_obs" in here[4]:
+                flags = there[4]["_final_obs"]
+                ended += flags.sum()
+                for name in ("final_obs", "_final_obs"):
+                    assert here[4][name].tobytes() == there[4][name].tobytes()
+                finals = here[4]["final_info"], there[4]["final_info"]
+                for name in NAMES:
+                    assert finals[0][name][flags].tobytes() == finals[1][name][flags].tobytes()
+                    assert (finals[0][f"_{name}"] == flags).all()
+        assert (ended > 0) == (mode == "SameStep")
+
+
+def test_a_mask_resets_some_and_the_others_hold() -> None:
+    local = ElevationVectorEnv(4, autoreset_mode="Disabled")
+    with flying(2, 2, autoreset="Disabled") as (remote, _):
+        assert_same(remote.reset(seed=1), local.reset(seed=1))
+        dice = np.random.default_rng(0)
+        for number in range(20):
+            actions = dice.uniform(-1, 1, (4, 1)).astype(np.float32)
+            assert_same(remote.step(actions), local.step(actions))
+            mask = np.array([[True, False, False, False], [False, True, True, False]][number % 2])
+            masked = [
+                env.reset(seed=[number, 1, 2, 3], options={"reset_mask": mask.copy()})
+                for env in (remote, local)
+            ]
+            assert_same(*masked)
+            assert (masked[0][1]["_Y"] == mask).all()
+        with pytest.raises(ValueError, match="reset_mask: expected an array of 4 bool"):
+            remote.reset(options={"reset_mask": np.zeros(4, bool)})
+
+
+def test_an_env_of_others_is_held_too() -> None:
+    with flying(1, 2, env="CartPole-v1", autoreset="SameStep") as (remote, _):
+        remote.reset(seed=0)
+        push = np.array([1, 0])
+        for _ in range(60):
+            observations, _, terminated, _, info = remote.step(push)
+            if terminated.any():
+                assert (info["_final_obs"] == terminated).all()
+                assert (abs(observations[terminated]) < 0.05).all()
+                push = push[::-1]
+        assert remote.statistics.counters["resent"] == 0
 
 
 # ---- places

@@ -417,7 +417,9 @@ def test_text_and_a_key(key_file: str) -> None:
     with keyed(key_file, None, codec="text") as (remote, running):
         with pytest.raises(PeerSilent, match="last datagram dropped: forged"):
             remote.connect()
-        assert running.join() == "the agent closed"
+        error = running.join()
+        assert isinstance(error, Refused)
+        assert "closed before its first command: it has no free place, has a key" in str(error)
 
 
 def test_a_key_allows_every_address(key_file: str) -> None:

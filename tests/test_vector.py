@@ -121,6 +121,29 @@ def test_a_mask_resets_some_and_leaves_the_others() -> None:
     assert not env.step(hold)[3].any()
 
 
+def test_who_holds_is_as_before() -> None:
+    held, free = ElevationVectorEnv(2, episode_length=5), ElevationVectorEnv(2, episode_length=5)
+    hold, nobody = np.array([True, False]), np.zeros(2, bool)
+    actions = np.full((2, 1), 0.4, np.float32)
+    for env in (held, free):
+        env.reset(seed=0)
+        env.advance(actions, nobody)
+    before = held.observations[0].tobytes(), held.telemetry[0].tobytes()
+    for _ in range(4):
+        held.advance(np.full((2, 1), np.nan), nobody | ~hold, holds=hold)
+        held.advance(np.array([[9.0], [0.4]]), nobody, holds=hold)
+        assert (held.observations[0].tobytes(), held.telemetry[0].tobytes()) == before
+        assert (held.rewards[0], held.terminated[0], held.truncated[0]) == (0.0, False, False)
+    for _ in range(4):  # and its episode is as long as if it had not been held
+        held.advance(actions, ~hold)
+        free.advance(actions, ~hold)
+        assert held.observations[0].tobytes() == free.observations[0].tobytes()
+    assert held.truncated[0]
+    held.advance(actions, ~hold, holds=hold)  # it may hold when its episode is over, too
+    with pytest.raises(gym.error.ResetNeeded, match="env 0 first"):
+        held.advance(actions, nobody)
+
+
 def test_targets_and_starts_of_ones_own() -> None:
     env = ElevationVectorEnv(3)
     targets, starts = np.array([3.0, 5.0, 400.0]), np.array([2.5, 7.0, 399.0])

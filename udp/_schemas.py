@@ -70,7 +70,7 @@ def command_schema(hello: Hello) -> str:
         "uint8[6] reserved",
         "uint64[] seeds",
         f"float32[{drones * hello.action_low.size}] actions",
-        f"bool[{drones}] resets",
+        f"uint8[{drones}] orders",
     ]
     return "\n".join(lines) + "\n"
 

@@ -85,6 +85,8 @@ _WELCOME: Final = struct.Struct("<QB7xQ")  # nonce, has seed, seed
 _HELLO: Final = struct.Struct("<IHHHxxd16s")  # drones, sizes, discrete actions, period, model hash
 _LENGTH: Final = struct.Struct("<H")
 _FLAGS: Final = b"\0\1"
+_ORDERS: Final = b"\0\1\2"
+_HOLD: Final = 2
 _F4: Final = np.dtype("<f4")
 _F8: Final = np.dtype("<f8")
 _U8: Final = np.dtype("<u8")
@@ -207,9 +209,16 @@ def _encode_command(m: Command) -> bytes:
             _COMMAND.pack(drones, size, len(seeds) // 8),
             seeds,
             m.actions.astype(_F4, copy=False).tobytes(),
-            m.resets.astype(bool, copy=False).tobytes(),
+            _orders(m).tobytes(),
         )
     )
+
+
+def _orders(m: Command) -> np.ndarray:
+    orders: np.ndarray = m.resets.astype(np.uint8)
+    if m.holds is not None:
+        orders += _HOLD * m.holds.astype(np.uint8)
+    return orders
 
 
 def _decode_command(data: bytes, session: int, sequence: int) -> Command:
@@ -219,13 +228,21 @@ def _decode_command(data: bytes, session: int, sequence: int) -> Command:
     at = 40 + 8 * count
     flags = at + 4 * drones * k
     _expect_size(data, flags + drones)
-    _expect_flags(data[flags:])
+    holds = None
+    if data.find(_HOLD, flags) < 0:
+        _expect_flags(data[flags:])
+        resets = np.ndarray((drones,), bool, data, flags)
+    else:
+        _expect_flags(data[flags:], _ORDERS)
+        orders = np.ndarray((drones,), np.uint8, data, flags)
+        resets, holds = orders == 1, orders == _HOLD
     return Command(
         session=session,
         sequence=sequence,
         actions=np.ndarray((drones, k), _F4, data, at),
-        resets=np.ndarray((drones,), bool, data, flags),
+        resets=resets,
         seeds=np.ndarray((drones,), _U8, data, 40) if count else None,
+        holds=holds,
     )
 
 
@@ -334,9 +351,9 @@ def _expect_size(data: bytes, size: int) -> None:
         raise ValueError(f"expected {size} bytes, got {len(data)}")
 
 
-def _expect_flags(flags: bytes) -> None:
-    if wrong := flags.translate(None, _FLAGS):
-        raise ValueError(f"flags: expected 0 or 1, got {wrong[0]}")
+def _expect_flags(flags: bytes, allowed: bytes = _FLAGS) -> None:
+    if wrong := flags.translate(None, allowed):
+        raise ValueError(f"flags: expected 0 to {len(allowed) - 1}, got {wrong[0]}")
 
 
 def _entry(

@@ -31,8 +31,14 @@ class Drones(Protocol):
     telemetry: np.ndarray
     """float64, shape (N, m)."""
 
-    def advance(self, actions: np.ndarray, resets: np.ndarray, seeds: np.ndarray | None) -> None:
-        """Reset the flagged drones, with their seeds if there are any, and step the others."""
+    def advance(
+        self,
+        actions: np.ndarray,
+        resets: np.ndarray,
+        seeds: np.ndarray | None,
+        holds: np.ndarray | None,
+    ) -> None:
+        """As `rotorgram.envs.autoreset.AdvancingVectorEnv.advance`."""
 
     def close(self) -> None:
         """Close the env."""
@@ -79,26 +85,36 @@ class Fleet:
         count = self.hello.num_drones
         seeds = np.array([(seed + i) & MAX_UINT64 for i in range(count)], np.uint64)
         actions = np.zeros((count, self.hello.action_low.size), np.float32)
-        self._advance(actions, np.ones(count, bool), seeds)
+        self._drones.advance(actions, np.ones(count, bool), seeds, None)
+        self._over.fill(False)
 
-    def step(self, actions: np.ndarray, resets: np.ndarray, seeds: np.ndarray | None) -> None:
+    def step(
+        self,
+        actions: np.ndarray,
+        resets: np.ndarray,
+        seeds: np.ndarray | None = None,
+        holds: np.ndarray | None = None,
+    ) -> None:
         """Reset the flagged drones, with their seeds if there are any, and step the others.
 
         Args:
             actions: float32, shape (N, k).
             resets: bool, shape (N,).
             seeds: uint64, shape (N,), or None.
+            holds: bool, shape (N,): neither reset nor stepped; None for none.
 
         Raises:
             LinkError: A drone whose episode has ended is to be stepped; none was.
         """
-        flown_on = np.flatnonzero(self._over & ~resets)
+        left_alone = resets if holds is None else resets | holds
+        flown_on = np.flatnonzero(self._over & ~left_alone)
         if flown_on.size:
             raise LinkError(
                 f"an action came for drone {flown_on[0]} after the end of its episode: "
                 "expected a reset"
             )
-        self._advance(actions, resets, seeds)
+        self._drones.advance(actions, resets, seeds, holds)
+        self._over = self._drones.terminated | self._drones.truncated | (self._over & ~resets)
 
     def state(self, session: int, sequence: int) -> State:
         """What every drone sees now. Its arrays may be those of the next one too."""
@@ -116,10 +132,6 @@ class Fleet:
     def close(self) -> None:
         """Close the envs."""
         self._drones.close()
-
-    def _advance(self, actions: np.ndarray, resets: np.ndarray, seeds: np.ndarray | None) -> None:
-        self._drones.advance(actions, resets, seeds)
-        self._over = self._drones.terminated | self._drones.truncated
 
 
 class _Singles:
@@ -140,10 +152,19 @@ class _Singles:
         self.terminated, self.truncated = np.zeros(count, bool), np.zeros(count, bool)
         self.telemetry = np.zeros((count, len(self._names)))
 
-    def advance(self, actions: np.ndarray, resets: np.ndarray, seeds: np.ndarray | None) -> None:
+    def advance(
+        self,
+        actions: np.ndarray,
+        resets: np.ndarray,
+        seeds: np.ndarray | None,
+        holds: np.ndarray | None,
+    ) -> None:
         for drone, reset in enumerate(resets.tolist()):
             env = self.envs[drone]
-            if reset:
+            if holds is not None and holds[drone]:
+                self.rewards[drone] = 0.0
+                self.terminated[drone] = self.truncated[drone] = False
+            elif reset:
                 seed = None if seeds is None else int(seeds[drone])
                 observation, info = env.reset(seed=seed)
                 self._keep(drone, observation, 0.0, False, False, info)

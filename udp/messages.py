@@ -227,6 +227,8 @@ class Command:
     seeds: np.ndarray | None = None
     """uint64, shape (N,): seeds of the resets in this command; a drone that is not reset ignores
     its own. None leaves the generators as they are."""
+    holds: np.ndarray | None = None
+    """bool, shape (N,): neither reset nor step. None holds none."""
 
     def __post_init__(self) -> None:
         drones = _check_rows("actions", self.actions)
@@ -234,6 +236,11 @@ class Command:
         _check_finite("action", self.actions)
         if self.seeds is not None:
             _check_shape("seeds", self.seeds, (drones,))
+        if self.holds is not None:
+            _check_shape("holds", self.holds, (drones,))
+            if (self.holds & self.resets).any():
+                first = int((self.holds & self.resets).argmax())
+                raise ValueError(f"holds: expected a reset or a hold, got both for drone {first}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

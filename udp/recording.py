@@ -265,8 +265,9 @@ class _Tally:
     def _take_state(self, state: State) -> None:
         summary, command = self.summary, self._command
         summary.states += 1
-        stepped = np.zeros(len(state.rewards), bool) if command is None else ~command.resets
-        self._returns[~stepped] = 0.0
+        resets = np.ones(len(state.rewards), bool) if command is None else command.resets
+        stepped = ~resets if command is None or command.holds is None else ~resets & ~command.holds
+        self._returns[resets] = 0.0
         self._returns += np.where(stepped, state.rewards, 0.0)
         summary.steps += int(stepped.sum())
         ended = (state.terminated | state.truncated) & stepped

@@ -7,10 +7,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from ..envs import ENV_ID
+from ..envs import ENV_ID, autoreset
+from ..envs.autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
 from .link import Address
 from .messages import MAX_UINT64
 from .remote import LOST, keep_space
@@ -20,18 +21,18 @@ from .statistics import Statistics
 
 __all__ = ["RemoteVectorEnv"]
 
-Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 
-
-class RemoteVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class RemoteVectorEnv(AdvancingVectorEnv):
     """The M · N drones of M simulators with N drones each, in lock-step over one socket.
 
     The simulators may be on any machines, and come in any order: each takes the first place that
     is free, and one that comes too late waits until another leaves. Drone i of place p is env
     p · N + i. A slow simulator delays the others and changes nothing else.
 
-    Autoreset is Gymnasium's NEXT_STEP: the step after an episode's end resets that drone, ignores
-    its action and gives reward 0. `info` has the telemetry, an array for each name.
+    Autoreset is Gymnasium's NEXT_STEP (the default), SAME_STEP or DISABLED, as in
+    `rotorgram.envs.ElevationVectorEnv`; with SAME_STEP a step in which an episode ends takes a
+    second round trip, in which the other drones hold. `info` has the telemetry, an array for each
+    name.
 
     A simulator that is lost is replaced by the next that comes. The running episodes of its drones
     end as truncated, with the observation before, reward 0 and the reason in
@@ -44,6 +45,7 @@ class RemoteVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             is that of the first simulator that comes.
         env_id: The env to fly. A simulator of another one is refused.
         options: Options of that env; with them given, a simulator of others is refused.
+        autoreset_mode: `AutoresetMode`, or its value.
         connect: Wait for the simulators now; needs `num_envs` where it is False.
         connect_timeout: Longest wait for a simulator to take a free place, s.
         timeout: Longest wait for an answer from one, s, before another may take its place.
@@ -68,6 +70,7 @@ class RemoteVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         num_envs: int | None = None,
         env_id: str = ENV_ID,
         options: Mapping[str, Any] | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         connect: bool = True,
         connect_timeout: float = 60.0,
         timeout: float = 30.0,
@@ -86,6 +89,8 @@ class RemoteVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if num_envs is None and not connect:
             raise ValueError("num_envs: expected a number with connect=False, got None")
         self.env_id = env_id
+        self._broken: tuple[np.ndarray, np.ndarray] | None = None
+        self._mode = autoreset.autoreset_mode(autoreset_mode)
         self.num_simulators = num_simulators
         config = ServerConfig(
             env_id=env_id,
@@ -127,59 +132,69 @@ class RemoteVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self,
         *,
-        seed: int | Sequence[int] | None = None,
+        seed: int | Seeds | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode for every drone: env i with seed + i, or the i-th of the seeds."""
-        if options:
-            raise ValueError(f"options: expected none over UDP, got {options}")
+        """Begin an episode, for all drones or some.
+
+        Args:
+            seed: Drone i gets seed + i, or the i-th of N seeds; None leaves its generator as it is.
+            options: `reset_mask`: bool, shape (N,): which drones; the others hold.
+        """
+        options = options or {}
+        if unknown := [name for name in options if name != "reset_mask"]:
+            raise ValueError(f"options: expected reset_mask or none over UDP, got {unknown[0]!r}")
+        if "reset_mask" in options and self._flying:
+            mask = checked_mask(options["reset_mask"], self.num_envs)
+            self.advance(self._no_actions, mask, self._seeds(seed), ~mask)
+            return self.observations.copy(), self._info(mask)
         self._flying = False
         self._server.connect()
         self._take_interface(self.num_simulators * (self._server.interface.drones or 1))
-        seeds = self._seeds(seed)
-        places: Sequence[int] = range(self.num_simulators)
-        everyone = np.ones(self._shape, bool)
-        while places:
-            self._server.exchange(places, self._no_actions, everyone, seeds)
-            # A simulator that came in the place of a lost one was not reset.
-            places = [place for place, reason in enumerate(self._server.lost) if reason]
-        self._ended = np.zeros(self.num_envs, bool)
+        seeds, everyone = self._seeds(seed), np.ones(self.num_envs, bool)
+        self._reset_until_done(range(self.num_simulators), everyone, seeds)
+        self._over = np.zeros(self.num_envs, bool)
         self._flying = True
-        self._observations = self._joined("observations")
-        self._telemetry = self._joined("telemetry")
-        return self._observations.copy(), self._info()
+        self._take_states(everyone)
+        return self.observations.copy(), self._info(everyone)
 
-    def step(self, actions: np.ndarray) -> Step:
-        """Fly every drone for one control period; reset those whose episode has ended."""
+    def advance(
+        self,
+        actions: np.ndarray,
+        resets: np.ndarray,
+        seeds: np.ndarray | None = None,
+        holds: np.ndarray | None = None,
+    ) -> None:
+        """Reset some drones, hold some, and fly the others: see `AdvancingVectorEnv`."""
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
-        sent = self._sent(actions)
-        resets = self._ended.reshape(self._shape)
+        held = np.zeros(self.num_envs, bool) if holds is None else holds
+        sent, shape = self._sent(actions), self._shape
+        places = [p for p in range(self.num_simulators) if not held.reshape(shape)[p].all()]
         self._flying = False  # until the answers are there
         try:
-            self._server.exchange(range(self.num_simulators), sent, resets)
+            self._server.exchange(places, sent, *_by_place(shape, resets, seeds, holds))
         except ValueError:  # an action that is wrong, and nothing has happened
             self._flying = True
             raise
-        observations, rewards = self._joined("observations"), self._joined("rewards")
-        terminated, truncated = self._joined("terminated"), self._joined("truncated")
-        telemetry = self._joined("telemetry")
-        reasons = np.repeat(np.array(self._server.lost, object), self._shape[1])
-        broken = (reasons != "") & ~self._ended
+        lost = self._server.lost
+        if seeds is not None:  # a simulator that came instead of a lost one has not seen them
+            anew = [p for p in places if lost[p] and resets.reshape(shape)[p].any()]
+            self._reset_until_done(anew, resets, seeds)
+        before, telemetry = self.observations, self._telemetry
+        self._take_states(resets | held)
+        reasons = np.repeat(np.array(lost, object), shape[1])
+        broken = (reasons != "") & ~resets & ~self._over
         if broken.any():  # what came is the start of the next episodes
-            observations[broken] = self._observations[broken]
-            telemetry[broken] = self._telemetry[broken]
-            rewards[broken] = 0.0
-            terminated[broken] = False
-            truncated[broken] = True
-        self._ended = terminated | truncated
-        self._observations, self._telemetry = observations, telemetry
-        info = self._info()
-        if broken.any():
+            self.observations[broken] = before[broken]
+            self._telemetry[broken] = telemetry[broken]
+            self.rewards[broken] = 0.0
+            self.terminated[broken] = False
+            self.truncated[broken] = True
             reasons[~broken] = None
-            info[LOST], info[f"_{LOST}"] = reasons, broken
+            self._broken = reasons, broken
+        self._over = self.terminated | self.truncated | (self._over & ~resets)
         self._flying = True
-        return observations.copy(), rewards, terminated, truncated, info
 
     def close_extras(self, **kwargs: Any) -> None:
         """Tell the simulators and close the socket."""
@@ -192,7 +207,7 @@ class RemoteVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.metadata = {
             "render_modes": [],
             "render_fps": round(1 / interface.control_period),
-            "autoreset_mode": AutoresetMode.NEXT_STEP,
+            "autoreset_mode": self._mode,
         }
         keep_space(self, "single_observation_space", interface.observation)
         keep_space(self, "single_action_space", interface.action)
@@ -200,29 +215,37 @@ class RemoteVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         keep_space(self, "action_space", batch_space(interface.action, num_envs))
         self._shape = self.num_simulators, num_envs // self.num_simulators
         self._size = (interface.action.shape or (1,))[0]
-        self._no_actions = np.zeros((*self._shape, self._size), np.float32)
+        if not self._flying:
+            self.terminated = self.truncated = np.zeros(num_envs, bool)
+        self._no_actions = np.zeros((num_envs, self._size), np.float32)
 
-    def _seeds(self, seed: int | Sequence[int] | None) -> np.ndarray | None:
-        if seed is None:
-            return None
-        numbers = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
-        if (
-            not isinstance(numbers, Sequence | np.ndarray)
-            or len(numbers) != self.num_envs
-            or not all(isinstance(n, int | np.integer) and 0 <= n <= MAX_UINT64 for n in numbers)
-        ):
-            raise ValueError(
-                f"seed: expected a whole number, or {self.num_envs} of them, up to 2^64 - 1, "
-                f"got {seed}"
-            )
-        return np.array(numbers, np.uint64).reshape(self._shape)
+    def _seeds(self, seed: Any) -> np.ndarray | None:
+        seeds = checked_seeds(seed, self.num_envs, MAX_UINT64)
+        return None if seeds is None else np.array(seeds, np.uint64)
+
+    def _reset_until_done(
+        self, places: Sequence[int], resets: np.ndarray, seeds: np.ndarray | None
+    ) -> None:
+        """Reset some drones of these places, again where another simulator comes meanwhile."""
+        actions = self._no_actions.reshape(*self._shape, self._size)
+        while places:
+            self._server.exchange(places, actions, *_by_place(self._shape, resets, seeds, ~resets))
+            places = [place for place in places if self._server.lost[place]]
+
+    def _take_states(self, still: np.ndarray) -> None:
+        """Take over what came; rewards and flags are 0 for those that did not fly."""
+        self.observations, self._telemetry = self._joined("observations"), self._joined("telemetry")
+        self.rewards = np.where(still, 0.0, self._joined("rewards"))
+        self.terminated = self._joined("terminated") & ~still
+        self.truncated = self._joined("truncated") & ~still
+        self._broken = None
 
     def _sent(self, actions: np.ndarray) -> np.ndarray:
         """Actions as float32, shape (M, N, k). Raises `ValueError`."""
         array = np.asarray(actions)
-        if array.shape != self.action_space.shape:
+        if array.shape != (self.num_envs, self._size):
             raise ValueError(
-                f"actions: expected an array of shape {self.action_space.shape}, "
+                f"actions: expected an array of shape {(self.num_envs, self._size)}, "
                 f"got shape {array.shape}"
             )
         if isinstance(self.single_action_space, spaces.Discrete):
@@ -237,9 +260,15 @@ class RemoteVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """One field of the States of all places: a new array whose first axis has every drone."""
         return np.concatenate([getattr(state, name) for state in self._server.states])
 
-    def _info(self) -> dict[str, Any]:
-        columns = self._telemetry.T.copy()
-        info: dict[str, Any] = {}
-        for name, column in zip(self._server.interface.telemetry, columns, strict=True):
-            info[name], info[f"_{name}"] = column, np.ones(self.num_envs, bool)
+    def _info(self, mask: np.ndarray) -> dict[str, Any]:
+        names, columns = self._server.interface.telemetry, self._telemetry.T.copy()
+        info: dict[str, Any] = dict(zip(names, columns, strict=True))
+        info |= {f"_{name}": mask for name in names}
+        if self._broken:
+            info[LOST], info[f"_{LOST}"] = self._broken
         return info
+
+
+def _by_place(shape: tuple[int, int], *arrays: np.ndarray | None) -> list[Any]:
+    """Arrays of all drones, shape (M · N,), as (M, N)."""
+    return [None if array is None else array.reshape(shape) for array in arrays]

@@ -181,7 +181,7 @@ class _Repeat:
             number = command.sequence if command else "none"
             raise ValueError(f"expected Command {sequence - 1} before it, got {number}")
         elif self._known or (command.seeds is not None and command.resets.all()):
-            self._fleet.step(command.actions, command.resets, command.seeds)
+            self._fleet.step(command.actions, command.resets, command.seeds, command.holds)
             self._known = True
         self._sequence = sequence
 

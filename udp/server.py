@@ -130,6 +130,7 @@ class Server:
         actions: np.ndarray,
         resets: np.ndarray,
         seeds: np.ndarray | None = None,
+        holds: np.ndarray | None = None,
     ) -> None:
         """Send each place its Command, and wait for the States of all.
 
@@ -141,12 +142,13 @@ class Server:
             actions: float32, shape (places in all, N, k).
             resets: bool, shape (places in all, N).
             seeds: uint64, shape (places in all, N), or None.
+            holds: bool, shape (places in all, N), or None.
 
         Raises:
             ValueError: An action is not finite; nothing was sent.
             PeerSilent, PeerClosed: As `connect`.
         """
-        commands = {place: self._command(place, actions, resets, seeds) for place in places}
+        commands = {place: self._command(place, actions, resets, seeds, holds) for place in places}
         self.lost = [""] * len(self.lost)
         now = time.monotonic()
         for place, command in commands.items():
@@ -154,7 +156,12 @@ class Server:
         self._gather()
 
     def _command(
-        self, place: int, actions: np.ndarray, resets: np.ndarray, seeds: np.ndarray | None
+        self,
+        place: int,
+        actions: np.ndarray,
+        resets: np.ndarray,
+        seeds: np.ndarray | None,
+        holds: np.ndarray | None,
     ) -> Command:
         session = self.link.places[place]
         assert session is not None
@@ -164,6 +171,7 @@ class Server:
             actions=actions[place],
             resets=resets[place],
             seeds=None if seeds is None else seeds[place],
+            holds=None if holds is None or not holds[place].any() else holds[place],
         )
 
     def _gather(self) -> None:

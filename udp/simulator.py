@@ -151,7 +151,7 @@ class Simulator:
             if isinstance(message, Welcome):
                 fleet.reset(message.session if message.seed is None else message.seed)
             elif isinstance(message, Command):
-                fleet.step(message.actions, message.resets, message.seeds)
+                fleet.step(message.actions, message.resets, message.seeds, message.holds)
             self._send_state()
 
     def _send_state(self) -> None:
