@@ -30,7 +30,7 @@ class BatchPhysics:
 
     def __init__(self, num_envs: int, linear_drag: float = 0.0, num_threads: int = 0) -> None:
         switch_off_log_file()
-        self._batch = Batch(load_model(linear_drag=linear_drag), num_envs, num_threads)
+        self._batch = Batch(load_model(linear_drag, visual=False), num_envs, num_threads)
         # Live views of simulator memory, made once; nothing hands them on.
         self._qpos: np.ndarray = self._batch.bind("qpos")
         self._qvel: np.ndarray = self._batch.bind("qvel")

@@ -32,7 +32,7 @@ class Physics:
 
     def __init__(self, linear_drag: float = 0.0) -> None:
         switch_off_log_file()
-        self.model = load_model(linear_drag=linear_drag)
+        self.model = load_model(linear_drag, visual=False)
         self.data = mujoco.MjData(self.model)
         # Live views of simulator memory, made once; nothing hands them on.
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl

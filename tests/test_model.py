@@ -129,6 +129,26 @@ def test_front_is_marked_and_symmetric_otherwise(model: mujoco.MjModel) -> None:
     assert model.mat(materials[0]).name == "front disc"
 
 
+def test_without_what_is_only_looked_at_the_physics_is_the_same() -> None:
+    models = load_model(0.3), load_model(0.3, visual=False)
+    assert models[0].ngeom > models[1].ngeom
+    dice, contacts = np.random.default_rng(0), 0
+    data = [mujoco.MjData(model) for model in models]
+    for one in data:
+        one.qpos[:] = [0, 0, 3, 0.99, 0.1, 0.05, 0.02]
+        one.qpos[3:] /= np.linalg.norm(one.qpos[3:])
+    for _ in range(300):
+        thrusts = dice.uniform(20, 70, 4)
+        for model, one in zip(models, data, strict=True):
+            one.ctrl[:] = thrusts
+            mujoco.mj_step(model, one, 4)
+        contacts += data[0].ncon
+        for name in ("qpos", "qvel", "qacc", "sensordata"):
+            assert getattr(data[0], name).tobytes() == getattr(data[1], name).tobytes()
+        assert data[0].ncon == data[1].ncon
+    assert contacts > 0  # it came down
+
+
 def test_only_few_geoms_collide(model: mujoco.MjModel) -> None:
     colliding = {model.geom(i).name for i in range(model.ngeom) if model.geom_contype[i]}
     motors = {f"motor{i}" for i in range(1, 5)}
