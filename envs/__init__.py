@@ -27,15 +27,21 @@ __all__ = [
     "register",
 ]
 
+WARP_ENV_ID = "rotorgram/ElevationWarp-v0"  # needs rotorgram[gpu]; a vector env only
+
 
 def register() -> None:
-    """Add `rotorgram/Elevation-v0` to Gymnasium's registry, once."""
+    """Add the envs to Gymnasium's registry, once."""
     if ENV_ID not in gymnasium.registry:
         # No max_episode_steps: the env truncates by itself, since over UDP no wrapper would.
         gymnasium.register(
             id=ENV_ID,
             entry_point="rotorgram.envs.elevation:ElevationEnv",
             vector_entry_point="rotorgram.envs.vector:ElevationVectorEnv",
+        )
+    if WARP_ENV_ID not in gymnasium.registry:
+        gymnasium.register(
+            id=WARP_ENV_ID, vector_entry_point="rotorgram.envs.warp:ElevationWarpEnv"
         )
 
 

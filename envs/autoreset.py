@@ -1,13 +1,21 @@
 """What vector envs of the wire have in common: Gymnasium's autoreset over a single method."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-__all__ = ["AdvancingVectorEnv", "Seeds", "Step", "autoreset_mode", "checked_mask", "checked_seeds"]
+__all__ = [
+    "AdvancingVectorEnv",
+    "Seeds",
+    "Step",
+    "autoreset_mode",
+    "check_names",
+    "checked_mask",
+    "checked_seeds",
+]
 
 Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 Seeds = Sequence[int | None] | np.ndarray
@@ -20,12 +28,20 @@ class AdvancingVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         observations: float32, shape (N, n). This and the others are as `advance` left them.
         rewards: float64, shape (N,).
         terminated, truncated: bool, shape (N,).
+        lost: bool, shape (N,): whose episode was truncated since its simulator was lost.
     """
 
     observations: np.ndarray
     rewards: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
+    lost: np.ndarray
+
+    @abstractmethod
+    def reset(
+        self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode, for all drones or some."""
 
     @abstractmethod
     def advance(
@@ -91,6 +107,12 @@ def autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
     except ValueError:
         expected = " or ".join(repr(m.value) for m in AutoresetMode)
         raise ValueError(f"autoreset_mode: expected {expected}, got {mode!r}") from None
+
+
+def check_names(options: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Raise `ValueError` if a reset has an option that is not known."""
+    if unknown := [name for name in options if name not in known]:
+        raise ValueError(f"options: expected some of {', '.join(known)}, got {unknown[0]!r}")
 
 
 def checked_mask(mask: Any, num_envs: int) -> np.ndarray:

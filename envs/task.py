@@ -29,7 +29,7 @@ Flag = TypeVar("Flag", bool, np.ndarray)
 def _clip(x: Any, low: float, high: float) -> Any:
     if isinstance(x, float):
         return low if x < low else high if x > high else x
-    return np.clip(x, low, high)
+    return x.clip(low, high)  # NumPy's arrays and tensors
 
 
 class ElevationTask:

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from ..models import model_hash
 from ..models.constants import HOVER_THRUST
 from . import autoreset
-from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
+from .autoreset import AdvancingVectorEnv, Seeds, check_names, checked_mask, checked_seeds
 from .batch import BatchPhysics
 from .config import (
     FURTHEST,
@@ -25,9 +25,10 @@ from .config import (
 )
 from .task import ElevationTask
 
-__all__ = ["ElevationVectorEnv"]
+__all__ = ["RESET_OPTIONS", "ElevationVectorEnv", "checked_elevations"]
 
-_OPTIONS: Final = ("reset_mask", "target", "start")
+RESET_OPTIONS: Final = ("reset_mask", "target", "start")
+"""Options of `ElevationVectorEnv.reset`."""
 
 
 class ElevationVectorEnv(AdvancingVectorEnv):
@@ -102,6 +103,7 @@ class ElevationVectorEnv(AdvancingVectorEnv):
         self.telemetry = np.zeros((num_envs, len(TELEMETRY_NAMES)))
         self.rewards = np.zeros(num_envs)
         self.terminated, self.truncated = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
+        self.lost = np.zeros(num_envs, bool)
         self._clipped = np.zeros(num_envs, bool)
         self.closed = False
 
@@ -125,10 +127,9 @@ class ElevationVectorEnv(AdvancingVectorEnv):
                 of those that the seed gives. Without `start` it gives how far from the target.
         """
         options = options or {}
-        if unknown := [name for name in options if name not in _OPTIONS]:
-            raise ValueError(f"options: expected some of {', '.join(_OPTIONS)}, got {unknown[0]!r}")
+        check_names(options, RESET_OPTIONS)
         mask = checked_mask(options.get("reset_mask"), self.num_envs)
-        chosen = self._elevations(options)
+        chosen = checked_elevations(options, self.config, self.num_envs)
         self._begin(np.flatnonzero(mask), checked_seeds(seed, self.num_envs), chosen)
         self._observe()
         return self.observations.copy(), self._info(mask)
@@ -231,26 +232,29 @@ class ElevationVectorEnv(AdvancingVectorEnv):
             values -= 1.0
         return values
 
-    def _elevations(self, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Targets and starts that were chosen, float64, shape (N,)."""
-        least = LOWEST_START + (0.0 if "start" in options else self.config.start_band)
-        lowest = {"target": least, "start": LOWEST_START}
-        chosen = {}
-        for name in lowest:
-            if name in options:
-                values = np.asarray(options[name], np.float64)
-                fits = (values >= lowest[name]) & (values <= FURTHEST)
-                if values.shape not in ((), (self.num_envs,)) or not fits.all():
-                    raise ValueError(
-                        f"{name}: expected elevations of {lowest[name]:g} to {FURTHEST:g} m, a "
-                        f"number or shape ({self.num_envs},), got {options[name]!r}"
-                    )
-                chosen[name] = np.broadcast_to(values, self.num_envs)
-        if "start" in chosen:
-            for target in (chosen["target"],) if "target" in chosen else self.config.target_range:
-                if (abs(chosen["start"] - target) > self.config.flight_band).any():
-                    raise ValueError(
-                        f"start: expected at most flight_band = {self.config.flight_band:g} m "
-                        f"from the target, got {options['start']!r}"
-                    )
-        return chosen
+
+def checked_elevations(
+    options: Mapping[str, Any], config: ElevationConfig, num_envs: int
+) -> dict[str, np.ndarray]:
+    """Targets and starts of a reset's options, float64, shape (N,). Raises `ValueError`."""
+    least = LOWEST_START + (0.0 if "start" in options else config.start_band)
+    lowest = {"target": least, "start": LOWEST_START}
+    chosen = {}
+    for name in lowest:
+        if name in options:
+            values = np.asarray(options[name], np.float64)
+            fits = (values >= lowest[name]) & (values <= FURTHEST)
+            if values.shape not in ((), (num_envs,)) or not fits.all():
+                raise ValueError(
+                    f"{name}: expected elevations of {lowest[name]:g} to {FURTHEST:g} m, a "
+                    f"number or shape ({num_envs},), got {options[name]!r}"
+                )
+            chosen[name] = np.broadcast_to(values, num_envs)
+    if "start" in chosen:
+        for target in (chosen["target"],) if "target" in chosen else config.target_range:
+            if (abs(chosen["start"] - target) > config.flight_band).any():
+                raise ValueError(
+                    f"start: expected at most flight_band = {config.flight_band:g} m "
+                    f"from the target, got {options['start']!r}"
+                )
+    return chosen
