@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 
@@ -11,7 +10,7 @@ from .networks import Actor, Critic
 from .policies import NetworkPolicy
 from .presets import A2CConfig
 from .returns import advantages
-from .rollouts import Collector, Rollout
+from .rollouts import AnyCollector, Rollout
 
 __all__ = ["A2C"]
 
@@ -29,7 +28,7 @@ class A2C(Learner):
         seed: Seed of the run: weights and actions.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], config: A2CConfig, seed: int) -> None:
+    def __init__(self, env: Any, config: A2CConfig, seed: int) -> None:
         size, actions = sizes(env)
         torch_seed, rng = seeds_of(seed)
         torch.manual_seed(torch_seed)
@@ -43,7 +42,7 @@ class A2C(Learner):
             rng=rng,
         )
 
-    def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
+    def collect(self, collector: AnyCollector, policy: NetworkPolicy, most: int) -> Rollout:
         """Fly a fixed number of steps, across episodes."""
         return collector.steps(policy, min(self.config.steps_per_update, most))
 

@@ -25,6 +25,7 @@ __all__ = ["Checkpoint", "CheckpointError", "load", "software_versions", "store"
 FORMAT: Final = 1
 _ACTOR: Final = "policy/"
 _STATE: Final = "state/"
+_POSITION: Final = "episode/"
 _MALFORMED: Final = (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError)
 """What reading a file of somebody else's making can raise."""
 
@@ -53,6 +54,8 @@ class Checkpoint:
     """State of the agent."""
     position: Position
     """Where the run stands."""
+    num_envs: int = 1
+    """Drones that it trains with."""
     versions: dict[str, str] = field(default_factory=lambda: software_versions())
 
     def policy(self) -> NetworkPolicy:
@@ -71,7 +74,8 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
     position = checkpoint.position
     arrays = {_ACTOR + name: value for name, value in checkpoint.actor.items()}
     arrays |= {_STATE + name: value for name, value in checkpoint.state.items()}
-    arrays |= {"episode/actions": position.actions, "episode/observation": position.observation}
+    here = asdict(position)
+    arrays |= {_POSITION + k: v for k, v in here.items() if isinstance(v, np.ndarray)}
     meta = {
         "format": FORMAT,
         "algorithm": checkpoint.algorithm,
@@ -81,9 +85,8 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
         "env_steps": checkpoint.env_steps,
         "model_hash": checkpoint.model_hash,
         "versions": checkpoint.versions,
-        "position": {
-            k: v for k, v in asdict(position).items() if k not in ("actions", "observation")
-        },
+        "num_envs": checkpoint.num_envs,
+        "position": {name: here[name] for name in ("episode", "env_steps", "seconds")},
     }
     data = save({k: np.asarray(v, order="C") for k, v in arrays.items()},
                 metadata={"rotorgram": json.dumps(meta)})  # fmt: skip
@@ -113,7 +116,9 @@ def _read(path: Path) -> Checkpoint:
     _expect(meta["format"] == FORMAT, f"format {FORMAT}", meta["format"])
     position = meta["position"]
     _expect(meta["algorithm"] in PRESETS, f"one of {sorted(PRESETS)}", meta["algorithm"])
-    for count in (meta["seed"], meta["env_steps"], position["episode"], position["env_steps"]):
+    num_envs = meta.get("num_envs", 1)
+    counts = meta["seed"], meta["env_steps"], num_envs, position["episode"], position["env_steps"]
+    for count in counts:
         _expect(type(count) is int and count >= 0, "a whole number, 0 or more", count)
     seconds = position["seconds"]
     _expect(type(seconds) is float and 0 <= seconds < float("inf"), "seconds", seconds)
@@ -125,11 +130,8 @@ def _read(path: Path) -> Checkpoint:
         **{name: meta[name] for name in fields},
         actor=_part(arrays, _ACTOR),
         state=_part(arrays, _STATE),
-        position=Position(
-            **position,
-            actions=arrays["episode/actions"],
-            observation=arrays["episode/observation"],
-        ),
+        num_envs=num_envs,
+        position=Position(**{**position, **_part(arrays, _POSITION)}),
     )
 
 

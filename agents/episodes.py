@@ -54,12 +54,18 @@ class Position:
     """Where a run stands: after so many actions of an episode."""
 
     episode: int
+    """Episodes that have ended; so, with one drone, the number of the running one."""
     env_steps: int
     seconds: float
     actions: np.ndarray
-    """Actions of the running episode: float32, shape (t, k), or int64, shape (t,)."""
+    """Actions of the running episode: float32, shape (t, k), or int64, shape (t,). Of N drones:
+    float32, shape (t, N, k), where t steps are those of the longest running episode."""
     observation: np.ndarray
-    """What the last of them led to: float32, shape (n,)."""
+    """What the last of them led to: float32, shape (n,) or (N, n)."""
+    numbers: np.ndarray | None = None
+    """Of N drones, the number of the running episode of each: int64, shape (N,)."""
+    lengths: np.ndarray | None = None
+    """Of N drones, the steps of the running episode of each: int64, shape (N,)."""
 
 
 class EpisodeLog(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):

@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-import gymnasium as gym
 import numpy as np
 import torch
 from torch import nn
@@ -12,10 +11,12 @@ from torch import nn
 from .episodes import EpisodeLog
 from .networks import arrays_of, load_arrays
 from .policies import NetworkPolicy
-from .rollouts import Collector, Rollout
+from .rollouts import AnyCollector, Collector, Rollout, VectorCollector
+from .vector_episodes import VectorEpisodeLog
 
 __all__ = [
     "Agent",
+    "AnyLog",
     "Learner",
     "OnUpdate",
     "optimizer_arrays",
@@ -24,6 +25,9 @@ __all__ = [
     "sizes",
 ]
 
+AnyLog = EpisodeLog | VectorEpisodeLog
+"""What a training flies through: one drone or many."""
+
 OnUpdate = Callable[[], bool]
 """Called after every update; training stops where it returns False."""
 
@@ -31,7 +35,7 @@ OnUpdate = Callable[[], bool]
 class Agent(Protocol):
     """An algorithm in training. Its state is plain arrays, whole at every update."""
 
-    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
+    def train(self, log: AnyLog, env_steps: int, on_update: OnUpdate) -> None:
         """Train until the log counts `env_steps`; the state resumes where it stood."""
 
     def last_step(self, env_steps: int) -> int:
@@ -74,7 +78,7 @@ class Learner:
         self._optimizer = torch.optim.Adam(parameters, lr=learning_rate, foreach=True)
         self._observation: np.ndarray | None = None
 
-    def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
+    def collect(self, collector: AnyCollector, policy: NetworkPolicy, most: int) -> Rollout:
         """Fly for one update, at most so many env steps."""
         raise NotImplementedError
 
@@ -82,9 +86,13 @@ class Learner:
         """What one step of Adam lowers."""
         raise NotImplementedError
 
-    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
+    def train(self, log: AnyLog, env_steps: int, on_update: OnUpdate) -> None:
         """Train until the log counts `env_steps`, or `on_update` returns False."""
-        collector = Collector(log, self._rng, self._observation)
+        collector: AnyCollector
+        if isinstance(log, VectorEpisodeLog):
+            collector = VectorCollector(log, self._rng, self._observation)
+        else:
+            collector = Collector(log, self._rng, self._observation)
         while log.env_steps < env_steps:
             policy = NetworkPolicy(self.actor())
             rollout = self.collect(collector, policy, env_steps - log.env_steps)
@@ -166,10 +174,10 @@ def _text_array(text: str) -> np.ndarray:
     return np.frombuffer(text.encode(), np.uint8)
 
 
-def sizes(env: gym.Env[Any, Any]) -> tuple[int, Any]:
-    """Length of an observation, and the action space."""
-    assert env.observation_space.shape is not None
-    return env.observation_space.shape[0], env.action_space
+def sizes(env: Any) -> tuple[int, Any]:
+    """Length of an observation, and the action space, of an env or of one of a vector env."""
+    observation = getattr(env, "single_observation_space", env.observation_space)
+    return observation.shape[0], getattr(env, "single_action_space", env.action_space)
 
 
 def seeds_of(seed: int) -> tuple[int, np.random.Generator]:

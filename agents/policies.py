@@ -77,6 +77,22 @@ class NetworkPolicy:
             return np.array((output.argmax(),), np.float32)
         return output
 
+    def samples(self, observations: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """`sample` for N observations, shape (N, n), and N rows of noise: float32, shape (N, k)."""
+        hidden: np.ndarray = observations @ self._w1.T
+        hidden += self._b1
+        np.maximum(hidden, 0.0, out=hidden)
+        output: np.ndarray = hidden @ self._w2.T
+        output += self._b2
+        output += noise
+        if self._std is None:
+            output = output.argmax(axis=1)[:, np.newaxis].astype(np.float32)
+        return output
+
+    def to_envs(self, actions: np.ndarray) -> np.ndarray:
+        """What a vector env gets for drawn actions, shape (N, k)."""
+        return actions if self._std is None else clip(actions)
+
     def to_env(self, action: np.ndarray) -> Any:
         """What the env gets for a drawn action."""
         return int(action[0]) if self._std is None else clip(action)

@@ -62,7 +62,7 @@ class A2CConfig:
     gamma: float = 0.99
     """Discount. The paper names none."""
     steps_per_update: int = 1
-    """Env steps between updates (paper: one)."""
+    """Env steps between updates (paper: one), of all drones together."""
     trace: float = 0.0
     """Lambda of generalised advantage estimation; 0 is the paper's Equation 3."""
     normalize: bool = False
@@ -79,6 +79,10 @@ class A2CConfig:
                flags=("anneal", "normalize"))  # fmt: skip
         for name in ("value_weight", "entropy_weight"):
             _expect(self, name, "a number, 0 or more", _is_number(getattr(self, name), 0.0))
+
+    def rollout_size(self, drones: int) -> int:
+        """Env steps of a rollout: `steps_per_update`, rounded up to whole steps of all drones."""
+        return -(-self.steps_per_update // drones) * drones
 
 
 def _check(

@@ -1,20 +1,21 @@
 """Collecting experience: a policy flies, and every transition is kept."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from .policies import NetworkPolicy
+from .vector_episodes import VectorEpisodeLog
 
-__all__ = ["Collector", "Rollout"]
+__all__ = ["AnyCollector", "Collector", "Rollout", "VectorCollector"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rollout:
-    """T transitions in the order in which they were flown."""
+    """T transitions in the order in which they were flown; of many drones, one after the other."""
 
     observations: np.ndarray
     """float32, shape (T, n)."""
@@ -100,3 +101,133 @@ class _Rows(list[tuple[np.ndarray, np.ndarray, float, np.ndarray, bool, bool]]):
             terminated=np.array(terminated, bool),
             truncated=np.array(truncated, bool),
         )
+
+
+_COLUMNS = tuple(field.name for field in fields(Rollout))
+
+
+class VectorCollector:
+    """`Collector` for many drones. Its rollouts are drone by drone.
+
+    The rows of a rollout are kept in buffers that the next rollout of the same size writes anew.
+
+    Args:
+        log: The vector env.
+        rng: Draws the actions.
+        observation: What the policy sees next, where the env stands in episodes already: shape
+            (N, n).
+    """
+
+    def __init__(
+        self,
+        log: VectorEpisodeLog,
+        rng: np.random.Generator,
+        observation: np.ndarray | None = None,
+    ) -> None:
+        self._log = log
+        self._rng = rng
+        self.observation = observation
+        self._buffers: _Buffers | None = None
+
+    def steps(self, policy: NetworkPolicy, count: int) -> Rollout:
+        """So many transitions, rounded up to whole steps of all drones.
+
+        Where a drone's last episode goes on, its last transition counts as truncated: a value is
+        carried over it, and nothing of the next drone.
+        """
+        log, drones = self._log, self._log.num_envs
+        length = -(-count // drones)
+        rows = self._rows(policy, length)
+        observation = self._start()
+        noise = policy.draw_noise(self._rng, length * drones).reshape(length, drones, -1)
+        for step in range(length):
+            actions = policy.samples(observation, noise[step])
+            after, rewards, terminated, truncated, info = log.step(policy.to_envs(actions))
+            led_to = info.get("final_obs", after)
+            rows.put(step, observation, actions, rewards, led_to, terminated, truncated)
+            observation = after
+        self.observation = observation
+        rows.truncated[:, -1] |= ~rows.terminated[:, -1]
+        return rows.rollout()
+
+    def episodes(self, policy: NetworkPolicy, count: int, most_steps: int) -> Rollout:
+        """Whole episodes, as many as there are drones or a multiple: at least so many.
+
+        Whose episode ends first holds until all have ended. All are broken off where `most_steps`
+        are flown before.
+        """
+        rounds = -(-count // self._log.num_envs)
+        flown: list[Rollout] = []
+        for _ in range(rounds):
+            left = most_steps - sum(map(len, flown))
+            if left > 0:
+                flown.append(self._fly_round(policy, left))
+        return _joined(flown)
+
+    def _fly_round(self, policy: NetworkPolicy, most_steps: int) -> Rollout:
+        """An episode of each drone."""
+        log = self._log
+        observation = self._start()
+        done, kept, steps = np.zeros(log.num_envs, bool), [], 0
+        while not done.all() and steps < most_steps:
+            noise = policy.draw_noise(self._rng, log.num_envs)
+            actions = policy.samples(observation, noise)
+            after, rewards, terminated, truncated, _ = log.fly(policy.to_envs(actions), done)
+            kept.append((observation, actions, rewards, after, terminated, truncated, ~done))
+            steps += int((~done).sum())
+            done = done | terminated | truncated
+            observation = after
+        self.observation = log.begin(~np.zeros_like(done)) if done.all() else observation
+        columns = [np.stack(column, axis=1) for column in zip(*kept, strict=True)]
+        flown = columns.pop()
+        names = (
+            "observations",
+            "actions",
+            "rewards",
+            "next_observations",
+            "terminated",
+            "truncated",
+        )
+        return Rollout(**{n: column[flown] for n, column in zip(names, columns, strict=True)})
+
+    def _start(self) -> np.ndarray:
+        if self.observation is None:
+            self.observation, _ = self._log.reset()
+        return self.observation
+
+    def _rows(self, policy: NetworkPolicy, length: int) -> "_Buffers":
+        if self._buffers is None or self._buffers.rewards.shape[1] != length:
+            drones = self._log.num_envs
+            self._buffers = _Buffers(drones, length, policy.observation_size, policy.action_size)
+        return self._buffers
+
+
+AnyCollector = Collector | VectorCollector
+
+
+class _Buffers:
+    """Transitions of N drones, (N, T, …): drone by drone without a copy."""
+
+    def __init__(self, drones: int, length: int, observation_size: int, action_size: int) -> None:
+        shape = drones, length
+        self.observations = np.empty((*shape, observation_size), np.float32)
+        self.actions = np.empty((*shape, action_size), np.float32)
+        self.rewards = np.empty(shape)
+        self.next_observations = np.empty((*shape, observation_size), np.float32)
+        self.terminated, self.truncated = np.empty(shape, bool), np.empty(shape, bool)
+
+    def put(self, step: int, *values: np.ndarray) -> None:
+        for column, value in zip(vars(self).values(), values, strict=True):
+            column[:, step] = value
+
+    def rollout(self) -> Rollout:
+        flat = {k: v.reshape(-1, *v.shape[2:]) for k, v in vars(self).items()}
+        return Rollout(**flat)
+
+
+def _joined(rollouts: list[Rollout]) -> Rollout:
+    if len(rollouts) == 1:
+        return rollouts[0]
+    return Rollout(
+        **{k: np.concatenate([getattr(r, k) for r in rollouts]) for k in vars(rollouts[0])}
+    )

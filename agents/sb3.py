@@ -4,15 +4,15 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3 import A2C
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from .episodes import EpisodeLog
-from .learner import OnUpdate, optimizer_arrays, seeds_of, set_optimizer_arrays
+from .learner import AnyLog, OnUpdate, optimizer_arrays, seeds_of, set_optimizer_arrays
 from .presets import A2CConfig
+from .sb3_vec import SB3VecEnv
+from .vector_episodes import VectorEpisodeLog
 
 __all__ = ["SB3A2C"]
 
@@ -29,25 +29,27 @@ class SB3A2C:
         seed: Seed of the run: weights and actions.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], config: A2CConfig, seed: int) -> None:
+    def __init__(self, env: Any, config: A2CConfig, seed: int) -> None:
         torch_seed, _ = seeds_of(seed)
         # SB3 draws from the global generators: torch for actions, NumPy for the order of samples.
         torch.manual_seed(torch_seed)
         np.random.seed(torch_seed % 2**32)  # noqa: NPY002
         self._config = config
+        drones = getattr(env, "num_envs", 1)
+        self._rollout = config.rollout_size(drones)
         self._ahead = 0.0
         self._model = _A2C(
             "MlpPolicy",
-            DummyVecEnv([lambda: env]),
+            SB3VecEnv(env) if isinstance(env, VectorEpisodeLog) else DummyVecEnv([lambda: env]),
             learning_rate=self._learning_rate,
-            n_steps=config.steps_per_update,
+            n_steps=self._rollout // drones,
             gamma=config.gamma,
             gae_lambda=config.trace,
             ent_coef=config.entropy_weight,
             vf_coef=config.value_weight,
             max_grad_norm=float("inf"),
             use_rms_prop=False,
-            normalize_advantage=config.normalize and config.steps_per_update > 1,
+            normalize_advantage=config.normalize and self._rollout > 1,
             policy_kwargs={
                 "net_arch": {"pi": [config.hidden], "vf": [config.hidden]},
                 "activation_fn": torch.nn.ReLU,
@@ -57,12 +59,12 @@ class SB3A2C:
             device="cpu",
         )
 
-    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
+    def train(self, log: AnyLog, env_steps: int, on_update: OnUpdate) -> None:
         """Train until the log counts `env_steps`, or `on_update` returns False.
 
         SB3 flies whole rollouts only: steps short of another rollout are left unflown.
         """
-        model, rollout = self._model, self._config.steps_per_update
+        model, rollout = self._model, self._rollout
         done, whole = model.num_timesteps, env_steps // rollout * rollout
         if done >= whole:
             return
@@ -73,7 +75,7 @@ class SB3A2C:
 
     def last_step(self, env_steps: int) -> int:
         """Env steps after which a training of so many ends."""
-        return env_steps // self._config.steps_per_update * self._config.steps_per_update
+        return env_steps // self._rollout * self._rollout
 
     def _learning_rate(self, left: float) -> float:
         # SB3 counts what is left after the rollout; ours, and so here, before it.

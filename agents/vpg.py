@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 
@@ -11,7 +10,7 @@ from .networks import Actor
 from .policies import NetworkPolicy
 from .presets import VPGConfig
 from .returns import rewards_to_go
-from .rollouts import Collector, Rollout
+from .rollouts import AnyCollector, Rollout
 
 __all__ = ["VPG", "step_of_episode"]
 
@@ -28,7 +27,7 @@ class VPG(Learner):
         seed: Seed of the run: weights and actions.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], config: VPGConfig, seed: int) -> None:
+    def __init__(self, env: Any, config: VPGConfig, seed: int) -> None:
         size, actions = sizes(env)
         torch_seed, rng = seeds_of(seed)
         torch.manual_seed(torch_seed)
@@ -41,7 +40,7 @@ class VPG(Learner):
             rng=rng,
         )
 
-    def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
+    def collect(self, collector: AnyCollector, policy: NetworkPolicy, most: int) -> Rollout:
         """Fly whole episodes with one policy."""
         return collector.episodes(policy, self.config.episodes_per_update, most)
 

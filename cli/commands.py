@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -45,6 +45,10 @@ class Train(AgentCommand):
     """Seed of weights, actions and episodes."""
     env_steps: int = 200_000
     """Env steps to train for."""
+    num_envs: int = 1
+    """Drones that fly at the same time, in lock-step. Env steps count all of them."""
+    num_simulators: int = 1
+    """With --listen: simulators to wait for, each with its share of the drones."""
     out: Path | None = None
     """Folder to write to. Default: runs/ALGORITHM-seedSEED-TIME."""
     resume: Path | None = None
@@ -160,7 +164,11 @@ class Compare(Command):
     episodes: int = 20
     """Evaluation episodes of each final policy."""
     jobs: int | None = None
-    """Runs at a time. Default: one for each core."""
+    """Runs at a time. Default: one for each core of this machine, or of the cluster."""
+    backend: Literal["loky", "ray"] = "loky"
+    """loky: processes of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
+    address: Annotated[str | None, arg(metavar="ray://HOST:PORT")] = None
+    """The Ray cluster. Default: the one that this machine is part of."""
     out: Path | None = None
     """Folder to write; it must not exist. Default: runs/compare-TIME."""
     resume: Path | None = None

@@ -12,7 +12,7 @@ from ..envs import ElevationConfig
 
 if TYPE_CHECKING:
     from ..agents.policies import Policy
-    from ..udp import Address, RemoteEnv
+    from ..udp import Address, RemoteEnv, RemoteVectorEnv
     from .base import AgentCommand
 
 __all__ = [
@@ -77,12 +77,17 @@ def load_policy(name: str, env: ElevationConfig) -> "tuple[Policy, ElevationConf
 
 
 @contextmanager
-def remote_env(config: ElevationConfig, command: "AgentCommand") -> "Iterator[RemoteEnv]":
-    """A remote env with a simulator of its own, or the one that comes to `command.listen`.
+def remote_env(
+    config: ElevationConfig, command: "AgentCommand", num_envs: int = 1, num_simulators: int = 1
+) -> "Iterator[Any]":
+    """A remote env with a simulator of its own, or those that come to `command.listen`.
 
-    At the end it tells what the wire was like.
+    One drone is a `RemoteEnv`, more are a `RemoteVectorEnv` without autoreset. At the end it tells
+    what the wire was like.
     """
-    with _connected(config, command) as env:
+    if num_simulators > 1 and command.listen is None:
+        raise ValueError(f"num-simulators: expected 1 without --listen, got {num_simulators}")
+    with _connected(config, command, num_envs, num_simulators) as env:
         try:
             yield env
         finally:
@@ -90,7 +95,9 @@ def remote_env(config: ElevationConfig, command: "AgentCommand") -> "Iterator[Re
 
 
 @contextmanager
-def _connected(config: ElevationConfig, command: "AgentCommand") -> "Iterator[RemoteEnv]":
+def _connected(
+    config: ElevationConfig, command: "AgentCommand", num_envs: int, num_simulators: int
+) -> "Iterator[RemoteEnv | RemoteVectorEnv]":
     if command.listen is None:
         from ..experiments.pairs import socket_pair
 
@@ -99,25 +106,38 @@ def _connected(config: ElevationConfig, command: "AgentCommand") -> "Iterator[Re
                 "key-file, insecure: expected them with --listen, got them for a simulator of "
                 "our own on this machine"
             )
-        with socket_pair(config, record=command.record) as env:
+        with socket_pair(config, num_envs=num_envs, record=command.record) as env:
             yield env
         return
-    from ..udp import RemoteEnv
+    from ..udp import RemoteEnv, RemoteVectorEnv
 
-    env = RemoteEnv(
-        parse_address(command.listen),
-        options=asdict(config),
-        connect=False,
-        connect_timeout=_PATIENCE,
-        key_file=command.key_file,
-        insecure=command.insecure,
-        record=command.record,
-    )
-    with closing(env):
-        here = "{}:{}".format(*env.address)
-        print(f"waiting for a simulator at {here} (Ctrl-C ends)", flush=True)
-        env.connect()
-        yield env
+    address = parse_address(command.listen)
+    settings: dict[str, Any] = {
+        "options": asdict(config),
+        "connect": False,
+        "connect_timeout": _PATIENCE,
+        "key_file": command.key_file,
+        "insecure": command.insecure,
+        "record": command.record,
+    }
+    remote: RemoteEnv | RemoteVectorEnv
+    if num_envs == num_simulators == 1:
+        remote = RemoteEnv(address, **settings)
+    else:
+        remote = RemoteVectorEnv(
+            address,
+            num_envs=num_envs,
+            num_simulators=num_simulators,
+            autoreset_mode="Disabled",
+            **settings,
+        )
+    with closing(remote):
+        who = "a simulator" if num_simulators == 1 else f"{num_simulators} simulators"
+        share = f" of {num_envs // num_simulators} drones" if num_envs > num_simulators else ""
+        print(f"waiting for {who}{share} at {'{}:{}'.format(*remote.address)} (Ctrl-C ends)",
+              flush=True)  # fmt: skip
+        remote.connect()
+        yield remote
 
 
 def refuse_settings(command: Any, folder: Path, *, free: tuple[str, ...]) -> None:

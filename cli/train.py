@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["train"]
 
 EPISODES: Final = "episodes.csv"
-_NOT_KEPT: Final = ("listen", "key_file", "insecure", "record", "store_every")
+_NOT_KEPT: Final = ("listen", "num_simulators", "key_file", "insecure", "record", "store_every")
 _UPDATE_WITHIN: Final = 0.7  # s
 _SHOW_EVERY: Final = 0.2  # s
 
@@ -46,9 +46,10 @@ def train(command: "Train") -> int:
         env=command.env.checked(),
         seed=command.seed,
         env_steps=command.env_steps,
+        num_envs=command.num_envs,
     )
     folder = new_folder(command.out, f"{run.algorithm}-seed{run.seed}")
-    with remote_env(run.env, command) as env:
+    with remote_env(run.env, command, run.num_envs, command.num_simulators) as env:
         training = Training(run, env)
         _write_config(training, folder)
         return _train(training, folder, command)
@@ -68,7 +69,7 @@ def _resume(command: "Train", folder: Path) -> int:
         print(f"checkpoint: {folder / CHECKPOINT}")
         return 0
     options = ElevationConfig.from_options(kept.env)
-    with remote_env(options, command) as env:
+    with remote_env(options, command, kept.num_envs, command.num_simulators) as env:
         return _train(Training.resume(kept, env, episodes), folder, command)
 
 
@@ -77,6 +78,8 @@ def _train(training: Training, folder: Path, command: "Train") -> int:
     go_on = f"go on with: rotorgram train {training.run.algorithm} --resume {folder}"
     if command.listen:
         go_on += f" --listen {command.listen}"
+        if command.num_simulators > 1:
+            go_on += f" --num-simulators {command.num_simulators}"
         go_on += f" --key-file {command.key_file}" if command.key_file else ""
         go_on += " --insecure" if command.insecure else ""
     keeper = _Keeper(training, folder, command.store_every)
@@ -163,7 +166,7 @@ def _read_episodes(path: Path, count: int) -> list[Episode]:
         episodes = [
             Episode(**{str(k): v for k, v in row.items()}) for row in table.to_dict("records")
         ]
-        whole = [e.episode for e in episodes[:count]] == list(range(count))
+        whole = len({episode.episode for episode in episodes[:count]}) == count
     except (FileNotFoundError, TypeError, ValueError):
         whole = False
     if not whole:

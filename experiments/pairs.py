@@ -1,4 +1,4 @@
-"""A socket pair: an agent's `RemoteEnv` here and a simulator in a process of its own."""
+"""A socket pair: an agent's remote env here and a simulator in a process of its own."""
 
 import json
 import subprocess
@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Final
+from typing import Any, Final
 
 from ..envs import ElevationConfig
-from ..udp import PeerClosed, PeerSilent, RemoteEnv
+from ..udp import PeerClosed, PeerSilent, RemoteEnv, RemoteVectorEnv
 
 __all__ = ["socket_pair"]
 
@@ -23,13 +23,16 @@ _POLL: Final = 0.5
 
 
 @contextmanager
-def socket_pair(config: ElevationConfig, *, record: Path | None = None) -> Iterator[RemoteEnv]:
+def socket_pair(
+    config: ElevationConfig, *, num_envs: int = 1, record: Path | None = None
+) -> Iterator[Any]:
     """A connected remote env, on free ports of the loopback interface.
 
     The simulator ends with this process, however this one ends.
 
     Args:
         config: Options of the env.
+        num_envs: Drones: one makes a `RemoteEnv`, more a `RemoteVectorEnv` without autoreset.
         record: MCAP file for the agent's journal.
 
     Raises:
@@ -37,15 +40,20 @@ def socket_pair(config: ElevationConfig, *, record: Path | None = None) -> Itera
         PeerSilent: The simulator runs and does not answer.
     """
     options = asdict(config)
-    env = RemoteEnv(
-        ("127.0.0.1", 0),
-        options=options,
-        connect=False,
-        connect_timeout=_POLL,
-        timeout=_ANSWER_TIMEOUT,
-        record=record,
-    )
-    arguments = {"server": env.address, "bind": ("127.0.0.1", 0), **options}
+    settings: dict[str, Any] = {
+        "options": options,
+        "connect": False,
+        "connect_timeout": _POLL,
+        "timeout": _ANSWER_TIMEOUT,
+        "record": record,
+    }
+    here = ("127.0.0.1", 0)
+    env: RemoteEnv | RemoteVectorEnv
+    if num_envs == 1:
+        env = RemoteEnv(here, **settings)
+    else:
+        env = RemoteVectorEnv(here, num_envs=num_envs, autoreset_mode="Disabled", **settings)
+    arguments = {"server": env.address, "bind": here, "num_envs": num_envs, **options}
     command = [sys.executable, "-m", "rotorgram.udp", json.dumps(arguments)]
     with TemporaryFile("w+") as said:
         process = subprocess.Popen(
@@ -66,7 +74,7 @@ def socket_pair(config: ElevationConfig, *, record: Path | None = None) -> Itera
             _end(process)
 
 
-def _connect(env: RemoteEnv, process: subprocess.Popen[bytes]) -> None:
+def _connect(env: RemoteEnv | RemoteVectorEnv, process: subprocess.Popen[bytes]) -> None:
     """Wait for the simulator, as long as it lives."""
     deadline = time.monotonic() + _START_TIMEOUT
     while True:

@@ -12,10 +12,15 @@ import torch
 from ..agents import A2CConfig, VPGConfig, make_agent, preset
 from ..agents.checkpoints import Checkpoint, CheckpointError, store
 from ..agents.episodes import Episode, EpisodeLog, ResumeError
+from ..agents.learner import AnyLog
+from ..agents.vector_episodes import VectorEpisodeLog
 from ..envs import ElevationConfig
+from ..envs.autoreset import AdvancingVectorEnv
 from .progress import Progress
 
 __all__ = ["Run", "Snapshot", "Training", "is_finished"]
+
+AnyEnv = gym.Env[np.ndarray, Any] | AdvancingVectorEnv
 
 _RECENT = 20  # episodes that a progress report averages over
 
@@ -29,11 +34,18 @@ class Run:
     env: ElevationConfig
     seed: int
     env_steps: int
+    """Of all drones together."""
+    num_envs: int = 1
+    """Drones that train it at the same time."""
 
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ValueError(f"seed: expected 0 or more, got {self.seed}")
-        least = self.config.steps_per_update if isinstance(self.config, A2CConfig) else 1
+        if self.num_envs < 1:
+            raise ValueError(f"num_envs: expected 1 or more, got {self.num_envs}")
+        least = 1
+        if isinstance(self.config, A2CConfig):
+            least = self.config.rollout_size(self.num_envs)
         if self.env_steps < least:
             raise ValueError(f"env_steps: expected at least {least}, got {self.env_steps}")
 
@@ -49,8 +61,10 @@ class Snapshot:
 
 def is_finished(kept: Checkpoint) -> bool:
     """Whether a training has flown all that it was to. SB3 flies whole rollouts only."""
-    least = kept.config["steps_per_update"] if kept.algorithm == "sb3-a2c" else 1
-    return bool(kept.env_steps - kept.position.env_steps < least)
+    least = 1
+    if kept.algorithm == "sb3-a2c":
+        least = A2CConfig(**kept.config).rollout_size(kept.num_envs)
+    return kept.env_steps - kept.position.env_steps < least
 
 
 @dataclass
@@ -59,26 +73,31 @@ class Training:
 
     Args:
         run: What to train.
-        env: Local or remote; not closed here.
+        env: Local or remote, a vector env where the run has many drones; not closed here.
         snapshots: How many times, evenly spread, the policy is kept for later evaluation, besides
             the untrained one.
     """
 
     run: Run
-    env: gym.Env[np.ndarray, Any]
+    env: AnyEnv
     snapshots: int = 0
     taken: list[Snapshot] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         # Networks of 16 units: a second thread costs more than it brings.
         torch.set_num_threads(1)
-        self.log = EpisodeLog(self.env, self.run.seed)
+        drones = getattr(self.env, "num_envs", 1)
+        if drones != self.run.num_envs:
+            raise ValueError(f"env: expected one of {self.run.num_envs} drones, got {drones}")
+        self.log: AnyLog
+        if isinstance(self.env, AdvancingVectorEnv):
+            self.log = VectorEpisodeLog(self.env, self.run.seed)
+        else:
+            self.log = EpisodeLog(self.env, self.run.seed)
         self.agent = make_agent(self.run.algorithm, self.log, self.run.config, self.run.seed)
 
     @classmethod
-    def resume(
-        cls, kept: Checkpoint, env: gym.Env[np.ndarray, Any], episodes: list[Episode]
-    ) -> "Training":
+    def resume(cls, kept: Checkpoint, env: AnyEnv, episodes: list[Episode]) -> "Training":
         """Go on from a checkpoint. `episodes` are those that ended before it.
 
         Raises:
@@ -92,6 +111,7 @@ class Training:
                 env=ElevationConfig.from_options(kept.env),
                 seed=kept.seed,
                 env_steps=kept.env_steps,
+                num_envs=kept.num_envs,
             )
             training = cls(run, env)
             training.agent.set_state(kept.state)
@@ -143,6 +163,7 @@ class Training:
             env=asdict(self.run.env),
             seed=self.run.seed,
             env_steps=self.run.env_steps,
+            num_envs=self.run.num_envs,
             model_hash=hello.model_hash if hello else "",
             actor=self.agent.actor(),
             state=self.agent.state(),

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from ..envs import ENV_ID, autoreset
 from ..envs.autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
 from .link import Address
-from .messages import MAX_UINT64
+from .messages import MAX_UINT64, Hello
 from .remote import LOST, keep_space
 from .server import Server, ServerConfig
 from .simulator import DEFAULT_AGENT
@@ -120,6 +120,11 @@ class RemoteVectorEnv(AdvancingVectorEnv):
         return self._server.address
 
     @property
+    def hello(self) -> Hello | None:
+        """What the last simulator that came said of itself; None before one came, or by text."""
+        return self._server.hello
+
+    @property
     def statistics(self) -> Statistics:
         """Counts and round trips of the wire, over all simulators."""
         return self._server.link.statistics
@@ -192,7 +197,7 @@ class RemoteVectorEnv(AdvancingVectorEnv):
             self.terminated[broken] = False
             self.truncated[broken] = True
             reasons[~broken] = None
-            self._broken = reasons, broken
+            self._broken, self.lost = (reasons, broken), broken
         self._over = self.terminated | self.truncated | (self._over & ~resets)
         self._flying = True
 
@@ -239,6 +244,7 @@ class RemoteVectorEnv(AdvancingVectorEnv):
         self.terminated = self._joined("terminated") & ~still
         self.truncated = self._joined("truncated") & ~still
         self._broken = None
+        self.lost = np.zeros(self.num_envs, bool)
 
     def _sent(self, actions: np.ndarray) -> np.ndarray:
         """Actions as float32, shape (M, N, k). Raises `ValueError`."""
