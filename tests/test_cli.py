@@ -19,7 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 COMMANDS = [
     "sim", "train", "serve", "evaluate", "compare", "report", "check-model",
-    "key", "relay", "replay",
+    "key", "relay", "replay", "bench",
 ]  # fmt: skip
 
 
@@ -133,6 +133,34 @@ def test_check_model(capsys: pytest.CaptureFixture[str]) -> None:
     assert status == 0
     passed, checks = re.search(r"(\d+) of (\d+) checks passed", out).groups()  # type: ignore[union-attr]
     assert passed == checks
+
+
+def test_train_with_many_drones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, port = tmp_path / "run", free_port()
+    settings = ("--env-steps", 1200, "--num-envs", 4, "--set", "steps_per_update=100")
+    listen = ("--listen", f"127.0.0.1:{port}", "--num-simulators", 2)
+    sims = [
+        start("sim", "--server", f"127.0.0.1:{port}", "--bind", "127.0.0.1:0", "--num-envs", 2)
+        for _ in range(2)
+    ]
+    status, out, _ = run(capsys, "train", "a2c", "--out", folder, *settings, *listen)
+    assert status == 0
+    assert f"waiting for 2 simulators of 2 drones at 127.0.0.1:{port}" in out
+    assert "trained 1,200 of 1,200 env steps" in out
+    assert [sim.communicate(timeout=20)[0].splitlines()[-2] for sim in sims] == [
+        "the agent closed"
+    ] * 2
+    assert load(folder / "checkpoint.safetensors").num_envs == 4
+    status, out, _ = run(capsys, "train", "a2c", "--resume", folder)
+    assert (status, "already trained 1,200 of 1,200" in out, "wire" in out) == (0, True, False)
+    again = tmp_path / "again"  # with a simulator of its own: the same numbers
+    assert run(capsys, "train", "a2c", "--out", again, *settings)[0] == 0
+    weights = [load(f / "checkpoint.safetensors").actor for f in (folder, again)]
+    assert all(weights[0][name].tobytes() == weights[1][name].tobytes() for name in weights[0])
+    status, _, err = run(capsys, "train", "a2c", "--num-simulators", 2)
+    assert (status, "num-simulators: expected 1 without --listen" in err) == (1, True)
+    status, _, err = run(capsys, "train", "a2c", *settings[:2], "--num-envs", 0)
+    assert (status, "num_envs: expected 1 or more, got 0" in err) == (1, True)
 
 
 def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
