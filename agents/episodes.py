@@ -66,6 +66,8 @@ class Position:
     """Of N drones, the number of the running episode of each: int64, shape (N,)."""
     lengths: np.ndarray | None = None
     """Of N drones, the steps of the running episode of each: int64, shape (N,)."""
+    first_steps: np.ndarray | None = None
+    """Of N drones, env steps of the run before the running episode of each: int64, shape (N,)."""
 
 
 class EpisodeLog(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):

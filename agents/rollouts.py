@@ -130,25 +130,28 @@ class VectorCollector:
         self._buffers: _Buffers | None = None
 
     def steps(self, policy: NetworkPolicy, count: int) -> Rollout:
-        """So many transitions, rounded up to whole steps of all drones.
+        """Whole steps of all drones, as many as so many transitions need.
 
-        Where a drone's last episode goes on, its last transition counts as truncated: a value is
-        carried over it, and nothing of the next drone.
+        Whose episode has ended begins the next in place of a step, so that there are fewer
+        transitions by as many. Where a drone's last episode goes on, its last transition counts as
+        truncated: a value is carried over it, and nothing of the next drone.
         """
         log, drones = self._log, self._log.num_envs
         length = -(-count // drones)
         rows = self._rows(policy, length)
-        observation = self._start()
+        observation, over = self._start(), np.zeros(drones, bool)
+        flown = np.empty((drones, length), bool)
         noise = policy.draw_noise(self._rng, length * drones).reshape(length, drones, -1)
         for step in range(length):
+            flown[:, step] = ~over
             actions = policy.samples(observation, noise[step])
-            after, rewards, terminated, truncated, info = log.step(policy.to_envs(actions))
-            led_to = info.get("final_obs", after)
-            rows.put(step, observation, actions, rewards, led_to, terminated, truncated)
-            observation = after
-        self.observation = observation
+            after, *results, _ = log.fly(policy.to_envs(actions), begins=over)
+            rewards, terminated, truncated = results
+            rows.put(step, observation, actions, rewards, after, terminated, truncated)
+            observation, over = after, terminated | truncated
+        self.observation = log.begin(over) if over.any() else observation
         rows.truncated[:, -1] |= ~rows.terminated[:, -1]
-        return rows.rollout()
+        return rows.rollout(flown)
 
     def episodes(self, policy: NetworkPolicy, count: int, most_steps: int) -> Rollout:
         """Whole episodes, as many as there are drones or a multiple: at least so many.
@@ -220,9 +223,10 @@ class _Buffers:
         for column, value in zip(vars(self).values(), values, strict=True):
             column[:, step] = value
 
-    def rollout(self) -> Rollout:
-        flat = {k: v.reshape(-1, *v.shape[2:]) for k, v in vars(self).items()}
-        return Rollout(**flat)
+    def rollout(self, flown: np.ndarray) -> Rollout:
+        if flown.all():
+            return Rollout(**{k: v.reshape(-1, *v.shape[2:]) for k, v in vars(self).items()})
+        return Rollout(**{k: v[flown] for k, v in vars(self).items()})
 
 
 def _joined(rollouts: list[Rollout]) -> Rollout:

@@ -70,18 +70,30 @@ class VectorEpisodeLog(VectorWrapper):
         info = {"final_obs": result[0], "_final_obs": ended}
         return self.begin(ended), rewards, terminated, truncated, info
 
-    def fly(self, actions: np.ndarray, holds: np.ndarray | None = None) -> Step:
+    def fly(
+        self,
+        actions: np.ndarray,
+        holds: np.ndarray | None = None,
+        begins: np.ndarray | None = None,
+    ) -> Step:
         """Fly one step and keep it; whose episode ends has to hold or begin the next.
 
         Args:
             actions: Shape (N, k), or (N,) if discrete.
             holds: bool, shape (N,): drones that do not fly.
+            begins: bool, shape (N,): drones that begin their next episode instead of flying.
         """
-        env, held = self.env, self._nobody if holds is None else holds
+        env = self.env
         sent = np.asarray(actions, np.float32).reshape(self.num_envs, -1)
-        env.advance(sent, self._nobody, None, holds)
-        self._keep_step(sent, held)
-        self.env_steps += self.num_envs - int(held.sum())
+        idle = self._nobody if holds is None else holds
+        if begins is None or not begins.any():
+            env.advance(sent, self._nobody, None, holds)
+        else:
+            self._begin(begins)
+            env.advance(sent, begins, self._seeds, holds)
+            idle = idle | begins
+        self._keep_step(sent, idle)
+        self.env_steps += self.num_envs - int(idle.sum())
         if (env.terminated | env.truncated).any():
             self._keep_episodes()
         return env.observations.copy(), env.rewards, env.terminated, env.truncated, {}
@@ -108,6 +120,7 @@ class VectorEpisodeLog(VectorWrapper):
             observation=self.env.observations.copy(),
             numbers=self._numbers.copy(),
             lengths=self._lengths.copy(),
+            first_steps=self._first_steps.copy(),
         )
 
     def resume(self, position: Position, episodes: list[Episode]) -> None:
@@ -120,12 +133,12 @@ class VectorEpisodeLog(VectorWrapper):
             ResumeError: The env does not repeat what it did then: another model, another version
                 of MuJoCo, or other options.
         """
-        numbers, lengths = position.numbers, position.lengths
-        if numbers is None or lengths is None or numbers.shape != (self.num_envs,):
+        numbers, lengths, first = position.numbers, position.lengths, position.first_steps
+        if numbers is None or lengths is None or first is None or len(numbers) != self.num_envs:
             raise ResumeError(f"resume: expected a training with {self.num_envs} drones")
         self.episodes = list(episodes)
         self.env_steps = position.env_steps
-        self._numbers = numbers.copy()
+        self._numbers, self._first_steps = numbers.copy(), first.copy()
         self._draw_seeds(~self._nobody)
         while self._repeat(position, lengths):  # a simulator was lost: once more, with the next
             pass
@@ -137,7 +150,6 @@ class VectorEpisodeLog(VectorWrapper):
                 f"observations {position.observation.tolist()[:3]}…, got "
                 f"{self.env.observations.tolist()[:3]}…"
             )
-        self._first_steps = self.env_steps - lengths * self.num_envs
         self._began = time.perf_counter() - position.seconds
 
     def _repeat(self, position: Position, lengths: np.ndarray) -> bool:

@@ -1,5 +1,6 @@
 """`rotorgram bench`: measure the layers, print a table, draw a plot."""
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,7 @@ __all__ = ["bench"]
 def bench(command: "Bench") -> int:
     """Measure, print and draw."""
     config = BenchConfig(rounds=command.rounds, seconds=command.seconds)
+    logging.getLogger("rotorgram").setLevel(logging.WARNING)  # no reports of every wire each minute
     folder = new_folder(command.out, "bench")
     with bars() as progress:
         layers = measure(config, folder, lambda name, at, of: progress("bench", at, of, name))

@@ -34,7 +34,7 @@ def test_snippet(code: str, tmp_path: Path) -> None:
 
 
 def test_every_snippet_is_found() -> None:
-    assert len(BLOCKS) == 4
+    assert len(BLOCKS) == 5
 
 
 def test_links_lead_somewhere() -> None:

@@ -1,0 +1,101 @@
+"""Wall time from nothing to a policy that holds: ours and SB3's A2C, each with its best settings.
+
+    python benchmarks/time_to_hover.py [--seeds 5] [--out FILE.json]
+
+For each setting and seed a process is started that imports everything, starts a simulator, trains
+over UDP and evaluates the policy without exploration: the mean of |E| over the last half of 20
+episodes, m. The clock runs from the start of the process to its end. A setting counts as reached
+where every seed holds |E| < 0.05 m; the settings are those that reached it soonest among those that
+were tried.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from rotorgram.agents.checkpoints import software_versions
+
+FLY = """
+import json, sys
+import numpy as np
+from rotorgram.agents import preset
+from rotorgram.agents.policies import NetworkPolicy
+from rotorgram.envs import ElevationConfig
+from rotorgram.experiments.evaluate import evaluation_row, fly_episodes
+from rotorgram.experiments.pairs import socket_pair
+from rotorgram.experiments.training import Run, Training
+s = json.loads(sys.argv[1])
+env = ElevationConfig()
+run = Run(algorithm=s["agent"], config=preset(s["agent"], "tuned", **s["changes"]), env=env,
+          seed=s["seed"], env_steps=s["env_steps"], num_envs=s["drones"])
+with socket_pair(env, num_envs=run.num_envs) as remote:
+    training = Training(run, remote)
+    training.train()
+with socket_pair(env) as remote:
+    flights = fly_episodes(remote, NetworkPolicy(training.agent.actor()), 20)
+rows = [evaluation_row(f, k, env.control_period) for k, f in enumerate(flights)]
+print(json.dumps({"training": training.log.seconds,
+                  "error": float(np.mean([r["steady_error"] for r in rows]))}))
+"""
+
+SETTINGS: list[dict[str, Any]] = [
+    {"agent": "a2c", "drones": 16, "env_steps": 150_000,
+     "changes": {"steps_per_update": 1024, "learning_rate": 0.03}},
+    {"agent": "a2c", "drones": 1, "env_steps": 200_000, "changes": {}},
+    {"agent": "sb3-a2c", "drones": 64, "env_steps": 200_000,
+     "changes": {"steps_per_update": 2048, "learning_rate": 0.03}},
+    {"agent": "sb3-a2c", "drones": 16, "env_steps": 150_000,
+     "changes": {"steps_per_update": 1024, "learning_rate": 0.03}},
+    {"agent": "sb3-a2c", "drones": 1, "env_steps": 200_000, "changes": {}},
+]  # fmt: skip
+
+
+def measure(setting: dict[str, Any], seed: int) -> dict[str, float]:
+    start = time.perf_counter()
+    words = [sys.executable, "-c", FLY, json.dumps({**setting, "seed": seed})]
+    said = subprocess.run(words, check=True, capture_output=True, text=True).stdout
+    wall = time.perf_counter() - start
+    return {"wall": round(wall, 2), **{k: round(v, 4) for k, v in json.loads(said).items()}}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=5)
+    default = Path("docs/results/performance/time_to_hover.json")
+    parser.add_argument("--out", type=Path, default=default)
+    args = parser.parse_args()
+    runs: list[list[dict[str, float]]] = [[] for _ in SETTINGS]
+    for seed in range(args.seeds):
+        for setting, flown in zip(SETTINGS, runs, strict=True):
+            flown.append(measure(setting, seed))
+            print(f"{setting['agent']:8} {setting['drones']:3} drones, seed {seed}: {flown[-1]}",
+                  flush=True)  # fmt: skip
+    results = [
+        {
+            **setting,
+            "wall_seconds": statistics.median(run["wall"] for run in flown),
+            "training_seconds": statistics.median(run["training"] for run in flown),
+            "worst_error": max(run["error"] for run in flown),
+            "reached": all(run["error"] < 0.05 for run in flown),
+            "runs": flown,
+        }
+        for setting, flown in zip(SETTINGS, runs, strict=True)
+    ]
+    content = {"settings": results, "versions": software_versions(),
+               "machine": {"cores": os.cpu_count()}}  # fmt: skip
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(content, indent=2) + "\n")
+    print("| agent | drones | env steps | wall time, s | worst |E|, m |\n|---|---|---|---|---|")
+    for r in results:
+        print(f"| {r['agent']} | {r['drones']} | {r['env_steps']:,} | {r['wall_seconds']:.1f} | "
+              f"{r['worst_error']:.3f} |")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,165 @@
+"""The comparison on a Ray cluster: two nodes of one core each, on this machine."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from rotorgram.agents.checkpoints import load, software_versions
+from rotorgram.envs import ElevationConfig
+from rotorgram.experiments import compare as module
+from rotorgram.experiments.compare import CompareConfig, compare
+from rotorgram.experiments.errors import RunsFailed
+from rotorgram.experiments.records import read_records, read_steps
+
+ray = pytest.importorskip("ray", reason="needs Ray: pip install 'rotorgram[ray]'")
+
+CONFIG = CompareConfig(
+    agents=("a2c",), seeds=1, env_steps=600, snapshots=1, curve_episodes=1, episodes=1,
+    env=ElevationConfig(episode_length=50),
+)  # fmt: skip
+TIMES = ["seconds", "steps_per_second"]
+
+
+def nothing(*_: object) -> None:
+    """No progress is shown."""
+
+
+CLUSTER = """
+import sys
+from ray.cluster_utils import Cluster
+
+cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+cluster.add_node(num_cpus=1)
+print("at", cluster.address, flush=True)
+sys.stdin.read()
+cluster.shutdown()
+"""
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    # In a process of its own: it leaves pipes and processes open, which are errors in ours.
+    process = subprocess.Popen(
+        [sys.executable, "-c", CLUSTER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "RAY_USAGE_STATS_ENABLED": "0"},
+    )
+    with process:
+        assert process.stdout is not None
+        words = next(line for line in process.stdout if line.startswith("at "))
+        yield words.split()[1]
+
+
+def test_the_numbers_are_those_of_this_machine(tmp_path: Path, address: str) -> None:
+    shown = []
+    on_ray, here = tmp_path / "ray", tmp_path / "here"
+    config = replace(CONFIG, backend="ray", address=address)
+    compare(config, on_ray, "", lambda name, done, total, words: shown.append((name, words)))
+    compare(CONFIG, here, "", nothing)
+    assert {("a2c seed 0", "done"), ("pid", "done")} <= {*shown}
+    a, b = read_records(on_ray), read_records(here)
+    assert len(a.episodes) > 5
+    for table in ("episodes", "evaluations", "runs"):
+        left, right = (
+            getattr(records, table).drop(columns=TIMES, errors="ignore") for records in (a, b)
+        )
+        pd.testing.assert_frame_equal(left, right, check_exact=True)
+    for phase in ("train", "evaluation"):
+        pd.testing.assert_frame_equal(
+            read_steps(on_ray, phase), read_steps(here, phase), check_exact=True
+        )
+    name = "checkpoints/a2c-seed0.safetensors"
+    actor, other = load(on_ray / name).actor, load(here / name).actor
+    assert {k: v.tobytes() for k, v in actor.items()} == {k: v.tobytes() for k, v in other.items()}
+
+
+def test_every_node_flies(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def node(job: int) -> tuple[int, str]:
+        time.sleep(0.5)
+        return job, ray.get_runtime_context().get_node_id()
+
+    monkeypatch.setattr(module, "_fly", node)
+    with module._workers(replace(CONFIG, backend="ray", address=address)) as fly:
+        results = dict(fly([1, 2, 3, 4]))
+    assert sorted(results) == [1, 2, 3, 4]
+    assert len({*results.values()}) == 2
+
+
+def test_a_worker_with_other_software_is_refused(
+    tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = software_versions()
+    monkeypatch.setattr(module, "software_versions", lambda: {**here, "numpy": "0.1"})
+    config = replace(CONFIG, backend="ray", address=address)
+    sentence = f"numpy: expected version 0.1 .*, got {here['numpy']} on {socket.gethostname()}"
+    with pytest.raises(RunsFailed, match=f"2 of 2 runs failed: .*{sentence}"):
+        compare(config, tmp_path / "out", "", nothing)
+
+
+def test_ctrl_c_ends_workers_and_simulators(tmp_path: Path, address: str) -> None:
+    folder = tmp_path / "out"
+    where = ["--backend", "ray", "--address", address]
+    settings = ["--agents", "a2c", "--seeds", "2", "--env-steps", "1000000", "--out", str(folder)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rotorgram.cli", "compare", *settings, *where],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    deadline = time.monotonic() + 60
+    while len(simulators := _simulators()) < 2:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert err == "rotorgram: interrupted\n"
+    assert f"go on with: rotorgram compare --resume {folder} {' '.join(where)}" in out
+    deadline = time.monotonic() + 10
+    while any(Path(f"/proc/{simulator}").exists() for simulator in simulators):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def _simulators() -> list[int]:
+    """Simulators that descend from this process, whose children the nodes are."""
+    listing = subprocess.run(
+        ["ps", "-ewwo", "pid,ppid,args"], capture_output=True, text=True, check=True
+    )
+    rows = [line.split(None, 2) for line in listing.stdout.splitlines()[1:]]
+    parents = {int(pid): int(parent) for pid, parent, _ in rows}
+
+    def is_ours(pid: int) -> bool:
+        return pid == os.getpid() or (pid in parents and is_ours(parents[pid]))
+
+    return [int(p) for p, _, words in rows if "until-stdin-closes" in words and is_ours(int(p))]
+
+
+def test_no_such_cluster(tmp_path: Path) -> None:
+    with socket.socket() as sock:  # bound, but nobody listens
+        sock.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{sock.getsockname()[1]}"
+        sentence = f"address: expected a Ray cluster at {address}, got: Connection refused"
+        with pytest.raises(ValueError, match=sentence):
+            compare(replace(CONFIG, backend="ray", address=address), tmp_path / "out", "", nothing)
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ValueError, match=r"pip install 'rotorgram\[ray\]'"):
+        compare(replace(CONFIG, backend="ray"), tmp_path / "out", "", nothing)
+
+
+def test_an_address_is_of_a_cluster() -> None:
+    with pytest.raises(ValueError, match="address: expected it with backend ray"):
+        replace(CONFIG, address="auto")
