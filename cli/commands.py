@@ -233,6 +233,24 @@ class CheckModel(Command):
         return 1 if failed else 0
 
 
+@dataclass(frozen=True, kw_only=True)
+class Bench(Command):
+    """Measure what bounds a training on this machine, from raw physics to an update."""
+
+    rounds: int = 7
+    """Turns of every layer, besides one to warm up; medians count."""
+    seconds: float = 0.5
+    """Length of a turn."""
+    out: Path | None = None
+    """Folder to write to. Default: runs/bench-TIME."""
+
+    def run(self) -> int:
+        """Measure, print and draw."""
+        from .bench import bench
+
+        return bench(self)
+
+
 COMMANDS: dict[str, Any] = {
     "sim": Sim,
     "train": Train,
@@ -240,6 +258,7 @@ COMMANDS: dict[str, Any] = {
     "evaluate": Evaluate,
     "compare": Compare,
     "report": Report,
+    "bench": Bench,
     "check-model": CheckModel,
     "key": MakeKey,
     "relay": RelayFaults,

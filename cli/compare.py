@@ -4,7 +4,7 @@ import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -25,10 +25,11 @@ __all__ = ["compare", "report"]
 
 def compare(command: "Compare") -> int:
     """Train, evaluate and report."""
+    workers: dict[str, Any] = {n: getattr(command, n) for n in ("jobs", "backend", "address")}
     if command.resume:
         folder = command.resume
-        refuse_settings(command, folder, free=("resume", "jobs"))
-        config = replace(read_compare_config(folder), jobs=command.jobs)
+        refuse_settings(command, folder, free=("resume", *workers))
+        config = replace(read_compare_config(folder), **workers)
         if not (folder / PARTS).is_dir():
             raise ValueError(
                 f"resume: expected an interrupted comparison, {folder} is finished; "
@@ -43,7 +44,7 @@ def compare(command: "Compare") -> int:
             env=command.env.checked(),
             snapshots=command.snapshots,
             episodes=command.episodes,
-            jobs=command.jobs,
+            **workers,
         )
         folder = new_folder(command.out, "compare")
     words = shlex.join(["rotorgram", *sys.argv[1:]])
@@ -51,7 +52,10 @@ def compare(command: "Compare") -> int:
         with bars() as progress:
             run_comparison(config, folder, words, progress)
     except (KeyboardInterrupt, RunsFailed):
-        print(f"go on with: rotorgram compare --resume {folder}")
+        where = f" --backend {command.backend}" if command.backend != "loky" else ""
+        where += f" --address {command.address}" if command.address else ""
+        if folder.exists():
+            print(f"go on with: rotorgram compare --resume {folder}{where}")
         raise
     report(folder)
     return 0

@@ -360,20 +360,14 @@ _LAYERS: Final[list[tuple[str, str, int, Callable[[], Any]]]] = [
     ("mj_step", "a loop over mj_step, substeps of one control step", 1, _mj_step),
     ("env", "ElevationEnv.step", 1, _env),
     ("Batch.step, 1024", "mujoco.batch, the same substeps", 1024, lambda: _batch_step(1024)),
-    *(
-        (f"vector env, {n}", "ElevationVectorEnv", n, lambda n=n: _vector_env(n))
-        for n in _MANY
-    ),
+    *((f"vector env, {n}", "ElevationVectorEnv", n, lambda n=n: _vector_env(n)) for n in _MANY),
     ("UDP echo", "blocking sockets in Python, datagrams of the same sizes", 1, _echo),
     ("UDP, 1", "RemoteEnv and a simulator", 1, _udp_single),
     *(
         (f"UDP, {n}", "RemoteVectorEnv and a simulator", n, lambda n=n: _udp_batch(n))
         for n in _MANY
     ),
-    *(
-        (f"policy, {n}", "16 units, sampled", n, lambda n=n: _policy(n))
-        for n in (1, 1024)
-    ),
+    *((f"policy, {n}", "16 units, sampled", n, lambda n=n: _policy(n)) for n in (1, 1024)),
     *(
         (f"{a}, {n}", "training over UDP", n, lambda a=a, n=n: _training(a, n))
         for n in (1, 64)

@@ -1,7 +1,8 @@
 """Progress of runs in other processes: one small datagram now and then, to whoever shows it.
 
 A lost one matters nothing: the next tells the same. No process, pipe or lock has to be shared, and
-a run goes on where nobody listens any more.
+a run goes on where nobody listens any more. Datagrams stay on this machine: runs on another tell
+nothing before they are done.
 """
 
 import contextlib
@@ -11,7 +12,7 @@ import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from threading import Thread
+from threading import Lock, Thread
 from typing import Final
 
 __all__ = ["OnProgress", "Progress", "ProgressListener", "ProgressSender"]
@@ -42,16 +43,24 @@ class Progress:
 
 
 class ProgressSender:
-    """Tells the progress of one run to a `ProgressListener` on this machine."""
+    """Tells the progress of one run to a `ProgressListener` on the same machine.
 
-    def __init__(self, name: str, port: int) -> None:
+    Args:
+        name: Of the run.
+        home: The listener's.
+    """
+
+    def __init__(self, name: str, home: tuple[str, int]) -> None:
         self.name = name
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._to = ("127.0.0.1", port)
+        host, port = home
+        self._to = ("127.0.0.1", port) if host == socket.gethostname() else None
         self._last = 0.0
 
     def __call__(self, done: int, total: int, words: str) -> None:
         """Tell it now."""
+        if self._to is None:
+            return
         with contextlib.suppress(OSError):  # nobody listens
             self._socket.sendto(json.dumps([self.name, done, total, words]).encode(), self._to)
 
@@ -77,9 +86,12 @@ class ProgressListener:
 
     def __init__(self, on_progress: OnProgress) -> None:
         self._on_progress = on_progress
+        self._lock = Lock()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
-        self.port: int = self._socket.getsockname()[1]
+        self._port: int = self._socket.getsockname()[1]
+        self.home = (socket.gethostname(), self._port)
+        """Name of this machine, and port: for `ProgressSender`."""
         self._thread = Thread(target=self._listen, daemon=True)
 
     def __enter__(self) -> "ProgressListener":
@@ -90,9 +102,14 @@ class ProgressListener:
     def __exit__(self, *_: object) -> None:
         """Hand on what has come, and end."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-            sock.sendto(b"", ("127.0.0.1", self.port))
+            sock.sendto(b"", ("127.0.0.1", self._port))
         self._thread.join()
         self._socket.close()
+
+    def tell(self, name: str, done: int, total: int, words: str) -> None:
+        """Hand on what this process knows by itself."""
+        with self._lock:
+            self._on_progress(name, done, total, words)
 
     def _listen(self) -> None:
         while datagram := self._socket.recv(4096):
@@ -100,4 +117,4 @@ class ProgressListener:
                 name, done, total, words = json.loads(datagram)
             except ValueError:
                 continue
-            self._on_progress(str(name), int(done), int(total), str(words))
+            self.tell(str(name), int(done), int(total), str(words))

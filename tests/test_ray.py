@@ -1,6 +1,7 @@
 """The comparison on a Ray cluster: two nodes of one core each, on this machine."""
 
 import os
+import secrets
 import signal
 import socket
 import subprocess
@@ -19,6 +20,12 @@ from rotorgram.experiments.compare import CompareConfig, compare
 from rotorgram.experiments.errors import RunsFailed
 from rotorgram.experiments.records import read_records, read_steps
 
+# Ray listens beyond this machine. It reads these when it is imported.
+os.environ |= {
+    "RAY_AUTH_MODE": "token",
+    "RAY_AUTH_TOKEN": secrets.token_hex(32),
+    "RAY_USAGE_STATS_ENABLED": "0",
+}
 ray = pytest.importorskip("ray", reason="needs Ray: pip install 'rotorgram[ray]'")
 
 CONFIG = CompareConfig(
@@ -47,14 +54,9 @@ cluster.shutdown()
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     # In a process of its own: it leaves pipes and processes open, which are errors in ours.
-    process = subprocess.Popen(
-        [sys.executable, "-c", CLUSTER],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "RAY_USAGE_STATS_ENABLED": "0"},
-    )
-    with process:
+    command = [sys.executable, "-c", CLUSTER]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
         assert process.stdout is not None
         words = next(line for line in process.stdout if line.startswith("at "))
         yield words.split()[1]
@@ -114,13 +116,16 @@ def test_ctrl_c_ends_workers_and_simulators(tmp_path: Path, address: str) -> Non
         [sys.executable, "-m", "rotorgram.cli", "compare", *settings, *where],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
-    deadline = time.monotonic() + 60
-    while len(simulators := _simulators()) < 2:
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-    os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=20)
+    try:
+        deadline = time.monotonic() + 60
+        while len(simulators := _simulators()) < 2:
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=20)
+    finally:
+        process.kill()
     assert process.returncode == 130
     assert err == "rotorgram: interrupted\n"
     assert f"go on with: rotorgram compare --resume {folder} {' '.join(where)}" in out
