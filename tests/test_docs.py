@@ -65,3 +65,25 @@ def test_the_reliability_page_tells_what_the_benchmarks_wrote() -> None:
     assert kills["agent_killed"]["identical_to_unbroken"]
     assert flood["identical"]
     assert soak["control_steps"] >= 1_000_000
+
+
+def test_the_performance_page_tells_what_the_benchmarks_wrote() -> None:
+    page = (ROOT / "docs" / "performance.md").read_text()
+    bench, hover, peers = (
+        json.loads((RESULTS / "performance" / f"{name}.json").read_text())
+        for name in ("bench", "time_to_hover", "peers")
+    )
+    told = [f"| {rate:,.0f} | {1e6 / rate:.2f} |" for rate in bench["medians"].values()]
+    told += [f"| {ratio:.2f} |" for ratio in list(bench["ratios"].values())[:5]]
+    told += [f"| {one['wall_seconds']:.1f} | {one['worst_error']:.3f} |"
+             for one in hover["settings"]]  # fmt: skip
+    told += [f"| {rate:,.0f} |" for rate in peers["env_steps_per_second"].values()]
+    for sentence in told:
+        assert sentence in page
+    ratios = bench["ratios"]
+    assert ratios["env / mj_step"] >= 0.6
+    assert ratios["vector env, 1024 / Batch.step, 1024"] >= 0.85
+    assert ratios["UDP, 1024 / vector env, 1024"] >= 0.75
+    assert ratios["vector env, 4096 / vector env, 64"] >= 1.0
+    assert hover["settings"][0]["wall_seconds"] <= 20
+    assert hover["settings"][0]["reached"]
