@@ -27,7 +27,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib import metadata
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,7 +35,7 @@ import atheris
 import numpy as np
 
 with atheris.instrument_imports(include=["rotorgram.udp"]):
-    from rotorgram.udp import binary, interface, text
+    from rotorgram.udp import binary, interface, parts, text
     from rotorgram.udp.agent_link import AgentLink
     from rotorgram.udp.errors import DecodeError
     from rotorgram.udp.keys import OVERHEAD, Key, is_sealed
@@ -135,6 +135,32 @@ def fuzz_keys(data: bytes) -> None:
         with suppress(DecodeError):
             theirs.open(hostile)
             raise Finding("opened", hostile)
+
+
+def fuzz_parts(data: bytes) -> None:
+    """Parts in any order, of messages that are a few bytes long."""
+    program, largest = Program(data), 100
+    assembler, came = parts.Assembler(largest), {}
+    while program:
+        sequence, number, count = program.byte() % 3, program.byte() % 5, program.byte() % 5
+        piece = program.piece()
+        part = part_of(binary.STATE, SESSION, sequence, number, count, piece)
+        expect(parts.is_part(part), "no part")
+        with suppress(DecodeError):
+            whole = assembler.take(sequence, part)
+            came.setdefault((sequence, count, number), set()).add(piece)
+            if whole is not None:
+                expect(len(whole) <= largest, "too much", whole)
+                texts = [came[sequence, count, n] for n in range(count)]
+                known = {b"".join(choice) for choice in product(*texts)}
+                expect(whole in known, "made up", whole)
+        kept = sum(map(len, assembler._slices.values()))
+        expect(kept == assembler._size <= largest, "kept", kept)
+
+
+def part_of(kind: int, session: int, sequence: int, number: int, count: int, piece: bytes) -> bytes:
+    body = struct.pack("<HH4x", number, count) + piece
+    return binary.frame(kind | binary.PART, session, sequence, body)
 
 
 def fuzz_accept(data: bytes) -> None:
@@ -332,6 +358,10 @@ class Flight:
             datagram = datagram[:at] + new + datagram[at + len(new) :]
         if flags & 2:
             datagram = datagram[: program.byte()]
+        if flags & 64:  # a part of it
+            numbers = program.byte() % 4, 1 + program.byte() % 4
+            piece = datagram[numbers[0] * len(datagram) // numbers[1] :]
+            datagram = part_of(*binary.peek(datagram), *numbers, piece[: program.byte()])
         if flags & 4:
             datagram = fixed(datagram)
         if flags & 8 and is_sealed(datagram):
@@ -383,7 +413,7 @@ def fuzz_links(data: bytes) -> None:
 
 # ---- the program
 
-TARGETS: Final = [fuzz_binary, fuzz_text, fuzz_keys, fuzz_accept, *[fuzz_links] * 4]
+TARGETS: Final = [fuzz_binary, fuzz_text, fuzz_keys, fuzz_accept, *[fuzz_links] * 4, fuzz_parts]
 
 
 def fuzz_one(data: bytes) -> None:
@@ -422,6 +452,11 @@ def seeds() -> Iterator[bytes]:
         for mode in (0x20, 0x21, 0x22):
             piece = bytes([0, len(datagram)]) + datagram
             yield bytes([4, mode]) + b"\x07" + b"\0" + piece[:1] + b"\4" + piece[1:] + b"\x07\x07"
+        for number in range(2):
+            halves = bytes([0, 1]) + bytes([number, 1, 255])
+            yield bytes([4, 0x20, 0]) + halves[:1] + b"\x44" + piece[1:] + halves[2:] + b"\x07\x07"
+    for order in ((0, 1, 2), (2, 0, 0, 1), (1, 2, 0, 1, 2, 0)):
+        yield b"\x08" + b"".join(bytes([1, number, 3, 2, number, 7]) for number in order)
     yield b"\3" + binary.encode(greeting())[1:]
     for line in (b"1,0.5,0,1,0.25,-0.0,1.5,1.0,-2.0", b"1,0,0,0,.5,1,2", b"1,0.5", b"1,reset",
                  b"1,reset,7\r\n", b"1,close", b"3,-1e-300,+2.,3E4"):  # fmt: skip
