@@ -149,7 +149,7 @@ class VectorCollector:
             rewards, terminated, truncated = results
             rows.put(step, observation, actions, rewards, after, terminated, truncated)
             observation, over = after, terminated | truncated
-        self.observation = log.begin(over) if over.any() else observation
+        self.observation = log.begin(over)[0] if over.any() else observation
         rows.truncated[:, -1] |= ~rows.terminated[:, -1]
         return rows.rollout(flown)
 
@@ -180,9 +180,10 @@ class VectorCollector:
             steps += int((~done).sum())
             done = done | terminated | truncated
             observation = after
-        self.observation = log.begin(~np.zeros_like(done)) if done.all() else observation
+        self.observation = log.begin(done)[0] if done.all() else observation
         columns = [np.stack(column, axis=1) for column in zip(*kept, strict=True)]
         flown = columns.pop()
+        columns[-1][~done, -1] = True  # broken off: as truncated, nothing runs on into the next
         names = (
             "observations",
             "actions",

@@ -63,12 +63,13 @@ class VectorEpisodeLog(VectorWrapper):
 
     def step(self, actions: np.ndarray) -> Step:
         """Fly one step and keep it. `info` has `final_obs` where an episode ended."""
-        result = self.fly(actions)
-        if not (ended := result[2] | result[3]).any():
-            return result
-        _, rewards, terminated, truncated, _ = result
-        info = {"final_obs": result[0], "_final_obs": ended}
-        return self.begin(ended), rewards, terminated, truncated, info
+        last, rewards, terminated, truncated, info = self.fly(actions)
+        if not (terminated | truncated).any():
+            return last, rewards, terminated, truncated, info
+        observations, broken = self.begin(terminated | truncated)
+        truncated |= broken
+        info = {"final_obs": last, "_final_obs": terminated | truncated}
+        return observations, rewards, terminated, truncated, info
 
     def fly(
         self,
@@ -84,7 +85,7 @@ class VectorEpisodeLog(VectorWrapper):
             begins: bool, shape (N,): drones that begin their next episode instead of flying.
         """
         env = self.env
-        sent = np.asarray(actions, np.float32).reshape(self.num_envs, -1)
+        sent = np.array(actions, np.float32).reshape(self.num_envs, -1)
         idle = self._nobody if holds is None else holds
         if begins is None or not begins.any():
             env.advance(sent, self._nobody, None, holds)
@@ -96,17 +97,31 @@ class VectorEpisodeLog(VectorWrapper):
         self.env_steps += self.num_envs - int(idle.sum())
         if (env.terminated | env.truncated).any():
             self._keep_episodes()
-        return env.observations.copy(), env.rewards, env.terminated, env.truncated, {}
+        results = (env.observations, env.rewards, env.terminated, env.truncated)
+        observations, rewards, terminated, truncated = (array.copy() for array in results)
+        return observations, rewards, terminated, truncated, {}
 
-    def begin(self, drones: np.ndarray) -> np.ndarray:
-        """Begin the next episodes of some drones; what all see, float32, shape (N, n).
+    def begin(self, drones: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Begin the next episodes of some drones.
+
+        A simulator that is lost meanwhile truncates the episodes of those that held: they begin
+        their next as well.
 
         Args:
             drones: bool, shape (N,).
+
+        Returns:
+            What all see, float32, shape (N, n); and whose episode was truncated, bool, shape (N,).
         """
-        self._begin(drones)
-        self.env.advance(self._no_actions, drones, self._seeds, ~drones)
-        return self.env.observations.copy()
+        env, broken = self.env, np.zeros(self.num_envs, bool)
+        while drones.any():
+            self._begin(drones)
+            env.advance(self._no_actions, drones, self._seeds, ~drones)
+            drones = env.lost.copy()
+            broken |= drones
+            if drones.any():
+                self._keep_episodes()
+        return env.observations.copy(), broken
 
     def position(self) -> Position:
         """Where the run stands now."""
@@ -195,6 +210,8 @@ class VectorEpisodeLog(VectorWrapper):
         ended = env.terminated | env.truncated
         for drone in np.flatnonzero(ended).tolist():
             length = int(self._lengths[drone])
+            if length == 0:  # lost before its first step
+                continue
             self.episodes.append(
                 Episode(
                     episode=int(self._numbers[drone]),

@@ -28,6 +28,7 @@ class AdvancingVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         observations: float32, shape (N, n). This and the others are as `advance` left them.
         rewards: float64, shape (N,).
         terminated, truncated: bool, shape (N,).
+        over: bool, shape (N,): whose episode has ended and the next has not begun.
         lost: bool, shape (N,): whose episode was truncated since its simulator was lost.
     """
 
@@ -35,6 +36,7 @@ class AdvancingVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     rewards: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
+    over: np.ndarray
     lost: np.ndarray
 
     @abstractmethod
@@ -77,26 +79,31 @@ class AdvancingVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 f"got shape {array.shape}"
             )
         mode, nobody = self.metadata["autoreset_mode"], np.zeros(self.num_envs, bool)
-        ended = self.terminated | self.truncated
-        self.advance(
-            array.reshape(self.num_envs, -1), ended if mode == AutoresetMode.NEXT_STEP else nobody
-        )
-        rewards, terminated, truncated = self.rewards, self.terminated, self.truncated
-        info = self._info(~nobody)
-        if mode == AutoresetMode.SAME_STEP and (ended := terminated | truncated).any():
-            info = self._begin_next(ended, info)
-        # Copies, for whoever writes into them: the autoreset looks at these.
-        return self.observations.copy(), rewards, terminated.copy(), truncated.copy(), info
+        resets = self.over if mode == AutoresetMode.NEXT_STEP else nobody
+        self.advance(array.reshape(self.num_envs, -1), resets)
+        # Copies, for whoever writes into them.
+        rewards, terminated = self.rewards.copy(), self.terminated.copy()
+        truncated, info = self.truncated.copy(), self._info(~nobody)
+        if mode == AutoresetMode.SAME_STEP and self.over.any():
+            info = self._begin_next(truncated, info)
+        return self.observations.copy(), rewards, terminated, truncated, info
 
-    def _begin_next(self, ended: np.ndarray, last_info: dict[str, Any]) -> dict[str, Any]:
-        """SAME_STEP: reset those whose episode ended; the info, with that of their last step."""
-        last = self.observations.copy()
-        masks = {name: ended for name in last_info if name.startswith("_")}
+    def _begin_next(self, truncated: np.ndarray, last_info: dict[str, Any]) -> dict[str, Any]:
+        """SAME_STEP: reset those whose episode ended; the info, with that of their last step.
+
+        A simulator that is lost meanwhile truncates the episodes of those that held: they begin
+        their next as well.
+        """
+        last, ended = self.observations.copy(), np.zeros(self.num_envs, bool)
         shape = self.num_envs, *(self.single_action_space.shape or (1,))
-        self.advance(np.zeros(shape, np.float32), ended, holds=~ended)
+        while self.over.any():
+            truncated |= self.lost
+            ended |= self.over
+            self.advance(np.zeros(shape, np.float32), self.over, holds=~self.over)
+        masks = {name: mask & ended for name, mask in last_info.items() if name.startswith("_")}
         info = self._info(np.ones(self.num_envs, bool))
         info |= {"final_obs": last, "_final_obs": ended}
-        info |= {"final_info": last_info | masks, "_final_info": ended}
+        info |= {"final_info": last_info | masks, "_final_info": ended.copy()}
         return info
 
 

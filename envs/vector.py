@@ -103,7 +103,7 @@ class ElevationVectorEnv(AdvancingVectorEnv):
         self.telemetry = np.zeros((num_envs, len(TELEMETRY_NAMES)))
         self.rewards = np.zeros(num_envs)
         self.terminated, self.truncated = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
-        self.lost = np.zeros(num_envs, bool)
+        self.over, self.lost = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
         self._clipped = np.zeros(num_envs, bool)
         self.closed = False
 
@@ -163,6 +163,7 @@ class ElevationVectorEnv(AdvancingVectorEnv):
         self.terminated = ending & flown
         self.truncated = (steps >= length) & ~self.terminated & flown
         self.rewards = np.where(flown, sum(self._task.reward_terms(error, self.terminated)), 0.0)
+        self.over = self.terminated | self.truncated | (self.over & ~resets)
         going_on = flown & ~(self.terminated | self.truncated)
         self._steps[going_on] = steps[going_on]
 
@@ -194,6 +195,7 @@ class ElevationVectorEnv(AdvancingVectorEnv):
         kept = np.ones(self.num_envs, bool)
         kept[ids] = False
         self.terminated, self.truncated = self.terminated & kept, self.truncated & kept
+        self.over = self.over & kept
 
     def _observe(self) -> np.ndarray:
         """Take down what every drone sees; the elevation errors, m."""

@@ -1,6 +1,7 @@
 """Messages in parts: cut, put together in any order, within bounds, over both links."""
 
 import random
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,8 @@ from rotorgram.udp.agent_link import AgentLink
 from rotorgram.udp.errors import DecodeError
 from rotorgram.udp.keys import Key
 from rotorgram.udp.link import LinkConfig
-from rotorgram.udp.messages import Command, Hello, State
-from rotorgram.udp.parts import Assembler, cut, is_part
+from rotorgram.udp.messages import Command, Hello, Refuse, State
+from rotorgram.udp.parts import Assembler, cut, is_part, turned
 from rotorgram.udp.simulator_link import SimulatorLink
 
 DRONES = 4096
@@ -92,6 +93,28 @@ def test_sizes_are_those_of_the_messages() -> None:
 def test_a_part_is_no_message() -> None:
     with pytest.raises(DecodeError, match="type: expected 1 to 8, got 132"):
         binary.decode(cut(binary.encode(state(1)))[0])
+
+
+def test_a_buffer_that_is_too_small_delays_only() -> None:
+    """Of each burst the first three parts arrive: repeats begin with others."""
+    message = binary.encode(state(1, drones=20_000))
+    parts, assembler = cut(message), Assembler(len(message))
+    assert len(parts) > 12
+    for times in range(len(parts)):
+        whole = [assembler.take(1, part) for part in turned(parts, times)[:3]]
+        if whole[-1] or any(whole):
+            assert message in whole
+            return
+    raise AssertionError("never whole")
+
+
+def test_a_message_has_the_header_of_its_parts() -> None:
+    other = binary.encode(state(2, drones=1))
+    halves = part(0, 2, other[:30]), part(1, 2, other[30:])
+    assembler = Assembler(len(other))
+    assert assembler.take(1, halves[0]) is None
+    with pytest.raises(DecodeError, match="header of its parts"):
+        assembler.take(1, halves[1])
 
 
 def test_parts_of_an_older_message_change_nothing() -> None:
@@ -248,3 +271,14 @@ def test_a_strangers_parts_do_not_disturb_a_session() -> None:
     assert event is not None
     assert binary.encode(event.message) == binary.encode(state(1, session=session))
     assert pair.simulator.receive(junk[0], 0.0) is None
+
+
+def test_a_hello_of_too_large_states_is_refused() -> None:
+    pair = Pair(sealed=False, loss=0.0)
+    bounds = np.zeros(8000, np.float32)
+    large = replace(hello(65_536), observation_low=bounds, observation_high=bounds)
+    pair.agent.receive(binary.encode(large), ELSEWHERE, 0.0)
+    ((datagram, _),) = pair.agent.take_outgoing()
+    refuse = binary.decode(datagram)
+    assert isinstance(refuse, Refuse)
+    assert refuse.reason.startswith("expected States and Commands of at most 16777216 bytes, got 2")

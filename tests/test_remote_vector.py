@@ -387,6 +387,43 @@ def test_a_mask_resets_some_and_the_others_hold() -> None:
             remote.reset(options={"reset_mask": np.zeros(4, bool)})
 
 
+def test_who_has_ended_and_holds_is_not_forgotten() -> None:
+    options: dict[str, Any] = {"start_band": 0.3, "flight_band": 0.4}
+    local = ElevationVectorEnv(2, **options)
+    with flying(1, 2, **options) as (remote, _):
+        assert_same(remote.reset(seed=1), local.reset(seed=1))
+        actions = np.array([[1.0], [0.0]], np.float32)
+        while not local.over.any():
+            assert_same(remote.step(actions), local.step(actions))
+        assert local.over.tolist() == [True, False]
+        others = {"reset_mask": np.array([False, True])}
+        assert_same(remote.reset(seed=7, options=others), local.reset(seed=7, options=others))
+        for _ in range(3):  # the first resets drone 0
+            assert_same(remote.step(actions), local.step(actions))
+
+
+def test_a_step_after_the_end_without_autoreset_changes_nothing() -> None:
+    with flying(1, 2, autoreset="Disabled", episode_length=2) as (remote, _):
+        remote.reset(seed=0)
+        hold = np.zeros((2, 1), np.float32)
+        remote.step(hold)
+        assert remote.step(hold)[3].all()
+        with pytest.raises(gym.error.ResetNeeded, match="for env 0 first"):
+            remote.step(hold)
+        remote.reset(options={"reset_mask": np.ones(2, bool)})
+        assert not remote.step(hold)[3].any()
+
+
+def test_states_larger_than_the_systems_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rotorgram.udp.sockets._BUFFER", 212_992)  # Linux's own limit
+    local = ElevationVectorEnv(5000)
+    with flying(1, 5000) as (remote, _):
+        assert_same(remote.reset(seed=1), local.reset(seed=1))
+        actions = np.full((5000, 1), 0.1, np.float32)
+        for _ in range(3):
+            assert_same(remote.step(actions), local.step(actions))
+
+
 def test_an_env_of_others_is_held_too() -> None:
     with flying(1, 2, env="CartPole-v1", autoreset="SameStep") as (remote, _):
         remote.reset(seed=0)

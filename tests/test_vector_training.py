@@ -212,7 +212,9 @@ def test_episodes_are_broken_off_where_the_training_ends() -> None:
     log = VectorEpisodeLog(ElevationVectorEnv(N), 0)
     rollout = VectorCollector(log, np.random.default_rng(0)).episodes(policy(), 1, 23)
     assert len(rollout) == log.env_steps == 25
-    assert not rollout.ends.any()
+    # The last step of each drone: no return of one runs on into the next.
+    assert np.flatnonzero(rollout.ends).tolist() == [4, 9, 14, 19, 24]
+    assert not rollout.terminated.any()
 
 
 def test_policies_of_many_are_those_of_each() -> None:
@@ -318,6 +320,43 @@ def test_a_lost_simulator_is_marked() -> None:
         single = VectorEpisodeLog(ElevationVectorEnv(2, **OPTIONS), 0)
         single.resume(log.position(), log.episodes)
     other.join()
+
+
+class Losing(ElevationVectorEnv):
+    """Loses the simulator of its second half while the first half is reset, once."""
+
+    armed = False
+
+    def advance(self, actions: Any, resets: Any, seeds: Any = None, holds: Any = None) -> None:
+        super().advance(actions, resets, seeds, holds)
+        self.lost = np.zeros(self.num_envs, bool)
+        if self.armed and holds is not None and resets.any() and holds[-1]:
+            self.armed = False
+            self.lost[-2:] = holds[-2:]
+            self.truncated, self.over = self.lost.copy(), self.over | self.lost
+
+
+@pytest.mark.parametrize("wrapped", [True, False])
+def test_a_simulator_lost_while_others_begin(wrapped: bool) -> None:
+    env: Any = Losing(4, autoreset_mode="SameStep", **OPTIONS)
+    flown: Any = VectorEpisodeLog(env, 0) if wrapped else env
+    flown.reset(seed=0)
+    dice, seen = np.random.default_rng(0), False
+    for step in range(80):
+        env.armed = step > 5 and not seen
+        observations, rewards, terminated, truncated, info = flown.step(random_actions(dice, 4))
+        assert len(rewards) == 4
+        if env.lost.any() or ("final_obs" in info and not env.armed and step > 5 and not seen):
+            seen = True
+            # Whoever held is truncated too, with its last observation, and at a new start.
+            assert truncated[-2:].any()
+            ended = terminated | truncated
+            assert (info["_final_obs"] == ended).all()
+            assert not observations[ended, 1:].any()
+            assert not env.over.any()
+    assert seen
+    if wrapped:
+        assert any(episode.simulator_lost for episode in flown.episodes)
 
 
 def test_the_env_has_as_many_drones_as_the_run() -> None:

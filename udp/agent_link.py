@@ -27,7 +27,7 @@ from .messages import (
     Welcome,
     one_line,
 )
-from .parts import Assembler, is_first, is_part
+from .parts import Assembler, is_first, is_part, turned
 from .statistics import Statistics
 
 __all__ = ["AgentLink", "Event", "Session"]
@@ -65,6 +65,8 @@ class Session:
     welcome: Welcome | None = None
     reply: list[bytes] = field(default_factory=list)
     """The answer to the last State, or the Welcome: one datagram or its parts."""
+    repeats: int = 0
+    """How often an answer was sent again."""
     parts: Assembler | None = None
     """Of the State that is coming in parts."""
     state: str = "expecting"
@@ -228,7 +230,7 @@ class AgentLink:
         elif opening and not self.closed:
             self._repeat(opening)
             self._drop("duplicate", "", address, now)
-        elif reason := "the agent has closed" if self.closed else self._accept(hello):
+        elif reason := self._reason_to_refuse(hello):
             self._refuse(hello.session, reason, address, size, key=self._key)
             self._drop("refused", reason, address, now)
         elif None in self.places or address in self._seats:
@@ -236,6 +238,14 @@ class AgentLink:
         else:
             wait = self._send(Wait(session=hello.session), address, self._key)
             _keep(self._waiting, address, (hello.session, size - len(wait)))
+
+    def _reason_to_refuse(self, hello: Hello) -> str:
+        if self.closed:
+            return "the agent has closed"
+        size = max(binary.state_size(hello), binary.command_size(hello))
+        if size > binary.MAX_WHOLE:
+            return f"expected States and Commands of at most {binary.MAX_WHOLE} bytes, got {size}"
+        return self._accept(hello)
 
     def _welcome(self, hello: Hello, address: Address) -> None:
         welcome = Welcome(session=hello.session, nonce=self._draw_nonce())
@@ -394,7 +404,9 @@ class AgentLink:
 
     def _repeat(self, session: Session) -> None:
         """Send its last answer again, the same bytes."""
-        self._outgoing += [(part, session.peer) for part in session.reply]
+        session.repeats += 1
+        parts = turned(session.reply, session.repeats)
+        self._outgoing += [(part, session.peer) for part in parts]
         self.statistics.counters["resent"] += 1
 
     # ---- a State in parts

@@ -12,7 +12,7 @@ from . import binary
 from .binary import HEADER_SIZE, MAX_MESSAGE
 from .errors import DecodeError
 
-__all__ = ["MAX_PARTS", "Assembler", "cut", "is_first", "is_part"]
+__all__ = ["MAX_PARTS", "Assembler", "cut", "is_first", "is_part", "turned"]
 
 MAX_PARTS: Final = 8192
 """Most parts of one message. We cut as few as will do; another sender may cut finer."""
@@ -39,6 +39,14 @@ def cut(message: bytes) -> list[bytes]:
     ]
 
 
+def turned(parts: list[bytes], times: int) -> list[bytes]:
+    """The parts in another order for each repeat: where a buffer is full, it is of others."""
+    if len(parts) == 1:
+        return parts
+    first = times * (len(parts) // 2 + 1) % len(parts)
+    return parts[first:] + parts[:first]
+
+
 def is_part(datagram: bytes) -> bool:
     """Whether a datagram, not sealed, says of itself that it is a part."""
     return len(datagram) > 3 and datagram[3] >= binary.PART
@@ -61,7 +69,7 @@ class Assembler:
     """
 
     def __init__(self, largest: int) -> None:
-        self._largest = largest
+        self._largest = min(largest, binary.MAX_WHOLE)
         self._sequence = -1
         self._count = 0
         self._slices: dict[int, bytes] = {}
@@ -94,6 +102,8 @@ class Assembler:
             return None
         message = b"".join(self._slices[i] for i in range(count))
         self._begin(sequence, count)
+        if binary.peek(message) != binary.peek(part):
+            raise DecodeError("parts: expected those of a message with the header of its parts")
         return message
 
     def _begin(self, sequence: int, count: int) -> None:

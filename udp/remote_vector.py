@@ -1,6 +1,6 @@
 """The drones of one or many simulators elsewhere, as one vector env of the agent's."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -157,8 +157,8 @@ class RemoteVectorEnv(AdvancingVectorEnv):
         self._server.connect()
         self._take_interface(self.num_simulators * (self._server.interface.drones or 1))
         seeds, everyone = self._seeds(seed), np.ones(self.num_envs, bool)
-        self._reset_until_done(range(self.num_simulators), everyone, seeds)
-        self._over = np.zeros(self.num_envs, bool)
+        self._reset_until_done(everyone, seeds)
+        self.over = np.zeros(self.num_envs, bool)
         self._flying = True
         self._take_states(everyone)
         return self.observations.copy(), self._info(everyone)
@@ -174,6 +174,9 @@ class RemoteVectorEnv(AdvancingVectorEnv):
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
         held = np.zeros(self.num_envs, bool) if holds is None else holds
+        if (waiting := self.over & ~(resets | held)).any():
+            first = int(waiting.argmax())
+            raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
         sent, shape = self._sent(actions), self._shape
         places = [p for p in range(self.num_simulators) if not held.reshape(shape)[p].all()]
         self._flying = False  # until the answers are there
@@ -183,13 +186,12 @@ class RemoteVectorEnv(AdvancingVectorEnv):
             self._flying = True
             raise
         lost = self._server.lost
-        if seeds is not None:  # a simulator that came instead of a lost one has not seen them
-            anew = [p for p in places if lost[p] and resets.reshape(shape)[p].any()]
-            self._reset_until_done(anew, resets, seeds)
+        if any(lost) and seeds is not None:  # who came instead of a lost one has not seen them
+            lost = self._reset_until_done(resets, seeds, lost)
         before, telemetry = self.observations, self._telemetry
         self._take_states(resets | held)
         reasons = np.repeat(np.array(lost, object), shape[1])
-        broken = (reasons != "") & ~resets & ~self._over
+        broken = (reasons != "") & ~resets & ~self.over
         if broken.any():  # what came is the start of the next episodes
             self.observations[broken] = before[broken]
             self._telemetry[broken] = telemetry[broken]
@@ -197,8 +199,8 @@ class RemoteVectorEnv(AdvancingVectorEnv):
             self.terminated[broken] = False
             self.truncated[broken] = True
             reasons[~broken] = None
-            self._broken, self.lost = (reasons, broken), broken
-        self._over = self.terminated | self.truncated | (self._over & ~resets)
+            self._broken, self.lost = (reasons, broken), broken.copy()
+        self.over = self.terminated | self.truncated | (self.over & ~resets)
         self._flying = True
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -221,7 +223,7 @@ class RemoteVectorEnv(AdvancingVectorEnv):
         self._shape = self.num_simulators, num_envs // self.num_simulators
         self._size = (interface.action.shape or (1,))[0]
         if not self._flying:
-            self.terminated = self.truncated = np.zeros(num_envs, bool)
+            self.over = np.zeros(num_envs, bool)
         self._no_actions = np.zeros((num_envs, self._size), np.float32)
 
     def _seeds(self, seed: Any) -> np.ndarray | None:
@@ -229,13 +231,24 @@ class RemoteVectorEnv(AdvancingVectorEnv):
         return None if seeds is None else np.array(seeds, np.uint64)
 
     def _reset_until_done(
-        self, places: Sequence[int], resets: np.ndarray, seeds: np.ndarray | None
-    ) -> None:
-        """Reset some drones of these places, again where another simulator comes meanwhile."""
+        self, resets: np.ndarray, seeds: np.ndarray | None, lost: list[str] | None = None
+    ) -> list[str]:
+        """Reset drones, again where another simulator comes meanwhile; which were lost, and why.
+
+        Args:
+            resets: Which, bool, shape (N,).
+            seeds: Of all drones, or None.
+            lost: For each place why its simulator was lost before; None: all are to be reset.
+        """
         actions = self._no_actions.reshape(*self._shape, self._size)
-        while places:
+        wanted: np.ndarray = np.any(resets.reshape(self._shape), axis=1)
+        reasons = lost or [""] * self.num_simulators
+        anew = [not lost or bool(reason) for reason in reasons]
+        while places := [p for p in range(self.num_simulators) if anew[p] and wanted[p]]:
             self._server.exchange(places, actions, *_by_place(self._shape, resets, seeds, ~resets))
-            places = [place for place in places if self._server.lost[place]]
+            reasons = [new or old for new, old in zip(self._server.lost, reasons, strict=True)]
+            anew = [bool(reason) for reason in self._server.lost]
+        return reasons
 
     def _take_states(self, still: np.ndarray) -> None:
         """Take over what came; rewards and flags are 0 for those that did not fly."""

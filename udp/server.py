@@ -20,7 +20,7 @@ from .journal import Journal, of_agent
 from .keys import Key, read_key
 from .link import Address
 from .messages import Close, Command, Hello, State
-from .sockets import Port, address_text, log_notices
+from .sockets import LARGE, Port, address_text, log_notices, pause_between_parts
 
 __all__ = ["Server", "ServerConfig"]
 
@@ -302,7 +302,9 @@ def _leave(link: AgentLink, port: Port, journal: Journal | None) -> None:
 
 
 def _flush(link: AgentLink, port: Port) -> None:
-    for datagram, address in link.take_outgoing():
+    for number, (datagram, address) in enumerate(link.take_outgoing()):
+        if len(datagram) > LARGE:
+            pause_between_parts(number)
         try:
             port.send(datagram, address)
         except OSError:  # as good as lost: the simulator asks again, or the wait ends in time

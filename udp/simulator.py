@@ -15,7 +15,15 @@ from .keys import Key, read_key
 from .link import Address, LinkConfig, encode
 from .messages import Close, Command, Message, Refuse, Welcome
 from .simulator_link import SimulatorLink
-from .sockets import address_text, log_notices, open_socket, receive, resolve
+from .sockets import (
+    LARGE,
+    address_text,
+    log_notices,
+    open_socket,
+    pause_between_parts,
+    receive,
+    resolve,
+)
 
 __all__ = ["DEFAULT_AGENT", "DEFAULT_SIMULATOR", "Simulator"]
 
@@ -209,7 +217,9 @@ class Simulator:
                 self.link.handle_timer(time.monotonic())
 
     def _flush(self) -> None:
-        for datagram in self.link.take_outgoing():
+        for number, datagram in enumerate(self.link.take_outgoing()):
+            if len(datagram) > LARGE:
+                pause_between_parts(number)
             try:
                 self._socket.send(datagram)
             except ConnectionError:

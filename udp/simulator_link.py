@@ -2,7 +2,6 @@
 
 import secrets
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from typing import Final
 
@@ -22,7 +21,7 @@ from .messages import (
     Welcome,
     one_line,
 )
-from .parts import Assembler, is_part
+from .parts import Assembler, is_part, turned
 from .statistics import Statistics
 
 __all__ = ["SimulatorLink", "new_session"]
@@ -186,7 +185,7 @@ class SimulatorLink:
                 return True
             self.close(f"no answer from the agent for {self._config.timeout:g} s", now)
             return False
-        self._outgoing += self._outstanding
+        self._outgoing += turned(self._outstanding, self.sends)
         self.statistics.counters["resent"] += 1
         wait = min(self._resend_interval() * 2 ** min(self.sends, 16), self._config.max_resend)
         self._resend_at = now + (CLOSE_INTERVAL if self.state == "closing" else wait)
@@ -244,11 +243,8 @@ class SimulatorLink:
         return key.open(datagram)
 
     def _open_answer(self, datagram: bytes, key: Key) -> bytes:
-        """An answer to one of the datagrams that were sent last."""
-        for asked in self._outstanding:
-            with suppress(Forged):
-                return key.open(datagram, asked)
-        raise Forged("key: the tag is not of this key and State")
+        """An answer to the State that was sent last: to its datagram, or its first part."""
+        return key.open(datagram, self._outstanding[0] if self._outstanding else b"")
 
     def _is_current(self, message: Message) -> bool:
         number = getattr(message, "sequence", None)
@@ -264,7 +260,8 @@ class SimulatorLink:
         if command.actions.shape != shape:
             return f"Command: expected actions of shape {shape}, got {command.actions.shape}"
         if hello.discrete_actions:
-            choices = command.actions[~command.resets]
+            idle = command.resets if command.holds is None else command.resets | command.holds
+            choices = command.actions[~idle]
             wrong = (choices < 0) | (choices >= hello.discrete_actions) | (choices % 1 != 0)
             if wrong.any():
                 return (

@@ -17,11 +17,13 @@ from .link import Address
 from .statistics import Statistics
 
 __all__ = [
+    "LARGE",
     "Port",
     "address_text",
     "is_loopback",
     "log_notices",
     "open_socket",
+    "pause_between_parts",
     "receive",
     "resolve",
 ]
@@ -33,6 +35,13 @@ _STRANGERS_EVERY: Final = 0.01
 """While every place is taken, a datagram of a stranger is looked at so often, s."""
 _BUFFER: Final = 1 << 22
 """Bytes of datagrams that a socket may hold until they are looked at."""
+LARGE: Final = 16_384
+"""Datagrams of more bytes are not sent many at once."""
+_AT_ONCE: Final = 3
+"""Datagrams of a message in parts that are sent without a pause: as many as fit into the smallest
+buffer that systems give, and"""
+_PAUSE: Final = 200e-6
+"""how long they are given to be taken out, s."""
 _LONGEST: Final = 3600.0
 """Longest wait in one go, s: the system counts milliseconds in an int, and longer ones wrap."""
 _give_way: Final[Callable[[], None]] = getattr(os, "sched_yield", lambda: time.sleep(0))
@@ -255,6 +264,16 @@ def _receive_any(selector: selectors.BaseSelector, timeout: float) -> tuple[byte
         datagram, address = sock.recvfrom(MAX_DATAGRAM)
         return datagram, address
     raise TimeoutError
+
+
+def pause_between_parts(number: int) -> None:
+    """Wait a moment after every few datagrams that are sent in one go.
+
+    Args:
+        number: Of the datagram that is about to be sent, from 0.
+    """
+    if number and number % _AT_ONCE == 0:
+        time.sleep(_PAUSE)
 
 
 def log_notices(statistics: Statistics, now: float) -> None:
