@@ -15,7 +15,7 @@ import numpy as np
 
 from ..udp import LOST
 
-__all__ = ["Episode", "EpisodeLog", "Position", "ResumeError", "episode_seed"]
+__all__ = ["Clock", "Episode", "EpisodeLog", "Position", "ResumeError", "episode_seed"]
 
 
 class ResumeError(RuntimeError):
@@ -70,7 +70,23 @@ class Position:
     """Of N drones, env steps of the run before the running episode of each: int64, shape (N,)."""
 
 
-class EpisodeLog(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
+class Clock:
+    """Wall time of a training: what both logs have in common."""
+
+    _began: float | None = None
+
+    def start_clock(self) -> None:
+        """Training begins now; after `resume` it has begun before."""
+        if self._began is None:
+            self._began = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since training began, s."""
+        return 0.0 if self._began is None else time.perf_counter() - self._began
+
+
+class EpisodeLog(Clock, gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
     """Gives every episode its seed, and keeps what was flown.
 
     Args:
@@ -91,17 +107,6 @@ class EpisodeLog(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         self._episode = -1
         self._actions: list[Any] = []
         self._observation = np.empty(0, np.float32)
-        self._began: float | None = None
-
-    def start_clock(self) -> None:
-        """Training begins now; after `resume` it has begun before."""
-        if self._began is None:
-            self._began = time.perf_counter()
-
-    @property
-    def seconds(self) -> float:
-        """Wall time since training began, s."""
-        return 0.0 if self._began is None else time.perf_counter() - self._began
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

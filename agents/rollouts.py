@@ -184,15 +184,7 @@ class VectorCollector:
         columns = [np.stack(column, axis=1) for column in zip(*kept, strict=True)]
         flown = columns.pop()
         columns[-1][~done, -1] = True  # broken off: as truncated, nothing runs on into the next
-        names = (
-            "observations",
-            "actions",
-            "rewards",
-            "next_observations",
-            "terminated",
-            "truncated",
-        )
-        return Rollout(**{n: column[flown] for n, column in zip(names, columns, strict=True)})
+        return Rollout(**{n: c[flown] for n, c in zip(_COLUMNS, columns, strict=True)})
 
     def _start(self) -> np.ndarray:
         if self.observation is None:

@@ -7,12 +7,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from ..envs.autoreset import AdvancingVectorEnv, Step
-from .episodes import Episode, Position, ResumeError, episode_seed
+from .episodes import Clock, Episode, Position, ResumeError, episode_seed
 
 __all__ = ["VectorEpisodeLog"]
 
 
-class VectorEpisodeLog(VectorWrapper):
+class VectorEpisodeLog(Clock, VectorWrapper):
     """Gives every episode of every drone its seed, and keeps what was flown.
 
     It is a vector env of Gymnasium's SAME_STEP itself, whatever the autoreset of `env`. Episodes
@@ -44,17 +44,6 @@ class VectorEpisodeLog(VectorWrapper):
         self._nobody = np.zeros(env.num_envs, bool)
         size = (env.single_action_space.shape or (1,))[0]
         self._no_actions = np.zeros((env.num_envs, size), np.float32)
-        self._began: float | None = None
-
-    def start_clock(self) -> None:
-        """Training begins now; after `resume` it has begun before."""
-        if self._began is None:
-            self._began = time.perf_counter()
-
-    @property
-    def seconds(self) -> float:
-        """Wall time since training began, s."""
-        return 0.0 if self._began is None else time.perf_counter() - self._began
 
     def reset(self, **_: Any) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin the next episode of every drone, with its own seed; arguments are not used."""

@@ -19,7 +19,7 @@ def load_model(linear_drag: float = 0.0, *, visual: bool = True) -> mujoco.MjMod
 
     Args:
         visual: Keep what is only looked at. Without it the physics is the same, bit for bit, and
-            an eighth faster.
+            faster.
         linear_drag: 1/s. Acceleration −linear_drag · velocity, as Unity's `Rigidbody.drag`; finite
             and not negative. 0 is the paper's frictionless craft.
 
