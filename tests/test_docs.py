@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 ROOT = Path(__file__).parent.parent
@@ -87,3 +88,31 @@ def test_the_performance_page_tells_what_the_benchmarks_wrote() -> None:
     assert ratios["vector env, 4096 / vector env, 64"] >= 1.0
     assert hover["settings"][0]["wall_seconds"] <= 20
     assert hover["settings"][0]["reached"]
+
+
+def test_the_scaling_page_tells_what_the_benchmark_wrote() -> None:
+    page = (ROOT / "docs" / "scaling.md").read_text()
+    scaling = json.loads((RESULTS / "performance" / "scaling.json").read_text())
+    extrapolated, drones = scaling["extrapolated"], scaling["drones"]
+    told = [f"| {threads} | {rate:,} |" for threads, rate in scaling["threads"].items()]
+    told += [
+        f"| {count} | {int(count) * drones:,} | {one['rate']:,} "
+        f"| {one['agent_seconds'] * 1e3:.2f} |"
+        for count, one in scaling["simulators"].items()
+    ]
+    told += [
+        f"| {count} | {int(count) * drones:,} | {rate:,} |"
+        for count, rate in extrapolated["rates"].items()
+    ]
+    told += [f"| {seconds:.1f} |" for seconds in scaling["runs"]["seconds"].values()]
+    told += [f"{extrapolated['t_agent'] * 1e3:.2f} ms at the median"]
+    for sentence in told:
+        assert sentence in page
+    for count, rate in extrapolated["rates"].items():  # the formula on the page
+        t_agent = int(count) * extrapolated["t_agent"]
+        period = extrapolated["t_physics"] + t_agent + extrapolated["t_network"]
+        assert int(count) * drones / period == pytest.approx(rate, rel=1e-3)
+    runs = pd.read_csv(RESULTS / "tuned" / "runs.csv")["seconds"]
+    assert (
+        f"{len(runs)} runs of {runs.sum():,.0f} s in all, the longest of {runs.max():.0f} s" in page
+    )
