@@ -1,15 +1,13 @@
 """The figures of a comparison, drawn from its files: the paper's 6 to 8 and a learning curve.
 
-Lines are interquartile means over seeds; bands are the quartiles over seeds (from four seeds on) or
-the range from the lowest to the highest seed. Curves of one agent's seeds end where the shortest of
-them ends. Drawn with matplotlib's object interface, so that no display or global state is involved.
+What the lines and bands are is told where they are made, in `curves`. Drawn with matplotlib's
+object interface, so that no display or global state is involved.
 """
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import pandas as pd
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -18,22 +16,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter
 
-from .metrics import (
-    HOLD_THRESHOLD,
-    Curve,
-    Spread,
-    average_return,
-    episode_ends,
-    iqm,
-    spread_over_seeds,
-    training_runs,
-)
-from .records import (
-    Records,
-    read_records,
-    read_steps,
-    sort_agents,
-)
+from .curves import Curves, Fan, Flights, make_curves
+from .metrics import HOLD_THRESHOLD, Spread, episode_ends, training_runs
+from .records import Records, read_records, sort_agents
 
 __all__ = ["FIGURE_FILES", "agent_color", "agent_label", "draw_figures"]
 
@@ -44,15 +29,22 @@ FIGURE_FILES: Final = (
     "learning_curve.png",
 )
 
-AVERAGING_SHARE: Final = 0.05
-"""Share of training over which the average reward is a running mean."""
-
 _LABELS: Final = {"vpg": "VPG", "a2c": "A2C", "sb3-a2c": "SB3 A2C", "pid": "PID"}
 # Okabe and Ito's palette: told apart by readers with colour-blindness.
 _COLORS: Final = {"vpg": "#D55E00", "a2c": "#0072B2", "sb3-a2c": "#009E73", "pid": "#555555"}
 _SPARE_COLORS: Final = ("#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
+# The same hues, lighter, where the ground is dark.
+_DARK_COLORS: Final = {
+    "#D55E00": "#F58A3C",
+    "#0072B2": "#55B0F0",
+    "#009E73": "#2CC998",
+    "#555555": "#B4BCC4",
+    "#CC79A7": "#E29AC3",
+    "#E69F00": "#F0B840",
+    "#56B4E9": "#7CC8F2",
+    "#8C564B": "#C9938A",
+}
 _MAX_POINTS: Final = 2000
-_MAX_STEP_ROWS: Final = 400_000
 _OUTER: Final = 0.18  # opacity of the 5–95 % band
 _INNER: Final = 0.38  # and of the 25–75 % band
 _STYLE: Final[dict[Any, Any]] = {
@@ -87,13 +79,21 @@ def agent_label(agent: str) -> str:
     return _LABELS.get(agent, agent)
 
 
-def agent_color(agent: str) -> str:
-    """Give an agent's colour, the same in every figure and every report."""
+def agent_color(agent: str, dark: bool = False) -> str:
+    """Give an agent's colour, the same in every figure and every report.
+
+    Args:
+        agent: Its name.
+        dark: Whether it is drawn on a dark ground.
+    """
     spare = _SPARE_COLORS[sum(agent.encode()) % len(_SPARE_COLORS)]
-    return _COLORS.get(agent, spare)
+    color = _COLORS.get(agent, spare)
+    return _DARK_COLORS[color] if dark else color
 
 
-def draw_figures(folder: Path | str, records: Records | None = None) -> list[Path]:
+def draw_figures(
+    folder: Path | str, records: Records | None = None, curves: Curves | None = None
+) -> list[Path]:
     """Draw all figures of a comparison into `figures/` inside its folder.
 
     Agents or runs that are missing are left out of the figures; a panel with nothing in it says so.
@@ -101,19 +101,20 @@ def draw_figures(folder: Path | str, records: Records | None = None) -> list[Pat
     Args:
         folder: Where `rotorgram compare` wrote its records.
         records: What `read_records(folder)` gave, where it is at hand.
+        curves: What `make_curves(folder, records)` gave, where they are at hand.
 
     Returns:
         The PNG files, in the order of `FIGURE_FILES`.
     """
     records = records or read_records(folder)
+    drawn = curves or make_curves(folder, records)
     target = Path(folder) / "figures"
     target.mkdir(exist_ok=True)
-    # Bound to the folder here, so that the step rows are in memory only while they are drawn.
     draw: tuple[Callable[[], Figure], ...] = (
-        lambda: _draw_reward(records.episodes),
-        lambda: _draw_cumulative(records.episodes),
-        lambda: _draw_error(Path(folder), records),
-        lambda: _draw_learning_curve(records.evaluations),
+        lambda: _draw_reward(records.episodes, drawn),
+        lambda: _draw_cumulative(drawn),
+        lambda: _draw_error(sort_agents(records.evaluations["agent"]), drawn),
+        lambda: _draw_learning_curve(records.evaluations, drawn),
     )
     paths = []
     with rc_context(_STYLE):
@@ -123,7 +124,7 @@ def draw_figures(folder: Path | str, records: Records | None = None) -> list[Pat
     return paths
 
 
-def _draw_reward(episodes: pd.DataFrame) -> Figure:
+def _draw_reward(episodes: pd.DataFrame, curves: Curves) -> Figure:
     """Draw figure 6: a panel per agent (episodes and average), and all averages in one panel."""
     agents = sort_agents(episodes["agent"])
     panels = max(1, len(agents) + (len(agents) > 1))
@@ -131,7 +132,7 @@ def _draw_reward(episodes: pd.DataFrame) -> Figure:
     everything = axes[-1] if len(agents) > 1 else None
     for axis, agent in zip(axes, agents, strict=False):
         runs = training_runs(episodes, agent)
-        spread = spread_over_seeds([average_return(run, AVERAGING_SHARE) for run in runs])
+        spread = curves.average_return[agent]
         _scatter_episodes(axis, pd.concat(runs), agent)
         _plot(axis, spread, agent, label="average reward")
         axis.set_title(f"{agent_label(agent)} ({_seeds(len(runs))})")
@@ -151,16 +152,12 @@ def _draw_reward(episodes: pd.DataFrame) -> Figure:
     return figure
 
 
-def _draw_cumulative(episodes: pd.DataFrame) -> Figure:
+def _draw_cumulative(curves: Curves) -> Figure:
     """Draw figure 7: the cumulative reward over env steps and over episodes."""
     figure, axes = _panels(2)
-    for agent in sort_agents(episodes["agent"]):
-        runs = training_runs(episodes, agent)
-        totals = [run["return"].cumsum().to_numpy() for run in runs]
-        by_step = [Curve(episode_ends(run), total) for run, total in zip(runs, totals, strict=True)]
-        by_episode = [Curve(np.arange(1.0, len(total) + 1), total) for total in totals]
-        _plot(axes[0], spread_over_seeds(by_step), agent)
-        _plot(axes[1], spread_over_seeds(by_episode), agent)
+    for axis, spreads in zip(axes, (curves.return_by_step, curves.return_by_episode), strict=True):
+        for agent, spread in spreads.items():
+            _plot(axis, spread, agent)
     _env_steps_axis(axes[0])
     axes[1].set_xlabel("training episodes")
     axes[0].set_ylabel("cumulative reward")
@@ -174,17 +171,13 @@ def _draw_cumulative(episodes: pd.DataFrame) -> Figure:
     return figure
 
 
-def _draw_error(folder: Path, records: Records) -> Figure:
+def _draw_error(agents: Sequence[str], curves: Curves) -> Figure:
     """Draw figure 8: E in training (above) and in the final evaluation (below), per agent."""
-    training = read_steps(folder, "train", ("agent", "step", "error"), max_rows=_MAX_STEP_ROWS)
-    flown = read_steps(folder, "evaluation")
-    period = float(records.config["env"]["control_period"])
-    agents = sort_agents(records.evaluations["agent"])
     figure = Figure(figsize=(max(5.0, 3.1 * len(agents)), 5.6), dpi=110)
     axes = figure.subplots(2, max(1, len(agents)), squeeze=False, sharey="row")
     for (above, below), agent in zip(axes.T, agents, strict=False):
-        _training_error(above, training[training["agent"] == agent], agent)
-        _flown_error(below, flown[flown["agent"] == agent], agent, period)
+        _training_error(above, curves.training_error.get(agent), agent)
+        _flown_error(below, curves.flights.get(agent), agent)
         above.set_title(agent_label(agent))
         below.set_xlabel("time in the episode (s)")
     _explain_quantiles(figure)
@@ -193,40 +186,29 @@ def _draw_error(folder: Path, records: Records) -> Figure:
     return figure
 
 
-def _training_error(axis: Axes, steps: pd.DataFrame, agent: str) -> None:
+def _training_error(axis: Axes, fan: Fan | None, agent: str) -> None:
     """Draw quantiles of E over windows of env steps, pooled over the agent's seeds."""
-    if steps.empty:
+    if fan is None:
         _say(axis, "no training")
         return
     _env_steps_axis(axis)
-    step = steps["step"].to_numpy()
-    windows = min(100, max(1, len(steps) // 50))
-    width = (float(step.max()) + 1) / windows
-    window = np.minimum((step / width).astype(np.int64), windows - 1)
-    quantiles = steps["error"].groupby(window).quantile([0.05, 0.25, 0.5, 0.75, 0.95]).unstack()
-    x = (quantiles.index.to_numpy() + 0.5) * width
-    low, lower, middle, upper, high = quantiles.to_numpy().T
     color = agent_color(agent)
-    axis.fill_between(x, low, high, color=color, alpha=_OUTER, lw=0)
-    axis.fill_between(x, lower, upper, color=color, alpha=_INNER, lw=0)
-    axis.plot(x, middle, color=color, lw=1.2)
+    axis.fill_between(fan.x, fan.low, fan.high, color=color, alpha=_OUTER, lw=0)
+    axis.fill_between(fan.x, fan.lower, fan.upper, color=color, alpha=_INNER, lw=0)
+    axis.plot(fan.x, fan.middle, color=color, lw=1.2)
     axis.axhline(0.0, color="#333333", lw=0.7, ls=":")
 
 
-def _flown_error(axis: Axes, steps: pd.DataFrame, agent: str, period: float) -> None:
-    """Draw E over time of every episode of the agent's final evaluations, at most 40 of them."""
-    if steps.empty:
+def _flown_error(axis: Axes, flights: Flights | None, agent: str) -> None:
+    """Draw E over time of some episodes of the agent's final evaluations."""
+    if flights is None:
         _say(axis, "not evaluated")
         return
-    flights = [flight for _, flight in steps.groupby(["seed", "episode"], sort=True)]
-    # At random: every n-th would be the same few start positions for every seed.
-    order = np.random.default_rng(0).permutation(len(flights))[:40]
-    chosen = [flights[index] for index in order]
-    for flight in chosen:
-        time = flight["step"].to_numpy() * period
-        axis.plot(time, flight["error"].to_numpy(), color=agent_color(agent), lw=0.8, alpha=0.45)
+    shown, total = flights
+    for time, error in shown:
+        axis.plot(time, error, color=agent_color(agent), lw=0.8, alpha=0.45)
     axis.axhspan(-HOLD_THRESHOLD, HOLD_THRESHOLD, color="#333333", alpha=0.12, lw=0)
-    count = f"{len(chosen)} of {len(flights)}" if len(chosen) < len(flights) else len(flights)
+    count = f"{len(shown)} of {total}" if len(shown) < total else total
     axis.set_title(f"{count} flights", fontsize=8.5, color="#444444")
 
 
@@ -240,23 +222,15 @@ def _explain_quantiles(figure: Figure) -> None:
     figure.legend(handles=handles, loc="outside upper right", ncols=3, fontsize=8.5)
 
 
-def _draw_learning_curve(evaluations: pd.DataFrame) -> Figure:
+def _draw_learning_curve(evaluations: pd.DataFrame, curves: Curves) -> Figure:
     """Draw the steady-state |E| of the snapshots over training; agents without any as a line."""
     figure, (axis,) = _panels(1)
-    for agent in sort_agents(evaluations["agent"]):
-        own = evaluations[evaluations["agent"] == agent].dropna(subset="steady_error")
-        means = own.groupby(["seed", "env_steps"])["steady_error"].mean().reset_index()
-        curves = [
-            Curve(run["env_steps"].to_numpy(float), run["steady_error"].to_numpy(float))
-            for _, run in means.groupby("seed")
-        ]
-        if means.empty:
-            continue
-        if means["env_steps"].max() == 0:
-            value = iqm(means["steady_error"].to_numpy())
-            axis.axhline(value, color=agent_color(agent), ls="--", label=agent_label(agent))
+    for agent in sort_agents((*curves.learning, *curves.levels)):
+        if agent in curves.levels:
+            level, label = curves.levels[agent], agent_label(agent)
+            axis.axhline(level, color=agent_color(agent), ls="--", label=label)
         else:
-            _plot(axis, spread_over_seeds(curves, np.unique(means["env_steps"])), agent, marker="o")
+            _plot(axis, curves.learning[agent], agent, marker="o")
     axis.axhline(HOLD_THRESHOLD, color="#333333", lw=0.9, ls=":", label=f"{HOLD_THRESHOLD} m")
     axis.set_yscale("log")
     axis.set_ylabel("steady-state |E| in evaluation (m)")

@@ -329,7 +329,8 @@ def test_compare_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture
     names = {p.name for p in (folder / "checkpoints").iterdir()}
     assert names == {f"{a}-seed0.safetensors" for a in ("vpg", "a2c", "sb3-a2c")}
     page = (folder / "report.html").read_text()
-    assert page.count("data:image/png;base64,") >= 4
+    assert page.count('<figure class="card chart"') == 6
+    assert len(list((folder / "figures").glob("*.png"))) == 4
     assert (folder / "results.csv").exists()
     config = json.loads((folder / "config.json").read_text())
     assert config["env"]["episode_length"] == 50

@@ -1,0 +1,230 @@
+"""The curves of a comparison, from its records: what the figures and the report's page both draw.
+
+Lines are interquartile means over seeds; bands are the quartiles over seeds (from four seeds on) or
+the range from the lowest to the highest seed. Curves of one agent's seeds end where the shortest of
+them ends. An agent without any data for a curve is not in that curve's dictionary.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from .metrics import (
+    Curve,
+    Spread,
+    average_return,
+    episode_ends,
+    iqm,
+    spread_over_seeds,
+    training_runs,
+)
+from .records import Records, read_steps, sort_agents
+
+__all__ = [
+    "AVERAGING_SHARE",
+    "Curves",
+    "Fan",
+    "Flights",
+    "cumulative_returns",
+    "error_fan",
+    "flown_error",
+    "learning_curves",
+    "make_curves",
+    "pick_flights",
+    "return_curves",
+]
+
+AVERAGING_SHARE: Final = 0.05
+"""Share of training over which the average reward is a running mean."""
+
+_MAX_STEP_ROWS: Final = 400_000
+_MAX_FLIGHTS: Final = 40
+_MAX_MOMENTS: Final = 500
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class Fan(NamedTuple):
+    """Quantiles of E over windows of training, each of shape (windows,); x in env steps, E in m."""
+
+    x: FloatArray
+    low: FloatArray
+    """5 %."""
+    lower: FloatArray
+    """25 %."""
+    middle: FloatArray
+    """50 %."""
+    upper: FloatArray
+    """75 %."""
+    high: FloatArray
+    """95 %."""
+
+
+class Flights(NamedTuple):
+    """Some flights of an agent's final evaluations."""
+
+    shown: list[Curve]
+    """E (m) over the time in the episode (s)."""
+    total: int
+    """How many flights there are."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curves:
+    """All curves of a comparison, by agent."""
+
+    average_return: dict[str, Spread]
+    """Running mean of the training episodes' return over env steps."""
+    return_by_step: dict[str, Spread]
+    """Sum of all rewards since training began, over env steps."""
+    return_by_episode: dict[str, Spread]
+    """The same over training episodes."""
+    training_error: dict[str, Fan]
+    """E in training, all seeds together."""
+    flights: dict[str, Flights]
+    """E over time in the final evaluation."""
+    flown_error: dict[str, Spread]
+    """|E| (m) over time (s) in the final evaluation, all flights of all seeds together."""
+    learning: dict[str, Spread]
+    """Steady-state |E| (m) of the snapshots over env steps."""
+    levels: dict[str, float]
+    """Steady-state |E| (m) of the agents that were not trained."""
+
+
+def make_curves(folder: Path | str, records: Records) -> Curves:
+    """Make all curves of a comparison.
+
+    Args:
+        folder: Where `rotorgram compare` wrote its records; the step rows are read from it.
+        records: What `records.read_records(folder)` gave.
+
+    Raises:
+        RecordsError: If the step rows are missing or are not what they should be.
+    """
+    by_step, by_episode = cumulative_returns(records.episodes)
+    learning, levels = learning_curves(records.evaluations)
+    training = read_steps(folder, "train", ("agent", "step", "error"), max_rows=_MAX_STEP_ROWS)
+    flown = read_steps(folder, "evaluation")
+    period = float(records.config["env"]["control_period"])
+    return Curves(
+        average_return=return_curves(records.episodes),
+        return_by_step=by_step,
+        return_by_episode=by_episode,
+        training_error={name: error_fan(rows) for name, rows in _by_agent(training)},
+        flights={name: pick_flights(rows, period) for name, rows in _by_agent(flown)},
+        flown_error={name: flown_error(rows, period) for name, rows in _by_agent(flown)},
+        learning=learning,
+        levels=levels,
+    )
+
+
+def _by_agent(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    return [(name, rows[rows["agent"] == name]) for name in sort_agents(rows["agent"])]
+
+
+def return_curves(episodes: pd.DataFrame, share: float = AVERAGING_SHARE) -> dict[str, Spread]:
+    """The running mean of the return over the last `share` of training, spread over seeds."""
+    return {
+        agent: spread_over_seeds([average_return(run, share) for run in runs])
+        for agent, runs in _runs(episodes)
+    }
+
+
+def cumulative_returns(episodes: pd.DataFrame) -> tuple[dict[str, Spread], dict[str, Spread]]:
+    """The sum of all rewards since training began, over env steps and over episodes (from 1)."""
+    by_step, by_episode = {}, {}
+    for agent, runs in _runs(episodes):
+        totals = [run["return"].cumsum().to_numpy() for run in runs]
+        ends = [Curve(episode_ends(run), total) for run, total in zip(runs, totals, strict=True)]
+        numbers = [Curve(np.arange(1.0, len(total) + 1), total) for total in totals]
+        by_step[agent] = spread_over_seeds(ends)
+        by_episode[agent] = spread_over_seeds(numbers)
+    return by_step, by_episode
+
+
+def _runs(episodes: pd.DataFrame) -> list[tuple[str, list[pd.DataFrame]]]:
+    agents = sort_agents(episodes["agent"])
+    return [(agent, training_runs(episodes, agent)) for agent in agents]
+
+
+def error_fan(steps: pd.DataFrame) -> Fan:
+    """Quantiles of E over at most 100 windows of env steps.
+
+    Args:
+        steps: Training steps of one agent, columns `step` and `error`; at least one row.
+    """
+    step = steps["step"].to_numpy()
+    windows = min(100, max(1, len(steps) // 50))
+    width = (float(step.max()) + 1) / windows
+    window = np.minimum((step / width).astype(np.int64), windows - 1)
+    quantiles = steps["error"].groupby(window).quantile([0.05, 0.25, 0.5, 0.75, 0.95]).unstack()
+    return Fan((quantiles.index.to_numpy() + 0.5) * width, *quantiles.to_numpy().T)
+
+
+def pick_flights(steps: pd.DataFrame, control_period: float) -> Flights:
+    """Pick at most 40 flights, at random but always the same ones.
+
+    Args:
+        steps: Evaluation steps of one agent, columns `seed`, `episode`, `step` and `error`.
+        control_period: Time between two control steps, s.
+    """
+    flights = [flight for _, flight in steps.groupby(["seed", "episode"], sort=True)]
+    # At random: every n-th would be the same few start positions for every seed.
+    order = np.random.default_rng(0).permutation(len(flights))[:_MAX_FLIGHTS]
+    chosen = [flights[index] for index in order]
+    curves = [Curve(one["step"].to_numpy() * control_period, one["error"].to_numpy())
+              for one in chosen]  # fmt: skip
+    return Flights(curves, len(flights))
+
+
+def flown_error(steps: pd.DataFrame, control_period: float) -> Spread:
+    """Interquartile mean and spread of |E| over flights, at most at 500 moments of the episode.
+
+    A flight that crashed counts as long as it lasted.
+
+    Args:
+        steps: Evaluation steps of one agent, columns `step` and `error`; at least one row.
+        control_period: Time between two control steps, s.
+    """
+    last = int(steps["step"].max())
+    moments = np.unique(np.linspace(0, last, min(last + 1, _MAX_MOMENTS)).round().astype(np.int64))
+    shown = steps[steps["step"].isin(moments)]
+    groups = [np.abs(rows.to_numpy(np.float64)) for _, rows in shown.groupby("step")["error"]]
+    ends = np.array([_ends(values) for values in groups])
+    x = np.unique(shown["step"]) * control_period
+    return Spread(x, np.array([iqm(values) for values in groups]), ends[:, 0], ends[:, 1])
+
+
+def _ends(values: FloatArray) -> FloatArray:
+    """The quartiles, or the extremes below four values, as `spread_over_seeds` has them."""
+    quartiles = (0.25, 0.75) if len(values) >= 4 else (0.0, 1.0)
+    return np.asarray(np.quantile(values, quartiles))
+
+
+def learning_curves(evaluations: pd.DataFrame) -> tuple[dict[str, Spread], dict[str, float]]:
+    """Steady-state |E| of the snapshots of each agent over env steps.
+
+    Returns:
+        The curves of the agents that were trained, and the interquartile means over seeds of those
+        that were not (all of whose evaluations are at 0 env steps).
+    """
+    curves: dict[str, Spread] = {}
+    levels: dict[str, float] = {}
+    for agent in sort_agents(evaluations["agent"]):
+        own = evaluations[evaluations["agent"] == agent].dropna(subset="steady_error")
+        if own.empty:
+            continue
+        means = own.groupby(["seed", "env_steps"])["steady_error"].mean().reset_index()
+        if means["env_steps"].max() == 0:
+            levels[agent] = iqm(means["steady_error"].to_numpy())
+            continue
+        runs = [
+            Curve(run["env_steps"].to_numpy(float), run["steady_error"].to_numpy(float))
+            for _, run in means.groupby("seed")
+        ]
+        curves[agent] = spread_over_seeds(runs, np.unique(means["env_steps"]))
+    return curves, levels
