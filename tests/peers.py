@@ -6,7 +6,7 @@ import sys
 import textwrap
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 from rotorgram.udp import Simulator
 from rotorgram.udp.faults import FaultConfig, Relay
@@ -57,9 +57,9 @@ def plain_socket(bind: tuple[str, int] = ANY) -> Iterator[socket.socket]:
 
 
 @contextmanager
-def relaying(server: tuple[str, int], config: FaultConfig) -> Iterator[Relay]:
-    """A relay in a thread, which ends with the block."""
-    with Relay(ANY, server, config) as relay:
+def running(relay: Relay) -> Iterator[Relay]:
+    """The relay in a thread, which ends with the block."""
+    with relay:
         thread = threading.Thread(target=relay.run)
         thread.start()
         try:
@@ -68,3 +68,8 @@ def relaying(server: tuple[str, int], config: FaultConfig) -> Iterator[Relay]:
             relay.stop()
             thread.join(5)
     assert not thread.is_alive()
+
+
+def relaying(server: tuple[str, int], config: FaultConfig) -> AbstractContextManager[Relay]:
+    """A relay to that server, running."""
+    return running(Relay(ANY, server, config))

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from math import inf, nan, sqrt
 
 import pytest
+from peers import ANY, running
 from rotorgram.udp import faults
 from rotorgram.udp.faults import FaultConfig, Faults, Relay
 
-ANY = ("127.0.0.1", 0)
 COUNT = 20_000
 
 
@@ -28,20 +28,6 @@ def client_of(relay: Relay) -> socket.socket:
     sock = udp()
     sock.connect(relay.address)
     return sock
-
-
-@contextmanager
-def running(relay: Relay) -> Iterator[Relay]:
-    """The relay in a thread, which ends with the block."""
-    with relay:
-        thread = threading.Thread(target=relay.run)
-        thread.start()
-        try:
-            yield relay
-        finally:
-            relay.stop()
-            thread.join(5)
-    assert not thread.is_alive()
 
 
 @contextmanager

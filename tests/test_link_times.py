@@ -4,11 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rotorgram.udp import binary
-from rotorgram.udp.agent_link import Event
-from rotorgram.udp.messages import Refuse, Wait
-from rotorgram.udp.simulator_link import SimulatorLink
-from test_link import (
+from links import (
     HERE,
     OTHER,
     REFUSE,
@@ -29,6 +25,10 @@ from test_link import (
     to_waiting,
     unknown,
 )
+from rotorgram.udp import binary
+from rotorgram.udp.agent_link import Event
+from rotorgram.udp.messages import Refuse, Wait
+from rotorgram.udp.simulator_link import SimulatorLink
 
 
 def resend_times(link: SimulatorLink, now: float) -> list[float]:

@@ -12,13 +12,13 @@ from heapq import heappop, heappush
 
 import numpy as np
 import pytest
+from links import SECRET, command, hello, state
 from rotorgram.udp import LinkConfig
 from rotorgram.udp.agent_link import AgentLink
 from rotorgram.udp.keys import Key
 from rotorgram.udp.link import Address
 from rotorgram.udp.messages import Close, Command, Refuse, State, Welcome
 from rotorgram.udp.simulator_link import SimulatorLink
-from test_link import SECRET, command, hello, state
 
 Fate = Callable[[bytes], list[tuple[float, bytes]]]
 """What becomes of a datagram: delays, s, and bytes."""

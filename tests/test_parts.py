@@ -2,6 +2,7 @@
 
 import random
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from rotorgram.udp.agent_link import AgentLink
 from rotorgram.udp.errors import DecodeError
 from rotorgram.udp.keys import Key
 from rotorgram.udp.link import LinkConfig
-from rotorgram.udp.messages import Command, Hello, Refuse, State
+from rotorgram.udp.messages import Close, Command, Hello, Refuse, State
 from rotorgram.udp.parts import Assembler, cut, is_part, turned
 from rotorgram.udp.simulator_link import SimulatorLink
 
@@ -248,13 +249,60 @@ def test_strangers_parts_are_kept_for_a_few_only() -> None:
         pair.agent.receive(binary.encode(hello(session=session)), address, 0.0)
         for piece in cut(binary.encode(state(1, session=session)))[:-1]:
             assert pair.agent.receive(piece, address, 0.0) is None
-    held = [opening for opening in pair.agent._openings.values() if opening.parts]
-    assert len(held) == len(pair.agent._assembling) == 16
+    kept = pair.agent._admission
+    held = [opening for opening in kept.openings.values() if opening.parts]
+    assert len(held) == len(kept.assembling) == 16
     # Who comes now is taken in all the same.
     pair.agent.take_outgoing()
     pair.until(object)
     pair.simulator.send_state(state(1, session=pair.simulator.hello.session), 0.0)
     assert pair.until(State).sequence == 1
+
+
+def first_parts(agent: AgentLink, number: int) -> list[tuple[bytes, tuple[str, int]]]:
+    """A simulator's Hello to the agent, and the parts of its first State with its address."""
+    address = ("127.0.0.1", 10_000 + number)
+    agent.receive(binary.encode(hello(session=number)), address, 0.0)
+    return [(piece, address) for piece in cut(binary.encode(state(1, session=number)))]
+
+
+def test_as_many_as_there_are_places_may_come_in_parts_at_the_same_moment() -> None:
+    agent = AgentLink(lambda _: "", (3, 3), places=40)
+    everybody = [first_parts(agent, number) for number in range(1, 41)]
+    for round_ in zip(*everybody, strict=True):  # one part of each, then the next of each
+        events = [agent.receive(piece, address, 0.0) for piece, address in round_]
+    assert [event.place for event in events if event and event.joined] == list(range(40))
+    assert not agent._admission.assembling
+
+
+def test_strangers_do_not_push_out_who_goes_on_sending_parts() -> None:
+    agent = AgentLink(lambda _: "", (3, 3), places=1)
+    honest = first_parts(agent, 1)
+    assert len(honest) == 3
+    for number, (piece, address) in enumerate(honest):
+        for stranger in range(15):  # one less than the sessions for which parts are kept
+            other, there = first_parts(agent, 100 + 15 * number + stranger)[0]
+            assert agent.receive(other, there, 0.0) is None
+        event = agent.receive(piece, address, 0.0)
+    assert event is not None
+    assert event.joined
+
+
+def test_a_state_in_parts_is_turned_away_with_all_the_words_that_fit_the_whole() -> None:
+    reasons = [""]
+    agent = AgentLink(lambda _: reasons[0], (3, 3))
+    agent.receive(binary.encode(hello()), HERE, 0.0)
+    agent.take_outgoing()
+    reasons[0] = "another simulator has come meanwhile"
+    whole = binary.encode(state(1))
+    ends = [*range(0, len(whole) - 1, 60_000), len(whole) - 1, len(whole)]
+    slices = [whole[start:end] for start, end in pairwise(ends)]
+    for number, slice_ in enumerate(slices):
+        assert agent.receive(part(number, len(slices), slice_), HERE, 0.0) is None
+    ((datagram, _),) = agent.take_outgoing()
+    message = binary.decode(datagram)
+    assert isinstance(message, Close)
+    assert message.reason == reasons[0]
 
 
 def test_a_strangers_parts_do_not_disturb_a_session() -> None:

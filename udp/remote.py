@@ -9,12 +9,11 @@ import numpy as np
 from gymnasium import spaces
 
 from ..envs import ENV_ID
-from .interface import same_space
 from .link import Address
-from .messages import MAX_UINT64, Hello, State
+from .messages import MAX_UINT64, State
+from .served import ServedEnv, keep_space
 from .server import Server, ServerConfig
 from .simulator import DEFAULT_AGENT
-from .statistics import Statistics
 
 __all__ = ["LOST", "RemoteEnv"]
 
@@ -22,7 +21,7 @@ LOST: Final = "simulator_lost"
 """Key of `info`: why the simulator was lost whose episode ends here as truncated."""
 
 
-class RemoteEnv(gym.Env[np.ndarray, Any]):
+class RemoteEnv(ServedEnv, gym.Env[np.ndarray, Any]):
     """A drone in a simulator elsewhere, flown in lock-step over UDP.
 
     The simulator may start before or after. Its Hello brings the spaces; a text simulator says
@@ -93,21 +92,6 @@ class RemoteEnv(gym.Env[np.ndarray, Any]):
             except BaseException:
                 self.close()
                 raise
-
-    @property
-    def address(self) -> Address:
-        """Address that this side listens on."""
-        return self._server.address
-
-    @property
-    def hello(self) -> Hello | None:
-        """What the simulator said of itself; None before it came, or if it speaks text."""
-        return self._server.hello
-
-    @property
-    def statistics(self) -> Statistics:
-        """Counts and round trips of the wire."""
-        return self._server.link.statistics
 
     def connect(self) -> None:
         """Wait until it is the agent's turn: for the simulator's first State, if none has come."""
@@ -190,12 +174,6 @@ class RemoteEnv(gym.Env[np.ndarray, Any]):
 
     def _info(self, state: State) -> dict[str, Any]:
         return dict(zip(self._names, state.telemetry[0].tolist(), strict=True))
-
-
-def keep_space(env: Any, name: str, space: spaces.Space[Any]) -> None:
-    """Give an env a space, unless it has that one already: its generator may have been seeded."""
-    if name not in vars(env) or not same_space(vars(env)[name], space):
-        setattr(env, name, space)
 
 
 _ONLY = (0,)

@@ -13,16 +13,16 @@ from gymnasium.vector.utils import batch_space
 from ..envs import ENV_ID, autoreset
 from ..envs.autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
 from .link import Address
-from .messages import MAX_UINT64, Hello
-from .remote import LOST, keep_space
+from .messages import MAX_UINT64
+from .remote import LOST
+from .served import ServedEnv, keep_space
 from .server import Server, ServerConfig
 from .simulator import DEFAULT_AGENT
-from .statistics import Statistics
 
 __all__ = ["RemoteVectorEnv"]
 
 
-class RemoteVectorEnv(AdvancingVectorEnv):
+class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
     """The M · N drones of M simulators with N drones each, in lock-step over one socket.
 
     The simulators may be on any machines, and come in any order: each takes the first place that
@@ -58,7 +58,8 @@ class RemoteVectorEnv(AdvancingVectorEnv):
         OSError: The port is in use.
         PeerSilent: A place stayed free for `connect_timeout`.
         PeerClosed: The last simulator ended the exchange.
-        gymnasium.error.ResetNeeded: A step before a reset.
+        gymnasium.error.ResetNeeded: A step before every drone was reset, or (DISABLED) after an
+            episode's end.
         gymnasium.error.ClosedEnvironmentError: A reset after `close`.
     """
 
@@ -114,21 +115,6 @@ class RemoteVectorEnv(AdvancingVectorEnv):
                 self.close()
                 raise
 
-    @property
-    def address(self) -> Address:
-        """Address that this side listens on."""
-        return self._server.address
-
-    @property
-    def hello(self) -> Hello | None:
-        """What the last simulator that came said of itself; None before one came, or by text."""
-        return self._server.hello
-
-    @property
-    def statistics(self) -> Statistics:
-        """Counts and round trips of the wire, over all simulators."""
-        return self._server.link.statistics
-
     def connect(self) -> None:
         """Wait until every place is taken."""
         self._server.connect()
@@ -142,6 +128,9 @@ class RemoteVectorEnv(AdvancingVectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode, for all drones or some.
 
+        Where none is under way, before the first reset or after an error, a step wants a reset of
+        every drone: with several masks too, as in `ElevationVectorEnv`.
+
         Args:
             seed: Drone i gets seed + i, or the i-th of N seeds; None leaves its generator as it is.
             options: `reset_mask`: bool, shape (N,): which drones; the others hold.
@@ -154,14 +143,13 @@ class RemoteVectorEnv(AdvancingVectorEnv):
             self.advance(self._no_actions, mask, self._seeds(seed), ~mask)
             return self.observations.copy(), self._info(mask)
         self._flying = False
-        self._server.connect()
-        self._take_interface(self.num_simulators * (self._server.interface.drones or 1))
-        seeds, everyone = self._seeds(seed), np.ones(self.num_envs, bool)
-        self._reset_until_done(everyone, seeds)
-        self.over = np.zeros(self.num_envs, bool)
+        self.connect()
+        mask, seeds = checked_mask(options.get("reset_mask"), self.num_envs), self._seeds(seed)
+        self._reset_until_done(mask, seeds)
+        self.over, self._idle = np.zeros(self.num_envs, bool), ~mask
         self._flying = True
-        self._take_states(everyone)
-        return self.observations.copy(), self._info(everyone)
+        self._take_states(np.ones(self.num_envs, bool))
+        return self.observations.copy(), self._info(mask)
 
     def advance(
         self,
@@ -174,7 +162,8 @@ class RemoteVectorEnv(AdvancingVectorEnv):
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
         held = np.zeros(self.num_envs, bool) if holds is None else holds
-        if (waiting := self.over & ~(resets | held)).any():
+        grounded = self.over | self._idle
+        if (waiting := grounded & ~(resets | held)).any():
             first = int(waiting.argmax())
             raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
         sent, shape = self._sent(actions), self._shape
@@ -191,7 +180,7 @@ class RemoteVectorEnv(AdvancingVectorEnv):
         before, telemetry = self.observations, self._telemetry
         self._take_states(resets | held)
         reasons = np.repeat(np.array(lost, object), shape[1])
-        broken = (reasons != "") & ~resets & ~self.over
+        broken = (reasons != "") & ~resets & ~grounded
         if broken.any():  # what came is the start of the next episodes
             self.observations[broken] = before[broken]
             self._telemetry[broken] = telemetry[broken]
@@ -201,6 +190,7 @@ class RemoteVectorEnv(AdvancingVectorEnv):
             reasons[~broken] = None
             self._broken, self.lost = (reasons, broken), broken.copy()
         self.over = self.terminated | self.truncated | (self.over & ~resets)
+        self._idle = self._idle & ~resets
         self._flying = True
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -224,7 +214,8 @@ class RemoteVectorEnv(AdvancingVectorEnv):
         self._size = (interface.action.shape or (1,))[0]
         if not self._flying:
             self.over = np.zeros(num_envs, bool)
-        self._no_actions = np.zeros((num_envs, self._size), np.float32)
+            self._idle = np.ones(num_envs, bool)  # whom no reset has begun
+        self._no_actions: np.ndarray = np.zeros((num_envs, self._size), np.float32)
 
     def _seeds(self, seed: Any) -> np.ndarray | None:
         seeds = checked_seeds(seed, self.num_envs, MAX_UINT64)

@@ -299,11 +299,12 @@ class Flight:
         agent = self.agent
         before = [(s, s.sequence) if s else (None, 0) for s in agent.places]
         seats = {s.peer: place for place, s in enumerate(agent.places) if s}
-        expect(agent._seats == seats, "seats", agent._seats, seats)
-        sent = len(agent._outgoing)
+        kept = agent._admission.seats
+        expect(kept == seats, "seats", kept, seats)
+        sent = len(agent._outbox.datagrams)
         event = agent.receive(datagram, address, self.now)
-        expect(len(agent._outgoing) <= sent + 1, "more answers than one")
-        self.opened = self.opened or ADDRESSES[2] in agent._seats
+        expect(len(agent._outbox.datagrams) <= sent + 1, "more answers than one")
+        self.opened = self.opened or ADDRESSES[2] in kept
         if event is None:
             expect([s for s, _ in before] == agent.places, "a place changed without a word")
             return

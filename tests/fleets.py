@@ -1,0 +1,96 @@
+"""A RemoteVectorEnv for the tests, its simulators, and local envs to compare it with."""
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import rotorgram.envs
+from gymnasium import spaces
+from gymnasium.vector import VectorEnv
+from peers import ANY, ENV_ID, Running
+from rotorgram.udp import (
+    LinkConfig,
+    RemoteVectorEnv,
+    Simulator,
+)
+
+QUICK = LinkConfig(timeout=10, first_resend=0.02, max_resend=0.2)
+NAMES = rotorgram.envs.TELEMETRY_NAMES
+
+
+@contextmanager
+def flying(
+    simulators: int, drones: int, env: str = ENV_ID, autoreset: str = "NextStep", **options: Any
+) -> Iterator[tuple[RemoteVectorEnv, list[Running]]]:
+    """A RemoteVectorEnv, and simulators for it in threads."""
+    remote = RemoteVectorEnv(
+        ANY,
+        num_simulators=simulators,
+        num_envs=simulators * drones,
+        env_id=env,
+        autoreset_mode=autoreset,
+        connect=False,
+    )
+    running = [simulate(remote, num_envs=drones, env=env, **options) for _ in range(simulators)]
+    try:
+        yield remote, running
+    finally:
+        remote.close()
+        for one in running:
+            one.join()
+
+
+def simulate(remote: RemoteVectorEnv, config: LinkConfig = QUICK, **arguments: Any) -> Running:
+    return Running(Simulator(server=remote.address, config=config, **{"bind": ANY, **arguments}))
+
+
+@contextmanager
+def sync(num_envs: int, **options: Any) -> Iterator[VectorEnv]:
+    with closing(
+        gym.make_vec(ENV_ID, num_envs=num_envs, vectorization_mode="sync", **options)
+    ) as env:
+        yield env
+
+
+def assert_same(here: tuple, there: tuple, drones: slice = slice(None)) -> None:
+    """What reset or step gave, without the info, bit for bit."""
+    for ours, theirs in zip(here[:-1], there[:-1], strict=True):
+        assert ours.dtype == theirs.dtype
+        assert ours[drones].tobytes() == theirs[drones].tobytes()
+    for name in (name for name in there[-1] if name.lstrip("_") in NAMES):
+        ours, theirs = here[-1][name], there[-1][name]
+        assert ours.dtype == theirs.dtype
+        assert ours[drones].tobytes() == theirs[drones].tobytes()
+
+
+def random_actions(env: VectorEnv, dice: np.random.Generator) -> np.ndarray:
+    shape = env.action_space.shape
+    if isinstance(env.single_action_space, spaces.Discrete):
+        return dice.integers(3, size=shape)
+    return dice.uniform(-1.2, 1.2, shape).astype(np.float32)
+
+
+def assert_parity(remote: VectorEnv, local: VectorEnv, steps: int) -> int:
+    """How many episodes ended on the way."""
+    dice = np.random.default_rng(5)
+    ends = 0
+    for _ in range(steps):
+        actions = random_actions(local, dice)
+        here, there = remote.step(actions), local.step(actions)
+        assert_same(here, there)
+        assert set(here[-1]) == {*NAMES, *(f"_{name}" for name in NAMES)}
+        ends += int((here[2] | here[3]).sum())
+    return ends
+
+
+class Failing(gym.Wrapper):
+    """Raises when it is told to."""
+
+    fails = False
+
+    def step(self, action: Any) -> Any:
+        if self.fails:
+            raise RuntimeError("out of fuel")
+        return super().step(action)

@@ -1,0 +1,84 @@
+"""A RemoteEnv for the tests, and the simulator that flies for it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import rotorgram.envs  # noqa: F401
+from gymnasium import spaces
+from peers import ANY, ENV_ID, Running
+from rotorgram.udp import (
+    LinkConfig,
+    RemoteEnv,
+    Simulator,
+)
+
+QUICK = LinkConfig(timeout=5)
+
+
+@contextmanager
+def flying(env: Any = ENV_ID, codec: Any = "binary", **options: Any) -> Iterator[SimpleNamespace]:
+    """A RemoteEnv, and a simulator for it in a thread."""
+    remote_options = options if codec == "text" else None
+    remote = RemoteEnv(ANY, connect=False, options=remote_options, timeout=5, connect_timeout=5)
+    simulator = Simulator(
+        env, server=remote.address, bind=ANY, codec=codec, config=QUICK, **options
+    )
+    running = Running(simulator)
+    try:
+        yield SimpleNamespace(remote=remote, simulator=simulator, running=running)
+    finally:
+        remote.close()
+        running.join()
+
+
+def assert_parity(remote: gym.Env, local: gym.Env, steps: int, seeds: list[int]) -> None:
+    """The same seeds and actions give the same bits."""
+    dice = np.random.default_rng(5)
+    names = local.unwrapped.telemetry_names
+
+    def same(here: tuple, there: tuple) -> None:
+        assert here[0].tobytes() == there[0].tobytes()
+        assert here[0].dtype == there[0].dtype
+        assert here[1:-1] == there[1:-1]
+        assert [type(v) for v in here[1:-1]] == [type(v) for v in there[1:-1]]
+        assert {name: there[-1][name] for name in names} == here[-1]
+
+    same(remote.reset(seed=seeds[0]), local.reset(seed=seeds[0]))
+    ends = 0
+    for _ in range(steps):
+        if isinstance(local.action_space, spaces.Discrete):
+            action: Any = int(dice.integers(3))
+        else:
+            action = dice.uniform(-1.2, 1.2, 1).astype(np.float32)
+        here, there = remote.step(action), local.step(action)
+        same(here, there)
+        if here[2] or here[3]:
+            ends += 1
+            seed = seeds[ends] if ends < len(seeds) else None
+            same(remote.reset(seed=seed), local.reset(seed=seed))
+    assert ends >= len(seeds)
+
+
+class Broken(gym.Env[np.ndarray, np.ndarray]):
+    """Raises, or goes bad, at the third step."""
+
+    observation_space = spaces.Box(-1, 1, (1,), np.float32)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+    spec = SimpleNamespace(id=ENV_ID)  # type: ignore[assignment]
+
+    def __init__(self, value: float | None) -> None:
+        self.value, self.steps = value, 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.steps += 1
+        if self.steps == 3 and self.value is None:
+            raise RuntimeError("bad state\n" + "x" * 600)
+        value = self.value if self.steps == 3 else 0.0
+        return np.array([value], np.float32), 0.0, False, False, {}

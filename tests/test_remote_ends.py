@@ -1,0 +1,410 @@
+"""One drone over real sockets: silence, restarts and ends on either side."""
+
+import errno
+import gc
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import rotorgram.envs  # noqa: F401
+from peers import ANY, ENV_ID, Running, launch, plain_socket
+from remotes import QUICK, Broken, assert_parity, flying
+from rotorgram.udp import (
+    LinkConfig,
+    LinkError,
+    PeerClosed,
+    PeerSilent,
+    Refused,
+    RemoteEnv,
+    Simulator,
+    binary,
+    sockets,
+)
+from rotorgram.udp.messages import Close, Hello, Welcome
+
+# ---- silence and ends
+
+
+def test_no_simulator_comes() -> None:
+    start = time.monotonic()
+    with pytest.raises(PeerSilent, match=r"no simulator came to 127.0.0.1:\d+ for 0.2 s"):
+        RemoteEnv(ANY, connect_timeout=0.2)
+    assert time.monotonic() - start < 2
+
+
+def test_nothing_listens() -> None:
+    with plain_socket() as sock:
+        port = sock.getsockname()[1]
+    for codec, what in (("binary", "Hello"), ("text", "State 1")):
+        with Simulator(
+            server=("127.0.0.1", port), bind=ANY, codec=codec, config=LinkConfig(timeout=0.5)
+        ) as simulator:
+            with pytest.raises(PeerSilent) as caught:
+                simulator.run()
+            with pytest.raises(ValueError, match="run: expected one call"):
+                simulator.run()
+        assert re.fullmatch(
+            rf"no answer from the agent at 127.0.0.1:{port} for 0.5 s, {what} sent \d+ times; "
+            "nothing listens on that port",
+            str(caught.value),
+        )
+
+
+def test_an_agent_that_hears_but_never_answers() -> None:
+    with plain_socket() as sock:
+        simulator = Simulator(
+            server=sock.getsockname(), bind=ANY, config=LinkConfig(timeout=0.3, first_resend=0.1)
+        )
+        running = Running(simulator)
+        error = running.join()
+        assert isinstance(error, PeerSilent)
+        sends = int(re.findall(r"for 0.3 s, Hello sent (\d+) times", str(error))[0])
+        datagrams = [sock.recv(65507) for _ in range(sends)]
+        sock.setblocking(False)
+        with pytest.raises(BlockingIOError):  # who was not welcome does not take leave
+            sock.recv(65507)
+    assert len(set(datagrams)) == 1
+    assert isinstance(binary.decode(datagrams[0]), Hello)
+
+
+def test_an_agent_that_falls_silent_is_told() -> None:
+    with plain_socket() as sock:
+        simulator = Simulator(
+            server=sock.getsockname(), bind=ANY, config=LinkConfig(timeout=0.3, first_resend=0.1)
+        )
+        running = Running(simulator)
+        hello, address = sock.recvfrom(65507)
+        welcome = Welcome(session=binary.decode(hello).session)
+        sock.sendto(binary.encode(welcome), address)
+        error = running.join()
+        assert isinstance(error, PeerSilent)
+        sends = int(re.findall(r"for 0.3 s, State 1 sent (\d+) times", str(error))[0])
+        states = [sock.recv(65507) for _ in range(sends)]
+        goodbyes = [sock.recv(65507) for _ in range(5)]  # of ten: nobody answers
+    assert len(set(states)) == len(set(goodbyes)) == 1
+    goodbye = binary.decode(goodbyes[0])
+    assert isinstance(goodbye, Close)
+    assert goodbye.reason == "no answer from the agent for 0.3 s"
+
+
+def test_a_flood_of_junk_does_not_extend_either_wait() -> None:
+    stop = threading.Event()
+
+    def flood(sock: socket.socket, target: Any) -> None:
+        while not stop.is_set():
+            sock.sendto(b"junk", target)
+            time.sleep(1e-4)
+
+    with plain_socket() as sock, plain_socket() as stranger:
+        simulator = Simulator(server=sock.getsockname(), bind=ANY, config=LinkConfig(timeout=0.5))
+        remote = RemoteEnv(ANY, connect=False, connect_timeout=0.5)
+        threads = [
+            threading.Thread(target=flood, args=pair)
+            for pair in ((sock, simulator.address), (stranger, remote.address))
+        ]
+        for thread in threads:
+            thread.start()
+        start = time.monotonic()
+        try:
+            with pytest.raises(PeerSilent, match="last datagram dropped: malformed"):
+                simulator.run()
+            with pytest.raises(PeerSilent, match="last datagram dropped: malformed from 127"):
+                remote.connect()
+        finally:
+            stop.set()
+            for thread in threads:
+                thread.join()
+        assert time.monotonic() - start < 4
+        assert simulator.link.statistics.counters["malformed"] > 10
+        simulator.close()
+        remote.close()
+
+
+def test_a_wait_may_be_longer_than_the_system_waits_in_one_go(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sockets, "_LONGEST", 0.02)
+    start = time.monotonic()
+    with pytest.raises(PeerSilent, match=r"for 0\.2 s"):
+        RemoteEnv(ANY, connect_timeout=0.2)
+    assert 0.2 <= time.monotonic() - start < 2
+    with sockets.open_socket(ANY, insecure=False) as sock, pytest.raises(TimeoutError):
+        sockets.receive(sock, 1e300)
+
+
+class Interrupted(socket.socket):
+    def settimeout(self, value: float | None) -> None:
+        super().settimeout(value)
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_wait_leaves_the_socket_as_it_was() -> None:
+    with Interrupted(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(ANY)
+        sock.setblocking(False)
+        with pytest.raises(KeyboardInterrupt):
+            sockets.receive(sock, 0.1)
+        assert sock.gettimeout() == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_signals_neither_end_nor_extend_a_wait() -> None:
+    before = signal.signal(signal.SIGALRM, lambda *_: None)
+    try:
+        with sockets.open_socket(ANY, insecure=False) as sock:
+            signal.setitimer(signal.ITIMER_REAL, 0.005, 0.005)
+            start = time.monotonic()
+            with pytest.raises(TimeoutError):
+                sockets.receive(sock, 0.1)
+            assert 0.1 <= time.monotonic() - start < 1
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_empty_and_largest_datagrams_are_counted_and_dropped() -> None:
+    with RemoteEnv(ANY, connect=False, connect_timeout=0.1) as remote, plain_socket() as sock:
+        for datagram in (b"", bytes(65507)):
+            sock.sendto(datagram, remote.address)
+            with pytest.raises(PeerSilent, match="last datagram dropped: malformed"):
+                remote.connect()
+        assert remote.statistics.counters == {"received": 2, "malformed": 2}
+
+
+def test_no_way_to_the_agent_is_like_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = [OSError(errno.EHOSTUNREACH, "No route to host")]  # a firewall rejects, for example
+
+    def receive(sock: socket.socket, timeout: float) -> Any:
+        if errors:
+            raise errors.pop()
+        return sockets.receive(sock, timeout)
+
+    monkeypatch.setattr("rotorgram.udp.simulator.receive", receive)
+    with plain_socket() as sock:
+        address = sock.getsockname()
+        with Simulator(server=address, bind=ANY, config=LinkConfig(timeout=0.3)) as simulator:
+            sentence = r"Hello sent \d times; receiving failed: No route to host"
+            with pytest.raises(PeerSilent, match=sentence):
+                simulator.run()
+
+
+def test_closed_by_another_thread_while_it_waits() -> None:
+    remote = RemoteEnv(ANY, connect=False, connect_timeout=0.3)
+    closing = threading.Timer(0.05, remote.close)
+    closing.start()
+    with pytest.raises(gym.error.ClosedEnvironmentError, match="the env was closed"):
+        remote.connect()
+    closing.join()
+    with plain_socket() as sock:
+        simulator = Simulator(server=sock.getsockname(), bind=ANY, config=QUICK)
+        closing = threading.Timer(0.05, simulator.close)
+        closing.start()
+        with pytest.raises(OSError) as caught:
+            simulator.run()
+        assert caught.value.errno == errno.EBADF
+        closing.join()
+
+
+def test_a_simulator_that_falls_silent() -> None:
+    with RemoteEnv(ANY, connect=False, connect_timeout=1, timeout=0.5) as remote:
+        running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))
+        remote.reset(seed=0)
+        running.cut()
+        gone = (
+            r"no datagram from the simulator at 127.0.0.1:\d+ for 0.5 s, "
+            r"waiting at 127.0.0.1:\d+ for State 3"
+        )
+        start = time.monotonic()
+        with pytest.raises(PeerSilent, match=rf"^{gone}; no other came to 127.0.0.1:\d+ for 1 s$"):
+            remote.step(np.zeros(1))
+        assert 1.5 <= time.monotonic() - start < 2.5
+        with pytest.raises(gym.error.ResetNeeded):
+            remote.step(np.zeros(1))
+        with pytest.raises(PeerSilent, match=f"^{gone}; no other came"):  # a reset waits again
+            remote.reset()
+        running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))
+        local = gym.make(ENV_ID)
+        assert remote.reset(seed=3)[0].tobytes() == local.reset(seed=3)[0].tobytes()
+    assert running.join() == "the agent closed"
+
+
+def test_a_reset_after_a_close_waits_for_another_simulator() -> None:
+    with RemoteEnv(ANY, connect=False, connect_timeout=0.5) as remote:
+        for _ in range(2):
+            running = Running(Simulator(Broken(None), server=remote.address, bind=ANY))
+            remote.reset()
+            remote.step(np.zeros(1))
+            remote.step(np.zeros(1))
+            with pytest.raises(PeerClosed, match="RuntimeError: bad state"):
+                remote.step(np.zeros(1))
+            with pytest.raises(gym.error.ResetNeeded):
+                remote.step(np.zeros(1))
+            running.join()
+        sentence = r"closed: RuntimeError: bad state x+; no other came to 127.0.0.1:\d+ for 0.5 s$"
+        with pytest.raises(PeerSilent, match=sentence):
+            remote.reset()
+
+
+def test_a_simulator_that_is_started_anew_at_the_same_address() -> None:
+    with RemoteEnv(ANY, connect=False, timeout=10) as remote:
+        running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))
+        remote.reset(seed=0)
+        before = remote.step(np.ones(1))
+        here = running.simulator.address
+        running.cut()
+        running = Running(Simulator(server=remote.address, bind=here, config=QUICK))
+        after = remote.step(np.ones(1))
+        assert after[0].tobytes() == before[0].tobytes()
+        assert after[1:4] == (0.0, False, True)
+        reason = f"the simulator at 127.0.0.1:{here[1]} was started anew"
+        assert after[4] == {**before[4], "simulator_lost": reason}
+        with pytest.raises(gym.error.ResetNeeded):
+            remote.step(np.ones(1))
+        local = gym.make(ENV_ID)
+        assert_parity(remote, local, 300, [5])
+        running.cut()  # the next reset meets the new one
+        running = Running(Simulator(server=remote.address, bind=here, config=QUICK))
+        assert_parity(remote, local, 300, [6])
+        assert remote.statistics.counters["sessions"] == 3
+    assert running.join() == "the agent closed"
+
+
+def test_a_second_simulator_waits_until_the_first_has_left(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with RemoteEnv(ANY, connect=False, timeout=5) as remote:
+        first = Running(Simulator(Broken(None), server=remote.address, bind=ANY, config=QUICK))
+        remote.reset()
+        # Its timeout is shorter than the wait: it does not run while the agent says Wait.
+        config = LinkConfig(timeout=0.6, first_resend=0.05, max_resend=0.2)
+        second = Running(Simulator(Broken(0.0), server=remote.address, bind=ANY, config=config))
+        until = time.monotonic() + 1.2
+        while time.monotonic() < until:
+            remote.reset()
+            time.sleep(0.02)
+        remote.step(np.zeros(1))
+        remote.step(np.zeros(1))
+        with pytest.raises(PeerClosed, match="bad state"):
+            remote.step(np.zeros(1))
+        remote.reset()
+        remote.step(np.zeros(1))
+        assert remote.statistics.counters["refused"] == 0
+        first.join()
+    assert second.join() == "the agent closed"
+    assert "every place at the agent is taken; waiting for a free one" in caplog.text
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_the_simulator_program_ends_on_sigterm_and_tells_the_agent() -> None:
+    with RemoteEnv(ANY, connect=False, connect_timeout=20, timeout=10) as remote:
+        arguments = json.dumps({"server": remote.address, "bind": ANY})
+        process = subprocess.Popen([sys.executable, "-m", "rotorgram.udp", arguments])
+        remote.reset(seed=0)
+        process.send_signal(signal.SIGINT)  # Ctrl-C is for the agent
+        remote.step(np.zeros(1))
+        process.send_signal(signal.SIGTERM)
+        with pytest.raises(PeerClosed, match="closed: the simulator was stopped"):
+            remote.reset()
+        assert process.wait(10) == 128 + signal.SIGTERM
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_ctrl_c_at_the_agent_tells_the_simulator() -> None:
+    agent = launch(
+        """
+        import time
+        from rotorgram.udp import RemoteEnv
+        env = RemoteEnv(("127.0.0.1", 0), connect=False)
+        print(env.address[1], flush=True)
+        env.reset()
+        print("flying", flush=True)
+        time.sleep(60)
+        """
+    )
+    assert agent.stdout is not None
+    port = int(agent.stdout.readline())
+    running = Running(Simulator(server=("127.0.0.1", port), bind=ANY, config=QUICK))
+    assert agent.stdout.readline() == "flying\n"
+    agent.send_signal(signal.SIGINT)
+    _, err = agent.communicate(timeout=10)
+    assert "KeyboardInterrupt" in err
+    assert running.join() == "the agent closed"
+
+
+def test_a_forgotten_env_tells_the_simulator() -> None:
+    remote = RemoteEnv(ANY, connect=False)
+    running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))
+    remote.reset()
+    del remote
+    gc.collect()
+    assert running.join() == "the agent closed"
+
+
+def test_a_simulator_that_waits_is_told_when_the_agent_closes() -> None:
+    with flying() as pair:
+        pair.remote.reset()
+        waiting = Running(Simulator(server=pair.remote.address, bind=ANY, config=QUICK))
+        until = time.monotonic() + 5
+        while not waiting.simulator.link.statistics.counters["received"]:
+            assert time.monotonic() < until
+            pair.remote.reset()
+        pair.remote.close()
+        error = waiting.join()
+        assert isinstance(error, Refused)
+        assert str(error).endswith(" refused: the agent closed")
+
+
+@pytest.mark.parametrize("codec", ["binary", "text"])
+@pytest.mark.parametrize(
+    ("value", "sentence"),
+    [
+        (None, "RuntimeError: bad state x+"),
+        (np.nan, "ValueError: observations: expected finite"),
+    ],
+)
+def test_an_env_that_fails(codec: Any, value: float | None, sentence: str) -> None:
+    remote = RemoteEnv(
+        ANY, connect=False, options={"observation": "error"} if codec == "text" else None
+    )
+    env = Broken(value)
+    if codec == "text":
+        env.telemetry_names = remote._names  # type: ignore[attr-defined]
+        info = dict.fromkeys(remote._names, 0.0)
+        reset, step = env.reset, env.step
+        env.reset = lambda **k: (reset(**k)[0], info)  # type: ignore[method-assign]
+        env.step = lambda action: (*step(action)[:4], info)  # type: ignore[method-assign]
+    running = Running(Simulator(env, server=remote.address, bind=ANY, codec=codec, config=QUICK))
+    remote.reset()
+    remote.step(np.zeros(1))
+    remote.step(np.zeros(1))
+    if codec == "text":
+        sentence = "the simulator closed"
+    with pytest.raises(PeerClosed, match=f"the simulator at .* closed: {sentence}"):
+        remote.step(np.zeros(1))
+    assert isinstance(running.join(), RuntimeError if value is None else ValueError)
+    remote.close()
+
+
+def test_an_agent_that_flies_on_after_the_end() -> None:
+    with plain_socket() as sock:
+        simulator = Simulator(
+            server=sock.getsockname(), bind=ANY, codec="text", config=QUICK, episode_length=1
+        )
+        running = Running(simulator)
+        for sequence in (1, 2):
+            line, address = sock.recvfrom(1024)
+            sock.sendto(f"{sequence},0.0".encode(), address)
+        assert b"2," in line
+        assert sock.recv(1024) == b"2,close"
+    error = running.join()
+    assert isinstance(error, LinkError)
+    assert "an action came for drone 0 after the end of its episode: expected a reset" in str(error)

@@ -1,0 +1,326 @@
+"""Many drones of one or several simulators: places, and simulators that are lost."""
+
+import json
+import logging
+import re
+import time
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from fleets import (
+    Failing,
+    assert_parity,
+    assert_same,
+    flying,
+    random_actions,
+    simulate,
+    sync,
+)
+from peers import ANY, ENV_ID, launch, plain_socket
+from rotorgram.udp import (
+    LinkConfig,
+    PeerClosed,
+    PeerSilent,
+    Refused,
+    RemoteVectorEnv,
+    binary,
+)
+from rotorgram.udp.fleet import describe, make_env
+from rotorgram.udp.messages import Wait
+
+SIMULATE = """
+    import json, sys
+    from rotorgram.udp import LinkConfig, Simulator
+    arguments = json.loads(sys.argv[1])
+    for name in ("server", "bind"):
+        arguments[name] = tuple(arguments[name])
+    config = LinkConfig(timeout=20, first_resend=0.02, max_resend=0.2)
+    with Simulator(config=config, **arguments) as simulator:
+        print(simulator.address[1], flush=True)
+        print(simulator.run())
+"""
+
+
+# ---- places
+
+
+def test_a_place_that_stays_free() -> None:
+    remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=2, connect=False, connect_timeout=0.4)
+    running = simulate(remote)
+    sentence = rf"^no simulator came to 127.0.0.1:{remote.address[1]} for 0.4 s"
+    for _ in range(2):
+        with pytest.raises(PeerSilent, match=sentence):
+            remote.reset()
+    other = simulate(remote)
+    with sync(2) as local:
+        assert_same(remote.reset(seed=5), local.reset(seed=5))
+    remote.close()
+    assert running.join() == other.join() == "the agent closed"
+
+
+def test_a_late_simulator_waits_until_another_leaves(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    # Its timeout is shorter than its wait: it does not run while the agent says Wait.
+    config = LinkConfig(timeout=0.5, first_resend=0.05, max_resend=0.1)
+    with flying(2, 2) as (remote, running):
+        remote.reset(seed=3)
+        late = simulate(remote, config, num_envs=2)
+        start = time.monotonic()
+        while time.monotonic() - start < 1:
+            remote.step(np.zeros((4, 1)))
+            time.sleep(0.02)
+        assert late.simulator.link.state == "hello"
+        assert late.simulator.link.statistics.counters["refused"] == 0
+        assert "every place at the agent is taken; waiting for a free one" in caplog.text
+        running[0].cut()
+        remote._server.config = replace(remote._server.config, timeout=0.3)
+        *_, truncated, info = remote.step(np.zeros((4, 1)))
+        assert truncated.sum() == 2
+        assert late.simulator.link.state == "waiting"
+        reason = info["simulator_lost"][truncated][0]
+        assert reason.startswith("no datagram from the simulator at 127.0.0.1:")
+        remote.step(np.zeros((4, 1)))
+    assert late.join() == "the agent closed"
+
+
+def test_a_stranger_is_told_to_wait_with_no_more_bytes_than_he_sent() -> None:
+    with flying(1, 2) as (remote, _), plain_socket() as stranger:
+        remote.reset()
+        hello = describe(make_env(ENV_ID, {}), 2)
+        stranger.sendto(binary.encode(hello), remote.address)
+        answer = b""
+        stranger.setblocking(False)
+        until = time.monotonic() + 5
+        while not answer and time.monotonic() < until:
+            remote.step(np.zeros((2, 1)))
+            try:
+                answer = stranger.recv(65507)
+            except BlockingIOError:
+                time.sleep(0.01)
+        message = binary.decode(answer)
+        assert isinstance(message, Wait)
+        assert message.session == hello.session
+        assert len(answer) <= len(binary.encode(hello))
+
+
+class Slow(gym.Wrapper):
+    def step(self, action: Any) -> Any:
+        time.sleep(0.02)
+        return super().step(action)
+
+
+def test_a_slow_simulator_only_delays() -> None:
+    remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=2, connect=False)
+    running = [
+        simulate(remote),
+        simulate(remote, env=Slow(gym.make(ENV_ID, disable_env_checker=True))),
+    ]
+    with closing(remote), sync(2) as local:
+        assert_same(remote.reset(seed=8), local.reset(seed=8))
+        start = time.monotonic()
+        assert_parity(remote, local, 30)
+        assert time.monotonic() - start >= 0.6
+    assert [one.join() for one in running] == ["the agent closed"] * 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"num_envs": 1}, "expected a simulator of 2 drones, got one of 1"),
+        ({"num_envs": 3}, "expected a simulator of 2 drones, got one of 3"),
+        ({"num_envs": 2, "env": "CartPole-v1"}, f"expected a simulator of {ENV_ID}, got one of"),
+        ({"num_envs": 2, "linear_drag": 0.5}, "expected linear_drag 0.0, got 0.5"),
+        ({"num_envs": 2, "observation": "error"}, "expected observation 'full', got 'error'"),
+    ],
+)
+def test_another_kind_of_simulator_is_refused(arguments: dict[str, Any], sentence: str) -> None:
+    """With a place still free; what counts is the first that came, and the number asked for."""
+    remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=4, connect=False, connect_timeout=0.5)
+    good = simulate(remote, num_envs=2)
+    with pytest.raises(PeerSilent):
+        remote.reset()
+    bad = simulate(remote, **arguments)
+    with pytest.raises(PeerSilent, match=f"last datagram dropped: refused from .*{sentence}"):
+        remote.reset()
+    error = bad.join()
+    assert isinstance(error, Refused)
+    assert re.search(sentence, str(error))
+    other = simulate(remote, num_envs=2)
+    remote.reset()
+    remote.close()
+    assert good.join() == other.join() == "the agent closed"
+
+
+def test_a_text_simulator_is_turned_away_where_two_drones_are_expected() -> None:
+    remote = RemoteVectorEnv(ANY, num_simulators=1, num_envs=2, connect=False, connect_timeout=0.5)
+    line = b"1,0.0,0,0,1,1,1," + b"0," * 9 + b"0"
+    with plain_socket() as sock:
+        sock.sendto(line, remote.address)
+        with pytest.raises(PeerSilent):
+            remote.reset()
+        assert sock.recv(1024) == b"1,close"
+    remote.close()
+
+
+def test_text_simulators_fly_as_well() -> None:
+    remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=2, connect=False)
+    running = [simulate(remote, codec="text") for _ in range(2)]
+    with closing(remote), sync(2) as local:
+        assert_same(remote.reset(seed=2), local.reset(seed=2))
+        assert assert_parity(remote, local, 300) >= 2
+    assert [one.join() for one in running] == ["the agent closed"] * 2
+
+
+# ---- lost simulators
+
+
+def test_all_simulators_close() -> None:
+    envs = [Failing(gym.make(ENV_ID, disable_env_checker=True)) for _ in range(2)]
+    remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=2, connect=False, connect_timeout=5)
+    running = [simulate(remote, env=env) for env in envs]
+    actions = np.zeros((2, 1))
+    remote.reset(seed=0)
+    remote.step(actions)
+    for env in envs:
+        env.fails = True
+    sentence = r"the simulator at 127.0.0.1:\d+ closed: RuntimeError: out of fuel"
+    with pytest.raises(PeerClosed, match=sentence):
+        remote.step(actions)
+    with pytest.raises(gym.error.ResetNeeded):
+        remote.step(actions)
+    assert [str(one.join()) for one in running] == ["out of fuel"] * 2
+    running = [simulate(remote) for _ in envs]  # a reset waits for others
+    with sync(2) as local:
+        assert_same(remote.reset(seed=0), local.reset(seed=0))
+        assert_parity(remote, local, 10)
+    remote.close()
+    assert [one.join() for one in running] == ["the agent closed"] * 2
+
+
+def test_one_simulator_closes_and_no_other_comes() -> None:
+    env = Failing(gym.make(ENV_ID, disable_env_checker=True))
+    remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=2, connect=False, connect_timeout=0.5)
+    running = [simulate(remote), simulate(remote, env=env)]
+    remote.reset(seed=0)
+    env.fails = True
+    sentence = (
+        r"^the simulator at 127.0.0.1:\d+ closed: RuntimeError: out of fuel; "
+        rf"no other came to 127.0.0.1:{remote.address[1]} for 0.5 s$"
+    )
+    with pytest.raises(PeerSilent, match=sentence):
+        remote.step(np.zeros((2, 1)))
+    running[1].join()
+    running[1] = simulate(remote)
+    with sync(2) as local:
+        assert_same(remote.reset(seed=1), local.reset(seed=1))
+        assert_parity(remote, local, 10)
+    remote.close()
+    assert [one.join() for one in running] == ["the agent closed"] * 2
+
+
+@pytest.mark.parametrize("how", ["another waits", "same address", "comes later"])
+def test_a_killed_simulator_takes_only_its_own_drones_along(how: str) -> None:
+    """Three simulators of two drones; the others' numbers are those of a flight without it."""
+    options = {"episode_length": 40}
+    same = how == "same address"
+    remote = RemoteVectorEnv(
+        ANY, num_simulators=3, num_envs=6, connect=False, timeout=10 if same else 0.5
+    )
+    with ExitStack() as stack:
+        stack.callback(remote.close)
+
+        def start(bind: tuple[str, int] = ANY) -> Any:
+            arguments = {"server": remote.address, "bind": bind, "num_envs": 2, **options}
+            process = launch(SIMULATE, json.dumps(arguments))
+            stack.callback(process.communicate)
+            stack.callback(process.kill)
+            return process
+
+        processes = [start() for _ in range(3)]
+        ports = [int(process.stdout.readline()) for process in processes]
+        local = stack.enter_context(sync(6, **options))
+        assert_same(remote.reset(seed=6), local.reset(seed=6))
+        assert assert_parity(remote, local, 65) == 6
+        place = 1
+        session = remote._server.link.places[place]
+        assert session is not None
+        port = session.peer[1]
+        if how == "another waits":
+            processes.append(start())
+            assert processes[3].stdout.readline()
+        victim = processes.pop(ports.index(port))
+        before = local.step(np.zeros((6, 1), np.float32))
+        assert_same(remote.step(np.zeros((6, 1))), before)
+        victim.kill()
+        victim.wait()
+        if how != "another waits":
+            processes.append(start(("127.0.0.1", port) if same else ANY))
+        drones, others = slice(2, 4), np.array([0, 1, 4, 5])
+        actions = np.full((6, 1), 0.3, np.float32)
+        here, there = remote.step(actions), local.step(actions)
+        assert_same(here, there, others)
+        assert_same((here[0], here[-1]), (before[0], before[-1]), drones)
+        assert here[1][drones].tolist() == [0.0, 0.0]
+        assert here[2].tolist() == [False] * 6
+        assert here[3].tolist() == [False, False, True, True, False, False]
+        assert here[4]["_simulator_lost"].tolist() == here[3].tolist()
+        reasons = here[4]["simulator_lost"].tolist()
+        assert reasons[2] == reasons[3]
+        assert reasons[:2] == reasons[4:] == [None, None]
+        if same:
+            assert reasons[2] == f"the simulator at 127.0.0.1:{port} was started anew"
+        else:
+            sentence = f"no datagram from the simulator at 127.0.0.1:{port} for 0.5 s, waiting at "
+            assert reasons[2].startswith(sentence)
+        # The others fly on as if nothing had been; the new ones begin with a reset.
+        actions = np.full((6, 1), -0.2, np.float32)
+        here, there = remote.step(actions), local.step(actions)
+        assert_same(here, there, others)
+        assert here[1][drones].tolist() == [0.0, 0.0]
+        assert (here[0][drones, 1:] == 0).all()
+        assert "simulator_lost" not in here[4]
+        dice = np.random.default_rng(0)
+        for _ in range(100):
+            actions = random_actions(local, dice)
+            assert_same(remote.step(actions), local.step(actions), others)
+        # And all of them obey a seed.
+        assert_same(remote.reset(seed=1), local.reset(seed=1))
+        assert_parity(remote, local, 50)
+        assert remote.statistics.counters["sessions"] == 4
+        remote.close()
+        for process in processes:
+            out, err = process.communicate(timeout=10)
+            assert process.returncode == 0, err
+            assert out.endswith("the agent closed\n")
+
+
+def test_a_simulator_lost_between_an_episode_and_the_next() -> None:
+    """Its drones were to be reset anyway: they are, by its successor, and no episode is cut."""
+    with flying(2, 1, episode_length=3) as (remote, running):
+        remote.reset(seed=0)
+        for _ in range(3):
+            *_, truncated, _ = remote.step(np.zeros((2, 1)))
+        assert truncated.all()
+        here = running[1].simulator.address
+        running[1].cut()
+        running.append(simulate(remote, bind=here, episode_length=3))
+        observations, rewards, terminated, truncated, info = remote.step(np.zeros((2, 1)))
+        assert rewards.tolist() == [0.0, 0.0]
+        assert not (terminated | truncated).any()
+        assert "simulator_lost" not in info
+        assert (observations[:, 1:] == 0).all()
+        del running[1]
+
+
+def test_a_simulator_lost_during_a_reset_is_replaced_and_seeded() -> None:
+    with flying(2, 1) as (remote, running), sync(2) as local:
+        remote.reset(seed=0)
+        here = running[0].simulator.address
+        running[0].cut()
+        running[0] = simulate(remote, bind=here)
+        assert_same(remote.reset(seed=9), local.reset(seed=9))
+        assert assert_parity(remote, local, 260) >= 2
