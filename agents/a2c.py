@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from .learner import Learner, seeds_of, sizes
+from .learner import Learner, Terms, seeds_of, sizes
 from .networks import Actor, Critic
 from .policies import NetworkPolicy
 from .presets import A2CConfig
@@ -51,17 +51,25 @@ class A2C(Learner):
         config = self.config
         observations = torch.from_numpy(rollout.observations)
         values = self._critic(observations)
-        advantage = self.advantages(rollout, values.detach().numpy())
-        targets = torch.from_numpy(advantage.astype(np.float32)) + values.detach()
+        held = values.detach()
+        advantage = self.advantages(rollout, held.numpy())
+        targets = torch.from_numpy(advantage.astype(np.float32)) + held
         if config.normalize and len(advantage) > 1:
             advantage = (advantage - advantage.mean()) / (advantage.std(ddof=1) + 1e-8)
         log_probability, entropy = self._actor.score(
             observations, torch.from_numpy(rollout.actions)
         )
-        gain = log_probability * torch.from_numpy(advantage.astype(np.float32))
+        gain = (log_probability * torch.from_numpy(advantage.astype(np.float32))).mean()
         value_loss = (targets - values).square().mean()
         bonus = config.entropy_weight * entropy.mean()
-        loss: torch.Tensor = config.value_weight * value_loss - gain.mean() - bonus
+        loss: torch.Tensor = config.value_weight * value_loss - gain - bonus
+        self.terms = Terms(
+            gain=gain.detach(),
+            entropy=entropy.detach(),
+            value_loss=value_loss.detach(),
+            values=held,
+            targets=targets,
+        )
         return loss
 
     def advantages(self, rollout: Rollout, values: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,17 +20,19 @@ __all__ = [
     "AnyLog",
     "Learner",
     "OnUpdate",
+    "Terms",
     "optimizer_arrays",
     "seeds_of",
     "set_optimizer_arrays",
     "sizes",
+    "updates_of",
 ]
 
 AnyLog = EpisodeLog | VectorEpisodeLog
 """What a training flies through: one drone or many."""
 
 OnUpdate = Callable[[], bool]
-"""Called after every update; training stops where it returns False."""
+"""Called after every rollout and its update; training stops where it returns False."""
 
 
 class Agent(Protocol):
@@ -50,9 +53,48 @@ class Agent(Protocol):
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over a state."""
 
+    def scalars(self) -> dict[str, float]:
+        """Numbers of the last update under SB3's names, `train/…`; none before the first.
+
+        `docs/algorithms/README.md` has the table. One that is not defined is NaN.
+        """
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Terms:
+    """What the loss of an update was made of, kept as tensors: few updates are asked for numbers.
+
+    Those of the critic are None where there is none.
+    """
+
+    gain: torch.Tensor
+    """Mean of weight · log P, which the actor climbs."""
+    entropy: torch.Tensor
+    """Of the policy at each step, nats: shape (T,)."""
+    value_loss: torch.Tensor | None = None
+    """Mean squared error of the values."""
+    values: torch.Tensor | None = None
+    """V(s_t) before the update, shape (T,)."""
+    targets: torch.Tensor | None = None
+    """What they were drawn to, shape (T,)."""
+
+    def numbers(self) -> dict[str, float]:
+        """By SB3's names and with its signs."""
+        numbers = {
+            "train/policy_loss": -float(self.gain),
+            "train/entropy_loss": -float(self.entropy.mean()),
+        }
+        if self.value_loss is not None:
+            numbers["train/value_loss"] = float(self.value_loss)
+        if self.values is not None and self.targets is not None:
+            values, targets = self.values.numpy(), self.targets.numpy()
+            spread, left = float(np.var(targets)), float(np.var(targets - values))
+            numbers["train/explained_variance"] = 1 - left / spread if spread else np.nan
+        return numbers
+
 
 class Learner:
-    """Base of our own algorithms: `collect` and `loss` are theirs.
+    """Base of our own algorithms: `collect` and `loss` are theirs; `loss` sets `terms` too.
 
     Args:
         networks: By name; `actor` is one of them.
@@ -77,9 +119,11 @@ class Learner:
         # foreach: one call for all parameters instead of one for each; same arithmetic.
         self._optimizer = torch.optim.Adam(parameters, lr=learning_rate, foreach=True)
         self._observation: np.ndarray | None = None
+        self.terms: Terms | None = None
+        """Of the last update."""
 
     def collect(self, collector: AnyCollector, policy: NetworkPolicy, most: int) -> Rollout:
-        """Fly for one update, at most so many env steps."""
+        """Fly for one update, at most so many env steps; an empty rollout makes none."""
         raise NotImplementedError
 
     def loss(self, rollout: Rollout) -> torch.Tensor:
@@ -94,17 +138,21 @@ class Learner:
         else:
             collector = Collector(log, self._rng, self._observation)
         while log.env_steps < env_steps:
-            policy = NetworkPolicy(self.actor())
-            rollout = self.collect(collector, policy, env_steps - log.env_steps)
+            policy, before = NetworkPolicy(self.actor()), log.env_steps
+            rollout = self.collect(collector, policy, env_steps - before)
             self._observation = collector.observation
             if self._anneal:
-                self._set_learning_rate(1 - (log.env_steps - len(rollout)) / env_steps)
-            self._optimizer.zero_grad()
-            self.loss(rollout).backward()  # type: ignore[no-untyped-call]
-            self._optimizer.step()
-            self.networks["actor"].clamp_()  # type: ignore[operator]
+                self._set_learning_rate(1 - before / env_steps)
+            if len(rollout):
+                self._update(rollout)
             if not on_update():
                 return
+
+    def _update(self, rollout: Rollout) -> None:
+        self._optimizer.zero_grad()
+        self.loss(rollout).backward()  # type: ignore[no-untyped-call]
+        self._optimizer.step()
+        self.networks["actor"].clamp_()  # type: ignore[operator]
 
     def last_step(self, env_steps: int) -> int:
         """Env steps after which a training of so many ends: all are flown."""
@@ -136,6 +184,19 @@ class Learner:
         set_optimizer_arrays(self._optimizer, state)
         self._rng.bit_generator.state = json.loads(state["rng"].tobytes())
         self._observation = state.get("observation")
+        self.terms = None
+
+    def scalars(self) -> dict[str, float]:
+        """Numbers of the last update under SB3's names; none before the first."""
+        if self.terms is None:
+            return {}
+        numbers = self.terms.numbers()
+        numbers["train/learning_rate"] = self._optimizer.param_groups[0]["lr"]
+        numbers["train/n_updates"] = updates_of(self._optimizer)
+        log_std = self.networks["actor"].log_std
+        if isinstance(log_std, torch.Tensor):  # else the actions are discrete
+            numbers["train/std"] = float(log_std.detach().exp().mean())
+        return numbers
 
     def _set_learning_rate(self, share: float) -> None:
         for group in self._optimizer.param_groups:
@@ -168,6 +229,12 @@ def set_optimizer_arrays(
                 raise ValueError(f"optimizer.{place}.{key}: expected shape {tuple(shape)}")
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": state, "param_groups": groups})
+
+
+def updates_of(optimizer: torch.optim.Optimizer) -> int:
+    """How many steps an Adam has taken."""
+    states = list(optimizer.state.values())
+    return int(states[0]["step"]) if states else 0
 
 
 def _text_array(text: str) -> np.ndarray:

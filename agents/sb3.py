@@ -7,9 +7,17 @@ from typing import Any
 import numpy as np
 import torch
 from stable_baselines3 import A2C
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from .learner import AnyLog, OnUpdate, optimizer_arrays, seeds_of, set_optimizer_arrays
+from .learner import (
+    AnyLog,
+    OnUpdate,
+    optimizer_arrays,
+    seeds_of,
+    set_optimizer_arrays,
+    updates_of,
+)
 from .presets import A2CConfig
 from .sb3_vec import SB3VecEnv
 from .vector_episodes import VectorEpisodeLog
@@ -58,6 +66,8 @@ class SB3A2C:
             },
             device="cpu",
         )
+        # It keeps the numbers of the last update for us; SB3's own makes a folder in /tmp.
+        self._model.set_logger(Logger(folder=None, output_formats=[]))
 
     def train(self, log: AnyLog, env_steps: int, on_update: OnUpdate) -> None:
         """Train until the log counts `env_steps`, or `on_update` returns False.
@@ -113,6 +123,7 @@ class SB3A2C:
              if k.startswith(prefix)}
         )  # fmt: skip
         set_optimizer_arrays(model.policy.optimizer, state)
+        model._n_updates = updates_of(model.policy.optimizer)
         torch.set_rng_state(torch.from_numpy(state["rng.torch"].copy()))
         *keys, place = state["rng.numpy"]
         np.random.set_state(("MT19937", np.array(keys, np.uint32), int(place), 0, 0.0))  # noqa: NPY002
@@ -120,6 +131,11 @@ class SB3A2C:
         if "observation" in state:
             model._last_obs = state["observation"]
             model._last_episode_starts = state["starts"]
+
+    def scalars(self) -> dict[str, float]:
+        """Numbers of the last update, as SB3 logs them; none before the first."""
+        kept = self._model.logger.name_to_value
+        return {name: float(value) for name, value in kept.items() if name.startswith("train/")}
 
 
 class _Stopped(Exception):

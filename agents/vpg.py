@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from .learner import Learner, seeds_of, sizes
+from .learner import Learner, Terms, seeds_of, sizes
 from .networks import Actor
 from .policies import NetworkPolicy
 from .presets import VPGConfig
@@ -47,10 +47,12 @@ class VPG(Learner):
     def loss(self, rollout: Rollout) -> torch.Tensor:
         """Minus the mean of R_t · log P(a_t | s_t)."""
         weights = self.weights(rollout)
-        log_probability, _ = self._actor.score(
+        log_probability, entropy = self._actor.score(
             torch.from_numpy(rollout.observations), torch.from_numpy(rollout.actions)
         )
-        return -(log_probability * torch.from_numpy(weights)).mean()
+        gain = (log_probability * torch.from_numpy(weights)).mean()
+        self.terms = Terms(gain=gain.detach(), entropy=entropy.detach())
+        return -gain
 
     def weights(self, rollout: Rollout) -> np.ndarray:
         """R_t, less a baseline and scaled where the config says so: float32, shape (T,)."""

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import pandas as pd
-from torch.utils.tensorboard import SummaryWriter
 
 from ..agents import preset
 from ..agents.checkpoints import load, software_versions, write_whole
@@ -22,6 +21,7 @@ from ..experiments.training import Run, Training, is_finished
 from ..udp import LinkError
 from .inputs import CHECKPOINT, new_folder, parse_changes, refuse_settings, remote_env
 from .progress import bars
+from .scalars import ScalarWriter
 
 if TYPE_CHECKING:
     from .commands import Train
@@ -95,7 +95,7 @@ def _train(training: Training, folder: Path, command: "Train") -> int:
             finished = training.train(on_update)
             if finished:
                 stop.reached()
-                keeper.keep(now=True)
+                keeper.keep(now=True, last=True)
     except (LinkError, KeyboardInterrupt):
         keeper.close()
         if (folder / CHECKPOINT).exists():
@@ -114,7 +114,8 @@ def _train(training: Training, folder: Path, command: "Train") -> int:
 class _Keeper:
     """Stores a training at its first update, then every so many seconds, and when told to.
 
-    The numbers for TensorBoard are written along with it, under the names that SB3 gives them.
+    The numbers for TensorBoard are written by env steps, not by the clock, so that those of a
+    training that was stopped and resumed stand at the same steps as those of an unbroken one.
     """
 
     def __init__(self, training: Training, folder: Path, every: float) -> None:
@@ -122,41 +123,30 @@ class _Keeper:
         self._folder = folder
         self._every = every
         self._due = 0.0
-        self._board = SummaryWriter(str(folder / "tensorboard"))
+        self._scalars = ScalarWriter(
+            folder / "tensorboard", training.run.env_steps, behind=training.log.env_steps
+        )
 
-    def keep(self, *, now: bool) -> None:
+    def keep(self, *, now: bool, last: bool = False) -> None:
+        at = self._training.log.env_steps
+        if self._scalars.due(at, last=last):
+            self._scalars.write(at, self._training.scalars())
         if now or time.monotonic() >= self._due:
-            # First the episodes: a checkpoint takes those that ended before it.
+            # First the rest: a checkpoint takes the episodes and the curves that end before it.
             self._write_episodes()
+            self._scalars.flush()
             self._training.store(self._folder / CHECKPOINT)
-            self._write_scalars()
             self._due = time.monotonic() + self._every
 
     def close(self) -> None:
         """Write what does not need an update to be whole."""
         self._write_episodes()
-        self._write_scalars()
-        self._board.close()
+        self._scalars.close()
 
     def _write_episodes(self) -> None:
         rows = [asdict(episode) for episode in self._training.log.episodes]
         table = pd.DataFrame(rows, columns=[f.name for f in fields(Episode)])
         write_whole(self._folder / EPISODES, table.to_csv(index=False).encode())
-
-    def _write_scalars(self) -> None:
-        state = self._training.progress()
-        scalars = {
-            "rollout/ep_rew_mean": state.mean_return,
-            "rollout/ep_error_mean": state.mean_abs_error,
-            "time/fps": state.env_steps / state.seconds if state.seconds else math.nan,
-        }
-        statistics = getattr(self._training.env, "statistics", None)
-        if statistics is not None:
-            scalars |= {f"wire/{name}": value for name, value in statistics.numbers().items()}
-        for name, value in scalars.items():
-            if math.isfinite(value):
-                self._board.add_scalar(name, value, state.env_steps)
-        self._board.flush()
 
 
 def _read_episodes(path: Path, count: int) -> list[Episode]:

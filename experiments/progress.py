@@ -31,9 +31,9 @@ class Progress:
     total: int
     seconds: float
     mean_return: float
-    """Of the last episodes; NaN before the first has ended."""
+    """Of the last 20 episodes; NaN before the first has ended. TensorBoard's curve is over 100."""
     mean_abs_error: float
-    """Of the last episodes, m."""
+    """Of the last 20 episodes, m."""
 
     def words(self) -> str:
         """How it goes, for a progress bar."""

@@ -22,7 +22,10 @@ __all__ = ["Run", "Snapshot", "Training", "is_finished"]
 
 AnyEnv = gym.Env[np.ndarray, Any] | AdvancingVectorEnv
 
-_RECENT = 20  # episodes that a progress report averages over
+# Episodes to average over, but no fewer than one of each drone: of those that are under way together
+# the shortest end first, and the last few to end are those that flew longest.
+_RECENT = 20  # in a progress report: it tells how it goes now
+_WINDOW = 100  # in a point of a curve: SB3's `stats_window_size`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +49,8 @@ class Run:
         least = 1
         if isinstance(self.config, A2CConfig):
             least = self.config.rollout_size(self.num_envs)
+        elif self.num_envs > 1:  # a whole episode of each
+            least = self.num_envs * self.env.episode_length
         if self.env_steps < least:
             raise ValueError(f"env_steps: expected at least {least}, got {self.env_steps}")
 
@@ -145,7 +150,7 @@ class Training:
 
     def progress(self) -> Progress:
         """Where the training stands."""
-        recent = self.log.episodes[-_RECENT:]
+        recent = self.log.episodes[-max(_RECENT, self.run.num_envs) :]
         return Progress(
             env_steps=self.log.env_steps,
             total=self.run.env_steps,
@@ -153,6 +158,26 @@ class Training:
             mean_return=float(np.mean([e.total_reward for e in recent])) if recent else np.nan,
             mean_abs_error=float(np.mean([e.mean_abs_error for e in recent])) if recent else np.nan,
         )
+
+    def scalars(self) -> dict[str, float]:
+        """Where the training stands, in numbers for TensorBoard, by the names that SB3 gives them.
+
+        To be asked for at an update. `docs/algorithms/README.md` has the table. What is not defined
+        yet, or not finite, is left out.
+        """
+        log = self.log
+        numbers = {
+            "time/total_timesteps": float(log.env_steps),
+            "time/fps": log.env_steps / log.seconds if log.seconds else np.nan,
+            **self.agent.scalars(),
+        }
+        if recent := log.episodes[-max(_WINDOW, self.run.num_envs) :]:
+            numbers["rollout/ep_rew_mean"] = float(np.mean([e.total_reward for e in recent]))
+            numbers["rollout/ep_len_mean"] = float(np.mean([e.length for e in recent]))
+            numbers["rollout/ep_error_mean"] = float(np.mean([e.mean_abs_error for e in recent]))
+        if (statistics := getattr(self.env, "statistics", None)) is not None:
+            numbers |= {f"wire/{name}": value for name, value in statistics.numbers().items()}
+        return {name: value for name, value in numbers.items() if np.isfinite(value)}
 
     def checkpoint(self) -> Checkpoint:
         """Everything that resuming needs. To be taken at an update."""

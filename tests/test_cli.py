@@ -308,7 +308,7 @@ def test_tensorboard_has_the_training_and_the_wire(
     last = board.Scalars("rollout/ep_rew_mean")[-1]
     episodes = pd.read_csv(tmp_path / "run" / "episodes.csv")
     assert last.step == 1200
-    assert last.value == pytest.approx(episodes.total_reward[-20:].mean(), rel=1e-5)
+    assert last.value == pytest.approx(episodes.total_reward[-100:].mean(), rel=1e-5)
     assert board.Scalars("wire/received")[-1].value >= 1200
 
 
