@@ -1,9 +1,9 @@
 # Everything a user needs: `make demo` and `make test` set themselves up in .venv and run.
 PYTHON ?= python3
 BIN := .venv/bin
-PACKAGES := models envs udp agents experiments cli
+PACKAGES := models rendering envs udp agents experiments cli
 
-.PHONY: install demo test lint types clean
+.PHONY: install demo test lint types docs clean
 
 install: .venv/.installed
 
@@ -22,7 +22,7 @@ install: .venv/.installed
 demo: install
 	$(BIN)/rotorgram compare --seeds 3 --env-steps 80000 --episodes 10
 
-test: lint types
+test: lint types docs
 	$(BIN)/python -m pytest
 
 lint: install
@@ -33,5 +33,10 @@ lint: install
 types: install
 	MYPYPATH=.venv/types $(BIN)/mypy
 
+# The pages as a site, in build/site: python -m http.server -d build/site. A warning fails it.
+docs: install
+	$(BIN)/python docs/stage.py
+	$(BIN)/zensical build --strict --clean
+
 clean:
-	rm -rf .venv *.egg-info build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv *.egg-info build dist .cache .pytest_cache .mypy_cache .ruff_cache .hypothesis

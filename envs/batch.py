@@ -9,7 +9,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from ..models import load_model
-from .frames import attitudes_in_paper_frame, positions_in_paper_frame
+from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from .physics import CONTACT_CHECK, PhysicsError, switch_off_log_file, warning_names
 
 __all__ = ["BatchPhysics"]

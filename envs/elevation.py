@@ -1,7 +1,7 @@
 """`rotorgram/Elevation-v0`: hold a quadcopter at a target elevation."""
 
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -11,7 +11,11 @@ from ..models import model_hash
 from ..models.constants import HOVER_THRUST
 from .config import TELEMETRY_NAMES, ElevationConfig, action_space, observation_space
 from .physics import Physics
+from .rendering import RENDER_MODES, checked_render_mode, moment_of, painter
 from .task import ElevationTask
+
+if TYPE_CHECKING:
+    from ..rendering.painter import Painter
 
 __all__ = ["ElevationEnv"]
 
@@ -71,24 +75,30 @@ class ElevationEnv(gym.Env[np.ndarray, Any]):
     `reward_termination`, and `thrust_clipped`: whether the action asked for less than 0 N or more
     than 100 N.
 
+    ## Render modes
+
+    `rgb_array`: `render()` gives a picture, uint8, shape (360, 480, 3). `human`: a window shows the
+    flight in real time. The physics is the same with either. Needs OpenGL; nothing else does.
+
     Args:
-        render_mode: None.
+        render_mode: None, `rgb_array` or `human`.
         options: Every field of `ElevationConfig`, by name.
 
     Raises:
         ValueError: An option or action is not what it should be.
         PhysicsError: MuJoCo warned of a bad state; `reset` makes the env usable again.
         gymnasium.error.ResetNeeded: A step before a reset, or after an episode's end.
+        rotorgram.rendering.NoOpenGL: There is nothing to draw with, or no display.
     """
 
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}  # noqa: RUF012
     telemetry_names = TELEMETRY_NAMES
 
     def __init__(self, render_mode: str | None = None, **options: Any) -> None:
-        if render_mode is not None:
-            raise ValueError(f"render_mode: expected None, got {render_mode!r}")
-        self.render_mode = None
+        self.render_mode = checked_render_mode(render_mode)
         self.config = ElevationConfig.from_options(options)
-        self.metadata = {"render_modes": [], "render_fps": round(1 / self.config.control_period)}
+        fps = round(1 / self.config.control_period)
+        self.metadata = {"render_modes": RENDER_MODES, "render_fps": fps}
         self.observation_space: spaces.Box = observation_space(self.config)
         self.action_space: spaces.Space[Any] = action_space(self.config)
         self.control_period = self.config.control_period
@@ -99,6 +109,9 @@ class ElevationEnv(gym.Env[np.ndarray, Any]):
         self._full = self.config.observation == "full"
         self._target = self._thrust = 0.0
         self._steps = -1  # control steps flown in this episode; -1: not to be stepped
+        self._painter: Painter | None = None
+        self._shown = self._episode = 0  # steps and episodes, for pictures
+        self._reward = 0.0
 
     @cached_property
     def model_hash(self) -> str:
@@ -120,6 +133,8 @@ class ElevationEnv(gym.Env[np.ndarray, Any]):
         self._physics.reset(start, self._thrust)
         self._steps = 0
         error = self._target - self._physics.elevation
+        if self.render_mode is not None:
+            self._take_down(0, 0.0)
         return self._observation(error), self._info(error, False, False)
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -139,7 +154,41 @@ class ElevationEnv(gym.Env[np.ndarray, Any]):
         if not (terminated or truncated):
             self._steps = steps
         reward = info["reward_elevation"] + info["reward_termination"]
+        if self.render_mode is not None:
+            self._take_down(steps, reward)
         return self._observation(error), reward, terminated, truncated, info
+
+    def render(self) -> Any:
+        """A picture of now, uint8, shape (360, 480, 3), with `rgb_array`; None otherwise."""
+        if self.render_mode is None:
+            gym.logger.warn("render: expected render_mode='rgb_array' or 'human', got None")
+            return None
+        if self._episode == 0:
+            raise gym.error.ResetNeeded("render: expected a call of reset() first")
+        if self._painter is None:
+            self._painter = painter(self.render_mode, 1, self.control_period)
+        moment = moment_of(
+            self._physics.telemetry(),
+            self._target - self._physics.elevation,
+            reward=self._reward,
+            step=self._shown,
+            episode=self._episode - 1,
+        )
+        pictures = self._painter.pictures([moment])
+        return pictures[0] if pictures else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._painter is not None:
+            self._painter.close()
+            self._painter = None
+
+    def _take_down(self, steps: int, reward: float) -> None:
+        """What a picture says besides what the craft does; a window shows it at once."""
+        self._shown, self._reward = steps, reward
+        self._episode += steps == 0
+        if self.render_mode == "human":
+            self.render()
 
     def _action_value(self, action: Any) -> float:
         if self._discrete:

@@ -6,7 +6,7 @@ from typing import Final
 import mujoco
 
 from ..models import load_model
-from .frames import attitude_in_paper_frame, position_in_paper_frame
+from ..models.frames import attitude_in_paper_frame, position_in_paper_frame
 
 __all__ = ["CONTACT_CHECK", "Physics", "PhysicsError", "switch_off_log_file", "warning_names"]
 

@@ -1,37 +1,28 @@
 """`rotorgram/Elevation-v0` for many drones at once, stepped by `mujoco.batch`."""
 
 from collections.abc import Mapping
-from functools import cached_property
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
 
-from ..models import model_hash
 from ..models.constants import HOVER_THRUST
-from . import autoreset
-from .autoreset import AdvancingVectorEnv, Seeds, check_names, checked_mask, checked_seeds
+from .autoreset import AdvancingVectorEnv, Seeds, checked_seeds
 from .batch import BatchPhysics
-from .config import (
-    FURTHEST,
-    LOWEST_START,
-    TELEMETRY_NAMES,
-    ElevationConfig,
-    action_space,
-    observation_space,
-)
+from .config import TELEMETRY_NAMES
+from .many import ManyDrones
+from .rendering import RENDER_MODES, checked_render_mode, moment_of, painter
 from .task import ElevationTask
 
-__all__ = ["RESET_OPTIONS", "ElevationVectorEnv", "checked_elevations"]
+if TYPE_CHECKING:
+    from ..rendering.painter import Painter
 
-RESET_OPTIONS: Final = ("reset_mask", "target", "start")
-"""Options of `ElevationVectorEnv.reset`."""
+__all__ = ["ElevationVectorEnv"]
 
 
-class ElevationVectorEnv(AdvancingVectorEnv):
+class ElevationVectorEnv(ManyDrones, AdvancingVectorEnv):
     """N drones with a target each: the task of `ElevationEnv`, bit for bit that of N single ones.
 
     Spaces, reward, start, termination and truncation are those of `ElevationEnv`, with the drone as
@@ -44,9 +35,12 @@ class ElevationVectorEnv(AdvancingVectorEnv):
     gives reward 0. With SAME_STEP the observation is that of the next episode, and `info` has
     `final_obs` and `final_info` where one ended. With DISABLED a reset with a mask begins the next.
 
+    With the render mode `rgb_array`, `render()` gives N pictures; with `human` a window shows the
+    first sixteen drones side by side, in real time.
+
     Args:
         num_envs: N.
-        render_mode: None.
+        render_mode: None, `rgb_array` or `human`.
         autoreset_mode: `AutoresetMode`, or its value.
         num_threads: Threads that step the physics; 0 takes one for each processor.
         options: Every field of `ElevationConfig`, by name.
@@ -61,8 +55,6 @@ class ElevationVectorEnv(AdvancingVectorEnv):
         gymnasium.error.ResetNeeded: A step before a reset, or (DISABLED) after an episode's end.
     """
 
-    telemetry_names = TELEMETRY_NAMES
-
     def __init__(
         self,
         num_envs: int = 1,
@@ -73,44 +65,26 @@ class ElevationVectorEnv(AdvancingVectorEnv):
         **options: Any,
     ) -> None:
         self.closed = True  # nothing is open yet
-        if num_envs < 1:
-            raise ValueError(f"num_envs: expected 1 or more, got {num_envs}")
         if num_threads < 0:
             raise ValueError(f"num_threads: expected 0 or more, got {num_threads}")
-        if render_mode is not None:
-            raise ValueError(f"render_mode: expected None, got {render_mode!r}")
-        self.render_mode = None
-        self.num_envs = num_envs
-        self.config = config = ElevationConfig.from_options(options)
-        self.control_period = config.control_period
-        self.metadata = {
-            "render_modes": [],
-            "render_fps": round(1 / config.control_period),
-            "autoreset_mode": autoreset.autoreset_mode(autoreset_mode),
-        }
-        self.single_observation_space = observation_space(config)
-        self.single_action_space = action_space(config)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self._task = ElevationTask(config)
-        self._physics = BatchPhysics(num_envs, config.linear_drag, num_threads)
-        self._discrete = config.action_type == "discrete"
+        self.render_mode = checked_render_mode(render_mode)
+        self._take_options(num_envs, autoreset_mode, options)
+        self.metadata["render_modes"] = RENDER_MODES
+        self._task = ElevationTask(self.config)
+        self._physics = BatchPhysics(num_envs, self.config.linear_drag, num_threads)
         self._generators: list[np.random.Generator | None] = [None] * num_envs
         self._target, self._thrust = np.zeros(num_envs), np.zeros(num_envs)
         self._steps = np.full(num_envs, -1)  # flown in this episode; -1: not to be stepped
-        size = self.single_observation_space.shape[0]
+        (size,) = self.single_observation_space.shape or ()
         self.observations = np.zeros((num_envs, size), np.float32)
         self.telemetry = np.zeros((num_envs, len(TELEMETRY_NAMES)))
         self.rewards = np.zeros(num_envs)
         self.terminated, self.truncated = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
         self.over, self.lost = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
         self._clipped = np.zeros(num_envs, bool)
+        self._painter: Painter | None = None
+        self._shown, self._episodes = np.zeros(num_envs, int), np.zeros(num_envs, int)
         self.closed = False
-
-    @cached_property
-    def model_hash(self) -> str:
-        """Name of the vehicle's model with its drag: 32 hexadecimal characters."""
-        return model_hash(self.config.linear_drag)
 
     def reset(
         self,
@@ -126,12 +100,11 @@ class ElevationVectorEnv(AdvancingVectorEnv):
                 `target`, `start`: target and start elevations, m, a number or shape (N,), in place
                 of those that the seed gives. Without `start` it gives how far from the target.
         """
-        options = options or {}
-        check_names(options, RESET_OPTIONS)
-        mask = checked_mask(options.get("reset_mask"), self.num_envs)
-        chosen = checked_elevations(options, self.config, self.num_envs)
+        mask, chosen = self._asked(options or {})
         self._begin(np.flatnonzero(mask), checked_seeds(seed, self.num_envs), chosen)
         self._observe()
+        if self.render_mode == "human":
+            self.render()
         return self.observations.copy(), self._info(mask)
 
     def advance(
@@ -166,6 +139,39 @@ class ElevationVectorEnv(AdvancingVectorEnv):
         self.over = self.terminated | self.truncated | (self.over & ~resets)
         going_on = flown & ~(self.terminated | self.truncated)
         self._steps[going_on] = steps[going_on]
+        if self.render_mode is not None:
+            self._shown = np.where(flown, steps, self._shown)
+            if self.render_mode == "human":
+                self.render()
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """With `rgb_array` a picture of each drone, uint8, shape (180, 240, 3); otherwise None."""
+        if self.render_mode is None:
+            gym.logger.warn("render: expected render_mode='rgb_array' or 'human', got None")
+            return None
+        if not self._episodes.all():
+            raise gym.error.ResetNeeded("render: expected a call of reset() first")
+        if self._painter is None:
+            self._painter = painter(self.render_mode, self.num_envs, self.control_period)
+        error = self._target - self._physics.elevation
+        return self._painter.pictures(
+            [
+                moment_of(
+                    self.telemetry[i].tolist(),
+                    error[i],
+                    reward=float(self.rewards[i]),
+                    step=int(self._shown[i]),
+                    episode=int(self._episodes[i]) - 1,
+                )
+                for i in range(self.num_envs)
+            ]
+        )
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the window, if there is one."""
+        if self._painter is not None:
+            self._painter.close()
+            self._painter = None
 
     def _begin(
         self,
@@ -189,7 +195,8 @@ class ElevationVectorEnv(AdvancingVectorEnv):
             self._target[ids] = targets[ids]
         self._thrust[ids] = HOVER_THRUST
         self._physics.reset(ids, starts[ids], HOVER_THRUST)
-        self._steps[ids] = 0
+        self._steps[ids] = self._shown[ids] = 0
+        self._episodes[ids] += 1
         self._clipped[ids] = False
         # Not in place: what `step` gave away stays as it was.
         kept = np.ones(self.num_envs, bool)
@@ -233,30 +240,3 @@ class ElevationVectorEnv(AdvancingVectorEnv):
         if self._discrete:
             values -= 1.0
         return values
-
-
-def checked_elevations(
-    options: Mapping[str, Any], config: ElevationConfig, num_envs: int
-) -> dict[str, np.ndarray]:
-    """Targets and starts of a reset's options, float64, shape (N,). Raises `ValueError`."""
-    least = LOWEST_START + (0.0 if "start" in options else config.start_band)
-    lowest = {"target": least, "start": LOWEST_START}
-    chosen = {}
-    for name in lowest:
-        if name in options:
-            values = np.asarray(options[name], np.float64)
-            fits = (values >= lowest[name]) & (values <= FURTHEST)
-            if values.shape not in ((), (num_envs,)) or not fits.all():
-                raise ValueError(
-                    f"{name}: expected elevations of {lowest[name]:g} to {FURTHEST:g} m, a "
-                    f"number or shape ({num_envs},), got {options[name]!r}"
-                )
-            chosen[name] = np.broadcast_to(values, num_envs)
-    if "start" in chosen:
-        for target in (chosen["target"],) if "target" in chosen else config.target_range:
-            if (abs(chosen["start"] - target) > config.flight_band).any():
-                raise ValueError(
-                    f"start: expected at most flight_band = {config.flight_band:g} m "
-                    f"from the target, got {options['start']!r}"
-                )
-    return chosen

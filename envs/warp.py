@@ -5,7 +5,6 @@ two agree, and why their random starts differ.
 """
 
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any, Final
 
 import gymnasium as gym
@@ -13,18 +12,15 @@ import mujoco
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from torch.utils.dlpack import from_dlpack
 
-from ..models import load_model, model_hash
+from ..models import load_model
 from ..models.constants import HOVER_THRUST
-from .autoreset import autoreset_mode as checked_mode
-from .autoreset import check_names, checked_mask
-from .config import TELEMETRY_NAMES, ElevationConfig, action_space, observation_space
-from .frames import attitudes_in_paper_frame, positions_in_paper_frame
+from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
+from .config import TELEMETRY_NAMES
+from .many import ManyDrones
 from .physics import CONTACT_CHECK, PhysicsError
 from .task import ElevationTask
-from .vector import RESET_OPTIONS, checked_elevations
 
 try:
     import mujoco_warp as mjw
@@ -122,7 +118,7 @@ class WarpPhysics:
         return ~good
 
 
-class ElevationWarpEnv(VectorEnv[torch.Tensor, torch.Tensor, torch.Tensor]):
+class ElevationWarpEnv(ManyDrones, VectorEnv[torch.Tensor, torch.Tensor, torch.Tensor]):
     """N drones with a target each: the task of `ElevationVectorEnv`, in float32 on one device.
 
     Spaces, options, reward, start, termination, truncation and autoreset are those of
@@ -156,8 +152,6 @@ class ElevationWarpEnv(VectorEnv[torch.Tensor, torch.Tensor, torch.Tensor]):
         gymnasium.error.ResetNeeded: A step before a reset, or (DISABLED) after an episode's end.
     """
 
-    telemetry_names = TELEMETRY_NAMES
-
     def __init__(
         self,
         num_envs: int = 1,
@@ -169,30 +163,16 @@ class ElevationWarpEnv(VectorEnv[torch.Tensor, torch.Tensor, torch.Tensor]):
         **options: Any,
     ) -> None:
         self.closed = True  # nothing is open yet
-        if num_envs < 1:
-            raise ValueError(f"num_envs: expected 1 or more, got {num_envs}")
         if render_mode is not None:
             raise ValueError(f"render_mode: expected None, got {render_mode!r}")
         self.render_mode = None
-        self.num_envs = num_envs
-        self.config = config = ElevationConfig.from_options(options)
-        _reachable(config.target)
-        self.control_period = config.control_period
-        self._mode = checked_mode(autoreset_mode)
-        self.metadata = {
-            "render_modes": [],
-            "render_fps": round(1 / config.control_period),
-            "autoreset_mode": self._mode,
-        }
-        self.single_observation_space = observation_space(config)
-        self.single_action_space = action_space(config)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._take_options(num_envs, autoreset_mode, options)
+        _reachable(self.config.target)
+        self._mode = self.metadata["autoreset_mode"]
         self.device, name = _device(device)
-        self.physics = WarpPhysics(num_envs, config.linear_drag, name, config.substeps)
+        self.physics = WarpPhysics(num_envs, self.config.linear_drag, name, self.config.substeps)
         self.checks = checks
-        self._task: Any = ElevationTask(config)  # its operators take tensors as well
-        self._discrete = config.action_type == "discrete"
+        self._task: Any = ElevationTask(self.config)  # its operators take tensors as well
         self._generator = torch.Generator(self.device)
         self._seeded = False
         self._target = self._thrust = torch.zeros(num_envs, device=self.device)
@@ -201,11 +181,6 @@ class ElevationWarpEnv(VectorEnv[torch.Tensor, torch.Tensor, torch.Tensor]):
         self._terminated = self._ended = self._clipped = self._nobody
         self._steps = torch.full((num_envs,), -1, device=self.device)  # -1: not to be stepped
         self.closed = False
-
-    @cached_property
-    def model_hash(self) -> str:
-        """Name of the vehicle's model with its drag: 32 hexadecimal characters."""
-        return model_hash(self.config.linear_drag)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -222,9 +197,7 @@ class ElevationWarpEnv(VectorEnv[torch.Tensor, torch.Tensor, torch.Tensor]):
             name: value.cpu().numpy() if isinstance(value, torch.Tensor) else value
             for name, value in (options or {}).items()
         }
-        check_names(options, RESET_OPTIONS)
-        mask = checked_mask(options.get("reset_mask"), self.num_envs)
-        chosen = checked_elevations(options, self.config, self.num_envs)
+        mask, chosen = self._asked(options)
         if "target" in chosen:
             _reachable(options["target"])
         if seed is not None:

@@ -52,7 +52,7 @@ def _fixed(start: float, target: float = 5.0, **options: Any) -> ElevationEnv:
 @pytest.mark.parametrize("options", COMBINATIONS, ids=lambda o: "-".join(map(str, o.values())))
 def test_contract(options: dict[str, Any]) -> None:
     env = gym.make(ENV_ID, disable_env_checker=True, **options).unwrapped
-    check_env(env)
+    check_env(env, skip_render_check=True)  # pictures: test_render_modes.py
     sb3_check_env(env)
 
 
@@ -90,8 +90,8 @@ def test_options_through_make() -> None:
         gym.make(ENV_ID, targt=6)
     with pytest.raises(ValueError, match=r"^episode_length: expected .*, got 2.5$"):
         gym.make(ENV_ID, episode_length=2.5)
-    with pytest.raises(ValueError, match=r"^render_mode: expected None, got 'human'$"):
-        ElevationEnv(render_mode="human")
+    with pytest.raises(ValueError, match=r"^render_mode: expected None, .*, got 'ansi'$"):
+        ElevationEnv(render_mode="ansi")
     with pytest.raises(ValueError, match=r"^reset: expected no options, got {'target': 3}$"):
         env.reset(options={"target": 3})
 

@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rotorgram.envs.frames import attitude_in_paper_frame, position_in_paper_frame
+from rotorgram.models.frames import (
+    attitude_in_paper_frame,
+    pose_in_mujoco_frame,
+    position_in_paper_frame,
+)
 from scipy.spatial.transform import Rotation
 
 # (x, y, z) -> (X, Y, Z): right is minus left, up is up, forward is forward.
@@ -110,3 +114,22 @@ def _unity(phi: float, theta: float, psi: float) -> np.ndarray:
     about_y = [[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]]
     about_z = [[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]]
     return np.array(about_y) @ np.array(about_x) @ np.array(about_z)
+
+
+def test_a_pose_by_hand_on_the_way_back() -> None:
+    # 1 m right, 2 m up, 3 m forward, nose 90 degrees to the right: MuJoCo turns by -90 about +z.
+    half = math.sqrt(0.5)
+    expected = [3.0, -1.0, 2.0, half, 0.0, 0.0, -half]
+    assert pose_in_mujoco_frame((1.0, 2.0, 3.0), (0.0, 90.0, 0.0)) == pytest.approx(expected)
+
+
+@given(
+    st.tuples(*[st.floats(-100, 100)] * 3),
+    st.tuples(st.floats(-89, 89), st.floats(-179, 179), st.floats(-179, 179)),
+)
+def test_there_and_back(
+    position: tuple[float, float, float], attitude: tuple[float, float, float]
+) -> None:
+    pose = pose_in_mujoco_frame(position, attitude).tolist()
+    assert position_in_paper_frame(pose[:3]) == pytest.approx(position)
+    assert attitude_in_paper_frame(pose[3:]) == pytest.approx(attitude, abs=1e-6)

@@ -8,8 +8,8 @@ import pytest
 import rotorgram.envs
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from rotorgram.envs import ENV_ID, ElevationVectorEnv
-from rotorgram.envs.frames import attitude_in_paper_frame, attitudes_in_paper_frame
 from rotorgram.envs.physics import PhysicsError
+from rotorgram.models.frames import attitude_in_paper_frame, attitudes_in_paper_frame
 
 N = 7
 SHORT: dict[str, Any] = {"episode_length": 40, "flight_band": 1.5}
@@ -188,7 +188,7 @@ def test_wrong_seeds(seed: Any) -> None:
         ({"num_envs": 0}, "num_envs: expected 1 or more, got 0"),
         ({"num_threads": -1}, "num_threads: expected 0 or more, got -1"),
         ({"autoreset_mode": "never"}, "autoreset_mode: expected 'NextStep' or 'SameStep'"),
-        ({"render_mode": "human"}, "render_mode: expected None, got 'human'"),
+        ({"render_mode": "ansi"}, "render_mode: expected None, 'human' or 'rgb_array', got 'ansi'"),
         ({"speed": 1}, "options: expected some of target"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The one place where MuJoCo's frame becomes the paper's.
+"""The one place where MuJoCo's frame becomes the paper's, and the paper's MuJoCo's.
 
 MuJoCo: x forward, y left, z up, right-handed, quaternions scalar first.
 Paper and Unity: X right, Y up, Z forward, left-handed, degrees (paper, section 2.2, figure 4).
@@ -18,6 +18,7 @@ import numpy as np
 __all__ = [
     "attitude_in_paper_frame",
     "attitudes_in_paper_frame",
+    "pose_in_mujoco_frame",
     "position_in_paper_frame",
     "positions_in_paper_frame",
 ]
@@ -47,6 +48,23 @@ def attitude_in_paper_frame(quaternion: Sequence[float]) -> tuple[float, float, 
     theta = math.atan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y))
     psi = math.atan2(2 * (w * z + x * y), 1 - 2 * (x * x + z * z))
     return math.degrees(math.asin(sin_phi)), math.degrees(theta), math.degrees(psi)
+
+
+def pose_in_mujoco_frame(position: Sequence[float], attitude: Sequence[float]) -> np.ndarray:
+    """The way back, for what is drawn: a free joint's `qpos`, float64, shape (7,).
+
+    Args:
+        position: (X, Y, Z), m.
+        attitude: (phi, theta, psi), degrees.
+    """
+    right, up, forward = position
+    (a, d), (b, e), (c, f) = (
+        (math.cos(half), math.sin(half)) for half in (math.radians(angle) / 2 for angle in attitude)
+    )
+    # Ry(theta) · Rx(phi) · Rz(psi) as a quaternion about X, Y and Z.
+    w, x = b * a * c + e * d * f, b * d * c + e * a * f
+    y, z = e * a * c - b * d * f, b * a * f - e * d * c
+    return np.array((forward, 0.0 - right, up, w, 0.0 - z, x, 0.0 - y))
 
 
 def positions_in_paper_frame(positions: np.ndarray, out: np.ndarray) -> None:

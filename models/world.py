@@ -1,0 +1,79 @@
+"""The world around the craft: an airport to look at, which the physics never notices."""
+
+from typing import Final
+
+import mujoco
+import numpy as np
+
+from . import AIRPORT_XML
+
+__all__ = ["AIRPORT_PREFIX", "attach_airport"]
+
+AIRPORT_PREFIX: Final = "airport/"
+"""What the name of everything begins with that `attach_airport` adds."""
+
+_HIDDEN_GROUP: Final = 3  # viewers and renderers draw groups 0 to 2 unless told otherwise
+_NEAR, _FAR = 0.25, 1200.0  # m: where drawing begins and ends; the hills lie within
+
+# The depth of a directional light's shadow map spans the whole of _FAR, and a map of finer pixels
+# than 12 mm (1024 over the 12 m around the craft) speckles flat ground at this span.
+_SHADOW_PIXELS: Final = 1024
+_ROUNDNESS: Final = 40  # slices of a cylinder: the pad's ring is seen from near
+_HAZE: Final = 0.1  # of the distance to the horizon
+_HAZE_COLOUR: Final = (0.80, 0.88, 0.96, 1.0)  # the sky's colour where it meets the ground
+
+
+def attach_airport(spec: mujoco.MjSpec) -> None:
+    """Put the airport of `AIRPORT_XML` around the scene `spec`, in place; compile `spec` yourself.
+
+    The origin of the world becomes the centre of a pad on the apron; +x points along runway 09, z
+    up, metres. What is added is only looked at: geoms of the world body without mass that collide
+    with nothing, so that the scene moves bit for bit as without them. Only a rangefinder would see
+    them. `spec.compiler.discardvisual` drops them all.
+
+    Horizontal planes of the world body at z = 0, the scene's floor, stay as they are and still
+    carry what stands on them, but move to the geom group 3, which is not drawn unless asked for:
+    the airport brings its own ground. It also brings its sky in place of the scene's, and sets
+    haze, shadow map, and the near and far end of drawing. Lights and cameras stay.
+
+    Raises:
+        ValueError: if the scene has an airport already, or does not compile.
+    """
+    if any(geom.name.startswith(AIRPORT_PREFIX) for geom in spec.geoms):
+        raise ValueError("spec: expected a scene without an airport, got one that has it")
+    scene = spec.copy()
+    scene.compiler.discardvisual = False
+    model = scene.compile()
+    for geom, compiled in zip(spec.geoms, scene.geoms, strict=True):
+        if _is_ground(model, compiled.id):
+            geom.group = _HIDDEN_GROUP
+    for texture in list(spec.textures):
+        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
+            spec.delete(texture)
+    _set_visuals(spec, model)
+    airport = mujoco.MjSpec.from_file(str(AIRPORT_XML))
+    spec.attach(airport, prefix=AIRPORT_PREFIX, frame=spec.worldbody.add_frame())
+
+
+def _is_ground(model: mujoco.MjModel, geom: int) -> bool:
+    """Whether a geom is a plane of the world body at z = 0 that faces up."""
+    if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE or model.geom_bodyid[geom] != 0:
+        return False
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+    return bool(np.isclose(rotation[8], 1.0) and model.geom_pos[geom, 2] == 0.0)
+
+
+def _set_visuals(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Make `spec` see as far as the hills, and keep the scale that the scene has without them.
+
+    MuJoCo measures the ends of drawing, shadows and the free camera's first distance in extents of
+    the scene; an extent taken anew, with a runway in it, would spoil them.
+    """
+    stat, visual = model.stat, spec.visual
+    spec.stat.extent, spec.stat.center, spec.stat.meansize = stat.extent, stat.center, stat.meansize
+    visual.map.znear, visual.map.zfar = _NEAR / stat.extent, _FAR / stat.extent
+    visual.map.haze = _HAZE
+    visual.rgba.haze = _HAZE_COLOUR
+    visual.quality.shadowsize = min(visual.quality.shadowsize, _SHADOW_PIXELS)
+    visual.quality.numslices = max(visual.quality.numslices, _ROUNDNESS)

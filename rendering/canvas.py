@@ -1,0 +1,87 @@
+"""Draws a stage into arrays of pixels, without a window."""
+
+from typing import Any, Self
+
+import mujoco
+import numpy as np
+
+from .gl import NoOpenGL, offscreen_context
+from .stage import Camera, Stage, scene_geoms
+
+__all__ = ["Canvas"]
+
+_ROOM = 10_000  # geoms
+_SAMPLES = 4  # of every pixel, for smooth edges; software has no more
+
+
+class Canvas:
+    """Pictures of a stage, of one size.
+
+    Args:
+        stage: What is drawn.
+        width, height: Pixels.
+        fast: Without shadows and smooth edges, which take most of the time where software draws.
+
+    Raises:
+        NoOpenGL: There is nothing to draw with.
+    """
+
+    def __init__(
+        self, stage: Stage, width: int = 640, height: int = 480, *, fast: bool = False
+    ) -> None:
+        for name, pixels in (("width", width), ("height", height)):
+            if not 16 <= pixels <= 8192:
+                raise ValueError(f"{name}: expected 16 to 8192 pixels, got {pixels}")
+        self.stage, self.width, self.height = stage, width, height
+        self._gl: Any = offscreen_context(width, height)
+        model = stage.model
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        model.vis.quality.offsamples = 0 if fast else _SAMPLES
+        try:
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        except mujoco.FatalError as error:  # an OpenGL that is too old
+            self._gl.free()
+            raise NoOpenGL(f"OpenGL: expected one that MuJoCo can draw with, got {error}") from None
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._scene = mujoco.MjvScene(model, _ROOM)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = not fast
+        self._option, self._rect = mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
+
+    def draw(self, camera: Camera = "chase", stage: Stage | None = None) -> np.ndarray:
+        """The stage as it is now: uint8, shape (height, width, 3), the caller's own.
+
+        Args:
+            camera: From where.
+            stage: Another than the canvas was made for: a twin of it.
+        """
+        stage = stage or self.stage
+        if stage.model is not self.stage.model:
+            raise ValueError("stage: expected the canvas's own or a twin of it, got another")
+        model, data, scene = stage.model, stage.data, self._scene
+        view, every = stage.camera(camera), mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(model, data, self._option, None, view, every, scene)
+        for light in scene.lights[: scene.nlight]:
+            if light.headlight and camera == "top":  # it would add itself to the sun
+                light.diffuse[:] = 0.0
+        stage.decorate(scene_geoms(scene))
+        self._gl.make_current()
+        mujoco.mjr_render(self._rect, scene, self._context)
+        pixels = np.empty((self.height, self.width, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
+        return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
+
+    def close(self) -> None:
+        """Give back the context. A second call does nothing."""
+        if self._gl is not None:
+            self._gl.make_current()
+            self._context.free()
+            self._gl.free()
+            self._gl = None
+
+    def __enter__(self) -> Self:
+        """Return the canvas, to be closed at the end of the block."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+        self.close()

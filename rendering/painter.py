@@ -1,0 +1,60 @@
+"""Gymnasium's render modes: one picture, one for each of many craft, or a window."""
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from .canvas import Canvas
+from .moment import Moment
+from .stage import Stage
+
+__all__ = ["Painter"]
+
+_ONE: Final = (480, 360)
+_OF_MANY: Final = (240, 180)
+_AT_MOST: Final = 16
+"""Craft in a window."""
+
+
+class Painter:
+    """What the `render` of an env gives or shows. Nothing is opened before the first call.
+
+    Args:
+        mode: `rgb_array`, or `human`.
+        drones: Craft of the env.
+        control_period: Time between two moments, s: a window shows them in real time.
+    """
+
+    def __init__(self, mode: str, drones: int, control_period: float) -> None:
+        self._mode, self._drones, self._period = mode, drones, control_period
+        self._canvas: Canvas | None = None
+        self._view: Any = None
+
+    def pictures(self, moments: Sequence[Moment]) -> tuple[np.ndarray, ...] | None:
+        """A picture of each craft, uint8 of shape (height, width, 3); None with `human`.
+
+        Raises:
+            NoOpenGL: There is nothing to draw with, or no display to show it on.
+        """
+        if self._mode == "human":
+            self._show(moments[:_AT_MOST])
+            return None
+        if self._canvas is None:
+            one = self._drones == 1
+            self._canvas = Canvas(Stage(trail=one), *(_ONE if one else _OF_MANY))
+        return tuple(self._draw(self._canvas, moment) for moment in moments)
+
+    def close(self) -> None:
+        """Close what is open."""
+        for opened in (self._canvas, self._view):
+            if opened is not None:
+                opened.close()
+        self._canvas = self._view = None
+
+    def _draw(self, canvas: Canvas, moment: Moment) -> np.ndarray:
+        canvas.stage.show(moment)
+        return canvas.draw("chase")
+
+    def _show(self, moments: Sequence[Moment]) -> None:
+        raise NotImplementedError

@@ -1,0 +1,118 @@
+"""Gymnasium's render modes: pictures of what flies, and the same physics with and without."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from rotorgram.envs import ENV_ID, ElevationEnv, ElevationVectorEnv
+from rotorgram.rendering import Moment, NoOpenGL
+from rotorgram.rendering.gl import offscreen_context
+from rotorgram.rendering.stage import Stage
+
+try:
+    offscreen_context(16, 16).free()
+except NoOpenGL as error:
+    pytest.skip(str(error), allow_module_level=True)
+
+
+def moment(y: float = 5.0, **rest: object) -> Moment:
+    return Moment(position=(0, y, 0), attitude=(0, 0, 0), thrusts=(49,) * 4, error=5 - y, **rest)
+
+
+def test_a_picture_of_one_drone_and_the_same_bits() -> None:
+    env, plain = gym.make(ENV_ID, render_mode="rgb_array"), gym.make(ENV_ID)
+    first, _ = env.reset(seed=3)
+    other, _ = plain.reset(seed=3)
+    assert first.tobytes() == other.tobytes()
+    before = env.render()
+    for _ in range(40):
+        full = np.array([1.0], np.float32)
+        one, two = env.step(full), plain.step(full)
+        assert one[0].tobytes() == two[0].tobytes()
+        assert one[1:4] == two[1:4]
+        if one[2]:
+            break
+    after = env.render()
+    env.close()
+    plain.close()
+    for picture in (before, after):
+        assert picture.shape == (360, 480, 3)
+        assert picture.dtype == np.uint8
+        top, bottom = picture[:30].mean(axis=(0, 1)), picture[-30:].mean(axis=(0, 1))
+        assert top[2] > top[0] + 20, "the sky is blue"
+        assert abs(bottom[2] - bottom[0]) < 40, "the ground is not"
+    assert (before != after).mean() > 0.05, "it climbed, and the camera with it"
+
+
+def test_a_picture_of_each_of_many() -> None:
+    envs = gym.make_vec(ENV_ID, num_envs=3, render_mode="rgb_array")
+    with pytest.raises(gym.error.ResetNeeded, match="render: expected a call of reset"):
+        envs.render()
+    start = np.array([4.0, 5.0, 6.0])
+    envs.reset(seed=0, options={"target": 5.0, "start": start})
+    low, middle, high = pictures = envs.render()
+    envs.close()
+    assert {picture.shape for picture in pictures} == {(180, 240, 3)}
+    # The camera goes with the craft, so that the green disc of the target lies elsewhere.
+    rows = [np.average(np.arange(180), weights=_green(picture)) for picture in pictures]
+    assert rows[0] < rows[1] < rows[2]
+    assert (low != middle).any()
+    assert (middle != high).any()
+
+
+def _green(picture: np.ndarray) -> np.ndarray:
+    red, green, blue = (picture[..., i].astype(int) for i in range(3))
+    disc = (green > red + 60) & (green > blue + 20)
+    assert disc.any()
+    return disc.sum(axis=1)
+
+
+def test_no_picture_without_a_mode(caplog: pytest.LogCaptureFixture) -> None:
+    for env in (ElevationEnv(), ElevationVectorEnv(2)):
+        env.reset(seed=0)
+        with pytest.warns(UserWarning, match="render: expected render_mode"):
+            assert env.render() is None
+        env.close()
+
+
+def test_a_path_begins_anew_with_each_episode() -> None:
+    stage = Stage("plain")
+    geoms = []
+
+    def count() -> int:
+        geoms.clear()
+        stage.decorate(lambda: geoms.append(mujoco.MjvGeom()) or geoms[-1])
+        return len(geoms)
+
+    stage.show(moment())
+    assert count() == 1, "the disc"
+    for step in range(1, 10):
+        stage.show(moment(5 + 0.1 * step, step=step))
+    assert count() == 1 + 3, "pieces from steps 0, 3, 6; the one that begins at 9 has no length"
+    stage.show(moment(6.5, step=10))
+    assert count() == 1 + 4
+    stage.show(moment(4.0, step=2, episode=1))  # whoever draws now and then misses its start
+    assert count() == 1
+
+
+def test_many_stand_side_by_side() -> None:
+    stage = Stage("plain", drones=5)
+    stage.show(*[moment(3.0 + i) for i in range(5)])
+    places = stage.data.qpos.reshape(5, 7)[:, :3]
+    assert places[:, 2].tolist() == [3.0, 4.0, 5.0, 6.0, 7.0]
+    gaps = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=2)
+    assert gaps[~np.eye(5, dtype=bool)].min() == 4.0
+    with pytest.raises(ValueError, match="moments: expected 5, got 1"):
+        stage.show(moment())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ({"world": "moon"}, "world: expected airport or plain, got 'moon'"),
+        ({"drones": 0}, "drones: expected 1 or more, got 0"),
+    ],
+)
+def test_wrong_stages(arguments: dict[str, object], expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
+        Stage(**arguments)
