@@ -4,4 +4,4 @@ __all__ = ["RunsFailed"]
 
 
 class RunsFailed(RuntimeError):
-    """Some runs of a comparison failed."""
+    """Some runs of a comparison or a sweep failed."""

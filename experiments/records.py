@@ -222,7 +222,7 @@ def read_steps(
 def _existing(folder: Path | str, name: str) -> Path:
     path = Path(folder) / name
     if not path.is_file():
-        raise RecordsError(f"{path} is missing: is {folder} the folder of a comparison?")
+        raise RecordsError(f"{path} is missing: is {folder} the folder of a comparison or a sweep?")
     return path
 
 

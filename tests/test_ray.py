@@ -1,4 +1,4 @@
-"""The comparison on a Ray cluster: two nodes of one core each, on this machine."""
+"""Comparison and sweep on a Ray cluster: two nodes of one core each, on this machine."""
 
 import os
 import secrets
@@ -15,10 +15,12 @@ import pandas as pd
 import pytest
 from rotorgram.agents.checkpoints import load, software_versions
 from rotorgram.envs import ElevationConfig
-from rotorgram.experiments import compare as module
+from rotorgram.experiments import workers as module
 from rotorgram.experiments.compare import CompareConfig, compare
 from rotorgram.experiments.errors import RunsFailed
 from rotorgram.experiments.records import read_records, read_steps
+from rotorgram.experiments.sweep import SweepConfig, read_sweep_runs, sweep
+from rotorgram.experiments.workers import WorkersConfig, open_workers
 
 # Ray listens beyond this machine. It reads these when it is imported.
 os.environ |= {
@@ -85,16 +87,33 @@ def test_the_numbers_are_those_of_this_machine(tmp_path: Path, address: str) -> 
     assert {k: v.tobytes() for k, v in actor.items()} == {k: v.tobytes() for k, v in other.items()}
 
 
-def test_every_node_flies(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def node(job: int) -> tuple[int, str]:
+def test_a_sweep_gives_the_rows_of_this_machine(tmp_path: Path, address: str) -> None:
+    config = SweepConfig(
+        algorithm="a2c", grid={"gamma": (0.9, 0.99)}, seeds=1, env_steps=300, episodes=1,
+        env=ElevationConfig(episode_length=50),
+    )  # fmt: skip
+    tables = []
+    for where in (config, replace(config, backend="ray", address=address)):
+        folder = tmp_path / where.backend
+        sweep(where, folder, "", nothing)
+        rows = read_sweep_runs(folder, config).sort_values("point").reset_index(drop=True)
+        tables.append(rows.drop(columns=TIMES))
+    assert tables[0]["point"].tolist() == [0, 1]
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
+
+
+def test_every_node_flies(address: str) -> None:
+    def node(job: int, _: object) -> tuple[int, str]:
         time.sleep(0.5)
         return job, ray.get_runtime_context().get_node_id()
 
-    monkeypatch.setattr(module, "_fly", node)
-    with module._workers(replace(CONFIG, backend="ray", address=address)) as fly:
-        results = dict(fly([1, 2, 3, 4]))
-    assert sorted(results) == [1, 2, 3, 4]
-    assert len({*results.values()}) == 2
+    config = WorkersConfig(backend="ray", address=address)
+    with open_workers(config, nothing) as workers:
+        results = list(workers.fly(node, {f"job {n}": n for n in range(4)}))
+    assert sorted((result.name, result.value[0]) for result in results) == [
+        ("job 0", 0), ("job 1", 1), ("job 2", 2), ("job 3", 3),
+    ]  # fmt: skip
+    assert len({result.value[1] for result in results}) == 2
 
 
 def test_a_worker_with_other_software_is_refused(
