@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not isinstance(error, user_errors()) or "ROTORGRAM_TRACEBACK" in os.environ:
             raise
         print(f"rotorgram: {_sentence(error)}", file=sys.stderr)
-        return 1
+        return getattr(error, "exit_status", 1)
 
 
 class _ToStandardError(logging.Handler):

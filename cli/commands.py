@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from ..agents.presets import AlgorithmName, PresetName
 from .base import AgentCommand, Command, EnvOptions
@@ -23,8 +23,9 @@ def user_errors() -> tuple[type[Exception], ...]:
     """Errors that are one sentence to the user. A bug of ours is not among them."""
     from ..agents.episodes import ResumeError
     from ..experiments.errors import RunsFailed
+    from ..rendering.gl import NoOpenGL
 
-    return (ValueError, OSError, ResumeError, RunsFailed)
+    return (ValueError, OSError, ResumeError, RunsFailed, NoOpenGL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +40,7 @@ class Train(AgentCommand):
     """vpg, a2c or sb3-a2c."""
     preset: PresetName = "tuned"
     """Hyperparameters: the paper's, or ours."""
-    set: tuple[str, ...] = ()
+    set: UseAppendAction[Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE …")]] = ()
     """Changes to the preset, such as gamma=0.99 steps_per_update=64."""
     seed: int = 0
     """Seed of weights, actions and episodes."""
@@ -144,7 +145,48 @@ class Evaluate(AgentCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare(Command):
+class View(Command):
+    """Look at flights, in real time or slower: in a window, or on a page for browsers.
+
+    Keys: space pauses, the arrow to the right takes one step, - and + change the speed.
+    """
+
+    what: Positional[str]
+    """Checkpoint, folder of a training, pid, random, or a journal (.mcap)."""
+    web: bool = False
+    """Serve a page for browsers, for a machine without a display."""
+    port: int = 8080
+    """TCP port of the page, on this machine's loopback; 0 takes the first free one."""
+    world: Literal["airport", "plain"] = "airport"
+    """What is around the drone."""
+    speed: float = 1.0
+    """1 is real time, from 1/16 to 8."""
+    episodes: int | None = None
+    """End after so many episodes. Default: go on until it is closed."""
+    env: EnvOptions = field(default_factory=EnvOptions)
+    """With a checkpoint: changes to the options that it was trained with."""
+
+    def run(self) -> int:
+        """Fly and show, episode after episode."""
+        from .view import view
+
+        return view(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunsCommand(Command):
+    """A command of many runs, which may fly on many machines."""
+
+    jobs: int | None = None
+    """Runs at a time. Default: one for each core of this machine, or of the cluster."""
+    backend: Literal["loky", "ray"] = "loky"
+    """loky: processes of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
+    address: Annotated[str | None, arg(metavar="ray://HOST:PORT")] = None
+    """The Ray cluster. Default: the one that this machine is part of."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare(RunsCommand):
     """Train VPG, A2C and SB3's A2C over the same seeds and steps, and report.
 
     Every run has a simulator process and a socket pair of its own. Writes one folder: records,
@@ -163,12 +205,8 @@ class Compare(Command):
     """Policies kept during each training, for the learning curves."""
     episodes: int = 20
     """Evaluation episodes of each final policy."""
-    jobs: int | None = None
-    """Runs at a time. Default: one for each core of this machine, or of the cluster."""
-    backend: Literal["loky", "ray"] = "loky"
-    """loky: processes of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
-    address: Annotated[str | None, arg(metavar="ray://HOST:PORT")] = None
-    """The Ray cluster. Default: the one that this machine is part of."""
+    film: bool = True
+    """Film the agents side by side for the report. Without OpenGL there is no film."""
     out: Path | None = None
     """Folder to write; it must not exist. Default: runs/compare-TIME."""
     resume: Path | None = None
@@ -183,18 +221,110 @@ class Compare(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report(Command):
-    """Draw a comparison's figures, table and report again from its files."""
+class Sweep(RunsCommand):
+    """Train an algorithm over a grid of hyperparameters, every point on the same seeds.
 
-    folder: Positional[Path]
-    """Folder that `rotorgram compare` wrote."""
+    Every run has a simulator process and a socket pair of its own. Ctrl-C keeps the runs that are
+    done; --resume flies the others.
+    """
+
+    algorithm: Positional[AlgorithmName]
+    """vpg, a2c or sb3-a2c."""
+    grid: UseAppendAction[
+        Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE,... ...")]
+    ] = ()
+    """Values to try, such as learning_rate=0.003,0.01 steps_per_update=64,256: every combination
+    is a point."""
+    preset: PresetName = "tuned"
+    """Hyperparameters that the grid does not name: the paper's, or ours."""
+    seeds: int = 3
+    """Seeds 0 ... SEEDS - 1, the same for every point."""
+    env_steps: int = 200_000
+    """Env steps of each training, of all its drones together."""
+    num_envs: int = 1
+    """Drones that fly at the same time, in lock-step, in each training."""
+    episodes: int = 20
+    """Evaluation episodes of each final policy."""
+    out: Path | None = None
+    """Folder to write; it must not exist. Default: runs/sweep-ALGORITHM-TIME."""
+    resume: Path | None = None
+    """Folder of an interrupted sweep to go on with; its own settings hold."""
+    env: EnvOptions = field(default_factory=EnvOptions)
 
     def run(self) -> int:
-        """Write the report and print the table."""
-        from .compare import report
+        """Sweep, and print the table."""
+        from .sweep import sweep
 
+        return sweep(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Command):
+    """Draw a comparison's figures, table and report again from its files, or a sweep's table."""
+
+    folder: Positional[Path]
+    """Folder that `rotorgram compare` or `rotorgram sweep` wrote."""
+
+    def run(self) -> int:
+        """Write what is drawn from the files, and print the table."""
+        from ..experiments.sweep import is_sweep
+
+        if is_sweep(self.folder):
+            from .sweep import report
+        else:
+            from .compare import report
         report(self.folder)
         return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render(Command):
+    """Film flights: a policy's, or those of a journal; several side by side.
+
+    Needs no display. Exit status 2 where there is no OpenGL.
+    """
+
+    what: Positional[tuple[str, ...]]
+    """Checkpoint, folder of a training, pid, random, or a journal (.mcap). Policies fly evaluation
+    episodes without exploration."""
+    out: Path
+    """film.mp4, film.gif, picture.png, or a folder for pictures 0001.png and so on. It must not
+    exist."""
+    camera: Literal["chase", "front", "side", "top", "onboard"] = "chase"
+    """From where. Front and side stand still, the others follow."""
+    episode: int = 0
+    """The first episode: of an evaluation, or of those in the journal."""
+    episodes: int = 1
+    """How many."""
+    size: str = "1280x720"
+    """WIDTHxHEIGHT of the picture with all its panes, pixels."""
+    fps: float = 25.0
+    """Pictures per second."""
+    speed: float = 1.0
+    """Seconds of flight per second of film: 0.25 is slow motion."""
+    at: float | None = None
+    """One picture, at this time of the first episode, s. Without it a .png is the last one."""
+    world: Literal["airport", "plain"] = "airport"
+    """Where it flies, to look at; what is flown is the same."""
+    overlay: bool = True
+    """Numbers and error curves on the picture."""
+    fast: bool = False
+    """Without shadows and smooth edges: several times as fast where software draws."""
+    names: tuple[str, ...] = ()
+    """Titles, once for each flight. Default: what it is."""
+    session: int | None = None
+    """With a journal: which session, as rotorgram replay counts them. Default: the first that
+    flew."""
+    drone: int = 0
+    """With a journal: which drone of the session."""
+    env: EnvOptions = field(default_factory=EnvOptions)
+    """With a checkpoint: changes to the options that it was trained with. No use to a journal."""
+
+    def run(self) -> int:
+        """Fly or read, draw, and say where."""
+        from .render import render
+
+        return render(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,8 +386,11 @@ COMMANDS: dict[str, Any] = {
     "train": Train,
     "serve": Serve,
     "evaluate": Evaluate,
+    "view": View,
     "compare": Compare,
+    "sweep": Sweep,
     "report": Report,
+    "render": Render,
     "bench": Bench,
     "check-model": CheckModel,
     "key": MakeKey,

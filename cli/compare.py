@@ -1,21 +1,19 @@
 """`rotorgram compare` and `rotorgram report`."""
 
-import shlex
-import sys
+import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from ..experiments.compare import PARTS, CompareConfig, read_compare_config
 from ..experiments.compare import compare as run_comparison
-from ..experiments.errors import RunsFailed
 from ..experiments.metrics import results_table
 from ..experiments.records import read_records
-from ..experiments.report import terminal_table, write_report
+from ..experiments.report import VIDEO_FILE, terminal_table, write_report
 from .inputs import new_folder, refuse_settings
-from .progress import bars
+from .workers import WORKERS, command_line, showing, workers
 
 if TYPE_CHECKING:
     from .commands import Compare
@@ -25,11 +23,10 @@ __all__ = ["compare", "report"]
 
 def compare(command: "Compare") -> int:
     """Train, evaluate and report."""
-    workers: dict[str, Any] = {n: getattr(command, n) for n in ("jobs", "backend", "address")}
     if command.resume:
         folder = command.resume
-        refuse_settings(command, folder, free=("resume", *workers))
-        config = replace(read_compare_config(folder), **workers)
+        refuse_settings(command, folder, free=("resume", "film", *WORKERS))
+        config = replace(read_compare_config(folder), **workers(command))
         if not (folder / PARTS).is_dir():
             raise ValueError(
                 f"resume: expected an interrupted comparison, {folder} is finished; "
@@ -44,27 +41,33 @@ def compare(command: "Compare") -> int:
             env=command.env.checked(),
             snapshots=command.snapshots,
             episodes=command.episodes,
-            **workers,
+            **workers(command),
         )
         folder = new_folder(command.out, "compare")
-    words = shlex.join(["rotorgram", *sys.argv[1:]])
-    try:
-        with bars() as progress:
-            run_comparison(config, folder, words, progress)
-    except (KeyboardInterrupt, RunsFailed):
-        where = f" --backend {command.backend}" if command.backend != "loky" else ""
-        where += f" --address {command.address}" if command.address else ""
-        if folder.exists():
-            print(f"go on with: rotorgram compare --resume {folder}{where}")
-        raise
-    report(folder)
+    with showing("compare", command, folder) as progress:
+        run_comparison(config, folder, command_line(), progress)
+    report(folder, film=command.film)
     return 0
 
 
-def report(folder: Path) -> None:
-    """Write figures and report from the folder's files, and print the table."""
+def report(folder: Path, *, film: bool = True) -> None:
+    """Write figures, film and report from the folder's files, and print the table."""
     records = read_records(folder)
     results = results_table(records.evaluations, records.runs)
+    if film and not (folder / VIDEO_FILE).exists():
+        _film(folder)
     page = write_report(folder, records, results)
     Console(width=100).print(terminal_table(results))
     print(f"report: {page}")
+
+
+def _film(folder: Path) -> None:
+    """A film of the agents for the report. A report without one is a report."""
+    # OpenGL is loaded when everything is trained, not before.
+    from ..experiments.comparison_film import film_comparison
+
+    print("filming the agents side by side", flush=True)
+    try:
+        film_comparison(folder, folder / VIDEO_FILE)
+    except OSError as error:
+        logging.getLogger(__name__).info("no film of the agents: %s", error)

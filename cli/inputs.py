@@ -1,7 +1,7 @@
 """What the commands make of their flags: addresses, policies, envs, folders."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, fields
 from datetime import datetime
@@ -37,7 +37,7 @@ def parse_address(text: str) -> "Address":
     return host, int(port)
 
 
-def parse_changes(changes: tuple[str, ...]) -> dict[str, Any]:
+def parse_changes(changes: Iterable[str]) -> dict[str, Any]:
     """`name=value` pairs of hyperparameters. Raises `ValueError`."""
     result = {}
     for change in changes:

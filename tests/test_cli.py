@@ -18,8 +18,8 @@ from rotorgram.experiments.records import read_records, read_steps
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 COMMANDS = [
-    "sim", "train", "serve", "evaluate", "compare", "report", "check-model",
-    "key", "relay", "replay", "bench",
+    "sim", "train", "serve", "evaluate", "compare", "sweep", "report", "check-model",
+    "key", "relay", "replay", "bench", "render", "view",
 ]  # fmt: skip
 
 
@@ -331,6 +331,7 @@ def test_compare_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture
     page = (folder / "report.html").read_text()
     assert page.count('<figure class="card chart"') == 6
     assert len(list((folder / "figures").glob("*.png"))) == 4
+    assert (folder / "video.mp4").exists() == ("data:video/mp4;base64," in page)
     assert (folder / "results.csv").exists()
     config = json.loads((folder / "config.json").read_text())
     assert config["env"]["episode_length"] == 50
@@ -361,7 +362,7 @@ def test_an_interrupted_comparison_goes_on(
     status, _, err = run(capsys, "compare", "--resume", folder, "--seeds", 4)
     assert status == 1
     assert "got others by --seeds" in err
-    assert run(capsys, "compare", "--resume", folder, "--jobs", 1)[0] == 0
+    assert run(capsys, "compare", "--resume", folder, "--jobs", 1, "--no-film")[0] == 0
     assert read_records(folder).runs.seed.tolist() == [0, 1, 2]
     assert first.splitlines()[1] in (folder / "evaluations.csv").read_text()
     assert not (folder / "parts").exists()

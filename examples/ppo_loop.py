@@ -1,0 +1,81 @@
+"""PPO in one file on the vector env: collect, advantages, update, and nothing hidden.
+
+    python examples/ppo_loop.py [--updates 40]
+
+The env resets a drone in the step after its episode's end (Gymnasium's NEXT_STEP). That step is no
+transition: its action is ignored and its reward is 0, so it is masked out of everything.
+"""
+
+import argparse
+
+import gymnasium as gym
+import numpy as np
+import rotorgram.envs
+import torch
+from torch import nn
+
+assert rotorgram.envs  # importing it registers the env
+parser = argparse.ArgumentParser()
+parser.add_argument("--updates", type=int, default=40)
+args = parser.parse_args()
+
+DRONES, STEPS, GAMMA, LAMBDA, CLIP = 64, 64, 0.98, 0.95, 0.2
+torch.manual_seed(0)
+torch.set_num_threads(1)
+envs = gym.make_vec("rotorgram/Elevation-v0", num_envs=DRONES)
+
+
+def network(outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(3, 32), nn.Tanh(), nn.Linear(32, outputs))
+
+
+actor, critic, log_std = network(1), network(1), nn.Parameter(torch.tensor(-0.5))
+optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters(), log_std], lr=3e-3)
+observation, _ = envs.reset(seed=0)
+fresh = np.zeros(DRONES, bool)  # whose next step is a reset, no transition
+total, returns = np.zeros(DRONES), []
+
+for update in range(args.updates):
+    rows = []
+    for _ in range(STEPS):
+        seen = torch.as_tensor(observation)
+        with torch.no_grad():
+            policy = torch.distributions.Normal(actor(seen), log_std.exp())
+            action, value = policy.sample(), critic(seen).squeeze(1)
+            log_prob = policy.log_prob(action).sum(1)
+        following, reward, terminated, truncated, _ = envs.step(action.clamp(-1, 1).numpy())
+        with torch.no_grad():  # a truncated flight would have gone on; a terminated one would not
+            after = critic(torch.as_tensor(following)).squeeze(1) * torch.as_tensor(~terminated)
+        rows.append((seen, action, log_prob, value, after, torch.as_tensor(reward).float(),
+                     torch.as_tensor(terminated | truncated), torch.as_tensor(~fresh)))  # fmt: skip
+        total += reward
+        fresh = terminated | truncated
+        returns += total[fresh].tolist()
+        total[fresh] = 0
+        observation = following
+    seen, action, log_prob, value, after, reward, ended, flown = map(
+        torch.stack, zip(*rows, strict=True)
+    )
+
+    advantage, ahead = torch.zeros_like(reward), torch.zeros(DRONES)
+    for t in reversed(range(STEPS)):
+        delta = reward[t] + GAMMA * after[t] - value[t]
+        ahead = delta + GAMMA * LAMBDA * ahead * ~ended[t] * flown[t]
+        advantage[t] = ahead
+    target, old = (advantage + value)[flown], log_prob[flown]
+    seen, action, advantage = seen[flown], action[flown], advantage[flown]
+    advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+
+    for _ in range(8):
+        for batch in torch.randperm(len(seen)).split(512):
+            policy = torch.distributions.Normal(actor(seen[batch]), log_std.exp())
+            ratio = (policy.log_prob(action[batch]).sum(1) - old[batch]).exp()
+            clipped = ratio.clamp(1 - CLIP, 1 + CLIP)
+            gain = torch.min(ratio * advantage[batch], clipped * advantage[batch]).mean()
+            miss = (critic(seen[batch]).squeeze(1) - target[batch]).pow(2).mean()
+            optimizer.zero_grad()
+            (0.5 * miss - gain).backward()
+            optimizer.step()
+    recent = f"{np.mean(returns[-DRONES:]):.1f}" if returns else "none yet"
+    print(f"update {update + 1}: {(update + 1) * DRONES * STEPS:,} steps, return {recent}")
+envs.close()

@@ -1,0 +1,176 @@
+"""Films of pictures: MP4, GIF, PNGs. A film is there whole or not at all."""
+
+import subprocess
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+from typing import IO, Final
+
+import numpy as np
+from PIL import Image
+
+__all__ = ["SUFFIXES", "check_film", "write_film"]
+
+SUFFIXES: Final = (".mp4", ".gif", ".png", "")
+"""What a film may be; no suffix is a folder of PNGs."""
+QUALITY: Final = 20
+"""x264's constant rate factor: less is better and larger."""
+
+
+def check_film(path: Path, width: int, height: int, fps: float) -> None:
+    """Tell before anything is drawn what `write_film` could not write. Raises `ValueError`."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(
+            f"film: expected a name that ends in .mp4, .gif or .png, or a folder's name without a "
+            f"dot, got {path}"
+        )
+    if path.exists():
+        raise ValueError(f"film: {path} is there already; choose another name")
+    if not (0.01 <= fps <= 1000):
+        raise ValueError(f"fps: expected 0.01 to 1000 pictures per second, got {fps:g}")
+    if path.suffix.lower() == ".mp4" and (width % 2 or height % 2):
+        raise ValueError(
+            f"film: expected an even width and an even height for MP4, got {width}x{height}"
+        )
+    if path.suffix.lower() == ".gif" and abs(100 / fps - round(100 / fps)) > 1e-6:
+        raise ValueError(
+            "fps: expected 100 divided by a whole number (50, 25, 20, 10) for GIF, which counts "
+            f"hundredths of a second, got {fps:g}"
+        )
+
+
+def write_film(
+    path: Path, frames: Iterable[np.ndarray], fps: float, *, quality: int = QUALITY
+) -> int:
+    """Write a film of a kind that its name says.
+
+    `.mp4` is H.264 that every browser plays and that starts before it is loaded whole; `.gif`
+    repeats for ever; `.png` is the last frame alone; a name without a dot becomes a folder of
+    `0001.png`, `0002.png` and so on. Everything is written beside `path` and gets its name when it
+    is whole: Ctrl-C leaves nothing behind.
+
+    Args:
+        path: Must not exist.
+        frames: uint8, shape (height, width, 3), all of one size; taken one by one.
+        fps: Frames per second.
+        quality: Of `.mp4`, x264's constant rate factor: 0 (every bit) to 51.
+
+    Returns:
+        How many frames were taken.
+
+    Raises:
+        ValueError: The name, the size or the rate is not what it should be; there are no frames.
+        OSError: It cannot be written, or the encoder failed.
+    """
+    taken = iter(frames)
+    first = next(taken, None)
+    if first is None:
+        raise ValueError("film: expected at least one frame, got none")
+    check_film(path, first.shape[1], first.shape[0], fps)
+    counted = _Counted(chain((first,), taken))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        unfinished = Path(folder) / path.name
+        match path.suffix.lower():
+            case ".mp4":
+                _write_mp4(unfinished, counted, fps, quality)
+            case ".gif":
+                _write_gif(unfinished, counted, fps)
+            case ".png":
+                *_, last = counted
+                Image.fromarray(last).save(unfinished)
+            case _:
+                unfinished.mkdir()
+                for number, frame in enumerate(counted, 1):
+                    Image.fromarray(frame).save(unfinished / f"{number:04}.png")
+        unfinished.rename(path)
+    return counted.count
+
+
+class _Counted:
+    """Hands frames on, all of the size of the first, and counts them."""
+
+    def __init__(self, frames: Iterator[np.ndarray]) -> None:
+        self._frames = frames
+        self._shape: tuple[int, ...] = ()
+        self.count = 0
+
+    def __iter__(self) -> "_Counted":
+        return self
+
+    def __next__(self) -> np.ndarray:
+        frame = next(self._frames)
+        self._shape = self._shape or frame.shape
+        if frame.dtype != np.uint8 or frame.shape != self._shape or frame.shape[2:] != (3,):
+            raise ValueError(
+                f"film: expected frames of uint8, shape {(*self._shape[:2], 3)}, "
+                f"got {frame.dtype}, shape {frame.shape}"
+            )
+        self.count += 1
+        return frame
+
+
+def _write_gif(path: Path, frames: _Counted, fps: float) -> None:
+    # Without dithering: what stands still stays the same, and costs nothing.
+    pictures = (Image.fromarray(f).quantize(256, dither=Image.Dither.NONE) for f in frames)
+    first = next(pictures)
+    milliseconds = round(100 / fps) * 10
+    with path.open("wb") as file:  # Pillow's own stays open when it is interrupted
+        first.save(
+            file, "GIF", save_all=True, append_images=pictures, duration=milliseconds, loop=0
+        )
+
+
+def _write_mp4(path: Path, frames: _Counted, fps: float, quality: int) -> None:
+    first = next(frames)
+    height, width, _ = first.shape
+    rate = str(Fraction(fps).limit_denominator(1001))
+    words = [
+        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", rate, "-i", "-"),
+        *("-an", "-c:v", "libx264", "-preset", "slow", "-crf", str(quality)),
+        *("-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(path)),
+    ]
+    with _encoder(words) as encoder:
+        for frame in chain((first,), frames):
+            encoder.write(np.ascontiguousarray(frame).data)
+
+
+@contextmanager
+def _encoder(words: list[str]) -> Iterator[IO[bytes]]:
+    """FFmpeg, to which raw frames are written. Raises `OSError` with its words where it fails."""
+    from imageio_ffmpeg import get_ffmpeg_exe  # type: ignore[import-untyped]
+
+    try:
+        program = get_ffmpeg_exe()
+    except RuntimeError:
+        raise OSError(
+            "ffmpeg: expected one that imageio-ffmpeg brings or finds, got none; "
+            "write a .gif or a folder of PNGs"
+        ) from None
+    with tempfile.TemporaryFile() as said:
+        # In a session of its own: Ctrl-C is for us, who then end it.
+        with subprocess.Popen(
+            [program, "-y", "-v", "error", *words],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+            start_new_session=True,
+        ) as process:
+            assert process.stdin is not None
+            broken = False
+            try:
+                yield process.stdin
+                process.stdin.close()
+            except BrokenPipeError:
+                broken = True
+            except BaseException:
+                process.kill()
+                raise
+            failed = process.wait() != 0 or broken
+        if failed:
+            said.seek(0)
+            why = " ".join(said.read().decode(errors="replace").split())
+            raise OSError(f"ffmpeg: the film could not be written: {why:.300}")

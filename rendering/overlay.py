@@ -1,0 +1,240 @@
+"""What is written on a picture: whose flight it is, its numbers, and its error over time."""
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+import numpy as np
+from PIL import Image, ImageColor, ImageDraw, ImageFont
+
+from ..models.constants import HOVER_THRUST, MAX_THRUST
+from .moment import Moment
+
+__all__ = ["Overlay"]
+
+_GROUND: Final = (13, 18, 26, 168)
+"""Of panels: dark, and some of the picture shows through."""
+_EDGE: Final = (255, 255, 255, 36)
+_NAMES: Final = (164, 176, 190)
+_VALUES: Final = (238, 242, 246)
+_ZERO: Final = (150, 162, 176)
+_LIMIT: Final = (84, 96, 110)
+_ALARM: Final = (255, 107, 96)
+_BAR: Final = (120, 190, 255)
+_BAR_GROUND: Final = (70, 82, 98)
+_TIMES: Final = 2
+"""Everything is drawn so much larger, and reduced: smooth lines, letters where they belong."""
+
+
+class Box(NamedTuple):
+    """Edges, pixels."""
+
+    left: int
+    upper: int
+    right: int
+    lower: int
+
+
+class Overlay:
+    """Draws on the pictures of one flight: a panel of numbers, and a strip of E over time.
+
+    Everything scales with the picture. A number that has no room is left out.
+
+    Args:
+        width, height: Of the pictures, pixels.
+        title: Who flies.
+        color: The title's and the curve's, as "#RRGGBB": light, the ground is dark.
+        period: Between two errors of the strip, s.
+        seconds: Length of the strip's time axis, s.
+        band: The strip reaches from -band to +band, m.
+
+    Attributes:
+        panel: Where the numbers are.
+        strip: Where the strip is.
+        plot: Where in it the curve is.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        *,
+        title: str,
+        color: str = "#7CC8F2",
+        period: float,
+        seconds: float,
+        band: float,
+    ) -> None:
+        self._size = width, height
+        self._title, self._color = title, ImageColor.getrgb(color)[:3]
+        self._period, self._seconds, self._band = period, max(seconds, period), band
+        unit = max(7.0, min(height / 30, width / 29))
+        self._unit, self._gap = unit, max(2, round(0.55 * unit))
+        self._line = round(1.38 * unit)
+        self._small, self._font, self._large = (_font(unit * share) for share in (0.85, 1, 1.25))
+        self.panel = self._panel_box()
+        self.strip, self.plot = self._strip_boxes()
+        self._grounds = [(box, _ground(box, self._gap)) for box in (self.panel, self.strip)]
+
+    def draw(
+        self, picture: np.ndarray, moment: Moment, errors: Sequence[float], note: str = ""
+    ) -> np.ndarray:
+        """A picture with everything on it.
+
+        Args:
+            picture: uint8, shape (height, width, 3). It stays as it is.
+            moment: What its panel tells.
+            errors: E from the episode's start to this moment, m, one for each period.
+            note: What happened, such as "terminated".
+        """
+        image = Image.fromarray(picture)
+        if image.size != self._size:
+            raise ValueError(f"picture: expected {self._size} pixels, got {image.size}")
+        for box, ground in self._grounds:
+            image.paste(ground, box[:2], ground)
+        _enlarged(image, self.panel, lambda draw: self._write_panel(draw, moment))
+        _enlarged(image, self.strip, lambda draw: self._write_strip(draw, errors))
+        if note:
+            box = self._note_box(note)
+            _enlarged(image, box, lambda draw: self._write_note(draw, box, note))
+        return np.asarray(image)
+
+    # Boxes are in pixels of the picture; what writes into them draws in enlarged pixels, from the
+    # box's own corner on.
+
+    def _panel_box(self) -> Box:
+        gap, (width, height) = self._gap, self._size
+        lower = gap + 2 * gap + round(1.6 * self._unit) + 6 * self._line + 2 * gap
+        title = 4 * gap + self._large.getlength(self._title) / _TIMES + 1.2 * self._unit
+        right = gap + max(round(17.5 * self._unit), round(title))
+        return Box(gap, gap, min(right, width - gap), min(lower, height - gap))
+
+    def _write_panel(self, draw: ImageDraw.ImageDraw, moment: Moment) -> None:
+        unit, gap, line = self._unit * _TIMES, self._gap * _TIMES, self._line * _TIMES
+        right, lower = (
+            (a - b) * _TIMES for a, b in zip(self.panel[2:], self.panel[:2], strict=True)
+        )
+        left, right, y = 2 * gap, right - 2 * gap, gap
+        middle, radius = y + 0.8 * unit, 0.36 * unit
+        draw.ellipse((left, middle - radius, left + 2 * radius, middle + radius), self._color)
+        title = _fitted(self._title, self._large, right - left - 1.2 * unit)
+        draw.text((left + 1.2 * unit, middle), title, self._color, self._large, anchor="lm")
+        y += round(1.6 * unit) + gap // 2
+        for name, value in moment.lines():
+            if y + line > lower:
+                return
+            draw.text((left, y), name, _NAMES, self._font)
+            draw.text((right, y), _spaced(value), _VALUES, self._font, anchor="ra")
+            y += line
+            if name.startswith("F1"):
+                self._draw_bars(draw, Box(left, y, right, y + gap), moment.thrusts)
+                y += 2 * gap
+
+    def _draw_bars(
+        self, draw: ImageDraw.ImageDraw, box: Box, thrusts: tuple[float, float, float, float]
+    ) -> None:
+        """The thrusts side by side, with a mark at hover."""
+        gap = self._gap * _TIMES
+        long, thick = (box.right - box.left - 3 * gap) / 4, max(1, round(self._unit / 7))
+        for number, thrust in enumerate(thrusts):
+            start = box.left + number * (long + gap)
+            full = start + long * min(max(thrust / MAX_THRUST, 0.0), 1.0)
+            draw.rectangle((start, box.upper, start + long, box.lower), _BAR_GROUND)
+            if full > start:
+                draw.rectangle((start, box.upper, full, box.lower), _BAR)
+            mark = start + long * HOVER_THRUST / MAX_THRUST
+            draw.line((mark, box.upper - _TIMES, mark, box.lower + _TIMES), _VALUES, thick)
+
+    def _strip_boxes(self) -> tuple[Box, Box]:
+        gap, (width, height) = self._gap, self._size
+        upper = max(height - gap - round(6.6 * self._unit), 0)
+        strip = Box(gap, upper, width - gap, height - gap)
+        label = max(self._small.getlength(name) for name, _ in self._levels()) / _TIMES
+        left, upper = strip.left + round(label) + 3 * gap, upper + gap + round(1.75 * self._unit)
+        right, lower = strip.right - 2 * gap, strip.lower - round(1.5 * gap)
+        return strip, Box(left, upper, max(left, right), max(upper, lower))
+
+    def _levels(self) -> tuple[tuple[str, float], ...]:
+        """What stands at the lines of the strip, and where they are: shares of the band."""
+        return (f"+{self._band:g}", 1.0), ("0", 0.0), (f"-{self._band:g}", -1.0)
+
+    def _write_strip(self, draw: ImageDraw.ImageDraw, errors: Sequence[float]) -> None:
+        unit, gap = self._unit * _TIMES, self._gap * _TIMES
+        draw.text((2 * gap, gap), "E over time, m", _NAMES, self._font)
+        time = f"{max(len(errors) - 1, 0) * self._period:.2f} s"
+        end = (self.strip.right - self.strip.left) * _TIMES - 2 * gap
+        draw.text((end, gap), time, _VALUES, self._font, anchor="ra")
+        dx, dy = self.strip.left, self.strip.upper
+        left, upper, right, lower = (
+            (edge - (dx, dy)[number % 2]) * _TIMES for number, edge in enumerate(self.plot)
+        )
+        for label, share in self._levels():
+            y, color = lower - (lower - upper) * (1 + share) / 2, _LIMIT if share else _ZERO
+            draw.line((left, y, right, y), color, max(1, round(unit / 14)))
+            if share or lower - upper > 2.4 * unit:  # there is room for the zero too
+                draw.text((left - gap, y), label, _NAMES, self._small, anchor="rm")
+        self._draw_curve(draw, Box(left, upper, right, lower), errors)
+
+    def _draw_curve(self, draw: ImageDraw.ImageDraw, box: Box, errors: Sequence[float]) -> None:
+        shares = np.clip(np.asarray(errors, float) / self._band, -1.0, 1.0)
+        across = (box.right - box.left) * self._period / self._seconds
+        xs = np.minimum(box.left + across * np.arange(len(shares)), box.right)
+        ys = box.lower - (box.lower - box.upper) * (1 + shares) / 2
+        points = list(zip(xs.tolist(), ys.tolist(), strict=True))
+        thick = max(_TIMES, round(self._unit * _TIMES / 6))
+        if len(points) > 1:
+            draw.line(points, self._color, thick, joint="curve")
+        for x, y in points[-1:]:
+            draw.ellipse((x - thick, y - thick, x + thick, y + thick), self._color)
+
+    def _note_box(self, note: str) -> Box:
+        """Below the panel, away from the craft."""
+        wide = self._large.getlength(note) / _TIMES + 3 * self._gap
+        left, upper = self.panel.left, self.panel.lower + self._gap
+        return Box(left, upper, round(left + wide), round(upper + 1.9 * self._unit))
+
+    def _write_note(self, draw: ImageDraw.ImageDraw, box: Box, note: str) -> None:
+        size = (box.right - box.left) * _TIMES - 1, (box.lower - box.upper) * _TIMES - 1
+        thick = max(1, round(self._unit * _TIMES / 12))
+        draw.rounded_rectangle((0, 0, *size), self._gap * _TIMES, _GROUND[:3], _ALARM, thick)
+        draw.text((size[0] / 2, size[1] / 2), note, _ALARM, self._large, anchor="mm")
+
+
+def _enlarged(image: Image.Image, box: Box, write: Callable[[ImageDraw.ImageDraw], None]) -> None:
+    """Write on a part of the picture. What is not written on stays as it is, bit for bit."""
+    part = image.crop(box)
+    part = part.resize((part.width * _TIMES, part.height * _TIMES), Image.Resampling.NEAREST)
+    write(ImageDraw.Draw(part))
+    image.paste(part.reduce(_TIMES), box[:2])
+
+
+def _ground(box: Box, radius: int) -> Image.Image:
+    """An empty panel, RGBA."""
+    size = (box.right - box.left) * _TIMES, (box.lower - box.upper) * _TIMES
+    image = Image.new("RGBA", size)
+    edges = (0, 0, size[0] - 1, size[1] - 1)
+    ImageDraw.Draw(image).rounded_rectangle(edges, radius * _TIMES, _GROUND, _EDGE, _TIMES)
+    return image.reduce(_TIMES)
+
+
+def _spaced(value: str) -> str:
+    """Numbers of a row further apart than a number from its unit."""
+    words = value.split()
+    return " ".join(("  ".join(words[:-1]), words[-1])) if len(words) > 2 else " ".join(words)
+
+
+def _fitted(text: str, font: ImageFont.FreeTypeFont, room: float) -> str:
+    """The text, or its beginning where it is too long."""
+    if font.getlength(text) <= room:
+        return text
+    while text and font.getlength(text + "...") > room:
+        text = text[:-1]
+    return text + "..."
+
+
+@lru_cache
+def _font(size: float) -> ImageFont.FreeTypeFont:
+    """For so many pixels of the picture."""
+    font = ImageFont.load_default(size * _TIMES)
+    assert isinstance(font, ImageFont.FreeTypeFont)  # Pillow's wheels bring FreeType
+    return font
