@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import pandas as pd
 
-from ..agents import preset
+from ..agents import A2CConfig, preset
 from ..agents.checkpoints import load, software_versions, write_whole
 from ..agents.episodes import Episode
 from ..envs import ElevationConfig
@@ -32,6 +32,8 @@ EPISODES: Final = "episodes.csv"
 _NOT_KEPT: Final = ("listen", "num_simulators", "key_file", "insecure", "record", "store_every")
 _UPDATE_WITHIN: Final = 0.7  # s
 _SHOW_EVERY: Final = 0.2  # s
+_LEAST_STEPS: Final = 16  # of each drone for an update of A2C
+_LEAST_UPDATES: Final = 30  # of VPG
 
 
 def train(command: "Train") -> int:
@@ -42,17 +44,49 @@ def train(command: "Train") -> int:
         return _resume(command, command.resume)
     run = Run(
         algorithm=command.algorithm,
-        config=preset(command.algorithm, command.preset, **parse_changes(command.set)),
+        config=preset(
+            command.algorithm,
+            command.preset,
+            **parse_changes(word for words in command.set for word in words),
+        ),
         env=command.env.checked(),
         seed=command.seed,
         env_steps=command.env_steps,
         num_envs=command.num_envs,
     )
+    if advice := _advice(run):
+        print(f"note: {advice}", flush=True)
     folder = new_folder(command.out, f"{run.algorithm}-seed{run.seed}")
     with remote_env(run.env, command, run.num_envs, command.num_simulators) as env:
         training = Training(run, env)
         _write_config(training, folder)
         return _train(training, folder, command)
+
+
+def _advice(run: Run) -> str:
+    """What to set where the other settings leave too little for so many drones; or nothing."""
+    drones, config = run.num_envs, run.config
+    if drones == 1:
+        return ""
+    if isinstance(config, A2CConfig):
+        steps = config.rollout_size(drones) // drones
+        if steps >= _LEAST_STEPS:
+            return ""
+        better = 2 * _LEAST_STEPS * drones
+        return (
+            f"an update has {steps} steps of each of {drones} drones, and {run.algorithm} learns "
+            f"little from fewer than {_LEAST_STEPS}: try --set steps_per_update={better}, a higher "
+            f"learning_rate, and --env-steps {100 * better} or more"
+        )
+    whole = -(-config.episodes_per_update // drones) * drones * run.env.episode_length
+    updates = run.env_steps // whole
+    if updates >= _LEAST_UPDATES:
+        return ""
+    return (
+        f"{run.env_steps:,} env steps of {drones} drones may be as few as {updates} updates, and "
+        f"vpg learns little from fewer than {_LEAST_UPDATES}: try --env-steps "
+        f"{_LEAST_UPDATES * whole} or more, or fewer drones"
+    )
 
 
 def _resume(command: "Train", folder: Path) -> int:

@@ -22,8 +22,8 @@ __all__ = ["Run", "Snapshot", "Training", "is_finished"]
 
 AnyEnv = gym.Env[np.ndarray, Any] | AdvancingVectorEnv
 
-# Episodes to average over, but no fewer than one of each drone: of those that are under way together
-# the shortest end first, and the last few to end are those that flew longest.
+# Episodes to average over, or as many as there are drones, if that is more: of those that began
+# together the shortest end first, so that the last few to end are those that flew longest.
 _RECENT = 20  # in a progress report: it tells how it goes now
 _WINDOW = 100  # in a point of a curve: SB3's `stats_window_size`
 

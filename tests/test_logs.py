@@ -75,7 +75,7 @@ def sized(algorithm: str, steps: int = 100) -> tuple[str, str]:
 @pytest.mark.parametrize("algorithm", AGENTS)
 def test_the_names_are_those_of_the_pages(algorithm: str, drones: int, tmp_path: Path) -> None:
     logged = train(
-        algorithm, tmp_path / "run", "--env-steps", 400, "--num-envs", drones, *sized(algorithm)
+        algorithm, tmp_path / "run", "--env-steps", 600, "--num-envs", drones, *sized(algorithm)
     )
     assert set(logged) == documented("README.md") | documented(f"{algorithm}.md")
     critic = {"train/value_loss", "train/explained_variance"}

@@ -20,6 +20,7 @@ from rotorgram.agents.returns import advantages
 from rotorgram.agents.rollouts import VectorCollector
 from rotorgram.agents.sb3_vec import SB3VecEnv
 from rotorgram.agents.vector_episodes import VectorEpisodeLog
+from rotorgram.cli import main
 from rotorgram.envs import ENV_ID, ElevationConfig, ElevationVectorEnv
 from rotorgram.experiments.training import Run, Training, is_finished
 from rotorgram.udp import RemoteVectorEnv, Simulator
@@ -208,12 +209,14 @@ def test_whole_episodes_of_every_drone() -> None:
 
 
 def test_episodes_are_broken_off_where_the_training_ends() -> None:
+    """A part of an episode is not learnt from, but it was flown; a single drone keeps its last."""
     log = VectorEpisodeLog(ElevationVectorEnv(N), 0)
     rollout = VectorCollector(log, np.random.default_rng(0)).episodes(policy(), 1, 23)
-    assert len(rollout) == log.env_steps == 25
-    # The last step of each drone: no return of one runs on into the next.
-    assert np.flatnonzero(rollout.ends).tolist() == [4, 9, 14, 19, 24]
-    assert not rollout.terminated.any()
+    assert (len(rollout), log.env_steps) == (0, 25)
+    assert rollout.observations.shape == (0, 3)
+    log = VectorEpisodeLog(ElevationVectorEnv(1), 0)
+    rollout = VectorCollector(log, np.random.default_rng(0)).episodes(policy(), 1, 23)
+    assert len(rollout) == log.env_steps == 23
 
 
 def test_policies_of_many_are_those_of_each() -> None:
@@ -280,6 +283,57 @@ def test_a_training_that_was_stopped_ends_as_if_it_had_not(
             assert ours[name].tobytes() == theirs[name].tobytes(), name
     kept_episodes = [[replace(e, seconds=0.0) for e in t.log.episodes] for t in (resumed, unbroken)]
     assert kept_episodes[0] == kept_episodes[1]
+
+
+def test_progress_tells_of_every_drone() -> None:
+    """Of 120 drones that begin together the last 20 to end are those that flew longest."""
+    run = replace(run_of("vpg"), num_envs=120, env_steps=7200)
+    training = Training(run, ElevationVectorEnv(120, **OPTIONS))
+    training.train()
+    assert len(training.log.episodes) >= 240
+    last = training.log.episodes[-120:]
+    lengths = [episode.length for episode in last]
+    assert np.mean(lengths[-20:]) > np.mean(lengths)
+    mean = np.mean([episode.total_reward for episode in last])
+    assert training.progress().mean_return == pytest.approx(mean)
+    assert training.scalars()["rollout/ep_rew_mean"] == pytest.approx(mean)
+    assert training.scalars()["rollout/ep_len_mean"] == pytest.approx(np.mean(lengths))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings", "note"),
+    [
+        ("a2c", ("--num-envs", 16), ""),
+        (
+            "sb3-a2c",
+            ("--num-envs", 18),
+            "note: an update has 15 steps of each of 18 drones, and sb3-a2c learns little from "
+            "fewer than 16: try --set steps_per_update=576, a higher learning_rate, and "
+            "--env-steps 57600 or more\n",
+        ),
+        # Rounds of 4 episodes of 5 steps: 30 updates, and one less.
+        ("vpg", ("--num-envs", 4, "--env-steps", 600), ""),
+        (
+            "vpg",
+            ("--num-envs", 4, "--env-steps", 599),
+            "note: 599 env steps of 4 drones may be as few as 29 updates, and vpg learns little "
+            "from fewer than 30: try --env-steps 600 or more, or fewer drones\n",
+        ),
+    ],
+)
+def test_train_says_where_the_drones_are_too_many(
+    algorithm: str,
+    settings: tuple[object, ...],
+    note: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    arguments = ["train", algorithm, "--env-steps", 600, "--env.episode-length", 5]
+    folder = tmp_path / "run"
+    assert main([str(a) for a in (*arguments, *settings, "--out", folder)]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith(note)
+    assert out.count("note: ") == bool(note)
 
 
 @pytest.mark.parametrize("algorithm", ["vpg", "a2c"])
@@ -363,6 +417,8 @@ def test_the_env_has_as_many_drones_as_the_run() -> None:
         Training(run_of("a2c"), ElevationVectorEnv(3))
     with pytest.raises(ValueError, match="num_envs: expected 1 or more, got 0"):
         replace(run_of("a2c"), num_envs=0)
+    with pytest.raises(ValueError, match="env_steps: expected at least 120, got 119"):
+        replace(run_of("vpg"), env_steps=119)  # an episode of each
 
 
 # ---- Stable-Baselines3

@@ -1,0 +1,137 @@
+"""Drones that fly a script, which says when each episode ends and how; all else is random."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from rotorgram.agents.episodes import EpisodeLog
+from rotorgram.agents.vector_episodes import VectorEpisodeLog
+from rotorgram.envs.autoreset import AdvancingVectorEnv
+from rotorgram.udp import LOST
+
+Script = Sequence[Sequence[tuple[int, str]]]
+"""Of each drone, length and end of its episodes, over and over."""
+
+CALM: Script = [
+    [(3, "end"), (5, "limit"), (1, "end"), (2, "both")],
+    [(4, "limit"), (1, "limit"), (6, "end")],
+    [(7, "end"), (2, "limit")],
+]
+LOSSES: Script = [
+    [(3, "end"), (5, "lost"), (1, "end"), (2, "both"), (1, "lost")],
+    [(4, "lost"), (1, "limit"), (6, "end")],
+    [(7, "end"), (2, "limit"), (6, "lost"), (3, "lost")],
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A step as it was flown."""
+
+    episode: int
+    observation: np.ndarray
+    action: np.ndarray
+    reward: float
+    after: np.ndarray
+    terminated: bool
+    truncated: bool
+    lost: bool
+
+    @property
+    def ends(self) -> bool:
+        return self.terminated or self.truncated
+
+
+class Scripted(AdvancingVectorEnv):
+    """Flies a script; a lost simulator as `RemoteVectorEnv` reports it."""
+
+    def __init__(self, script: Script, *, discrete: bool = False, reward: float | None = None):
+        self.closed, self.num_envs, self._script, self._reward = False, len(script), script, reward
+        self.metadata = {"autoreset_mode": AutoresetMode.DISABLED}
+        box = spaces.Box(-1, 1, (2,), np.float32)
+        self.single_action_space = spaces.Discrete(3) if discrete else box
+        self.single_observation_space = spaces.Box(-9, 9, (3,), np.float32)
+        self.action_space = batch_space(self.single_action_space, len(script))
+        self.observation_space = batch_space(self.single_observation_space, len(script))
+        self.flown: list[list[Row]] = [[] for _ in script]
+        self._episodes, self._steps = [-1] * len(script), [0] * len(script)
+        self._dice = np.random.default_rng(42)
+        self.observations = np.zeros((len(script), 3), np.float32)
+        self._clear()
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        self.advance(None, np.ones(self.num_envs, bool))
+        return self.observations.copy(), {}
+
+    def advance(self, actions: Any, resets: Any, seeds: Any = None, holds: Any = None) -> None:
+        self.observations = self.observations.copy()
+        self._clear()
+        for drone in range(self.num_envs):
+            if resets[drone]:
+                self._episodes[drone] += 1
+                self._steps[drone] = 0
+                self.observations[drone] = self._dice.normal(size=3)
+            elif holds is None or not holds[drone]:
+                self._fly(drone, actions[drone])
+
+    def _clear(self) -> None:
+        self.rewards = np.zeros(self.num_envs)
+        self.terminated, self.truncated, self.lost = np.zeros((3, self.num_envs), bool)
+
+    def _fly(self, drone: int, action: np.ndarray) -> None:
+        episodes, self._steps[drone] = self._script[drone], self._steps[drone] + 1
+        length, end = episodes[self._episodes[drone] % len(episodes)]
+        assert self._steps[drone] <= length, "flown after its end"
+        if self._steps[drone] < length:
+            end = "none"
+        before = self.observations[drone].copy()
+        self.terminated[drone] = end in ("end", "both")
+        self.truncated[drone] = end in ("limit", "both", "lost")
+        self.lost[drone] = end == "lost"
+        if end != "lost":
+            self.observations[drone] = self._dice.normal(size=3)
+            # Other rewards for each drone: they are not to be mistaken for each other.
+            random = self._dice.normal() + 5 * drone
+            self.rewards[drone] = random if self._reward is None else self._reward
+        row = Row(
+            episode=self._episodes[drone],
+            observation=before,
+            action=action.copy(),
+            reward=self.rewards[drone],
+            after=self.observations[drone].copy(),
+            terminated=bool(self.terminated[drone]),
+            truncated=bool(self.truncated[drone]),
+            lost=bool(self.lost[drone]),
+        )
+        self.flown[drone].append(row)
+
+    def _info(self, mask: np.ndarray) -> dict[str, Any]:
+        return {}
+
+
+class OneDrone(gym.Env[np.ndarray, Any]):
+    """The first drone of a scripted env, as `RemoteEnv` would fly it."""
+
+    def __init__(self, env: Scripted) -> None:
+        self.env, self._nobody = env, np.zeros(1, bool)
+        self.observation_space = env.single_observation_space
+        self.action_space = env.single_action_space
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        return self.env.reset()[0][0], {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        env = self.env
+        env.advance(np.reshape(action, (1, -1)), self._nobody)
+        info = {LOST: "killed"} if env.lost[0] else {}
+        ends = bool(env.terminated[0]), bool(env.truncated[0])
+        return env.observations[0].copy(), float(env.rewards[0]), *ends, info
+
+
+def log_of(env: Scripted) -> Any:
+    return VectorEpisodeLog(env, 7) if env.num_envs > 1 else EpisodeLog(OneDrone(env), 7)
