@@ -116,3 +116,17 @@ def test_the_scaling_page_tells_what_the_benchmark_wrote() -> None:
     assert (
         f"{len(runs)} runs of {runs.sum():,.0f} s in all, the longest of {runs.max():.0f} s" in page
     )
+
+
+def test_the_limits_are_those_that_were_measured() -> None:
+    page = (ROOT / "docs" / "limits.md").read_text()
+    bench, peers = (
+        json.loads((RESULTS / "performance" / f"{name}.json").read_text())
+        for name in ("bench", "peers")
+    )
+    echo = bench["ratios"]["UDP, 1 / UDP echo"]
+    assert f"{echo:.2f} of the rate of a bare echo, not the 0.6" in page
+    rates = peers["env_steps_per_second"]
+    factor = rates["Crazyflow DroneReachPos-v0, 4096"] / rates["rotorgram, 4096"]
+    assert round(factor) == 7
+    assert "Crazyflow is seven times as fast" in page

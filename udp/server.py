@@ -256,7 +256,8 @@ class Server:
 
     def _say_waiting(self, place: int) -> None:
         here, wait = address_text(self.address), self.config.connect_timeout
-        _log.warning("%s; waiting %g s for another at %s", self.lost[place], wait, here)
+        long = f"{wait:g} s " if wait < 86_400 else ""  # who waits for a month waits
+        _log.warning("%s; waiting %sfor another at %s", self.lost[place], long, here)
 
     def _nobody_came(self, lost: str) -> str:
         who = f"{lost}; no other" if lost else "no simulator"
