@@ -41,11 +41,21 @@ class Sim(Command):
     """Allow addresses beyond this machine without a key: whoever reaches them may take part."""
     record: Path | None = None
     """MCAP file to write every message to."""
+    view: Literal["window", "web"] | None = None
+    """Show what is flown, up to 16 drones: in a window, or on a page for browsers. Lock-step does
+    not wait for it. Keys: docs/viewing.md."""
+    view_port: int = 8080
+    """TCP port of the page, on this machine's loopback; 0 takes the first free one."""
+    world: Literal["airport", "plain"] = "airport"
+    """What is around the drones in the view."""
+    realtime: bool = False
+    """Fly no faster than real time, for who looks on."""
     env: EnvOptions = field(default_factory=EnvOptions)
 
     def run(self) -> int:
         """Simulate until the agent closes."""
         from ..udp import Simulator
+        from .watch import watched
 
         simulator = Simulator(
             server=parse_address(self.server),
@@ -62,7 +72,8 @@ class Sim(Command):
             record=self.record,
             **asdict(self.env.checked()),
         )
-        with simulator:
+        view = watched(simulator, self.view, self.view_port, self.world, realtime=self.realtime)
+        with simulator, view:
             here = "{}:{}".format(*simulator.address)
             print(f"simulating at {here} for the agent at {self.server} (Ctrl-C ends)", flush=True)
             try:

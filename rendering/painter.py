@@ -1,20 +1,20 @@
 """Gymnasium's render modes: one picture, one for each of many craft, or a window."""
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from .canvas import Canvas
+from .live import MOST_DRONES, LiveView, open_surface
 from .moment import Moment
+from .pace import Pace
 from .stage import Stage
 
 __all__ = ["Painter"]
 
 _ONE: Final = (480, 360)
 _OF_MANY: Final = (240, 180)
-_AT_MOST: Final = 16
-"""Craft in a window."""
 
 
 class Painter:
@@ -29,7 +29,7 @@ class Painter:
     def __init__(self, mode: str, drones: int, control_period: float) -> None:
         self._mode, self._drones, self._period = mode, drones, control_period
         self._canvas: Canvas | None = None
-        self._view: Any = None
+        self._view: LiveView | None = None
 
     def pictures(self, moments: Sequence[Moment]) -> tuple[np.ndarray, ...] | None:
         """A picture of each craft, uint8 of shape (height, width, 3); None with `human`.
@@ -38,7 +38,7 @@ class Painter:
             NoOpenGL: There is nothing to draw with, or no display to show it on.
         """
         if self._mode == "human":
-            self._show(moments[:_AT_MOST])
+            self._show(moments[:MOST_DRONES])
             return None
         if self._canvas is None:
             one = self._drones == 1
@@ -57,4 +57,8 @@ class Painter:
         return canvas.draw("chase")
 
     def _show(self, moments: Sequence[Moment]) -> None:
-        raise NotImplementedError
+        if self._view is None:
+            stage, pace = Stage(drones=len(moments)), Pace(self._period)
+            surface = open_surface("window", stage, pace)
+            self._view = LiveView(stage, surface, pace, of=self._drones)
+        self._view.draw_in_time(*moments)

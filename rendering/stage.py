@@ -161,17 +161,28 @@ def _grid(drones: int) -> list[tuple[float, float]]:
 
 
 def _disc(next_geom: NextGeom, centre: np.ndarray) -> None:
-    if (geom := next_geom()) is not None:
-        size = np.array((1.7, 0.006, 0.0))  # radius, half of its height
-        rgba = np.array(_DISC, np.float32)
-        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
-        mujoco.mjv_initGeom(geom, kind, size, centre, np.eye(3).ravel(), rgba)
+    size = (1.7, 0.006, 0.0)  # radius, half of its height
+    _decoration(next_geom, mujoco.mjtGeom.mjGEOM_CYLINDER, size, centre, _DISC)
 
 
 def _piece(next_geom: NextGeom, start: np.ndarray, end: np.ndarray, freshness: float) -> None:
-    if np.array_equal(start, end) or (geom := next_geom()) is None:
-        return
-    rgba = np.array((*_PATH, 0.85 * freshness), np.float32)
-    kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-    mujoco.mjv_initGeom(geom, kind, np.ones(3), np.zeros(3), np.eye(3).ravel(), rgba)
-    mujoco.mjv_connector(geom, kind, 0.035, start, end)
+    kind, rgba = mujoco.mjtGeom.mjGEOM_CAPSULE, (*_PATH, 0.85 * freshness)
+    if not np.array_equal(start, end):
+        geom = _decoration(next_geom, kind, (1.0, 1.0, 1.0), start, rgba)
+        if geom is not None:
+            mujoco.mjv_connector(geom, kind, 0.035, start, end)
+
+
+def _decoration(
+    next_geom: NextGeom,
+    kind: mujoco.mjtGeom,
+    size: tuple[float, ...],
+    centre: np.ndarray,
+    rgba: tuple[float, ...],
+) -> mujoco.MjvGeom | None:
+    """A geom that casts no shadow; None where there is no more room."""
+    if (geom := next_geom()) is not None:
+        color = np.array(rgba, np.float32)
+        mujoco.mjv_initGeom(geom, kind, np.array(size), centre, np.eye(3).ravel(), color)
+        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+    return geom

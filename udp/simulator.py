@@ -1,6 +1,7 @@
 """The simulator's side: a UDP client that steps Gymnasium envs by the commands of an agent."""
 
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -13,7 +14,7 @@ from .fleet import Fleet
 from .journal import of_simulator
 from .keys import Key, read_key
 from .link import Address, LinkConfig, encode
-from .messages import Close, Command, Message, Refuse, Welcome
+from .messages import Close, Command, Message, Refuse, State, Welcome
 from .simulator_link import SimulatorLink
 from .sockets import (
     LARGE,
@@ -25,10 +26,14 @@ from .sockets import (
     resolve,
 )
 
-__all__ = ["DEFAULT_AGENT", "DEFAULT_SIMULATOR", "Simulator"]
+__all__ = ["DEFAULT_AGENT", "DEFAULT_SIMULATOR", "Observer", "Simulator"]
 
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
+
+Observer = Callable[[Message | None, State], None]
+"""Is told what moved the drones, a Command or the Welcome that resets them all, and the State that
+it led to: valid during the call only. None, by text: the reset before the first State."""
 
 
 class Simulator:
@@ -47,6 +52,9 @@ class Simulator:
         insecure: Allow an address that is not loopback without a key.
         record: MCAP file to write every message to; it must not exist.
         options: Options of the env, by name.
+
+    Attributes:
+        observer: Called for every State once it is sent, while the agent thinks; None at first.
 
     Raises:
         ValueError: An option, an address, the key file or the env's spaces are not what they
@@ -81,6 +89,7 @@ class Simulator:
         self._keyed, self._text = key is not None, codec == "text"
         self.fleet = Fleet(env, num_envs, options)
         self._trouble = ""
+        self.observer: Observer | None = None
         with ExitStack() as failing:  # what is open, should a later step fail
             failing.callback(self.fleet.close)
             by_text = codec == "text"
@@ -146,7 +155,7 @@ class Simulator:
         link.connect(time.monotonic())
         if link.state == "ready":  # by text: the agent says nothing before the first State
             fleet.reset(link.hello.session)
-            self._send_state()
+            self._send_state(None)
         while True:
             message = self._wait()
             if isinstance(message, Close):
@@ -160,11 +169,14 @@ class Simulator:
                 fleet.reset(message.session if message.seed is None else message.seed)
             elif isinstance(message, Command):
                 fleet.step(message.actions, message.resets, message.seeds, message.holds)
-            self._send_state()
+            self._send_state(message)
 
-    def _send_state(self) -> None:
+    def _send_state(self, cause: Message | None) -> None:
         state = self.fleet.state(self.link.hello.session, self.link.sequence + 1)
         self.link.send_state(state, time.monotonic())
+        if self.observer is not None:
+            self._flush()
+            self.observer(cause, state)
 
     def _wait(self) -> Message:
         """Send what is due and wait for the message that moves the exchange on."""

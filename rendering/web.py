@@ -1,0 +1,188 @@
+"""A page for browsers: MuJoCo's web viewer, where there is no display or it is elsewhere.
+
+The server draws nothing: the browser gets the model once and then poses, and draws them itself.
+"""
+
+import threading
+from dataclasses import dataclass
+from ipaddress import ip_address
+from typing import Any, Final
+
+import mujoco
+from mujoco.studio import launch_thread, messages, plugin, viewer_protocol, web_viewer
+from mujoco.studio.dear_imgui import dear_imgui as imgui
+from mujoco.studio.web.state_payload import MAX_EXTRA_GEOMS
+
+from .camera import Aim
+from .live import Lines
+from .pace import Pace, Press
+from .stage import Stage
+
+__all__ = ["WebPage"]
+
+_HOST: Final = "127.0.0.1"
+_KEYS: Final[tuple[tuple[Any, Press], ...]] = (
+    (imgui.Key.Space, "pause"),
+    (imgui.Key.RightArrow, "step"),
+    (imgui.Key.Minus, "slower"),
+    (imgui.Key.KeypadSubtract, "slower"),
+    (imgui.Key.Equal, "faster"),
+    (imgui.Key.KeypadAdd, "faster"),
+)
+_COLUMN: Final = 90.0
+"""Where values begin, in pixels of the panel."""
+
+
+class WebPage:
+    """A stage in browsers, served on this machine's loopback alone. `Surface`.
+
+    Args:
+        stage: What is shown.
+        pace: What the buttons and keys are for.
+        port: TCP port; 0 takes the first free one from 8080 on.
+
+    Attributes:
+        port: The one that it got.
+
+    Raises:
+        ValueError: The port is in use, or none.
+    """
+
+    def __init__(self, stage: Stage, pace: Pace, port: int) -> None:
+        if not 0 <= port <= 65535:
+            raise ValueError(f"port: expected 0 to 65535, got {port}")
+        self._stage, self._panel = stage, _Panel(pace, Aim(stage))
+        config = viewer_protocol.ViewerConfig(title="rotorgram", gfx="web", http_port=port)
+
+        def serve(endpoint: Any) -> None:
+            viewer = _LoopbackViewer(config, endpoint, model=stage.model, plugins=[self._panel])
+            viewer_protocol.run_viewer_loop(viewer)
+
+        self._handle = launch_thread.launch_thread(serve)
+        self._handle.model, self._handle.data = stage.model, stage.data
+        try:
+            while not self._panel.started.wait(0.05):
+                self._handle.is_running()  # raises what the other thread has raised
+        except RuntimeError as error:  # the viewer's own sentence names an option that is not ours
+            raise ValueError(f"port: expected a free one, got {port}: {error}") from None
+        self.port = self._panel.viewer.address[1]
+        self.where = (
+            f"at http://{_HOST}:{self.port}/ (from another machine after "
+            f"ssh -L {self.port}:{_HOST}:{self.port} THIS-MACHINE)"
+        )
+
+    def show(self, lines: Lines) -> None:
+        """Draw the stage as it is now, with these lines over it."""
+        geoms: list[mujoco.MjvGeom] = []
+
+        def next_geom() -> mujoco.MjvGeom | None:
+            if len(geoms) == MAX_EXTRA_GEOMS:
+                return None
+            geoms.append(mujoco.MjvGeom())
+            return geoms[-1]
+
+        self._stage.decorate(next_geom)
+        self._handle.sync()
+        self._handle.send_to_viewer(_Look(lines=lines, geoms=geoms))
+
+    def is_running(self) -> bool:
+        """Whether the page is served."""
+        return bool(self._handle.is_running())
+
+    def is_watched(self) -> bool:
+        """Whether a browser has come."""
+        return self._panel.watched.is_set()
+
+    def close(self) -> None:
+        """Stop serving it."""
+        self._handle.close()
+
+
+class _LoopbackViewer(web_viewer.WebViewer):  # type: ignore[misc]
+    """MuJoCo's, which binds every interface of the machine and asks nobody for a password.
+
+    It has no option for the address yet, only an attribute that it sets itself.
+    """
+
+    @property
+    def _host(self) -> str:
+        return _HOST
+
+    @_host.setter
+    def _host(self, everywhere: str) -> None:
+        pass
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Where it is served."""
+        host, port = self._http_sock.getsockname()[:2]
+        return str(host), int(port)
+
+    def _start_server(self) -> None:
+        host, port = self.address
+        if not ip_address(host).is_loopback:  # another version of MuJoCo
+            self._http_sock.close()
+            self._tcp_sock.close()
+            raise OSError(f"the web viewer would serve {host} port {port} to everybody")
+        super()._start_server()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Look(messages.Snapshot):  # type: ignore[misc]
+    """What there is to see besides poses."""
+
+    lines: Lines
+    geoms: list[mujoco.MjvGeom]
+
+
+class _Panel(plugin.ViewerPlugin):  # type: ignore[misc]
+    """The overlay, with buttons. Lives in the viewer's thread."""
+
+    def __init__(self, pace: Pace, aim: Aim) -> None:
+        self._pace, self._aim = pace, aim
+        self._lines: Lines = []
+        self.started, self.watched = threading.Event(), threading.Event()
+
+    @messages.handler  # type: ignore[untyped-decorator]
+    def _on_viewer_init(self, _: plugin.ViewerInitEvent) -> None:
+        self.started.set()
+
+    @messages.handler  # type: ignore[untyped-decorator]
+    def _on_look(self, look: _Look) -> bool:
+        self._lines = look.lines
+        self.viewer.extra_geoms[:] = look.geoms
+        self._aim.apply(self.viewer.camera)
+        return True
+
+    @messages.handler  # type: ignore[untyped-decorator]
+    def _on_build_gui(self, _: messages.BuildGuiEvent) -> None:
+        if imgui.IsMousePosValid():  # of a browser: frames are built without one, too
+            self.watched.set()
+        imgui.SetNextWindowPos(imgui.Vec2(12, 12), int(imgui.Cond.FirstUseEver))
+        imgui.SetNextWindowBgAlpha(0.75)
+        # Without navigation space presses no button that was pressed before.
+        names = ("AlwaysAutoResize", "NoNav", "NoTitleBar")
+        flags = sum(int(getattr(imgui.WindowFlags, name)) for name in names)
+        imgui.Begin("rotorgram", None, flags)
+        for name, value in self._lines:
+            imgui.Text(name)
+            imgui.SameLine(_COLUMN)
+            imgui.Text(value)
+        self._buttons()
+        imgui.End()
+        for key, press in _KEYS:
+            if imgui.IsKeyPressed(key, False):
+                self._pace.press(press)
+
+    def _buttons(self) -> None:
+        buttons: list[tuple[str, Press]] = [
+            ("Go on" if self._pace.paused else "Pause", "pause"),
+            ("Step", "step"),
+        ]
+        if self._pace.period:
+            buttons += [("Slower", "slower"), ("Faster", "faster")]
+        for number, (label, press) in enumerate(buttons):
+            if number:
+                imgui.SameLine()
+            if imgui.Button(label):
+                self._pace.press(press)

@@ -1,0 +1,701 @@
+"""Live views: when a step is due, what is written, and that nobody who flies ever waits."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from peers import Running
+from rotorgram.cli import main
+from rotorgram.cli import view as cli_view
+from rotorgram.cli.watch import Onlooker, Realtime
+from rotorgram.envs import TELEMETRY_NAMES, ElevationEnv
+from rotorgram.rendering import Moment, Stage
+from rotorgram.rendering.camera import Aim
+from rotorgram.rendering.live import Lines, LiveView, lines_over
+from rotorgram.rendering.pace import Pace
+from rotorgram.udp import RemoteEnv, Simulator
+from rotorgram.udp.messages import Command, Hello, Message, State, Welcome
+
+
+def moment(step: int = 0, *, height: float = 5.0, error: float = 0.5, episode: int = 0) -> Moment:
+    return Moment(
+        position=(0.0, height, 0.0),
+        attitude=(0.0, 0.0, 0.0),
+        thrusts=(49.0, 49.0, 49.0, 49.0),
+        error=error,
+        reward=0.25,
+        step=step,
+        episode=episode,
+    )
+
+
+@dataclass
+class FakeSurface:
+    """Keeps what it is to draw; until `gate` opens it is busy with it."""
+
+    stage: Stage
+    gate: threading.Event = field(default_factory=threading.Event)
+    where: str = "nowhere"
+    shown: list[tuple[Moment, ...]] = field(default_factory=list)
+    lines: list[Lines] = field(default_factory=list)
+    error: Exception | None = None
+    open: bool = True
+
+    def show(self, lines: Lines) -> None:
+        self.shown.append(self.stage.moments)
+        self.lines.append(lines)
+        assert self.gate.wait(60)
+        if self.error is not None:
+            raise self.error
+
+    def is_running(self) -> bool:
+        return self.open
+
+    def is_watched(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        self.open = False
+
+
+@pytest.fixture(scope="module")
+def stage() -> Stage:
+    return Stage("plain")
+
+
+@contextmanager
+def fake_view(stage: Stage, *, busy: bool = False) -> Iterator[tuple[LiveView, FakeSurface]]:
+    surface = FakeSurface(stage)
+    if not busy:
+        surface.gate.set()
+    live = LiveView(stage, surface, Pace(0.0))
+    try:
+        yield live, surface
+    finally:
+        surface.gate.set()
+        live.close()
+
+
+def wait_until(condition: object, seconds: float = 20.0) -> None:
+    assert callable(condition)
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.002)
+
+
+# When a step is due: by hand, with times that are sums of powers of two.
+
+
+def test_real_time_is_one_step_each_period() -> None:
+    pace = Pace(0.25)
+    assert pace.wait(100.0) == 0.0
+    pace.stepped(100.0)
+    assert pace.wait(100.0) == 0.25
+    assert pace.wait(100.125) == 0.125
+    assert pace.wait(100.25) == 0.0
+    # Taken 1/16 s late; the next one is due when it always was.
+    pace.stepped(100.3125)
+    assert pace.wait(100.3125) == 0.1875
+
+
+def test_a_late_step_is_made_up_for_up_to_a_tenth_of_a_second() -> None:
+    pace = Pace(0.25)
+    pace.stepped(100.0)
+    pace.stepped(101.0)  # due at 100.25: so it counts as taken at 100.9
+    assert pace.wait(101.0) == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize(("speed", "wait"), [(1 / 16, 4.0), (0.5, 0.5), (8.0, 0.03125)])
+def test_speed_divides_the_period(speed: float, wait: float) -> None:
+    pace = Pace(0.25, speed)
+    pace.stepped(100.0)
+    assert pace.wait(100.0) == wait
+
+
+def test_a_new_speed_holds_for_the_step_that_waits() -> None:
+    pace = Pace(0.25)
+    pace.stepped(100.0)
+    pace.press("slower")
+    assert pace.wait(100.0) == 0.5
+    pace.press("faster")
+    pace.press("faster")
+    assert pace.wait(100.0) == 0.125
+    assert pace.words == "2 x"
+
+
+def test_speeds_end_at_a_sixteenth_and_at_eight() -> None:
+    pace = Pace(0.25)
+    for _ in range(9):
+        pace.press("slower")
+    pace.wait(0.0)
+    assert (pace.speed, pace.words) == (1 / 16, "1/16 x")
+    for _ in range(9):
+        pace.press("faster")
+    pace.wait(0.0)
+    assert (pace.speed, pace.words) == (8.0, "8 x")
+    odd = Pace(0.25, 3.0)  # between two of them
+    odd.press("slower")
+    odd.wait(0.0)
+    assert odd.speed == 2.0
+
+
+def test_pause_waits_for_ever_and_goes_on_at_once() -> None:
+    pace = Pace(0.25)
+    pace.stepped(100.0)
+    pace.press("pause")
+    assert pace.wait(100.5) is None
+    assert pace.wait(900.0) is None
+    assert pace.words == "1 x, paused"
+    pace.press("pause")
+    assert pace.wait(900.0) == 0.0
+    pace.stepped(900.0)  # and there is nothing to catch up on
+    assert pace.wait(900.0) == 0.25
+
+
+def test_each_press_of_step_lets_one_pass() -> None:
+    pace = Pace(0.25)
+    pace.stepped(100.0)
+    pace.press("step")  # pauses, too
+    assert pace.wait(100.0) == 0.0
+    pace.stepped(100.0)
+    assert pace.wait(100.5) is None
+    pace.press("step")
+    pace.press("step")
+    assert pace.wait(101.0) == 0.0
+    pace.stepped(101.0)
+    assert pace.wait(101.0) == 0.0
+    pace.stepped(101.0)
+    assert pace.wait(101.0) is None
+
+
+def test_without_a_period_every_step_is_due() -> None:
+    pace = Pace(0.0)
+    for now in (5.0, 5.0, 6.0):
+        assert pace.wait(now) == 0.0
+        pace.stepped(now)
+    assert pace.words == "as fast as it flies"
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, 1 / 17, 8.5, float("nan")])
+def test_wrong_speed(speed: float) -> None:
+    with pytest.raises(ValueError, match=r"^speed: expected 0.0625 to 8, got"):
+        Pace(0.02, speed)
+
+
+# What is written and where it is looked from.
+
+
+def test_lines_over_one_drone() -> None:
+    assert lines_over((moment(7, height=4.5, error=0.5, episode=3),), "1 x", 1) == [
+        ("target", "5.00 m"),
+        ("E", "+0.500 m"),
+        ("F1 to F4", " 49.0  49.0  49.0  49.0 N"),
+        ("reward", "+0.250"),
+        ("step", "7"),
+        ("episode", "3"),
+        ("speed", "1 x"),
+    ]
+
+
+@pytest.mark.parametrize(("drones", "said"), [(2, "2"), (64, "2 of 64")])
+def test_lines_over_many_drones(drones: int, said: str) -> None:
+    lines = lines_over((moment(1), moment(2)), "1 x", drones)
+    assert lines[0] == ("drones", f"{said} shown, numbers of the first")
+    assert ("step", "1") in lines
+
+
+def test_the_camera_stands_still_until_the_target_is_elsewhere(stage: Stage) -> None:
+    aim, camera = Aim(stage), mujoco.MjvCamera()
+    stage.show(moment(height=4.5, error=0.5))
+    assert aim.apply(camera)
+    assert camera.lookat.tolist() == [0.0, 0.0, 5.0]
+    assert (camera.azimuth, camera.elevation) == (0.0, -17.0)  # from behind, from above
+    camera.azimuth = 45.0  # whoever looks turns it
+    stage.show(moment(height=2.5, error=3.0))  # the target 0.5 m higher
+    assert not aim.apply(camera)
+    assert camera.lookat[2] == 5.0
+    stage.show(moment(height=8.0, error=0.0))
+    assert aim.apply(camera)
+    assert (camera.lookat[2], camera.azimuth) == (8.0, 45.0)
+
+
+# Whoever flies never waits.
+
+
+def test_a_busy_view_drops_all_but_the_latest(stage: Stage) -> None:
+    with fake_view(stage, busy=True) as (live, surface):
+        assert live.wants
+        live.draw(moment(0))
+        wait_until(lambda: surface.shown)
+        for step in range(1, 100):  # none of these calls may wait: the surface never answers
+            live.draw(moment(step))
+        assert not live.wants
+        surface.gate.set()
+        wait_until(lambda: live.wants and len(surface.shown) == 2)
+        assert [shown[0].step for shown in surface.shown] == [0, 99]
+
+
+def test_a_pause_is_told_without_a_new_moment(stage: Stage) -> None:
+    with fake_view(stage) as (live, surface):
+        live.draw(moment(5))
+        wait_until(lambda: surface.lines)
+        live.pace.press("pause")
+        live.pace.wait(0.0)
+        wait_until(lambda: surface.lines[-1][-1] == ("speed", "paused"))
+        assert ("step", "5") in surface.lines[-1]
+
+
+def test_what_drawing_raises_is_raised_by_is_running(stage: Stage) -> None:
+    with fake_view(stage) as (live, surface):
+        surface.error = RuntimeError("the driver is gone")
+        assert live.is_running
+        live.draw(moment())
+        with pytest.raises(RuntimeError, match="the driver is gone"):
+            wait_until(lambda: not live.is_running)
+        assert not live.is_running
+
+
+def test_what_drawing_raises_because_it_was_closed_is_no_error(stage: Stage) -> None:
+    with fake_view(stage, busy=True) as (live, surface):
+        live.draw(moment())
+        wait_until(lambda: surface.shown)
+        surface.error, surface.open = RuntimeError("there is no window"), False
+        surface.gate.set()
+        wait_until(lambda: not live.is_running)
+        assert not live.draw_in_time(moment())
+
+
+def test_a_view_of_two_wants_two_moments() -> None:
+    with fake_view(Stage("plain", 2)) as (live, _), pytest.raises(ValueError, match="expected 2"):
+        live.draw(moment())
+
+
+ACTIONS = np.sin(np.arange(600)).astype(np.float32)[:, np.newaxis]
+
+
+def flown(env: object, steps: int) -> list[tuple[bytes, float, bool, bool]]:
+    """The bits of so many steps of an env, with resets where they are due."""
+    assert isinstance(env, ElevationEnv | RemoteEnv)
+    observation, _ = env.reset(seed=3)
+    seen = [(observation.tobytes(), 0.0, False, False)]
+    for action in ACTIONS[:steps]:
+        if seen[-1][2] or seen[-1][3]:
+            observation, _ = env.reset()
+            seen.append((observation.tobytes(), 0.0, False, False))
+        else:
+            observation, reward, terminated, truncated, _ = env.step(action)
+            seen.append((observation.tobytes(), float(reward), terminated, truncated))
+    return seen
+
+
+def test_a_watched_simulator_flies_the_same_bits_and_does_not_wait(stage: Stage) -> None:
+    expected = flown(ElevationEnv(), 600)
+    assert sum(terminated or truncated for *_, terminated, truncated in expected) >= 2
+    with RemoteEnv(("127.0.0.1", 0), connect=False, connect_timeout=20) as env:
+        simulator = Simulator(server=env.address, bind=("127.0.0.1", 0))
+        with simulator, fake_view(stage, busy=True) as (live, surface):
+            simulator.observer = Onlooker(live, simulator.fleet.hello)
+            running = Running(simulator)
+            # The surface is busy with its first picture until all of this is flown.
+            assert flown(env, 600) == expected
+            assert len(surface.shown) == 1
+            surface.gate.set()
+            env.close()
+            running.join()
+
+
+# What an onlooker makes of the wire.
+
+
+def hello(drones: int) -> Hello:
+    one = np.ones(1, np.float32)
+    return Hello(
+        session=1,
+        env_id="any",
+        num_drones=drones,
+        observation_low=-one,
+        observation_high=one,
+        action_low=-one,
+        action_high=one,
+        discrete_actions=0,
+        control_period=0.02,
+        model_hash="0" * 32,
+        telemetry_names=TELEMETRY_NAMES,
+        options="",
+    )
+
+
+def state(*heights: float) -> State:
+    drones = len(heights)
+    telemetry = np.zeros((drones, len(TELEMETRY_NAMES)))
+    telemetry[:, TELEMETRY_NAMES.index("Y")] = heights
+    return State(
+        session=1,
+        sequence=1,
+        observations=np.full((drones, 1), 0.5, np.float32),
+        rewards=np.full(drones, 0.25),
+        terminated=np.zeros(drones, bool),
+        truncated=np.zeros(drones, bool),
+        telemetry=telemetry,
+    )
+
+
+def command(*what: str) -> Command:
+    """r resets, h holds, any other letter steps."""
+    return Command(
+        session=1,
+        sequence=1,
+        actions=np.zeros((len(what), 1), np.float32),
+        resets=np.array([w == "r" for w in what]),
+        holds=np.array([w == "h" for w in what]) if "h" in what else None,
+    )
+
+
+class RecordingView:
+    """A live view that keeps what it is given."""
+
+    is_running = wants = True
+
+    def __init__(self, stage: Stage) -> None:
+        self.stage, self.pace = stage, Pace(0.0)
+        self.drawn: list[tuple[Moment, ...]] = []
+
+    def draw(self, *moments: Moment) -> None:
+        self.drawn.append(moments)
+
+
+def test_an_onlooker_counts_steps_and_episodes_of_each_drone() -> None:
+    view = RecordingView(Stage("plain", 2))
+    onlooker = Onlooker(view, hello(3))  # type: ignore[arg-type]
+    causes: list[Message] = [
+        Welcome(session=1, seed=None),
+        command("r", "r", "r"),  # as an agent begins: nothing was flown yet
+        command("s", "s", "s"),
+        command("s", "h", "s"),
+        command("r", "s", "s"),
+        command("s", "r", "s"),
+    ]
+    for cause in causes:
+        onlooker(cause, state(4.0, 6.0, 8.0))
+    counted = [[(m.step, m.episode) for m in moments] for moments in view.drawn]
+    assert counted == [
+        [(0, 0), (0, 0)],
+        [(0, 0), (0, 0)],
+        [(1, 0), (1, 0)],
+        [(2, 0), (1, 0)],
+        [(0, 1), (2, 0)],
+        [(1, 1), (0, 1)],
+    ]
+    first, second = view.drawn[-1]
+    assert (first.position, first.error, first.target) == ((0.0, 4.0, 0.0), 0.5, 4.5)
+    assert (first.reward, second.reward) == (0.25, 0.0)  # no step led to a start
+
+
+def test_a_pause_freezes_the_picture_alone() -> None:
+    view = RecordingView(Stage("plain"))
+    onlooker = Onlooker(view, hello(1))  # type: ignore[arg-type]
+    onlooker(None, state(5.0))
+    view.pace.press("pause")
+    for _ in range(3):
+        onlooker(command("s"), state(5.0))  # returns: lock-step goes on
+    view.pace.press("step")
+    for _ in range(3):
+        onlooker(command("s"), state(5.0))
+    assert [moments[0].step for moments in view.drawn] == [0, 4]
+
+
+def test_a_view_that_fails_or_closes_stops_no_simulator(
+    caplog: pytest.LogCaptureFixture, stage: Stage
+) -> None:
+    class FailingView(RecordingView):
+        @property
+        def is_running(self) -> bool:  # type: ignore[override]
+            raise RuntimeError("the driver is gone")
+
+    failing, closed = FailingView(stage), RecordingView(stage)
+    closed.is_running = False
+    for view in (failing, closed):
+        onlooker = Onlooker(view, hello(1))  # type: ignore[arg-type]
+        for _ in range(2):
+            onlooker(command("s"), state(5.0))
+        assert not view.drawn
+    assert "the simulator goes on: the driver is gone" in caplog.text
+    assert len(caplog.records) == 1 or "was closed" in caplog.text
+
+
+def test_realtime_sleeps_from_step_to_step() -> None:
+    hold, began = Realtime(0.05), time.monotonic()
+    for _ in range(5):  # the first at once, the others 0.05 s apart
+        hold(None, state(5.0))
+    assert time.monotonic() - began >= 0.2
+
+
+# The command.
+
+
+def status_and_error(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
+    status = main(list(words))
+    return status, capsys.readouterr().err.strip()
+
+
+@pytest.mark.parametrize(
+    "words", [("view", "pid"), ("sim", "--view", "window", "--bind", "127.0.0.1:0")]
+)
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
+def test_no_display(
+    words: tuple[str, ...],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    status, error = status_and_error(capsys, *words, "--world", "plain")
+    assert status == 2
+    assert error.startswith("rotorgram: window: expected a display, got none")
+    assert "--web" in error
+    assert "rotorgram render" in error
+    assert "\n" not in error
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--speed", "9"), "speed: expected 0.0625 to 8, got 9"),
+        (("--web", "--port", "70000"), "port: expected 0 to 65535, got 70000"),
+        (("--episodes", "0"), "episodes: expected at least 1, got 0"),
+    ],
+)
+def test_wrong_flags(
+    words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, error = status_and_error(capsys, "view", "pid", "--world", "plain", *words)
+    assert (status, error) == (1, f"rotorgram: {expected}")
+
+
+def open_fakes(monkeypatch: pytest.MonkeyPatch) -> list[FakeSurface]:
+    """What `rotorgram view` opens in place of windows."""
+    surfaces: list[FakeSurface] = []
+
+    def open_fake(kind: str, stage: Stage, pace: Pace, port: int) -> FakeSurface:
+        surfaces.append(FakeSurface(stage))
+        surfaces[-1].gate.set()
+        return surfaces[-1]
+
+    monkeypatch.setattr(cli_view, "open_surface", open_fake)
+    return surfaces
+
+
+def test_view_shows_a_journal_to_its_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal, options = tmp_path / "flight.mcap", {"episode_length": 30}
+    anywhere = ("127.0.0.1", 0)
+    with RemoteEnv(anywhere, options=options, connect=False, record=journal) as env:
+        simulator = Simulator(server=env.address, bind=anywhere, episode_length=30)
+        running = Running(simulator)
+        seen = flown(env, 70)  # 30 steps, a reset, 30 steps, a reset, 8 steps
+    running.join()
+    surfaces = open_fakes(monkeypatch)
+    assert main(["view", str(journal), "--world", "plain", "--speed", "8"]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in out[1:]] == [f"episode {k}" for k in range(3)]
+    total = sum(reward for _, reward, *_ in seen[1:31])
+    assert out[1].startswith(f"episode 0: return {total:.1f}, last |E| ")
+    assert {shown[0].episode for shown in surfaces[0].shown} == {0, 1, 2}
+    assert main(["view", str(journal), "--env.linear-drag", "1"]) == 1
+    assert "expected no options with a journal" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("who", ["pid", "random"])
+def test_view_shows_episodes_at_the_speed_that_was_asked_for(
+    who: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    surfaces = open_fakes(monkeypatch)
+    words = ["--episodes", "2", "--speed", "8", "--env.episode-length", "80"]
+    began = time.monotonic()
+    assert main(["view", who, "--world", "plain", *words]) == 0
+    # 81 pictures an episode, 0.02 s / 8 between two; at most 0.1 s are made up for.
+    assert time.monotonic() - began >= 161 * 0.02 / 8 - 0.1
+    out = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in out] == [
+        f"showing {who} nowhere (Ctrl-C ends)",
+        "episode 0",
+        "episode 1",
+    ]
+    shown = [shown[0] for shown in surfaces[0].shown]
+    order = [(m.episode, m.step) for m in shown]
+    assert order == sorted(set(order))
+    assert {m.episode for m in shown} == {0, 1}
+
+
+def test_the_page_of_the_docs_tells_what_the_benchmark_wrote() -> None:
+    docs = Path(__file__).parent.parent / "docs"
+    page = (docs / "viewing.md").read_text()
+    result = json.loads((docs / "results" / "performance" / "viewing.json").read_text())
+    rates, ratios = result["control_steps_per_second"], result["of_that_without"]
+    for kind in rates["1"]:
+        one, many = (f"{rates[n][kind]:,.0f} | {ratios[n][kind]:.2f}" for n in ("1", "64"))
+        assert f" | {one} | {many} |" in page
+    assert result["opengl"] in page
+
+
+# The window and the page themselves.
+
+WINDOW = """
+import os, sys, threading, time
+import mujoco
+from rotorgram.rendering import Moment, Stage
+from rotorgram.rendering.live import LiveView, open_surface
+from rotorgram.rendering.pace import Pace
+
+niceness = os.getpriority(os.PRIO_PROCESS, 0)
+stage, pace = Stage("plain", 2), Pace(0.02)
+surface = open_surface("window", stage, pace)
+live = LiveView(stage, surface, pace)
+for step in range(20):
+    height = 5.0 + step / 20
+    live.draw(*[
+        Moment(position=(0.0, height, 0.0), attitude=(0.0, 0.0, 0.0), thrusts=(49.0,) * 4,
+               error=-step / 20, step=step)
+    ] * 2)
+    time.sleep(0.05)
+end = time.monotonic() + 60
+while not live.wants and time.monotonic() < end:
+    time.sleep(0.05)
+assert live.is_running and live.is_watched
+handle = surface._handle
+assert abs(stage.data.qpos[2] - 5.95) < 1e-9, stage.data.qpos
+assert handle.cam.lookat[2] == 5.0
+discs = [g for g in handle.user_scn.geoms[:handle.user_scn.ngeom]
+         if g.type == mujoco.mjtGeom.mjGEOM_CYLINDER]
+assert [round(float(g.pos[2]), 6) for g in discs] == [5.0, 5.0], discs
+assert handle.user_scn.ngeom > 2  # and pieces of paths
+for key in (32, 262, 61, 340):  # space, arrow, +, shift
+    surface._press(key)
+pace.wait(0.0)
+assert (pace.paused, pace.speed) == (True, 2.0)
+if sys.platform == "linux":  # whoever flies comes first
+    assert os.getpriority(os.PRIO_PROCESS, threading.main_thread().native_id) == niceness
+    for thread in surface._threads:
+        assert os.getpriority(os.PRIO_PROCESS, thread.native_id) == 10
+live.close()
+assert not live.is_running
+print("looked at")
+"""
+
+
+@pytest.mark.skipif(shutil.which("Xvfb") is None, reason="no Xvfb to open a window on")
+def test_the_window(tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    screen = ["-screen", "0", "320x240x24", "-nolisten", "tcp"]
+    with subprocess.Popen(
+        ["Xvfb", "-displayfd", str(writing), *screen],
+        pass_fds=[writing],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    ) as xvfb:
+        os.close(writing)
+        try:
+            with os.fdopen(reading) as pipe:
+                display = f":{pipe.readline().strip()}"
+            environment = {k: v for k, v in os.environ.items() if k != "WAYLAND_DISPLAY"}
+            done = subprocess.run(
+                [sys.executable, "-c", WINDOW],
+                env=environment | {"DISPLAY": display},
+                cwd=tmp_path,
+                capture_output=True,
+                text=True,
+                timeout=100,
+            )
+        finally:
+            xvfb.terminate()
+    if "NoDisplay" in done.stderr:
+        pytest.skip("Xvfb has no OpenGL (on Debian and Ubuntu: libgl1-mesa-dri)")
+    assert (done.returncode, done.stdout) == (0, "looked at\n"), done.stderr
+
+
+PAGE = """
+import time
+from urllib.request import urlopen
+import mujoco
+from rotorgram.rendering import Moment, Stage
+from rotorgram.rendering import web
+from rotorgram.rendering.live import LiveView, open_surface
+from rotorgram.rendering.pace import Pace
+
+def wait_until(condition):
+    end = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+
+def answers(url):
+    try:
+        urlopen(url, timeout=20).close()
+    except OSError:  # the server is about to listen
+        return False
+    return True
+
+def look(stage, pace, page, live):
+    live.draw(Moment(position=(0.0, 5.0, 0.0), attitude=(0.0, 0.0, 0.0), thrusts=(49.0,) * 4,
+                     error=0.5, step=3))
+    url = f"http://127.0.0.1:{page.port}/"
+    assert url in page.where
+    wait_until(lambda: answers(url))
+    assert b"<canvas" in urlopen(url, timeout=20).read()
+    assert len(urlopen(url + "model", timeout=20).read()) >= mujoco.mj_sizeModel(stage.model)
+    viewer = page._panel.viewer
+    wait_until(lambda: page._panel._lines)
+    assert ("step", "3") in page._panel._lines
+    assert viewer.address == ("127.0.0.1", page.port)
+    assert viewer.extra_geoms[0].type == mujoco.mjtGeom.mjGEOM_CYLINDER
+    assert viewer.extra_geoms[0].pos.tolist() == [0.0, 0.0, 5.5]
+    assert viewer.camera.lookat[2] == 5.5
+    wait_until(lambda: viewer.data.qpos[2] == 5.0)
+    time.sleep(0.2)  # a few frames
+    assert live.is_running
+    assert not live.is_watched  # no browser has come
+    try:
+        web.WebPage(stage, pace, page.port)
+    except ValueError as error:
+        assert str(error).startswith(f"port: expected a free one, got {page.port}"), error
+    else:
+        raise AssertionError("two pages at one port")
+
+stage, pace = Stage("plain"), Pace(0.02)
+page = open_surface("web", stage, pace, 0)
+with LiveView(stage, page, pace) as live:
+    look(stage, pace, page, live)
+assert not page.is_running()
+
+web._HOST = "0.0.0.0"  # as another version of MuJoCo might: it binds what it likes
+try:
+    web.WebPage(stage, pace, 0)
+except OSError as error:
+    assert "would serve 0.0.0.0 port" in str(error), error
+else:
+    raise AssertionError("a page for everybody")
+print("looked at")
+"""
+
+
+def test_the_page(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco.studio.web_viewer", reason="no mujoco-studio")
+    # In a process of its own: MuJoCo's server leaves connections to Python's end.
+    done = subprocess.run(
+        [sys.executable, "-c", PAGE], cwd=tmp_path, capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("looked at\n")
