@@ -15,7 +15,7 @@ from .inputs import new_folder
 from .progress import bars
 
 if TYPE_CHECKING:
-    from .commands import Bench
+    from .measuring import Bench
 
 __all__ = ["bench"]
 

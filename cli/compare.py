@@ -16,7 +16,7 @@ from .inputs import new_folder, refuse_settings
 from .workers import WORKERS, command_line, showing, workers
 
 if TYPE_CHECKING:
-    from .commands import Compare
+    from .training import Compare
 
 __all__ = ["compare", "report"]
 
@@ -54,20 +54,22 @@ def report(folder: Path, *, film: bool = True) -> None:
     """Write figures, film and report from the folder's files, and print the table."""
     records = read_records(folder)
     results = results_table(records.evaluations, records.runs)
-    if film and not (folder / VIDEO_FILE).exists():
-        _film(folder)
     page = write_report(folder, records, results)
     Console(width=100).print(terminal_table(results))
+    # Only now: whatever becomes of the film, there is a report.
+    if film and not (folder / VIDEO_FILE).exists() and _film(folder):
+        write_report(folder, records, results)
     print(f"report: {page}")
 
 
-def _film(folder: Path) -> None:
-    """A film of the agents for the report. A report without one is a report."""
+def _film(folder: Path) -> bool:
+    """Whether there is a film of the agents for the report. A report without one is a report."""
     # OpenGL is loaded when everything is trained, not before.
     from ..experiments.comparison_film import film_comparison
 
     print("filming the agents side by side", flush=True)
     try:
-        film_comparison(folder, folder / VIDEO_FILE)
-    except OSError as error:
+        return film_comparison(folder, folder / VIDEO_FILE)
+    except (OSError, ValueError) as error:
         logging.getLogger(__name__).info("no film of the agents: %s", error)
+        return False

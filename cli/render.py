@@ -10,11 +10,12 @@ from ..experiments.figures import agent_color, agent_label
 from ..experiments.filming import Film, Shot, film
 from ..experiments.flights import Track, flown_tracks, recorded_tracks
 from ..rendering.film import check_film
+from ..rendering.gl import offscreen_context
 from .inputs import CHECKPOINT, load_policy
 from .progress import bars
 
 if TYPE_CHECKING:
-    from .commands import Render
+    from .looking import Render
 
 __all__ = ["parse_size", "render"]
 
@@ -34,6 +35,7 @@ def render(command: "Render") -> int:
         fast=command.fast,
     )
     check_film(command.out, width, height, command.fps)
+    offscreen_context(16, 16).free()  # to fly takes longer than to say that there is no OpenGL
     shots = _shots(command)
     with bars() as progress:
         frames = film(
@@ -70,6 +72,8 @@ def _shots(command: "Render") -> list[Shot]:
             f"got {command.episode} and {command.episodes}"
         )
     env = command.env.checked()
+    if env != ElevationConfig() and all(Path(w).suffix == ".mcap" for w in command.what):
+        raise ValueError("env: expected no options with a journal, which has its own")
     found = [_find(what, command, env) for what in command.what]
     names = command.names or _told_apart([name for _, name, _ in found], command.what)
     colors = _colors([agent for agent, _, _ in found])

@@ -24,7 +24,7 @@ from .inputs import new_folder, parse_changes, refuse_settings
 from .workers import WORKERS, command_line, showing, workers
 
 if TYPE_CHECKING:
-    from .commands import Sweep
+    from .training import Sweep
 
 __all__ = ["parse_grid", "report", "sweep"]
 

@@ -6,7 +6,7 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -18,13 +18,12 @@ from ..agents.checkpoints import load, software_versions, write_whole
 from ..agents.episodes import Episode
 from ..envs import ElevationConfig
 from ..experiments.training import Run, Training, is_finished
-from ..udp import LinkError
 from .inputs import CHECKPOINT, new_folder, parse_changes, refuse_settings, remote_env
 from .progress import bars
 from .scalars import ScalarWriter
 
 if TYPE_CHECKING:
-    from .commands import Train
+    from .training import Train
 
 __all__ = ["train"]
 
@@ -130,8 +129,9 @@ def _train(training: Training, folder: Path, command: "Train") -> int:
             if finished:
                 stop.reached()
                 keeper.keep(now=True, last=True)
-    except (LinkError, KeyboardInterrupt):
-        keeper.close()
+    except BaseException:  # a full disk and SIGTERM too
+        with suppress(OSError):
+            keeper.close()
         if (folder / CHECKPOINT).exists():
             print(go_on)
         raise

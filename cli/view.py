@@ -14,7 +14,7 @@ from .inputs import load_policy
 
 if TYPE_CHECKING:
     from ..experiments.flights import Track
-    from .commands import View
+    from .looking import View
 
 __all__ = ["view"]
 
@@ -40,6 +40,8 @@ def view(command: "View") -> int:
                 f"episode {last.episode}: return {total:.1f}, last |E| {abs(last.error):.3f} m",
                 flush=True,
             )
+        while live.is_running and not live.wants:  # the last picture is still to come
+            time.sleep(0.02)
     return 0
 
 
@@ -51,12 +53,8 @@ def _tracks(command: "View") -> Iterator["Track"]:
     if (path := Path(command.what)).suffix == ".mcap":
         if config != ElevationConfig():
             raise ValueError("env: expected no options with a journal, which has its own")
-        yield recorded_tracks(path, [0])[0]
-        for episode in count(1):
-            try:
-                yield recorded_tracks(path, [episode])[0]
-            except ValueError:  # that was the last one
-                return
+        yield from recorded_tracks(path)
+        return
     policy = None
     if command.what != "random":
         policy, config = load_policy(command.what, config)

@@ -1,9 +1,9 @@
 """Commands of the wire: simulate, make a key, relay with faults, replay a journal."""
 
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
@@ -11,6 +11,9 @@ from ..udp.faults import FaultConfig
 from ..udp.link import LinkConfig
 from .base import Command, EnvOptions
 from .inputs import parse_address
+
+if TYPE_CHECKING:
+    from ..udp import Simulator
 
 __all__ = ["MakeKey", "RelayFaults", "Replay", "Sim"]
 
@@ -55,7 +58,6 @@ class Sim(Command):
     def run(self) -> int:
         """Simulate until the agent closes."""
         from ..udp import Simulator
-        from .watch import watched
 
         simulator = Simulator(
             server=parse_address(self.server),
@@ -72,8 +74,7 @@ class Sim(Command):
             record=self.record,
             **asdict(self.env.checked()),
         )
-        view = watched(simulator, self.view, self.view_port, self.world, realtime=self.realtime)
-        with simulator, view:
+        with simulator, self._watched(simulator):
             here = "{}:{}".format(*simulator.address)
             print(f"simulating at {here} for the agent at {self.server} (Ctrl-C ends)", flush=True)
             try:
@@ -81,6 +82,14 @@ class Sim(Command):
             finally:
                 print(f"wire: {simulator.link.statistics}", flush=True)
         return 0
+
+    def _watched(self, simulator: "Simulator") -> AbstractContextManager[None]:
+        """Whoever looks on; without one, nothing that draws is imported."""
+        if self.view is None and not self.realtime:
+            return nullcontext()
+        from .watch import watched
+
+        return watched(simulator, self.view, self.view_port, self.world, realtime=self.realtime)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,12 +7,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from ..experiments.errors import RunsFailed
 from ..experiments.progress import OnProgress
 from .progress import bars
 
 if TYPE_CHECKING:
-    from .commands import RunsCommand
+    from .training import RunsCommand
 
 __all__ = ["WORKERS", "command_line", "showing", "workers"]
 
@@ -42,7 +41,7 @@ def showing(name: str, command: "RunsCommand", folder: Path) -> Iterator[OnProgr
     try:
         with bars() as progress:
             yield progress
-    except (KeyboardInterrupt, RunsFailed):
+    except BaseException:
         where = f" --backend {command.backend}" if command.backend != "loky" else ""
         where += f" --address {command.address}" if command.address else ""
         if folder.exists():

@@ -148,9 +148,13 @@ class _Studio:
         tracks = [track for shot in shots for track in shot.tracks]
         seconds = max(track.seconds for track in tracks)
         band = max(map(_band, tracks))
-        self._panes = [
-            _Pane(shot, config, self._canvas, stage.twin(), seconds, band) for shot in shots
-        ]
+        try:
+            self._panes = [
+                _Pane(shot, config, self._canvas, stage.twin(), seconds, band) for shot in shots
+            ]
+        except BaseException:
+            self._canvas.close()
+            raise
 
     def frame(self, episode: int, seconds: float) -> np.ndarray:
         """The picture at that time of flight: uint8, shape (height, width, 3)."""

@@ -84,14 +84,19 @@ def _flown(env: ElevationEnv, policy: Policy | None, episode: int) -> Track:
 
 
 def recorded_tracks(
-    path: Path, episodes: Sequence[int], *, session: int | None = None, drone: int = 0
+    path: Path,
+    episodes: Sequence[int] | None = None,
+    *,
+    session: int | None = None,
+    drone: int = 0,
 ) -> list[Track]:
     """Episodes of one drone of one session of a journal.
 
     Args:
         path: What `--record` wrote; cut off by a crash it is read up to the cut.
-        episodes: Their numbers. They count, from 0, the episodes of which a step is recorded, those
-            that were given up and one that the journal's end cut off among them.
+        episodes: Their numbers; None for all there are. They count, from 0, the episodes of which a
+            step is recorded, those that were given up and one that the journal's end cut off among
+            them.
         session: As `rotorgram replay` counts them, from 1. None: the first in which something was
             flown.
         drone: Of the session, from 0.
@@ -136,8 +141,8 @@ class _Reader:
             if self._known and 0 <= self._drone < self._hello.num_drones:
                 self._take_state(message, self._command)
 
-    def chosen(self, episodes: Sequence[int], path: Path) -> list[Track]:
-        """Episodes by number, once all is read. Raises `ValueError`."""
+    def chosen(self, episodes: Sequence[int] | None, path: Path) -> list[Track]:
+        """Episodes by number, or all, once all is read. Raises `ValueError`."""
         hello, tracks = self._hello, self._tracks
         if not self._known:
             raise ValueError(f"{path}: expected a drone of {ENV_ID}, got one of {hello.env_id}")
@@ -147,6 +152,8 @@ class _Reader:
         self._keep("cut off")
         if not tracks:
             raise ValueError(f"{path}: expected an episode of drone {self._drone}, got none")
+        if episodes is None:
+            return tracks
         for episode in episodes:
             if not 0 <= episode < len(tracks):
                 last = len(tracks) - 1

@@ -115,6 +115,6 @@ class ProgressListener:
         while datagram := self._socket.recv(4096):
             try:
                 name, done, total, words = json.loads(datagram)
-            except ValueError:
+            except (TypeError, ValueError):
                 continue
             self.tell(str(name), int(done), int(total), str(words))

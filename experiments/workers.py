@@ -20,6 +20,7 @@ from typing import Any, Final, Literal, TypeVar
 
 from joblib import Parallel, cpu_count, delayed
 from joblib.externals.loky import get_reusable_executor
+from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from ..agents.checkpoints import software_versions
 from .errors import RunsFailed
@@ -168,11 +169,16 @@ def _fly_by_loky(tasks: list[_Task], workers: int) -> Generator[Result, None, No
         # `yield from` would close it without the care below.
         for result in results:  # noqa: UP028
             yield result
-    except BaseException:
+    except BaseException as error:
         # Their simulators end with the workers.
         get_reusable_executor().shutdown(wait=False, kill_workers=True)
         with warnings.catch_warnings(action="ignore"):  # that runs are cut short is what we want
             results.close()
+        if isinstance(error, TerminatedWorkerError):
+            raise RunsFailed(
+                "a worker was killed, perhaps for want of memory (try fewer --jobs); "
+                "what was done before is kept"
+            ) from None
         raise
 
 

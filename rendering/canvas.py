@@ -37,12 +37,14 @@ class Canvas:
         model = stage.model
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         model.vis.quality.offsamples = 0 if fast else _SAMPLES
+        font, buffer = mujoco.mjtFontScale.mjFONTSCALE_100, mujoco.mjtFramebuffer.mjFB_OFFSCREEN
         try:
-            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+            with self._gl.as_current():  # and then no more, so that any thread may draw
+                self._context = mujoco.MjrContext(model, font.value)
+                mujoco.mjr_setBuffer(buffer.value, self._context)
         except mujoco.FatalError as error:  # an OpenGL that is too old
             self._gl.free()
             raise NoOpenGL(f"OpenGL: expected one that MuJoCo can draw with, got {error}") from None
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._scene = mujoco.MjvScene(model, _ROOM)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = not fast
         self._option, self._rect = mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
@@ -64,17 +66,17 @@ class Canvas:
             if light.headlight and camera == "top":  # it would add itself to the sun
                 light.diffuse[:] = 0.0
         stage.decorate(scene_geoms(scene))
-        self._gl.make_current()
-        mujoco.mjr_render(self._rect, scene, self._context)
         pixels = np.empty((self.height, self.width, 3), np.uint8)
-        mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
+        with self._gl.as_current():
+            mujoco.mjr_render(self._rect, scene, self._context)
+            mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
         return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
 
     def close(self) -> None:
         """Give back the context. A second call does nothing."""
         if self._gl is not None:
-            self._gl.make_current()
-            self._context.free()
+            with self._gl.as_current():
+                self._context.free()
             self._gl.free()
             self._gl = None
 

@@ -18,7 +18,7 @@ class NoOpenGL(RuntimeError):
 
 
 def offscreen_context(width: int, height: int) -> Any:
-    """A context of MuJoCo's for pictures of so many pixels, made current.
+    """A context of MuJoCo's for pictures of so many pixels, to be made current by whoever draws.
 
     `MUJOCO_GL` decides where it is set (egl, osmesa, glfw; MuJoCo itself reads it once, when it is
     imported). Otherwise it is EGL on Linux, with a display or without; a window that is hidden
@@ -31,7 +31,8 @@ def offscreen_context(width: int, height: int) -> Any:
     for name in _candidates():
         try:
             context = import_module(f"mujoco.{name}").GLContext(width, height)
-            context.make_current()
+            with context.as_current():
+                pass
         except Exception as error:  # each library fails in a way of its own
             reasons.append(f"{name}: {_why(error)}")
         else:

@@ -104,8 +104,10 @@ class LiveView:
         """Stop drawing and close what it was drawn on. A second call does nothing."""
         if not self._closing.is_set():
             self._closing.set()
-            self._thread.join()
-            self.surface.close()
+            try:
+                self._thread.join()
+            finally:  # Ctrl-C twice too
+                self.surface.close()
 
     def __enter__(self) -> Self:
         """Return the view, to be closed at the end of the block."""

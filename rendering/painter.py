@@ -30,6 +30,7 @@ class Painter:
         self._mode, self._drones, self._period = mode, drones, control_period
         self._canvas: Canvas | None = None
         self._view: LiveView | None = None
+        self._shown: Sequence[Moment] = ()
 
     def pictures(self, moments: Sequence[Moment]) -> tuple[np.ndarray, ...] | None:
         """A picture of each craft, uint8 of shape (height, width, 3); None with `human`.
@@ -61,4 +62,6 @@ class Painter:
             stage, pace = Stage(drones=len(moments)), Pace(self._period)
             surface = open_surface("window", stage, pace)
             self._view = LiveView(stage, surface, pace, of=self._drones)
-        self._view.draw_in_time(*moments)
+        if moments != self._shown:  # `step` shows by itself, and a script may ask once more
+            self._shown = moments
+            self._view.draw_in_time(*moments)

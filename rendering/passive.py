@@ -1,5 +1,6 @@
 """A window on this machine's display: MuJoCo's passive viewer."""
 
+import atexit
 import os
 import sys
 import threading
@@ -73,7 +74,10 @@ class Window:
                 f"or {_INSTEAD}"
             ) from None
         self._threads = set(threading.enumerate()) - others
-        for task in _tasks() - before:  # they draw, on the processor where there is no GPU
+        # Whoever forgets to close it: MuJoCo's thread must have ended before GLFW does.
+        atexit.register(self.close)
+        # All that were begun meanwhile: they draw, on the processor where there is no GPU.
+        for task in _tasks() - before:
             with suppress(OSError):  # it has ended
                 os.setpriority(os.PRIO_PROCESS, task, _NICENESS)
 
@@ -102,6 +106,7 @@ class Window:
         self._handle.close()
         for thread in self._threads:
             thread.join(timeout=10)
+        atexit.unregister(self.close)
 
     def _press(self, key: int) -> None:
         if (press := KEYS.get(key)) is not None:

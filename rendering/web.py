@@ -90,7 +90,7 @@ class WebPage:
         return bool(self._handle.is_running())
 
     def is_watched(self) -> bool:
-        """Whether a browser has come."""
+        """Whether a browser has come, with the pointer over the page."""
         return self._panel.watched.is_set()
 
     def close(self) -> None:

@@ -1,11 +1,13 @@
 """Gymnasium's render modes: pictures of what flies, and the same physics with and without."""
 
+from threading import Thread
+
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 from rotorgram.envs import ENV_ID, ElevationEnv, ElevationVectorEnv
-from rotorgram.rendering import Moment, NoOpenGL
+from rotorgram.rendering import Moment, NoOpenGL, painter
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.rendering.stage import Stage
 
@@ -65,6 +67,43 @@ def _green(picture: np.ndarray) -> np.ndarray:
     disc = (green > red + 60) & (green > blue + 20)
     assert disc.any()
     return disc.sum(axis=1)
+
+
+def test_any_thread_may_ask_for_a_picture() -> None:
+    env = gym.make(ENV_ID, render_mode="rgb_array")
+    env.reset(seed=0)
+    here, there = env.render(), []
+    thread = Thread(target=lambda: there.append(env.render()))
+    thread.start()
+    thread.join()
+    closing = Thread(target=env.close)
+    closing.start()
+    closing.join()
+    np.testing.assert_array_equal(here, there[0])
+
+
+def test_a_window_shows_a_moment_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+
+    class View:
+        def __init__(self, stage: Stage, *_: object, of: int) -> None:
+            assert stage.drones == of == 1
+
+        def draw_in_time(self, *moments: Moment) -> None:
+            drawn.extend(moments)
+
+        def close(self) -> None:
+            drawn.append(None)
+
+    monkeypatch.setattr(painter, "LiveView", View)
+    monkeypatch.setattr(painter, "open_surface", lambda *_: None)
+    env = gym.make(ENV_ID, render_mode="human")
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.zeros(1, np.float32))
+        assert env.render() is None
+    env.close()
+    assert [moment and moment.step for moment in drawn] == [0, 1, 2, 3, None]
 
 
 def test_no_picture_without_a_mode(caplog: pytest.LogCaptureFixture) -> None:

@@ -33,6 +33,7 @@ from rotorgram.experiments.sweep import (
     write_sweep_table,
 )
 from rotorgram.experiments.training import Run, Training
+from rotorgram.experiments.workers import WorkersConfig, open_workers
 
 OPTIONS: dict[str, Any] = {"episode_length": 40, "flight_band": 1.2}
 CONFIG = SweepConfig(
@@ -152,6 +153,17 @@ def test_a_run_that_fails_is_named_and_the_others_are_kept(
     with pytest.raises(RunsFailed, match=r"1 of 1 runs failed: learning_rate=1e\+39 seed 0"):
         sweep(config, folder, "", nothing)
     assert read_sweep_runs(folder, config)["point"].tolist() == [0]
+
+
+def _dies(job: int, _: object) -> int:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return job
+
+
+def test_a_worker_that_is_killed_is_one_sentence() -> None:
+    sentence = pytest.raises(RunsFailed, match=r"^a worker was killed, .* before is kept$")
+    with open_workers(WorkersConfig(jobs=2), nothing) as workers, sentence:
+        list(workers.fly(_dies, {"one": 1, "two": 2}))
 
 
 def test_points_are_all_combinations_and_every_one_flies_before_the_next_seed() -> None:
