@@ -13,6 +13,7 @@ from ..experiments.metrics import results_table
 from ..experiments.records import read_records
 from ..experiments.report import VIDEO_FILE, terminal_table, write_report
 from .inputs import new_folder, refuse_settings
+from .progress import bars
 from .workers import WORKERS, command_line, showing, workers
 
 if TYPE_CHECKING:
@@ -67,9 +68,13 @@ def _film(folder: Path) -> bool:
     # OpenGL is loaded when everything is trained, not before.
     from ..experiments.comparison_film import film_comparison
 
-    print("filming the agents side by side", flush=True)
     try:
-        return film_comparison(folder, folder / VIDEO_FILE)
+        with bars() as progress:
+
+            def on_frame(done: int, total: int) -> None:
+                progress(VIDEO_FILE, done, total, "done" if done == total else "film of the agents")
+
+            return film_comparison(folder, folder / VIDEO_FILE, on_frame)
     except (OSError, ValueError) as error:
         logging.getLogger(__name__).info("no film of the agents: %s", error)
         return False

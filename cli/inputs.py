@@ -63,7 +63,14 @@ def load_policy(name: str, env: ElevationConfig) -> "tuple[Policy, ElevationConf
     from ..agents.checkpoints import load
 
     path = Path(name)
-    checkpoint = load(path / CHECKPOINT if path.is_dir() else path)
+    file = path / CHECKPOINT if path.is_dir() else path
+    if not file.is_file():
+        inside = f": look into {path / 'checkpoints'}" if (path / "checkpoints").is_dir() else ""
+        raise ValueError(
+            f"policy: expected pid, a checkpoint or the folder of a training, got {name}, where "
+            f"there is no file {file}{inside}"
+        )
+    checkpoint = load(file)
     plain = asdict(ElevationConfig())
     changed = {k: v for k, v in asdict(env).items() if v != plain[k]}
     env = ElevationConfig.from_options({**checkpoint.env, **changed})

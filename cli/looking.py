@@ -56,7 +56,7 @@ class Render(Command):
     camera: Literal["chase", "front", "side", "top", "onboard"] = "chase"
     """From where. Front and side stand still, the others follow."""
     episode: int = 0
-    """The first episode: of an evaluation, or of those in the journal."""
+    """The first episode, from 0: of an evaluation, or of those in the journal."""
     episodes: int = 1
     """How many."""
     size: str = "1280x720"
@@ -66,20 +66,21 @@ class Render(Command):
     speed: float = 1.0
     """Seconds of flight per second of film: 0.25 is slow motion."""
     at: float | None = None
-    """One picture, at this time of the first episode, s. Without it a .png is the last one."""
+    """With a .png: the time of the picture in the first episode, s. Default: its end."""
     world: Literal["airport", "plain"] = "airport"
     """Where it flies, to look at; what is flown is the same."""
     overlay: bool = True
-    """Numbers and error curves on the picture."""
+    """Whether numbers and error curves are on the picture. Of several flights the names always
+    are."""
     fast: bool = False
     """Without shadows and smooth edges: several times as fast where software draws."""
     names: tuple[str, ...] = ()
     """Titles, once for each flight. Default: what it is."""
     session: int | None = None
-    """With a journal: which session, as rotorgram replay counts them. Default: the first that
+    """With a journal: which session, from 1, as rotorgram replay counts. Default: the first that
     flew."""
     drone: int = 0
-    """With a journal: which drone of the session."""
+    """With a journal: which drone of the session, from 0."""
     env: EnvOptions = field(default_factory=EnvOptions)
     """With a checkpoint: changes to the options that it was trained with. No use to a journal."""
 

@@ -35,8 +35,13 @@ def render(command: "Render") -> int:
         fast=command.fast,
     )
     check_film(command.out, width, height, command.fps)
+    if command.at is not None and command.out.suffix.lower() != ".png":
+        raise ValueError(f"at: expected it with a picture, --out NAME.png, got {command.out}")
     offscreen_context(16, 16).free()  # to fly takes longer than to say that there is no OpenGL
     shots = _shots(command)
+    longest = max(shot.tracks[0].seconds for shot in shots)
+    if command.at is not None and command.at > longest:
+        raise ValueError(f"at: expected 0 to {longest:g} s, the flight's end, got {command.at:g}")
     with bars() as progress:
         frames = film(
             command.out,
@@ -66,13 +71,15 @@ def _shots(command: "Render") -> list[Shot]:
         raise ValueError(
             f"names: expected one for each of {len(command.what)} flights, got {len(command.names)}"
         )
-    if command.episode < 0 or command.episodes < 1:
-        raise ValueError(
-            f"episode, episodes: expected 0 or more and at least 1, "
-            f"got {command.episode} and {command.episodes}"
-        )
+    if command.episode < 0:
+        raise ValueError(f"episode: expected 0 or more, got {command.episode}")
+    if command.episodes < 1:
+        raise ValueError(f"episodes: expected at least 1, got {command.episodes}")
+    journals = [Path(words).suffix == ".mcap" for words in command.what]
+    if not any(journals) and (command.session is not None or command.drone):
+        raise ValueError("session, drone: expected them with a journal (.mcap), got none")
     env = command.env.checked()
-    if env != ElevationConfig() and all(Path(w).suffix == ".mcap" for w in command.what):
+    if env != ElevationConfig() and all(journals):
         raise ValueError("env: expected no options with a journal, which has its own")
     found = [_find(what, command, env) for what in command.what]
     names = command.names or _told_apart([name for _, name, _ in found], command.what)

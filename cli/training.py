@@ -82,7 +82,7 @@ class Compare(RunsCommand):
     episodes: int = 20
     """Evaluation episodes of each final policy."""
     film: bool = True
-    """Film the agents side by side for the report. Without OpenGL there is no film."""
+    """Whether the agents are filmed side by side for the report, where there is OpenGL."""
     out: Path | None = None
     """Folder to write; it must not exist. Default: runs/compare-TIME."""
     resume: Path | None = None
@@ -141,7 +141,7 @@ class Report(Command):
     folder: Positional[Path]
     """Folder that `rotorgram compare` or `rotorgram sweep` wrote."""
     film: bool = True
-    """Film a comparison's agents, if that was not done yet. Without OpenGL there is no film."""
+    """Whether a comparison's agents are filmed, where that was not done and there is OpenGL."""
 
     def run(self) -> int:
         """Write what is drawn from the files, and print the table."""

@@ -19,6 +19,8 @@ from rotorgram.udp.replay import verify
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 journal, task = folder / "flight.mcap", ElevationConfig()
+if journal.exists():
+    sys.exit(f"{journal} is there already: name another folder")
 
 with socket_pair(task, record=journal) as env:
     flight = fly(env, PID(task), seed=7)

@@ -2,7 +2,10 @@
 
     python examples/train_headless.py [--env-steps 100000] [--num-envs 16] [--out FILE]
 
-The same from the command line: rotorgram train a2c --env-steps 100000 --num-envs 16
+The same from the command line, with checkpoints on the way and curves for TensorBoard:
+
+    rotorgram train a2c --env-steps 100000 --num-envs 16 --env.target 4 8 \\
+        --set steps_per_update=1024 learning_rate=0.02
 """
 
 import argparse

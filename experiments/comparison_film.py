@@ -15,7 +15,7 @@ from ..envs import ElevationConfig, ElevationEnv
 from ..rendering import NoOpenGL, World
 from .evaluate import evaluation_seed
 from .figures import agent_color, agent_label
-from .filming import Film, Shot, film
+from .filming import Film, OnFrame, Shot, film
 from .flights import flown_tracks
 from .metrics import final_per_run
 from .records import read_config, read_evaluations, sort_agents
@@ -28,7 +28,9 @@ _QUALITY: Final = 27
 """Small enough for a page that holds the film in itself."""
 
 
-def film_comparison(folder: Path, out: Path, *, world: World = "airport") -> bool:
+def film_comparison(
+    folder: Path, out: Path, on_frame: OnFrame | None = None, *, world: World = "airport"
+) -> bool:
     """Film what a comparison trained: each agent and the PID, the same episode side by side.
 
     Of an agent's seeds the middle one flies, by steady |E| in the final evaluation (of an even
@@ -39,6 +41,7 @@ def film_comparison(folder: Path, out: Path, *, world: World = "airport") -> boo
     Args:
         folder: Where `rotorgram compare` wrote.
         out: The film; one that is there is replaced.
+        on_frame: Told how far it is.
         world: Where.
 
     Returns:
@@ -60,7 +63,7 @@ def film_comparison(folder: Path, out: Path, *, world: World = "airport") -> boo
     fresh = out.with_name(f".fresh-{out.name}")
     fresh.unlink(missing_ok=True)
     try:
-        film(fresh, _shots(folder), config)
+        film(fresh, _shots(folder), config, on_frame)
     except NoOpenGL as error:
         logging.getLogger(__name__).info("no film of the agents: %s", error)
         return False

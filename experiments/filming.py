@@ -13,7 +13,7 @@ from ..rendering.film import QUALITY, check_film, write_film
 from ..rendering.overlay import Overlay
 from .flights import Track
 
-__all__ = ["Film", "Shot", "film", "grid"]
+__all__ = ["Film", "OnFrame", "Shot", "film", "grid"]
 
 OnFrame = Callable[[int, int], None]
 """Called with frames drawn, and frames in all."""
@@ -48,7 +48,7 @@ class Film:
     """Seconds of flight per second of film."""
     world: World = "airport"
     overlay: bool = True
-    """Whether numbers and error curves are drawn."""
+    """Whether numbers and error curves are drawn. Of several panes the names always are."""
     at: float | None = None
     """Only the picture at this time of the first episode, s."""
     fast: bool = False
@@ -147,10 +147,11 @@ class _Studio:
         self._canvas = Canvas(stage, width, height, fast=config.fast)
         tracks = [track for shot in shots for track in shot.tracks]
         seconds = max(track.seconds for track in tracks)
-        band = max(map(_band, tracks))
+        band = _band(tracks)
         try:
             self._panes = [
-                _Pane(shot, config, self._canvas, stage.twin(), seconds, band) for shot in shots
+                _Pane(shot, config, self._canvas, stage.twin(), seconds, band, len(shots) > 1)
+                for shot in shots
             ]
         except BaseException:
             self._canvas.close()
@@ -175,12 +176,20 @@ class _Pane:
     """The picture of one flight, drawn again only where it changes."""
 
     def __init__(
-        self, shot: Shot, config: Film, canvas: Canvas, stage: Stage, seconds: float, band: float
+        self,
+        shot: Shot,
+        config: Film,
+        canvas: Canvas,
+        stage: Stage,
+        seconds: float,
+        band: float,
+        named: bool,
     ) -> None:
         self._shot, self._config = shot, config
         self._canvas, self._stage = canvas, stage
         self._shown = (-1, -1)  # episode and step
         self._picture = np.empty(0, np.uint8)
+        self._bare = not (config.overlay or named)
         self._overlay = Overlay(
             canvas.width,
             canvas.height,
@@ -189,6 +198,7 @@ class _Pane:
             period=shot.tracks[0].control_period,
             seconds=seconds,
             band=band,
+            numbers=config.overlay,
         )
 
     def picture(self, episode: int, seconds: float) -> np.ndarray:
@@ -204,15 +214,24 @@ class _Pane:
 
     def _draw(self, track: Track, step: int) -> np.ndarray:
         picture = self._canvas.draw(self._config.camera, self._stage)
-        if not self._config.overlay:
+        if self._bare:
             return picture
-        ended = step == len(track.moments) - 1 and track.ending != "truncated"
+        ended = (
+            self._config.overlay and step == len(track.moments) - 1 and track.ending != "truncated"
+        )
         note = track.ending if ended else ""
         return self._overlay.draw(picture, track.moments[step], track.errors[: step + 1], note)
 
 
-def _band(track: Track) -> float:
-    """A round number of metres that holds E; of a crash its start, for the others to be seen."""
-    errors = track.errors[:1] if track.ending == "terminated" else track.errors
-    largest = max(map(abs, errors))
+def _band(tracks: Sequence[Track]) -> float:
+    """A round number of metres that holds E.
+
+    Of a crash it holds the start only, for the others to be seen, unless all crashed.
+    """
+    crashed = [track.ending == "terminated" for track in tracks]
+    largest = max(
+        abs(error)
+        for track, ended in zip(tracks, crashed, strict=True)
+        for error in (track.errors[:1] if ended and not all(crashed) else track.errors)
+    )
     return next((band for band in _BANDS if largest <= band), math.ceil(largest))

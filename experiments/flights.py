@@ -105,6 +105,8 @@ def recorded_tracks(
         ValueError: It is no journal, or has no such session, drone or episode.
         OSError: It cannot be read.
     """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a journal (.mcap), got no such file")
     readers: dict[int, _Reader] = {}
     for item in read_journal(path):
         index = item.flight.index

@@ -18,7 +18,7 @@ from ..envs import ElevationConfig
 from ..envs.autoreset import AdvancingVectorEnv
 from .progress import Progress
 
-__all__ = ["Run", "Snapshot", "Training", "is_finished"]
+__all__ = ["AnyEnv", "Run", "Snapshot", "Training", "is_finished"]
 
 AnyEnv = gym.Env[np.ndarray, Any] | AdvancingVectorEnv
 

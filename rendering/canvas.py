@@ -65,7 +65,8 @@ class Canvas:
         for light in scene.lights[: scene.nlight]:
             if light.headlight and camera == "top":  # it would add itself to the sun
                 light.diffuse[:] = 0.0
-        stage.decorate(scene_geoms(scene))
+        # From on board, at the target, its disc would fill the lower half.
+        stage.decorate(scene_geoms(scene), discs=camera != "onboard")
         pixels = np.empty((self.height, self.width, 3), np.uint8)
         with self._gl.as_current():
             mujoco.mjr_render(self._rect, scene, self._context)

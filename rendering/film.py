@@ -12,7 +12,7 @@ from typing import IO, Final
 import numpy as np
 from PIL import Image
 
-__all__ = ["SUFFIXES", "check_film", "write_film"]
+__all__ = ["QUALITY", "SUFFIXES", "check_film", "write_film"]
 
 SUFFIXES: Final = (".mp4", ".gif", ".png", "")
 """What a film may be; no suffix is a folder of PNGs."""

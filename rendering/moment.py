@@ -55,9 +55,10 @@ class Moment:
 
     def lines(self) -> list[tuple[str, str]]:
         """What an overlay says: names and values."""
-        thrusts = " ".join(f"{thrust:5.1f}" for thrust in self.thrusts)
+        thrusts = " ".join(f"{thrust:.0f}" for thrust in self.thrusts)
         return [
             ("target", f"{self.target:.2f} m"),
+            ("elevation", f"{self.position[1]:.2f} m"),
             ("E", f"{self.error:+.3f} m"),
             ("F1 to F4", f"{thrusts} N"),
             ("reward", f"{self.reward:+.3f}"),

@@ -1,7 +1,9 @@
 """What is written on a picture: whose flight it is, its numbers, and its error over time."""
 
+import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -12,7 +14,7 @@ from .moment import Moment
 
 __all__ = ["Overlay"]
 
-_GROUND: Final = (13, 18, 26, 168)
+_GROUND: Final = (13, 18, 26, 150)
 """Of panels: dark, and some of the picture shows through."""
 _EDGE: Final = (255, 255, 255, 36)
 _NAMES: Final = (164, 176, 190)
@@ -22,8 +24,27 @@ _LIMIT: Final = (84, 96, 110)
 _ALARM: Final = (255, 107, 96)
 _BAR: Final = (120, 190, 255)
 _BAR_GROUND: Final = (70, 82, 98)
+_WIDEST: Final = Moment(
+    position=(0.0, -10.0, 0.0),
+    attitude=(0.0, 0.0, 0.0),
+    thrusts=(MAX_THRUST,) * 4,
+    error=-10.0,
+    reward=-10.0,
+    step=100_000,
+    episode=100_000,
+)
+"""What a panel has room for."""
+_STRIP_SIZE: Final = 160, 240
+"""Width and height of the smallest picture with a strip, pixels."""
+_NUMBERS_HEIGHT: Final = 160
+"""Of the smallest picture with numbers, pixels."""
+_NUMBERS_SHARE: Final = 0.4
+"""Of the width or of the height: larger ones would hide the craft in the middle."""
 _TIMES: Final = 2
 """Everything is drawn so much larger, and reduced: smooth lines, letters where they belong."""
+
+
+Point = tuple[float, float]
 
 
 class Box(NamedTuple):
@@ -38,7 +59,7 @@ class Box(NamedTuple):
 class Overlay:
     """Draws on the pictures of one flight: a panel of numbers, and a strip of E over time.
 
-    Everything scales with the picture. A number that has no room is left out.
+    Everything scales with the picture. A small one has no strip, and a smaller one only the title.
 
     Args:
         width, height: Of the pictures, pixels.
@@ -46,11 +67,15 @@ class Overlay:
         color: The title's and the curve's, as "#RRGGBB": light, the ground is dark.
         period: Between two errors of the strip, s.
         seconds: Length of the strip's time axis, s.
-        band: The strip reaches from -band to +band, m.
+        band: The strip reaches from -band to +band, m. What is beyond is not drawn: a triangle
+            marks where the curve leaves.
+        numbers: Whether there is more than the title.
 
     Attributes:
-        panel: Where the numbers are.
-        strip: Where the strip is.
+        has_numbers: Whether the panel has numbers.
+        has_strip: Whether there is a strip.
+        panel: Where title and numbers are.
+        strip: Where the strip is, if there is one.
         plot: Where in it the curve is.
     """
 
@@ -64,17 +89,21 @@ class Overlay:
         period: float,
         seconds: float,
         band: float,
+        numbers: bool = True,
     ) -> None:
         self._size = width, height
         self._title, self._color = title, ImageColor.getrgb(color)[:3]
         self._period, self._seconds, self._band = period, max(seconds, period), band
-        unit = max(7.0, min(height / 30, width / 29))
+        unit = max(7.0, min(height / 30, width / 34))
         self._unit, self._gap = unit, max(2, round(0.55 * unit))
-        self._line = round(1.38 * unit)
+        self._line = round(1.28 * unit)
         self._small, self._font, self._large = (_font(unit * share) for share in (0.85, 1, 1.25))
-        self.panel = self._panel_box()
+        self.has_numbers = numbers and self._have_room()
+        self.has_strip = numbers and width >= _STRIP_SIZE[0] and height >= _STRIP_SIZE[1]
+        self.panel = self._panel_box(self.has_numbers)
         self.strip, self.plot = self._strip_boxes()
-        self._grounds = [(box, _ground(box, self._gap)) for box in (self.panel, self.strip)]
+        boxes = (self.panel, self.strip) if self.has_strip else (self.panel,)
+        self._grounds = [(box, _ground(box, self._gap)) for box in boxes]
 
     def draw(
         self, picture: np.ndarray, moment: Moment, errors: Sequence[float], note: str = ""
@@ -93,7 +122,8 @@ class Overlay:
         for box, ground in self._grounds:
             image.paste(ground, box[:2], ground)
         _enlarged(image, self.panel, lambda draw: self._write_panel(draw, moment))
-        _enlarged(image, self.strip, lambda draw: self._write_strip(draw, errors))
+        if self.has_strip:
+            _enlarged(image, self.strip, lambda draw: self._write_strip(draw, errors))
         if note:
             box = self._note_box(note)
             _enlarged(image, box, lambda draw: self._write_note(draw, box, note))
@@ -102,33 +132,46 @@ class Overlay:
     # Boxes are in pixels of the picture; what writes into them draws in enlarged pixels, from the
     # box's own corner on.
 
-    def _panel_box(self) -> Box:
+    def _numbers_width(self) -> int:
+        """Of a panel in which every name and its value fit beside each other."""
+        lines = ((name, _spaced(value)) for name, value in _WIDEST.lines())
+        texts = max(sum(map(self._font.getlength, line)) for line in lines) / _TIMES
+        return round(texts + self._unit + 4 * self._gap)
+
+    def _have_room(self) -> bool:
+        """Whether numbers fit, and leave the middle free."""
         gap, (width, height) = self._gap, self._size
-        lower = gap + 2 * gap + round(1.6 * self._unit) + 6 * self._line + 2 * gap
-        title = 4 * gap + self._large.getlength(self._title) / _TIMES + 1.2 * self._unit
-        right = gap + max(round(17.5 * self._unit), round(title))
+        if height < _NUMBERS_HEIGHT or width < self._numbers_width() + 2 * gap:
+            return False
+        wide, high = gap + self._numbers_width(), self._panel_box(True).lower
+        return wide <= _NUMBERS_SHARE * width or high <= _NUMBERS_SHARE * height
+
+    def _panel_box(self, numbers: bool) -> Box:
+        gap, (width, height) = self._gap, self._size
+        title = math.ceil(self._large.getlength(self._title) / _TIMES + 1.2 * self._unit) + 1
+        lower, right = 3 * gap + round(1.6 * self._unit), 5 * gap + title
+        if numbers:
+            lower += len(_WIDEST.lines()) * self._line + 3 * gap
+            right = max(right, gap + self._numbers_width())
         return Box(gap, gap, min(right, width - gap), min(lower, height - gap))
 
     def _write_panel(self, draw: ImageDraw.ImageDraw, moment: Moment) -> None:
         unit, gap, line = self._unit * _TIMES, self._gap * _TIMES, self._line * _TIMES
-        right, lower = (
-            (a - b) * _TIMES for a, b in zip(self.panel[2:], self.panel[:2], strict=True)
-        )
-        left, right, y = 2 * gap, right - 2 * gap, gap
+        left, y = 2 * gap, gap
+        right = (self.panel.right - self.panel.left) * _TIMES - 2 * gap
         middle, radius = y + 0.8 * unit, 0.36 * unit
         draw.ellipse((left, middle - radius, left + 2 * radius, middle + radius), self._color)
         title = _fitted(self._title, self._large, right - left - 1.2 * unit)
         draw.text((left + 1.2 * unit, middle), title, self._color, self._large, anchor="lm")
         y += round(1.6 * unit) + gap // 2
-        for name, value in moment.lines():
-            if y + line > lower:
-                return
+        for name, value in moment.lines() if self.has_numbers else ():
             draw.text((left, y), name, _NAMES, self._font)
             draw.text((right, y), _spaced(value), _VALUES, self._font, anchor="ra")
             y += line
             if name.startswith("F1"):
+                y += gap // 2
                 self._draw_bars(draw, Box(left, y, right, y + gap), moment.thrusts)
-                y += 2 * gap
+                y += round(1.5 * gap)
 
     def _draw_bars(
         self, draw: ImageDraw.ImageDraw, box: Box, thrusts: tuple[float, float, float, float]
@@ -176,15 +219,24 @@ class Overlay:
         self._draw_curve(draw, Box(left, upper, right, lower), errors)
 
     def _draw_curve(self, draw: ImageDraw.ImageDraw, box: Box, errors: Sequence[float]) -> None:
-        shares = np.clip(np.asarray(errors, float) / self._band, -1.0, 1.0)
+        shares = np.asarray(errors, float) / self._band
         across = (box.right - box.left) * self._period / self._seconds
         xs = np.minimum(box.left + across * np.arange(len(shares)), box.right)
-        ys = box.lower - (box.lower - box.upper) * (1 + shares) / 2
-        points = list(zip(xs.tolist(), ys.tolist(), strict=True))
+        points = list(zip(xs.tolist(), shares.tolist(), strict=True))
         thick = max(_TIMES, round(self._unit * _TIMES / 6))
-        if len(points) > 1:
-            draw.line(points, self._color, thick, joint="curve")
-        for x, y in points[-1:]:
+
+        def height(share: float) -> float:
+            return box.lower - (box.lower - box.upper) * (1 + share) / 2
+
+        pieces, exits = _within(points)
+        for piece in pieces:
+            draw.line([(x, height(y)) for x, y in piece], self._color, thick, joint="curve")
+        for x, side in exits:
+            edge, inside = height(side), 2.5 * thick * side  # rows count downwards
+            x = min(max(x, box.left + 2 * thick), box.right - 2 * thick)
+            corners = [(x, edge), (x - 2 * thick, edge + inside), (x + 2 * thick, edge + inside)]
+            draw.polygon(corners, self._color)
+        for x, y in ((x, height(y)) for x, y in points[-1:] if abs(y) <= 1):
             draw.ellipse((x - thick, y - thick, x + thick, y + thick), self._color)
 
     def _note_box(self, note: str) -> Box:
@@ -215,6 +267,27 @@ def _ground(box: Box, radius: int) -> Image.Image:
     edges = (0, 0, size[0] - 1, size[1] - 1)
     ImageDraw.Draw(image).rounded_rectangle(edges, radius * _TIMES, _GROUND, _EDGE, _TIMES)
     return image.reduce(_TIMES)
+
+
+def _within(points: Sequence[Point]) -> tuple[list[list[Point]], list[Point]]:
+    """What of a line is between -1 and +1, in pieces, and where it leaves."""
+    pieces: list[list[Point]] = []
+    exits = [(x, math.copysign(1.0, y)) for x, y in points[:1] if abs(y) > 1]
+    connected = False
+    for (x, y), (next_x, next_y) in pairwise(points):
+        if y == next_y:
+            first, last = (0.0, 1.0) if abs(y) <= 1 else (1.0, 0.0)
+        else:  # shares of the way at which it enters and leaves
+            edges = sorted((edge - y) / (next_y - y) for edge in (-1.0, 1.0))
+            first, last = max(edges[0], 0.0), min(edges[1], 1.0)
+        if first <= last:
+            if not (connected and first == 0):
+                pieces.append([(x + first * (next_x - x), y + first * (next_y - y))])
+            pieces[-1].append((x + last * (next_x - x), y + last * (next_y - y)))
+        connected = first <= last == 1
+        if first <= last < 1:
+            exits.append((pieces[-1][-1][0], math.copysign(1.0, next_y)))
+    return pieces, exits
 
 
 def _spaced(value: str) -> str:

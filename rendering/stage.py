@@ -13,7 +13,7 @@ import numpy as np
 from ..models import QUAD_XML, SCENE_XML, attach_airport
 from .moment import Moment
 
-__all__ = ["CAMERAS", "WORLDS", "Camera", "Stage", "World"]
+__all__ = ["CAMERAS", "WORLDS", "Camera", "NextGeom", "Stage", "World", "scene_geoms"]
 
 Camera = Literal["chase", "front", "side", "top", "onboard"]
 World = Literal["airport", "plain"]
@@ -31,10 +31,13 @@ _EVERY: Final = 3
 """Control steps of one piece of a path."""
 _DISC = (0.13, 0.78, 0.52, 0.30)
 _PATH = (1.0, 0.85, 0.25)
+_LOWER: Final = 0.75
+"""How far below the target front and side look, m: the strip of E covers the picture's lower end,
+and a craft 3 m below its target is still above it."""
 _VIEWS: Final[dict[str, tuple[float, float, float]]] = {
     "chase": (0.0, -17.0, 7.0),
-    "front": (180.0, -3.0, 9.5),
-    "side": (90.0, -3.0, 9.5),
+    "front": (180.0, -7.0, 12.5),  # from a little above the target: its disc is seen
+    "side": (90.0, -7.0, 12.5),
     "top": (0.0, -89.9, 10.0),
 }
 """Azimuth and elevation in degrees, distance in m."""
@@ -108,16 +111,18 @@ class Stage:
         centres = self.data.qpos.reshape(self.drones, 7)[:, :3]
         camera.lookat[:] = centres.mean(axis=0)
         if name in ("front", "side") and self.moments:
-            camera.lookat[2] = sum(moment.target for moment in self.moments) / self.drones
+            target = sum(moment.target for moment in self.moments) / self.drones
+            camera.lookat[2] = max(target - _LOWER, 0.0)  # the camera stays above the ground
         camera.azimuth, camera.elevation, camera.distance = _VIEWS[name]
         camera.distance += np.ptp(self._offsets, axis=0).max()
         return camera
 
-    def decorate(self, next_geom: NextGeom) -> None:
-        """Add the discs that mark the targets, and the paths, which fade."""
+    def decorate(self, next_geom: NextGeom, *, discs: bool = True) -> None:
+        """Add the discs that mark the targets, unless they are not wanted, and the fading paths."""
         for moment, offset, path in zip(self.moments, self._offsets, self._paths, strict=False):
             here = moment.qpos[:3] + np.array((*offset, 0.0))
-            _disc(next_geom, np.array((here[0], here[1], moment.target)))
+            if discs:
+                _disc(next_geom, np.array((here[0], here[1], moment.target)))
             points = [*path, here]
             for number, (start, end) in enumerate(pairwise(points), 1):
                 _piece(next_geom, start, end, number / len(path))

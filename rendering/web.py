@@ -63,8 +63,8 @@ class WebPage:
         try:
             while not self._panel.started.wait(0.05):
                 self._handle.is_running()  # raises what the other thread has raised
-        except RuntimeError as error:  # the viewer's own sentence names an option that is not ours
-            raise ValueError(f"port: expected a free one, got {port}: {error}") from None
+        except RuntimeError:  # its own sentence names an option that is not ours
+            raise ValueError(f"port: expected a free one, got {port}, which is in use") from None
         self.port = self._panel.viewer.address[1]
         self.where = (
             f"at http://{_HOST}:{self.port}/ (from another machine after "

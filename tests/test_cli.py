@@ -62,7 +62,7 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["evaluate", "nowhere.safetensors"], "checkpoint: no file nowhere.safetensors"),
+        (["evaluate", "nowhere.safetensors"], "there is no file nowhere.safetensors"),
         (["evaluate", "pid", "--episodes", "0"], "episodes: expected at least 1, got 0"),
         (["evaluate", "pid", "--env.observation", "error"], "pid: expected observation='full'"),
         (["train", "a2c", "--set", "gamma"], "set: expected NAME=VALUE, got 'gamma'"),

@@ -200,8 +200,9 @@ def test_wrong_speed(speed: float) -> None:
 def test_lines_over_one_drone() -> None:
     assert lines_over((moment(7, height=4.5, error=0.5, episode=3),), "1 x", 1) == [
         ("target", "5.00 m"),
+        ("elevation", "4.50 m"),
         ("E", "+0.500 m"),
-        ("F1 to F4", " 49.0  49.0  49.0  49.0 N"),
+        ("F1 to F4", "49 49 49 49 N"),
         ("reward", "+0.250"),
         ("step", "7"),
         ("episode", "3"),
