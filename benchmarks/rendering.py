@@ -22,6 +22,7 @@ from rotorgram.envs import ElevationConfig
 from rotorgram.experiments.filming import Film, Shot, film
 from rotorgram.experiments.flights import Track, flown_tracks
 from rotorgram.rendering import Canvas, Stage
+from rotorgram.rendering.gl import offscreen_context
 from rotorgram.rendering.overlay import Overlay
 
 SIZES = ((640, 360), (1280, 720))
@@ -57,10 +58,14 @@ def pictures(track: Track, rounds: int, frames: int) -> tuple[dict[str, float], 
 
 
 def driver() -> str:
-    """What OpenGL calls itself, with its context current."""
-    from OpenGL.GL import GL_RENDERER, glGetString
+    """What OpenGL calls itself."""
+    context = offscreen_context(16, 16)
+    from OpenGL.GL import GL_RENDERER, glGetString  # after the context has chosen its platform
 
-    return str(glGetString(GL_RENDERER).decode())
+    with context.as_current():
+        name = str(glGetString(GL_RENDERER).decode())
+    context.free()
+    return name
 
 
 def overlays(track: Track, rounds: int, frames: int) -> dict[str, float]:
