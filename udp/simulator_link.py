@@ -101,7 +101,7 @@ class SimulatorLink:
     def connect(self, now: float) -> None:
         """Say Hello, until a Welcome or a Refuse comes. With the text codec there is none."""
         if self.state == "hello":
-            self._send(self.hello, now)
+            self._send(self.hello, now, "hello", 0)
 
     def send_state(self, state: State, now: float) -> None:
         """Send the State whose sequence number is `sequence` + 1."""
@@ -110,9 +110,7 @@ class SimulatorLink:
                 f"send_state: expected link state 'ready' and sequence {self.sequence + 1}, "
                 f"got {self.state!r} and {state.sequence}"
             )
-        self._send(state, now)
-        self.sequence = state.sequence
-        self.state = "waiting"
+        self._send(state, now, "waiting", state.sequence)
 
     def close(self, reason: str, now: float) -> None:
         """End the exchange. An agent that has welcomed this simulator is told, until it answers."""
@@ -120,8 +118,7 @@ class SimulatorLink:
             message = Close(
                 session=self.hello.session, sequence=self.sequence, reason=one_line(reason)
             )
-            self._send(message, now)
-            self.state = "closing"
+            self._send(message, now, "closing", self.sequence)
         elif self.state == "hello":
             self.state = "closed"
 
@@ -285,7 +282,7 @@ class SimulatorLink:
         self.hello = replace(self.hello, session=self._draw_session())
         self.sequence, self._session_key, self._waits = 0, None, False
         self._parts = Assembler(binary.command_size(self.hello))
-        self._send(self.hello, now)
+        self._send(self.hello, now, "hello", 0)
 
     def _answer_close(self) -> None:
         close = Close(session=self.hello.session, sequence=self.sequence, reason="")
@@ -294,18 +291,22 @@ class SimulatorLink:
         self.statistics.counters["sent"] += 1
         self._record(close, datagram)
 
-    def _send(self, message: Hello | State | Close, now: float) -> None:
+    def _send(self, message: Hello | State | Close, now: float, state: str, sequence: int) -> None:
+        """Send, and be in that state with that sequence number from then on."""
         key = self._key if isinstance(message, Hello) else self._session_key
         datagram = encode(message, as_text=self._text)
         self._record(message, datagram)
-        self._outstanding = packed(datagram, key)
-        self._outgoing += self._outstanding
-        self.statistics.counters["sent"] += 1
+        outstanding, closing = packed(datagram, key), isinstance(message, Close)
+        resend_at = now + (CLOSE_INTERVAL if closing else self._resend_interval())
+        # Ctrl-C strikes where something is called. It must find all of this done or nothing, for
+        # the Close that follows has to have the number of what was sent last.
+        self.state, self.sequence = state, sequence
+        self._outstanding = outstanding
+        self._outgoing += outstanding
         self.sends = 1
-        self._sent_at = now
-        closing = isinstance(message, Close)
-        self._resend_at = now + (CLOSE_INTERVAL if closing else self._resend_interval())
+        self._sent_at, self._resend_at = now, resend_at
         self._deadline = now + (CLOSE_LINGER if closing else self._config.timeout)
+        self.statistics.counters["sent"] += 1
 
     def _record(self, message: Message, datagram: bytes) -> None:
         if self._tap:
