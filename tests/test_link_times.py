@@ -22,6 +22,7 @@ from links import (
     simulator,
     state,
     to_ready,
+    to_ready_again,
     to_waiting,
     unknown,
 )
@@ -254,3 +255,22 @@ def test_a_reason_becomes_one_line() -> None:
     link.take_outgoing()
     link.close("line one\nline two", 0.0)
     assert link.take_outgoing() == [binary.encode(close(0, reason="line one line two"))]
+
+
+def test_ctrl_c_in_the_midst_of_a_state_leaves_it_unsent(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Or else the agent would have a State 2 and a Close of State 1, which is stale to it.
+    link, wire = simulator(), Wire("agent", False)
+    to_ready_again(link, wire)
+    link.take_outgoing()
+
+    def interrupted(_: SimulatorLink) -> float:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(SimulatorLink, "_resend_interval", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            link.send_state(state(2), 1.0)
+    assert (link.state, link.sequence) == ("ready", 1)
+    link.close("stopped", 1.0)
+    (datagram,) = link.take_outgoing()
+    assert binary.decode(datagram) == close(1, reason="stopped")
