@@ -104,6 +104,10 @@ def test_an_encoder_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_picture_of_odd_size_may_be_anything_but_mp4(tmp_path: Path) -> None:
     check_film(tmp_path / "film.gif", 63, 47, 25.0)
     check_film(tmp_path / "film", 63, 47, 30.0)
+    write_film(tmp_path / "film.gif", greys(2, 63, 47), 25.0)
+    write_film(tmp_path / "film", greys(2, 63, 47), 30.0)
+    for path in (tmp_path / "film.gif", tmp_path / "film" / "0001.png"):
+        assert pixels(path).shape == (47, 63, 3)
 
 
 @pytest.mark.parametrize(
