@@ -1,0 +1,40 @@
+"""Errors that are one sentence to the user. Imports the standard library alone."""
+
+from importlib import import_module
+from types import ModuleType
+
+__all__ = ["InputError", "MissingPackage", "require"]
+
+
+class InputError(ValueError):
+    """Something that the user gave is wrong. The message says what was expected and what came.
+
+    The command line prints it as one sentence. Any other `ValueError` is a bug of ours and keeps
+    its traceback.
+    """
+
+
+class MissingPackage(ImportError):
+    """An optional package is not installed. The message names the `pip install` that brings it."""
+
+
+def require(module: str, extra: str, purpose: str) -> ModuleType:
+    """Import an optional package.
+
+    Args:
+        module: Its import name.
+        extra: The extra of rotorgram that installs it.
+        purpose: What it is needed for, as the subject of a sentence: "training".
+
+    Raises:
+        MissingPackage: It is not installed.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] != module.partition(".")[0]:
+            raise  # it is there, and lacks something of its own
+        raise MissingPackage(
+            f"{purpose} needs the package {error.name}: pip install 'rotorgram[{extra}]'",
+            name=error.name,
+        ) from None
