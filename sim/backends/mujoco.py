@@ -1,7 +1,7 @@
 """MuJoCo on the threads of this machine, float64.
 
-`mujoco.batch.Batch` gives each world the bits that a loop over single ones gives it, with any number
-of threads.
+`mujoco.batch.Batch` gives each world the bits that a loop over single ones gives it, with any
+number of threads.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
