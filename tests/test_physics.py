@@ -53,7 +53,7 @@ def test_every_vehicle_has_the_same_checks_and_the_papers_has_more() -> None:
     ("measured", "passed"), [(1.0, True), (1.25, True), (1.26, False), (math.nan, False)]
 )
 def test_passing_is_within_tolerance_and_never_nan(measured: float, passed: bool) -> None:
-    check = Check(name="x", expected=1.0, measured=measured, tolerance=0.25, source="hand")
+    check = Check("x", 1.0, measured, "m", "hand", tolerance=0.25)
     assert check.passed is passed
 
 
