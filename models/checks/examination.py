@@ -10,7 +10,6 @@ Frames: world x, y, z with z up; body x forward, y left, z up. SI units and radi
 
 import copy
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final
 
 import mujoco
@@ -19,48 +18,27 @@ import numpy as np
 from .. import QUAD_XML
 from ..errors import InputError
 from ..vehicle import Vehicle
-from ._measure import HEIGHT, RigidBody, fly, forces, in_vacuum, ready, rigid_body
+from ._measure import (
+    DRAG,
+    EXACT,
+    HEIGHT,
+    SPIN,
+    TRUNCATION,
+    Check,
+    RigidBody,
+    fly,
+    forces,
+    in_vacuum,
+    ready,
+    rigid_body,
+)
+from .paper import examine_paper
 
-__all__ = ["DRAG", "EXACT", "SPIN", "TRUNCATION", "Check", "examine"]
+__all__ = ["examine"]
 
-EXACT: Final = 1e-9
-"""Tolerance where the integrator is exact: it leaves room for rounding over a flight, no more."""
-
-TRUNCATION: Final = 1e-6
-"""Tolerance for tumbling flight, where RK4 truncates: 4e-7 rad/s in ten seconds at 10 ms for the
-paper's vehicle. MuJoCo's Euler misses by 1 rad/s."""
-
-SPIN: Final = (1.0, 2.0, 3.0)
-"""Body rates with which tumbling begins, rad/s: about no axis of symmetry."""
 _LEAST_TIMESTEP: Final = 1e-4  # s: 20 s of flights take seconds
-DRAG: Final = "Unity's Rigidbody.drag, in the limit of small steps"
-"""Source of the checks of linear drag."""
-
 _MODEL: Final = "compiled model"
 _MECHANICS: Final = "rigid-body mechanics"
-
-
-@dataclass(frozen=True)
-class Check:
-    """One line of the examination."""
-
-    name: str
-    """What was measured."""
-    expected: float
-    """The value worked out beforehand."""
-    measured: float
-    """The value that the simulation gave."""
-    unit: str
-    """Unit of the three numbers; empty for pure numbers."""
-    source: str
-    """Where the expected value comes from."""
-    tolerance: float = EXACT
-    """Largest difference that passes."""
-
-    @property
-    def passed(self) -> bool:
-        """Whether measured and expected agree; NaN never does."""
-        return abs(self.measured - self.expected) <= self.tolerance
 
 
 def examine(vehicle: Vehicle, *, paper: bool | None = None) -> list[Check]:
@@ -91,8 +69,6 @@ def examine(vehicle: Vehicle, *, paper: bool | None = None) -> list[Check]:
         *_linear_drag(vehicle, model, body),
     ]
     if paper if paper is not None else vehicle.path == QUAD_XML.resolve():
-        from .paper import examine_paper
-
         checks += examine_paper(vehicle, body)
     return checks
 

@@ -14,8 +14,7 @@ import numpy as np
 from ..constants import GRAVITY, MASS, MAX_THRUST, NUM_ROTORS, SIDE
 from ..errors import InputError
 from ..vehicle import Vehicle
-from ._measure import HEIGHT, RigidBody, fly, forces, ready
-from .examination import DRAG, SPIN, TRUNCATION, Check
+from ._measure import DRAG, HEIGHT, SPIN, TRUNCATION, Check, RigidBody, fly, forces, ready
 
 __all__ = ["closed_form_inertia", "examine_paper"]
 
@@ -117,9 +116,8 @@ def _flights(vehicle: Vehicle) -> Iterator[Check]:
     ):
         data = ready(vehicle, vehicle.model, thrust)
         measured = 2 / fly(vehicle.model, data, 2.0) ** 2 * (float(data.qpos[2]) - HEIGHT)
-        yield Check(
-            f"2 s at {name}: acceleration", expected, measured, "m/s²", f"{_PAPER}: {source}"
-        )
+        name = f"2 s at {how}: acceleration"
+        yield Check(name, expected, measured, "m/s²", f"{_PAPER}: {source}")
 
 
 def _spinning_top(vehicle: Vehicle) -> Iterator[Check]:
