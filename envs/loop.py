@@ -15,7 +15,7 @@ import numpy as np
 from ..models.errors import InputError
 from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..models.vehicle import Vehicle
-from ..sim import Array, Backend, PhysicsError, World, make_world
+from ..sim import Array, Backend, PhysicsError, World, make_world, on_host
 from . import registry
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
@@ -155,7 +155,7 @@ class Loop:
         self.terminated = self.truncated = self.done = self._nobody
         self.rewards: Array = 0.0 * self._nobody
         self.observations: dict[str, Array] = {}
-        self._steps: Array = (0 * self.rewards).reshape(lead)[()]
+        self._steps: Array = (0 * self._nobody).reshape(lead)[()]
         self._waiting = ~self._nobody  # for a reset
         self._anyone_waits = True
         self._begun = False
@@ -185,6 +185,7 @@ class Loop:
             frozen: bool, shape (N,); None freezes none.
             chosen: By the names of `Task.choices`, what replaces a draw, shape (N,).
         """
+        resets, frozen = self.ours(resets), self.ours(frozen)
         idle = resets if frozen is None else frozen if resets is None else resets | frozen
         flown = None if idle is None or not idle.any() else ~idle
         if self._anyone_waits:
@@ -339,24 +340,30 @@ class Loop:
             return self._telemetry
         state, n, at = self.world.state, self.num_envs, self._columns
         self._telemetry = told = np.empty((n, at[self.spec.telemetry[-1].name].stop))
-        position, quaternion = _on_host(state.position), _on_host(state.quaternion)
+        position, quaternion = on_host(state.position), on_host(state.quaternion)
         positions_in_paper_frame(position.reshape(n, 3), told[:, :3])
         attitudes_in_paper_frame(quaternion.reshape(n, 4), told[:, 3:6])
-        told[:, at["thrust"]] = _on_host(state.thrust).reshape(n, -1)
+        told[:, at["thrust"]] = on_host(state.thrust).reshape(n, -1)
         if self._has_goal:
             goal = self.task.goal(state)
             if goal is not self._goal[0]:  # many goals stay as they are
-                self._goal = goal, positions_in_paper_frame(_on_host(goal).reshape(n, 3))
+                self._goal = goal, positions_in_paper_frame(on_host(goal).reshape(n, 3))
             told[:, at["goal"]] = self._goal[1]
         if self.task.metrics and self._outcome is not None:
             for column, metric in enumerate(self.task.metrics, at["metrics"].start):
                 values = self._outcome.metrics[metric.name]
-                told[:, column] = values if not self.world.shape else _on_host(values).reshape(n)
+                told[:, column] = values if not self.world.shape else on_host(values).reshape(n)
         return told
 
     def close(self) -> None:
         """Let go of threads and memory."""
         self.world.close()
+
+    def ours(self, mask: Array | None) -> Array | None:
+        """A mask that the caller gave, NumPy's or a tensor, as an array of the world's kind."""
+        if mask is None or self._xp is np:
+            return mask
+        return self._xp.asarray(mask, device=self._nobody.device)
 
     def _per_drone(self, values: Array) -> Array:
         if not self.world.shape:
@@ -378,11 +385,4 @@ def _columns(spec: EnvSpec) -> dict[str, slice]:
 
 
 def _as_type(values: Array, dtype: Any) -> Array:
-    return values.astype(dtype) if isinstance(values, np.ndarray) else values.to(dtype)
-
-
-def _on_host(array: Array) -> np.ndarray:
-    if isinstance(array, np.ndarray | np.generic):
-        return np.asarray(array)
-    copied: np.ndarray = array.detach().cpu().numpy().astype(np.float64)
-    return copied
+    return values.astype(dtype) if isinstance(values, np.ndarray) else values.to(dtype, copy=True)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Array", "Pose", "WorldState", "clip", "constant", "stack"]
+__all__ = ["Array", "Pose", "WorldState", "clip", "constant", "on_host", "stack"]
 
 Array = Any
 """A NumPy array or a torch tensor. Code for both uses operators and the namespace of the array
@@ -92,3 +92,11 @@ def _tensor(raw: bytes, shape: tuple[int, ...], dtype: Any, device: Any) -> Arra
 
     array = np.frombuffer(raw).reshape(shape)
     return torch.tensor(array, dtype=dtype, device=device)
+
+
+def on_host(array: Array) -> np.ndarray:
+    """A number, array or tensor as a NumPy array; the memory may be shared. Tensors: float64."""
+    if isinstance(array, np.ndarray | np.generic | float | int):
+        return np.asarray(array)
+    copied: np.ndarray = array.detach().cpu().numpy()
+    return copied.astype(np.float64) if copied.dtype.kind == "f" else copied

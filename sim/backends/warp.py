@@ -1,15 +1,18 @@
 """MuJoCo Warp, float32, on a GPU or on the CPU; torch tensors share the simulator's memory."""
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import array_api_compat.torch as torch_api
 import mujoco
+import mujoco_warp
 import numpy as np
 import torch
+import warp
 from torch.utils.dlpack import from_dlpack
 
-from ...models.errors import InputError, require
+from ...models.errors import InputError
 from ...models.vehicle import Vehicle
 from ..random import START, Draw
 from ..state import Array, Pose, WorldState, constant
@@ -17,8 +20,8 @@ from ..world import PhysicsError, contact_check
 
 __all__ = ["FURTHEST", "WarpWorld", "make"]
 
-wp: Any = require("warp", "gpu", "the backend warp")  # its types have gaps
-mjw: Any = require("mujoco_warp", "gpu", "the backend warp")
+wp: Any = warp  # its types have gaps
+mjw: Any = mujoco_warp
 
 FURTHEST: Final = 100.0
 """Largest coordinate of a start, m. float32 rounds 100 m to 8 µm; much further out a slow craft
@@ -67,9 +70,10 @@ class WarpWorld:
         self._check = contact_check(vehicle.timestep)
         self._generator = torch.Generator(self.device)
         self._generator.seed()
-        model = vehicle.model.__copy__()
+        model = copy.copy(vehicle.model)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nothing reads them
-        contacts = CONTACTS_PER_GEOM * int((model.geom_contype | model.geom_conaffinity != 0).sum())
+        solid = (model.geom_contype | model.geom_conaffinity) != 0
+        contacts = CONTACTS_PER_GEOM * int(solid.sum())
         rows = max(1, 2 * (int(model.geom_condim.max(initial=1)) - 1))
         with wp.ScopedDevice(self._name):
             self._data = data = mjw.make_data(
@@ -101,10 +105,10 @@ class WarpWorld:
 
     def reset(self, mask: Array, pose: Pose) -> None:
         """As `World.reset`. Raises `InputError` for a position beyond `FURTHEST`."""
-        state, rows = self.state, mask[:, None, None]
-        far = (pose.position.abs() > FURTHEST).any(dim=2)[:, 0] & mask
+        state, rows = self.state, mask[..., None]
+        far = (pose.position.abs() > FURTHEST).any(dim=-1) & mask
         if far.any():
-            got = [round(x, 3) for x in pose.position[far][0, 0].tolist()]
+            got = [round(x, 3) for x in pose.position[far][0].tolist()]
             raise InputError(
                 f"start: expected coordinates within {FURTHEST:g} m for the float32 of the "
                 f"backend warp, got {got}"
@@ -117,29 +121,29 @@ class WarpWorld:
             (state.thrust, pose.thrust, self._hover),
         ):
             array.copy_(torch.where(rows, default if values is None else values, array))
-        self._warmstart.masked_fill_(mask[:, None], 0.0)
+        self._warmstart.masked_fill_(mask, 0.0)
         self._apply_thrust()
         self._launch(self._forward)
-        state.touching.copy_(torch.where(mask, self._contact(), state.touching[:, 0])[:, None])
+        state.touching.copy_(torch.where(mask, self._contact(), state.touching))
 
     def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
         """As `World.step`."""
         state, before = self.state, []
         if mask is not None:
-            thrust = torch.where(mask[:, None, None], thrust, state.thrust)
+            thrust = torch.where(mask[..., None], thrust, state.thrust)
             before = [(array, array.clone()) for array in (self.qpos, self.qvel, self._warmstart)]
         state.thrust.copy_(thrust)
         self._apply_thrust()
-        touching = torch.zeros_like(state.touching[:, 0])
+        touching = torch.zeros_like(state.touching)
         while substeps > 0:
             self._launch(self._graph(min(substeps, self._check)))
             touching = touching | self._contact()
             substeps -= self._check
         for array, values in before:
-            array.copy_(torch.where(mask[:, None], array, values))  # type: ignore[index]
+            array.copy_(torch.where(mask, array, values))  # type: ignore[arg-type]
         if mask is not None:
-            touching = torch.where(mask, touching, state.touching[:, 0])
-        state.touching.copy_(touching[:, None])
+            touching = torch.where(mask, touching, state.touching)
+        state.touching.copy_(touching)
         bad = ~(torch.cat((self.qpos, self.qvel), dim=1).abs() < mujoco.mjMAXVAL).all(dim=1)
         if bad.any():
             ids = bad.nonzero().flatten().tolist()
@@ -147,7 +151,7 @@ class WarpWorld:
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """Seed the one generator of all worlds with the seeds of the mask together."""
-        ids = mask.nonzero().flatten().tolist()
+        ids = mask.flatten().nonzero().flatten().tolist()
         given = [int(seed) for seed in (seeds[i] for i in ids) if seed is not None]
         if given:
             sequence = np.random.SeedSequence(given, spawn_key=(START,))
@@ -155,44 +159,37 @@ class WarpWorld:
 
     def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
         """As `World.draw`; a seed does not give the numbers that it gives the other backends."""
-        return TorchDraw(self._generator, mask, chosen or {})
+        put = {
+            name: torch.as_tensor(values, dtype=torch.float32, device=self.device)
+            for name, values in (chosen or {}).items()
+        }
+        return TorchDraw(self._generator, mask, put)
 
-    def checked(
-        self, actions: Array, shape: tuple[int, ...], choices: int, flown: Array | None
-    ) -> Array:
-        """Actions as controllers take them: float32, of that shape, 0 for those that do not fly.
-
-        Args:
-            actions: A tensor on `device`, or a NumPy array.
-            shape: (W, A, k).
-            choices: As of `Controller`.
-            flown: Worlds that fly, bool, shape (W,); None: all.
-
-        Raises:
-            InputError: They are not what they should be.
-        """
+    def checked(self, actions: Array, width: int, choices: int, flown: Array | None) -> Array:
+        """As `World.checked`: a tensor on `device` or a NumPy array, as float32, shape (W, k)."""
         if isinstance(actions, torch.Tensor) and actions.device != self.device:
             raise InputError(f"actions: expected a tensor on {self.device}, got {actions.device}")
         try:
             values = torch.as_tensor(actions, device=self.device).detach()
         except (TypeError, ValueError, RuntimeError):
             raise InputError(f"actions: expected real numbers, got {actions!r:.80}") from None
-        if values.is_complex() or values.numel() != shape[0] * shape[1] * shape[2]:
+        shape = (self.shape[0], width)
+        if values.is_complex() or values.numel() != shape[0] * width:
             raise InputError(
-                f"actions: expected real numbers of shape {(shape[0], shape[2])}, "
+                f"actions: expected real numbers of shape {shape}, "
                 f"got {values.dtype} of shape {tuple(values.shape)}"
             )
         values = values.reshape(shape).to(torch.float32)
         right = values.isfinite()
         if choices:
             right = (values >= 0) & (values < choices) & (values % 1 == 0)
-        wrong = ~right.all(dim=2)[:, 0]
+        wrong = ~right.all(dim=1)
         if flown is not None:
             wrong = wrong & flown
         if wrong.any():
             first = int(wrong.nonzero()[0])
             expected = f"a whole number 0 to {choices - 1}" if choices else "finite numbers"
-            got = values[first, 0].tolist()
+            got = values[first].tolist()
             raise InputError(f"actions: expected {expected}, got {got} for env {first}")
         return torch.where(right, values, 0.0)
 
@@ -204,7 +201,7 @@ class WarpWorld:
         self.ctrl.copy_(self.state.thrust[:, 0] / self._newtons)
 
     def _contact(self) -> torch.Tensor:
-        return self._rows > self._rows_in_air
+        return (self._rows > self._rows_in_air)[:, None]
 
     def _graph(self, steps: int) -> Any:
         if steps not in self._steps:
@@ -250,12 +247,12 @@ class TorchDraw:
         return self._chosen.get(name)
 
     def _random(self, kind: Any, size: tuple[int, ...]) -> torch.Tensor:
-        shape, device = (len(self._mask), 1, *size), self._mask.device
+        shape, device = (*self._mask.shape, *size), self._mask.device
         numbers: torch.Tensor = kind(shape, generator=self._generator, device=device)
         return numbers
 
     def _drawn(self, numbers: torch.Tensor, name: str) -> Array:
-        mask = self._mask.reshape(-1, *[1] * (numbers.ndim - 1))
+        mask = self._mask.reshape(*self._mask.shape, *[1] * (numbers.ndim - 2))
         return self._chosen.get(name, torch.where(mask, numbers, 0.0))
 
 
