@@ -152,7 +152,7 @@ class Loop:
         self._has_goal = has_goal(draft)
         self._dtypes = [(a.name, a.shape, getattr(self._xp, a.dtype)) for a in draft.observation]
         none = self.world.state.touching != self.world.state.touching  # all False, on its device
-        self._nobody = none.reshape(num_envs)
+        self._none, self._nobody = none, none.reshape(num_envs)
         self.terminated = self.truncated = self.done = self._nobody
         self.rewards: Array = 0.0 * self._nobody
         self.observations: dict[str, Array] = {}
@@ -266,7 +266,9 @@ class Loop:
             over = bool(ended or late)
         else:
             self.rewards = total.reshape(n)
-            self.terminated, self.truncated = ended.reshape(n), late.reshape(n)
+            # New arrays, whatever the task gave: what a step gave away stays as it was.
+            self.terminated = (ended | self._none).reshape(n)
+            self.truncated = late.reshape(n)
             over = True
         if flown is not None:
             # A drone that did not fly gets no reward: nothing has ended, nothing was won.
@@ -390,7 +392,7 @@ class Loop:
     def _per_drone(self, values: Array) -> Array:
         if not self.world.shape:
             return np.array((values,))
-        return values.reshape(self.num_envs)
+        return _as_type(values.reshape(self.num_envs), values.dtype)
 
     def __reduce__(self) -> Any:
         """Raise: simulator memory cannot be copied, and a copy that seems to fly would be wrong."""
@@ -407,4 +409,5 @@ def _columns(spec: EnvSpec) -> dict[str, slice]:
 
 
 def _as_type(values: Array, dtype: Any) -> Array:
+    """A copy of that type."""
     return values.astype(dtype) if isinstance(values, np.ndarray) else values.to(dtype, copy=True)
