@@ -101,7 +101,9 @@ class LocalVectorEnv(AdvancingVectorEnv):
         options, names = dict(options or {}), self._loop.task.choices
         asked = options.pop("reset_mask", None)
         mask = checked_mask(self._given(asked), self.num_envs)
-        chosen = {name: self._choice(name, self._given(value), names) for name, value in options.items()}
+        chosen = {
+            name: self._choice(name, self._given(value), names) for name, value in options.items()
+        }
         seeds = checked_seeds(seed, self.num_envs)
         self._advance(self._no_actions(), mask, seeds, ~mask, chosen)
         return self._observed(), self._info(mask)
