@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from rotorgram.envs import ElevationEnv
 from rotorgram.udp import RemoteEnv
-from rotorgram.udp.faults import FaultConfig, Relay
+from rotorgram.udp.transport.relay import FaultConfig, Relay
 
 ROOT = Path(__file__).parent.parent
 PEERS = ROOT / "examples" / "peers"
