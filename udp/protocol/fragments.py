@@ -85,6 +85,7 @@ class Transfer:
         if len(message) > largest:
             self.count = ceil(len(message) / (largest - _OVERHEAD))
             self._slice = ceil(len(message) / self.count)
+            self.count = ceil(len(message) / self._slice)  # fewer, where rounding made empty ones
         self._window = window
         self._burst: list[int] = []
         self._next = 0  # no fragment from this one on was sent
