@@ -84,7 +84,8 @@ class Journal:
     Args:
         path: The file; it must not exist.
         side: `simulator` or `agent`.
-        text_hello: Stands for the Hello that the text codec does not have.
+        text_hello: Stands for the Hello that the text codec does not have: of a simulator that
+            speaks text, or of session 0 at an agent.
         model: MJCF of the vehicle, to keep in the file.
     """
 
@@ -145,14 +146,14 @@ class Journal:
         Args:
             slot: Of the agent; 0 at a simulator.
             message: Any message.
-            datagram: Its whole binary message, not sealed; of a message by text anything.
+            datagram: Its whole binary message, not sealed; ignored if it came by text.
         """
         now = time.time_ns()
         if not self._open:
             return
         try:
-            if datagram[:2] != binary.MAGIC:
-                datagram = self._take_text(slot, message, now)
+            if self._text_hello and (self._side == "simulator" or not message.session):
+                datagram = self._take_text(slot, message, self._text_hello, now)
             if isinstance(message, State | Command):
                 seeded = isinstance(message, Command) and message.seeds is not None
                 channel = self._channels[slot, _SEEDED if seeded else datagram[3]]
@@ -206,17 +207,15 @@ class Journal:
 
     # ---- sessions
 
-    def _take_text(self, slot: int, message: Message, now: int) -> bytes:
+    def _take_text(self, slot: int, message: Message, hello: Hello, now: int) -> bytes:
         """The binary form of a message by text. One of a new simulator begins a session."""
-        hello, layout = self._text_hello, self._text_layout
-        assert hello is not None, "a message by text needs a text_hello"
         holder = self._slots[slot] if self._slots else _ONE  # a simulator has one agent
         if holder is not self._holders.get(slot):
             self._holders[slot] = holder
             self._begin(slot, hello, "text", now)
             words = _words(hello, binary.encode(hello)) | {"codec": "text"}
             self._add_json(f"/slot{slot}/events", _EVENT, words, now)
-        return binary.encode(message, layout)
+        return binary.encode(message, self._text_layout)
 
     def _begin(self, slot: int, hello: Hello, codec: str, now: int) -> None:
         """Take note of a new session, whose messages may have another layout."""
