@@ -25,7 +25,7 @@ from ..protocol.messages import Close, Command, Hello, Message, Refuse, State, W
 from ..protocol.statistics import Statistics
 from ._file import McapFile
 
-__all__ = ["ABOUT", "FORMAT", "MODEL", "Journal", "software"]
+__all__ = ["ABOUT", "FORMAT", "MODEL", "Journal", "model_of", "software"]
 
 ABOUT: Final = "rotorgram"
 """Name of the metadata about the whole file; those of each session are named `session`."""
@@ -84,8 +84,8 @@ class Journal:
     Args:
         path: The file; it must not exist.
         side: `simulator` or `agent`.
-        text_hello: Stands for the Hello that the text codec does not have: of a simulator that
-            speaks text, or of session 0 at an agent.
+        text_hello: Stands for the Hello that the text codec does not have. An agent gives it the
+            session 0.
         model: MJCF of the vehicle, to keep in the file.
     """
 
@@ -96,7 +96,6 @@ class Journal:
         self._side = side
         self._model = model
         self._text_hello = text_hello
-        self._text_layout = _layout(text_hello) if text_hello else None
         self._slots: Sequence[object] = ()
         self._holders: dict[int, object] = {}
         self._schemas: dict[str, dict[str, int]] = {}
@@ -146,14 +145,16 @@ class Journal:
         Args:
             slot: Of the agent; 0 at a simulator.
             message: Any message.
-            datagram: Its whole binary message, not sealed; ignored if it came by text.
+            datagram: Its whole binary message, not sealed; also for the text codec.
         """
         now = time.time_ns()
         if not self._open:
             return
         try:
-            if self._text_hello and (self._side == "simulator" or not message.session):
-                datagram = self._take_text(slot, message, self._text_hello, now)
+            if not isinstance(message, Hello) and (
+                not message.session or (slot, binary.STATE) not in self._channels
+            ):
+                self._begin_by_text(slot, now)
             if isinstance(message, State | Command):
                 seeded = isinstance(message, Command) and message.seeds is not None
                 channel = self._channels[slot, _SEEDED if seeded else datagram[3]]
@@ -207,15 +208,16 @@ class Journal:
 
     # ---- sessions
 
-    def _take_text(self, slot: int, message: Message, hello: Hello, now: int) -> bytes:
-        """The binary form of a message by text. One of a new simulator begins a session."""
+    def _begin_by_text(self, slot: int, now: int) -> None:
+        """Begin a session if this is the first message of a new text simulator."""
+        hello = self._text_hello
+        assert hello is not None, "the text codec needs a text_hello"
         holder = self._slots[slot] if self._slots else _ONE  # a simulator has one agent
         if holder is not self._holders.get(slot):
             self._holders[slot] = holder
             self._begin(slot, hello, "text", now)
             words = _words(hello, binary.encode(hello)) | {"codec": "text"}
             self._add_json(f"/slot{slot}/events", _EVENT, words, now)
-        return binary.encode(message, self._text_layout)
 
     def _begin(self, slot: int, hello: Hello, codec: str, now: int) -> None:
         """Take note of a new session, whose messages may have another layout."""
@@ -274,6 +276,25 @@ def software() -> dict[str, str]:
     return versions
 
 
+def model_of(stepped: Any) -> str:
+    """The whole MJCF of what a simulator steps, its includes resolved; "" if it has none."""
+    task = getattr(stepped, "task", None)
+    if task is not None:
+        from ...models.scene import build_scene
+
+        return str(build_scene(task.vehicle.path, visual=False).to_xml())
+    # As the MuJoCo envs of Gymnasium have it.
+    path = getattr(stepped.envs[0].unwrapped, "fullpath", None)
+    if not isinstance(path, str):
+        return ""
+    try:
+        import mujoco
+
+        return str(mujoco.MjSpec.from_file(path).to_xml())
+    except (ImportError, ValueError, OSError):
+        return ""
+
+
 # ---- ROS 1 messages
 
 
@@ -316,10 +337,6 @@ def _field_names(prefix: str, names: Iterable[str]) -> list[str]:
             field += "_"
         fields.append(field)
     return fields
-
-
-def _layout(hello: Hello) -> Layout:
-    return layout_of(EnvSpec.from_json(hello.spec), hello.worlds)
 
 
 def _words(message: Message, datagram: bytes) -> dict[str, Any]:

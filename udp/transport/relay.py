@@ -15,7 +15,7 @@ from heapq import heappop, heappush
 from typing import Final
 
 from ...models.errors import InputError
-from ..sockets import is_loopback, open_socket, resolve
+from .sockets import is_loopback, open_socket, resolve
 
 __all__ = ["FaultConfig", "Faults", "Relay"]
 
