@@ -17,8 +17,6 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
-from ..models.errors import InputError
-
 if TYPE_CHECKING:
     from ._flags import Command
 
@@ -54,8 +52,6 @@ EXTRAS: Final = {
 """Import names of the packages of each extra, as pyproject.toml lists them."""
 
 _ABOUT: Final = "A MuJoCo drone simulator that reinforcement-learning agents fly over UDP."
-_DRAWING: Final = {"egl", "glfw", "osmesa", "glx", "cgl", "enable", "enabled", "on", "true", "1"}
-_NOT_DRAWING: Final = {"disable", "disabled", "off", "false", "0"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -104,11 +100,12 @@ def _run(words: list[str]) -> int:
         known = ", ".join(COMMANDS)
         print(f"rotorgram: expected a command of {known}, got {name}", file=sys.stderr)
         return 2
+    from ..rendering.gl import tolerate_gl_setting
     from ._flags import parse
 
     with _wide_enough():
         command = parse(_class_of(name), f"rotorgram {name}", words[1:])
-    _check_opengl_setting()
+    tolerate_gl_setting()  # MuJoCo raises at import, in commands that draw nothing too
     return command.run()
 
 
@@ -141,15 +138,6 @@ def _wide_enough() -> Iterator[None]:
             os.environ["COLUMNS"] = before
         else:
             os.environ.pop("COLUMNS", None)
-
-
-def _check_opengl_setting() -> None:
-    """MuJoCo raises at import for another word, whether the command draws or not."""
-    wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if wanted and wanted not in _DRAWING | _NOT_DRAWING:
-        raise InputError(
-            f"MUJOCO_GL: expected egl, glfw, osmesa or disable, got {os.environ['MUJOCO_GL']!r}"
-        )
 
 
 def _prepare_streams() -> None:

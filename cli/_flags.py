@@ -1,10 +1,11 @@
 """What every command declares and how its flags are parsed: tyro, plus the options of any task."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar
+from types import UnionType
+from typing import Annotated, Any, Final, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.conf import Fixed, Suppress, arg
@@ -20,7 +21,7 @@ DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
 class Command:
     """What every command is: its fields are the flags, their docstrings the help."""
 
-    given: Suppress[Fixed[frozenset[str]]] = frozenset()
+    given: Suppress[Fixed[frozenset]] = frozenset()  # type: ignore[type-arg]
     """Names of the fields that the user set, if only to their default; those of options of the
     task begin with `env.`."""
 
@@ -38,8 +39,8 @@ class EnvFlags(Command):
     Its options are flags --env.NAME."""
     vehicle: Path | None = None
     """MJCF file of a multirotor. Default: the paper's quadcopter."""
-    options: Suppress[Fixed[Any]] = field(default_factory=dict)
-    """Options of the task that the user set, JSON values by name."""
+    options: Suppress[Fixed[dict]] = field(default_factory=dict)  # type: ignore[type-arg]
+    """Options of the task. A checkpoint brings those that it was trained with."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,39 +64,64 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     """A command from its words. A wrong flag exits with status 2, `--help` with 0.
 
     Raises:
-        InputError: The task is not known.
+        InputError: The task or one of its options is not what it should be.
     """
-    words = list(words)
     given = _given(words)
     if not issubclass(kind, EnvFlags):
-        return replace(tyro.cli(kind, prog=prog, args=words), given=given)
-    listens = "listen" in given or _default(kind, "listen")
+        return replace(tyro.cli(_for_tyro(kind), prog=prog, args=words), given=given)
     env_id = _value(words, "--env") or DEFAULT_ENV
     from ..envs import registry
 
-    if listens and ":" not in env_id and not registry.is_known(env_id):
-        requirements = _take_requirements(words)
-        return replace(
-            tyro.cli(kind, prog=prog, args=words), given=given, options=requirements
-        )
+    if _listens(kind, given) and ":" not in env_id and not registry.is_known(env_id):
+        words, required = _without_requirements(words)
+        command = tyro.cli(_for_tyro(kind), prog=prog, args=words)
+        return replace(command, given=given, options=required)
     env_id = registry.load(env_id)
     options_type = registry.options_type(env_id)
-    # A wrong value is told like every other wrong input, by the options themselves, not by tyro.
-    raw = type("EnvOptions", (options_type,), {"__post_init__": lambda self: None,
-                                               "__doc__": f"Options of {env_id}."})  # fmt: skip
+    # Wrong values are refused by the options themselves, below, as every other wrong input.
+    raw = _for_tyro(options_type, __post_init__=lambda self: None, __doc__=f"Options of {env_id}.")
     typed = make_dataclass(
         kind.__name__,
         [("options", Annotated[raw, arg(name="env")], field(default_factory=raw))],
-        bases=(kind,),
+        bases=(_for_tyro(kind),),
+        namespace={"__doc__": kind.__doc__},
         frozen=True,
         kw_only=True,
     )
-    typed.__doc__ = kind.__doc__
     command = tyro.cli(typed, prog=prog, args=words)
-    values = {n.removeprefix("env."): None for n in given if n.startswith("env.")}
-    chosen = {name: getattr(command.options, name) for name in values}
-    options_type.from_options(_json(chosen))  # raises InputError
-    return replace(command, given=given, env=env_id, options=_json(chosen))
+    names = sorted(name.removeprefix("env.") for name in given if name.startswith("env."))
+    options = {name: getattr(command.options, name) for name in names}
+    checked = options_type.from_options(options)
+    plain = json.loads(json.dumps({name: getattr(checked, name) for name in names}))
+    return replace(command, given=given, env=env_id, options=plain)
+
+
+def _for_tyro(kind: type[Any], **namespace: Any) -> type[Any]:
+    """A dataclass with `Union[X, Y]` in place of `X | Y`: for the latter, and Python before 3.14,
+    tyro imports typeguard, which takes as long as all else.
+    """
+    hints = get_type_hints(kind, include_extras=True)
+    changed = {
+        one.name: hint
+        for one in fields(kind)
+        if (hint := _with_union(hints[one.name])) is not hints[one.name]
+    }
+    made = type(kind.__name__, (kind,), {"__annotations__": changed, "__doc__": kind.__doc__,
+                                         **namespace})  # fmt: skip
+    return dataclass(frozen=True, kw_only=True)(made)
+
+
+def _with_union(hint: Any) -> Any:
+    if isinstance(hint, UnionType):
+        return Union[get_args(hint)]  # noqa: UP007
+    if get_origin(hint) is Annotated and isinstance(get_args(hint)[0], UnionType):
+        first, *rest = get_args(hint)
+        return Annotated[_with_union(first), *rest]
+    return hint
+
+
+def _listens(kind: type[Command], given: frozenset[str]) -> bool:
+    return "listen" in given or any(f.name == "listen" and f.default for f in fields(kind))
 
 
 def parse_value(text: str) -> Any:
@@ -125,10 +151,10 @@ def _value(words: Sequence[str], flag: str) -> str | None:
     return found
 
 
-def _take_requirements(words: list[str]) -> dict[str, Any]:
-    """Take `--env.NAME VALUE` out of the words: JSON values of a task that is not known here."""
-    found: dict[str, Any] = {}
+def _without_requirements(words: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    """The words without `--env.NAME VALUE`, and these: JSON values of a task not known here."""
     kept: list[str] = []
+    required: dict[str, Any] = {}
     rest = iter(words)
     for word in rest:
         name, equals, value = word.partition("=")
@@ -138,16 +164,5 @@ def _take_requirements(words: list[str]) -> dict[str, Any]:
         text = value if equals else next(rest, None)
         if text is None:
             raise InputError(f"{name}: expected a value, got none")
-        found[name.removeprefix("--env.").replace("-", "_")] = parse_value(text)
-    words[:] = kept
-    return found
-
-
-def _default(kind: type[Command], name: str) -> Any:
-    return next((f.default for f in fields(kind) if f.name == name), None)
-
-
-def _json(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options as JSON values: tuples become lists."""
-    plain: dict[str, Any] = json.loads(json.dumps(dict(options)))
-    return plain
+        required[name.removeprefix("--env.").replace("-", "_")] = parse_value(text)
+    return kept, required
