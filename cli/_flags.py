@@ -5,16 +5,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Final, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.conf import Fixed, Suppress, arg
 
 from ..models.errors import InputError
 
-__all__ = ["DEFAULT_ENV", "AgentFlags", "Command", "EnvFlags", "parse", "parse_value"]
+__all__ = [
+    "DEFAULT_ENV",
+    "AgentFlags",
+    "AlgorithmName",
+    "Command",
+    "EnvFlags",
+    "PresetName",
+    "parse",
+    "parse_value",
+]
 
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
+
+# As in agents/presets.py, which is not imported for them before the flags are checked.
+AlgorithmName = Literal["vpg", "a2c", "sb3-a2c"]
+PresetName = Literal["paper", "tuned"]
 
 
 @dataclass(frozen=True, kw_only=True)

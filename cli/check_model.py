@@ -26,8 +26,9 @@ class CheckModel(Command):
         from rich.table import Table
 
         from ..models.checks import examine
+        from ..models.vehicle import Vehicle
 
-        checks = examine(self.xml)
+        checks = examine(Vehicle.load(self.xml))
         table = Table("", "check", "expected", "measured - expected", "tolerance", "source")
         for check in checks:
             table.add_row(

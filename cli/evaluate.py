@@ -1,33 +1,45 @@
 """`rotorgram evaluate`: fly episodes without exploration, print the means."""
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Annotated
 
-import numpy as np
+from tyro.conf import Positional, arg
 
-from ..experiments.evaluate import evaluation_row, fly_episodes
-from .inputs import load_policy, remote_env
+from ._flags import AgentFlags
+from ._inputs import check_count
 
-if TYPE_CHECKING:
-    from .flying import Evaluate
-
-__all__ = ["evaluate"]
+__all__ = ["Evaluate"]
 
 
-def evaluate(command: "Evaluate") -> int:
-    """Fly and print the means; the exit status."""
-    if command.episodes < 1:
-        raise ValueError(f"episodes: expected at least 1, got {command.episodes}")
-    policy, config = load_policy(command.policy, command.env.checked())
-    with remote_env(config, command) as env:
-        flights = fly_episodes(env, policy, command.episodes)
-    rows = [evaluation_row(f, k, config.control_period) for k, f in enumerate(flights)]
-    settled = [r["settling_time"] for r in rows if not np.isnan(r["settling_time"])]
-    crashes = sum(r["terminated"] for r in rows)
-    settling = f"{np.mean(settled):.2f} s" if settled else "never"
-    print(f"policy            {command.policy}")
-    print(f"episodes          {len(rows)}, {crashes} terminated")
-    print(f"return            {np.mean([r['return'] for r in rows]):.1f}")
-    print(f"steady-state |E|  {np.mean([r['steady_error'] for r in rows]):.4f} m")
-    print(f"settling to 5 cm  {settling} ({len(settled)} of {len(rows)} episodes)")
-    print(f"overshoot         {np.mean([r['overshoot'] for r in rows]):.3f} m")
-    return 0
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(AgentFlags):
+    """Measure a trained policy or the PID over episodes without exploration."""
+
+    policy: Positional[Annotated[str, arg(metavar="POLICY")]]
+    """Checkpoint, folder of a training, or pid."""
+    episodes: int = 20
+    """Episodes to fly, from seeds that no training uses."""
+
+    def run(self) -> int:
+        """Fly and print the means."""
+        import numpy as np
+
+        from ..experiments.metrics import Headline
+        from ..experiments.trajectories import evaluation_row, fly_episodes
+        from ._env import chosen_env, load_checkpoint, policy_for, remote_env
+
+        check_count("episodes", self.episodes)
+        checkpoint = load_checkpoint(self.policy)
+        required = checkpoint is not None or bool(self.options) or "env" in self.given
+        with remote_env(self, *chosen_env(self, checkpoint), required=required) as env:
+            policy = policy_for(self.policy, checkpoint, env.env_spec)
+            trajectories = fly_episodes(env, policy, self.episodes, "final")
+        headline = Headline.of(trajectories[0].spec)
+        rows = [evaluation_row(trajectory) for trajectory in trajectories]
+        means = {name: np.mean([row[name] for row in rows]) for name in ("return", "steady")}
+        terminated = sum(row["terminated"] for row in rows)
+        print(f"policy      {self.policy} on {trajectories[0].spec.env_id}")
+        print(f"episodes    {len(rows)}, {terminated} terminated")
+        print(f"return      {means['return']:.1f}")
+        print(f"steady      {headline.size_symbol} {headline.amount(f'{means['steady']:.4f}')}")
+        return 0
