@@ -72,9 +72,7 @@ def spec_of(env_id: str, task: Task) -> EnvSpec:
 def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
     def numbers(name: str, components: Sequence[str], **rest: Any) -> ArraySpec:
         names = tuple(components)
-        return ArraySpec(
-            name=name, shape=(len(names),), dtype="float64", components=names, **rest
-        )
+        return ArraySpec(name=name, shape=(len(names),), dtype="float64", components=names, **rest)
 
     vehicle = task.vehicle
     specs = [
@@ -163,6 +161,7 @@ class Loop:
         self.terminated = self.truncated = self.done = self._nobody
         self._waiting = self._everybody  # for a reset
         self._anyone_waits = True
+        self._begun = False
         self._outcome: Outcome | None = None
         self._telemetry: dict[str, np.ndarray] | None = None
 
@@ -202,20 +201,18 @@ class Loop:
         chosen: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Begin episodes of the drones of a mask, bool, shape (N,): part of `advance`."""
-        xp, task, world = self._xp, self.task, self.world
-        if self._outcome is None and not mask.all():  # the first time a task wants all of them
-            self._begin(self._everybody, None)
+        if not self._begun and not mask.all():  # the first time a task wants all of them
+            self._begin(self._everybody, {})
             self._waiting = ~mask
         if seeds is not None:
-            ids = np.flatnonzero(np.asarray(mask)).tolist()
-            world.streams.seed(ids, [seeds[i] for i in ids])
-        self._begin(mask, chosen)
-        del xp, task
+            self.world.seed(mask, seeds)
+        shape = self.world.shape
+        self._begin(mask, {name: x.reshape(shape) for name, x in (chosen or {}).items()})
 
-    def _begin(self, mask: Array, chosen: Mapping[str, np.ndarray] | None) -> None:
-        world, rows = self.world, mask[:, None]
-        draws = {name: values.reshape(world.shape) for name, values in (chosen or {}).items()}
-        world.reset(mask, self.task.begin(rows, world.draw(mask, draws)))
+    def _begin(self, mask: Array, chosen: Mapping[str, np.ndarray]) -> None:
+        world = self.world
+        world.reset(mask, self.task.begin(mask[:, None], world.draw(mask, chosen)))
+        self._begun = True
         self.steps = self._xp.where(mask, 0, self.steps)
         self._waiting = self._waiting & ~mask
         self._anyone_waits = bool(self._waiting.any())
@@ -273,9 +270,10 @@ class Loop:
 
     def _values(self, actions: Array, flown: Array | None) -> Array:
         """Actions as controllers take them: float64, shape (W, A, k). Raises `InputError`."""
-        values = actions
-        if values.dtype != np.float32 or isinstance(values, np.ndarray):
-            values = self._checked(actions, flown)
+        if self._xp is np:
+            values = self._checked(np.asarray(actions), flown)
+        else:
+            values = self.world.checked(actions, self._action_shape, self._choices)  # type: ignore[attr-defined]
         return values.reshape(self._action_shape)
 
     def _checked(self, actions: np.ndarray, flown: Array | None) -> np.ndarray:

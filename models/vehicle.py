@@ -183,7 +183,7 @@ def _load(cls: type[Vehicle], path: Path, drag: float, changed: int) -> Any:
             f"vehicle: expected a mass > 0 and gravity along -z, got {mass:g} kg and "
             f"{model.opt.gravity.tolist()} m/s²"
         )
-    if not LEAST_TIMESTEP <= model.opt.timestep:
+    if not model.opt.timestep >= LEAST_TIMESTEP:
         raise InputError(
             f"vehicle: expected a physics step of at least {LEAST_TIMESTEP:g} s, "
             f"got {model.opt.timestep:g}"

@@ -6,8 +6,6 @@ action has k numbers within bounds, or is one of some choices.
 
 from typing import Final, Protocol
 
-import numpy as np
-
 from ..models.vehicle import Vehicle
 from .state import Array, WorldState, clip, constant
 

@@ -1,11 +1,12 @@
 """Worlds behind one interface, whatever steps their physics."""
 
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, Final, Literal, Protocol, get_args
 
 from ..models.errors import InputError
 from ..models.vehicle import Vehicle
-from .random import Draw, Streams
+from .random import Draw
 from .state import Array, Pose, WorldState
 
 __all__ = ["BACKENDS", "Backend", "PhysicsError", "World", "contact_check", "make_world"]
@@ -35,14 +36,12 @@ class World(Protocol):
         shape: (W, A).
         state: As the last step or reset left it.
         xp: Namespace of the array API standard for the state's arrays.
-        streams: Random streams of the worlds, for starts.
     """
 
     vehicle: Vehicle
     shape: tuple[int, int]
     state: WorldState
     xp: Any
-    streams: Streams
 
     def reset(self, mask: Array, pose: Pose) -> None:
         """Begin anew in the worlds of the mask, bool, shape (W,); their poses are those given."""
@@ -57,6 +56,14 @@ class World(Protocol):
 
         Raises:
             PhysicsError: A state is bad; reset the worlds that the message names.
+        """
+
+    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
+        """Seed the random streams of the worlds of a mask; a seed of None leaves its stream.
+
+        Args:
+            mask: bool, shape (W,).
+            seeds: Shape (W,).
         """
 
     def draw(self, mask: Array, chosen: Any = None) -> Draw:

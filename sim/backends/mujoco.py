@@ -4,7 +4,7 @@
 of threads.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -46,7 +46,7 @@ class MujocoWorld:
         _switch_off_log_file()
         self.vehicle = vehicle
         self.shape = (num_worlds, 1)
-        self.streams = Streams(num_worlds)
+        self._streams = Streams(num_worlds)
         self._check = contact_check(vehicle.timestep)
         threads = 1 if num_worlds == 1 else num_threads
         self._batch = batch = Batch(vehicle.model, num_worlds, threads)
@@ -106,9 +106,14 @@ class MujocoWorld:
         if self._warnings.tobytes() != self._no_warnings:
             raise PhysicsError(self._describe_warnings())
 
+    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
+        """As `World.seed`."""
+        ids = np.flatnonzero(mask).tolist()
+        self._streams.seed(ids, [seeds[i] for i in ids])
+
     def draw(self, mask: Array, chosen: Mapping[str, Any] | None = None) -> Draw:
         """As `World.draw`."""
-        return NumpyDraw(self.streams, np.flatnonzero(mask).tolist(), self.shape, chosen)
+        return NumpyDraw(self._streams, np.flatnonzero(mask).tolist(), self.shape, chosen)
 
     def close(self) -> None:
         """Nothing is held but memory."""
