@@ -13,9 +13,10 @@ if TYPE_CHECKING:
     from ..agents.checkpoints import Checkpoint
     from ..agents.policies import Policy
     from ..envs.spec import EnvSpec
+    from ..experiments.trajectories import Trajectory
     from ..udp import RemoteEnv, RemoteVectorEnv
 
-__all__ = ["CHECKPOINT", "chosen_env", "load_checkpoint", "local_spec", "policy_for", "remote_env"]
+__all__ = ["CHECKPOINT", "chosen_env", "load_checkpoint", "local_spec", "policy_for", "remote_env", "words_of"]
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 _CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
@@ -81,6 +82,15 @@ def policy_for(name: str, checkpoint: "Checkpoint | None", spec: "EnvSpec") -> "
         if trained != flown:
             raise InputError(f"{name}: expected the {part} {trained}, got {flown} of {spec.env_id}")
     return policy
+
+
+def words_of(trajectory: "Trajectory") -> str:
+    """Return of an episode, and the metric that decides at its end."""
+    words = f"return {trajectory.rewards.sum():.1f}"
+    if (metric := trajectory.spec.headline) is None:
+        return words
+    value = f"{trajectory.headline[-1]:.3f} {metric.unit}".rstrip()
+    return f"{words}, last {metric.symbol or metric.name} {value}"
 
 
 def _shapes(arrays: Any) -> str:

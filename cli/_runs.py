@@ -86,17 +86,15 @@ def report_comparison(folder: Path, *, film: bool = True) -> None:
     """Write figures, film and report from the folder's files, and print the table."""
     from rich.console import Console
 
-    from ..experiments.metrics import results_table
-    from ..experiments.report import VIDEO_FILE, terminal_table, write_report
+    from ..experiments.report import VIDEO_FILE, table_of, terminal_table, write_report
     from ..experiments.results import read_results
 
-    found = read_results(folder)
-    table = results_table(found)
-    page = write_report(folder, found, table)
-    Console(width=100).print(terminal_table(table))
+    results = read_results(folder)
+    page = write_report(folder, results)
+    Console(width=100).print(terminal_table(table_of(results), results.headline))
     # Only now: if the film fails, there is a report.
     if film and not (folder / VIDEO_FILE).exists() and _film(folder):
-        write_report(folder, found, table)
+        write_report(folder, results)
     print(f"report: {page}")
 
 

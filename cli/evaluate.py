@@ -25,21 +25,34 @@ class Evaluate(AgentFlags):
         import numpy as np
 
         from ..experiments.metrics import Headline
-        from ..experiments.trajectories import evaluation_row, fly_episodes
+        from ..experiments.results import evaluation_row
+        from ..experiments.trajectories import fly_episodes
         from ._env import chosen_env, load_checkpoint, policy_for, remote_env
 
         check_count("episodes", self.episodes)
         checkpoint = load_checkpoint(self.policy)
         required = checkpoint is not None or bool(self.options) or "env" in self.given
         with remote_env(self, *chosen_env(self, checkpoint), required=required) as env:
+            headline = Headline.of(env.env_spec)
             policy = policy_for(self.policy, checkpoint, env.env_spec)
             trajectories = fly_episodes(env, policy, self.episodes, "final")
-        headline = Headline.of(trajectories[0].spec)
-        rows = [evaluation_row(trajectory) for trajectory in trajectories]
-        means = {name: np.mean([row[name] for row in rows]) for name in ("return", "steady")}
-        terminated = sum(row["terminated"] for row in rows)
-        print(f"policy      {self.policy} on {trajectories[0].spec.env_id}")
-        print(f"episodes    {len(rows)}, {terminated} terminated")
-        print(f"return      {means['return']:.1f}")
-        print(f"steady      {headline.size_symbol} {headline.amount(f'{means['steady']:.4f}')}")
+        rows = [evaluation_row(trajectory, headline) for trajectory in trajectories]
+
+        def mean(name: str) -> float:
+            return float(np.nanmean([row[name] for row in rows]))
+
+        def amount(name: str) -> str:
+            return headline.amount(f"{mean(name):.4f}")
+
+        print(f"policy     {self.policy} on {trajectories[0].spec.env_id}")
+        print(f"episodes   {len(rows)}, {sum(row['terminated'] for row in rows)} terminated")
+        print(f"return     {mean('return'):.1f}")
+        print(f"steady     {headline.size_symbol} {amount('steady')}")
+        if (bound := headline.metric.settled) is not None and not headline.high:
+            count = sum(not np.isnan(row["settling_time"]) for row in rows)
+            when = f"{mean('settling_time'):.2f} s" if count else "never"
+            bound_text = headline.amount(f"{bound:g}")
+            print(f"settling   to {bound_text}: {when} ({count} of {len(rows)} episodes)")
+        if headline.signed:
+            print(f"overshoot  {amount('overshoot')}")
         return 0

@@ -26,8 +26,8 @@ class Serve(AgentFlags):
 
     def run(self) -> int:
         """Fly episode after episode."""
-        from ..experiments.evaluate import evaluation_seed, fly
-        from ._env import chosen_env, load_checkpoint, policy_for, remote_env
+        from ..experiments.trajectories import evaluation_seed, fly
+        from ._env import chosen_env, load_checkpoint, policy_for, remote_env, words_of
 
         check_count("episodes", self.episodes)
         checkpoint = load_checkpoint(self.policy)
@@ -37,8 +37,8 @@ class Serve(AgentFlags):
             policy = policy_for(self.policy, checkpoint, env.env_spec)
             while self.episodes is None or episode < self.episodes:
                 with _next_simulator():
-                    flight = fly(env, policy, evaluation_seed(episode))
-                    print(f"episode {episode}: {flight.words()}", flush=True)
+                    flown = fly(env, policy, evaluation_seed(episode), episode)
+                    print(f"episode {episode}: {words_of(flown)}", flush=True)
                     episode += 1
         return 0
 
