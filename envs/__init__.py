@@ -1,6 +1,6 @@
-"""Gymnasium environments: importing this package registers `rotorgram/Elevation-v0`.
+"""Gymnasium environments: importing this package registers `rotorgram/Elevation-v0` and `Hover-v0`.
 
-Gymnasium 1.0 stopped reading the entry point `gymnasium.envs`, so one of these makes the env known:
+Gymnasium 1.0 stopped reading the entry point `gymnasium.envs`, so one of these makes the envs known:
 
     import rotorgram.envs; gym.make("rotorgram/Elevation-v0")
     gym.make("rotorgram.envs:rotorgram/Elevation-v0")  # imports by itself
@@ -8,53 +8,55 @@ Gymnasium 1.0 stopped reading the entry point `gymnasium.envs`, so one of these 
 Neither loads MuJoCo before an env is made.
 """
 
-from typing import TYPE_CHECKING, Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
 
-import gymnasium
-
-from .config import ENV_ID, TELEMETRY_NAMES, ElevationConfig
+from .registry import is_known, register
+from .spec import ArraySpec, Discrete, EnvSpec, Metric
 
 if TYPE_CHECKING:
-    from .elevation import ElevationEnv
-    from .vector import ElevationVectorEnv
+    from .loop import Loop
+    from .single import SingleEnv
+    from .tasks.task import Outcome, Task, TaskOptions
+    from .vector import LocalVectorEnv
 
 __all__ = [
-    "ENV_ID",
-    "TELEMETRY_NAMES",
-    "ElevationConfig",
-    "ElevationEnv",
-    "ElevationVectorEnv",
+    "ArraySpec",
+    "Discrete",
+    "EnvSpec",
+    "LocalVectorEnv",
+    "Loop",
+    "Metric",
+    "Outcome",
+    "SingleEnv",
+    "Task",
+    "TaskOptions",
     "register",
+    "register_all",
 ]
 
-WARP_ENV_ID = "rotorgram/ElevationWarp-v0"  # needs rotorgram[gpu]; a vector env only
+_HOMES: Final = {
+    "Loop": "loop",
+    "LocalVectorEnv": "vector",
+    "Outcome": "tasks.task",
+    "SingleEnv": "single",
+    "Task": "tasks.task",
+    "TaskOptions": "tasks.task",
+}
 
 
-def register() -> None:
-    """Add the envs to Gymnasium's registry, once."""
-    if ENV_ID not in gymnasium.registry:
-        # No max_episode_steps: the env truncates by itself, since over UDP no wrapper would.
-        gymnasium.register(
-            id=ENV_ID,
-            entry_point="rotorgram.envs.elevation:ElevationEnv",
-            vector_entry_point="rotorgram.envs.vector:ElevationVectorEnv",
-        )
-    if WARP_ENV_ID not in gymnasium.registry:
-        gymnasium.register(
-            id=WARP_ENV_ID, vector_entry_point="rotorgram.envs.warp:ElevationWarpEnv"
-        )
+def register_all() -> None:
+    """Add our envs to Gymnasium's registry, once."""
+    for name in ("Elevation", "Hover"):
+        if not is_known(f"rotorgram/{name}-v0"):
+            register(f"rotorgram/{name}-v0", f"rotorgram.envs.tasks.{name.lower()}:{name}")
 
 
 def __getattr__(name: str) -> Any:
-    if name == "ElevationEnv":
-        from .elevation import ElevationEnv
-
-        return ElevationEnv
-    if name == "ElevationVectorEnv":
-        from .vector import ElevationVectorEnv
-
-        return ElevationVectorEnv
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """Import what needs MuJoCo on first use (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f".{_HOMES[name]}", __name__), name)
 
 
-register()
+register_all()

@@ -1,4 +1,4 @@
-"""What vector envs of the wire have in common: Gymnasium's autoreset over a single method."""
+"""What local and remote vector envs have in common: Gymnasium's autoreset over a single method."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -6,124 +6,151 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 
-__all__ = [
-    "AdvancingVectorEnv",
-    "Seeds",
-    "Step",
-    "autoreset_mode",
-    "check_names",
-    "checked_mask",
-    "checked_seeds",
-]
+from ..models.errors import InputError
+from .spaces import action_space, info_columns, observation_space
+from .spec import Discrete, EnvSpec
 
-Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
+__all__ = ["AdvancingVectorEnv", "Seeds", "Step", "checked_mask", "checked_seeds"]
+
+Step = tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 Seeds = Sequence[int | None] | np.ndarray
 
 
-class AdvancingVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
     """A vector env that is stepped by `advance`, the step of the wire.
 
+    A derived class sets the attributes below in `advance` to new arrays; what a step gave away
+    stays as it was.
+
     Attributes:
-        observations: float32, shape (N, n). This and the others are as `advance` left them.
+        env_spec: What there is to know of the env.
+        control_period: Time of a step, s.
+        observations: float32, shape (N, n), where the spec has one array; else a dict of arrays.
         rewards: float64, shape (N,).
         terminated, truncated: bool, shape (N,).
-        over: bool, shape (N,): whose episode has ended and the next has not begun.
-        lost: bool, shape (N,): whose episode was truncated since its simulator was lost.
+        done: bool, shape (N,): the episode has ended and the next has not begun.
+        lost: bool, shape (N,): the episode was truncated because its simulator was lost.
+        telemetry: By name, float64, shape (N, *shape).
     """
 
-    observations: np.ndarray
+    env_spec: EnvSpec
+    control_period: float
+    observations: Any
     rewards: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
-    over: np.ndarray
+    done: np.ndarray
     lost: np.ndarray
+    telemetry: Mapping[str, np.ndarray]
 
     @abstractmethod
     def reset(
         self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode, for all drones or some."""
 
     @abstractmethod
     def advance(
         self,
         actions: np.ndarray,
-        resets: np.ndarray,
-        seeds: np.ndarray | None = None,
-        holds: np.ndarray | None = None,
+        resets: np.ndarray | None = None,
+        seeds: Seeds | None = None,
+        frozen: np.ndarray | None = None,
     ) -> None:
-        """Reset some drones, hold some, and fly the others for one control period.
+        """Reset some drones, freeze some, and fly the others for one control period.
 
-        Rewards and flags of a drone that is reset or held are 0, and its action is ignored. One
-        that is held is afterwards as it was before.
+        Rewards and flags of a drone that is reset or frozen are 0, and its action is ignored. One
+        that is frozen is afterwards as it was before.
 
         Args:
-            actions: Shape (N, k), a discrete one by its number.
-            resets: bool, shape (N,).
-            seeds: uint64, shape (N,), of those that are reset; None leaves their generators as
-                they are.
-            holds: bool, shape (N,); None holds none.
+            actions: Shape (N, k); of discrete actions (N,) or (N, 1).
+            resets: bool, shape (N,); None resets none.
+            seeds: Of those that are reset, shape (N,); None leaves their streams as they are.
+            frozen: bool, shape (N,); None freezes none.
         """
 
-    @abstractmethod
-    def _info(self, mask: np.ndarray) -> dict[str, Any]:
-        """What there is to say of the drones now, each name with its mask."""
-
-    def step(self, actions: np.ndarray) -> Step:
+    def step(self, actions: Any) -> Step:
         """Fly every drone for one control period; what follows an episode, the autoreset says."""
+        array = self._shaped(actions)
+        mode = self.metadata["autoreset_mode"]
+        resets = self.done if mode == AutoresetMode.NEXT_STEP and self.done.any() else None
+        self.advance(array, resets)
+        rewards, terminated, truncated = self.rewards, self.terminated, self.truncated
+        info = self._info(np.ones(self.num_envs, bool))
+        if mode == AutoresetMode.SAME_STEP and self.done.any():
+            truncated, info = self._begin_next(truncated, info)
+        return self._observed(), rewards, terminated, truncated, info
+
+    def _take_spec(self, spec: EnvSpec, num_envs: int, mode: AutoresetMode | str) -> None:
+        """Set what follows from a spec, spaces too. Raises `InputError`.
+
+        Spaces that are equal to those there are stay: their generators may have been seeded.
+        """
+        try:
+            mode = AutoresetMode(mode)
+        except ValueError:
+            expected = " or ".join(repr(m.value) for m in AutoresetMode)
+            raise InputError(f"autoreset_mode: expected {expected}, got {mode!r}") from None
+        if getattr(self, "env_spec", None) != spec or self.num_envs != num_envs:
+            self.single_observation_space = observation_space(spec)
+            self.single_action_space = action_space(spec)
+            self.observation_space = batch_space(self.single_observation_space, num_envs)
+            self.action_space = batch_space(self.single_action_space, num_envs)
+        self.env_spec, self.num_envs = spec, num_envs
+        self.control_period = spec.control_period
+        fps = max(1, round(1 / spec.control_period))
+        self.metadata = {"render_modes": [], "render_fps": fps, "autoreset_mode": mode}
+
+    def _shaped(self, actions: Any) -> np.ndarray:
         array = np.asarray(actions)
         if array.shape != self.action_space.shape:
-            raise ValueError(
+            raise InputError(
                 f"actions: expected an array of shape {self.action_space.shape}, "
                 f"got shape {array.shape}"
             )
-        mode, nobody = self.metadata["autoreset_mode"], np.zeros(self.num_envs, bool)
-        resets = self.over if mode == AutoresetMode.NEXT_STEP else nobody
-        self.advance(array.reshape(self.num_envs, -1), resets)
-        # Copies, for whoever writes into them.
-        rewards, terminated = self.rewards.copy(), self.terminated.copy()
-        truncated, info = self.truncated.copy(), self._info(~nobody)
-        if mode == AutoresetMode.SAME_STEP and self.over.any():
-            info = self._begin_next(truncated, info)
-        return self.observations.copy(), rewards, terminated, truncated, info
+        return array
 
-    def _begin_next(self, truncated: np.ndarray, last_info: dict[str, Any]) -> dict[str, Any]:
+    def _no_actions(self) -> np.ndarray:
+        action = self.env_spec.action
+        shape = (1,) if isinstance(action, Discrete) else action.shape
+        return np.zeros((self.num_envs, *shape), np.float32)
+
+    def _begin_next(
+        self, truncated: np.ndarray, last_info: dict[str, Any]
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         """SAME_STEP: reset those whose episode ended; the info, with that of their last step.
 
-        A simulator that is lost meanwhile truncates the episodes of those that held: they begin
+        A simulator that is lost meanwhile truncates the episodes of its frozen drones: they begin
         their next as well.
         """
-        last, ended = self.observations.copy(), np.zeros(self.num_envs, bool)
-        shape = self.num_envs, *(self.single_action_space.shape or (1,))
-        while self.over.any():
-            truncated |= self.lost
-            ended |= self.over
-            self.advance(np.zeros(shape, np.float32), self.over, holds=~self.over)
+        last, ended = self._observed(), np.zeros(self.num_envs, bool)
+        while self.done.any():
+            truncated = truncated | self.lost
+            ended = ended | self.done
+            self.advance(self._no_actions(), self.done, None, ~self.done)
         masks = {name: mask & ended for name, mask in last_info.items() if name.startswith("_")}
         info = self._info(np.ones(self.num_envs, bool))
         info |= {"final_obs": last, "_final_obs": ended}
         info |= {"final_info": last_info | masks, "_final_info": ended.copy()}
-        return info
+        return truncated, info
 
+    def _observed(self) -> Any:
+        """Observations as the space has them."""
+        return self.observations
 
-def autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    """The mode of that value. Raises `ValueError`."""
-    try:
-        return AutoresetMode(mode)
-    except ValueError:
-        expected = " or ".join(repr(m.value) for m in AutoresetMode)
-        raise ValueError(f"autoreset_mode: expected {expected}, got {mode!r}") from None
-
-
-def check_names(options: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Raise `ValueError` if a reset has an option that is not known."""
-    if unknown := [name for name in options if name not in known]:
-        raise ValueError(f"options: expected some of {', '.join(known)}, got {unknown[0]!r}")
+    def _info(self, mask: np.ndarray) -> dict[str, Any]:
+        """The telemetry of the drones by its components, each name with its mask."""
+        info: dict[str, Any] = {
+            name: column.copy()
+            for name, column in info_columns(self.env_spec, self.telemetry).items()
+        }
+        return info | {f"_{name}": mask for name in info}
 
 
 def checked_mask(mask: Any, num_envs: int) -> np.ndarray:
-    """The `reset_mask` of a reset's options, bool, shape (N,); None is all. Raises `ValueError`."""
+    """The `reset_mask` of a reset's options, bool, shape (N,); None is all. Raises `InputError`."""
     if mask is None:
         return np.ones(num_envs, bool)
     if (
@@ -131,14 +158,14 @@ def checked_mask(mask: Any, num_envs: int) -> np.ndarray:
         or (mask.dtype, mask.shape) != (bool, (num_envs,))
         or not mask.any()
     ):
-        raise ValueError(
+        raise InputError(
             f"reset_mask: expected an array of {num_envs} bool, one of them True, got {mask!r}"
         )
     return mask.copy()
 
 
 def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | None:
-    """One seed for each env, from one number, N of them, or None. Raises `ValueError`.
+    """One seed for each env, from one number, N of them, or None. Raises `InputError`.
 
     Args:
         seed: As Gymnasium's reset takes it.
@@ -156,7 +183,7 @@ def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | 
         or not all(_is_seed(number, most) for number in numbers)
     ):
         up_to = "from 0 on" if most is None else f"from 0 to 2^{most.bit_length()} - 1"
-        raise ValueError(
+        raise InputError(
             f"seed: expected a whole number {up_to}, or {num_envs} of them, got {seed!r}"
         )
     return numbers

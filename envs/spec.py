@@ -95,7 +95,9 @@ class ArraySpec:
         try:
             values = np.asarray(bound, np.float64)
         except (TypeError, ValueError, OverflowError):
-            raise SpecError(f"{self.name}: expected numbers for {name}, got {bound!r:.80}") from None
+            raise SpecError(
+                f"{self.name}: expected numbers for {name}, got {bound!r:.80}"
+            ) from None
         if values.shape not in ((), self.shape, (self.size,)) or np.isnan(values).any():
             raise SpecError(
                 f"{self.name}: expected one number for {name} or one for each element, "

@@ -1,34 +1,50 @@
-"""The vehicle: its MJCF, its numbers, how to load it, its physical examination, and its world.
+"""Vehicles: their MJCF, what follows from it, the scene around them, and their examination.
 
-Importing this package, or `constants`, does not import MuJoCo: the agent's side of the wire needs
-the numbers and has no simulator. `load_model`, `model_hash` and `attach_airport` import it when
-first asked for.
+Importing this package does not import MuJoCo: `Vehicle`, `build_scene` and `attach_airport` do so
+when they are first asked for.
 """
 
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-if TYPE_CHECKING:
-    from .loading import load_model, model_hash
-    from .world import attach_airport
+from .errors import InputError, MissingPackage
 
-__all__ = ["AIRPORT_XML", "QUAD_XML", "SCENE_XML", "attach_airport", "load_model", "model_hash"]
+if TYPE_CHECKING:
+    from .scene import attach_airport, build_scene
+    from .vehicle import Rotor, Vehicle
+
+__all__ = [
+    "AIRPORT_XML",
+    "QUAD_XML",
+    "SCENE_XML",
+    "InputError",
+    "MissingPackage",
+    "Rotor",
+    "Vehicle",
+    "attach_airport",
+    "build_scene",
+]
 
 QUAD_XML: Final = Path(__file__).parent / "quad.xml"
-"""The vehicle alone."""
+"""The paper's vehicle."""
 
 SCENE_XML: Final = Path(__file__).parent / "scene.xml"
-"""The vehicle with floor, sky and light: what `load_model` loads."""
+"""Ground, sky and light, which `build_scene` puts around a vehicle."""
 
 AIRPORT_XML: Final = Path(__file__).parent / "airport.xml"
 """An airport to look at: what `attach_airport` puts around a scene."""
 
-_HOMES: Final = {"attach_airport": "world", "load_model": "loading", "model_hash": "loading"}
+_HOMES: Final = {
+    "Rotor": "vehicle",
+    "Vehicle": "vehicle",
+    "attach_airport": "scene",
+    "build_scene": "scene",
+}
 
 
 def __getattr__(name: str) -> Any:
-    """Import `attach_airport`, `load_model`, `model_hash` and MuJoCo on first use (PEP 562)."""
+    """Import what needs MuJoCo on first use (PEP 562)."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f".{_HOMES[name]}", __name__), name)

@@ -8,78 +8,88 @@ becomes one by -a about S·n. The angles are named as in the paper's nomenclatur
 theta about Y, psi about Z. It gives no order: we take Unity's (`Transform.eulerAngles`), so that
 R = Ry(theta) · Rx(phi) · Rz(psi). Positive phi is nose down, positive theta is nose right, and
 positive psi is right side up.
+
+Every function takes any leading axes, none included, and gives a row the same bits alone as among
+others: it runs the same NumPy functions on contiguous arrays.
 """
 
-import math
-from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "attitude_in_paper_frame",
-    "attitudes_in_paper_frame",
-    "pose_in_mujoco_frame",
-    "position_in_paper_frame",
-    "positions_in_paper_frame",
-]
+__all__ = ["attitudes_in_paper_frame", "pose_in_mujoco_frame", "positions_in_paper_frame"]
 
-_POLE = 1 - 1e-12  # sine of phi past which (within 1e-4 degrees) the nose counts as vertical
+Array = NDArray[np.float64]
+
+_POLE: Final = 1 - 1e-12  # sine of phi past which (within 1e-4 degrees) the nose counts as vertical
 
 
-def position_in_paper_frame(position: Sequence[float]) -> tuple[float, float, float]:
-    """(x, y, z) in MuJoCo's world, m -> (X, Y, Z) in the paper's, m."""
-    x, y, z = position
-    return 0.0 - y, z, x  # 0 - y: no negative zeros
-
-
-def attitude_in_paper_frame(quaternion: Sequence[float]) -> tuple[float, float, float]:
-    """Unit quaternion (w, x, y, z) in MuJoCo's world -> (phi, theta, psi) about X, Y, Z, degrees.
-
-    phi lies in [-90, 90], the others in [-180, 180]. With the nose straight up or down only a sum
-    of theta and psi is defined: psi is then 0.
-    """
-    w, mx, my, mz = quaternion
-    x, y, z = my, 0.0 - mz, 0.0 - mx
-    sin_phi = 2 * (w * x - y * z)
-    if abs(sin_phi) > _POLE:
-        phi = math.copysign(90.0, sin_phi)
-        theta = 2 * math.degrees(math.atan2(y, w))
-        return phi, theta - 360.0 * round(theta / 360.0), 0.0
-    theta = math.atan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y))
-    psi = math.atan2(2 * (w * z + x * y), 1 - 2 * (x * x + z * z))
-    return math.degrees(math.asin(sin_phi)), math.degrees(theta), math.degrees(psi)
-
-
-def pose_in_mujoco_frame(position: Sequence[float], attitude: Sequence[float]) -> np.ndarray:
-    """The way back, for what is drawn: a free joint's `qpos`, float64, shape (7,).
+def positions_in_paper_frame(positions: ArrayLike, out: Array | None = None) -> Array:
+    """(x, y, z) in MuJoCo's world -> (X, Y, Z) in the paper's, m; both (..., 3).
 
     Args:
-        position: (X, Y, Z), m.
-        attitude: (phi, theta, psi), degrees.
+        positions: Any leading axes.
+        out: Where to write, not `positions` itself; a new array without it.
     """
-    right, up, forward = position
-    (a, d), (b, e), (c, f) = (
-        (math.cos(half), math.sin(half)) for half in (math.radians(angle) / 2 for angle in attitude)
-    )
+    positions = np.asarray(positions, np.float64)
+    if out is None:
+        out = np.empty(positions.shape)
+    np.subtract(0.0, positions[..., 1], out=out[..., 0])  # no negative zeros
+    out[..., 1:] = positions[..., 2::-2]
+    return out
+
+
+def attitudes_in_paper_frame(quaternions: ArrayLike, out: Array | None = None) -> Array:
+    """Unit quaternions (w, x, y, z) in MuJoCo's world -> (phi, theta, psi), degrees.
+
+    phi lies in [-90, 90], the others in [-180, 180]. With the nose straight up or down only a sum
+    of theta and psi is defined: psi is then 0. Level craft that point forward, as all of the
+    elevation task, cost next to nothing.
+
+    Args:
+        quaternions: (..., 4), any leading axes.
+        out: (..., 3), where to write; a new array without it.
+    """
+    quaternions = np.asarray(quaternions, np.float64)
+    if out is None:
+        out = np.empty((*quaternions.shape[:-1], 3))
+    if not np.count_nonzero(quaternions[..., 1:]):
+        out.fill(0.0)
+        return out
+    # One craft as four floats, many as four contiguous rows: the same bits, and fast for one.
+    if quaternions.size == 4:
+        w, mx, my, mz = quaternions.reshape(4).tolist()
+    else:
+        w, mx, my, mz = np.moveaxis(quaternions, -1, 0).copy()
+    x, y, z = my, -mz, -mx
+    sin_phi = 2 * (w * x - y * z)
+    vertical = np.count_nonzero(pole := abs(sin_phi) > _POLE)
+    if vertical:
+        sin_phi = np.clip(sin_phi, -1.0, 1.0)  # rounding may have taken it past 1
+    out[..., 0] = np.arcsin(sin_phi)
+    out[..., 1] = np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y))
+    out[..., 2] = np.arctan2(2 * (w * z + x * y), 1 - 2 * (x * x + z * z))
+    np.degrees(out, out=out)
+    if vertical:
+        theta = 2 * np.degrees(np.arctan2(y, w))
+        theta -= 360 * np.round(theta / 360)
+        there = np.stack([np.copysign(90.0, sin_phi), theta, np.zeros_like(theta)], axis=-1)
+        np.copyto(out, there, where=np.expand_dims(pole, -1))
+    return np.add(out, 0.0, out=out)  # no negative zeros
+
+
+def pose_in_mujoco_frame(positions: ArrayLike, attitudes: ArrayLike) -> Array:
+    """The way back, for what is drawn: `qpos` of a free joint, (..., 7).
+
+    Args:
+        positions: (X, Y, Z), m, (..., 3).
+        attitudes: (phi, theta, psi), degrees, (..., 3).
+    """
+    right, up, forward = np.moveaxis(np.asarray(positions, np.float64), -1, 0)
+    halves = np.radians(np.moveaxis(np.asarray(attitudes, np.float64), -1, 0)) / 2
+    (a, b, c), (d, e, f) = np.cos(halves), np.sin(halves)
     # Ry(theta) · Rx(phi) · Rz(psi) as a quaternion about X, Y and Z.
     w, x = b * a * c + e * d * f, b * d * c + e * a * f
     y, z = e * a * c - b * d * f, b * a * f - e * d * c
-    return np.array((forward, 0.0 - right, up, w, 0.0 - z, x, 0.0 - y))
-
-
-def positions_in_paper_frame(positions: np.ndarray, out: np.ndarray) -> None:
-    """`position_in_paper_frame` of every row: float64, shapes (N, 3)."""
-    np.subtract(0.0, positions[:, 1], out=out[:, 0])
-    out[:, 1], out[:, 2] = positions[:, 2], positions[:, 0]
-
-
-def attitudes_in_paper_frame(quaternions: np.ndarray, out: np.ndarray) -> None:
-    """`attitude_in_paper_frame` of every row, bit for bit: float64, shapes (N, 4) and (N, 3).
-
-    NumPy's inverse functions round otherwise than Python's. So a craft that is turned goes through
-    those; one that is not, and the elevation task turns none in the air, has zeros.
-    """
-    out.fill(0.0)
-    turned = np.flatnonzero(quaternions[:, 1:].any(axis=1) | np.signbit(quaternions).any(axis=1))
-    if turned.size:
-        out[turned] = [attitude_in_paper_frame(q) for q in quaternions[turned].tolist()]
+    return np.stack((forward, -right, up, w, -z, x, -y), axis=-1) + 0.0

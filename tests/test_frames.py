@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rotorgram.models.frames import (
-    attitude_in_paper_frame,
+    attitudes_in_paper_frame,
     pose_in_mujoco_frame,
-    position_in_paper_frame,
+    positions_in_paper_frame,
 )
 from scipy.spatial.transform import Rotation
 
@@ -27,18 +27,21 @@ S = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     ],
 )
 def test_position(mujoco: tuple[float, ...], paper: tuple[float, ...]) -> None:
-    assert position_in_paper_frame(mujoco) == paper
+    assert positions_in_paper_frame(mujoco).tolist() == list(paper)
 
 
 def test_map_is_a_reflection_because_the_frames_differ_in_handedness() -> None:
     assert np.linalg.det(S) == pytest.approx(-1.0)
-    columns = [position_in_paper_frame(axis) for axis in np.eye(3).tolist()]
-    np.testing.assert_array_equal(np.array(columns).T, S)
+    np.testing.assert_array_equal(positions_in_paper_frame(np.eye(3)).T, S)
 
 
 def test_level_is_zero_without_negative_zeros() -> None:
-    values = (*position_in_paper_frame((0.0, 0.0, 0.0)), *attitude_in_paper_frame((1, 0, 0, 0)))
-    assert all(math.copysign(1.0, value) == 1.0 and value == 0.0 for value in values)
+    zeros = np.zeros((2, 3))
+    assert positions_in_paper_frame(zeros).tobytes() == zeros.tobytes()
+    level = np.array([[1.0, 0.0, 0.0, 0.0], [-1.0, -0.0, -0.0, -0.0]])
+    turned = np.array([0.5, 0.5, 0.5, 0.5])  # a row that is turned takes all through the arithmetic
+    assert attitudes_in_paper_frame(level).tobytes() == zeros.tobytes()
+    assert attitudes_in_paper_frame([*level, turned])[:2].tobytes() == zeros.tobytes()
 
 
 # MuJoCo, right-handed: +z turns the nose left, +y puts the nose down, +x lowers the right side.
@@ -62,14 +65,14 @@ def test_a_pitch_of_30_degrees_then_a_yaw_by_hand() -> None:
     # Nose down by 30 degrees, then the whole craft turned left by 90: the nose points to -X, and
     # sin 30 below the horizon. Unity calls that 30 about X first and then -90 about Y.
     attitude = Rotation.from_euler("yz", [30.0, 90.0], degrees=True)
-    assert attitude_in_paper_frame(_scalar_first(attitude)) == pytest.approx((30.0, -90.0, 0.0))
-    nose = position_in_paper_frame(attitude.apply([1.0, 0.0, 0.0]).tolist())
+    assert attitudes_in_paper_frame(_scalar_first(attitude)) == pytest.approx((30.0, -90.0, 0.0))
+    nose = positions_in_paper_frame(attitude.apply([1.0, 0.0, 0.0]))
     assert nose == pytest.approx((-math.sqrt(0.75), -0.5, 0.0))
 
 
 def test_random_attitudes_against_rotation_matrices() -> None:
     for attitude in Rotation.random(500, random_state=7):
-        phi, theta, psi = attitude_in_paper_frame(_scalar_first(attitude))
+        phi, theta, psi = attitudes_in_paper_frame(_scalar_first(attitude))
         assert -90 <= phi <= 90
         assert -180 <= theta <= 180
         assert -180 <= psi <= 180
@@ -80,8 +83,7 @@ def test_random_attitudes_against_rotation_matrices() -> None:
 @given(st.floats(-180, 180), st.floats(-89.9, 89.9), st.floats(-180, 180))
 def test_both_signs_of_a_quaternion_are_one_attitude(yaw: float, pitch: float, roll: float) -> None:
     q = _scalar_first(Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True))
-    one = _unity(*attitude_in_paper_frame(q))
-    other = _unity(*attitude_in_paper_frame([-value for value in q]))
+    one, other = (_unity(*attitude) for attitude in attitudes_in_paper_frame([q, -q]))
     np.testing.assert_allclose(one, other, atol=1e-9)
 
 
@@ -90,7 +92,7 @@ def test_both_signs_of_a_quaternion_are_one_attitude(yaw: float, pitch: float, r
 @pytest.mark.parametrize("roll", [0.0, 30.0, -120.0])
 def test_nose_straight_up_or_down(pitch: float, yaw: float, roll: float) -> None:
     attitude = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
-    phi, theta, psi = attitude_in_paper_frame(_scalar_first(attitude))
+    phi, theta, psi = attitudes_in_paper_frame(_scalar_first(attitude))
     assert (phi, psi) == (pitch, 0.0)
     assert -180 <= theta <= 180
     # At the pole an angle is known to the square root of the rounding only.
@@ -98,13 +100,12 @@ def test_nose_straight_up_or_down(pitch: float, yaw: float, roll: float) -> None
     np.testing.assert_allclose(_unity(phi, theta, psi), expected, atol=1e-6)
 
 
-def _attitude(axis: str, degrees: float) -> tuple[float, float, float]:
-    return attitude_in_paper_frame(_scalar_first(Rotation.from_euler(axis, degrees, degrees=True)))
+def _attitude(axis: str, degrees: float) -> np.ndarray:
+    return attitudes_in_paper_frame(_scalar_first(Rotation.from_euler(axis, degrees, degrees=True)))
 
 
-def _scalar_first(attitude: Rotation) -> list[float]:
-    x, y, z, w = attitude.as_quat().tolist()
-    return [w, x, y, z]
+def _scalar_first(attitude: Rotation) -> np.ndarray:
+    return attitude.as_quat(scalar_first=True)
 
 
 def _unity(phi: float, theta: float, psi: float) -> np.ndarray:
@@ -130,6 +131,49 @@ def test_a_pose_by_hand_on_the_way_back() -> None:
 def test_there_and_back(
     position: tuple[float, float, float], attitude: tuple[float, float, float]
 ) -> None:
-    pose = pose_in_mujoco_frame(position, attitude).tolist()
-    assert position_in_paper_frame(pose[:3]) == pytest.approx(position)
-    assert attitude_in_paper_frame(pose[3:]) == pytest.approx(attitude, abs=1e-6)
+    pose = pose_in_mujoco_frame(position, attitude)
+    assert positions_in_paper_frame(pose[:3]) == pytest.approx(position)
+    assert attitudes_in_paper_frame(pose[3:]) == pytest.approx(attitude, abs=1e-6)
+
+
+# --- one and many ---------------------------------------------------------------------------------
+
+
+def attitudes(count: int) -> np.ndarray:
+    """Unit quaternions (count, 4): random ones, some level, vertical, or turned about one axis."""
+    quaternions = Rotation.random(count, random_state=3).as_quat(scalar_first=True)
+    edge = np.sqrt(0.5)
+    special = [[1, 0, 0, 0], [-1, 0, 0, 0], [edge, 0, edge, 0], [edge, 0, -edge, 0], [0, 0, 0, 1]]
+    quaternions[: len(special)] = special
+    return np.random.default_rng(3).permutation(quaternions)
+
+
+def test_a_row_has_the_same_bits_alone_and_among_others() -> None:
+    quaternions = attitudes(100_000)
+    positions = np.random.default_rng(4).normal(scale=50.0, size=(len(quaternions), 3))
+    angles = attitudes_in_paper_frame(quaternions)
+    places = positions_in_paper_frame(positions)
+    poses = pose_in_mujoco_frame(places, angles)
+    for i, (quaternion, position) in enumerate(zip(quaternions, positions, strict=True)):
+        assert attitudes_in_paper_frame(quaternion).tobytes() == angles[i].tobytes()
+        assert positions_in_paper_frame(position).tobytes() == places[i].tobytes()
+        assert pose_in_mujoco_frame(places[i], angles[i]).tobytes() == poses[i].tobytes()
+
+
+@pytest.mark.parametrize("shape", [(1,), (7,), (3, 5), (2, 1, 4), (0,)])
+def test_any_leading_axes_and_any_memory(shape: tuple[int, ...]) -> None:
+    count = math.prod(shape)
+    quaternions = attitudes(64)[:count]
+    expected = [attitudes_in_paper_frame(quaternion) for quaternion in quaternions]
+    strided = np.asfortranarray(quaternions.reshape(*shape, 4))
+    out = np.full((*shape, 6), np.nan)[..., ::2]
+    assert attitudes_in_paper_frame(strided, out) is out
+    assert out.tobytes() == np.array(expected).tobytes()
+    assert positions_in_paper_frame(strided[..., 1:], out) is out
+    right, up, forward = np.moveaxis(out, -1, 0)
+    assert (strided[..., 1:] == np.stack([forward, -right, up], axis=-1)).all()
+    assert pose_in_mujoco_frame(out, out).shape == (*shape, 7)
+
+
+def test_nan_stays_nan_and_is_no_warning() -> None:
+    assert np.isnan(attitudes_in_paper_frame([[np.nan] * 4, [1.0, 0.0, 0.0, 0.0]])[0]).all()

@@ -1,17 +1,29 @@
-"""The world around the craft: an airport to look at, which the physics never notices."""
+"""The scene around a vehicle: ground, sky and light, and an airport to look at.
 
-from typing import Final
+Physics notices the ground alone. A vehicle file that brings a ground of its own keeps it.
+"""
+
+from pathlib import Path
+from typing import Any, Final, Literal
 
 import mujoco
 import numpy as np
 
-from . import AIRPORT_XML
+from . import AIRPORT_XML, QUAD_XML, SCENE_XML
+from .errors import InputError
 
-__all__ = ["AIRPORT_PREFIX", "attach_airport"]
+__all__ = ["AIRPORT_PREFIX", "World", "attach_airport", "build_scene"]
+
+World = Literal["plain", "airport"]
+"""What is around the vehicle."""
 
 AIRPORT_PREFIX: Final = "airport/"
 """What the name of everything begins with that `attach_airport` adds."""
 
+SCENE_PREFIX: Final = "scene/"
+"""What the name of everything begins with that `build_scene` adds."""
+
+_GROUNDS: Final = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 _HIDDEN_GROUP: Final = 3  # viewers and renderers draw groups 0 to 2 unless told otherwise
 _NEAR, _FAR = 0.25, 1200.0  # m: where drawing begins and ends; the hills lie within
 
@@ -21,6 +33,47 @@ _SHADOW_PIXELS: Final = 1024
 _ROUNDNESS: Final = 40  # slices of a cylinder: the pad's ring is seen from near
 _HAZE: Final = 0.1  # of the distance to the horizon
 _HAZE_COLOUR: Final = (0.80, 0.88, 0.96, 1.0)  # the sky's colour where it meets the ground
+
+
+def build_scene(
+    vehicle: Path | str | None = None, world: World = "plain", *, visual: bool = True
+) -> mujoco.MjSpec:
+    """A vehicle with ground, sky and light, to be compiled.
+
+    Args:
+        vehicle: Its MJCF file; None is the paper's.
+        world: `plain` or `airport`.
+        visual: Keep what is only looked at. Without it the physics is the same, bit for bit, and
+            faster.
+
+    Raises:
+        InputError: The world is not one of these.
+        ValueError: The file is no MJCF.
+    """
+    if world not in ("plain", "airport"):
+        raise InputError(f"world: expected 'plain' or 'airport', got {world!r}")
+    spec = mujoco.MjSpec.from_file(str(vehicle if vehicle is not None else QUAD_XML))
+    if not any(geom.type in _GROUNDS for geom in spec.worldbody.geoms):
+        scene = mujoco.MjSpec.from_file(str(SCENE_XML))
+        _copy_settings(scene.visual, spec.visual)
+        _copy_settings(scene.stat, spec.stat)
+        spec.attach(scene, prefix=SCENE_PREFIX, frame=spec.worldbody.add_frame())
+    if world == "airport":
+        attach_airport(spec)
+    spec.compiler.discardvisual = not visual
+    return spec
+
+
+def _copy_settings(source: Any, target: Any) -> None:
+    """Copy the settings of a part of a spec, and those of its parts."""
+    for name in dir(source):
+        value = getattr(source, name)
+        if name.startswith("_") or callable(value):
+            continue
+        if isinstance(value, int | float | np.ndarray):
+            setattr(target, name, value)
+        else:
+            _copy_settings(value, getattr(target, name))
 
 
 def attach_airport(spec: mujoco.MjSpec) -> None:
@@ -37,10 +90,11 @@ def attach_airport(spec: mujoco.MjSpec) -> None:
     haze, shadow map, and the near and far end of drawing. Lights and cameras stay.
 
     Raises:
-        ValueError: if the scene has an airport already, or does not compile.
+        InputError: The scene has an airport already.
+        ValueError: It does not compile.
     """
     if any(geom.name.startswith(AIRPORT_PREFIX) for geom in spec.geoms):
-        raise ValueError("spec: expected a scene without an airport, got one that has it")
+        raise InputError("spec: expected a scene without an airport, got one that has it")
     scene = spec.copy()
     scene.compiler.discardvisual = False
     model = scene.compile()

@@ -1,0 +1,388 @@
+"""The loop that joins a vehicle, a world and a task; every env and every simulator is this one.
+
+A single env is the loop with one world. An agent's command resets some drones, freezes some, and
+flies the others for one control period: `advance` is that step, the step of the wire.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium as gym
+import numpy as np
+
+from ..models.errors import InputError
+from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
+from ..models.vehicle import Vehicle
+from ..sim import Array, Backend, PhysicsError, World, make_world
+from . import registry
+from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
+from .tasks.task import Outcome, Task
+
+__all__ = ["Loop", "make_task", "spec_of"]
+
+_SMALL: Final = 64
+"""Up to this many numbers Python's loop is faster than NumPy's call."""
+
+
+def make_task(
+    env_id: str,
+    options: Mapping[str, Any],
+    vehicle: Path | str | None = None,
+    shape: tuple[int, int] = (1, 1),
+    xp: Any = np,
+) -> Task:
+    """The task of an env id with options by name, for W worlds of A drones. Raises `InputError`."""
+    kind = registry.task_type(env_id)
+    checked = kind.Options.from_options(options)
+    craft = Vehicle.load(vehicle, linear_drag=checked.linear_drag)
+    craft.substeps(checked.control_period)  # raises where they do not go together
+    return kind(checked, craft, shape, xp)
+
+
+def spec_of(env_id: str, task: Task) -> EnvSpec:
+    """What an agent must know of a task's env."""
+    vehicle, controller = task.vehicle, task.controller
+    if controller.choices:
+        action: ArraySpec | Discrete = Discrete(
+            n=controller.choices, components=controller.components
+        )
+    else:
+        action = ArraySpec(
+            name="action",
+            shape=(len(controller.low),),
+            low=controller.low,
+            high=controller.high,
+            components=controller.components,
+        )
+    return EnvSpec(
+        env_id=env_id,
+        options=asdict(task.options),
+        control_period=task.options.control_period,
+        vehicle=vehicle.name,
+        vehicle_hash=vehicle.hash,
+        observation=task.observation,
+        action=action,
+        telemetry=_telemetry_specs(task),
+        metrics=task.metrics,
+    )
+
+
+def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
+    def numbers(name: str, components: Sequence[str], **rest: Any) -> ArraySpec:
+        names = tuple(components)
+        return ArraySpec(name=name, shape=(len(names),), dtype="float64", components=names, **rest)
+
+    vehicle = task.vehicle
+    specs = [
+        numbers("position", "XYZ", unit="m", frame="paper"),
+        numbers("attitude", ("phi", "theta", "psi"), unit="deg", frame="paper"),
+        numbers(
+            "thrust",
+            [f"F{i + 1}" for i in range(vehicle.num_rotors)],
+            unit="N",
+            low=tuple(vehicle.thrust_low.tolist()),
+            high=tuple(vehicle.thrust_high.tolist()),
+        ),
+    ]
+    if has_goal(task):
+        names = ("X_goal", "Y_goal", "Z_goal")
+        specs.append(numbers("goal", names, unit="m", frame="paper"))
+    if task.metrics:
+        units = tuple(metric.unit for metric in task.metrics)
+        specs.append(numbers("metrics", [metric.name for metric in task.metrics], unit=units))
+    return tuple(specs)
+
+
+def has_goal(task: Task) -> bool:
+    """Whether a task says where the drones should be."""
+    return type(task).goal is not Task.goal
+
+
+class Loop:
+    """N drones of one env, each in a world of its own.
+
+    Args:
+        env_id: Of a registered task.
+        num_envs: N.
+        vehicle: MJCF file; None is the paper's.
+        backend: What steps the physics.
+        options: Of the task, by name.
+        settings: Of the backend: `num_threads`, or `device`.
+
+    Attributes:
+        spec: What there is to know of it.
+        task, world: What is joined here. Their arrays have the leading axes of the world; all
+            others here have one axis of N drones.
+        observations: By name, shape (N, *shape), of the declared dtypes. This and the following
+            are made anew by each `advance`: those of the last one stay as they were.
+        rewards: float64, shape (N,); 0 for a drone that did not fly.
+        terminated, truncated: bool, shape (N,).
+        done: bool, shape (N,): the episode has ended and the next has not begun.
+
+    Raises:
+        InputError: An argument, seed or action is not what it should be; nothing has changed.
+        PhysicsError: A state is bad; the drones that flew are to be reset.
+        gymnasium.error.ResetNeeded: A drone whose episode has not begun, or has ended, is to fly.
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        num_envs: int = 1,
+        *,
+        vehicle: Path | str | None = None,
+        backend: Backend = "mujoco",
+        options: Mapping[str, Any] | None = None,
+        **settings: Any,
+    ) -> None:
+        draft = make_task(env_id, options or {}, vehicle)
+        self.world: World = make_world(draft.vehicle, num_envs, backend, **settings)
+        self._xp, lead = self.world.xp, self.world.shape
+        self.task = type(draft)(draft.options, draft.vehicle, lead, self._xp)
+        self.spec = spec_of(canonical_id(env_id), self.task)
+        self.num_envs = num_envs
+        self.vehicle = draft.vehicle
+        self._substeps = draft.vehicle.substeps(draft.options.control_period)
+        self._length = draft.options.episode_length
+        self._choices = self.task.controller.choices
+        self._width = len(self.task.controller.low)
+        self._has_goal = has_goal(draft)
+        self._dtypes = [(a.name, a.shape, getattr(self._xp, a.dtype)) for a in draft.observation]
+        none = self.world.state.touching != self.world.state.touching  # all False, on its device
+        self._nobody = none.reshape(num_envs)
+        self.terminated = self.truncated = self.done = self._nobody
+        self.rewards: Array = 0.0 * self._nobody
+        self.observations: dict[str, Array] = {}
+        self._steps: Array = (0 * self.rewards).reshape(lead)[()]
+        self._waiting = ~self._nobody  # for a reset
+        self._anyone_waits = True
+        self._begun = False
+        self._outcome: Outcome | None = None
+        self._terms: dict[str, Array] = {}
+        self._telemetry: np.ndarray | None = None
+        self._goal: tuple[Any, Any] = (None, None)
+        self._columns = _columns(self.spec)
+
+    def advance(
+        self,
+        actions: Array,
+        resets: Array | None = None,
+        seeds: Sequence[int | None] | np.ndarray | None = None,
+        frozen: Array | None = None,
+        chosen: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """Reset some drones, freeze some, and fly the others for one control period.
+
+        Rewards and flags of a drone that is reset or frozen are 0, and its action is ignored. One
+        that is frozen is afterwards as it was before.
+
+        Args:
+            actions: float32, shape (N, k), or whole numbers, shape (N,) or (N, 1).
+            resets: bool, shape (N,); None resets none.
+            seeds: Shape (N,), of those that are reset; None leaves their streams as they are.
+            frozen: bool, shape (N,); None freezes none.
+            chosen: By the names of `Task.choices`, what replaces a draw, shape (N,).
+        """
+        idle = resets if frozen is None else frozen if resets is None else resets | frozen
+        flown = None if idle is None or not idle.any() else ~idle
+        if self._anyone_waits:
+            self._check_begun(flown)
+        if flown is None or flown.any():
+            self._fly(actions, flown)
+        if resets is not None and resets.any():
+            self._begin(resets, seeds, chosen or {})
+        self._look(flown)
+
+    def _check_begun(self, flown: Array | None) -> None:
+        waiting = self._waiting if flown is None else self._waiting & flown
+        if waiting.any():
+            first = int(waiting.nonzero()[0][0])
+            raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
+
+    def _fly(self, actions: Array, flown: Array | None) -> None:
+        world, lead = self.world, self.world.shape
+        if self._xp is np:
+            values = self._checked(np.asarray(actions), flown)
+        else:
+            values = world.checked(actions, self._width, self._choices, flown)
+        action = values.reshape((*lead, self._width))
+        thrust = self.task.controller.thrust(action, world.state)
+        some = None if flown is None else flown.reshape(lead)[()]
+        try:
+            world.step(thrust, self._substeps, some)
+        except PhysicsError:
+            self._waiting = self._waiting | (~self._nobody if flown is None else flown)
+            self._anyone_waits = True
+            raise
+        self._steps = self._steps + (1 if some is None else some)
+
+    def _begin(
+        self,
+        mask: Array,
+        seeds: Sequence[int | None] | np.ndarray | None,
+        chosen: Mapping[str, np.ndarray],
+    ) -> None:
+        """Begin the episodes of the drones of a mask, bool, shape (N,)."""
+        world, lead, every = self.world, self.world.shape, ~self._nobody
+        if not self._begun:  # the first time a task wants all of them
+            everybody = every.reshape(lead)[()]
+            if not mask.all():
+                world.reset(everybody, self.task.begin(everybody, world.draw(everybody)))
+            self._begun = True
+        some = mask.reshape(lead)[()]
+        if seeds is not None:
+            world.seed(some, seeds)
+        draws = {name: values.reshape(lead)[()] for name, values in chosen.items()}
+        world.reset(some, self.task.begin(some, world.draw(some, draws)))
+        self._steps = self._xp.where(some, 0, self._steps)[()]
+        self._waiting = self._waiting & ~mask
+        self._anyone_waits = bool(self._waiting.any())
+        self.done = self.done & ~mask
+
+    def _look(self, flown: Array | None) -> None:
+        """Observations, rewards and ends after a step."""
+        task, state, n = self.task, self.world.state, self.num_envs
+        self._telemetry = None
+        observed = task.observe(state)
+        self.observations = {
+            name: _as_type(observed[name].reshape((n, *shape)), dtype)
+            for name, shape, dtype in self._dtypes
+        }
+        self._outcome = outcome = task.outcome(state)
+        ended, total = outcome.terminated, 0.0
+        late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b
+        for term in outcome.reward.values():
+            total = total + term
+        self._terms = outcome.reward
+        if not self.world.shape:  # a single drone's numbers
+            self.rewards = np.array((total,))
+            self.terminated, self.truncated = np.array((ended,)), np.array((late,))
+            over = bool(ended or late)
+        else:
+            self.rewards = total.reshape(n)
+            self.terminated, self.truncated = ended.reshape(n), late.reshape(n)
+            over = True
+        if flown is not None:
+            # A drone that did not fly gets no reward: nothing has ended, nothing was won.
+            self.rewards = self._xp.where(flown, self.rewards, 0.0)
+            self.terminated, self.truncated = self.terminated & flown, self.truncated & flown
+        if over:
+            ends = self.terminated | self.truncated
+            if ends.any():
+                self._waiting, self._anyone_waits = self._waiting | ends, True
+                self.done = self.done | ends
+
+    def _checked(self, actions: np.ndarray, flown: Array | None) -> np.ndarray:
+        """Actions as controllers take them: float64, shape (N, k). Raises `InputError`."""
+        if actions.dtype.kind not in "iuf":
+            raise InputError(f"actions: expected real numbers, got {actions.dtype}")
+        if actions.size != self.num_envs * self._width:
+            expected = (self.num_envs, self._width)
+            raise InputError(f"actions: expected shape {expected}, got {actions.shape}")
+        values = actions.reshape(self.num_envs, self._width)
+        if values.dtype != np.float32 and not self._choices:
+            with np.errstate(over="ignore"):  # what overflows is infinite, and refused as such
+                values = values.astype(np.float32)
+        right = self._right(values)
+        if right is not None:
+            wrong = ~right if flown is None else ~right & flown
+            if wrong.any():
+                self._refuse(values, int(wrong.argmax()))
+            values = np.where(right[:, None], values, values.dtype.type(0))
+        return values.astype(np.float64)
+
+    def _right(self, values: np.ndarray) -> np.ndarray | None:
+        """Whose actions are of the space, shape (N,); None if all are."""
+        if self._choices:
+            right = ((values >= 0) & (values < self._choices) & (values % 1 == 0)).all(axis=1)
+        else:
+            if values.size <= _SMALL:
+                total = sum(values.ravel().tolist())
+                if total - total == 0.0:  # else one is NaN or infinite, or they add up to too much
+                    return None
+            right = np.isfinite(values).all(axis=1)
+        return None if right.all() else right
+
+    def _refuse(self, values: np.ndarray, first: int) -> None:
+        expected = f"a whole number 0 to {self._choices - 1}" if self._choices else "finite numbers"
+        got = values[first].tolist()
+        raise InputError(f"actions: expected {expected}, got {got} for env {first}")
+
+    @property
+    def steps(self) -> Array:
+        """Control steps of each running episode, shape (N,)."""
+        return self._per_drone(self._steps)
+
+    @property
+    def reward_terms(self) -> dict[str, Array]:
+        """Terms of the last rewards by name, each of shape (N,)."""
+        return {name: self._per_drone(term) for name, term in self._terms.items()}
+
+    @property
+    def metrics(self) -> dict[str, Array]:
+        """Metrics of the task by name, each of shape (N,)."""
+        metrics = self._outcome.metrics if self._outcome else {}
+        return {name: self._per_drone(value) for name, value in metrics.items()}
+
+    @property
+    def telemetry(self) -> dict[str, np.ndarray]:
+        """By the names of `spec.telemetry`, float64, shape (N, *shape), in the paper's frame."""
+        told = self.telemetry_table
+        return {name: told[:, columns] for name, columns in self._columns.items()}
+
+    @property
+    def telemetry_table(self) -> np.ndarray:
+        """All telemetry side by side, float64, shape (N, T), T in the order of `spec.telemetry`."""
+        if self._telemetry is not None:
+            return self._telemetry
+        state, n, at = self.world.state, self.num_envs, self._columns
+        self._telemetry = told = np.empty((n, at[self.spec.telemetry[-1].name].stop))
+        position, quaternion = _on_host(state.position), _on_host(state.quaternion)
+        positions_in_paper_frame(position.reshape(n, 3), told[:, :3])
+        attitudes_in_paper_frame(quaternion.reshape(n, 4), told[:, 3:6])
+        told[:, at["thrust"]] = _on_host(state.thrust).reshape(n, -1)
+        if self._has_goal:
+            goal = self.task.goal(state)
+            if goal is not self._goal[0]:  # many goals stay as they are
+                self._goal = goal, positions_in_paper_frame(_on_host(goal).reshape(n, 3))
+            told[:, at["goal"]] = self._goal[1]
+        if self.task.metrics and self._outcome is not None:
+            for column, metric in enumerate(self.task.metrics, at["metrics"].start):
+                values = self._outcome.metrics[metric.name]
+                told[:, column] = values if not self.world.shape else _on_host(values).reshape(n)
+        return told
+
+    def close(self) -> None:
+        """Let go of threads and memory."""
+        self.world.close()
+
+    def _per_drone(self, values: Array) -> Array:
+        if not self.world.shape:
+            return np.array((values,))
+        return values.reshape(self.num_envs)
+
+    def __reduce__(self) -> Any:
+        """Raise: simulator memory cannot be copied, and a copy that seems to fly would be wrong."""
+        raise TypeError("a running env cannot be copied or pickled: make another one")
+
+
+def _columns(spec: EnvSpec) -> dict[str, slice]:
+    """Where each array of the telemetry lies in the table of all."""
+    columns, start = {}, 0
+    for array in spec.telemetry:
+        columns[array.name] = slice(start, start + array.size)
+        start += array.size
+    return columns
+
+
+def _as_type(values: Array, dtype: Any) -> Array:
+    return values.astype(dtype) if isinstance(values, np.ndarray) else values.to(dtype)
+
+
+def _on_host(array: Array) -> np.ndarray:
+    if isinstance(array, np.ndarray | np.generic):
+        return np.asarray(array)
+    copied: np.ndarray = array.detach().cpu().numpy().astype(np.float64)
+    return copied

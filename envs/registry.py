@@ -1,0 +1,110 @@
+"""Tasks by env id. What a file or a peer names is looked up here, never imported."""
+
+import re
+import sys
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+import gymnasium
+
+from ..models.errors import InputError
+from .spec import EnvSpec, canonical_id
+
+if TYPE_CHECKING:
+    from .tasks.task import Task, TaskOptions
+
+__all__ = ["env_spec", "is_known", "known_ids", "load", "options_type", "register", "task_type"]
+
+_ID: Final = re.compile(r"([\w.-]+/)?[\w.-]+-v\d+")
+_tasks: Final[dict[str, "str | type[Task]"]] = {}
+
+
+def register(env_id: str, task: "str | type[Task]") -> None:
+    """Make a task known by an id, to rotorgram and to Gymnasium. Registering again replaces it.
+
+    Args:
+        env_id: As Gymnasium's: `name-v0` or `namespace/name-v0`.
+        task: A class derived from `Task`, or "module:Class", which is imported when needed.
+
+    Raises:
+        InputError: The id is not of that form, or belongs to an env of somebody else.
+    """
+    if not (isinstance(env_id, str) and _ID.fullmatch(env_id)):
+        raise InputError(f"env id: expected name-v0 or namespace/name-v0, got {env_id!r}")
+    if env_id not in _tasks and env_id in gymnasium.registry:
+        raise InputError(f"env id: expected one that is free, got {env_id!r}")
+    gymnasium.registry.pop(env_id, None)
+    _tasks[env_id] = task
+    # No max_episode_steps: the env truncates by itself, since over UDP no wrapper would.
+    gymnasium.register(
+        id=env_id,
+        entry_point="rotorgram.envs.single:SingleEnv",
+        vector_entry_point="rotorgram.envs.vector:LocalVectorEnv",
+        kwargs={"env_id": env_id},
+    )
+
+
+def load(env_id: str) -> str:
+    """The id without its module, once that is imported: for what a user typed, nothing else.
+
+    The module of "module:Name-v0" is looked for in the working folder too.
+
+    Raises:
+        InputError: There is no such module, or it registers no such env.
+    """
+    module, colon, name = env_id.rpartition(":")
+    if colon:
+        if "" not in sys.path:
+            sys.path.insert(0, "")
+        try:
+            import_module(module)
+        except ModuleNotFoundError as error:
+            if error.name != module.partition(".")[0] and error.name != module:
+                raise
+            raise InputError(f"env: expected a module {module} here, got none") from None
+        if not is_known(name):
+            raise InputError(f"env: expected {module} to register {name}, it does not")
+    return name
+
+
+def is_known(env_id: str) -> bool:
+    """Whether a task of ours or of the user's is registered under this id."""
+    return canonical_id(env_id) in _tasks
+
+
+def known_ids() -> tuple[str, ...]:
+    """Ids of all registered tasks."""
+    return tuple(_tasks)
+
+
+def task_type(env_id: str) -> "type[Task]":
+    """The class of a task. Raises `InputError` for an id that is not registered."""
+    task = _tasks.get(canonical_id(env_id))
+    if task is None:
+        expected = ", ".join(_tasks)
+        raise InputError(f"env: expected a registered id ({expected}), got {env_id!r}")
+    if isinstance(task, str):
+        module, _, name = task.partition(":")
+        task = _tasks[canonical_id(env_id)] = getattr(import_module(module), name)
+    return task
+
+
+def options_type(env_id: str) -> "type[TaskOptions]":
+    """The frozen dataclass of a task's options. Raises `InputError`."""
+    return task_type(env_id).Options
+
+
+def env_spec(env_id: str, options: Any = None, vehicle: Any = None) -> EnvSpec:
+    """The spec of an env, without stepping anything.
+
+    Args:
+        env_id: Of a registered task.
+        options: By name; the others have their defaults.
+        vehicle: MJCF file; None is the paper's.
+
+    Raises:
+        InputError: An option or the vehicle is not what it should be.
+    """
+    from .loop import make_task, spec_of
+
+    return spec_of(canonical_id(env_id), make_task(env_id, options or {}, vehicle))

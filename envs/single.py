@@ -1,0 +1,158 @@
+"""One drone behind Gymnasium's single signature: the loop with one world."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+
+from ..models.errors import InputError
+from .loop import Loop
+from .rendering import RENDER_MODES, checked_render_mode, moments, painter
+from .spaces import action_space, joined, observation_space, telemetry_names
+
+if TYPE_CHECKING:
+    from ..rendering.painter import Painter
+
+__all__ = ["SingleEnv"]
+
+
+class SingleEnv(gym.Env[Any, Any]):
+    """A drone that flies a task, in process.
+
+    `info` has every component of the telemetry by its name (positions and attitude in the paper's
+    frame, thrusts, metrics) and the terms of the reward as `reward_<term>`.
+
+    Actions are rounded to float32; what lies beyond a bound counts as the bound.
+
+    Render modes: with `rgb_array`, `render()` gives a picture, uint8, shape (360, 480, 3); with
+    `human` a window shows the flight in real time. The physics is the same with either.
+
+    Args:
+        env_id: Of a registered task.
+        render_mode: None, `rgb_array` or `human`.
+        vehicle: MJCF file; None is the paper's.
+        options: Of the task, by name.
+
+    Attributes:
+        env_spec: What there is to know of the env.
+        control_period: Time of a step, s.
+
+    Raises:
+        InputError: An option or action is not what it should be; the env is as before.
+        PhysicsError: The physics reported a bad state; `reset` makes the env usable again.
+        gymnasium.error.ResetNeeded: A step before a reset, or after an episode's end.
+        rotorgram.rendering.NoOpenGL: There is nothing to draw with, or no display.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}  # noqa: RUF012
+
+    def __init__(
+        self,
+        env_id: str,
+        render_mode: str | None = None,
+        *,
+        vehicle: Path | str | None = None,
+        **options: Any,
+    ) -> None:
+        self.render_mode = checked_render_mode(render_mode)
+        self._loop = loop = Loop(env_id, vehicle=vehicle, options=options)
+        self.env_spec = loop.spec
+        self.control_period = loop.spec.control_period
+        fps = max(1, round(1 / self.control_period))
+        self.metadata = {"render_modes": RENDER_MODES, "render_fps": fps}
+        self.observation_space = observation_space(loop.spec)
+        self.action_space = action_space(loop.spec)
+        self._names = telemetry_names(loop.spec)
+        self._all = np.ones(1, bool)
+        self._no_action = np.zeros((1, len(loop.task.controller.low)), np.float32)
+        self._episodes = 0
+        self._painter: Painter | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode; a seed makes it reproducible. `options` has no keys."""
+        if options:
+            raise InputError(f"reset: expected no options, got {options!r}")
+        super().reset(seed=seed)
+        self._loop.advance(self._no_action, self._all, [seed])
+        self._episodes += 1
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), self._info()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Fly for one control period. See the task for shapes, units and ends."""
+        loop = self._loop
+        loop.advance(self._checked(action))
+        result = (
+            self._observation(),
+            loop.rewards.item(),
+            loop.terminated.item(),
+            loop.truncated.item(),
+            self._info(),
+        )
+        if self.render_mode == "human":
+            self.render()
+        return result
+
+    def render(self) -> Any:
+        """A picture of now, uint8, shape (360, 480, 3), with `rgb_array`; None otherwise."""
+        if self.render_mode is None:
+            gym.logger.warn("render: expected render_mode='rgb_array' or 'human', got None")
+            return None
+        if self._episodes == 0:
+            raise gym.error.ResetNeeded("render: expected a call of reset() first")
+        if self._painter is None:
+            self._painter = painter(self.render_mode, self._loop)
+        pictures = self._painter.pictures(moments(self._loop, [self._episodes - 1]))
+        return pictures[0] if pictures else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._painter is not None:
+            self._painter.close()
+            self._painter = None
+        self._loop.close()
+
+    def _checked(self, action: Any) -> np.ndarray:
+        if isinstance(action, np.ndarray) and action.dtype == np.float32:
+            if action.shape == self.action_space.shape:
+                return action
+        elif isinstance(self.action_space, gym.spaces.Discrete):
+            if not self.action_space.contains(action):
+                expected = f"a whole number 0 to {self.action_space.n - 1}"
+                raise InputError(f"action: expected {expected}, got {action!r}")
+            return np.array((action,))
+        shape = self.action_space.shape
+        try:
+            array = np.asarray(action)
+        except ValueError:
+            array = np.asarray(None)
+        if array.dtype.kind not in "iuf":
+            raise InputError(
+                f"action: expected an array of shape {shape} of real numbers, got {action!r}"
+            )
+        if array.shape != shape:
+            raise InputError(f"action: expected an array of shape {shape}, got {array.shape}")
+        return array
+
+    def _observation(self) -> Any:
+        first = {name: values[0] for name, values in self._loop.observations.items()}
+        return joined(self.env_spec, first)
+
+    def _info(self) -> dict[str, Any]:
+        loop = self._loop
+        info = dict(zip(self._names, loop.telemetry_table[0].tolist(), strict=True))
+        for name, term in loop.reward_terms.items():
+            info[f"reward_{name}"] = term.item()
+        return info
+
+    def __deepcopy__(self, memo: Any) -> Any:
+        """Raise `TypeError`, as its loop does."""
+        return self._loop.__reduce__()
+
+    def __reduce__(self) -> Any:
+        """Raise `TypeError`, as its loop does."""
+        return self._loop.__reduce__()

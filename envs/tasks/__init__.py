@@ -1,0 +1,1 @@
+"""Tasks: start, observation, reward, end and metrics of an episode."""

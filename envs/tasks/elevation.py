@@ -1,0 +1,253 @@
+"""`rotorgram/Elevation-v0`: hold an elevation, the paper's task."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+
+from ...models.errors import InputError
+from ...sim import Array, CollectiveThrust, Draw, Pose, WorldState, stack
+from ..spec import ArraySpec, Metric
+from .task import Outcome, Task, TaskOptions, check_choice, check_number, finite
+
+__all__ = ["Elevation", "ElevationOptions"]
+
+ERROR_SCALE: Final = 0.5
+"""|E| at which the reward crosses zero, m."""
+TERMINATION_REWARD: Final = -20.0
+"""Added to the reward of the step that terminates an episode (crash, flip-over, out of band)."""
+MAX_TILT_COSINE: Final = 0.5
+"""Cosine of the tilt (60°) past which the craft counts as flipped over."""
+AIR: Final = 0.6
+"""Least room under a craft that starts, m."""
+FURTHEST: Final = 1e6
+"""Highest target and widest flight band, m: far inside what MuJoCo and float32 can hold."""
+
+ActionMode = Literal["increment", "offset"]
+ActionType = Literal["continuous", "discrete"]
+Observed = Literal["full", "error"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ElevationOptions(TaskOptions):
+    """Options of `rotorgram/Elevation-v0`."""
+
+    target: float | tuple[float, float] = 5.0
+    """Target elevation Y, m: a number, or (low, high) to draw one uniformly for each episode."""
+    start_band: float = 1.0
+    """An episode starts at rest, hovering, up to this far above or below the target, m."""
+    flight_band: float = 3.0
+    """An episode terminates when the craft is further than this from the target, m."""
+    action_mode: ActionMode = "increment"
+    """`increment`: thrust += scale · action (paper, section 2.2).
+    `offset`: thrust = hover + scale · action."""
+    action_type: ActionType = "continuous"
+    """`continuous`: one number in [-1, 1]. `discrete`: 0 decrease, 1 hold, 2 increase."""
+    observation: Observed = "full"
+    """`full`: E, its rate and the thrust. `error`: E alone, as the paper feeds its network."""
+    thrust_scale: float | None = None
+    """Thrust per unit of action for each rotor, N. None: 5 % (increment) or 20 % (offset) of the
+    rotors' largest thrust, which is 5 N and 20 N for the paper's vehicle."""
+
+    def check(self) -> None:
+        """Check the options of this task. Raises `InputError`."""
+        check_number(self, "start_band", 0.0, FURTHEST, "m")
+        check_number(self, "flight_band", 0.0, FURTHEST, "m")
+        if self.flight_band <= self.start_band:
+            raise InputError(
+                f"flight_band: expected more than start_band = {self.start_band:g} m, "
+                f"got {self.flight_band!r}"
+            )
+        for name, kind in (
+            ("action_mode", ActionMode),
+            ("action_type", ActionType),
+            ("observation", Observed),
+        ):
+            check_choice(self, name, get_args(kind))
+        if self.thrust_scale is not None:
+            check_number(self, "thrust_scale", math.ulp(0.0), FURTHEST, "N")
+        target: Any = self.target
+        pair = target if isinstance(target, tuple | list) else (target, target)
+        values = [value for value in map(finite, pair) if value is not None]
+        if not len(values) == len(pair) == 2 or values[0] > values[1]:
+            raise InputError(
+                "target: expected an elevation in m, or a pair (low, high) with low <= high, "
+                f"got {target!r}"
+            )
+        object.__setattr__(self, "target", tuple(values) if pair is target else values[0])
+
+    @property
+    def target_range(self) -> tuple[float, float]:
+        """Lowest and highest target elevation, m."""
+        return self.target if isinstance(self.target, tuple) else (self.target, self.target)
+
+
+class Elevation(Task):
+    """Hold a craft at a target elevation by changing the thrust of all rotors alike.
+
+    The task of "Drone Elevation Control Based on Python-Unity Integrated Framework for
+    Reinforcement Learning Applications" (Drones 2023, 7, 225), section 2.2 and figure 5. Where the
+    paper gives no number, the number here is ours; `docs/task.md` lists which. Numbers below are
+    those of the paper's vehicle and the default options.
+
+    ## Observation, `float32`
+
+    | index | quantity | unit | bounds |
+    |---|---|---|---|
+    | 0 | elevation error E = Y - Y', desired minus measured (world, up) | m | ±3.225 |
+    | 1 | rate of E: minus the climb rate | m/s | ±11.268 |
+    | 2 | thrust relative to hover: F / 49 N - 1 | 1 | -1 ... 1.041 |
+
+    `observation="error"` keeps index 0 alone, as in the paper. The bounds follow from vehicle and
+    options and cannot be left.
+
+    ## Action
+
+    | `action_type` | space | meaning |
+    |---|---|---|
+    | `continuous` | `Box(-1, 1, (1,), float32)` | a |
+    | `discrete` | `Discrete(3)` | 0: a = -1, 1: a = 0, 2: a = +1 |
+
+    | `action_mode` | thrust F of every rotor, N, clipped to 0 ... 100 |
+    |---|---|
+    | `increment` | F <- F + 5 a (`thrust_scale` changes the 5) |
+    | `offset` | F <- 49 + 20 a (`thrust_scale` changes the 20) |
+
+    ## Reward
+
+    (s - |E|) / (s + |E|) with s = 0.5 m: 1 at the target, 0 at half a metre, negative beyond; and
+    -20 on the step that terminates.
+
+    ## Start, termination, truncation
+
+    The craft starts level, at rest and at hover thrust, its elevation uniform in target ± 1 m
+    (`start_band`); with `target=(low, high)` the target is drawn first, uniformly. A reset's
+    options may choose `target` and `start`, m.
+
+    *Terminated*: |E| above 3 m (`flight_band`) or a tilt above 60° at the end of a step, or contact
+    during it (looked for every 0.02 s).
+    *Truncated*: after 250 steps (`episode_length`) of 0.02 s (`control_period`), unless the same
+    step terminated.
+    """
+
+    Options = ElevationOptions
+    metrics = (Metric(name="elevation_error", unit="m", settled=0.05, held=0.1, symbol="E"),)
+    choices = ("target", "start")
+
+    def setup(self) -> None:
+        """See the class."""
+        options, vehicle = self.options, self.vehicle
+        self.least_target = vehicle.rest_height + AIR + options.start_band
+        low, high = options.target_range
+        if low < self.least_target or high > FURTHEST:
+            raise InputError(
+                f"target: expected {self.least_target:g} m (start_band = {options.start_band:g} m, "
+                f"and {vehicle.rest_height + AIR:g} m of room) to {FURTHEST:g} m, "
+                f"got {options.target!r}"
+            )
+        increment, most = options.action_mode == "increment", float(vehicle.thrust_high.max())
+        scale = options.thrust_scale or (0.05 if increment else 0.2) * most
+        if scale > most:
+            raise InputError(
+                f"thrust_scale: expected at most {most:g} N, the largest thrust of a rotor, "
+                f"got {options.thrust_scale!r}"
+            )
+        self.controller = CollectiveThrust(
+            vehicle, scale, increment=increment, discrete=options.action_type == "discrete"
+        )
+        self._hover = float(vehicle.hover_thrust[0])
+        self.observation = (self._observation_spec(),)
+        self.target: Array = 0.0
+
+    def begin(self, mask: Array, draw: Draw) -> Pose:
+        """Level, at rest, near the target."""
+        band = self.options.start_band
+        target = draw.uniform(*self.options.target_range, name="target")
+        start = draw.uniform(-band, band) + target
+        if (chosen := draw.chosen("start")) is not None:
+            start = chosen
+        self._check(target, start, mask)
+        self.target = self.xp.where(mask, target, self.target)[()]
+        self._goal = stack((0.0 * self.target, 0.0 * self.target, self.target))
+        origin = 0.0 * start
+        return Pose(position=stack((origin, origin, start)))
+
+    def observe(self, state: WorldState) -> dict[str, Array]:
+        """E, its rate and the thrust; or E alone."""
+        error = self.target - state.position[..., 2]
+        if self.options.observation == "error":
+            return {"observation": error[..., None]}
+        rate = 0.0 - state.velocity[..., 2]
+        thrust = state.thrust[..., 0] / self._hover - 1.0
+        return {"observation": stack((error, rate, thrust))}
+
+    def outcome(self, state: WorldState) -> Outcome:
+        """Nearness to the target; the end at a crash, a flip-over, or outside the band."""
+        error = self.target - state.position[..., 2]
+        distance = abs(error)
+        outside = distance > self.options.flight_band
+        terminated = outside | state.touching | (state.tilt_cosine < MAX_TILT_COSINE)
+        elevation = (ERROR_SCALE - distance) / (ERROR_SCALE + distance)
+        termination = terminated * TERMINATION_REWARD + 0.0  # no negative zeros
+        return Outcome(
+            reward={"elevation": elevation, "termination": termination},
+            terminated=terminated,
+            metrics={"elevation_error": error},
+        )
+
+    def goal(self, state: WorldState) -> Array:
+        """Above the start, at the target elevation."""
+        return self._goal
+
+    @property
+    def rate_bound(self) -> float:
+        """Speed that no flight can exceed before its episode ends, m/s.
+
+        Thrust and gravity accelerate by a or less; drag only brakes. The band is checked at the
+        end of a control period T. So the craft may turn back outside the band, within one period
+        (out and back at no more than a T / 2), fly through the band (twice `flight_band`), and
+        then for one period more: sqrt((a T / 2)² + 2 a · 2 flight_band) + a T.
+        """
+        a, period = self.vehicle.max_acceleration, self.options.control_period
+        return math.hypot(a * period / 2, math.sqrt(4 * a * self.options.flight_band)) + a * period
+
+    @property
+    def error_bound(self) -> float:
+        """Largest |E| of an observation, m: the band and one control period of flight."""
+        return float(self.options.flight_band + self.rate_bound * self.options.control_period)
+
+    def _observation_spec(self) -> ArraySpec:
+        least, most = (
+            limit[0] / self._hover - 1
+            for limit in (self.vehicle.thrust_low, self.vehicle.thrust_high)
+        )
+        low = np.array((-self.error_bound, -self.rate_bound, least))
+        high = np.array((self.error_bound, self.rate_bound, most))
+        size = 3 if self.options.observation == "full" else 1
+        # Rounding to float32 may move a bound inwards by half a unit: step outwards once.
+        outwards = np.float32(np.inf)
+        low = np.nextafter(low.astype(np.float32), -outwards)[:size]
+        high = np.nextafter(high.astype(np.float32), outwards)[:size]
+        return ArraySpec(
+            name="observation",
+            shape=(size,),
+            low=tuple(low.tolist()),
+            high=tuple(high.tolist()),
+            unit=("m", "m/s", "1")[:size],
+            frame="world, up",
+            components=("elevation error", "rate of the error", "thrust over hover")[:size],
+        )
+
+    def _check(self, target: Array, start: Array, mask: Array) -> None:
+        """Raise `InputError` for a target or start that a reset chose and that cannot be."""
+        room = self.vehicle.rest_height + AIR
+        low = mask & ~((target >= room) & (target <= FURTHEST))
+        if low.any():
+            raise InputError(f"target: expected {room:g} to {FURTHEST:g} m, got {target[low][0]}")
+        far = mask & ~((start >= room) & (abs(start - target) <= self.options.flight_band))
+        if far.any():
+            raise InputError(
+                f"start: expected at least {room:g} m and at most flight_band = "
+                f"{self.options.flight_band:g} m from the target, got {start[far][0]}"
+            )

@@ -1,0 +1,167 @@
+"""What a task is. One class serves every backend, one drone or thousands, in process or over UDP.
+
+A task is written for arrays with any leading axes: W worlds and the A drones of each, or none for a
+single drone. It counts axes from the last (`position[..., 2]`), uses operators, `stack` and the
+functions of `self.xp` (the array API standard: NumPy, or torch on a GPU), and never changes an
+array in place.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from numbers import Real
+from typing import Any, ClassVar, Final, Self
+
+import numpy as np
+
+from ...models.errors import InputError
+from ...models.vehicle import MOST_DRAG, Vehicle
+from ...sim import Array, Controller, Draw, Pose, WorldState
+from ..spec import ArraySpec, Metric
+
+__all__ = ["Outcome", "Task", "TaskOptions", "check_choice", "check_number", "finite"]
+
+LONGEST_CONTROL_PERIOD: Final = 1.0
+"""Longest time between two actions, s."""
+LONGEST_EPISODE: Final = 1 << 31
+"""Most control steps of an episode."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskOptions:
+    """Options that every task has. A wrong one raises `InputError` with one sentence.
+
+    Numbers may be of any real type, NumPy's among them; they are kept as Python's float and int.
+    A task with options of its own derives from this and checks them in `check`.
+    """
+
+    episode_length: int = 250
+    """Control steps after which an episode is truncated."""
+    control_period: float = 0.02
+    """Time between two actions, s: a multiple of the physics step, at most 1 s. The default is that
+    of Unity's `FixedUpdate`."""
+    linear_drag: float = 0.0
+    """Acceleration of -linear_drag · velocity, 1/s, as Unity's `Rigidbody.drag`; at most 100."""
+
+    def __post_init__(self) -> None:
+        length = finite(self.episode_length)
+        if length is None or length != int(length) or not 1 <= length <= LONGEST_EPISODE:
+            raise InputError(
+                "episode_length: expected a whole number of control steps, 1 or more, "
+                f"got {self.episode_length!r}"
+            )
+        object.__setattr__(self, "episode_length", int(length))
+        check_number(self, "control_period", 1e-6, LONGEST_CONTROL_PERIOD, "s")
+        check_number(self, "linear_drag", 0.0, MOST_DRAG, "/s")
+        self.check()
+
+    def check(self) -> None:
+        """Check what a derived class adds; raise `InputError`."""
+
+    @classmethod
+    def from_options(cls, options: Mapping[str, Any]) -> Self:
+        """Options by name. An unknown name raises `InputError`, which names those there are."""
+        known = [field.name for field in fields(cls)]
+        for name in options:
+            if name not in known:
+                raise InputError(f"options: expected some of {', '.join(known)}, got {name!r}")
+        return cls(**options)
+
+
+@dataclass(kw_only=True, slots=True)
+class Outcome:
+    """What a control step led to."""
+
+    reward: dict[str, Array]
+    """Terms by name, each of shape (W, A); their sum is the reward."""
+    terminated: Array
+    """Whether the episode ends here for another reason than time, bool, shape (W, A)."""
+    metrics: dict[str, Array]
+    """By the names of `Task.metrics`, each of shape (W, A)."""
+
+
+class Task:
+    """Base of all tasks: derive, set the class attributes, and write the methods below.
+
+    Class attributes:
+        Options: Dataclass of the task's options.
+        metrics: What tells how well it is done. The first decides: the headline.
+        choices: Names of draws that a reset's options may choose.
+
+    Attributes:
+        options: An instance of `Options`.
+        vehicle: What flies.
+        shape: (W, A), or () for a single drone.
+        xp: Namespace of the array API standard.
+        controller: What an action means; set by `setup`.
+        observation: What an agent sees, as specs of one drone; set by `setup`.
+    """
+
+    Options: ClassVar[type[TaskOptions]] = TaskOptions
+    metrics: ClassVar[tuple[Metric, ...]] = ()
+    choices: ClassVar[tuple[str, ...]] = ()
+
+    controller: Controller
+    observation: tuple[ArraySpec, ...]
+
+    def __init__(
+        self, options: Any, vehicle: Vehicle, shape: tuple[int, ...] = (), xp: Any = np
+    ) -> None:
+        self.options = options
+        self.vehicle = vehicle
+        self.shape = shape
+        self.xp = xp
+        self.setup()
+
+    def setup(self) -> None:
+        """Set `controller` and `observation`, from `options` and `vehicle`."""
+        raise NotImplementedError
+
+    def begin(self, mask: Array, draw: Draw) -> Pose:
+        """Begin episodes: draw what they need, and say where the drones start.
+
+        Args:
+            mask: Worlds that begin one, bool, shape (W, A). The first call has all of them. Keep
+                what belongs to the others: `self.xp.where(mask, new, self.old)`.
+            draw: Draws numbers of shape (W, A, ...).
+        """
+        raise NotImplementedError
+
+    def observe(self, state: WorldState) -> dict[str, Array]:
+        """What the agent sees: an array (W, A, *shape) for each of `observation`, by its name."""
+        raise NotImplementedError
+
+    def outcome(self, state: WorldState) -> Outcome:
+        """Reward, end and metrics after a step."""
+        raise NotImplementedError
+
+    def goal(self, state: WorldState) -> Array:
+        """Where the drones should be, for pictures: world frame, m, shape (W, A, 3). Optional."""
+        raise NotImplementedError
+
+
+def finite(value: Any) -> float | None:
+    """A finite real number as a float; None for everything else, truth values among them."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def check_number(options: Any, name: str, low: float, high: float, unit: str = "") -> None:
+    """Keep an option as a float within bounds. Raises `InputError`."""
+    value = finite(getattr(options, name))
+    if value is None or not low <= value <= high:
+        expected = f"a number from {low:g} to {high:g} {unit}".rstrip()
+        raise InputError(f"{name}: expected {expected}, got {getattr(options, name)!r}")
+    object.__setattr__(options, name, value)
+
+
+def check_choice(options: Any, name: str, allowed: tuple[str, ...]) -> None:
+    """Check an option that is one of some words. Raises `InputError`."""
+    value = getattr(options, name)
+    if not (isinstance(value, str) and value in allowed):
+        raise InputError(f"{name}: expected {' or '.join(map(repr, allowed))}, got {value!r}")

@@ -1,0 +1,343 @@
+"""A vehicle: an MJCF file and what follows from its compiled model.
+
+A vehicle is one free body with rotors: actuators that push at a site of the body, along an axis and
+with a reaction about it. Nothing else about it is known beforehand: number of rotors, positions,
+directions, limits, mass, inertia, hover thrust and allocation are derived from the model.
+
+Body frame: that of the free body, x forward, y left, z up; SI units.
+"""
+
+import math
+import struct
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, Final, Self
+
+import mujoco
+import numpy as np
+
+from . import QUAD_XML
+from .errors import InputError
+from .scene import build_scene
+
+__all__ = ["Rotor", "Vehicle"]
+
+LEAST_TIMESTEP: Final = 1e-5
+"""Smallest physics step, s: a control step of 0.02 s then takes a hundredth of a second."""
+MOST_DRAG: Final = 100.0
+"""Largest linear drag, 1/s. RK4 at 10 ms is within 0.1 % there, and unstable above 278 /s."""
+
+_HASH_BYTES: Final = 16
+_RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rotor:
+    """One rotor of a vehicle."""
+
+    name: str
+    position: tuple[float, float, float]
+    """Where its thrust acts, body frame, m."""
+    axis: tuple[float, float, float]
+    """Unit vector of its thrust, body frame."""
+    reaction: tuple[float, float, float]
+    """Torque besides that of its position, body frame, N·m per newton of thrust."""
+    low: float
+    """Least thrust, N."""
+    high: float
+    """Largest thrust, N."""
+    newtons: float
+    """Thrust per unit of its actuator's control, N."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Vehicle:
+    """A vehicle over level ground, as `Vehicle.load` gives it."""
+
+    path: Path
+    name: str
+    """Name of the model."""
+    hash: str
+    """32 hexadecimal characters: the same file and drag, the same hash. See `Vehicle.load`."""
+    model: mujoco.MjModel
+    """Vehicle and ground, compiled without what is only looked at. Not to be changed."""
+    linear_drag: float
+    """Acceleration of -linear_drag · velocity, 1/s."""
+    mass: float
+    """kg."""
+    gravity: float
+    """Downward acceleration of a free fall, m/s²."""
+    center_of_mass: np.ndarray
+    """Body frame, shape (3,), m."""
+    inertia: np.ndarray
+    """About the center of mass, body axes, shape (3, 3), kg·m²."""
+    rotors: tuple[Rotor, ...]
+    allocation: np.ndarray
+    """What one newton of each rotor does, shape (4, R): thrust along body z (N), and torque about
+    body x, y and z at the center of mass (N·m)."""
+    hover_thrust: np.ndarray
+    """Thrusts at which the level craft neither moves nor turns, shape (R,), N."""
+    rest_height: float
+    """Height of the body's origin when it touches level ground, m."""
+
+    @classmethod
+    def load(cls, path: Path | str | None = None, *, linear_drag: float = 0.0) -> Self:
+        """The vehicle of an MJCF file; None is the paper's.
+
+        The same path and drag give the same object until the file changes.
+
+        Its `hash` is BLAKE2b over the MJCF of vehicle and scene with includes resolved, as
+        `MjSpec.to_xml()` writes it, the bytes of mesh and height field files, and the drag as a
+        little-endian float64. Comments, layout and folder do not enter; numbers do, to the six
+        digits that MuJoCo writes.
+
+        Args:
+            path: Of the file.
+            linear_drag: 1/s, as Unity's `Rigidbody.drag`; 0 to 100.
+
+        Raises:
+            InputError: There is no such file, or it is no vehicle.
+        """
+        file = Path(path if path is not None else QUAD_XML).resolve()
+        drag = _checked_drag(linear_drag)
+        try:
+            changed = file.stat().st_mtime_ns
+        except OSError as error:
+            raise InputError(f"vehicle: cannot read {path}: {error.strerror}") from None
+        vehicle: Self = _load(cls, file, drag, changed)
+        return vehicle
+
+    @property
+    def num_rotors(self) -> int:
+        """R."""
+        return len(self.rotors)
+
+    @cached_property
+    def thrust_low(self) -> np.ndarray:
+        """Least thrust of each rotor, shape (R,), N."""
+        return np.array([rotor.low for rotor in self.rotors])
+
+    @cached_property
+    def thrust_high(self) -> np.ndarray:
+        """Largest thrust of each rotor, shape (R,), N."""
+        return np.array([rotor.high for rotor in self.rotors])
+
+    @property
+    def timestep(self) -> float:
+        """Physics step, s."""
+        return float(self.model.opt.timestep)
+
+    @property
+    def max_acceleration(self) -> float:
+        """Largest vertical acceleration of the level craft, up or down, m/s²."""
+        vertical = self.allocation[0]
+        most = np.maximum(vertical * self.thrust_high, vertical * self.thrust_low).sum()
+        least = np.minimum(vertical * self.thrust_high, vertical * self.thrust_low).sum()
+        up, down = most / self.mass - self.gravity, self.gravity - least / self.mass
+        return float(max(up, down))
+
+    def substeps(self, period: float) -> int:
+        """Physics steps in a control period of so many seconds. Raises `InputError`."""
+        ratio = period / self.timestep
+        if not (ratio > 0.5 and abs(ratio - round(ratio)) < 1e-9 * max(ratio, 1.0)):
+            raise InputError(
+                f"control_period: expected a positive multiple of the physics step of "
+                f"{self.timestep:g} s, got {period!r}"
+            )
+        return round(ratio)
+
+    def __deepcopy__(self, memo: Any) -> Self:
+        """Itself: it never changes."""
+        return self
+
+    def __reduce__(self) -> Any:
+        """Loaded again from its file."""
+        return _again, (str(self.path), self.linear_drag)
+
+
+def _again(path: str, drag: float) -> Vehicle:
+    return Vehicle.load(path, linear_drag=drag)
+
+
+@lru_cache(maxsize=32)
+def _load(cls: type[Vehicle], path: Path, drag: float, changed: int) -> Any:
+    del changed  # a file that was written anew is another key
+    try:
+        spec = build_scene(path, visual=False)
+        text = spec.to_xml()
+        model = spec.compile()
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = " ".join(str(error).split())
+        raise InputError(f"vehicle: expected an MJCF file, got {path.name}: {reason}") from None
+    body = _free_body(model)
+    data = mujoco.MjData(model)
+    data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
+    mujoco.mj_forward(model, data)
+    mass, gravity = float(model.body_subtreemass[body]), -float(model.opt.gravity[2])
+    if not (mass > 0 and gravity > 0 and not model.opt.gravity[:2].any()):
+        raise InputError(
+            f"vehicle: expected a mass > 0 and gravity along -z, got {mass:g} kg and "
+            f"{model.opt.gravity.tolist()} m/s²"
+        )
+    if not model.opt.timestep >= LEAST_TIMESTEP:
+        raise InputError(
+            f"vehicle: expected a physics step of at least {LEAST_TIMESTEP:g} s, "
+            f"got {model.opt.timestep:g}"
+        )
+    center = data.subtree_com[body].copy()
+    rotors = tuple(_rotor(model, data, i, body) for i in range(model.nu))
+    allocation = _allocation(rotors, center)
+    model.dof_damping[0:3] = drag * mass
+    return cls(
+        path=path,
+        name=str(spec.modelname),
+        hash=_hash(spec, text, path, drag),
+        model=model,
+        linear_drag=drag,
+        mass=mass,
+        gravity=gravity,
+        center_of_mass=center,
+        inertia=_inertia(model, data, body),
+        rotors=rotors,
+        allocation=allocation,
+        hover_thrust=_hover(rotors, allocation, mass * gravity),
+        rest_height=_rest_height(model, data),
+    )
+
+
+def _free_body(model: mujoco.MjModel) -> int:
+    """Number of the one free body. Raises `InputError` for any other kind of model."""
+    free = int((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).sum())
+    if (free, model.njnt) != (1, 1):
+        raise InputError(
+            f"vehicle: expected one free body and no other joints, "
+            f"got {free} free of {model.njnt} joints"
+        )
+    if model.nu == 0:
+        raise InputError("vehicle: expected at least one rotor, an actuator at a site, got none")
+    return int(model.jnt_bodyid[0])
+
+
+def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
+    """The rotor of an actuator; `data` is at the origin and level. Raises `InputError`."""
+    name = model.actuator(index).name or f"rotor{index + 1}"
+    site = int(model.actuator_trnid[index, 0])
+    at_site = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_SITE
+    if not at_site or model.body_rootid[model.site_bodyid[site]] != body:
+        raise InputError(f"vehicle: expected rotor {name} to be an actuator at a site of the body")
+    if model.actuator_trnid[index, 1] >= 0:
+        raise InputError(f"vehicle: expected rotor {name} to act without a reference site")
+    plain = (
+        model.actuator_gaintype[index] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
+        and model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_NONE
+    )
+    if not plain:
+        raise InputError(f"vehicle: expected the thrust of rotor {name} to be gain times control")
+    force, torque = model.actuator_gear[index, :3], model.actuator_gear[index, 3:]
+    size = math.hypot(*force)
+    newtons = size * float(model.actuator_gainprm[index, 0])
+    if not model.actuator_ctrllimited[index] or newtons == 0.0:
+        raise InputError(f"vehicle: expected rotor {name} to have a thrust with limits (ctrlrange)")
+    turn = data.site_xmat[site].reshape(3, 3)
+    low, high = sorted((model.actuator_ctrlrange[index] * abs(newtons)).tolist())
+    sign = math.copysign(1.0, newtons)
+    return Rotor(
+        name=name,
+        position=tuple(data.site_xpos[site].tolist()),
+        axis=tuple((turn @ force * (sign / size)).tolist()),
+        reaction=tuple((turn @ torque * (sign / size)).tolist()),
+        low=low,
+        high=high,
+        newtons=abs(newtons),
+    )
+
+
+def _allocation(rotors: tuple[Rotor, ...], center: np.ndarray) -> np.ndarray:
+    columns = []
+    for rotor in rotors:
+        axis = np.array(rotor.axis)
+        torque = np.cross(np.array(rotor.position) - center, axis) + rotor.reaction
+        columns.append((axis[2], *torque))
+    return np.array(columns).T
+
+
+def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> np.ndarray:
+    """Thrusts that carry the weight and turn nothing: equal ones, or the least of all.
+
+    Raises `InputError` if there are none within the rotors' limits.
+    """
+    wanted = np.array((weight, 0.0, 0.0, 0.0))
+    total = float(allocation[0].sum())
+    thrust = np.full(len(rotors), weight / total if total > 0 else 0.0)
+    scale = weight * max(1e-3, float(np.abs(allocation[1:]).max()))
+    if np.abs(allocation @ thrust - wanted).max() > _RELATIVE * scale:
+        thrust = np.linalg.lstsq(allocation, wanted, rcond=None)[0]
+    if np.abs(allocation @ thrust - wanted).max() > 1e-6 * scale:
+        raise InputError("vehicle: expected rotors that can hover level, got ones that cannot")
+    for rotor, newtons in zip(rotors, thrust.tolist(), strict=True):
+        if not rotor.low <= newtons < rotor.high:
+            raise InputError(
+                f"vehicle: expected rotor {rotor.name} to carry its share of the weight, "
+                f"{newtons:.4g} N, within its limits, got {rotor.low:g} to {rotor.high:g} N"
+            )
+    return thrust
+
+
+def _inertia(model: mujoco.MjModel, data: Any, body: int) -> np.ndarray:
+    """About the center of mass of all bodies that are welded to the free one, shape (3, 3)."""
+    total = np.zeros((3, 3))
+    for part in np.flatnonzero(model.body_rootid == body):
+        turn = data.ximat[part].reshape(3, 3)
+        offset = data.xipos[part] - data.subtree_com[body]
+        steiner = model.body_mass[part] * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+        total += turn @ np.diag(model.body_inertia[part]) @ turn.T + steiner
+    return total
+
+
+def _rest_height(model: mujoco.MjModel, data: Any) -> float:
+    """Height at which the level body first touches anything, by bisection; 0 if it never does."""
+    high = max(float(model.stat.extent), 1e-3)
+    low = 0.0
+    if not _touches(model, data, low):
+        return 0.0
+    while _touches(model, data, high):
+        high *= 2
+    while high - low > 1e-10 * high:
+        middle = (low + high) / 2
+        if _touches(model, data, middle):
+            low = middle
+        else:
+            high = middle
+    return round(high, 9)
+
+
+def _touches(model: mujoco.MjModel, data: Any, height: float) -> bool:
+    data.qpos[2] = height
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_collision(model, data)
+    return bool(data.ncon > 0)
+
+
+def _hash(spec: mujoco.MjSpec, text: str, path: Path, drag: float) -> str:
+    digest = blake2b(text.encode() + b"\0" + struct.pack("<d", drag), digest_size=_HASH_BYTES)
+    for assets, folder in ((spec.meshes, spec.meshdir), (spec.hfields, spec.meshdir)):
+        for asset in assets:
+            file = path.parent / folder / asset.file
+            if asset.file and file.is_file():
+                digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _checked_drag(linear_drag: Any) -> float:
+    number = isinstance(linear_drag, int | float | np.floating)
+    if not (number and 0.0 <= linear_drag <= MOST_DRAG):
+        raise InputError(
+            f"linear_drag: expected a number from 0 to {MOST_DRAG:g} /s, got {linear_drag!r}"
+        )
+    return float(linear_drag) + 0.0  # no negative zero

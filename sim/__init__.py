@@ -1,0 +1,27 @@
+"""Worlds of vehicles, stepped together: state, draws, controllers, and the backends behind them.
+
+Knows nothing of tasks, rewards or Gymnasium.
+"""
+
+from .control import CollectiveThrust, Controller, RotorThrust
+from .random import Draw
+from .state import Array, Pose, WorldState, clip, constant, stack
+from .world import BACKENDS, Backend, PhysicsError, World, make_world
+
+__all__ = [
+    "BACKENDS",
+    "Array",
+    "Backend",
+    "CollectiveThrust",
+    "Controller",
+    "Draw",
+    "PhysicsError",
+    "Pose",
+    "RotorThrust",
+    "World",
+    "WorldState",
+    "clip",
+    "constant",
+    "make_world",
+    "stack",
+]

@@ -1,0 +1,1 @@
+"""What steps the physics of worlds."""

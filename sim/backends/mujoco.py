@@ -1,0 +1,154 @@
+"""MuJoCo on the threads of this machine, float64.
+
+`mujoco.batch.Batch` gives each world the bits that a loop over single ones gives it, with any number
+of threads.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+
+from ...models.errors import InputError
+from ...models.vehicle import Vehicle
+from ..random import Draw, NumpyDraw, Streams
+from ..state import Array, Pose, WorldState
+from ..world import PhysicsError, contact_check
+
+__all__ = ["MujocoWorld", "make"]
+
+
+def make(vehicle: Vehicle, num_worlds: int, *, num_threads: int = 0) -> "MujocoWorld":
+    """Worlds of one drone each. Raises `InputError`."""
+    if type(num_threads) is not int or num_threads < 0:
+        raise InputError(f"num_threads: expected 0 or more, got {num_threads!r}")
+    return MujocoWorld(vehicle, num_worlds, num_threads)
+
+
+class MujocoWorld:
+    """W worlds of one drone over ground of its own: `World`.
+
+    MuJoCo answers a bad state with a reset and a line in MUJOCO_LOG.TXT. Here it raises
+    `PhysicsError`, because a silent reset would be learnt from, and that file is switched off for
+    the whole process; a log file of another name stays on.
+
+    A single world has no leading axes: NumPy's scalars are ten times faster than its arrays of one.
+
+    Args:
+        vehicle: What flies.
+        num_worlds: W.
+        num_threads: Threads that step the worlds; 0 takes one for each processor.
+    """
+
+    xp: Any = np
+
+    def __init__(self, vehicle: Vehicle, num_worlds: int, num_threads: int = 0) -> None:
+        _switch_off_log_file()
+        self.vehicle = vehicle
+        self.shape: tuple[int, ...] = (num_worlds, 1) if num_worlds > 1 else ()
+        self._streams = Streams(num_worlds)
+        self._check = contact_check(vehicle.timestep)
+        threads = 1 if num_worlds == 1 else num_threads
+        self._batch = batch = Batch(vehicle.model, num_worlds, threads)
+        # Live views of simulator memory, made once.
+        qpos: np.ndarray = batch.bind("qpos")
+        qvel: np.ndarray = batch.bind("qvel")
+        self._ctrl: np.ndarray = batch.bind("ctrl")
+        self._contacts: np.ndarray = batch.bind("ncon")
+        self._warnings: np.ndarray = batch.warning[:, :, 1]  # counts, beside the last info
+        self._no_warnings = self._warnings.tobytes()
+        newtons = np.array([rotor.newtons for rotor in vehicle.rotors])
+        self._newtons = None if (newtons == 1.0).all() else newtons
+        self._thrust = np.zeros((num_worlds, vehicle.num_rotors))
+        self._touching = np.zeros(num_worlds, bool)
+        lead = self.shape
+        self.state = WorldState(
+            position=qpos[:, :3].reshape((*lead, 3)),
+            quaternion=qpos[:, 3:].reshape((*lead, 4)),
+            velocity=qvel[:, :3].reshape((*lead, 3)),
+            body_rates=qvel[:, 3:].reshape((*lead, 3)),
+            thrust=self._thrust.reshape((*lead, -1)),
+            touching=self._touching.reshape(lead),
+        )
+        assert np.shares_memory(self.state.position, qpos)
+
+    def reset(self, mask: Array, pose: Pose) -> None:
+        """As `World.reset`."""
+        ids = self._ids(mask)
+        self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        state, here = self.state, () if self.shape == () else ids
+        state.position[here] = pose.position[here]
+        for name, plain in (
+            ("quaternion", (1, 0, 0, 0)),
+            ("velocity", 0),
+            ("body_rates", 0),
+            ("thrust", self.vehicle.hover_thrust),
+        ):
+            given = getattr(pose, name)
+            getattr(state, name)[here] = plain if given is None else given[here]
+        self._apply_thrust()
+        self._batch.forward(ids)
+        self._touching[ids] = self._contacts[ids] > 0
+
+    def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
+        """As `World.step`."""
+        ids = None if mask is None else self._ids(mask)
+        here = ... if ids is None or self.shape == () else ids
+        self.state.thrust[here] = thrust[here]
+        self._apply_thrust()
+        touching: Any = None
+        while substeps > 0:
+            try:
+                self._batch.step(ids, nstep=min(substeps, self._check))
+            except SimulationError as error:
+                raise PhysicsError(f"{error}: reset the env") from None
+            touching = self._contacts > 0 if touching is None else touching | (self._contacts > 0)
+            substeps -= self._check
+        some = ... if ids is None else ids
+        self._touching[some] = touching[some]
+        if self._warnings.tobytes() != self._no_warnings:
+            raise PhysicsError(self._describe_warnings())
+
+    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
+        """As `World.seed`."""
+        ids = self._ids(mask).tolist()
+        self._streams.seed(ids, [seeds[i] for i in ids])
+
+    def draw(self, mask: Array, chosen: Mapping[str, Any] | None = None) -> Draw:
+        """As `World.draw`."""
+        return NumpyDraw(self._streams, self._ids(mask).tolist(), self.shape, chosen)
+
+    def close(self) -> None:
+        """Nothing is held but memory."""
+
+    def _ids(self, mask: Array) -> np.ndarray:
+        """Numbers of the worlds of a mask of the leading shape, or of shape (W,)."""
+        return np.flatnonzero(mask)
+
+    def _apply_thrust(self) -> None:
+        if self._newtons is None:
+            self._ctrl[:] = self._thrust
+        else:
+            np.divide(self._thrust, self._newtons, out=self._ctrl)
+
+    def _describe_warnings(self) -> str:
+        # Take the warnings off, so that a reset gives usable worlds again.
+        ids = np.flatnonzero(self._warnings.any(axis=1)).tolist()
+        names = ", ".join(_warning_names(self._warnings.sum(axis=0).tolist()))
+        self._warnings.fill(0)
+        return f"MuJoCo warned of {names} in envs {ids[:5]}: reset the env"
+
+
+def _warning_names(counts: Iterable[int]) -> list[str]:
+    """MuJoCo's names of the warnings whose counts are not 0."""
+    return [mujoco.mjtWarning(i).name for i, count in enumerate(counts) if count]
+
+
+def _switch_off_log_file() -> None:
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT; a log file of another name stays on."""
+    config = mujoco.MjLogConfig.get()
+    if config.logto_file and config.logfile == "MUJOCO_LOG.TXT":
+        config.logto_file = False
+        config.set()

@@ -1,0 +1,84 @@
+"""What an action means: controllers turn actions into rotor thrusts.
+
+A controller keeps nothing between steps: what it needs of the past it reads from the state. An
+action has k numbers within bounds, or is one of some choices.
+"""
+
+from typing import Final, Protocol
+
+from ..models.vehicle import Vehicle
+from .state import Array, WorldState, clip, constant
+
+__all__ = ["CollectiveThrust", "Controller", "RotorThrust"]
+
+
+class Controller(Protocol):
+    """Turns actions into thrusts."""
+
+    low: tuple[float, ...]
+    """Lower bound of each number of an action, shape (k,)."""
+    high: tuple[float, ...]
+    """Upper bounds, shape (k,)."""
+    components: tuple[str, ...]
+    """Name of each number, or of each choice."""
+    choices: int
+    """0: an action is k numbers. Otherwise it is one number, 0 to choices - 1."""
+
+    def thrust(self, action: Array, state: WorldState) -> Array:
+        """Thrust of each rotor until the next action, N, shape (W, A, R).
+
+        Args:
+            action: float64, shape (W, A, k), finite. What lies beyond a bound counts as the bound.
+            state: As the last step left it.
+        """
+
+
+class CollectiveThrust:
+    """One number for all rotors: they push alike, in proportion to their thrusts at hover.
+
+    Args:
+        vehicle: What flies.
+        newtons: Thrust per unit of action, mean over the rotors.
+        increment: Add to the present thrust; otherwise to that of a hover.
+        discrete: Three choices, decrease, hold and increase, in place of a number in [-1, 1].
+    """
+
+    def __init__(
+        self, vehicle: Vehicle, newtons: float, *, increment: bool, discrete: bool = False
+    ) -> None:
+        self.low, self.high = (-1.0,), (1.0,)
+        self.components = ("decrease", "hold", "increase") if discrete else ("collective",)
+        self.choices = 3 if discrete else 0
+        hover = vehicle.hover_thrust
+        self._hover: Final = hover
+        self._per_action: Final = newtons * (hover / hover.mean())
+        self._limits: Final = (vehicle.thrust_low, vehicle.thrust_high)
+        self._increment = increment
+
+    def thrust(self, action: Array, state: WorldState) -> Array:
+        """As `Controller.thrust`."""
+        share = action - 1.0 if self.choices else clip(action, -1.0, 1.0)
+        base = state.thrust if self._increment else constant(self._hover, state.thrust)
+        low, high = (constant(limit, state.thrust) for limit in self._limits)
+        return clip(base + constant(self._per_action, state.thrust) * share, low, high)
+
+
+class RotorThrust:
+    """One number for each rotor: 0 is its thrust at hover, -1 its least and 1 its largest.
+
+    Args:
+        vehicle: What flies.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.low, self.high = (-1.0,) * vehicle.num_rotors, (1.0,) * vehicle.num_rotors
+        self.components = tuple(f"F{i + 1}" for i in range(vehicle.num_rotors))
+        self.choices = 0
+        self._hover: Final = vehicle.hover_thrust
+        self._up: Final = vehicle.thrust_high - vehicle.hover_thrust
+        self._down: Final = vehicle.hover_thrust - vehicle.thrust_low
+
+    def thrust(self, action: Array, state: WorldState) -> Array:
+        """As `Controller.thrust`."""
+        hover, up, down = (constant(x, state.thrust) for x in (self._hover, self._up, self._down))
+        return hover + up * clip(action, 0.0, 1.0) + down * clip(action, -1.0, 0.0)

@@ -1,0 +1,112 @@
+"""Worlds behind one interface, whatever steps their physics."""
+
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any, Final, Literal, Protocol, get_args
+
+from ..models.errors import InputError
+from ..models.vehicle import Vehicle
+from .random import Draw
+from .state import Array, Pose, WorldState
+
+__all__ = ["BACKENDS", "Backend", "PhysicsError", "World", "contact_check", "make_world"]
+
+Backend = Literal["mujoco", "warp"]
+"""`mujoco`: threads of this machine, float64. `warp`: MuJoCo Warp, float32, a GPU if there is
+one."""
+BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
+
+MAX_WORLDS: Final = 1 << 16
+"""Most worlds of a batch."""
+
+CONTACT_CHECK: Final = 0.02
+"""Contact is looked for at least this often, s. A bounce of the paper's craft at full thrust lasts
+longer, unless its skids dip less than half a millimetre."""
+
+
+class PhysicsError(RuntimeError):
+    """The physics reported a bad state; the numbers after it would mean nothing."""
+
+
+class World(Protocol):
+    """W worlds of A drones.
+
+    Attributes:
+        vehicle: What flies in each.
+        shape: (W, A), the leading axes of all arrays; () for a single drone.
+        state: As the last step or reset left it.
+        xp: Namespace of the array API standard for the state's arrays.
+    """
+
+    vehicle: Vehicle
+    shape: tuple[int, ...]
+    state: WorldState
+    xp: Any
+
+    def reset(self, mask: Array, pose: Pose) -> None:
+        """Begin anew in the worlds of the mask, bool, shape (W, A); their poses are those given."""
+
+    def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
+        """Fly for so many physics steps with constant thrusts.
+
+        Args:
+            thrust: N, shape (W, A, R).
+            substeps: Physics steps.
+            mask: Worlds that fly, bool, shape (W, A); the others stay as they are. None: all fly.
+
+        Raises:
+            PhysicsError: A state is bad; reset the worlds that the message names.
+        """
+
+    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
+        """Seed the random streams of the worlds of a mask; a seed of None leaves its stream.
+
+        Args:
+            mask: bool, shape (W, A).
+            seeds: Shape (W,).
+        """
+
+    def checked(self, actions: Array, width: int, choices: int, flown: Array | None) -> Array:
+        """Actions as this backend's arrays, where those are not NumPy's. Raises `InputError`.
+
+        Args:
+            actions: What the caller gave: shape (N, k), or (N,) where they are choices.
+            width: k.
+            choices: 0, or how many.
+            flown: Whose actions count, bool, shape (N,); None: all.
+        """
+
+    def draw(self, mask: Array, chosen: Any = None) -> Draw:
+        """What draws numbers for the worlds of the mask; `chosen` as of `random.NumpyDraw`."""
+
+    def close(self) -> None:
+        """Let go of threads and memory."""
+
+
+def contact_check(timestep: float) -> int:
+    """Physics steps between two looks for contact."""
+    return max(1, round(CONTACT_CHECK / timestep))
+
+
+def make_world(
+    vehicle: Vehicle, num_worlds: int, backend: Backend = "mujoco", **settings: Any
+) -> World:
+    """Worlds of one drone each.
+
+    Args:
+        vehicle: What flies.
+        num_worlds: W.
+        backend: What steps the physics.
+        settings: Of that backend: `num_threads`, or `device`.
+
+    Raises:
+        InputError: The backend, the number or a setting is not what it should be.
+        MissingPackage: The backend's package is not installed.
+    """
+    if backend not in BACKENDS:
+        raise InputError(f"backend: expected {' or '.join(BACKENDS)}, got {backend!r}")
+    if type(num_worlds) is not int or not 1 <= num_worlds <= MAX_WORLDS:
+        raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
+    module = import_module(f".backends.{backend}", __package__)
+    world: World = module.make(vehicle, num_worlds, **settings)
+    return world
