@@ -16,7 +16,15 @@ if TYPE_CHECKING:
     from ..experiments.trajectories import Trajectory
     from ..udp import RemoteEnv, RemoteVectorEnv
 
-__all__ = ["CHECKPOINT", "chosen_env", "load_checkpoint", "local_spec", "policy_for", "remote_env", "words_of"]
+__all__ = [
+    "CHECKPOINT",
+    "chosen_env",
+    "load_checkpoint",
+    "local_spec",
+    "policy_for",
+    "remote_env",
+    "words_of",
+]
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 _CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
@@ -70,18 +78,11 @@ def local_spec(command: EnvFlags, checkpoint: "Checkpoint | None") -> "EnvSpec":
     return registry.env_spec(*chosen_env(command, checkpoint), vehicle=command.vehicle)
 
 
-def policy_for(name: str, checkpoint: "Checkpoint | None", spec: "EnvSpec") -> "Policy":
-    """The policy for an env. Raises `InputError` if it was made for another."""
-    if checkpoint is None:
-        from ..agents import PID
+def policy_for(checkpoint: "Checkpoint | None", spec: "EnvSpec") -> "Policy":
+    """The policy of a checkpoint, or the PID. Raises `InputError` if it does not fit the env."""
+    from ..agents import PID
 
-        return PID(spec)
-    policy = checkpoint.policy()
-    for part in ("observation", "action"):
-        trained, flown = (_shapes(getattr(s, part)) for s in (checkpoint.spec, spec))
-        if trained != flown:
-            raise InputError(f"{name}: expected the {part} {trained}, got {flown} of {spec.env_id}")
-    return policy
+    return checkpoint.policy(spec) if checkpoint else PID(spec)
 
 
 def words_of(trajectory: "Trajectory") -> str:
@@ -91,16 +92,6 @@ def words_of(trajectory: "Trajectory") -> str:
         return words
     value = f"{trajectory.headline[-1]:.3f} {metric.unit}".rstrip()
     return f"{words}, last {metric.symbol or metric.name} {value}"
-
-
-def _shapes(arrays: Any) -> str:
-    """Arrays of a spec in words, for comparison and for the user."""
-    if not isinstance(arrays, tuple):
-        arrays = (arrays,)
-    return ", ".join(
-        f"{array.name} {getattr(array, 'shape', None) or f'of {array.n} choices'}"
-        for array in arrays
-    )
 
 
 @contextmanager

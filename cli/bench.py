@@ -29,7 +29,6 @@ class Bench(Command):
 
     def run(self) -> int:
         """Measure, print and draw."""
-        import matplotlib as _  # what is missing is told before anything is measured
         from rich.console import Console
 
         from ..experiments.bench import BenchConfig, bench

@@ -34,7 +34,7 @@ class Evaluate(AgentFlags):
         required = checkpoint is not None or bool(self.options) or "env" in self.given
         with remote_env(self, *chosen_env(self, checkpoint), required=required) as env:
             headline = Headline.of(env.env_spec)
-            policy = policy_for(self.policy, checkpoint, env.env_spec)
+            policy = policy_for(checkpoint, env.env_spec)
             trajectories = fly_episodes(env, policy, self.episodes, "final")
         rows = [evaluation_row(trajectory, headline) for trajectory in trajectories]
 

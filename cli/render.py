@@ -132,14 +132,12 @@ class Render(EnvFlags):
         episodes = range(self.episode, self.episode + self.episodes)
         path = Path(what)
         if path.suffix == ".mcap":
-            recorded = recorded_trajectories(
-                path, episodes, session=self.session, drone=self.drone
-            )
+            recorded = recorded_trajectories(path, episodes, session=self.session, drone=self.drone)
             return path.stem, path.stem, recorded
         policy = checkpoint = None
         if what != "random":
             checkpoint = load_checkpoint(what)
-            policy = policy_for(what, checkpoint, local_spec(self, checkpoint))
+            policy = policy_for(checkpoint, local_spec(self, checkpoint))
         agent = checkpoint.algorithm if checkpoint else what
         env = chosen_env(self, checkpoint)
         flown = flown_trajectories(policy, *env, episodes, vehicle=self.vehicle)

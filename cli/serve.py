@@ -34,7 +34,7 @@ class Serve(AgentFlags):
         required = checkpoint is not None or bool(self.options) or "env" in self.given
         episode = 0
         with remote_env(self, *chosen_env(self, checkpoint), required=required) as env:
-            policy = policy_for(self.policy, checkpoint, env.env_spec)
+            policy = policy_for(checkpoint, env.env_spec)
             while self.episodes is None or episode < self.episodes:
                 with _next_simulator():
                     flown = fly(env, policy, evaluation_seed(episode), episode)
