@@ -14,8 +14,9 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from errno import ENOSPC, EPIPE
 from importlib import import_module
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeGuard
 
 if TYPE_CHECKING:
     from ._flags import Command
@@ -74,10 +75,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("rotorgram: interrupted", file=sys.stderr)
         return 128 + signal.SIGINT
     except Exception as error:
-        if isinstance(error, OSError) and (failure := _stdout_failure()):
-            if isinstance(failure, BrokenPipeError):
+        if _is_of_stdout(error):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is left
+            if isinstance(error, BrokenPipeError):
                 return 128 + signal.SIGPIPE
-            error = failure
+            error.filename = "standard output"
         sentence = _sentence(error)
         if sentence is None or "ROTORGRAM_TRACEBACK" in os.environ:
             raise
@@ -150,15 +152,17 @@ def _prepare_streams() -> None:
             stream.reconfigure(errors="replace")
 
 
-def _stdout_failure() -> OSError | None:
-    """Why standard output takes no more, if so. Python then writes to it no more."""
+def _is_of_stdout(error: Exception) -> TypeGuard[OSError]:
+    """Whether standard output takes no more: its reader is gone, or its disk is full."""
+    if not isinstance(error, OSError) or error.filename or error.errno not in (EPIPE, ENOSPC):
+        return False
     try:
-        sys.stdout.flush()
-    except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        error.filename = "standard output"
-        return error
-    return None
+        os.write(sys.stdout.fileno(), b"\n")
+    except io.UnsupportedOperation:  # it is no file
+        return False
+    except OSError:
+        return True
+    return False
 
 
 class _ToStandardError(logging.Handler):
