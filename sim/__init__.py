@@ -5,7 +5,7 @@ Knows nothing of tasks, rewards or Gymnasium.
 
 from .control import CollectiveThrust, Controller, RotorThrust
 from .random import Draw
-from .state import Array, Pose, WorldState, clip, constant
+from .state import Array, Pose, WorldState, clip, constant, stack
 from .world import BACKENDS, Backend, PhysicsError, World, make_world
 
 __all__ = [
@@ -23,4 +23,5 @@ __all__ = [
     "clip",
     "constant",
     "make_world",
+    "stack",
 ]

@@ -1,5 +1,8 @@
 """What a world is in: arrays whose first two axes are W worlds and the A drones of each.
 
+A single drone has neither axis: code that counts axes from the last, as `position[..., 2]`, serves
+both.
+
 Frames: world x, y, z with z up, right-handed; body x forward, y left, z up. SI units, quaternions
 scalar first. Arrays are NumPy's, or torch's where the backend runs on another device.
 """
@@ -10,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Array", "Pose", "WorldState", "clip", "constant"]
+__all__ = ["Array", "Pose", "WorldState", "clip", "constant", "stack"]
 
 Array = Any
 """A NumPy array or a torch tensor. Code for both uses operators and the namespace of the array
@@ -59,14 +62,26 @@ class Pose:
 
 def clip(array: Array, low: Any, high: Any) -> Array:
     """The nearest numbers within bounds: numbers, or arrays of the same kind."""
-    if isinstance(array, np.ndarray):
+    if isinstance(array, np.ndarray | np.generic):
         return np.minimum(np.maximum(array, low), high)  # a third of the time of NumPy's clip
     return array.clip(low, high)
 
 
+def stack(parts: Any) -> Array:
+    """Arrays, or numbers of a single drone, along a new last axis."""
+    first = parts[0]
+    if isinstance(first, float) or first.ndim == 0:
+        return np.array(parts)  # an eighth of the time of NumPy's stack
+    if isinstance(first, np.ndarray):
+        return np.stack(parts, axis=-1)
+    import torch
+
+    return torch.stack(parts, dim=-1)
+
+
 def constant(values: np.ndarray, like: Array) -> Array:
     """An array of the vehicle or the task as an array of the same kind as `like`."""
-    if isinstance(like, np.ndarray):
+    if isinstance(like, np.ndarray | np.generic):
         return values
     return _tensor(values.tobytes(), values.shape, like.dtype, like.device)
 

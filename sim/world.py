@@ -33,18 +33,18 @@ class World(Protocol):
 
     Attributes:
         vehicle: What flies in each.
-        shape: (W, A).
+        shape: (W, A), the leading axes of all arrays; () for a single drone.
         state: As the last step or reset left it.
         xp: Namespace of the array API standard for the state's arrays.
     """
 
     vehicle: Vehicle
-    shape: tuple[int, int]
+    shape: tuple[int, ...]
     state: WorldState
     xp: Any
 
     def reset(self, mask: Array, pose: Pose) -> None:
-        """Begin anew in the worlds of the mask, bool, shape (W,); their poses are those given."""
+        """Begin anew in the worlds of the mask, bool, shape (W, A); their poses are those given."""
 
     def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
         """Fly for so many physics steps with constant thrusts.
@@ -52,7 +52,7 @@ class World(Protocol):
         Args:
             thrust: N, shape (W, A, R).
             substeps: Physics steps.
-            mask: Worlds that fly, bool, shape (W,); the others stay as they are. None: all fly.
+            mask: Worlds that fly, bool, shape (W, A); the others stay as they are. None: all fly.
 
         Raises:
             PhysicsError: A state is bad; reset the worlds that the message names.
@@ -62,8 +62,18 @@ class World(Protocol):
         """Seed the random streams of the worlds of a mask; a seed of None leaves its stream.
 
         Args:
-            mask: bool, shape (W,).
+            mask: bool, shape (W, A).
             seeds: Shape (W,).
+        """
+
+    def checked(self, actions: Array, width: int, choices: int, flown: Array | None) -> Array:
+        """Actions as this backend's arrays, where those are not NumPy's. Raises `InputError`.
+
+        Args:
+            actions: What the caller gave: shape (N, k), or (N,) where they are choices.
+            width: k.
+            choices: 0, or how many.
+            flown: Whose actions count, bool, shape (N,); None: all.
         """
 
     def draw(self, mask: Array, chosen: Any = None) -> Draw:

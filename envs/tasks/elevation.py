@@ -7,7 +7,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 
 from ...models.errors import InputError
-from ...sim import Array, CollectiveThrust, Draw, Pose, WorldState
+from ...sim import Array, CollectiveThrust, Draw, Pose, WorldState, stack
 from ..spec import ArraySpec, Metric
 from .task import Outcome, Task, TaskOptions, check_choice, check_number, finite
 
@@ -168,9 +168,10 @@ class Elevation(Task):
         if (chosen := draw.chosen("start")) is not None:
             start = chosen
         self._check(target, start, mask)
-        self.target = self.xp.where(mask, target, self.target)
+        self.target = self.xp.where(mask, target, self.target)[()]
+        self._goal = stack((0.0 * self.target, 0.0 * self.target, self.target))
         origin = 0.0 * start
-        return Pose(position=self.xp.stack((origin, origin, start), axis=-1))
+        return Pose(position=stack((origin, origin, start)))
 
     def observe(self, state: WorldState) -> dict[str, Array]:
         """E, its rate and the thrust; or E alone."""
@@ -179,7 +180,7 @@ class Elevation(Task):
             return {"observation": error[..., None]}
         rate = 0.0 - state.velocity[..., 2]
         thrust = state.thrust[..., 0] / self._hover - 1.0
-        return {"observation": self.xp.stack((error, rate, thrust), axis=-1)}
+        return {"observation": stack((error, rate, thrust))}
 
     def outcome(self, state: WorldState) -> Outcome:
         """Nearness to the target; the end at a crash, a flip-over, or outside the band."""
@@ -197,8 +198,7 @@ class Elevation(Task):
 
     def goal(self, state: WorldState) -> Array:
         """Above the start, at the target elevation."""
-        origin = 0.0 * self.target
-        return self.xp.stack((origin, origin, self.target), axis=-1)
+        return self._goal
 
     @property
     def rate_bound(self) -> float:

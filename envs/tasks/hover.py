@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from ...models.errors import InputError
-from ...sim import Array, Draw, Pose, RotorThrust, WorldState, clip, constant
+from ...sim import Array, Draw, Pose, RotorThrust, WorldState, clip, constant, stack
 from ..spec import ArraySpec, Metric
 from .task import Outcome, Task, TaskOptions, check_number, finite
 
@@ -161,8 +161,8 @@ class Hover(Task):
         # First tilted about a horizontal axis, then turned about the vertical.
         w, x, y = xp.cos(tilt), xp.sin(tilt) * xp.cos(azimuth), xp.sin(tilt) * xp.sin(azimuth)
         c, s = xp.cos(heading), xp.sin(heading)
-        quaternion = xp.stack((c * w, c * x - s * y, c * y + s * x, s * w), axis=-1)
-        goal = xp.stack([0.0 * tilt + value for value in options.goal], axis=-1)
+        quaternion = stack((c * w, c * x - s * y, c * y + s * x, s * w))
+        goal = stack([0.0 * tilt + value for value in options.goal])
         return Pose(position=goal + offset, quaternion=quaternion)
 
     def observe(self, state: WorldState) -> dict[str, Array]:
@@ -200,7 +200,7 @@ class Hover(Task):
     def goal(self, state: WorldState) -> Array:
         """The same for every drone."""
         zero = 0.0 * state.position[..., 0]
-        return self.xp.stack([zero + value for value in self.options.goal], axis=-1)
+        return stack([zero + value for value in self.options.goal])
 
     def _turned(self, vectors: Array) -> Array:
         """World vectors in the world frame turned by the wanted heading, shape (..., 3)."""
@@ -208,7 +208,7 @@ class Hover(Task):
             return vectors
         c, s = math.cos(self._wanted), math.sin(self._wanted)
         x, y = vectors[..., 0], vectors[..., 1]
-        return self.xp.stack((c * x + s * y, c * y - s * x, vectors[..., 2]), axis=-1)
+        return stack((c * x + s * y, c * y - s * x, vectors[..., 2]))
 
 
 def _axes(xp: Any, quaternion: Array) -> tuple[Array, Array]:
@@ -216,4 +216,4 @@ def _axes(xp: Any, quaternion: Array) -> tuple[Array, Array]:
     w, x, y, z = (quaternion[..., i] for i in range(4))
     nose = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
     up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-    return xp.stack(nose, axis=-1), xp.stack(up, axis=-1)
+    return stack(nose), stack(up)
