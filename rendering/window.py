@@ -11,9 +11,8 @@ from typing import Any, Final
 
 import mujoco
 
-from .camera import Aim
 from .gl import NoOpenGL
-from .live import Lines
+from .live import Aim, Lines
 from .pace import Pace, Press
 from .stage import Stage, scene_geoms
 
@@ -27,7 +26,7 @@ KEYS: Final[dict[int, Press]] = {
     61: "faster",  # = and +
     334: "faster",  # + of the number pad
 }
-"""What a key of GLFW's asks for. The viewer uses none of them for itself while it is passive."""
+"""GLFW's keys. MuJoCo's passive viewer uses none of them."""
 _HELP: Final = [("space", "pause"), ("right arrow", "one step"), ("- and +", "slower, faster")]
 _INSTEAD: Final = (
     "look from a browser instead (--web, or --view web with rotorgram sim) or make a film "
@@ -35,11 +34,11 @@ _INSTEAD: Final = (
 )
 
 _NICENESS: Final = 10
-"""Of the threads that draw: whoever flies comes first."""
+"""Of the threads that draw: the simulation comes first."""
 
 
 class NoDisplay(NoOpenGL):
-    """There is no display for a window. The sentence names what else there is."""
+    """There is no display for a window. The sentence names other ways to look."""
 
 
 class Window:
@@ -47,7 +46,7 @@ class Window:
 
     Args:
         stage: What is shown.
-        pace: What the keys are for.
+        pace: What the keys change.
 
     Raises:
         NoDisplay: There is no display, or none that OpenGL can draw on.
@@ -74,9 +73,9 @@ class Window:
                 f"or {_INSTEAD}"
             ) from None
         self._threads = set(threading.enumerate()) - others
-        # Whoever forgets to close it: MuJoCo's thread must have ended before GLFW does.
+        # If it is never closed: MuJoCo's thread must have ended before GLFW does.
         atexit.register(self.close)
-        # All that were begun meanwhile: they draw, on the processor where there is no GPU.
+        # Threads that began meanwhile draw, on the processor if there is no GPU.
         for task in _tasks() - before:
             with suppress(OSError):  # it has ended
                 os.setpriority(os.PRIO_PROCESS, task, _NICENESS)
@@ -94,11 +93,11 @@ class Window:
         handle.sync()
 
     def is_running(self) -> bool:
-        """Whether nobody has closed it."""
+        """Whether it is open."""
         return bool(self._handle.is_running())
 
     def is_watched(self) -> bool:
-        """Whoever opens a window looks."""
+        """Whether somebody looks: a window is looked at from its start."""
         return True
 
     def close(self) -> None:
@@ -119,13 +118,13 @@ def _text(place: mujoco.mjtGridPos, lines: Lines) -> tuple[Any, ...]:
 
 
 def _tasks() -> set[int]:
-    """Threads of this process that the system knows by number; none where it does not tell."""
+    """Numbers of this process's threads; empty on systems without /proc."""
     folder = Path("/proc/self/task")
     return {int(task.name) for task in folder.iterdir()} if folder.is_dir() else set()
 
 
 def _viewer() -> Any:
-    """MuJoCo's module, once it is certain that there is a display: without one it waits forever."""
+    """MuJoCo's module. Raises `NoDisplay` first: without a display MuJoCo would wait forever."""
     on_x = sys.platform == "linux"
     if on_x and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise NoDisplay(f"window: expected a display, got none (DISPLAY is not set): {_INSTEAD}")
