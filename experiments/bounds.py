@@ -17,7 +17,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.tasks.elevation import ERROR_SCALE, Elevation
+from ..agents.pid import SHARES
+from ..envs.tasks.elevation import ERROR_SCALE, ElevationOptions
 from ..models.vehicle import Vehicle
 
 __all__ = ["bang_bang", "elevation_bounds", "elevation_reward"]
@@ -27,16 +28,18 @@ _HALVINGS: Final = 24
 Floats = npt.NDArray[np.float64]
 
 
-def elevation_bounds(task: Elevation, starts: Floats) -> dict[str, float]:
+def elevation_bounds(
+    options: ElevationOptions, vehicle: Vehicle, starts: Floats
+) -> dict[str, float]:
     """Mean returns of the two flights over episodes, by name.
 
     Args:
-        task: With its options and vehicle.
+        options: Of `rotorgram/Elevation-v0`.
+        vehicle: What flies.
         starts: E at the start of each episode, m, shape (n,).
     """
-    options, vehicle = task.options, task.vehicle
     steps, period = options.episode_length, options.control_period
-    up, down, change = _limits(options, vehicle, task.controller)
+    up, down, change = _limits(options, vehicle)
     rising = starts > 0
     left = bang_bang(
         np.abs(starts),
@@ -54,13 +57,12 @@ def elevation_bounds(task: Elevation, starts: Floats) -> dict[str, float]:
     }
 
 
-def _limits(options: Any, vehicle: Vehicle, controller: Any) -> tuple[float, float, float]:
+def _limits(options: ElevationOptions, vehicle: Vehicle) -> tuple[float, float, float]:
     """Largest accelerations up and down, m/s², and the largest change of one in a control step."""
-    rotors, mass = len(vehicle.rotors), vehicle.mass
-    hover = vehicle.gravity
-    up = float(vehicle.thrust_high.sum()) / mass - hover
-    down = hover - float(vehicle.thrust_low.sum()) / mass
-    scale = rotors * float(controller.scale) / mass
+    up = float(vehicle.thrust_high.sum()) / vehicle.mass - vehicle.gravity
+    down = vehicle.gravity - float(vehicle.thrust_low.sum()) / vehicle.mass
+    newtons = options.thrust_scale or SHARES[options.action_mode] * float(vehicle.thrust_high.max())
+    scale = vehicle.num_rotors * newtons / vehicle.mass
     if options.action_mode == "increment":
         return up, down, scale
     return min(up, scale), min(down, scale), np.inf

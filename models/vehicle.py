@@ -166,6 +166,7 @@ def _load(cls: type[Vehicle], path: Path, drag: float, changed: int) -> Any:
     del changed  # a file that was written anew is another key
     try:
         spec = build_scene(path, visual=False)
+        spec.comment = ""
         text = spec.to_xml()
         model = spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:

@@ -82,12 +82,12 @@ def ready(vehicle: Vehicle, model: mujoco.MjModel, thrust: ArrayLike = 0.0) -> A
 
 
 def fly(model: mujoco.MjModel, data: Any, seconds: float) -> float:
-    """Step `data` for `seconds`, or the next whole number of steps; returns the time flown, s.
+    """Step `data` for `seconds`, as a whole number of steps; returns the time flown, s.
 
     Raises:
         InputError: MuJoCo warned of anything. It resets bad states silently otherwise.
     """
-    steps = left = round(seconds / model.opt.timestep)
+    steps = left = max(1, round(seconds / model.opt.timestep))
     while left > 0:
         mujoco.mj_step(model, data, nstep=min(left, _STEPS_AT_ONCE))
         left -= _STEPS_AT_ONCE

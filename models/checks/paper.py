@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from ..constants import GRAVITY, MASS, MAX_THRUST, NUM_ROTORS, SIDE
+from ..errors import InputError
 from ..vehicle import Vehicle
 from ._measure import HEIGHT, RigidBody, fly, forces, ready
 from .examination import SPIN, TRUNCATION, Check
@@ -55,7 +56,15 @@ def closed_form_inertia() -> tuple[float, float]:
 
 
 def examine_paper(vehicle: Vehicle, body: RigidBody) -> Iterator[Check]:
-    """The additional checks: with air and drag, if there are any, for the paper has none."""
+    """The additional checks: with air and drag, if there are any, for the paper has none.
+
+    Raises:
+        InputError: It has another number of rotors.
+    """
+    if vehicle.num_rotors != NUM_ROTORS:
+        raise InputError(
+            f"vehicle: expected the {NUM_ROTORS} rotors of the paper, got {vehicle.num_rotors}"
+        )
     yield from _numbers(vehicle, body)
     yield from _rotors(vehicle, body)
     yield from _flights(vehicle)
@@ -64,7 +73,7 @@ def examine_paper(vehicle: Vehicle, body: RigidBody) -> Iterator[Check]:
 
 
 def _numbers(vehicle: Vehicle, body: RigidBody) -> Iterator[Check]:
-    """Mass, inertia and height of rest."""
+    """Mass, inertia, centre of mass and height of rest."""
     yield Check(
         name="mass of the paper", expected=MASS, measured=body.mass, unit="kg", source=_PAPER
     )
@@ -80,6 +89,12 @@ def _numbers(vehicle: Vehicle, body: RigidBody) -> Iterator[Check]:
         yield Check(
             name=name, expected=expected, measured=float(value), unit="kg·m²", source=_GEOMETRY
         )
+    yield Check(
+        name="centre of mass off the geometrical centre",
+        measured=float(np.linalg.norm(body.center_of_mass)),
+        unit="m",
+        source=_PAPER,
+    )
     yield Check(
         name="height of rest",
         expected=_REST_HEIGHT,
