@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 from types import UnionType
 from typing import (
@@ -167,7 +168,7 @@ def _given(words: Sequence[str]) -> frozenset[str]:
 def _value(words: Sequence[str], flag: str) -> str | None:
     """The last value of a flag, `--flag VALUE` or `--flag=VALUE`; None where it is not set."""
     found = None
-    for word, following in zip(words, [*words[1:], ""], strict=True):
+    for word, following in zip_longest(words, words[1:], fillvalue=""):
         name, equals, value = word.partition("=")
         if name == flag:
             found = value if equals else following
