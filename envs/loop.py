@@ -253,7 +253,8 @@ class Loop:
             for name, shape, dtype in self._dtypes
         }
         self._outcome = outcome = task.outcome(state)
-        ended, total = outcome.terminated, 0.0
+        ended: Array = outcome.terminated
+        total: Array = 0.0
         late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b
         for term in outcome.reward.values():
             total = total + term

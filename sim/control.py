@@ -46,8 +46,11 @@ class CollectiveThrust:
     def __init__(
         self, vehicle: Vehicle, newtons: float, *, increment: bool, discrete: bool = False
     ) -> None:
-        self.low, self.high = (-1.0,), (1.0,)
-        self.components = ("decrease", "hold", "increase") if discrete else ("collective",)
+        self.low: tuple[float, ...] = (-1.0,)
+        self.high: tuple[float, ...] = (1.0,)
+        self.components: tuple[str, ...] = (
+            ("decrease", "hold", "increase") if discrete else ("collective",)
+        )
         self.choices = 3 if discrete else 0
         hover, low, high = vehicle.hover_thrust, vehicle.thrust_low, vehicle.thrust_high
         alike = all((values == values[0]).all() for values in (hover, low, high))

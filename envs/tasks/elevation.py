@@ -210,7 +210,8 @@ class Elevation(Task):
         then for one period more: sqrt((a T / 2)² + 2 a · 2 flight_band) + a T.
         """
         a, period = self.vehicle.max_acceleration, self.options.control_period
-        return math.hypot(a * period / 2, math.sqrt(4 * a * self.options.flight_band)) + a * period
+        out = math.sqrt(4 * a * self.options.flight_band)
+        return float(math.hypot(a * period / 2, out) + a * period)
 
     @property
     def error_bound(self) -> float:
