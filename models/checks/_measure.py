@@ -62,7 +62,8 @@ class RigidBody:
 
     def velocity(self, data: Any) -> Array:
         """Of the centre of mass, world frame, (3,), m/s."""
-        return data.qvel[:3] + _turned(data, np.cross(data.qvel[3:], self.center_of_mass))
+        turning = np.cross(data.qvel[3:], self.center_of_mass)
+        return np.array(data.qvel[:3]) + _turned(data, turning)
 
 
 def in_vacuum(vehicle: Vehicle) -> mujoco.MjModel:
@@ -105,7 +106,7 @@ def rigid_body(vehicle: Vehicle, model: mujoco.MjModel) -> RigidBody:
     for wrench in np.eye(6):
         data.qfrc_applied[:] = wrench
         answers.append(_acceleration(model, data) - rest)
-    return RigidBody(np.linalg.inv(np.array(answers).T))
+    return RigidBody(np.asarray(np.linalg.inv(np.array(answers).T), np.float64))
 
 
 def forces(
