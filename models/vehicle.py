@@ -83,7 +83,7 @@ class Vehicle:
     """Height of the body's origin when it touches level ground, m."""
 
     @classmethod
-    def load(cls, path: Path | str | None = None, *, linear_drag: float = 0.0) -> Self:
+    def load(cls, path: Path | str | None = None, *, linear_drag: float = 0.0) -> "Vehicle":
         """The vehicle of an MJCF file; None is the paper's.
 
         The same path and drag give the same object until the file changes.
@@ -106,8 +106,7 @@ class Vehicle:
             changed = file.stat().st_mtime_ns
         except OSError as error:
             raise InputError(f"vehicle: cannot read {path}: {error.strerror}") from None
-        vehicle: Self = _load(cls, file, drag, changed)
-        return vehicle
+        return _load(file, drag, changed)
 
     @property
     def num_rotors(self) -> int:
@@ -162,10 +161,11 @@ def _again(path: str, drag: float) -> Vehicle:
 
 
 @lru_cache(maxsize=32)
-def _load(cls: type[Vehicle], path: Path, drag: float, changed: int) -> Any:
+def _load(path: Path, drag: float, changed: int) -> Vehicle:
     del changed  # a file that was written anew is another key
     try:
         spec = build_scene(path, visual=False)
+        spec.comment = ""
         text = spec.to_xml()
         model = spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
@@ -192,7 +192,7 @@ def _load(cls: type[Vehicle], path: Path, drag: float, changed: int) -> Any:
     rotors = tuple(_rotor(model, data, i, body) for i in range(model.nu))
     allocation = _allocation(rotors, center)
     model.dof_damping[0:3] = drag * mass
-    return cls(
+    return Vehicle(
         path=path,
         name=str(spec.modelname),
         hash=_hash(spec, text, path, drag),

@@ -1,6 +1,7 @@
 """The paper's frame against signs worked out by hand and against rotation matrices."""
 
 import math
+import timeit
 
 import numpy as np
 import pytest
@@ -177,3 +178,12 @@ def test_any_leading_axes_and_any_memory(shape: tuple[int, ...]) -> None:
 
 def test_nan_stays_nan_and_is_no_warning() -> None:
     assert np.isnan(attitudes_in_paper_frame([[np.nan] * 4, [1.0, 0.0, 0.0, 0.0]])[0]).all()
+
+
+def test_tilted_craft_are_not_converted_one_by_one() -> None:
+    quaternions = attitudes(1024)
+
+    def seconds(rows: np.ndarray) -> float:
+        return min(timeit.repeat(lambda: attitudes_in_paper_frame(rows), number=10, repeat=20))
+
+    assert seconds(quaternions) < 100 * seconds(quaternions[:1])
