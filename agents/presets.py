@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
+from ..models.errors import InputError
+
 __all__ = ["PRESETS", "A2CConfig", "AlgorithmName", "PresetName", "VPGConfig", "preset"]
 
 AlgorithmName = Literal["vpg", "a2c", "sb3-a2c"]
@@ -38,9 +40,9 @@ class VPGConfig:
         _check(self, counts=("hidden", "episodes_per_update"), shares=("gamma",),
                flags=("anneal", "normalize"))  # fmt: skip
         if self.baseline not in ("none", "time"):
-            raise ValueError(f"baseline: expected 'none' or 'time', got {self.baseline!r}")
+            raise InputError(f"baseline: expected 'none' or 'time', got {self.baseline!r}")
         if self.baseline == "time" and self.episodes_per_update < 2:
-            raise ValueError(
+            raise InputError(
                 "episodes_per_update: expected 2 or more with baseline 'time', where a single "
                 f"episode is its own mean, got {self.episodes_per_update}"
             )
@@ -63,21 +65,21 @@ class A2CConfig:
     """Discount. The paper names none."""
     steps_per_update: int = 1
     """Env steps between updates (paper: one), of all drones together."""
-    trace: float = 0.0
+    gae_lambda: float = 0.0
     """Lambda of generalised advantage estimation; 0 is the paper's Equation 3."""
     normalize: bool = False
     """Shift and scale the advantages of an update to mean 0 and standard deviation 1."""
-    value_weight: float = 0.5
+    vf_coef: float = 0.5
     """Weight of the squared error of the value."""
-    entropy_weight: float = 0.0
+    ent_coef: float = 0.0
     """Weight of the policy's entropy."""
     log_std: float = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""
 
     def __post_init__(self) -> None:
-        _check(self, counts=("hidden", "steps_per_update"), shares=("gamma", "trace"),
+        _check(self, counts=("hidden", "steps_per_update"), shares=("gamma", "gae_lambda"),
                flags=("anneal", "normalize"))  # fmt: skip
-        for name in ("value_weight", "entropy_weight"):
+        for name in ("vf_coef", "ent_coef"):
             _expect(self, name, "a number, 0 or more", _is_number(getattr(self, name), 0.0))
 
     def rollout_size(self, drones: int) -> int:
@@ -106,7 +108,7 @@ def _is_number(value: Any, low: float, high: float = math.inf) -> bool:
 
 def _expect(config: Any, name: str, expected: str, ok: bool) -> None:
     if not ok:
-        raise ValueError(f"{name}: expected {expected}, got {getattr(config, name)!r}")
+        raise InputError(f"{name}: expected {expected}, got {getattr(config, name)!r}")
 
 
 PRESETS: Final[dict[str, dict[str, VPGConfig | A2CConfig]]] = {
@@ -128,7 +130,7 @@ PRESETS: Final[dict[str, dict[str, VPGConfig | A2CConfig]]] = {
             anneal=True,
             gamma=0.98,
             steps_per_update=256,
-            trace=0.98,
+            gae_lambda=0.98,
             normalize=True,
         ),
     },
@@ -141,13 +143,13 @@ def preset(algorithm: str, name: str, **changes: Any) -> VPGConfig | A2CConfig:
     """A preset, with some of its fields changed.
 
     Raises:
-        ValueError: No such algorithm, preset or field.
+        InputError: No such algorithm, preset or field.
     """
     if algorithm not in PRESETS:
-        raise ValueError(f"algorithm: expected one of {sorted(PRESETS)}, got {algorithm!r}")
+        raise InputError(f"algorithm: expected one of {sorted(PRESETS)}, got {algorithm!r}")
     if name not in PRESETS[algorithm]:
-        raise ValueError(f"preset: expected one of {sorted(PRESETS[algorithm])}, got {name!r}")
+        raise InputError(f"preset: expected one of {sorted(PRESETS[algorithm])}, got {name!r}")
     base = PRESETS[algorithm][name]
     if unknown := sorted(set(changes) - set(vars(base))):
-        raise ValueError(f"hyperparameters: expected some of {sorted(vars(base))}, got {unknown}")
+        raise InputError(f"hyperparameters: expected some of {sorted(vars(base))}, got {unknown}")
     return replace(base, **changes)
