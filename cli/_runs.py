@@ -102,7 +102,7 @@ def report_comparison(folder: Path, *, film: bool = True) -> None:
 
 def _film(folder: Path) -> bool:
     """Whether there is a film of the agents for the report."""
-    from ..experiments.comparison_film import film_comparison
+    from ..experiments.filming import film_comparison
     from ..experiments.report import VIDEO_FILE
     from ..models.errors import InputError
     from ._progress import bars
