@@ -105,9 +105,9 @@ def _run(words: list[str]) -> int:
     from ..rendering.gl import tolerate_gl_setting
     from ._flags import parse
 
+    tolerate_gl_setting()  # MuJoCo raises at import, in commands that draw nothing too
     with _wide_enough():
         command = parse(_class_of(name), f"rotorgram {name}", words[1:])
-    tolerate_gl_setting()  # MuJoCo raises at import, in commands that draw nothing too
     return command.run()
 
 
