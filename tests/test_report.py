@@ -224,7 +224,7 @@ def test_cells_are_honest_about_what_is_missing():
     assert row[3] == ("–", ("0 of 10 settled",))
     assert row[6].details == ()
     (bound,) = result_rows(results_of(seeds=0, **{"return": 234.4}))
-    assert [cell.value for cell in bound] == ["SB3 A2C", *"––––", "234", *"––"]
+    assert [cell.value for cell in bound] == ["sb3-a2c", *"––––", "234", *"––"]
 
 
 def test_headings_and_note_name_the_metric_and_its_unit():

@@ -261,7 +261,7 @@ def test_the_page_tells_what_was_asked_for_and_where_it_ran(page: str, folder: P
     text = html.unescape(page)
     for words in ("0" * 32, "rotorgram report FOLDER", "rotorgram compare --resume FOLDER"):
         assert words in text
-    assert text.count('<span class="badge') == 4
+    assert text.count('<span class="badge') == 5
     for name in ("config.json", "results.csv", *(f"figures/{name}" for name in FIGURE_FILES)):
         assert (folder / name).is_file()
         assert f"<code>{name}</code>" in text
