@@ -79,7 +79,7 @@ class LocalVectorEnv(AdvancingVectorEnv):
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
         self._on_device = not isinstance(loop.done, np.ndarray)
-        self._nobody = self.lost = loop.done
+        self._nobody = self.lost = self.done = loop.done
         self._episodes = np.zeros(num_envs, int)
         self._painter: Painter | None = None
         self.closed = False

@@ -64,7 +64,7 @@ class Pose:
 def clip(array: Array, low: Any, high: Any) -> Array:
     """The nearest numbers within bounds: numbers, or arrays of the same kind."""
     if isinstance(array, float):  # a single drone's number, NumPy's among them
-        return low if array < low else high if array > high else array
+        return np.float64(low) if array < low else np.float64(high) if array > high else array
     if isinstance(array, np.ndarray):
         return np.minimum(np.maximum(array, low), high)  # a third of the time of NumPy's clip
     return array.clip(low, high)
