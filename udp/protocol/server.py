@@ -123,7 +123,7 @@ class Server:
     Args:
         accept: Looks at a Hello and gives the layout of its messages, or the reason to refuse it.
         text_layout: A text simulator says no Hello: its first line opens the session, and this
-            says how to read it. None: text is not flown.
+            gives the layout to read it by. None, or a result of None: text is not flown.
         slots: Simulators to fly at the same time. Others wait until a slot is free.
         keys: Shared with the simulators, any of them. Then nothing unsealed is taken.
         max_datagram: As `LinkConfig.max_datagram`.
@@ -138,7 +138,7 @@ class Server:
     def __init__(
         self,
         accept: Callable[[Hello], Layout | str],
-        text_layout: Layout | None,
+        text_layout: Callable[[], Layout | None] | None = None,
         *,
         slots: int = 1,
         keys: Sequence[Key] = (),
@@ -151,7 +151,7 @@ class Server:
         self.takes_text = text_layout is not None
         self.statistics = Statistics()
         self._accept = accept
-        self._text_layout = text_layout
+        self._text_layout = text_layout or (lambda: None)
         self._keys = {key.id: key for key in keys}
         self._max_datagram = max_datagram
         self._tap = tap
@@ -174,8 +174,8 @@ class Server:
         session = self.slots[slot] if slot >= 0 else None
         arrival = _Arrival(datagram, address, now)
         try:
-            if text.is_text(datagram) and not self._keys and self._text_layout is not None:
-                return self._receive_text(slot, session, arrival)
+            if text.is_text(datagram) and not self._keys and (layout := self._text_layout()):
+                return self._receive_text(slot, session, layout, arrival)
             plain, key = (
                 (datagram, None)
                 if not (self._keys or is_sealed(datagram))
@@ -476,10 +476,11 @@ class Server:
 
     # ---- text
 
-    def _receive_text(self, slot: int, session: Session | None, arrival: _Arrival) -> Event | None:
-        assert self._text_layout is not None
+    def _receive_text(
+        self, slot: int, session: Session | None, layout: Layout, arrival: _Arrival
+    ) -> Event | None:
         datagram, address, now = arrival
-        message = text.decode_state(datagram, self._text_layout)
+        message = text.decode_state(datagram, layout)
         if session and session.is_text:
             event = self._receive_known(slot, session, message, b"", arrival)
             if event and isinstance(message, State):
@@ -499,7 +500,7 @@ class Server:
         elif None not in self.slots:
             reason = "every slot is taken"
         else:
-            joining = Session(address, 0, self._text_layout, None, last=datagram)
+            joining = Session(address, 0, layout, None, last=datagram)
             return self._seat(joining, message, b"")
         line = text.encode(Close(session=0, sequence=message.sequence, reason=""))
         self._put([line], address, None)
@@ -606,9 +607,9 @@ class Server:
             trusted = under_seal and not isinstance(error, KeyMismatch)
             key = self._keys.get(key_id(datagram)) if trusted else None
             self._refuse(number, str(error), address, size, key)
-        elif isinstance(error, KeyMismatch) and text.is_text(datagram) and self._text_layout:
+        elif text.is_text(datagram) and (layout := self._text_layout()) and self._keys:
             with suppress(DecodeError):
-                line = text.decode_state(datagram, self._text_layout)
+                line = text.decode_state(datagram, layout)
                 if isinstance(line, State):  # two agents would answer each other's Closes for ever
                     close = Close(session=0, sequence=line.sequence, reason="")
                     self._put([text.encode(close)], address, None)
