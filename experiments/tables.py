@@ -1,6 +1,7 @@
 """The table of results: in words, for the terminal and as Markdown."""
 
 import math
+import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -100,7 +101,7 @@ def terminal_table(table: "pd.DataFrame", headline: Headline) -> Table:
 
 def _terminal_cell(cell: Cell) -> Text:
     # Text, not markup: an agent's name may hold brackets. The last words would cost the width.
-    details = (detail.removesuffix(" settled") for detail in cell.details)
+    details = (re.sub(r"( of \d+) (settled|seeds?)$", r"\1", one) for one in cell.details)
     return Text("\n".join((cell.value, *details)))
 
 

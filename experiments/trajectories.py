@@ -198,9 +198,7 @@ def _fly_batch(
         if isinstance(spec.action, Discrete)
         else np.zeros((count, *spec.action.shape), np.float32)
     )
-    starts = np.zeros(count, np.uint64)
-    starts[: len(seeds)] = list(seeds.values())
-    env.advance(actions, np.ones(count, bool), starts)
+    env.reset(seed=[*seeds.values(), *[0] * (count - len(seeds))])
     rows, rewards = [_copied(env.telemetry)], []
     lengths, terminated = np.zeros(count, int), np.zeros(count, bool)
     done, lost = np.arange(count) >= len(seeds), env.lost.copy()
@@ -349,15 +347,14 @@ class _Reader:
     def _take_state(self, state: Any, command: Any) -> None:
         drone = self._drone
         begins = command is None or bool(command.resets[drone])
-        if command is not None and command.frozen is not None and command.frozen[drone]:
+        if command is not None and command.frozen[drone]:
             return
         if begins:
             self._keep("cut off")
         elif not self._rows:  # stepped after its end: no episode
             return
-        self._rows.append(
-            {name: np.array(array[drone], np.float64) for name, array in state.telemetry.items()}
-        )
+        named = zip(self._spec.telemetry, state.telemetry, strict=True)
+        self._rows.append({array.name: np.array(told[drone], np.float64) for array, told in named})
         if not begins:
             self._rewards.append(float(state.rewards[drone]))
             if state.terminated[drone] or state.truncated[drone]:
