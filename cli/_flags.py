@@ -13,6 +13,7 @@ from typing import (
     Literal,
     TypeVar,
     Union,
+    cast,
     get_args,
     get_origin,
     get_type_hints,
@@ -61,7 +62,7 @@ class EnvFlags(Command):
     env: str = DEFAULT_ENV
     """Task by its id, or module:Name-v0 for one that a module of the working directory registers.
     Its options are flags --env.NAME."""
-    vehicle: Path | None = None
+    vehicle: Annotated[str | None, arg(metavar="FILE.xml")] = None
     """MJCF file of a multirotor. Default: the paper's quadcopter."""
     options: Suppress[Fixed[dict]] = field(default_factory=dict)  # type: ignore[type-arg]
     """Options of the task. A checkpoint brings those that it was trained with."""
@@ -92,14 +93,15 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     """
     given = _given(words)
     if not issubclass(kind, EnvFlags):
-        return replace(tyro.cli(_for_tyro(kind), prog=prog, args=words), given=given)
+        plain: C = tyro.cli(_for_tyro(kind), prog=prog, args=words)
+        return replace(plain, given=given)
     env_id = _value(words, "--env") or DEFAULT_ENV
     from ..envs import registry
 
     if _listens(kind, given) and ":" not in env_id and not registry.is_known(env_id):
         words, required = _without_requirements(words)
         command = tyro.cli(_for_tyro(kind), prog=prog, args=words)
-        return replace(command, given=given, options=required)
+        return cast(C, replace(command, given=given, options=required))
     env_id = registry.load(env_id)
     options_type = registry.options_type(env_id)
     # Wrong values are refused by the options themselves, below, as every other wrong input.
@@ -116,8 +118,8 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     names = sorted(name.removeprefix("env.") for name in given if name.startswith("env."))
     options = {name: getattr(command.options, name) for name in names}
     checked = options_type.from_options(options)
-    plain = json.loads(json.dumps({name: getattr(checked, name) for name in names}))
-    return replace(command, given=given, env=env_id, options=plain)
+    chosen = json.loads(json.dumps({name: getattr(checked, name) for name in names}))
+    return cast(C, replace(command, given=given, env=env_id, options=chosen))
 
 
 def _for_tyro(kind: type[Any], **namespace: Any) -> type[Any]:

@@ -17,8 +17,9 @@ from ._inputs import folder_to_write
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from ..experiments.metrics import Headline
     from ..experiments.progress import OnProgress
-    from ..experiments.sweep import SweepConfig
+    from ..experiments.settings import SweepConfig
 
 __all__ = [
     "RESUMED",
@@ -30,8 +31,9 @@ __all__ = [
 ]
 
 _WORKERS: Final = ("jobs", "backend", "address")
-RESUMED: Final = (*_WORKERS, "vehicle")
-"""Flags that a resumed command may be given: they change no number, or are checked elsewhere."""
+RESUMED: Final = (*_WORKERS, "resume", "env")
+"""Flags that a resumed command may be given: they change no number. `--env` imports the module of a
+task."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +102,7 @@ def report_comparison(folder: Path, *, film: bool = True) -> None:
 
 def _film(folder: Path) -> bool:
     """Whether there is a film of the agents for the report."""
-    from ..experiments.comparison_film import film_comparison
+    from ..experiments.filming import film_comparison
     from ..experiments.report import VIDEO_FILE
     from ..models.errors import InputError
     from ._progress import bars
@@ -121,32 +123,36 @@ def report_sweep(folder: Path) -> None:
     """Write `sweep.csv` from the folder's files, and print it."""
     from rich.console import Console
 
+    from ..experiments.metrics import Headline
+    from ..experiments.results import read_config, read_spec
     from ..experiments.sweep import SWEEP_FILE, read_sweep_config, write_sweep_table
 
     config = read_sweep_config(folder)
+    headline = Headline.of(read_spec(folder, read_config(folder)))
     results = write_sweep_table(config, folder)
-    Console(width=100).print(_sweep_table(results, config))
+    Console(width=100).print(_sweep_table(results, config, headline))
     print(f"{results['seeds'].sum()} of {len(config.runs())} runs done")
     print(f"table: {folder / SWEEP_FILE}")
 
 
-def _sweep_table(results: Any, config: "SweepConfig") -> "Table":
+def _sweep_table(results: Any, config: "SweepConfig", headline: "Headline") -> "Table":
     from rich import box
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD)
     for name in config.grid:
         table.add_column(name.replace("_", "\n"), overflow="fold")
+    steady = headline.labelled(f"Steady {headline.size_symbol},\nworst")
     for heading in (
-        "Steady |E|,\nworst (m)", "median\n(m)", "Return,\nmedian", "Settled", "Crashed",
-        "Seeds", "Training\n(s)", "Env\nsteps/s",
+        steady, "median", "Return,\nmedian", "Settled", "Crashed", "Seeds", "Training\n(s)",
+        "Env\nsteps/s",
     ):  # fmt: skip
         table.add_column(heading, justify="right")
     for row in results.to_dict("records"):
         table.add_row(
             *(str(row[name]) for name in config.grid),
-            f"{row['worst_error']:.3g}",
-            f"{row['median_error']:.3g}",
+            f"{row['worst']:.3g}",
+            f"{row['median']:.3g}",
             f"{row['return']:.0f}",
             f"{row['settled']} of {row['episodes']}",
             str(row["crashed"]),

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ..models.errors import InputError
+from ..models.errors import InputError, require
 from ._flags import AlgorithmName, PresetName
 from ._inputs import refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_comparison, runs_folder
@@ -42,12 +42,15 @@ class Compare(RunsFlags):
 
     def run(self) -> int:
         """Compare, report, print the table."""
-        from ..experiments.compare import CompareConfig, compare, is_finished, read_compare_config
+        for module in ("matplotlib", "jinja2"):  # before hours of training
+            require(module, "report", "a comparison's report")
+        from ..experiments.compare import PARTS, compare, read_compare_config
+        from ..experiments.settings import CompareConfig
 
         if self.resume:
-            refuse_settings(self, self.resume, free=("resume", "film", *RESUMED))
+            refuse_settings(self, self.resume, free=("film", *RESUMED))
             config = replace(read_compare_config(self.resume), **self.workers())
-            if is_finished(self.resume):
+            if not (self.resume / PARTS).is_dir():
                 raise InputError(
                     f"resume: expected an interrupted comparison, {self.resume} is finished; "
                     f"draw its report with: rotorgram report {self.resume}"

@@ -19,7 +19,7 @@ class Key(Command):
 
     def run(self) -> int:
         """Write it."""
-        from ..udp.transport.keys import write_key
+        from ..udp.protocol.auth import write_key
 
         write_key(self.file)
         print(f"key: {self.file} (give it to both sides with --key-file)")

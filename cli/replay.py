@@ -21,12 +21,13 @@ class Replay(Command):
     env: str | None = None
     """module:Name-v0 to import a module of the working directory that registers the journal's
     task. What a journal names is never imported."""
-    vehicle: Path | None = None
+    vehicle: str | None = None
     """MJCF file that was flown. Default: the paper's quadcopter."""
 
     def run(self) -> int:
         """Print the summary and the verdict."""
-        from ..udp.journal.replay import summarize, verify
+        from ..udp.journal.reader import summarize
+        from ..udp.journal.replay import verify
 
         print(summarize(self.file))
         if not self.verify:

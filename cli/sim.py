@@ -71,7 +71,7 @@ class Sim(EnvFlags):
             try:
                 print(simulator.run())
             finally:
-                print(f"wire: {simulator.statistics}", flush=True)
+                print(f"wire: {simulator.link.statistics}", flush=True)
         return 0
 
     def _watched(self, simulator: "Simulator") -> AbstractContextManager[None]:

@@ -50,7 +50,8 @@ class Sweep(RunsFlags):
     def run(self) -> int:
         """Sweep, and print the table."""
         from ..experiments.errors import RunsFailed
-        from ..experiments.sweep import SweepConfig, sweep
+        from ..experiments.settings import SweepConfig
+        from ..experiments.sweep import sweep
 
         if self.resume:
             config = self._resumed(self.resume)
@@ -88,7 +89,7 @@ class Sweep(RunsFlags):
                 f"resume: expected a sweep of {self.algorithm}, "
                 f"{folder} holds one of {config.algorithm}"
             )
-        refuse_settings(self, folder, free=("resume", *RESUMED))
+        refuse_settings(self, folder, free=RESUMED)
         if not missing_runs(config, read_sweep_runs(folder, config)):
             raise InputError(
                 f"resume: expected an interrupted sweep, {folder} is finished; "

@@ -85,7 +85,7 @@ class Train(AgentFlags):
             config=preset(self.algorithm, self.preset, **changes),
             env_id=env_id,
             options=options,
-            vehicle=None if self.vehicle is None else str(self.vehicle),
+            vehicle=self.vehicle,
             seed=self.seed,
             env_steps=self.env_steps,
             num_envs=self.num_envs,
@@ -266,7 +266,7 @@ def _write_config(training: "Training", folder: Path) -> None:
 
     content = {
         **asdict(training.run),
-        "vehicle_hash": training.env.env_spec.vehicle_hash,
+        "vehicle_hash": training.log.spec.vehicle_hash,
         "versions": software_versions(),
     }
     write_whole(folder / "config.json", (json.dumps(content, indent=2) + "\n").encode())

@@ -15,7 +15,6 @@ from ._inputs import check_count
 
 if TYPE_CHECKING:
     from ..experiments.trajectories import Trajectory
-    from ..rendering.moment import Moment
 
 __all__ = ["View"]
 
@@ -42,6 +41,7 @@ class View(EnvFlags):
 
     def run(self) -> int:
         """Fly and show, episode after episode."""
+        from ..experiments.filming import moments
         from ..rendering.live import LiveView, open_surface
         from ..rendering.pace import Pace
         from ..rendering.stage import Stage
@@ -58,7 +58,7 @@ class View(EnvFlags):
             while live.is_running and not live.is_watched:
                 time.sleep(0.02)
             for trajectory in chain((first,), trajectories):
-                if not all(live.draw_in_time(moment) for moment in _moments(trajectory)):
+                if not all(live.draw_in_time(moment) for moment in moments(trajectory)):
                     break
                 print(f"episode {trajectory.episode}: {words_of(trajectory)}", flush=True)
             while live.is_running and not live.wants:  # the last picture is still to come
@@ -82,13 +82,3 @@ class View(EnvFlags):
         env = chosen_env(self, checkpoint)
         for episode in count():
             yield from flown_trajectories(policy, *env, [episode], vehicle=self.vehicle)
-
-
-def _moments(trajectory: "Trajectory") -> "Iterator[Moment]":
-    """What pictures show of each control step."""
-    from ..rendering.moment import Moment
-
-    metrics = [(metric.name, metric.unit, metric.symbol) for metric in trajectory.spec.metrics]
-    for step, reward in enumerate([0.0, *trajectory.rewards.tolist()]):
-        telemetry = {name: array[step] for name, array in trajectory.telemetry.items()}
-        yield Moment.of(telemetry, metrics, reward=reward, step=step, episode=trajectory.episode)

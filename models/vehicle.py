@@ -26,6 +26,8 @@ __all__ = ["Rotor", "Vehicle"]
 
 LEAST_TIMESTEP: Final = 1e-5
 """Smallest physics step, s: a control step of 0.02 s then takes a hundredth of a second."""
+MOST_HEIGHT: Final = 1e4
+"""Height above which no craft may touch anything, m."""
 MOST_DRAG: Final = 100.0
 """Largest linear drag, 1/s. RK4 at 10 ms is within 0.1 % there, and unstable above 278 /s."""
 
@@ -300,13 +302,21 @@ def _inertia(model: mujoco.MjModel, data: Any, body: int) -> np.ndarray:
 
 
 def _rest_height(model: mujoco.MjModel, data: Any) -> float:
-    """Height at which the level body first touches anything, by bisection; 0 if it never does."""
+    """Height at which the level body first touches anything, by bisection; 0 if it never does.
+
+    Raises `InputError` if it touches something at any height, like a wall.
+    """
     high = max(float(model.stat.extent), 1e-3)
     low = 0.0
     if not _touches(model, data, low):
         return 0.0
     while _touches(model, data, high):
         high *= 2
+        if high > MOST_HEIGHT:
+            raise InputError(
+                f"vehicle: expected a craft that is free above the ground, "
+                f"got one that touches something at {high:.0f} m"
+            )
     while high - low > 1e-10 * high:
         middle = (low + high) / 2
         if _touches(model, data, middle):

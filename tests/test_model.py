@@ -262,6 +262,7 @@ def test_a_file_that_was_written_anew_is_loaded_anew(tmp_path: Path) -> None:
 # --- what is no vehicle ---------------------------------------------------------------------------
 
 FREE = '<freejoint name="free"/>'
+WALL = '<worldbody><geom type="plane" size="1 1 1"/><geom type="plane" size="1 1 1" zaxis="1 0 0"/>'
 SECOND = '<body pos="3 0 0"><freejoint/><geom size="0.1" mass="1"/></body></worldbody>'
 ROTOR1 = '<motor name="rotor1" class="quad" site="rotor1" gear="0 0 1 0 0  0.05"/>'
 HEIGHTS = '<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>'
@@ -285,6 +286,7 @@ HEIGHTS = '<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>
         ('ctrlrange="0 100"', 'ctrlrange="0 40"', r"49 N, within its limits, got 0 to 40 N"),
         ('gravity="0 0 -9.8"', 'gravity="0 1 -9.8"', "gravity along -z, got 20 kg and"),
         ('gravity="0 0 -9.8"', 'gravity="0 0 0"', "gravity along -z, got 20 kg and"),
+        ("<worldbody>", WALL, "free above the ground, got one that touches something at .* m"),
         ('timestep="0.01"', 'timestep="1e-8"', "physics step of at least .* s, got 1e-08"),
         ('mass="', 'mass="0" user="', "expected an MJCF file, got quad.xml: .*mass"),
         ("</asset>", HEIGHTS, "height field of at most 4096 × 4096 points, got 100000 × 100000"),

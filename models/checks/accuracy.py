@@ -12,7 +12,7 @@ import csv
 import sys
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -42,7 +42,7 @@ _SECONDS: Final = 5.0
 _REPEATS: Final = 5  # the same flight; only the time it takes differs, and the least counts
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Accuracy:
     """One integrator at one step."""
 
@@ -60,6 +60,9 @@ class Accuracy:
     """Wall time of a simulated second of tumbling flight, µs: the machine's, not the model's."""
 
 
+_COLUMNS: Final = [field.name for field in fields(Accuracy)]
+
+
 def accuracy(
     vehicle: Vehicle, integrators: Iterable[str] = INTEGRATORS, steps: Iterable[float] = STEPS
 ) -> list[Accuracy]:
@@ -69,17 +72,11 @@ def accuracy(
     for name in integrators:
         for step in steps:
             reached, cost = _tumble(vehicle, name, step, _REPEATS)
+            off = float(np.linalg.norm(reached[:3] - truth[:3]))
             apart = min(np.linalg.norm(reached[3:] - sign * truth[3:]) for sign in (1, -1))
-            rows.append(
-                Accuracy(
-                    integrator=name,
-                    step_ms=step * 1e3,
-                    position_m=float(np.linalg.norm(reached[:3] - truth[:3])),
-                    attitude_deg=float(np.degrees(4 * np.arcsin(apart / 2))),
-                    sinks_mm=_sinks(vehicle, name, step) * 1e3,
-                    cost_us=cost,
-                )
-            )
+            turned = float(np.degrees(4 * np.arcsin(apart / 2)))
+            sinks = _sinks(vehicle, name, step) * 1e3
+            rows.append(Accuracy(name, step * 1e3, off, turned, sinks, cost))
     return rows
 
 
@@ -102,21 +99,14 @@ def write(path: Path, rows: Sequence[Accuracy]) -> None:
     """Write the rows as CSV."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
-        table = csv.DictWriter(file, [field.name for field in fields(Accuracy)])
-        table.writeheader()
-        table.writerows(asdict(row) for row in rows)
+        csv.writer(file).writerows([_COLUMNS, *map(astuple, rows)])
 
 
 def read(path: Path) -> list[Accuracy]:
     """The rows of a file that `write` wrote."""
     with path.open(newline="", encoding="utf-8") as file:
-        return [
-            Accuracy(
-                integrator=row.pop("integrator"),
-                **{name: float(value) for name, value in row.items()},
-            )
-            for row in csv.DictReader(file)
-        ]
+        _, *rows = csv.reader(file)
+    return [Accuracy(integrator, *map(float, numbers)) for integrator, *numbers in rows]
 
 
 def _start(vehicle: Vehicle, integrator: str, step: float, height: float) -> tuple[Any, Any]:

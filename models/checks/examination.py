@@ -10,7 +10,6 @@ Frames: world x, y, z with z up; body x forward, y left, z up. SI units and radi
 
 import copy
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final
 
 import mujoco
@@ -19,44 +18,27 @@ import numpy as np
 from .. import QUAD_XML
 from ..errors import InputError
 from ..vehicle import Vehicle
-from ._measure import HEIGHT, RigidBody, fly, forces, in_vacuum, ready, rigid_body
+from ._measure import (
+    DRAG,
+    EXACT,
+    HEIGHT,
+    SPIN,
+    TRUNCATION,
+    Check,
+    RigidBody,
+    fly,
+    forces,
+    in_vacuum,
+    ready,
+    rigid_body,
+)
+from .paper import examine_paper
 
-__all__ = ["EXACT", "SPIN", "TRUNCATION", "Check", "examine"]
+__all__ = ["examine"]
 
-EXACT: Final = 1e-9
-"""Tolerance where the integrator is exact: it leaves room for rounding over a flight, no more."""
-
-TRUNCATION: Final = 1e-6
-"""Tolerance for tumbling flight, where RK4 truncates: 4e-7 rad/s in ten seconds at 10 ms for the
-paper's vehicle. MuJoCo's Euler misses by 1 rad/s."""
-
-SPIN: Final = (1.0, 2.0, 3.0)
-"""Body rates with which tumbling begins, rad/s: about no axis of symmetry."""
 _LEAST_TIMESTEP: Final = 1e-4  # s: 20 s of flights take seconds
 _MODEL: Final = "compiled model"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Check:
-    """One line of the examination."""
-
-    name: str
-    """What was measured."""
-    measured: float
-    """The value that the simulation gave."""
-    expected: float = 0.0
-    """The value worked out beforehand."""
-    tolerance: float = EXACT
-    """Largest difference that passes."""
-    unit: str = ""
-    """Unit of the three numbers; empty for pure numbers."""
-    source: str = "rigid-body mechanics"
-    """Where the expected value comes from."""
-
-    @property
-    def passed(self) -> bool:
-        """Whether measured and expected agree; NaN never does."""
-        return abs(self.measured - self.expected) <= self.tolerance
+_MECHANICS: Final = "rigid-body mechanics"
 
 
 def examine(vehicle: Vehicle, *, paper: bool | None = None) -> list[Check]:
@@ -87,35 +69,17 @@ def examine(vehicle: Vehicle, *, paper: bool | None = None) -> list[Check]:
         *_linear_drag(vehicle, model, body),
     ]
     if paper if paper is not None else vehicle.path == QUAD_XML.resolve():
-        from .paper import examine_paper
-
         checks += examine_paper(vehicle, body)
     return checks
 
 
 def _body(vehicle: Vehicle, body: RigidBody) -> Iterator[Check]:
     """Mass, centre of mass and inertia, from the answers to known forces and torques."""
-    yield Check(
-        name="mass",
-        expected=vehicle.mass,
-        measured=body.mass,
-        tolerance=EXACT * vehicle.mass,
-        unit="kg",
-        source=_MODEL,
-    )
-    yield Check(
-        name="centre of mass: difference",
-        measured=_size(body.center_of_mass - vehicle.center_of_mass),
-        unit="m",
-        source=_MODEL,
-    )
-    yield Check(
-        name="inertia: difference of the matrices",
-        measured=_size(body.inertia - vehicle.inertia),
-        tolerance=EXACT * _size(vehicle.inertia),
-        unit="kg·m²",
-        source=_MODEL,
-    )
+    yield Check("mass", vehicle.mass, body.mass, "kg", _MODEL, EXACT * vehicle.mass)
+    off = _size(body.center_of_mass - vehicle.center_of_mass)
+    yield Check("centre of mass: difference", 0.0, off, "m", _MODEL)
+    off, size = _size(body.inertia - vehicle.inertia), _size(vehicle.inertia)
+    yield Check("inertia: difference of the matrices", 0.0, off, "kg·m²", _MODEL, EXACT * size)
 
 
 def _rotors(vehicle: Vehicle, model: mujoco.MjModel, body: RigidBody) -> Iterator[Check]:
@@ -127,41 +91,28 @@ def _rotors(vehicle: Vehicle, model: mujoco.MjModel, body: RigidBody) -> Iterato
         one = np.where(np.arange(vehicle.num_rotors) == i, high, low)
         pushed = (forces(vehicle, model, body, one) - idle) / (rotor.high - rotor.low)
         columns.append(np.append(pushed[2], pushed[3:] - np.cross(body.center_of_mass, pushed[:3])))
-        yield Check(
-            name=f"{rotor.name}: difference of thrust and torques per newton",
-            measured=_size(columns[i] - vehicle.allocation[:, i]),
-            source=_MODEL,
-        )
-    vertical = vehicle.allocation[0]
-    limits = {"more than they have": (high + 50.0, high), "less": (low - 50.0, low)}
-    for name, (asked, given) in limits.items():
-        yield Check(
-            name=f"thrust of all when asked for {name}",
-            expected=float(vertical @ given),
-            measured=float(forces(vehicle, model, body, asked)[2]),
-            tolerance=EXACT * vehicle.mass * vehicle.gravity,
-            unit="N",
-            source=_MODEL,
-        )
-    yield Check(
-        name="rank of the allocation matrix",
-        expected=4.0,
-        measured=float(np.linalg.matrix_rank(np.array(columns), rtol=1e-6)),
-        tolerance=0.0,
-        source="six degrees of freedom, four of them to be had singly",
-    )
+        off = _size(columns[i] - vehicle.allocation[:, i])
+        name = f"{rotor.name}: difference of thrust and torques per newton"
+        yield Check(name, 0.0, off, "", _MODEL)
+    vertical, weight = vehicle.allocation[0], vehicle.mass * vehicle.gravity
+    for more_or_less, asked, given in (
+        ("more than they have", high + 50.0, high),
+        ("less", low - 50.0, low),
+    ):
+        name = f"thrust of all when asked for {more_or_less}"
+        measured = float(forces(vehicle, model, body, asked)[2])
+        yield Check(name, float(vertical @ given), measured, "N", _MODEL, EXACT * weight)
+    rank = float(np.linalg.matrix_rank(np.array(columns), rtol=1e-6))
+    source = "six degrees of freedom, four of them to be had singly"
+    yield Check("rank of the allocation matrix", 4.0, rank, "", source, 0.0)
 
 
 def _free_fall(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
     """Depth of a fall: g t² / 2. Semi-implicit Euler misses by g h t / 2."""
-    data = ready(vehicle, _unpowered(model))
-    seconds = fly(_unpowered(model), data, 2.0)
-    yield Check(
-        name="free fall in 2 s",
-        expected=vehicle.gravity * seconds**2 / 2,
-        measured=HEIGHT - float(data.qpos[2]),
-        unit="m",
-    )
+    model = _unpowered(model)
+    data = ready(vehicle, model)
+    depth = vehicle.gravity * fly(model, data, 2.0) ** 2 / 2
+    yield Check("free fall in 2 s", depth, HEIGHT - float(data.qpos[2]), "m", _MECHANICS)
 
 
 def _hover(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
@@ -170,13 +121,12 @@ def _hover(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
     mujoco.mj_forward(model, data)
     answer = np.array(data.qacc)
     fly(model, data, 5.0)
-    values = {
-        "acceleration": (answer[:3], "m/s²"),
-        "angular acceleration": (answer[3:], "rad/s²"),
-        "drift in 5 s": (data.qpos[:3] - (0.0, 0.0, HEIGHT), "m"),
-    }
-    for name, (value, unit) in values.items():
-        yield Check(name=f"hover: {name}", measured=_size(value), unit=unit)
+    for name, value, unit in (
+        ("acceleration", answer[:3], "m/s²"),
+        ("angular acceleration", answer[3:], "rad/s²"),
+        ("drift in 5 s", data.qpos[:3] - (0.0, 0.0, HEIGHT), "m"),
+    ):
+        yield Check(f"hover: {name}", 0.0, _size(value), unit, _MECHANICS)
 
 
 def _climb(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
@@ -184,14 +134,9 @@ def _climb(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
     hover = vehicle.hover_thrust
     most = float(np.min(vehicle.thrust_high[hover > 0] / hover[hover > 0]))
     data = ready(vehicle, model, most * hover)
-    seconds = fly(model, data, 2.0)
-    yield Check(
-        name="climb at the largest balanced thrust",
-        expected=vehicle.gravity * (most - 1),
-        measured=2 * (float(data.qpos[2]) - HEIGHT) / seconds**2,
-        tolerance=EXACT * max(1.0, most),
-        unit="m/s²",
-    )
+    measured = 2 / fly(model, data, 2.0) ** 2 * (float(data.qpos[2]) - HEIGHT)
+    expected, name = vehicle.gravity * (most - 1), "climb at the largest balanced thrust"
+    yield Check(name, expected, measured, "m/s²", _MECHANICS, EXACT * max(1.0, most))
 
 
 def _tumbling(vehicle: Vehicle, model: mujoco.MjModel, body: RigidBody) -> Iterator[Check]:
@@ -200,19 +145,16 @@ def _tumbling(vehicle: Vehicle, model: mujoco.MjModel, body: RigidBody) -> Itera
     before, after = ready(vehicle, model), ready(vehicle, model)
     before.qvel[3:] = after.qvel[3:] = SPIN
     seconds = fly(model, after, 10.0)
-    momentum = body.angular_momentum(before)
+    start, end = body.angular_momentum(before), body.angular_momentum(after)
     fallen = body.place(before) + body.velocity(before) * seconds
     fallen[2] -= vehicle.gravity * seconds**2 / 2
-    values = {
-        "relative change of angular momentum": (
-            _size(body.angular_momentum(after) - momentum) / _size(momentum),
-            "",
-        ),
-        "relative change of energy": (body.spin_energy(after) / body.spin_energy(before) - 1, ""),
-        "centre of mass off its path": (_size(body.place(after) - fallen), "m"),
-    }
-    for name, (value, unit) in values.items():
-        yield Check(name=f"tumbling 10 s: {name}", measured=value, tolerance=TRUNCATION, unit=unit)
+    energy = body.spin_energy(after) / body.spin_energy(before) - 1
+    for name, value, unit in (
+        ("relative change of angular momentum", _size(end - start) / _size(start), ""),
+        ("relative change of energy", energy, ""),
+        ("centre of mass off its path", _size(body.place(after) - fallen), "m"),
+    ):
+        yield Check(f"tumbling 10 s: {name}", 0.0, value, unit, _MECHANICS, TRUNCATION)
 
 
 def _resting(vehicle: Vehicle) -> Iterator[Check]:
@@ -220,18 +162,10 @@ def _resting(vehicle: Vehicle) -> Iterator[Check]:
     data = ready(vehicle, vehicle.model)
     data.qpos[2] = vehicle.rest_height + 0.05
     fly(vehicle.model, data, 5.0)
-    yield Check(
-        name="at rest on the floor: height",
-        expected=vehicle.rest_height,
-        measured=float(data.qpos[2]),
-        tolerance=1e-3,
-        unit="m",
-        source=_MODEL,
-    )
+    rest, height = vehicle.rest_height, float(data.qpos[2])
+    yield Check("at rest on the floor: height", rest, height, "m", _MODEL, 1e-3)
     for name, value, unit in (("speed", data.qvel[:3], "m/s"), ("turning", data.qvel[3:], "rad/s")):
-        yield Check(
-            name=f"at rest on the floor: {name}", measured=_size(value), tolerance=1e-6, unit=unit
-        )
+        yield Check(f"at rest on the floor: {name}", 0.0, _size(value), unit, _MECHANICS, 1e-6)
 
 
 def _linear_drag(vehicle: Vehicle, model: mujoco.MjModel, body: RigidBody) -> Iterator[Check]:
@@ -240,18 +174,12 @@ def _linear_drag(vehicle: Vehicle, model: mujoco.MjModel, body: RigidBody) -> It
     dragged = copy.copy(model)
     dragged.dof_damping[:] = Vehicle.load(vehicle.path, linear_drag=drag).model.dof_damping
     added = forces(vehicle, dragged, body, velocity=velocity) - forces(vehicle, model, body)
-    weight = vehicle.mass * vehicle.gravity
+    tolerance = EXACT * vehicle.mass * vehicle.gravity
     for name, value, unit in (
         ("force", added[:3] + drag * vehicle.mass * velocity, "N"),
         ("torque about the body's origin", added[3:], "N·m"),
     ):
-        yield Check(
-            name=f"linear drag: difference of {name}",
-            measured=_size(value),
-            tolerance=EXACT * weight,
-            unit=unit,
-            source="Unity's Rigidbody.drag, in the limit of small steps",
-        )
+        yield Check(f"linear drag: difference of {name}", 0.0, _size(value), unit, DRAG, tolerance)
 
 
 def _unpowered(model: mujoco.MjModel) -> mujoco.MjModel:
