@@ -5,6 +5,7 @@ or a check that failed; 2 a wrong flag, or no OpenGL for a command that draws; 1
 141 nobody reads standard output any more; 143 SIGTERM. A bug of ours keeps its traceback.
 """
 
+import ast
 import atexit
 import gc
 import io
@@ -16,7 +17,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from errno import ENOSPC, EPIPE
 from importlib import import_module
-from typing import TYPE_CHECKING, Final, TypeGuard
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeGuard, cast
 
 if TYPE_CHECKING:
     from ._flags import Command
@@ -112,16 +114,21 @@ def _run(words: list[str]) -> int:
 
 
 def _class_of(name: str) -> "type[Command]":
-    module = import_module(f".{name.replace('-', '_')}", __name__)
-    kind: type[Command] = getattr(module, COMMANDS[name])
+    kind: type[Command] = getattr(import_module(f".{_module(name)}", __name__), COMMANDS[name])
     return kind
+
+
+def _module(command: str) -> str:
+    return command.replace("-", "_")
 
 
 def _help() -> str:
     lines = ["usage: rotorgram [-h] [--version] COMMAND ...", "", _ABOUT, "", "commands:"]
-    for name in COMMANDS:
-        summary = (_class_of(name).__doc__ or "").partition("\n")[0]
-        lines.append(f"  {name:12} {summary}")
+    for name, kind in COMMANDS.items():
+        source = Path(__file__).with_name(f"{_module(name)}.py")  # read, not imported: for speed
+        (node,) = (n for n in ast.parse(source.read_bytes()).body if getattr(n, "name", "") == kind)
+        summary = ast.get_docstring(cast(ast.ClassDef, node)) or ""
+        lines.append(f"  {name:12} {summary.partition(chr(10))[0]}")
     return "\n".join([*lines, "", "rotorgram COMMAND --help lists the flags of a command."])
 
 

@@ -5,12 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich import box
+from rich.table import Table
+
+from ..models.errors import require
 from ._flags import Command
 from ._inputs import folder_to_write
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from ..experiments.bench import Layer
 
 __all__ = ["Bench"]
@@ -34,6 +36,7 @@ class Bench(Command):
         from ..experiments.bench import BenchConfig, bench
         from ._progress import bars
 
+        require("matplotlib", "report", "drawing")  # before anything is measured
         config = BenchConfig(rounds=self.rounds, seconds=self.seconds)
         logging.getLogger("rotorgram").setLevel(logging.WARNING)  # no counters of every wire
         with folder_to_write(self.out, "bench") as folder, bars() as progress:
@@ -42,37 +45,42 @@ class Bench(Command):
             progress("bench", turns, turns, "done")
         console = Console()
         console.print(_rates(layers))
+        console.print(_parts(layers))
         console.print(_ratios(layers))
         _draw(layers, folder / "bench.png")
         print(f"written: {folder / 'bench.json'}, {folder / 'bench.png'}")
         return 0
 
 
-def _rates(layers: "list[Layer]") -> "Table":
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD)
-    for name, where in (("layer", "left"), ("what", "left"), ("env steps/s", "right"),
-                        ("µs per env step", "right")):  # fmt: skip
-        table.add_column(name, justify=where)  # type: ignore[arg-type]
+def _rates(layers: "list[Layer]") -> Table:
+    table = Table("layer", "what", box=box.SIMPLE_HEAD)
+    for name in ("env steps/s", "µs per env step"):
+        table.add_column(name, justify="right")
     for layer in layers:
         table.add_row(layer.name, layer.about, f"{layer.rate:,.0f}", f"{1e6 / layer.rate:.2f}")
     return table
 
 
-def _ratios(layers: "list[Layer]") -> "Table":
-    from rich import box
-    from rich.table import Table
+def _ratios(layers: "list[Layer]") -> Table:
+    from ..experiments.bench import RATIOS
 
-    from ..experiments.bench import RATIOS, ratio_of
+    table = Table("ratio", box=box.SIMPLE_HEAD)
+    for name in ("median", "target"):
+        table.add_column(name, justify="right")
+    for ratio in RATIOS:
+        value = ratio.value(layers)
+        mark = "" if ratio.reached(value) else "[red]"
+        table.add_row(ratio.name, f"{mark}{value:.2f}", ratio.target_text)
+    return table
 
-    table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("ratio of rates")
-    table.add_column("median", justify="right")
-    for numerator, denominator in RATIOS:
-        ratio = ratio_of(layers, numerator, denominator)
-        table.add_row(f"{numerator} ÷ {denominator}", f"{ratio:.2f}")
+
+def _parts(layers: "list[Layer]") -> Table:
+    from ..experiments.bench import parts_of
+
+    table = Table("part of a lock-step step of one drone", box=box.SIMPLE_HEAD)
+    table.add_column("µs", justify="right")
+    for name, seconds in parts_of(layers):
+        table.add_row(name, f"{1e6 * seconds:.1f}")
     return table
 
 

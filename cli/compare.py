@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ..models.errors import InputError
+from ..models.errors import InputError, require
 from ._flags import AlgorithmName, PresetName
 from ._inputs import refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_comparison, runs_folder
@@ -42,6 +42,8 @@ class Compare(RunsFlags):
 
     def run(self) -> int:
         """Compare, report, print the table."""
+        for module in ("matplotlib", "jinja2"):  # before hours of training
+            require(module, "report", "a comparison's report")
         from ..experiments.compare import PARTS, compare, read_compare_config
         from ..experiments.settings import CompareConfig
 

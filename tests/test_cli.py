@@ -19,7 +19,7 @@ from rotorgram.cli._flags import AlgorithmName, PresetName, parse
 from rotorgram.cli._scalars import ScalarWriter
 from rotorgram.cli.serve import Serve
 from rotorgram.cli.sim import Sim
-from rotorgram.experiments.results import read_results, read_steps
+from rotorgram.experiments.results import read_steps
 from rotorgram.models import QUAD_XML
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

@@ -103,17 +103,18 @@ def test_the_base_alone_flies(tmp_path: Path) -> None:
     """What the base installs: a simulator and the PID meet; a key, a relay, a model's checks."""
     assert run_without(ALL, "key", tmp_path / "key").returncode == 0
     assert run_without(ALL, "check-model").returncode == 0
-    agent = subprocess.Popen(
-        [sys.executable, "-c", WITHOUT.format(names=ALL), "serve", "pid", "--episodes", "1",
-         "--listen", "127.0.0.1:0"],
-        stdout=subprocess.PIPE,
-        text=True,
-    )  # fmt: skip
-    assert agent.stdout is not None
-    server = re.search(r"at (\S+) \(", agent.stdout.readline())[1]  # type: ignore[index]
-    done = run_without(ALL, "sim", "--server", server, "--bind", "127.0.0.1:0")
-    out, _ = agent.communicate(timeout=30)
-    assert (done.returncode, agent.returncode) == (0, 0), done.stderr
+    serve = ["serve", "pid", "--episodes", "1", "--listen", "127.0.0.1:0"]
+    with subprocess.Popen(
+        [sys.executable, "-c", WITHOUT.format(names=ALL), *serve], stdout=subprocess.PIPE, text=True
+    ) as agent:
+        try:
+            assert agent.stdout is not None
+            server = re.search(r"at (\S+) \(", agent.stdout.readline())[1]  # type: ignore[index]
+            done = run_without(ALL, "sim", "--server", server, "--bind", "127.0.0.1:0")
+            assert done.returncode == 0, done.stderr
+            out, _ = agent.communicate(timeout=30)
+        finally:
+            agent.kill()
     assert "episode 0: return" in out
 
 
@@ -133,7 +134,7 @@ def imported(*arguments: str) -> set[str]:
 def test_flags_are_checked_before_anything_heavy_is_imported(command: str) -> None:
     heavy = {"torch", "pandas", "matplotlib", "stable_baselines3", "ray", "warp", "scipy"}
     assert not imported(command, "--wrong-flag") & heavy
-    if command in ("key", "relay", "replay", "check-model", "report", "bench"):
+    if command in ("key", "replay", "check-model", "report", "bench"):
         assert not imported(command, "--wrong-flag") & {"gymnasium", "mujoco"}
 
 
