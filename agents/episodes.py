@@ -186,7 +186,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             idle = begins if frozen is None else begins | frozen
         self._flown.append(sent)
         self._keep_step(idle)
-        self.env_steps += self.num_envs - (0 if idle is None else np.count_nonzero(idle))
+        self.env_steps += self.num_envs - (0 if idle is None else int(np.count_nonzero(idle)))
         ended = env.terminated | env.truncated
         if np.count_nonzero(ended):  # of few drones faster than `any`
             self._keep_episodes(ended)

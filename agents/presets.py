@@ -99,7 +99,7 @@ def _check(
     for name in flags:
         _expect(config, name, "true or false", type(getattr(config, name)) is bool)
     rate = config.learning_rate
-    _expect(config, "learning_rate", "a number above 0", _is_number(rate, 0.0) and rate > 0)
+    _expect(config, "learning_rate", "a number above 0", _is_number(rate, 0.0, 1e30) and rate > 0)
     _expect(config, "log_std", "a number from -4 to 1", _is_number(config.log_std, -4.0, 1.0))
 
 

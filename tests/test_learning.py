@@ -349,7 +349,7 @@ def test_what_is_stored_is_not_clipped_and_what_is_flown_is_in_the_units_of_the_
 @pytest.mark.parametrize("algorithm", ["vpg", "a2c", "sb3-a2c"])
 def test_a_training_that_diverges_says_so(algorithm: str) -> None:
     size = {"episodes_per_update": 2} if algorithm == "vpg" else {"steps_per_update": 16}
-    config = preset(algorithm, "paper", learning_rate=1e38, **size)
+    config = preset(algorithm, "paper", learning_rate=1e30, **size)
     log = log_of("limit")
     with pytest.raises(Diverged, match=r"training diverged: .* try a lower learning_rate"):
         make_agent(algorithm, log, config, 0).train(log, 2000, lambda: True)
