@@ -155,7 +155,7 @@ class LocalVectorEnv(AdvancingVectorEnv):
                 self.render()
 
     @property
-    def telemetry(self) -> Any:
+    def telemetry(self) -> Any:  # type: ignore[override]  # made when it is asked for
         """By name, float64, shape (N, *shape)."""
         return self._loop.telemetry
 
