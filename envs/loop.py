@@ -125,7 +125,7 @@ class Loop:
     Raises:
         InputError: An argument, seed or action is not what it should be; nothing has changed.
         PhysicsError: A state is bad; reset the drones that flew.
-        gymnasium.error.ResetNeeded: An action for a drone before its episode began, or after its end.
+        gymnasium.error.ResetNeeded: An action for a drone before its episode begins or after it ends.
     """
 
     def __init__(
