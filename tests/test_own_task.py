@@ -106,7 +106,7 @@ def test_it_is_a_gymnasium_env(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(LANDING.parent)
     env_id = registry.load(ID)
     check_env(gym.make(env_id, disable_env_checker=True).unwrapped, skip_render_check=True)
-    with pytest.raises(ValueError, match="^start: expected a number from 2 to 50 m, got 1"):
+    with pytest.raises(ValueError, match=r"^start: expected a number from 2 to 50 m, got 1"):
         gym.make(env_id, start=1)
     many = gym.make_vec(env_id, num_envs=16, autoreset_mode="Disabled", start=3.0)
     observations, info = many.reset(seed=0)
