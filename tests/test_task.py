@@ -35,7 +35,7 @@ def state_of(n: int, **arrays: Any) -> WorldState:
 
 
 def task_of(n: int, target: float = 5.0, **options: Any) -> Any:
-    task = make_task(ID, {"target": target, **options}, shape=(n, 1))
+    task: Any = make_task(ID, {"target": target, **options}, shape=(n, 1))
     task.target = np.full((n, 1), target)
     return task
 
@@ -108,7 +108,7 @@ def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: st
 def test_numpy_numbers_become_python_numbers() -> None:
     options = ElevationOptions(
         target=np.array([4, 6])[0],
-        start_band=np.float32(0.5),
+        start_band=np.float32(0.5),  # type: ignore[arg-type]
         episode_length=np.int64(10),  # type: ignore[arg-type]
         linear_drag=np.float64(2.0),
     )
