@@ -198,6 +198,9 @@ def test_what_a_user_typed_is_imported_and_nothing_else(
     assert registry.load("typed_here:Typed-v0") == "Typed-v0"
     assert registry.task_type("Typed-v0") is Task
     assert registry.load(ID) == ID
+    (tmp_path / "colorsys.py").write_text("raise AssertionError('not the installed one')\n")
+    with pytest.raises(InputError, match=r"^env: expected colorsys to register Typed-v1"):
+        registry.load("colorsys:Typed-v1")
     with pytest.raises(InputError, match=r"^env: expected typed_here to register Other-v0"):
         registry.load("typed_here:Other-v0")
     with pytest.raises(InputError, match=r"^env: expected a module nowhere here, got none"):
