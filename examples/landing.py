@@ -1,6 +1,6 @@
 """A task of one's own in one file: come down and stand on the ground. docs/extending.md tells it.
 
-    rotorgram train a2c --env landing:Landing-v0
+rotorgram train a2c --env landing:Landing-v0
 """
 
 from dataclasses import dataclass
