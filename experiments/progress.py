@@ -1,8 +1,8 @@
 """Progress of runs in other processes: one small datagram now and then.
 
 A lost datagram does no harm: the next one has the same numbers. Processes share no pipe or lock,
-and a run goes on without a listener. Datagrams stay on this machine: a run on another machine reports
-nothing before it is done.
+and a run goes on without a listener. Datagrams stay on this machine: a run on another machine
+reports nothing before it is done.
 """
 
 import contextlib
