@@ -3,10 +3,10 @@
     python benchmarks/gpu.py [--worlds 1024 4096 16384 65536] [--repeats 5] [--out FILE.json]
 
 Both fly the default task with random actions, each made where it is used: on the GPU, or by NumPy.
-They take turns, and medians are compared. The GPU's env flies with and without its checks, which
-make the host wait. Making an env, Warp's compilation among it, is not counted; nor is a first,
-short flight. Without a CUDA device it says so and exits with status 2. `--device cpu` tries the
-script on Warp's CPU device, and writes nothing unless told where.
+They take turns, and medians are compared. Making an env, Warp's compilation among it, is not
+counted; nor is a first, short flight. Without a CUDA device it says so and
+exits with status 2. `--device cpu` tries the script on Warp's CPU device, and writes nothing
+unless told where.
 """
 
 import argparse
@@ -24,30 +24,29 @@ from typing import Any
 import numpy as np
 import torch
 from rotorgram.agents.checkpoints import software_versions
-from rotorgram.envs import ElevationVectorEnv
+from rotorgram.envs import LocalVectorEnv
 
 OUT = Path("docs/results/performance/gpu.json")
-ROADS = ("warp", "warp, no checks", "mujoco.batch")
+TASK = "rotorgram/Elevation-v0"
+BACKENDS = ("warp", "mujoco")
 
 
-def on_device(worlds: int, device: str, checks: bool) -> Callable[[], None]:
-    from rotorgram.envs.warp import ElevationWarpEnv
-
-    env = ElevationWarpEnv(worlds, device=device, checks=checks)
+def on_device(worlds: int, device: str) -> Callable[[], None]:
+    env = LocalVectorEnv(TASK, worlds, backend="warp", device=device)
     env.reset(seed=0)
-    actions = torch.empty(env.action_space.shape, device=env.device)
+    actions = torch.empty(env.action_space.shape, device=device)
 
     def fly() -> None:
         for _ in range(10):
             env.step(actions.uniform_(-1.0, 1.0))
-        if env.device.type == "cuda":
-            torch.cuda.synchronize(env.device)
+        if actions.is_cuda:
+            torch.cuda.synchronize(actions.device)
 
     return fly
 
 
 def on_cpu(worlds: int) -> Callable[[], None]:
-    env = ElevationVectorEnv(worlds)
+    env = LocalVectorEnv(TASK, worlds)
     env.reset(seed=0)
     dice = np.random.default_rng(0)
 
@@ -68,20 +67,16 @@ def rate(fly: Callable[[], None], worlds: int, seconds: float) -> float:
 
 
 def measure(worlds: int, args: argparse.Namespace) -> dict[str, Any]:
-    roads = {
-        "warp": on_device(worlds, args.device, True),
-        "warp, no checks": on_device(worlds, args.device, False),
-        "mujoco.batch": on_cpu(worlds),
-    }
-    for fly in roads.values():
+    flown = {"warp": on_device(worlds, args.device), "mujoco": on_cpu(worlds)}
+    for fly in flown.values():
         rate(fly, worlds, args.seconds / 10)
-    rates: dict[str, list[float]] = {road: [] for road in ROADS}
+    rates: dict[str, list[float]] = {backend: [] for backend in BACKENDS}
     for _ in range(args.repeats):
-        for road in ROADS:
-            rates[road].append(round(rate(roads[road], worlds, args.seconds)))
-    medians = {road: statistics.median(values) for road, values in rates.items()}
-    for road, median in medians.items():
-        print(f"{worlds:7,} worlds  {road:15} {median:14,.0f} env steps/s", flush=True)
+        for backend in BACKENDS:
+            rates[backend].append(round(rate(flown[backend], worlds, args.seconds)))
+    medians = {backend: statistics.median(values) for backend, values in rates.items()}
+    for backend, median in medians.items():
+        print(f"{worlds:7,} worlds  {backend:8} {median:14,.0f} env steps/s", flush=True)
     return {"worlds": worlds, "rates": rates, "medians": medians}
 
 

@@ -20,7 +20,7 @@ from . import registry
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
 
-__all__ = ["Loop", "make_task", "spec_of"]
+__all__ = ["Loop", "OnHost", "make_task", "spec_of"]
 
 _SMALL: Final = 64
 """Up to this many numbers Python's loop is faster than NumPy's call."""
@@ -397,6 +397,47 @@ class Loop:
     def __reduce__(self) -> Any:
         """Raise: simulator memory cannot be copied, and a copy that seems to fly would be wrong."""
         raise TypeError("a running env cannot be copied or pickled: make another one")
+
+
+class OnHost:
+    """A loop whose results are NumPy arrays, wherever its world runs: what a simulator sends.
+
+    Its attributes are those of the loop.
+    """
+
+    def __init__(self, loop: Loop) -> None:
+        self.loop, self.spec, self.num_envs = loop, loop.spec, loop.num_envs
+        self._take()
+
+    def advance(
+        self,
+        actions: Array,
+        resets: Array | None = None,
+        seeds: Sequence[int | None] | np.ndarray | None = None,
+        frozen: Array | None = None,
+    ) -> None:
+        """As `Loop.advance`."""
+        self.loop.advance(actions, resets, seeds, frozen)
+        self._take()
+
+    def _take(self) -> None:
+        loop = self.loop
+        dtypes = {array.name: array.dtype for array in self.spec.observation}
+        self.observations = {
+            name: on_host(values).astype(dtypes[name]) for name, values in loop.observations.items()
+        }
+        self.rewards = on_host(loop.rewards).astype(np.float64)
+        self.terminated, self.truncated = on_host(loop.terminated), on_host(loop.truncated)
+        self.done = on_host(loop.done)
+
+    @property
+    def telemetry(self) -> dict[str, np.ndarray]:
+        """As of `Loop`."""
+        return self.loop.telemetry
+
+    def close(self) -> None:
+        """As `Loop.close`."""
+        self.loop.close()
 
 
 def _columns(spec: EnvSpec) -> dict[str, slice]:

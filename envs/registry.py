@@ -55,7 +55,7 @@ def load(env_id: str) -> str:
     module, colon, name = env_id.rpartition(":")
     if colon:
         if "" not in sys.path:
-            sys.path.insert(0, "")
+            sys.path.append("")  # last: no file there takes the place of an installed package
         try:
             import_module(module)
         except ModuleNotFoundError as error:

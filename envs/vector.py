@@ -164,7 +164,8 @@ class LocalVectorEnv(AdvancingVectorEnv):
             return super()._shaped(actions)
         if tuple(getattr(actions, "shape", ())) != self.action_space.shape:
             raise InputError(
-                f"actions: expected a tensor of shape {self.action_space.shape}, got {actions!r:.80}"
+                f"actions: expected a tensor of shape {self.action_space.shape}, "
+                f"got {actions!r:.80}"
             )
         return actions
 

@@ -14,12 +14,13 @@ import sys
 import tomllib
 from contextlib import redirect_stdout
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-import tyro
-from rotorgram.cli.commands import COMMANDS
+from rotorgram.cli import COMMANDS
+from rotorgram.cli._flags import parse
 
 ROOT = Path(__file__).parent.parent
 PAGES = [
@@ -63,9 +64,9 @@ INSTEAD = {
     # page: (what the page says, what is run, why)
     "README.md": [("10_000", "1_000", "the same, ten times")],
     "docs/gpu.md": [
-        ('4096, device="cuda"', '8, device="cpu"', "there need not be a GPU"),
+        ('4096, backend="warp", device="cuda"', '8, backend="warp", device="cpu"', "no GPU here"),
         ("range(250)", "range(2)", "Warp's CPU device is slow"),
-        ("rand(4096, 1", "rand(8, 1", "as many as there are drones"),
+        ("rand(4096, 4", "rand(8, 4", "as many as there are drones"),
     ],
     "docs/scaling.md": [
         ("0.0.0.0", "127.0.0.1", "a test opens no port to the network"),
@@ -154,9 +155,9 @@ def test_every_fence_says_what_it_is() -> None:
 
 def parsed(arguments: list[str]) -> Any:
     """The command, as the real parser makes it. SystemExit: it cannot."""
-    return tyro.extras.subcommand_cli_from_dict(
-        COMMANDS, args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
-    )
+    name, *flags = arguments
+    kind = getattr(import_module(f"rotorgram.cli.{name.replace('-', '_')}"), COMMANDS[name])
+    return parse(kind, f"rotorgram {name}", flags)
 
 
 @cache
@@ -212,7 +213,10 @@ RUN = {
 @pytest.mark.parametrize(
     ("page", "command"), TYPED, ids=[f"{page}-{i}" for i, (page, _) in enumerate(TYPED)]
 )
-def test_commands_are_ones_that_there_are(page: str, command: list[str]) -> None:
+def test_commands_are_ones_that_there_are(
+    page: str, command: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(ROOT / "examples")  # where landing.py is
     program, *arguments = command
     match program:
         case "rotorgram":

@@ -178,10 +178,10 @@ def test_ids() -> None:
     assert registry.is_known(f"rotorgram.envs:{ID}")
     with pytest.raises(InputError, match=r"^env: expected a registered id .*, got 'CartPole-v1'"):
         Loop("CartPole-v1")
-    with pytest.raises(InputError, match="^env id: expected one that is free, got 'CartPole-v1'"):
+    with pytest.raises(InputError, match=r"^env id: expected one that is free, got 'CartPole-v1'"):
         register("CartPole-v1", Careless)
     for wrong in ("landing", "my landing-v0", 3):
-        with pytest.raises(InputError, match="^env id: expected name-v0"):
+        with pytest.raises(InputError, match=r"^env id: expected name-v0"):
             register(wrong, Careless)  # type: ignore[arg-type]
 
 
@@ -193,14 +193,17 @@ def test_what_a_user_typed_is_imported_and_nothing_else(
         "from rotorgram.envs import Task, register\nregister('Typed-v0', Task)\n"
     )
     assert not registry.is_known("typed_here:Typed-v0")
-    with pytest.raises(InputError, match="^env: expected a registered id"):
+    with pytest.raises(InputError, match=r"^env: expected a registered id"):
         registry.task_type("typed_here:Typed-v0")
     assert registry.load("typed_here:Typed-v0") == "Typed-v0"
     assert registry.task_type("Typed-v0") is Task
     assert registry.load(ID) == ID
-    with pytest.raises(InputError, match="^env: expected typed_here to register Other-v0"):
+    (tmp_path / "colorsys.py").write_text("raise AssertionError('not the installed one')\n")
+    with pytest.raises(InputError, match=r"^env: expected colorsys to register Typed-v1"):
+        registry.load("colorsys:Typed-v1")
+    with pytest.raises(InputError, match=r"^env: expected typed_here to register Other-v0"):
         registry.load("typed_here:Other-v0")
-    with pytest.raises(InputError, match="^env: expected a module nowhere here, got none"):
+    with pytest.raises(InputError, match=r"^env: expected a module nowhere here, got none"):
         registry.load("nowhere:Typed-v0")
     gym.registry.pop("Typed-v0")
 

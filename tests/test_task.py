@@ -1,7 +1,9 @@
 """Options and arithmetic of the elevation task against values worked out by hand."""
 
 import math
+import re
 from dataclasses import FrozenInstanceError, asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,7 +35,7 @@ def state_of(n: int, **arrays: Any) -> WorldState:
 
 
 def task_of(n: int, target: float = 5.0, **options: Any) -> Any:
-    task = make_task(ID, {"target": target, **options}, shape=(n, 1))
+    task: Any = make_task(ID, {"target": target, **options}, shape=(n, 1))
     task.target = np.full((n, 1), target)
     return task
 
@@ -106,7 +108,7 @@ def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: st
 def test_numpy_numbers_become_python_numbers() -> None:
     options = ElevationOptions(
         target=np.array([4, 6])[0],
-        start_band=np.float32(0.5),
+        start_band=np.float32(0.5),  # type: ignore[arg-type]
         episode_length=np.int64(10),  # type: ignore[arg-type]
         linear_drag=np.float64(2.0),
     )
@@ -237,3 +239,36 @@ def test_observation_by_hand() -> None:
     state = state_of(1, position=[0, 0, 4.25], velocity=[1, 2, -0.5], thrust=[73.5] * 4)
     assert task_of(1).observe(state)["observation"].tolist() == [[[0.75, 0.5, 0.5]]]
     assert task_of(1, observation="error").observe(state)["observation"].tolist() == [[[0.75]]]
+
+
+# --- the page ---------------------------------------------------------------------------------
+
+
+def test_the_page_tells_the_metrics_of_both_tasks() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "task.md").read_text()
+    rows = [line for line in page.splitlines() if re.match(r"\| `\w+-v0` \| `\w+_error`", line)]
+    told = []
+    for env_id in (ID, "rotorgram/Hover-v0"):
+        for metric in env_spec(env_id).metrics:
+            bounds = [f"{x:g}" if x else "" for x in (metric.settled, metric.held)]
+            told.append((env_id.split("/")[1], metric.name, metric.unit, *bounds))
+    cells = [[cell.strip(" `") for cell in row.strip("| ").split("|")] for row in rows]
+    assert [
+        (task, metric.split("`")[0], unit, settled, held)
+        for task, metric, unit, settled, held in ([*row, ""][:5] for row in cells)
+    ] == told
+
+
+def test_the_page_and_the_class_tell_the_same_numbers() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "task.md").read_text()
+    options = ElevationOptions()
+    for sentence in (
+        f"| {options.target:g} m, or drawn from (low, high)",
+        f"uniform within {options.start_band:g} m of the target",
+        f"| {options.flight_band:g} m about the target",
+        f"| {options.control_period:g} s |",
+        f"| {options.episode_length} steps, 5 s |",
+        "(s − \\|E\\|) / (s + \\|E\\|), s = 0.5 m",
+        "5 N per unit and step; 20 N as an offset",
+    ):
+        assert sentence in page

@@ -44,7 +44,7 @@ def same(ours: Any, theirs: Any, where: str = "") -> None:
         assert ours.tobytes() == theirs.tobytes(), (where, ours, theirs)
 
 
-def actions_of(env: Any, dice: np.random.Generator) -> np.ndarray:
+def actions_of(env: Any, dice: np.random.Generator) -> Any:
     if isinstance(env.single_action_space, gym.spaces.Discrete):
         return dice.integers(0, 3, env.num_envs)
     return dice.uniform(-1.2, 1.2, env.action_space.shape).astype(np.float32)
@@ -111,7 +111,7 @@ def test_what_a_step_gives_is_the_callers(env_id: str) -> None:
 
 @pytest.mark.parametrize("env_id", [ID, HOVER])
 def test_a_mask_resets_some_and_leaves_the_others(env_id: str) -> None:
-    env = LocalVectorEnv(env_id, 4, autoreset_mode="Disabled", episode_length=3)
+    env: Any = LocalVectorEnv(env_id, 4, autoreset_mode="Disabled", episode_length=3)
     env.reset(seed=5)
     hold = np.zeros(env.action_space.shape, np.float32)
     for _ in range(3):
@@ -166,7 +166,7 @@ def test_wrong_options_of_a_reset(options: dict[str, Any], expected: str) -> Non
 
 @pytest.mark.parametrize("seed", [-1, [1], [1, -1], 0.5, "12"])
 def test_wrong_seeds(seed: Any) -> None:
-    with pytest.raises(InputError, match="^seed: expected a whole number from 0 on, or 2 of them"):
+    with pytest.raises(InputError, match=r"^seed: expected a whole number from 0 on, or 2 of them"):
         LocalVectorEnv(ID, 2).reset(seed=seed)
 
 

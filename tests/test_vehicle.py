@@ -1,4 +1,4 @@
-"""Vehicles from other MJCF files fly every task; tests/test_model.py has what is derived of them."""
+"""Vehicles from other MJCF files fly every task; tests/test_model.py has what is derived."""
 
 import math
 import struct
@@ -40,7 +40,9 @@ UNEQUAL = """<mujoco model="unequal">
 BODY = """<body name="craft" pos="0 0 1">
   <freejoint/>
   <geom type="mesh" mesh="wedge" mass="1"/>
-  <site name="a" pos="0.2 0 0"/><site name="b" pos="-0.1 0.17 0"/><site name="c" pos="-0.1 -0.17 0"/>
+  <site name="a" pos="0.2 0 0"/>
+  <site name="b" pos="-0.1 0.17 0"/>
+  <site name="c" pos="-0.1 -0.17 0"/>
 </body>"""
 
 INCLUDING = """<mujoco model="included">

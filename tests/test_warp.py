@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from rotorgram.envs import LocalVectorEnv, Loop
+from rotorgram.envs.loop import OnHost
 from rotorgram.models.errors import InputError, MissingPackage
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim import PhysicsError, Pose, World, make_world
@@ -168,7 +169,8 @@ def test_flies_as_the_backend_mujoco_does(options: dict[str, Any]) -> None:
             actions = dice.integers(0, 3, N)
         else:
             actions = dice.uniform(-1.2, 1.2, (N, 1)).astype(np.float32)
-        seen, rewards, terminated, truncated, info = ours.step(torch.from_numpy(actions))
+        mine: tuple[Any, ...] = ours.step(torch.from_numpy(actions))
+        seen, rewards, terminated, truncated, info = mine
         expected = theirs.step(actions)
         error = expected[4]["elevation_error"]
         # A flag may differ within the tolerance of its threshold alone; the ground is no threshold.
@@ -211,6 +213,23 @@ def test_hover_observes_and_judges_as_in_numpy(file: Path | None) -> None:
         tumbled = loop.telemetry["attitude"]
         assert tumbled.dtype == np.float64
         assert abs(tumbled).max() > 0.1
+
+
+def test_a_simulator_sends_what_the_tensors_hold() -> None:
+    every, still = np.ones(N, bool), np.zeros((N, 1), np.float32)
+    loops = [Loop(ELEVATION, N, backend="warp", device="cpu") for _ in range(2)]
+    sent = OnHost(loops[0])
+    for stepped in (sent, loops[1]):
+        stepped.advance(still, every, np.arange(N, dtype=np.uint64))
+        stepped.advance(still + 1, ~every, None, np.array([True, False, False, False]))
+    assert sent.observations["observation"].dtype == np.float32
+    assert sent.rewards.dtype == np.float64
+    assert sent.terminated.dtype == sent.truncated.dtype == bool
+    np.testing.assert_array_equal(
+        sent.observations["observation"], loops[1].observations["observation"]
+    )
+    assert sent.rewards.tolist() == loops[1].rewards.tolist()
+    assert (sent.rewards[0], sent.observations["observation"][0, 1]) == (0.0, 0.0)
 
 
 def test_next_step_autoreset_and_info_of_tensors() -> None:
