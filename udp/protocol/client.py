@@ -71,6 +71,10 @@ _PATIENCE: Final = 8
 """Resends before the waits double: most that was lost was lost by chance."""
 
 
+_TOO_EARLY: Final = 1.5
+"""By so much round trips are taken for longer when an answer comes twice."""
+
+
 def new_session() -> int:
     """A random session number, not 0."""
     return secrets.randbits(64) or 1
@@ -124,6 +128,11 @@ class RoundTrips:
         else:
             self._variation += (abs(self._smoothed - seconds) - self._variation) / 4
             self._smoothed += (seconds - self._smoothed) / 8
+
+    def answered_again(self) -> None:
+        """An answer came a second time: it was asked for too early."""
+        if self._smoothed is not None:
+            self._smoothed = min(_TOO_EARLY * self._smoothed, _LONGEST_RESEND)
 
     def wait(self, tries: int) -> float:
         """Wait for an answer before the next resend, s, after so many tries without any."""
@@ -276,6 +285,8 @@ class Client:
             or getattr(message, "sequence", self.sequence) == self.sequence
         )
         if state is None or not is_current:
+            if isinstance(message, Command) and self.sequence - message.sequence <= 1:
+                self._round_trips.answered_again()
             self._drop("stale", "", now)
             return None
         return self._take(message, state, plain, now)
