@@ -1,16 +1,14 @@
 """Advantage Actor-Critic: the paper's Algorithm 2, Equation 3."""
 
-from typing import Any
-
 import numpy as np
-import torch
 
-from .learner import Learner, Terms, seeds_of, sizes
-from .networks import Actor, Critic
-from .policies import NetworkPolicy
+from .episodes import EpisodeLog
+from .learner import Learner, Terms
+from .networks import Critic, nn, torch
+from .policies import NetworkPolicy, flat_size
 from .presets import A2CConfig
 from .returns import advantages
-from .rollouts import AnyCollector, Rollout
+from .rollouts import Collector, Rollout
 
 __all__ = ["A2C"]
 
@@ -21,48 +19,38 @@ class A2C(Learner):
     Algorithm 2 weighs the actor's gradient by Q in step 3; the text and Equation 3 say by the
     advantage A, and so do we. The critic descends the squared error to r + gamma · V(s'), with
     the target held still, which is step 5.
-
-    Args:
-        env: Gives the sizes; it is not kept.
-        config: Hyperparameters.
-        seed: Seed of the run: weights and actions.
     """
 
-    def __init__(self, env: Any, config: A2CConfig, seed: int) -> None:
-        size, actions = sizes(env)
-        torch_seed, rng = seeds_of(seed)
-        torch.manual_seed(torch_seed)
+    def __init__(self, log: EpisodeLog, config: A2CConfig, seed: int) -> None:
+        super().__init__(log, config, seed)
         self.config = config
-        self._actor = Actor(size, actions, hidden=config.hidden, log_std=config.log_std)
-        self._critic = Critic(size, hidden=config.hidden)
-        super().__init__(
-            {"actor": self._actor, "critic": self._critic},
-            learning_rate=config.learning_rate,
-            anneal=config.anneal,
-            rng=rng,
-        )
 
-    def collect(self, collector: AnyCollector, policy: NetworkPolicy, most: int) -> Rollout:
+    def others(self, config: A2CConfig) -> dict[str, nn.Module]:
+        """The critic."""
+        self._critic = Critic(flat_size(self.spec), hidden=config.hidden)
+        return {"critic": self._critic}
+
+    def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
         """Fly a fixed number of steps, across episodes."""
         return collector.steps(policy, min(self.config.steps_per_update, most))
 
     def loss(self, rollout: Rollout) -> torch.Tensor:
         """Minus the mean of A · log P, plus the weighted squared error of the value."""
         config = self.config
-        observations = torch.from_numpy(rollout.observations)
-        values = self._critic(observations)
+        values = self._values(rollout.observations)
+        advantage = rollout.rows(self.advantages(rollout, values.detach().numpy()))
+        values = values[torch.from_numpy(rollout.kept)]
         held = values.detach()
-        advantage = self.advantages(rollout, held.numpy())
         targets = torch.from_numpy(advantage.astype(np.float32)) + held
         if config.normalize and len(advantage) > 1:
             advantage = (advantage - advantage.mean()) / (advantage.std(ddof=1) + 1e-8)
         log_probability, entropy = self._actor.score(
-            observations, torch.from_numpy(rollout.actions)
+            torch.from_numpy(rollout.rows(rollout.observations)),
+            torch.from_numpy(rollout.rows(rollout.actions)),
         )
         gain = (log_probability * torch.from_numpy(advantage.astype(np.float32))).mean()
         value_loss = (targets - values).square().mean()
-        bonus = config.entropy_weight * entropy.mean()
-        loss: torch.Tensor = config.value_weight * value_loss - gain - bonus
+        loss: torch.Tensor = config.vf_coef * value_loss - gain - config.ent_coef * entropy.mean()
         self.terms = Terms(
             gain=gain.detach(),
             entropy=entropy.detach(),
@@ -73,15 +61,21 @@ class A2C(Learner):
         return loss
 
     def advantages(self, rollout: Rollout, values: np.ndarray) -> np.ndarray:
-        """A_t of every step, float64, shape (T,), from V(s_t), shape (T,)."""
+        """A_t of every row, float64, shape (T, N), from V(s_t), shape (T, N)."""
         with torch.no_grad():
-            following = self._critic(torch.from_numpy(rollout.next_observations))
+            following = self._values(rollout.next_observations).numpy()
         return advantages(
             rollout.rewards,
             values.astype(np.float64),
-            following.numpy().astype(np.float64),
+            following.astype(np.float64),
             rollout.terminated,
             rollout.truncated,
             gamma=self.config.gamma,
-            trace=self.config.trace,
+            gae_lambda=self.config.gae_lambda,
         )
+
+    def _values(self, observations: np.ndarray) -> torch.Tensor:
+        """V(s), shape (T, N), of observations, shape (T, N, n)."""
+        shape = observations.shape
+        values: torch.Tensor = self._critic(torch.from_numpy(observations.reshape(-1, shape[-1])))
+        return values.reshape(shape[:-1])

@@ -1,37 +1,42 @@
-"""Checkpoints: one safetensors file with weights, state, config, seed and versions.
+"""Checkpoints: one safetensors file with weights, state, config, spec, seed and versions.
 
-Loading one runs no code from it. Writing one replaces the old file whole or not at all.
+Loading one runs no code from it, and imports nothing that it names. Writing one replaces the old
+file whole or not at all. A checksum over all bytes of the file tells of the smallest damage.
 """
 
+import hashlib
 import json
 import os
 import platform
+import re
+import secrets
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
+from contextlib import suppress
+from dataclasses import dataclass, field, fields
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
-from .episodes import Position
-from .policies import NetworkPolicy
+from ..envs.spec import Discrete, EnvSpec
+from ..models.errors import InputError, require
+from .episodes import Episode, Position
+from .policies import NetworkPolicy, flat_size
 from .presets import PRESETS
 
 __all__ = ["Checkpoint", "CheckpointError", "load", "software_versions", "store", "write_whole"]
 
-FORMAT: Final = 1
-_ACTOR: Final = "policy/"
-_STATE: Final = "state/"
-_POSITION: Final = "episode/"
+FORMAT: Final = 2
+_GROUPS: Final = ("policy", "state", "position", "episodes")
+_MOST: Final = 2**62
+_CHECKSUM: Final = re.compile(rb'"sha256":"([0-9a-f]{64})"')
 _MALFORMED: Final = (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError)
-"""What reading a file of somebody else's making can raise."""
+"""What reading a crafted file can raise."""
 
 
-class CheckpointError(ValueError):
-    """A file is missing, or is not a checkpoint of ours."""
+class CheckpointError(InputError):
+    """A file is missing, is not a checkpoint of ours, or its parts do not fit together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,98 +46,214 @@ class Checkpoint:
     algorithm: str
     config: dict[str, Any]
     """Hyperparameters."""
-    env: dict[str, Any]
-    """Options of the env."""
+    spec: EnvSpec
+    """Of the env: id, options, vehicle and shapes."""
     seed: int
     env_steps: int
     """Env steps that the whole training is to have."""
-    model_hash: str
-    """Model of the simulator; empty where it told none."""
     actor: Mapping[str, np.ndarray]
     """Weights for `NetworkPolicy`."""
     state: Mapping[str, np.ndarray]
     """State of the agent."""
     position: Position
-    """Where the run stands."""
-    num_envs: int = 1
-    """Drones that it trains with."""
+    """Where the run stands, and the episodes that have ended."""
     versions: dict[str, str] = field(default_factory=lambda: software_versions())
 
-    def policy(self) -> NetworkPolicy:
-        """The policy, ready to fly."""
-        return NetworkPolicy(self.actor)
+    @property
+    def env_id(self) -> str:
+        """Id of the env."""
+        return self.spec.env_id
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Every option of the env."""
+        return dict(self.spec.options)
+
+    @property
+    def vehicle_hash(self) -> str:
+        """Model that flew; zeros where the env told none."""
+        return self.spec.vehicle_hash
+
+    @property
+    def num_envs(self) -> int:
+        """Drones that it trains with."""
+        return len(self.position.numbers)
+
+    def policy(self, spec: EnvSpec | None = None) -> NetworkPolicy:
+        """The policy, ready to fly.
+
+        Args:
+            spec: Of the env to fly; None: that of the training.
+
+        Raises:
+            InputError: The policy does not fit the env.
+        """
+        return NetworkPolicy(self.actor, spec or self.spec)
+
+    def other_versions(self) -> dict[str, tuple[str, str]]:
+        """Software whose version was another: its version then and now."""
+        now = software_versions()
+        return {
+            name: (self.versions.get(name, "none"), now.get(name, "none"))
+            for name in sorted({*self.versions, *now})
+            if self.versions.get(name) != now.get(name)
+        }
 
 
 def software_versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
-    names = ("rotorgram", "mujoco", "gymnasium", "numpy", "torch", "stable-baselines3")
-    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+    """Versions of what the numbers depend on, as far as it is installed."""
+    versions = {"python": platform.python_version()}
+    for name in ("rotorgram", "mujoco", "gymnasium", "numpy", "torch", "stable-baselines3"):
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return versions
 
 
 def store(checkpoint: Checkpoint, path: Path) -> None:
-    """Write a checkpoint: after a crash at any moment, `path` holds the old one or the new one."""
-    position = checkpoint.position
-    arrays = {_ACTOR + name: value for name, value in checkpoint.actor.items()}
-    arrays |= {_STATE + name: value for name, value in checkpoint.state.items()}
-    here = asdict(position)
-    arrays |= {_POSITION + k: v for k, v in here.items() if isinstance(v, np.ndarray)}
+    """Write a checkpoint: after a crash at any moment, `path` holds the old one or the new one.
+
+    Raises:
+        CheckpointError: A number is not finite: training diverged. The old file stays.
+    """
+    position = {k: v for k, v in vars(checkpoint.position).items() if k != "episodes"}
+    parts: dict[str, Mapping[str, Any]] = {
+        "policy": checkpoint.actor,
+        "state": checkpoint.state,
+        "position": {k: v for k, v in position.items() if isinstance(v, np.ndarray)},
+        "episodes": _columns(checkpoint.position.episodes),
+    }
+    arrays = {
+        f"{group}/{name}": np.array(value, order="C")
+        for group, part in parts.items()
+        for name, value in part.items()
+    }
+    for name, array in arrays.items():
+        if not _is_finite(name, array):
+            raise CheckpointError(f"checkpoint: training diverged, {name} is not finite")
     meta = {
         "format": FORMAT,
-        "algorithm": checkpoint.algorithm,
-        "config": checkpoint.config,
-        "env": checkpoint.env,
-        "seed": checkpoint.seed,
-        "env_steps": checkpoint.env_steps,
-        "model_hash": checkpoint.model_hash,
-        "versions": checkpoint.versions,
-        "num_envs": checkpoint.num_envs,
-        "position": {name: here[name] for name in ("episode", "env_steps", "seconds")},
+        **{name: getattr(checkpoint, name) for name in _PLAIN},
+        "spec": checkpoint.spec.to_json(),
+        "position": {k: v for k, v in position.items() if not isinstance(v, np.ndarray)},
     }
-    data = save({k: np.asarray(v, order="C") for k, v in arrays.items()},
-                metadata={"rotorgram": json.dumps(meta)})  # fmt: skip
-    write_whole(path, data)
+    numpy = require("safetensors.numpy", "train", "writing checkpoints")
+    text = {"rotorgram": json.dumps(meta), "sha256": "0" * 64}
+    data: bytes = numpy.save(arrays, metadata=text)
+    write_whole(path, _with_checksum(data, hashlib.sha256(data).hexdigest().encode()))
+
+
+_PLAIN: Final = ("algorithm", "config", "seed", "env_steps", "versions")
 
 
 def load(path: Path) -> Checkpoint:
     """Read a checkpoint.
 
     Raises:
-        CheckpointError: There is no such file, or it is not a checkpoint of this format.
+        CheckpointError: There is no such file, it is damaged, or it is not a checkpoint of this
+            format.
+        MissingPackage: safetensors is not installed.
     """
+    numpy = require("safetensors.numpy", "train", "reading checkpoints")
     if not path.is_file():
         raise CheckpointError(f"checkpoint: no file {path}")
     try:
-        return _read(path)
+        data = path.read_bytes()
+        _expect(len(data) > 8, "a file of more than 8 bytes", len(data))
+        return _read(data, numpy.load)
     except OSError as error:
         raise CheckpointError(f"checkpoint: cannot read {path}: {error.strerror}") from None
-    except (SafetensorError, *_MALFORMED) as error:
-        raise CheckpointError(f"{path}: expected a rotorgram checkpoint: {error!r:.200}") from None
+    except (require("safetensors", "train", "").SafetensorError, *_MALFORMED) as error:
+        reason = " ".join(str(error).split())
+        raise CheckpointError(f"{path}: expected a rotorgram checkpoint: {reason:.200}") from None
 
 
-def _read(path: Path) -> Checkpoint:
-    with safe_open(path, framework="numpy") as file:
-        meta = json.loads((file.metadata() or {})["rotorgram"])
-        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+def _read(data: bytes, parse: Any) -> Checkpoint:
+    found = _CHECKSUM.search(data)
+    _expect(found is not None, "a checksum", "none")
+    assert found is not None
+    plain = _with_checksum(data, b"0" * 64)
+    _expect(hashlib.sha256(plain).hexdigest().encode() == found[1], "a file without damage",
+            "another checksum than it holds")  # fmt: skip
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    meta = json.loads(header["__metadata__"]["rotorgram"])
     _expect(meta["format"] == FORMAT, f"format {FORMAT}", meta["format"])
-    position = meta["position"]
+    arrays: dict[str, dict[str, np.ndarray]] = {group: {} for group in _GROUPS}
+    for name, array in parse(data).items():
+        _expect(_is_finite(name, array), f"finite numbers in {name}", "NaN or infinity")
+        group, _, rest = name.partition("/")
+        arrays[group][rest] = array
     _expect(meta["algorithm"] in PRESETS, f"one of {sorted(PRESETS)}", meta["algorithm"])
-    num_envs = meta.get("num_envs", 1)
-    counts = meta["seed"], meta["env_steps"], num_envs, position["episode"], position["env_steps"]
-    for count in counts:
-        _expect(type(count) is int and count >= 0, "a whole number, 0 or more", count)
-    seconds = position["seconds"]
+    for name in ("config", "versions", "position"):
+        _expect(isinstance(meta[name], dict), f"an object for {name}", meta[name])
+    where = meta["position"]
+    for count in (meta["seed"], meta["env_steps"], where["env_steps"]):
+        _expect(type(count) is int and 0 <= count < _MOST, "a whole number, 0 or more", count)
+    seconds = where["seconds"]
     _expect(type(seconds) is float and 0 <= seconds < float("inf"), "seconds", seconds)
-    for name, array in arrays.items():
-        finite = array.dtype.kind != "f" or bool(np.isfinite(array).all())
-        _expect(finite, f"finite numbers in {name}", "NaN or infinity")
-    fields = ("algorithm", "config", "env", "seed", "env_steps", "model_hash", "versions")
-    return Checkpoint(
-        **{name: meta[name] for name in fields},
-        actor=_part(arrays, _ACTOR),
-        state=_part(arrays, _STATE),
-        num_envs=num_envs,
-        position=Position(**{**position, **_part(arrays, _POSITION)}),
+    spec = EnvSpec.from_json(meta["spec"])
+    position = Position(
+        env_steps=where["env_steps"],
+        seconds=seconds,
+        episodes=_episodes(arrays["episodes"]),
+        **arrays["position"],
     )
+    _check_shapes(position, spec)
+    checkpoint = Checkpoint(
+        **{name: meta[name] for name in _PLAIN},
+        spec=spec,
+        actor=arrays["policy"],
+        state=arrays["state"],
+        position=position,
+    )
+    checkpoint.policy()
+    return checkpoint
+
+
+def _with_checksum(data: bytes, checksum: bytes) -> bytes:
+    return _CHECKSUM.sub(b'"sha256":"%s"' % checksum, data, count=1)
+
+
+def _is_finite(name: str, array: np.ndarray) -> bool:
+    # An env without metrics tells no error: that is NaN, and no divergence.
+    allowed = name == "episodes/mean_size"
+    return allowed or array.dtype.kind != "f" or bool(np.isfinite(array).all())
+
+
+def _columns(episodes: tuple[Episode, ...]) -> dict[str, np.ndarray]:
+    return {
+        name: np.array([getattr(episode, name) for episode in episodes], kind)
+        for name, kind in _KINDS.items()
+    }
+
+
+_KINDS: Final = {
+    f.name: {int: np.int64, float: np.float64, bool: np.bool_}[f.type]  # type: ignore[index]
+    for f in fields(Episode)
+}
+
+
+def _episodes(columns: Mapping[str, np.ndarray]) -> tuple[Episode, ...]:
+    kinds = {name: column.dtype.type for name, column in columns.items()}
+    _expect(kinds == _KINDS, f"columns {sorted(_KINDS)} of episodes", sorted(kinds))
+    rows = zip(*(columns[name].tolist() for name in _KINDS), strict=True)
+    return tuple(Episode(**dict(zip(_KINDS, row, strict=True))) for row in rows)
+
+
+def _check_shapes(position: Position, spec: EnvSpec) -> None:
+    count, steps = len(position.numbers), len(position.actions)
+    action = spec.action
+    drawn = () if isinstance(action, Discrete) else (action.size,)
+    expected = {
+        "actions": ((steps, count, *drawn), "i" if isinstance(action, Discrete) else "f"),
+        "observations": ((count, flat_size(spec)), "f"),
+        "numbers": ((count,), "i"),
+        "lengths": ((count,), "i"),
+        "first_steps": ((count,), "i"),
+    }
+    arrays = {name: getattr(position, name) for name in expected}
+    got = {name: (array.shape, array.dtype.kind) for name, array in arrays.items()}
+    _expect(got == expected and count > 0, f"a position of shapes {expected}", got)
+    _expect(position.lengths.max() == steps, f"an episode of {steps} steps", position.lengths)
 
 
 def _expect(ok: bool, expected: str, got: object) -> None:
@@ -140,16 +261,25 @@ def _expect(ok: bool, expected: str, got: object) -> None:
         raise ValueError(f"expected {expected}, got {got!r:.80}")
 
 
-def _part(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
-
-
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file: after a crash at any moment, `path` holds the old one or the new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    with open(temporary, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    """Write a file: after a crash at any moment, `path` holds the old one or the new one.
+
+    Two processes may write it at the same time: one of them writes last.
+
+    Raises:
+        OSError: It cannot be written; the error names the file.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(temporary, "xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):
+            raise OSError(error.errno, error.strerror, str(path)) from None
+        raise

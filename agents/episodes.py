@@ -6,20 +6,27 @@ over any wire and in any simulator of the same model.
 """
 
 import time
-from array import array
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
 
-from ..udp import LOST
+from ..envs.autoreset import AdvancingVectorEnv
+from ..envs.spec import EnvSpec, component_names
+from ..models.errors import InputError
+from .policies import ActionMap, flat, flat_size
 
-__all__ = ["Clock", "Episode", "EpisodeLog", "Position", "ResumeError", "episode_seed"]
+__all__ = ["LOST", "Episode", "EpisodeLog", "Position", "ResumeError", "episode_seed"]
+
+LOST: Final = "simulator_lost"
+"""Name in the `info` of a step whose simulator was lost, as `rotorgram.udp` has it."""
 
 
-class ResumeError(RuntimeError):
-    """The simulator does not repeat the episode that was interrupted."""
+class ResumeError(InputError):
+    """The simulator does not repeat the episodes that were interrupted."""
 
 
 def episode_seed(run_seed: int, episode: int) -> int:
@@ -39,8 +46,8 @@ class Episode:
     """Control steps."""
     total_reward: float
     """Return, not discounted."""
-    mean_abs_error: float
-    """Mean of |E| over its steps, m."""
+    mean_size: float
+    """Mean of |headline metric| over its steps, in the metric's unit; NaN if there is none."""
     terminated: bool
     truncated: bool
     seconds: float
@@ -51,29 +58,87 @@ class Episode:
 
 @dataclass(frozen=True, kw_only=True)
 class Position:
-    """Where a run stands: after so many actions of an episode."""
+    """Where a run of N drones stands."""
 
-    episode: int
-    """Episodes that have ended; so, with one drone, the number of the running one."""
     env_steps: int
     seconds: float
+    """Wall time since training began."""
     actions: np.ndarray
-    """Actions of the running episode: float32, shape (t, k), or int64, shape (t,). Of N drones:
-    float32, shape (t, N, k), where t steps are those of the longest running episode."""
-    observation: np.ndarray
-    """What the last of them led to: float32, shape (n,) or (N, n)."""
-    numbers: np.ndarray | None = None
-    """Of N drones, the number of the running episode of each: int64, shape (N,)."""
-    lengths: np.ndarray | None = None
-    """Of N drones, the steps of the running episode of each: int64, shape (N,)."""
-    first_steps: np.ndarray | None = None
-    """Of N drones, env steps of the run before the running episode of each: int64, shape (N,)."""
+    """What the env got: float32, shape (t, N, k), or int64, shape (t, N), where t steps are those
+    of the longest running episode."""
+    observations: np.ndarray
+    """What the last of them led to, flat: float32, shape (N, n)."""
+    numbers: np.ndarray
+    """Number of the running episode of each: int64, shape (N,)."""
+    lengths: np.ndarray
+    """Steps of the running episode of each: int64, shape (N,)."""
+    first_steps: np.ndarray
+    """Env steps of the run before the running episode of each: int64, shape (N,)."""
+    episodes: tuple[Episode, ...] = ()
+    """Those that have ended, in that order."""
 
 
-class Clock:
-    """Wall time of a training: what both logs have in common."""
+class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Gives every episode of every drone its seed, and keeps what was flown.
 
-    _began: float | None = None
+    Episodes are numbered as they begin, of several that begin with the same step in the order of
+    the drones. `fly` and `begin` leave the results in the attributes of `env`. `reset` and `step`
+    make the log a vector env of Gymnasium's SAME_STEP, whatever the autoreset of `env`. Its
+    observations are flat, and its continuous actions are in the units of `ActionMap`.
+
+    Args:
+        env: Local or remote; of one drone, or a vector env.
+        seed: Seed of the run.
+        keep_steps: Whether `steps` is asked for.
+
+    Attributes:
+        spec: `EnvSpec` of the env.
+        env_steps: Control steps of all drones together.
+        episodes: Those that have ended, in that order.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any] | AdvancingVectorEnv,
+        seed: int,
+        *,
+        keep_steps: bool = False,
+    ) -> None:
+        told = ("metrics", "thrust") if keep_steps else ("metrics",)
+        self.env = env if isinstance(env, AdvancingVectorEnv) else _OneDrone(env, told)
+        self.spec: EnvSpec = self.env.env_spec  # type: ignore[assignment]  # not Gymnasium's
+        self.num_envs = count = self.env.num_envs
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.actions = ActionMap(self.spec.action)
+        self._take_spaces()
+        self.run_seed = seed
+        self.env_steps = 0
+        self.episodes: list[Episode] = []
+        self._began: float | None = None
+        self._numbers = np.arange(-count, 0)  # of the running episodes
+        self._lengths, self._first_steps = np.zeros(count, int), np.zeros(count, int)
+        self._rewards, self._sizes = np.zeros(count), np.zeros(count)
+        self._seeds = np.zeros(count, np.uint64)
+        self._all, self._nothing = np.ones(count, bool), np.full(count, np.nan)
+        self._flown: list[np.ndarray] = []  # actions; at least those of the running episodes
+        self._steps: list[np.ndarray] | None = [] if keep_steps else None
+        still = np.zeros((count, self.actions.size), np.float32)
+        self._still = self.actions.to_envs(still)
+
+    def _take_spaces(self) -> None:
+        low, high = (
+            np.concatenate([array.bounds()[i].ravel() for array in self.spec.observation])
+            for i in range(2)
+        )
+        choices, size = self.actions.outputs, (self.actions.size,)
+        self.single_observation_space = spaces.Box(
+            low.astype(np.float32), high.astype(np.float32), (flat_size(self.spec),), np.float32
+        )
+        self.single_action_space = (
+            spaces.Discrete(choices) if self.actions.discrete else spaces.Box(-1, 1, size)
+        )
+
+    # ---- time
 
     def start_clock(self) -> None:
         """Training begins now; after `resume` it has begun before."""
@@ -85,118 +150,286 @@ class Clock:
         """Wall time since training began, s."""
         return 0.0 if self._began is None else time.perf_counter() - self._began
 
+    # ---- flying
 
-class EpisodeLog(Clock, gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
-    """Gives every episode its seed, and keeps what was flown.
+    @property
+    def observations(self) -> np.ndarray:
+        """What the drones see now, flat: float32, shape (N, n)."""
+        return flat(self.env.observations, self.spec, self.num_envs)
 
-    Args:
-        env: A local or remote env whose observation begins with the elevation error.
-        seed: Seed of the run.
-    """
+    def start(self) -> None:
+        """Begin the first episode of every drone, unless that was done before."""
+        if self._numbers[0] < 0:
+            self._number(self._all)
+            self.env.reset(seed=self._seeds.tolist())
 
-    def __init__(self, env: gym.Env[np.ndarray, Any], seed: int) -> None:
-        super().__init__(env)
-        self.run_seed = seed
-        self.env_steps = 0
-        self.episodes: list[Episode] = []
-        self.errors = array("f")
-        """Elevation error after each step, m."""
-        self.rewards = array("f")
-        self.thrusts = array("f")
-        """Thrust of rotor 1 during each step, N; NaN where the env tells none."""
-        self._episode = -1
-        self._actions: list[Any] = []
-        self._observation = np.empty(0, np.float32)
+    def fly(
+        self,
+        actions: np.ndarray,
+        begins: np.ndarray | None = None,
+        frozen: np.ndarray | None = None,
+    ) -> None:
+        """Fly one step. A drone whose episode ends has to begin the next, or to be frozen.
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin the next episode, with its own seed; `seed` and `options` are not used."""
-        self._episode += 1
-        self._actions = []
-        observation, info = self.env.reset(seed=episode_seed(self.run_seed, self._episode))
-        self._observation = observation
-        return observation, info
+        Args:
+            actions: As a network draws them: shape (N, k), or (N, 1) if discrete.
+            begins: bool, shape (N,): drones that begin their next episode instead of flying.
+            frozen: bool, shape (N,): drones that stay as they are.
+        """
+        env, sent = self.env, self.actions.to_envs(actions)
+        if begins is None:
+            env.advance(sent, None, None, frozen)
+            idle = frozen
+        else:
+            self._number(begins)
+            env.advance(sent, begins, self._seeds, frozen)
+            idle = begins if frozen is None else begins | frozen
+        self._flown.append(sent)
+        self._keep_step(idle)
+        self.env_steps += self.num_envs - (0 if idle is None else int(np.count_nonzero(idle)))
+        ended = env.terminated | env.truncated
+        if np.count_nonzero(ended):  # of few drones faster than `any`
+            self._keep_episodes(ended)
 
-    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
-        """Fly one step and keep it."""
-        result = self.env.step(action)
-        observation, reward, terminated, truncated, info = result
-        self._keep_step(action, observation, reward, info)
-        self.env_steps += 1
-        if terminated or truncated:
-            self._keep_episode(terminated, truncated, lost=LOST in info)
-        return result
+    def begin(self, drones: np.ndarray) -> np.ndarray:
+        """Begin the next episodes of some drones, while the others are frozen.
+
+        If a simulator is lost meanwhile, the episodes of its frozen drones are truncated: these
+        begin their next as well.
+
+        Args:
+            drones: bool, shape (N,).
+
+        Returns:
+            Drones whose episode was truncated, bool, shape (N,).
+        """
+        env, broken = self.env, np.zeros(self.num_envs, bool)
+        while drones.any():
+            self._number(drones)
+            env.advance(self._still, drones, self._seeds, ~drones)
+            drones = env.lost.copy()
+            broken |= drones
+            if drones.any():
+                self._keep_episodes(drones)
+        return broken
+
+    # ---- Gymnasium's vector env
+
+    def reset(self, **_: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode of every drone, with its own seed; arguments are not used."""
+        self._number(self._all)
+        self.env.reset(seed=self._seeds.tolist())
+        return self.observations, {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Fly one step. `info` has `final_obs` where an episode ended."""
+        env = self.env
+        self.fly(np.asarray(actions, np.float32).reshape(self.num_envs, -1))
+        last, rewards, terminated = self.observations, env.rewards, env.terminated
+        truncated, info = env.truncated, {}
+        if (terminated | truncated).any():
+            truncated = truncated | self.begin(terminated | truncated)
+            info = {"final_obs": last, "_final_obs": terminated | truncated}
+        return self.observations, rewards, terminated, truncated, info
+
+    # ---- resuming
 
     def position(self) -> Position:
         """Where the run stands now."""
+        longest = int(self._lengths.max())
+        recent = self._flown[len(self._flown) - longest :]
         return Position(
-            episode=self._episode,
             env_steps=self.env_steps,
             seconds=self.seconds,
-            actions=np.array(self._actions),
-            observation=self._observation.copy(),
+            actions=np.array(recent or [self._still])[: len(recent)],
+            observations=self.observations,
+            numbers=self._numbers.copy(),
+            lengths=self._lengths.copy(),
+            first_steps=self._first_steps.copy(),
+            episodes=tuple(self.episodes),
         )
 
-    def resume(self, position: Position, episodes: list[Episode]) -> None:
+    def resume(self, position: Position) -> None:
         """Bring the env to where another run stood, and go on from there.
 
-        `errors`, `rewards` and `thrusts` begin with the episode that was running.
+        Every drone flies the actions of its running episode again. A drone whose episode is
+        shorter than the longest is frozen until its turn. `steps` begins with these steps.
 
         Raises:
             ResumeError: The env does not repeat what it did then: another model, another version
                 of MuJoCo, or other options.
         """
-        self.episodes = list(episodes)
-        self._episode = position.episode
-        observation, ended, lost = self._repeat(position)
-        while lost:  # by a simulator that another one has replaced: once more, with that one
-            observation, ended, lost = self._repeat(position)
-        if ended or observation.tobytes() != position.observation.tobytes():
+        if len(position.numbers) != self.num_envs:
             raise ResumeError(
-                f"the simulator does not repeat episode {position.episode}: after "
-                f"{len(position.actions)} steps expected the observation {position.observation}, "
-                f"got {observation}"
+                f"resume: expected a training with {self.num_envs} drones, "
+                f"got one with {len(position.numbers)}"
+            )
+        self.episodes = list(position.episodes)
+        self._numbers[:], self._first_steps[:] = position.numbers, position.first_steps
+        self._draw_seeds(self._all)
+        while self._repeat(position):  # a simulator was lost: once more, with the next
+            pass
+        expected, got = position.observations, self.observations
+        if (self._lengths != position.lengths).any() or got.tobytes() != expected.tobytes():
+            raise ResumeError(
+                "resume: the simulator does not repeat the episodes that were interrupted: "
+                f"expected the observations {expected.tolist()[:3]}, got {got.tolist()[:3]}"
             )
         self.env_steps = position.env_steps
         self._began = time.perf_counter() - position.seconds
 
-    def _repeat(self, position: Position) -> tuple[np.ndarray, bool, bool]:
-        """Fly the actions of a position; the last observation, and whether all ended before."""
-        del self.errors[:], self.rewards[:], self.thrusts[:]
-        observation, _ = self.env.reset(seed=episode_seed(self.run_seed, position.episode))
-        self._actions, self._observation = [], observation
-        ended = False
-        info: dict[str, Any] = {}
-        for action in position.actions:
-            if ended:
-                break
-            observation, reward, terminated, truncated, info = self.env.step(action)
-            self._keep_step(action, observation, reward, info)
-            ended = terminated or truncated
-        return observation, ended, LOST in info
+    def _repeat(self, position: Position) -> bool:
+        """Fly the actions of a position; whether a simulator was lost."""
+        self._forget(self._all)
+        self._flown = []
+        if self._steps is not None:
+            self._steps = []
+        self.env.reset(seed=self._seeds.tolist())
+        longest = len(position.actions)
+        for step, actions in enumerate(position.actions):
+            frozen = position.lengths < longest - step
+            self.env.advance(actions, None, None, frozen)
+            if self.env.lost.any():
+                return True
+            self._flown.append(actions)
+            self._keep_step(frozen)
+            if (self.env.terminated | self.env.truncated).any():
+                return False  # too early: the lengths differ
+        return False
 
-    def _keep_step(
-        self, action: Any, observation: np.ndarray, reward: Any, info: dict[str, Any]
-    ) -> None:
-        self._actions.append(action)
-        self._observation = observation
-        self.errors.append(observation[0])
-        self.rewards.append(reward)
-        self.thrusts.append(info.get("F1", np.nan))
+    # ---- keeping
 
-    def _keep_episode(self, terminated: bool, truncated: bool, *, lost: bool) -> None:
-        length = len(self._actions)
-        self.episodes.append(
-            Episode(
-                episode=self._episode,
-                first_step=self.env_steps - length,
-                length=length,
-                total_reward=float(sum(self.rewards[-length:])),
-                mean_abs_error=float(np.abs(self.errors[-length:]).mean()),
-                terminated=terminated,
-                truncated=truncated,
-                seconds=self.seconds,
-                simulator_lost=lost,
+    def steps(self) -> dict[str, np.ndarray]:
+        """Every step that was flown, in the order of flight, those of one moment drone by drone.
+
+        `episode` (int64), and float32 of the shape (T,): `value` of the headline metric, `reward`,
+        and `thrust`, the mean over the rotors in N. NaN where the env does not tell it.
+        """
+        if self._steps is None:
+            raise ValueError("steps: expected a log with keep_steps")
+        table = np.concatenate([np.zeros((0, 4)), *self._steps])
+        names = ("value", "reward", "thrust")
+        columns = {name: table[:, i].astype(np.float32) for i, name in enumerate(names, 1)}
+        return {"episode": table[:, 0].astype(np.int64), **columns}
+
+    def _number(self, drones: np.ndarray) -> None:
+        """Give these drones their next episodes."""
+        self._numbers[drones] = self._numbers.max() + 1 + np.arange(drones.sum())
+        self._first_steps[drones] = self.env_steps
+        self._draw_seeds(drones)
+        self._forget(drones)
+
+    def _forget(self, drones: np.ndarray) -> None:
+        self._lengths[drones] = 0
+        self._rewards[drones] = self._sizes[drones] = 0.0
+
+    def _draw_seeds(self, drones: np.ndarray) -> None:
+        for drone in np.flatnonzero(drones).tolist():
+            self._seeds[drone] = episode_seed(self.run_seed, int(self._numbers[drone]))
+
+    def _keep_step(self, idle: np.ndarray | None) -> None:
+        telemetry = self.env.telemetry
+        values = telemetry["metrics"][:, 0] if "metrics" in telemetry else self._nothing
+        if idle is None:
+            self._lengths += 1
+            self._rewards += self.env.rewards
+            self._sizes += np.abs(values)
+        else:
+            self._lengths += ~idle
+            self._rewards += np.where(idle, 0.0, self.env.rewards)
+            self._sizes += np.where(idle, 0.0, np.abs(values))
+        if self._steps is not None:
+            thrust = telemetry["thrust"] if "thrust" in telemetry else self._nothing[:, np.newaxis]
+            row = (self._numbers, values, self.env.rewards, thrust.mean(axis=1))
+            table = np.stack(row, axis=1)
+            self._steps.append(table if idle is None else table[~idle])
+
+    def _keep_episodes(self, ended: np.ndarray) -> None:
+        env = self.env
+        for drone in np.flatnonzero(ended).tolist():
+            length = int(self._lengths[drone])
+            if length == 0:  # lost before its first step
+                continue
+            self.episodes.append(
+                Episode(
+                    episode=int(self._numbers[drone]),
+                    first_step=int(self._first_steps[drone]),
+                    length=length,
+                    total_reward=float(self._rewards[drone]),
+                    mean_size=float(self._sizes[drone]) / length,
+                    terminated=bool(env.terminated[drone]),
+                    truncated=bool(env.truncated[drone]),
+                    seconds=self.seconds,
+                    simulator_lost=bool(env.lost[drone]),
+                )
             )
-        )
+        running = self._lengths[~ended]
+        keep = int(running.max()) if running.size else 0
+        self._flown = self._flown[len(self._flown) - keep :]
+
+
+class _OneDrone:
+    """An env of one drone as a batch of one: what the log needs of `AdvancingVectorEnv`.
+
+    Args:
+        env: The env.
+        told: Names of the arrays of the telemetry that are asked for.
+    """
+
+    num_envs = 1
+
+    def __init__(self, env: gym.Env[Any, Any], told: tuple[str, ...]) -> None:
+        self._env = env
+        self.env_spec: EnvSpec = env.get_wrapper_attr("env_spec")
+        action = self.env_spec.action
+        self._shape = getattr(action, "shape", None)
+        arrays = [array for array in self.env_spec.telemetry if array.name in told]
+        self._told = [(array.name, component_names(array)) for array in arrays]
+        self.telemetry: dict[str, np.ndarray] = {}
+        self.observations: Any = None
+        self._set(0.0, False, False, False)
+
+    def reset(self, *, seed: list[int]) -> None:
+        """Begin an episode."""
+        self._take(*self._env.reset(seed=seed[0]))
+
+    def advance(
+        self,
+        actions: np.ndarray,
+        resets: np.ndarray | None = None,
+        seeds: np.ndarray | None = None,
+        frozen: np.ndarray | None = None,
+    ) -> None:
+        """As `AdvancingVectorEnv.advance`."""
+        if resets is not None and resets[0] and seeds is not None:
+            self.reset(seed=[int(seeds[0])])
+        elif frozen is not None and frozen[0]:
+            self._set(0.0, False, False, False)
+        else:
+            action = int(actions[0]) if self._shape is None else actions[0].reshape(self._shape)
+            observation, reward, terminated, truncated, info = self._env.step(action)
+            self._take(observation, info, float(reward), terminated, truncated)
+
+    def _take(
+        self,
+        observation: Any,
+        info: dict[str, Any],
+        reward: float = 0.0,
+        terminated: bool = False,
+        truncated: bool = False,
+    ) -> None:
+        if isinstance(observation, dict):
+            self.observations = {k: np.asarray(v)[np.newaxis] for k, v in observation.items()}
+        else:
+            self.observations = np.asarray(observation)[np.newaxis]
+        self.telemetry = {
+            name: np.array([info[component] for component in components])[np.newaxis]
+            for name, components in self._told
+        }
+        self._set(reward, terminated, truncated, LOST in info)
+
+    def _set(self, reward: float, terminated: bool, truncated: bool, lost: bool) -> None:
+        self.rewards, self.lost = np.array((reward,)), np.array((lost,))
+        self.terminated, self.truncated = np.array((terminated,)), np.array((truncated,))

@@ -6,40 +6,44 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-import torch
-from torch import nn
 
+from ..models.errors import InputError
 from .episodes import EpisodeLog
-from .networks import arrays_of, load_arrays
-from .policies import NetworkPolicy
-from .rollouts import AnyCollector, Collector, Rollout, VectorCollector
-from .vector_episodes import VectorEpisodeLog
+from .networks import Actor, arrays_of, load_arrays, nn, torch
+from .policies import ActionMap, NetworkPolicy, flat_size
+from .presets import A2CConfig, VPGConfig
+from .rollouts import Collector, Rollout
 
 __all__ = [
     "Agent",
-    "AnyLog",
+    "Diverged",
     "Learner",
     "OnUpdate",
     "Terms",
+    "check_finite",
     "optimizer_arrays",
     "seeds_of",
     "set_optimizer_arrays",
-    "sizes",
     "updates_of",
 ]
-
-AnyLog = EpisodeLog | VectorEpisodeLog
-"""What a training flies through: one drone or many."""
 
 OnUpdate = Callable[[], bool]
 """Called after every rollout and its update; training stops where it returns False."""
 
 
+class Diverged(InputError):
+    """An update has left weights that are not finite. What was stored before it is whole."""
+
+
 class Agent(Protocol):
     """An algorithm in training. Its state is plain arrays, whole at every update."""
 
-    def train(self, log: AnyLog, env_steps: int, on_update: OnUpdate) -> None:
-        """Train until the log counts `env_steps`; the state resumes where it stood."""
+    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
+        """Train until the log counts `env_steps`; the state resumes where it stood.
+
+        Raises:
+            Diverged: An update has left weights that are not finite.
+        """
 
     def last_step(self, env_steps: int) -> int:
         """Env steps after which a training of so many ends: fewer where rollouts must be whole."""
@@ -97,32 +101,36 @@ class Learner:
     """Base of our own algorithms: `collect` and `loss` are theirs; `loss` sets `terms` too.
 
     Args:
-        networks: By name; `actor` is one of them.
-        learning_rate: Of Adam.
-        anneal: Lower it linearly to zero over the run.
-        rng: Draws the actions.
+        log: Gives the sizes; it is not kept.
+        config: Hyperparameters.
+        seed: Seed of the run: weights and actions.
     """
 
-    def __init__(
-        self,
-        networks: dict[str, nn.Module],
-        *,
-        learning_rate: float,
-        anneal: bool,
-        rng: np.random.Generator,
-    ) -> None:
-        self.networks = networks
-        self._learning_rate = learning_rate
-        self._anneal = anneal
-        self._rng = rng
-        parameters = [p for network in networks.values() for p in network.parameters()]
+    def __init__(self, log: EpisodeLog, config: VPGConfig | A2CConfig, seed: int) -> None:
+        weights_seed, self._rng = seeds_of(seed)
+        torch.manual_seed(weights_seed)
+        self.spec = log.spec
+        actions = ActionMap(log.spec.action)
+        self._actor = Actor(
+            flat_size(log.spec),
+            actions.outputs,
+            discrete=actions.discrete,
+            hidden=config.hidden,
+            log_std=config.log_std,
+        )
+        self.networks: dict[str, nn.Module] = {"actor": self._actor, **self.others(config)}
+        self._learning_rate, self._anneal = config.learning_rate, config.anneal
+        parameters = [p for network in self.networks.values() for p in network.parameters()]
         # foreach: one call for all parameters instead of one for each; same arithmetic.
-        self._optimizer = torch.optim.Adam(parameters, lr=learning_rate, foreach=True)
-        self._observation: np.ndarray | None = None
+        self._optimizer = torch.optim.Adam(parameters, lr=self._learning_rate, foreach=True)
         self.terms: Terms | None = None
         """Of the last update."""
 
-    def collect(self, collector: AnyCollector, policy: NetworkPolicy, most: int) -> Rollout:
+    def others(self, config: Any) -> dict[str, nn.Module]:
+        """Networks besides the actor, by name."""
+        return {}
+
+    def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
         """Fly for one update, at most so many env steps; an empty rollout makes none."""
         raise NotImplementedError
 
@@ -130,17 +138,12 @@ class Learner:
         """What one step of Adam lowers."""
         raise NotImplementedError
 
-    def train(self, log: AnyLog, env_steps: int, on_update: OnUpdate) -> None:
-        """Train until the log counts `env_steps`, or `on_update` returns False."""
-        collector: AnyCollector
-        if isinstance(log, VectorEpisodeLog):
-            collector = VectorCollector(log, self._rng, self._observation)
-        else:
-            collector = Collector(log, self._rng, self._observation)
+    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
+        """As `Agent.train`."""
+        collector = Collector(log, self._rng)
         while log.env_steps < env_steps:
-            policy, before = NetworkPolicy(self.actor()), log.env_steps
+            policy, before = NetworkPolicy(self.actor(), self.spec), log.env_steps
             rollout = self.collect(collector, policy, env_steps - before)
-            self._observation = collector.observation
             if self._anneal:
                 self._set_learning_rate(1 - before / env_steps)
             if len(rollout):
@@ -152,7 +155,8 @@ class Learner:
         self._optimizer.zero_grad()
         self.loss(rollout).backward()  # type: ignore[no-untyped-call]
         self._optimizer.step()
-        self.networks["actor"].clamp_()  # type: ignore[operator]
+        self._actor.clamp_()
+        check_finite(self._optimizer)
 
     def last_step(self, env_steps: int) -> int:
         """Env steps after which a training of so many ends: all are flown."""
@@ -160,7 +164,7 @@ class Learner:
 
     def actor(self) -> dict[str, np.ndarray]:
         """Weights of the policy."""
-        return arrays_of(self.networks["actor"])
+        return arrays_of(self._actor)
 
     def state(self) -> dict[str, np.ndarray]:
         """Weights, Adam's moments and the generator, by name."""
@@ -170,20 +174,16 @@ class Learner:
             for key, value in arrays_of(network).items()
         }
         state |= optimizer_arrays(self._optimizer)
-        state["rng"] = _text_array(json.dumps(self._rng.bit_generator.state))
-        if self._observation is not None:
-            state["observation"] = self._observation
+        text = json.dumps(self._rng.bit_generator.state)
+        state["rng"] = np.frombuffer(text.encode(), np.uint8)
         return state
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over a state."""
         for name, network in self.networks.items():
-            prefix = f"{name}."
-            load_arrays(network, {k[len(prefix):]: v for k, v in state.items()
-                                  if k.startswith(prefix)})  # fmt: skip
+            load_arrays(network, state, f"{name}.")
         set_optimizer_arrays(self._optimizer, state)
         self._rng.bit_generator.state = json.loads(state["rng"].tobytes())
-        self._observation = state.get("observation")
         self.terms = None
 
     def scalars(self) -> dict[str, float]:
@@ -193,14 +193,27 @@ class Learner:
         numbers = self.terms.numbers()
         numbers["train/learning_rate"] = self._optimizer.param_groups[0]["lr"]
         numbers["train/n_updates"] = updates_of(self._optimizer)
-        log_std = self.networks["actor"].log_std
-        if isinstance(log_std, torch.Tensor):  # else the actions are discrete
-            numbers["train/std"] = float(log_std.detach().exp().mean())
+        if self._actor.log_std is not None:
+            numbers["train/std"] = float(self._actor.log_std.detach().exp().mean())
         return numbers
 
     def _set_learning_rate(self, share: float) -> None:
         for group in self._optimizer.param_groups:
             group["lr"] = self._learning_rate * share
+
+
+def check_finite(optimizer: torch.optim.Optimizer) -> None:
+    """Raise `Diverged` unless all weights that an optimizer moves are finite numbers."""
+    weights = torch.cat([p.detach().flatten() for p in _parameters(optimizer)])
+    if not torch.isfinite(weights).all():
+        raise Diverged(
+            f"training diverged: weights are not finite after update {updates_of(optimizer)}; "
+            "try a lower learning_rate"
+        )
+
+
+def _parameters(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:
+    return [p for group in optimizer.param_groups for p in group["params"]]
 
 
 def optimizer_arrays(optimizer: torch.optim.Optimizer) -> dict[str, np.ndarray]:
@@ -215,18 +228,21 @@ def optimizer_arrays(optimizer: torch.optim.Optimizer) -> dict[str, np.ndarray]:
 def set_optimizer_arrays(
     optimizer: torch.optim.Optimizer, arrays: Mapping[str, np.ndarray]
 ) -> None:
-    """Take over what `optimizer_arrays` gave."""
-    state: dict[int, dict[str, Any]] = {}
-    for name, value in arrays.items():
-        if name.startswith("optimizer."):
-            _, index, key = name.split(".")
-            state.setdefault(int(index), {})[key] = torch.from_numpy(value.copy())
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    for place, entries in state.items():
-        shape = parameters[place].shape
-        for key, value in entries.items():
-            if key != "step" and value.shape != shape:
-                raise ValueError(f"optimizer.{place}.{key}: expected shape {tuple(shape)}")
+    """Take over what `optimizer_arrays` gave. Raises `ValueError` unless it is whole."""
+    given = {k: v for k, v in arrays.items() if k.startswith("optimizer.")}
+    expected = {
+        f"optimizer.{index}.{key}": tuple(shape)
+        for index, parameter in enumerate(_parameters(optimizer))
+        for key, shape in (("step", ()), ("exp_avg", parameter.shape),
+                           ("exp_avg_sq", parameter.shape))
+    }  # fmt: skip
+    got = {name: array.shape for name, array in given.items()}
+    if got not in (expected, {}):
+        raise ValueError(f"optimizer: expected arrays of shapes {expected}, got {got}")
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, value in given.items():
+        _, index, key = name.split(".")
+        state.setdefault(int(index), {})[key] = torch.from_numpy(value.copy())
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": state, "param_groups": groups})
 
@@ -235,16 +251,6 @@ def updates_of(optimizer: torch.optim.Optimizer) -> int:
     """How many steps an Adam has taken."""
     states = list(optimizer.state.values())
     return int(states[0]["step"]) if states else 0
-
-
-def _text_array(text: str) -> np.ndarray:
-    return np.frombuffer(text.encode(), np.uint8)
-
-
-def sizes(env: Any) -> tuple[int, Any]:
-    """Length of an observation, and the action space, of an env or of one of a vector env."""
-    observation = getattr(env, "single_observation_space", env.observation_space)
-    return observation.shape[0], getattr(env, "single_action_space", env.action_space)
 
 
 def seeds_of(seed: int) -> tuple[int, np.random.Generator]:

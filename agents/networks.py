@@ -6,11 +6,18 @@ checkpoints keep them.
 
 import math
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from gymnasium import spaces
-from torch import nn
+
+from ..models.errors import require
+
+if TYPE_CHECKING:
+    import torch
+    from torch import nn
+else:
+    torch = require("torch", "train", "training")
+    nn = torch.nn
 
 __all__ = ["Actor", "Critic", "arrays_of", "load_arrays"]
 
@@ -25,33 +32,33 @@ def _layer(inputs: int, outputs: int, gain: float) -> nn.Linear:
 
 
 class Actor(nn.Module):
-    """Policy: Gaussian for a `Box` of actions, categorical for `Discrete`.
+    """Policy: Gaussian for continuous actions, categorical for discrete ones.
 
     The Gaussian's standard deviation does not depend on the state. An action is neither clipped
     nor squashed here: what the env gets is clipped, what is scored is what was drawn.
 
     Args:
-        observation_size: Length of an observation.
-        action_space: Flat `Box`, or `Discrete`.
+        inputs: Length of a flat observation, n.
+        outputs: Numbers of an action, or its choices, k.
+        discrete: Whether an action is a choice.
         hidden: Units of the hidden layer.
         log_std: Logarithm of the standard deviation to begin with.
     """
 
     def __init__(
         self,
-        observation_size: int,
-        action_space: spaces.Space[np.ndarray],
+        inputs: int,
+        outputs: int,
         *,
+        discrete: bool = False,
         hidden: int = 16,
         log_std: float = -0.5,
     ) -> None:
         super().__init__()
-        discrete = isinstance(action_space, spaces.Discrete)
-        size = int(action_space.n) if discrete else action_space.shape[0]  # type: ignore[attr-defined,index]
-        self.hidden = _layer(observation_size, hidden, math.sqrt(2))
-        # Near zero: the first policy holds the thrust, whatever it sees.
-        self.output = _layer(hidden, size, 0.01)
-        self.log_std = None if discrete else nn.Parameter(torch.full((size,), log_std))
+        self.hidden = _layer(inputs, hidden, math.sqrt(2))
+        # Near zero: the first policy gives the middle of the action space, whatever it sees.
+        self.output = _layer(hidden, outputs, 0.01)
+        self.log_std = None if discrete else nn.Parameter(torch.full((outputs,), log_std))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Means, or logits, shape (B, k), of observations (B, n)."""
@@ -83,9 +90,9 @@ class Actor(nn.Module):
 class Critic(nn.Module):
     """State value: the second network of A2C, of the same size as the first."""
 
-    def __init__(self, observation_size: int, *, hidden: int = 16) -> None:
+    def __init__(self, inputs: int, *, hidden: int = 16) -> None:
         super().__init__()
-        self.hidden = _layer(observation_size, hidden, math.sqrt(2))
+        self.hidden = _layer(inputs, hidden, math.sqrt(2))
         self.output = _layer(hidden, 1, 1.0)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
@@ -99,6 +106,12 @@ def arrays_of(module: nn.Module) -> dict[str, np.ndarray]:
     return {name: p.detach().numpy().copy() for name, p in module.state_dict().items()}
 
 
-def load_arrays(module: nn.Module, arrays: Mapping[str, np.ndarray]) -> None:
-    """Set a module's parameters."""
-    module.load_state_dict({name: torch.from_numpy(a.copy()) for name, a in arrays.items()})
+def load_arrays(module: nn.Module, arrays: Mapping[str, np.ndarray], prefix: str = "") -> None:
+    """Set a module's parameters from the arrays whose names begin with a prefix."""
+    module.load_state_dict(
+        {
+            name.removeprefix(prefix): torch.from_numpy(array.copy())
+            for name, array in arrays.items()
+            if name.startswith(prefix)
+        }
+    )

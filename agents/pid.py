@@ -1,14 +1,16 @@
-"""A hand-tuned PID controller on the same socket: the classical yardstick."""
+"""A hand-tuned PID controller on the same socket: the classical yardstick of Elevation."""
 
 from typing import Any, Final
 
 import numpy as np
 
-from ..envs import ElevationConfig
-from ..models.constants import HOVER_THRUST, MASS, NUM_ROTORS
+from ..envs.spec import EnvSpec
+from ..models.constants import GRAVITY
+from ..models.errors import InputError
 
 __all__ = ["PID"]
 
+ENV_ID: Final = "rotorgram/Elevation-v0"
 PROPORTIONAL: Final = 9.0
 """1/s²: closed-loop natural frequency of 3 rad/s."""
 DERIVATIVE: Final = 5.4
@@ -17,27 +19,40 @@ INTEGRAL: Final = 1.0
 """1/s³: there is no steady load to remove here; an unknown mass would be one."""
 INTEGRAL_BAND: Final = 0.02
 """m: the integral grows only this near the target, so that the way there does not wind it up."""
+SHARES: Final = {"increment": 0.05, "offset": 0.2}
+"""Thrust per unit of action over the rotors' largest, where the option `thrust_scale` is None."""
 
 
 class PID:
     """Wanted acceleration from E, its rate and its integral; then the thrust that gives it.
 
-    Needs the full observation and continuous actions.
+    Needs the full observation and continuous actions. What it knows of the vehicle follows from the
+    spec: the bounds of the rotors' thrust in the telemetry, N, over those in the observation,
+    relative to hover, give the thrust at hover, and that over g the mass that a rotor carries.
 
     Args:
-        config: Options of the env that it flies.
+        spec: Of the env that it flies.
 
     Raises:
-        ValueError: The options lack what it needs.
+        InputError: It is another env, or its options lack what the PID needs.
     """
 
-    def __init__(self, config: ElevationConfig) -> None:
-        if config.observation != "full" or config.action_type != "continuous":
-            raise ValueError(
+    def __init__(self, spec: EnvSpec) -> None:
+        options = spec.options
+        if spec.env_id != ENV_ID:
+            raise InputError(f"pid: expected the env {ENV_ID}, got {spec.env_id}")
+        if options["observation"] != "full" or options["action_type"] != "continuous":
+            raise InputError(
                 "pid: expected observation='full' and action_type='continuous', "
-                f"got {config.observation!r} and {config.action_type!r}"
+                f"got {options['observation']!r} and {options['action_type']!r}"
             )
-        self._config = config
+        thrust = next(array for array in spec.telemetry if array.name == "thrust")
+        highest = thrust.bounds()[1]
+        self._hover = float(highest[0]) / (1 + float(spec.observation[0].bounds()[1][2]))
+        self._increment = options["action_mode"] == "increment"
+        share = SHARES[options["action_mode"]]
+        self._scale = options["thrust_scale"] or share * float(highest.max())
+        self._period = spec.control_period
         self._integral = 0.0
 
     def reset(self) -> None:
@@ -48,10 +63,10 @@ class PID:
         """Change of thrust, or thrust over hover, as the env's action, float32, shape (1,)."""
         error, rate, thrust = observation.tolist()
         if abs(error) < INTEGRAL_BAND:
-            self._integral += error * self._config.control_period
+            self._integral += error * self._period
         acceleration = PROPORTIONAL * error + DERIVATIVE * rate + INTEGRAL * self._integral
-        wanted = acceleration * MASS / NUM_ROTORS
-        if self._config.action_mode == "increment":
-            wanted -= thrust * HOVER_THRUST
-        action = wanted / self._config.newtons_per_action
+        wanted = acceleration * self._hover / GRAVITY
+        if self._increment:
+            wanted -= thrust * self._hover
+        action = wanted / self._scale
         return np.array((min(max(action, -1.0), 1.0),), np.float32)

@@ -5,17 +5,98 @@ from typing import Any, Protocol
 
 import numpy as np
 
-__all__ = ["NetworkPolicy", "Policy"]
+from ..envs.spec import ArraySpec, Discrete, EnvSpec
+from ..models.errors import InputError
+
+__all__ = ["ActionMap", "NetworkPolicy", "Policy", "flat", "flat_size"]
 
 
 class Policy(Protocol):
-    """Whatever flies a drone: called once for each control step."""
+    """What flies a drone: called once for each control step."""
 
     def reset(self) -> None:
         """Forget the last episode."""
 
-    def act(self, observation: np.ndarray) -> Any:
-        """The action for an observation, shape (n,), as the env takes it."""
+    def act(self, observation: Any) -> Any:
+        """The action for an observation, both as the env has them."""
+
+
+def flat(observations: Any, spec: EnvSpec, *lead: int) -> np.ndarray:
+    """Observations as networks take them: float32, shape (*lead, n).
+
+    Args:
+        observations: An array of shape (*lead, ...), or a mapping with one for each array of the
+            spec; these are joined in the order of the spec.
+        spec: Of the env.
+        lead: (N,) for N drones; nothing for a single one.
+    """
+    if not isinstance(observations, Mapping):
+        return np.asarray(observations, np.float32).reshape(*lead, -1)
+    parts = [observations[array.name] for array in spec.observation]
+    return np.concatenate([np.asarray(p, np.float32).reshape(*lead, -1) for p in parts], axis=-1)
+
+
+def flat_size(spec: EnvSpec) -> int:
+    """Length n of a flat observation."""
+    return sum(array.size for array in spec.observation)
+
+
+class ActionMap:
+    """From what a network gives to what an env takes.
+
+    Of a continuous action the network's 0 is the middle between the bounds, -1 the lower and 1 the
+    upper one; where there is no bound, it is the number itself. Of a discrete action the network
+    gives a number for each choice.
+
+    Args:
+        action: Of the env's spec.
+
+    Attributes:
+        outputs: Numbers that the network gives.
+        size: Numbers of a drawn action, k: 1 if discrete.
+        discrete: Whether an action is a choice.
+
+    Raises:
+        InputError: The action is an array of whole numbers.
+    """
+
+    def __init__(self, action: ArraySpec | Discrete) -> None:
+        self.discrete = isinstance(action, Discrete)
+        self._shape: tuple[int, ...] = ()
+        if isinstance(action, Discrete):
+            self.outputs, self.size = action.n, 1
+            return
+        if not action.dtype.startswith("float"):
+            raise InputError(
+                f"action: expected a choice or numbers of type float, got {action.dtype}"
+            )
+        self._shape, self.outputs, self.size = action.shape, action.size, action.size
+        # Two axes here and below: NumPy is slow where it has to add one to a batch of one.
+        low, high = (bound.reshape(1, -1) for bound in action.bounds())
+        bounded = np.isfinite(low) & np.isfinite(high)
+        with np.errstate(invalid="ignore"):
+            self._middle = np.where(bounded, (low + high) / 2, 0.0).astype(np.float32)
+            self._half = np.where(bounded, (high - low) / 2, 1.0).astype(np.float32)
+        self._low, self._high = low.astype(np.float32), high.astype(np.float32)
+        self._plain = bool((self._middle == 0).all() and (self._half == 1).all())
+
+    def to_envs(self, actions: np.ndarray) -> np.ndarray:
+        """What N drones get for drawn actions, shape (N, k).
+
+        float32, shape (N, k), inside the bounds; or int64, shape (N,).
+        """
+        if self.discrete:
+            return actions[:, 0].astype(np.int64)
+        if not self._plain:
+            actions = self._middle + self._half * actions
+        clipped: np.ndarray = np.minimum(np.maximum(actions, self._low), self._high)
+        return clipped
+
+    def to_env(self, action: np.ndarray) -> Any:
+        """What a single env gets for a drawn action, shape (k,): of its shape, or an int."""
+        if self.discrete:
+            return int(action[0])
+        return self.to_envs(action[np.newaxis])[0].reshape(self._shape)
 
 
 class NetworkPolicy:
@@ -24,97 +105,74 @@ class NetworkPolicy:
     Args:
         weights: `hidden.weight` (h, n), `hidden.bias` (h,), `output.weight` (k, h),
             `output.bias` (k,), all float32, and for continuous actions `log_std` (k,).
+        spec: Of the env that it flies.
 
     Raises:
-        ValueError: A weight is missing, or has another shape.
+        InputError: A weight is missing, or the shapes are not those that the env needs.
     """
 
-    def __init__(self, weights: Mapping[str, np.ndarray]) -> None:
-        _check_shapes(weights)
-        self._w1, self._b1 = weights["hidden.weight"], weights["hidden.bias"]
-        self._w2, self._b2 = weights["output.weight"], weights["output.bias"]
-        log_std = weights.get("log_std")
-        self._std = None if log_std is None else np.exp(log_std)
-        self._hidden = np.empty_like(self._b1)
-        self.observation_size = self._w1.shape[1]
-        self.action_size = 1 if self._std is None else len(self._b2)
+    def __init__(self, weights: Mapping[str, np.ndarray], spec: EnvSpec) -> None:
+        self.spec = spec
+        self.actions = ActionMap(spec.action)
+        _check_shapes(weights, flat_size(spec), self.actions)
+        self._w1, self._b1 = weights["hidden.weight"].T, weights["hidden.bias"][np.newaxis]
+        self._w2, self._b2 = weights["output.weight"].T, weights["output.bias"][np.newaxis]
+        self._zero = np.zeros_like(self._b1)
+        self._std = None if self.actions.discrete else np.exp(weights["log_std"])
 
     def reset(self) -> None:
         """Nothing to forget."""
 
-    def output(self, observation: np.ndarray) -> np.ndarray:
-        """Means, or logits, shape (k,)."""
-        hidden = self._hidden
-        np.dot(self._w1, observation, out=hidden)
-        np.add(hidden, self._b1, out=hidden)
-        np.maximum(hidden, 0.0, out=hidden)
-        mean: np.ndarray = self._w2.dot(hidden)
-        mean += self._b2
-        return mean
+    def output(self, observations: np.ndarray) -> np.ndarray:
+        """Means, or logits, shape (N, k), of flat observations, shape (N, n)."""
+        hidden: np.ndarray = observations.dot(self._w1)
+        hidden += self._b1
+        np.maximum(hidden, self._zero, out=hidden)
+        output: np.ndarray = hidden.dot(self._w2)
+        output += self._b2
+        return output
 
-    def act(self, observation: np.ndarray) -> Any:
-        """The most likely action, clipped to [-1, 1] if continuous."""
-        output = self.output(observation)
-        return int(output.argmax()) if self._std is None else clip(output)
+    def act(self, observation: Any) -> Any:
+        """The most likely action, inside the bounds of the env."""
+        output = self.output(flat(observation, self.spec, 1))[0]
+        return int(output.argmax()) if self.actions.discrete else self.actions.to_env(output)
 
     def draw_noise(self, rng: np.random.Generator, steps: int) -> np.ndarray:
-        """Randomness for so many calls of `sample`, drawn at once: shape (steps, k)."""
+        """Randomness for so many rows of `sample`, drawn at once: shape (steps, k)."""
+        shape = steps, self.actions.outputs
         if self._std is None:
             # The Gumbel trick: the largest of logits plus Gumbel noise is a categorical draw.
-            return rng.gumbel(size=(steps, len(self._b2))).astype(np.float32)
-        noise = rng.standard_normal((steps, self.action_size), dtype=np.float32)
+            return rng.gumbel(size=shape).astype(np.float32)
+        noise = rng.standard_normal(shape, dtype=np.float32)
         noise *= self._std
         return noise
 
-    def sample(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """An action drawn from the policy with one row of `draw_noise`, float32, not clipped.
+    def sample(self, observations: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Actions drawn from the policy, float32, shape (N, k), not clipped.
 
-        Shape (k,); (1,) holding a whole number if actions are discrete.
+        Shape (N, 1), holding whole numbers, if they are discrete.
+
+        Args:
+            observations: Flat, shape (N, n).
+            noise: N rows of `draw_noise`.
         """
-        output = self.output(observation)
-        output += noise
-        if self._std is None:
-            return np.array((output.argmax(),), np.float32)
-        return output
-
-    def samples(self, observations: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """`sample` for N observations, shape (N, n), and N rows of noise: float32, shape (N, k)."""
-        hidden: np.ndarray = observations @ self._w1.T
-        hidden += self._b1
-        np.maximum(hidden, 0.0, out=hidden)
-        output: np.ndarray = hidden @ self._w2.T
-        output += self._b2
+        output = self.output(observations)
         output += noise
         if self._std is None:
             output = output.argmax(axis=1)[:, np.newaxis].astype(np.float32)
         return output
 
-    def to_envs(self, actions: np.ndarray) -> np.ndarray:
-        """What a vector env gets for drawn actions, shape (N, k)."""
-        return actions if self._std is None else clip(actions)
 
-    def to_env(self, action: np.ndarray) -> Any:
-        """What the env gets for a drawn action."""
-        return int(action[0]) if self._std is None else clip(action)
-
-
-def _check_shapes(weights: Mapping[str, np.ndarray]) -> None:
+def _check_shapes(weights: Mapping[str, np.ndarray], inputs: int, actions: ActionMap) -> None:
     got = {name: array.shape for name, array in weights.items()}
-    units, inputs = (*got.get("hidden.weight", ()), 0, 0)[:2]
-    outputs = (*got.get("output.bias", ()), 0)[0]
+    units = (*got.get("hidden.bias", ()), 0)[0]
     expected = {
         "hidden.weight": (units, inputs),
         "hidden.bias": (units,),
-        "output.weight": (outputs, units),
-        "output.bias": (outputs,),
+        "output.weight": (actions.outputs, units),
+        "output.bias": (actions.outputs,),
     }
-    if "log_std" in got:
-        expected["log_std"] = (outputs,)
-    if got != expected or not units * inputs * outputs:
-        raise ValueError(f"policy: expected weights of shapes {expected}, got {got}")
-
-
-def clip(action: np.ndarray) -> np.ndarray:
-    """The nearest action inside [-1, 1]."""
-    clipped: np.ndarray = np.minimum(np.maximum(action, np.float32(-1.0)), np.float32(1.0))
-    return clipped
+    if not actions.discrete:
+        expected["log_std"] = (actions.outputs,)
+    if got != expected or not units:
+        raise InputError(f"policy: expected weights of shapes {expected}, got {got}")

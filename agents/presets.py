@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
+from ..models.errors import InputError
+
 __all__ = ["PRESETS", "A2CConfig", "AlgorithmName", "PresetName", "VPGConfig", "preset"]
 
 AlgorithmName = Literal["vpg", "a2c", "sb3-a2c"]
@@ -27,8 +29,9 @@ class VPGConfig:
     """Discount. The paper names none."""
     episodes_per_update: int = 1
     """Episodes flown with one policy ("a set of drone data"; the paper gives no number)."""
-    baseline: Literal["none", "time"] = "none"
-    """Taken off the returns: nothing (paper), or their mean at the same step of the episode."""
+    baseline: Literal["none", "time", "linear"] = "none"
+    """Taken off the returns: nothing (paper), their mean at the same step of the episode, or their
+    least-squares fit over observation and time."""
     normalize: bool = False
     """Divide the returns of an update by their standard deviation."""
     log_std: float = -0.5
@@ -37,10 +40,10 @@ class VPGConfig:
     def __post_init__(self) -> None:
         _check(self, counts=("hidden", "episodes_per_update"), shares=("gamma",),
                flags=("anneal", "normalize"))  # fmt: skip
-        if self.baseline not in ("none", "time"):
-            raise ValueError(f"baseline: expected 'none' or 'time', got {self.baseline!r}")
+        if self.baseline not in ("none", "time", "linear"):
+            raise InputError(f"baseline: expected none, time or linear, got {self.baseline!r}")
         if self.baseline == "time" and self.episodes_per_update < 2:
-            raise ValueError(
+            raise InputError(
                 "episodes_per_update: expected 2 or more with baseline 'time', where a single "
                 f"episode is its own mean, got {self.episodes_per_update}"
             )
@@ -63,21 +66,21 @@ class A2CConfig:
     """Discount. The paper names none."""
     steps_per_update: int = 1
     """Env steps between updates (paper: one), of all drones together."""
-    trace: float = 0.0
+    gae_lambda: float = 0.0
     """Lambda of generalised advantage estimation; 0 is the paper's Equation 3."""
     normalize: bool = False
     """Shift and scale the advantages of an update to mean 0 and standard deviation 1."""
-    value_weight: float = 0.5
+    vf_coef: float = 0.5
     """Weight of the squared error of the value."""
-    entropy_weight: float = 0.0
+    ent_coef: float = 0.0
     """Weight of the policy's entropy."""
     log_std: float = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""
 
     def __post_init__(self) -> None:
-        _check(self, counts=("hidden", "steps_per_update"), shares=("gamma", "trace"),
+        _check(self, counts=("hidden", "steps_per_update"), shares=("gamma", "gae_lambda"),
                flags=("anneal", "normalize"))  # fmt: skip
-        for name in ("value_weight", "entropy_weight"):
+        for name in ("vf_coef", "ent_coef"):
             _expect(self, name, "a number, 0 or more", _is_number(getattr(self, name), 0.0))
 
     def rollout_size(self, drones: int) -> int:
@@ -96,7 +99,7 @@ def _check(
     for name in flags:
         _expect(config, name, "true or false", type(getattr(config, name)) is bool)
     rate = config.learning_rate
-    _expect(config, "learning_rate", "a number above 0", _is_number(rate, 0.0) and rate > 0)
+    _expect(config, "learning_rate", "a number above 0", _is_number(rate, 0.0, 1e30) and rate > 0)
     _expect(config, "log_std", "a number from -4 to 1", _is_number(config.log_std, -4.0, 1.0))
 
 
@@ -106,7 +109,7 @@ def _is_number(value: Any, low: float, high: float = math.inf) -> bool:
 
 def _expect(config: Any, name: str, expected: str, ok: bool) -> None:
     if not ok:
-        raise ValueError(f"{name}: expected {expected}, got {getattr(config, name)!r}")
+        raise InputError(f"{name}: expected {expected}, got {getattr(config, name)!r}")
 
 
 PRESETS: Final[dict[str, dict[str, VPGConfig | A2CConfig]]] = {
@@ -117,7 +120,7 @@ PRESETS: Final[dict[str, dict[str, VPGConfig | A2CConfig]]] = {
             anneal=True,
             gamma=0.98,
             episodes_per_update=4,
-            baseline="time",
+            baseline="linear",
             normalize=True,
         ),
     },
@@ -128,7 +131,7 @@ PRESETS: Final[dict[str, dict[str, VPGConfig | A2CConfig]]] = {
             anneal=True,
             gamma=0.98,
             steps_per_update=256,
-            trace=0.98,
+            gae_lambda=0.98,
             normalize=True,
         ),
     },
@@ -141,13 +144,13 @@ def preset(algorithm: str, name: str, **changes: Any) -> VPGConfig | A2CConfig:
     """A preset, with some of its fields changed.
 
     Raises:
-        ValueError: No such algorithm, preset or field.
+        InputError: No such algorithm, preset or field.
     """
     if algorithm not in PRESETS:
-        raise ValueError(f"algorithm: expected one of {sorted(PRESETS)}, got {algorithm!r}")
+        raise InputError(f"algorithm: expected one of {sorted(PRESETS)}, got {algorithm!r}")
     if name not in PRESETS[algorithm]:
-        raise ValueError(f"preset: expected one of {sorted(PRESETS[algorithm])}, got {name!r}")
+        raise InputError(f"preset: expected one of {sorted(PRESETS[algorithm])}, got {name!r}")
     base = PRESETS[algorithm][name]
     if unknown := sorted(set(changes) - set(vars(base))):
-        raise ValueError(f"hyperparameters: expected some of {sorted(vars(base))}, got {unknown}")
+        raise InputError(f"hyperparameters: expected some of {sorted(vars(base))}, got {unknown}")
     return replace(base, **changes)

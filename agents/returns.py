@@ -1,30 +1,47 @@
-"""Returns and advantages, as pure functions of one sequence of transitions.
+"""Returns and advantages, as pure functions of what was flown.
 
-In every sequence `terminated` and `truncated` mark the last transition of an episode. A value is
-carried over a truncation and never over a termination; a recursion stops at either.
+Time is the first axis, drones may be the second: every array has the shape (T,) or (T, N).
+`terminated` and `truncated` mark the last transition of an episode. A value is carried over a
+truncation and never over a termination; a recursion stops at either, and at the last row.
 """
 
 import numpy as np
 
-__all__ = ["advantages", "rewards_to_go"]
+__all__ = ["advantages", "discounted_sums", "rewards_to_go", "step_of_episode"]
+
+
+def discounted_sums(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """S_t = v_t + f_t · S_t+1, where S is 0 after the last row: float64, shape of `values`.
+
+    The rows are combined in pairs, pairs of pairs and so on: log2(T) NumPy operations on all of
+    them take the place of T operations on one.
+
+    Args:
+        values: v.
+        factors: f, 0 where a sum stops.
+    """
+    sums = values.astype(np.float64)
+    factors = factors.astype(np.float64)
+    span = 1
+    while span < len(sums):
+        sums[:-span] += factors[:-span] * sums[span:]
+        factors[:-span] *= factors[span:]
+        factors[-span:] = 0.0
+        span *= 2
+    return sums
 
 
 def rewards_to_go(rewards: np.ndarray, ends: np.ndarray, gamma: float) -> np.ndarray:
     """Discounted return from each step to the end of its episode (paper, Algorithm 1, step 2).
 
-    R_t = sum of gamma^(t' - t) · r_t' for t' = t ... T - 1.
+    R_t = sum of gamma^(t' - t) · r_t' for t' = t ... the end.
 
     Args:
-        rewards: float64, shape (T,).
-        ends: bool, shape (T,): terminated or truncated.
+        rewards: Numbers.
+        ends: bool: terminated or truncated.
         gamma: Discount.
     """
-    result = np.empty(len(rewards))
-    running = 0.0
-    for t in range(len(rewards) - 1, -1, -1):
-        running = rewards[t] + (0.0 if ends[t] else gamma * running)
-        result[t] = running
-    return result
+    return discounted_sums(rewards, gamma * ~ends)
 
 
 def advantages(
@@ -35,28 +52,31 @@ def advantages(
     truncated: np.ndarray,
     *,
     gamma: float,
-    trace: float,
+    gae_lambda: float,
 ) -> np.ndarray:
-    """Generalised advantage estimates; with `trace` = 0 the paper's Equation 3.
+    """Generalised advantage estimates, float64; with `gae_lambda` = 0 the paper's Equation 3.
 
     A_t = r_t + gamma · V(s_t+1) - V(s_t), where V after a termination is 0.
 
     Args:
-        rewards: float64, shape (T,).
-        values: V(s_t), shape (T,).
-        next_values: V(s_t+1) of the state that the step led to, before any reset, shape (T,).
-        terminated: bool, shape (T,).
-        truncated: bool, shape (T,).
+        rewards: Numbers.
+        values: V(s_t).
+        next_values: V(s_t+1) of the state that the step led to, before any reset.
+        terminated: bool.
+        truncated: bool.
         gamma: Discount.
-        trace: Decay lambda of the sum over later errors, 0 to 1.
+        gae_lambda: Decay of the sum over later errors, 0 to 1.
     """
     errors: np.ndarray = rewards + gamma * np.where(terminated, 0.0, next_values) - values
-    if trace == 0.0:
+    if gae_lambda == 0.0:
         return errors
-    ends = terminated | truncated
-    result = np.empty(len(rewards))
-    running = 0.0
-    for t in range(len(rewards) - 1, -1, -1):
-        running = errors[t] + (0.0 if ends[t] else gamma * trace * running)
-        result[t] = running
+    return discounted_sums(errors, gamma * gae_lambda * ~(terminated | truncated))
+
+
+def step_of_episode(ends: np.ndarray) -> np.ndarray:
+    """Number of each step within its episode, where the first row begins at 0."""
+    index = np.arange(len(ends)).reshape(-1, *(1,) * (ends.ndim - 1))
+    starts = np.zeros(ends.shape, int)
+    starts[1:] = np.where(ends[:-1], index[1:], 0)
+    result: np.ndarray = index - np.maximum.accumulate(starts)
     return result

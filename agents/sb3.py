@@ -1,28 +1,110 @@
-"""Stable-Baselines3's A2C: the reference, with the same networks, settings and socket."""
+"""Stable-Baselines3: its A2C as the reference, and vector envs as it wants them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
-import torch
-from stable_baselines3 import A2C
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import DummyVecEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 
+from ..models.errors import InputError, require
+from .episodes import EpisodeLog
 from .learner import (
-    AnyLog,
     OnUpdate,
+    check_finite,
     optimizer_arrays,
     seeds_of,
     set_optimizer_arrays,
     updates_of,
 )
+from .networks import load_arrays, torch
 from .presets import A2CConfig
-from .sb3_vec import SB3VecEnv
-from .vector_episodes import VectorEpisodeLog
 
-__all__ = ["SB3A2C"]
+if TYPE_CHECKING:
+    import stable_baselines3 as sb3
+    from stable_baselines3.common import logger as sb3_logger
+    from stable_baselines3.common import vec_env as sb3_vec
+else:
+    sb3 = require("stable_baselines3", "train", "sb3-a2c")
+    sb3_logger, sb3_vec = sb3.common.logger, sb3.common.vec_env
+
+__all__ = ["SB3A2C", "SB3VecEnv"]
+
+
+class SB3VecEnv(sb3_vec.VecEnv):
+    """A SAME_STEP vector env, such as `RemoteVectorEnv(autoreset_mode="SameStep")`, for SB3.
+
+    Where an episode ended, `infos` has SB3's `terminal_observation` and `TimeLimit.truncated`; the
+    rest of `info` is left out, for SB3 would want a dictionary for each env and step.
+
+    Args:
+        env: The vector env; it is closed by `close`.
+
+    Raises:
+        InputError: Its autoreset is another one.
+    """
+
+    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        mode = env.metadata.get("autoreset_mode")
+        if mode != AutoresetMode.SAME_STEP:
+            raise InputError(f"env: expected a vector env with autoreset SAME_STEP, got {mode}")
+        self.env = env
+        self.render_mode = None
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self._actions = np.zeros(0)
+
+    def reset(self) -> Any:
+        """Begin an episode for every env, with the seeds of `seed` if it was called."""
+        seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
+        observations, _ = self.env.reset(seed=seeds)  # type: ignore[arg-type]
+        self._reset_seeds()
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> Any:
+        """Fly every env for one step."""
+        observations, rewards, terminated, truncated, info = self.env.step(self._actions)
+        ended = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for i in np.flatnonzero(ended).tolist():
+            last = info["final_obs"]
+            infos[i]["terminal_observation"] = (
+                {k: v[i] for k, v in last.items()} if isinstance(last, dict) else last[i]
+            )
+            infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+        return observations, rewards.astype(np.float32), ended, infos
+
+    def close(self) -> None:
+        """Close the vector env."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of the vector env, which all envs share."""
+        return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Not possible: the envs are one."""
+        raise NotImplementedError("set_attr: the envs of a vector env have no attributes to set")
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Not possible: the envs are one."""
+        raise NotImplementedError("env_method: the envs of a vector env have no methods to call")
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Any = None
+    ) -> list[bool]:
+        """False: wrappers of single envs are not here."""
+        return [False] * len(list(self._get_indices(indices)))
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """None: nothing is drawn."""
+        return [None] * self.num_envs
 
 
 class SB3A2C:
@@ -32,29 +114,28 @@ class SB3A2C:
     `A2CConfig`: given the same experience, it makes the same updates as ours.
 
     Args:
-        env: The env to train on: SB3 wants it at construction.
+        log: What it trains on: SB3 wants it at construction.
         config: Hyperparameters.
         seed: Seed of the run: weights and actions.
     """
 
-    def __init__(self, env: Any, config: A2CConfig, seed: int) -> None:
+    def __init__(self, log: EpisodeLog, config: A2CConfig, seed: int) -> None:
         torch_seed, _ = seeds_of(seed)
         # SB3 draws from the global generators: torch for actions, NumPy for the order of samples.
         torch.manual_seed(torch_seed)
         np.random.seed(torch_seed % 2**32)  # noqa: NPY002
         self._config = config
-        drones = getattr(env, "num_envs", 1)
-        self._rollout = config.rollout_size(drones)
+        self._rollout = config.rollout_size(log.num_envs)
         self._ahead = 0.0
         self._model = _A2C(
             "MlpPolicy",
-            SB3VecEnv(env) if isinstance(env, VectorEpisodeLog) else DummyVecEnv([lambda: env]),
+            SB3VecEnv(log),
             learning_rate=self._learning_rate,
-            n_steps=self._rollout // drones,
+            n_steps=self._rollout // log.num_envs,
             gamma=config.gamma,
-            gae_lambda=config.trace,
-            ent_coef=config.entropy_weight,
-            vf_coef=config.value_weight,
+            gae_lambda=config.gae_lambda,
+            ent_coef=config.ent_coef,
+            vf_coef=config.vf_coef,
             max_grad_norm=float("inf"),
             use_rms_prop=False,
             normalize_advantage=config.normalize and self._rollout > 1,
@@ -67,13 +148,10 @@ class SB3A2C:
             device="cpu",
         )
         # It keeps the numbers of the last update for us; SB3's own makes a folder in /tmp.
-        self._model.set_logger(Logger(folder=None, output_formats=[]))
+        self._model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
 
-    def train(self, log: AnyLog, env_steps: int, on_update: OnUpdate) -> None:
-        """Train until the log counts `env_steps`, or `on_update` returns False.
-
-        SB3 flies whole rollouts only: steps short of another rollout are left unflown.
-        """
+    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
+        """As `Agent.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
         model, rollout = self._model, self._rollout
         done, whole = model.num_timesteps, env_steps // rollout * rollout
         if done >= whole:
@@ -117,11 +195,7 @@ class SB3A2C:
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over a state."""
         model = self._model
-        prefix = "policy."
-        model.policy.load_state_dict(
-            {k[len(prefix):]: torch.from_numpy(v.copy()) for k, v in state.items()
-             if k.startswith(prefix)}
-        )  # fmt: skip
+        load_arrays(model.policy, state, "policy.")
         set_optimizer_arrays(model.policy.optimizer, state)
         model._n_updates = updates_of(model.policy.optimizer)
         torch.set_rng_state(torch.from_numpy(state["rng.torch"].copy()))
@@ -129,6 +203,10 @@ class SB3A2C:
         np.random.set_state(("MT19937", np.array(keys, np.uint32), int(place), 0, 0.0))  # noqa: NPY002
         model.num_timesteps = int(state["steps"])
         if "observation" in state:
+            shapes = state["observation"].shape, state["starts"].shape
+            expected = (model.n_envs, *model.observation_space.shape), (model.n_envs,)
+            if shapes != expected:
+                raise ValueError(f"observation, starts: expected shapes {expected}, got {shapes}")
             model._last_obs = state["observation"]
             model._last_episode_starts = state["starts"]
 
@@ -142,13 +220,14 @@ class _Stopped(Exception):
     """Ends SB3's loop between an update and the next rollout."""
 
 
-class _A2C(A2C):
+class _A2C(sb3.A2C):
     """SB3's A2C, which has no callback between an update and the next rollout."""
 
     on_update: OnUpdate
 
     def train(self) -> None:
         super().train()
+        check_finite(self.policy.optimizer)
         if not self.on_update():
             raise _Stopped
 

@@ -1,6 +1,7 @@
-"""Gymnasium environments: importing this package registers `rotorgram/Elevation-v0` and `Hover-v0`.
+"""Gymnasium environments: `rotorgram/Elevation-v0`, `rotorgram/Hover-v0`, and tasks of your own.
 
-Gymnasium 1.0 stopped reading the entry point `gymnasium.envs`, so one of these makes the envs known:
+Importing this package registers them. Gymnasium 1.0 stopped reading the entry point
+`gymnasium.envs`, so one of these makes them known:
 
     import rotorgram.envs; gym.make("rotorgram/Elevation-v0")
     gym.make("rotorgram.envs:rotorgram/Elevation-v0")  # imports by itself
@@ -17,7 +18,7 @@ from .spec import ArraySpec, Discrete, EnvSpec, Metric
 if TYPE_CHECKING:
     from .loop import Loop
     from .single import SingleEnv
-    from .tasks.task import Outcome, Task, TaskOptions
+    from .tasks.task import Outcome, Task, TaskOptions, check_choice, check_number
     from .vector import LocalVectorEnv
 
 __all__ = [
@@ -31,6 +32,8 @@ __all__ = [
     "SingleEnv",
     "Task",
     "TaskOptions",
+    "check_choice",
+    "check_number",
     "register",
     "register_all",
 ]
@@ -42,6 +45,8 @@ _HOMES: Final = {
     "SingleEnv": "single",
     "Task": "tasks.task",
     "TaskOptions": "tasks.task",
+    "check_choice": "tasks.task",
+    "check_number": "tasks.task",
 }
 
 

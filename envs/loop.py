@@ -15,7 +15,7 @@ import numpy as np
 from ..models.errors import InputError
 from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..models.vehicle import Vehicle
-from ..sim import Array, Backend, PhysicsError, World, make_world
+from ..sim import Array, Backend, PhysicsError, World, make_world, on_host
 from . import registry
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
@@ -113,14 +113,14 @@ class Loop:
 
     Attributes:
         spec: What there is to know of it.
-        task, world: What is joined here.
+        task, world: What is joined here. Their arrays have the leading axes of the world; all
+            others here have one axis of N drones.
         observations: By name, shape (N, *shape), of the declared dtypes. This and the following
             are made anew by each `advance`: those of the last one stay as they were.
         rewards: float64, shape (N,); 0 for a drone that did not fly.
-        reward_terms: By name, each of shape (N,).
         terminated, truncated: bool, shape (N,).
         done: bool, shape (N,): the episode has ended and the next has not begun.
-        steps: Control steps of the running episode, shape (N,).
+        terms: Terms of the last rewards by name, with the leading axes of the world.
 
     Raises:
         InputError: An argument, seed or action is not what it should be; nothing has changed.
@@ -140,30 +140,32 @@ class Loop:
     ) -> None:
         draft = make_task(env_id, options or {}, vehicle)
         self.world: World = make_world(draft.vehicle, num_envs, backend, **settings)
-        xp = self._xp = self.world.xp
-        self.task = type(draft)(draft.options, draft.vehicle, self.world.shape, xp)
+        self._xp, lead = self.world.xp, self.world.shape
+        self.task = type(draft)(draft.options, draft.vehicle, lead, self._xp)
         self.spec = spec_of(canonical_id(env_id), self.task)
         self.num_envs = num_envs
         self.vehicle = draft.vehicle
         self._substeps = draft.vehicle.substeps(draft.options.control_period)
         self._length = draft.options.episode_length
-        self._has_goal = has_goal(draft)
-        self._action_shape = (*self.world.shape, len(self.task.controller.low))
         self._choices = self.task.controller.choices
-        self._drones = (num_envs,)
-        self._zeros = 0.0 * self.world.state.position[:, 0, 0]
-        self._nobody = self._zeros != 0.0
-        self._everybody = ~self._nobody
-        self.steps: Array = self._xp.astype(self._zeros, self._xp.int64)
-        self.observations: dict[str, Array] = {}
-        self.rewards = self._zeros
-        self.reward_terms: dict[str, Array] = {}
+        self._width = len(self.task.controller.low)
+        self._has_goal = has_goal(draft)
+        self._dtypes = [(a.name, a.shape, getattr(self._xp, a.dtype)) for a in draft.observation]
+        none = self.world.state.touching != self.world.state.touching  # all False, on its device
+        self._none, self._nobody = none, none.reshape(num_envs)
         self.terminated = self.truncated = self.done = self._nobody
-        self._waiting = self._everybody  # for a reset
+        self.rewards: Array = 0.0 * self._nobody
+        self.observations: dict[str, Array] = {}
+        self._steps: Array = (0 * self._nobody).reshape(lead)[()]
+        self._waiting = ~self._nobody  # for a reset
         self._anyone_waits = True
         self._begun = False
         self._outcome: Outcome | None = None
-        self._telemetry: dict[str, np.ndarray] | None = None
+        self.terms: dict[str, Array] = {}
+        self._telemetry: np.ndarray | None = None
+        self._goal: tuple[Any, Any] = (None, None)
+        self._columns = _columns(self.spec)
+        self._told = len(draft.metrics)
 
     def advance(
         self,
@@ -185,107 +187,107 @@ class Loop:
             frozen: bool, shape (N,); None freezes none.
             chosen: By the names of `Task.choices`, what replaces a draw, shape (N,).
         """
+        resets, frozen = self.ours(resets), self.ours(frozen)
         idle = resets if frozen is None else frozen if resets is None else resets | frozen
         flown = None if idle is None or not idle.any() else ~idle
-        self._check_begun(flown)
+        if self._anyone_waits:
+            self._check_begun(flown)
         if flown is None or flown.any():
             self._fly(actions, flown)
         if resets is not None and resets.any():
-            self.begin(resets, seeds, chosen)
+            self._begin(resets, seeds, chosen or {})
         self._look(flown)
 
-    def begin(
-        self,
-        mask: Array,
-        seeds: Sequence[int | None] | np.ndarray | None = None,
-        chosen: Mapping[str, np.ndarray] | None = None,
-    ) -> None:
-        """Begin episodes of the drones of a mask, bool, shape (N,): part of `advance`."""
-        if not self._begun and not mask.all():  # the first time a task wants all of them
-            self._begin(self._everybody, {})
-            self._waiting = ~mask
-        if seeds is not None:
-            self.world.seed(mask, seeds)
-        shape = self.world.shape
-        self._begin(mask, {name: x.reshape(shape) for name, x in (chosen or {}).items()})
-
-    def _begin(self, mask: Array, chosen: Mapping[str, np.ndarray]) -> None:
-        world = self.world
-        world.reset(mask, self.task.begin(mask[:, None], world.draw(mask, chosen)))
-        self._begun = True
-        self.steps = self._xp.where(mask, 0, self.steps)
-        self._waiting = self._waiting & ~mask
-        self._anyone_waits = bool(self._waiting.any())
-        self.done = self.done & ~mask
-
     def _check_begun(self, flown: Array | None) -> None:
-        if not self._anyone_waits:
-            return
         waiting = self._waiting if flown is None else self._waiting & flown
         if waiting.any():
             first = int(waiting.nonzero()[0][0])
             raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
 
     def _fly(self, actions: Array, flown: Array | None) -> None:
-        world = self.world
-        values = self._values(actions, flown)
-        thrust = self.task.controller.thrust(values, world.state)
-        try:
-            world.step(thrust, self._substeps, flown)
-        except PhysicsError:
-            self._waiting = self._waiting | (self._everybody if flown is None else flown)
-            self._anyone_waits = True
-            raise
-        self.steps = self.steps + (1 if flown is None else self._xp.astype(flown, self._xp.int64))
-
-    def _look(self, flown: Array | None) -> None:
-        """Observations, rewards and ends after a step."""
-        task, state, n = self.task, self.world.state, self._drones
-        self._telemetry = None
-        observed = task.observe(state)
-        self.observations = {
-            array.name: self._declared(observed[array.name], array) for array in task.observation
-        }
-        self._outcome = outcome = task.outcome(state)
-        ended = outcome.terminated.reshape(n)
-        late = self.steps >= self._length
-        terms = {name: term.reshape(n) for name, term in outcome.reward.items()}
-        if flown is None:
-            self.terminated, self.truncated = ended, late & ~ended
-        else:
-            self.terminated, self.truncated = ended & flown, late & ~ended & flown
-            # A drone that did not fly gets no reward: nothing has ended, nothing was won.
-            terms = {name: self._xp.where(flown, term, 0.0) for name, term in terms.items()}
-        self.reward_terms = terms
-        self.rewards = sum(terms.values(), self._zeros)
-        over = self.terminated | self.truncated
-        if over.any():
-            self._waiting, self._anyone_waits = self._waiting | over, True
-            self.done = self.done | over
-
-    def _declared(self, values: Array, array: ArraySpec) -> Array:
-        """An observation (W, A, *shape) as (N, *shape) of its dtype."""
-        shaped = values.reshape((*self._drones, *array.shape))
-        return self._xp.astype(shaped, getattr(self._xp, array.dtype))
-
-    def _values(self, actions: Array, flown: Array | None) -> Array:
-        """Actions as controllers take them: float64, shape (W, A, k). Raises `InputError`."""
+        world, lead = self.world, self.world.shape
         if self._xp is np:
             values = self._checked(np.asarray(actions), flown)
         else:
-            values = self.world.checked(actions, self._action_shape, self._choices)  # type: ignore[attr-defined]
-        return values.reshape(self._action_shape)
+            values = world.checked(actions, self._width, self._choices, flown)
+        action = values.reshape((*lead, self._width))
+        thrust = self.task.controller.thrust(action, world.state)
+        some = None if flown is None else flown.reshape(lead)[()]
+        try:
+            world.step(thrust, self._substeps, some)
+        except PhysicsError:
+            self._waiting = self._waiting | (~self._nobody if flown is None else flown)
+            self._anyone_waits = True
+            raise
+        self._steps = self._steps + (1 if some is None else some)
+
+    def _begin(
+        self,
+        mask: Array,
+        seeds: Sequence[int | None] | np.ndarray | None,
+        chosen: Mapping[str, np.ndarray],
+    ) -> None:
+        """Begin the episodes of the drones of a mask, bool, shape (N,)."""
+        world, lead, every = self.world, self.world.shape, ~self._nobody
+        if not self._begun:  # the first time a task wants all of them
+            everybody = every.reshape(lead)[()]
+            if not mask.all():
+                world.reset(everybody, self.task.begin(everybody, world.draw(everybody)))
+            self._begun = True
+        some = mask.reshape(lead)[()]
+        if seeds is not None:
+            world.seed(some, seeds)
+        draws = {name: values.reshape(lead)[()] for name, values in chosen.items()}
+        world.reset(some, self.task.begin(some, world.draw(some, draws)))
+        self._steps = self._xp.where(some, 0, self._steps)[()]
+        self._waiting = self._waiting & ~mask
+        self._anyone_waits = bool(self._waiting.any())
+        self.done = self.done & ~mask
+
+    def _look(self, flown: Array | None) -> None:
+        """Observations, rewards and ends after a step."""
+        task, state, n = self.task, self.world.state, self.num_envs
+        self._telemetry = None
+        observed = task.observe(state)
+        self.observations = {
+            name: _as_type(observed[name].reshape((n, *shape)), dtype)
+            for name, shape, dtype in self._dtypes
+        }
+        self._outcome = outcome = task.outcome(state)
+        ended: Array = outcome.terminated
+        total: Array = 0.0
+        late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b
+        for term in outcome.reward.values():
+            total = total + term
+        self.terms = outcome.reward
+        if not self.world.shape:  # a single drone's numbers
+            self.rewards = np.array((total,))
+            self.terminated, self.truncated = np.array((ended,)), np.array((late,))
+            over = bool(ended or late)
+        else:
+            self.rewards = total.reshape(n)
+            # New arrays, whatever the task gave: what a step gave away stays as it was.
+            self.terminated = (ended | self._none).reshape(n)
+            self.truncated = late.reshape(n)
+            over = True
+        if flown is not None:
+            # A drone that did not fly gets no reward: nothing has ended, nothing was won.
+            self.rewards = self._xp.where(flown, self.rewards, 0.0)
+            self.terminated, self.truncated = self.terminated & flown, self.truncated & flown
+        if over:
+            ends = self.terminated | self.truncated
+            if ends.any():
+                self._waiting, self._anyone_waits = self._waiting | ends, True
+                self.done = self.done | ends
 
     def _checked(self, actions: np.ndarray, flown: Array | None) -> np.ndarray:
-        kind = actions.dtype.kind
-        if kind not in ("iuf" if not self._choices else "iufb"):
+        """Actions as controllers take them: float64, shape (N, k). Raises `InputError`."""
+        if actions.dtype.kind not in "iuf":
             raise InputError(f"actions: expected real numbers, got {actions.dtype}")
-        if actions.size != self._action_shape[0] * self._action_shape[1] * self._action_shape[2]:
-            raise InputError(
-                f"actions: expected shape {(self.num_envs, self._action_shape[2])}, "
-                f"got {actions.shape}"
-            )
-        values = actions.reshape(self.num_envs, -1)
+        if actions.size != self.num_envs * self._width:
+            expected = (self.num_envs, self._width)
+            raise InputError(f"actions: expected shape {expected}, got {actions.shape}")
+        values = actions.reshape(self.num_envs, self._width)
         if values.dtype != np.float32 and not self._choices:
             with np.errstate(over="ignore"):  # what overflows is infinite, and refused as such
                 values = values.astype(np.float32)
@@ -315,36 +317,97 @@ class Loop:
         raise InputError(f"actions: expected {expected}, got {got} for env {first}")
 
     @property
+    def steps(self) -> Array:
+        """Control steps of each running episode, shape (N,)."""
+        return self._per_drone(self._steps)
+
+    @property
+    def reward_terms(self) -> dict[str, Array]:
+        """Terms of the last rewards by name, each of shape (N,)."""
+        return {name: self._per_drone(term) for name, term in self.terms.items()}
+
+    @property
+    def metrics(self) -> dict[str, Array]:
+        """Metrics of the task by name, each of shape (N,)."""
+        metrics = self._outcome.metrics if self._outcome else {}
+        return {name: self._per_drone(value) for name, value in metrics.items()}
+
+    @property
     def telemetry(self) -> dict[str, np.ndarray]:
         """By the names of `spec.telemetry`, float64, shape (N, *shape), in the paper's frame."""
+        told = self.telemetry_table
+        return {name: told[:, columns] for name, columns in self._columns.items()}
+
+    @property
+    def telemetry_table(self) -> np.ndarray:
+        """All telemetry side by side, float64, shape (N, T), T in the order of `spec.telemetry`."""
         if self._telemetry is None:
-            state, n = self.world.state, self.num_envs
-            host = _on_host
-            told = {
-                "position": positions_in_paper_frame(host(state.position).reshape(n, 3)),
-                "attitude": attitudes_in_paper_frame(host(state.quaternion).reshape(n, 4)),
-                "thrust": host(state.thrust).reshape(n, -1).copy(),
-            }
-            if self._has_goal:
-                goal = host(self.task.goal(state)).reshape(n, 3)
-                told["goal"] = positions_in_paper_frame(goal)
-            if self._outcome is not None and self.task.metrics:
-                metrics = [host(self._outcome.metrics[m.name]) for m in self.task.metrics]
-                told["metrics"] = np.stack(metrics, axis=-1).reshape(n, -1)
-            self._telemetry = told
+            alone = not self.world.shape
+            self._telemetry = np.array((self._row(),)) if alone else self._table()
         return self._telemetry
+
+    def _table(self) -> np.ndarray:
+        state, n, at = self.world.state, self.num_envs, self._columns
+        told = np.empty((n, at[self.spec.telemetry[-1].name].stop))
+        positions_in_paper_frame(on_host(state.position).reshape(n, 3), told[:, :3])
+        attitudes_in_paper_frame(on_host(state.quaternion).reshape(n, 4), told[:, 3:6])
+        told[:, at["thrust"]] = on_host(state.thrust).reshape(n, -1)
+        if self._has_goal:
+            goal = self.task.goal(state)
+            if goal is not self._goal[0]:  # many goals stay as they are
+                self._goal = goal, positions_in_paper_frame(on_host(goal).reshape(n, 3))
+            told[:, at["goal"]] = self._goal[1]
+        if self._outcome is not None:
+            for column, metric in enumerate(self.task.metrics, told.shape[1] - self._told):
+                told[:, column] = on_host(self._outcome.metrics[metric.name]).reshape(n)
+        return told
+
+    def _row(self) -> list[float]:
+        """The table of a single drone: the same numbers, a third of the time."""
+        state = self.world.state
+        x, y, z = state.position.tolist()
+        row = [0.0 - y, z, x]
+        quaternion = state.quaternion
+        turned = any(quaternion[1:].tolist())
+        row += attitudes_in_paper_frame(quaternion).tolist() if turned else (0.0, 0.0, 0.0)
+        row += state.thrust.tolist()
+        if self._has_goal:
+            x, y, z = self.task.goal(state).tolist()
+            row += (0.0 - y, z, x)
+        if self._outcome is not None:
+            metrics = self._outcome.metrics
+            row += [metrics[metric.name] for metric in self.task.metrics]
+        return row
 
     def close(self) -> None:
         """Let go of threads and memory."""
         self.world.close()
+
+    def ours(self, mask: Array | None) -> Array | None:
+        """A mask that the caller gave, NumPy's or a tensor, as an array of the world's kind."""
+        if mask is None or self._xp is np:
+            return mask
+        return self._xp.asarray(mask, device=self._nobody.device)
+
+    def _per_drone(self, values: Array) -> Array:
+        if not self.world.shape:
+            return np.array((values,))
+        return _as_type(values.reshape(self.num_envs), values.dtype)
 
     def __reduce__(self) -> Any:
         """Raise: simulator memory cannot be copied, and a copy that seems to fly would be wrong."""
         raise TypeError("a running env cannot be copied or pickled: make another one")
 
 
-def _on_host(array: Array) -> np.ndarray:
-    if isinstance(array, np.ndarray):
-        return array
-    copied: np.ndarray = array.detach().cpu().numpy().astype(np.float64)
-    return copied
+def _columns(spec: EnvSpec) -> dict[str, slice]:
+    """Where each array of the telemetry lies in the table of all."""
+    columns, start = {}, 0
+    for array in spec.telemetry:
+        columns[array.name] = slice(start, start + array.size)
+        start += array.size
+    return columns
+
+
+def _as_type(values: Array, dtype: Any) -> Array:
+    """A copy of that type."""
+    return values.astype(dtype) if isinstance(values, np.ndarray) else values.to(dtype, copy=True)

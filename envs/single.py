@@ -9,7 +9,7 @@ import numpy as np
 from ..models.errors import InputError
 from .loop import Loop
 from .rendering import RENDER_MODES, checked_render_mode, moments, painter
-from .spaces import action_space, info_columns, joined, observation_space
+from .spaces import action_space, joined, observation_space, telemetry_names
 
 if TYPE_CHECKING:
     from ..rendering.painter import Painter
@@ -63,6 +63,7 @@ class SingleEnv(gym.Env[Any, Any]):
         self.metadata = {"render_modes": RENDER_MODES, "render_fps": fps}
         self.observation_space = observation_space(loop.spec)
         self.action_space = action_space(loop.spec)
+        self._names = telemetry_names(loop.spec)
         self._all = np.ones(1, bool)
         self._no_action = np.zeros((1, len(loop.task.controller.low)), np.float32)
         self._episodes = 0
@@ -139,15 +140,13 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def _observation(self) -> Any:
         first = {name: values[0] for name, values in self._loop.observations.items()}
-        return joined(self._loop.spec, first)
+        return joined(self.env_spec, first)
 
     def _info(self) -> dict[str, Any]:
         loop = self._loop
-        info: dict[str, Any] = {
-            name: column.item() for name, column in info_columns(loop.spec, loop.telemetry).items()
-        }
-        for name, term in loop.reward_terms.items():
-            info[f"reward_{name}"] = term.item()
+        info = dict(zip(self._names, loop.telemetry_table[0].tolist(), strict=True))
+        for name, term in loop.terms.items():
+            info[f"reward_{name}"] = float(term)
         return info
 
     def __deepcopy__(self, memo: Any) -> Any:

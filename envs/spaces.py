@@ -8,7 +8,7 @@ from gymnasium import spaces
 
 from .spec import ArraySpec, Discrete, EnvSpec, component_names
 
-__all__ = ["action_space", "info_columns", "joined", "observation_space"]
+__all__ = ["action_space", "info_columns", "joined", "observation_space", "telemetry_names"]
 
 
 def box(array: ArraySpec) -> spaces.Box:
@@ -40,6 +40,11 @@ def joined(spec: EnvSpec, arrays: Mapping[str, Any]) -> Any:
     if len(spec.observation) == 1:
         return arrays[spec.observation[0].name]
     return dict(arrays)
+
+
+def telemetry_names(spec: EnvSpec) -> tuple[str, ...]:
+    """Names of all components of the telemetry, in order."""
+    return tuple(name for array in spec.telemetry for name in component_names(array))
 
 
 def info_columns(spec: EnvSpec, telemetry: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

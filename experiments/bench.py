@@ -3,16 +3,19 @@
 Every layer is open at the same time and they take turns to run for a moment, in an order that
 changes from round to round. Ratios are made within a round, and their medians count, so that a
 machine that slows down for a while slows all alike.
+
+The parts of a lock-step exchange are layers too, each measured by itself, and what is left of the
+time of a step is the links' own.
 """
 
+import copy
 import json
-import platform
 import socket
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,35 +24,102 @@ from typing import Any, Final
 import gymnasium as gym
 import mujoco
 import numpy as np
-from joblib import cpu_count
 from mujoco.batch import Batch
 
 from ..agents import preset
 from ..agents.checkpoints import software_versions, write_whole
 from ..agents.policies import NetworkPolicy
-from ..envs import ENV_ID, ElevationConfig, ElevationVectorEnv
-from ..models import load_model
-from ..models.constants import HOVER_THRUST
-from ..udp import binary
-from ..udp.fleet import describe
+from ..envs.loop import Loop
+from ..envs.registry import env_spec
+from ..models.errors import InputError
+from ..models.vehicle import Vehicle
+from ..udp.layouts import layout_of
+from ..udp.protocol import binary
+from ..udp.protocol.messages import Command, State
 from .pairs import socket_pair
-from .training import Run, Training
+from .results import machine
+from .settings import Run
+from .training import Training
 
-__all__ = ["RATIOS", "BenchConfig", "Layer", "bench", "layers_of", "ratio_of"]
+__all__ = ["PARTS", "RATIOS", "BenchConfig", "Layer", "Ratio", "bench", "layers_of", "parts_of"]
+
+ENV_ID: Final = "rotorgram/Elevation-v0"
+_PERIOD: Final = 0.02  # s, of a control step
+_OLD_TIMESTEP: Final = 0.005  # s, of the first version's physics
 
 Slice = Callable[[float], int]
 """Runs for about so many seconds; how many env steps it made."""
 
+Rates = Mapping[str, float]
+"""Env steps per second, by layer."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ratio:
+    """A figure that follows from the rates of one round."""
+
+    name: str
+    of: Callable[[Rates], float]
+    target: float | None = None
+    """What it should reach; None: it is told only."""
+    at_most: bool = False
+    """Whether less is better."""
+
+    def value(self, layers: Sequence["Layer"]) -> float:
+        """Median over the rounds."""
+        rounds = zip(*(layer.rates for layer in layers), strict=True)
+        names = [layer.name for layer in layers]
+        return statistics.median(self.of(dict(zip(names, rates, strict=True))) for rates in rounds)
+
+    @property
+    def target_text(self) -> str:
+        """The target, with its sign."""
+        if self.target is None:
+            return ""
+        return f"{'≤' if self.at_most else '≥'} {self.target:g}"
+
+    def reached(self, value: float) -> bool:
+        """Whether a value is on the right side of the target."""
+        if self.target is None:
+            return True
+        return value <= self.target if self.at_most else value >= self.target
+
+
+def _over(numerator: str, denominator: str, target: float | None = None) -> Ratio:
+    return Ratio(
+        name=f"{numerator} ÷ {denominator}",
+        of=lambda rates: rates[numerator] / rates[denominator],
+        target=target,
+    )
+
+
 RATIOS: Final = (
-    ("env", "mj_step"),
-    ("vector env, 1024", "Batch.step, 1024"),
-    ("UDP, 1", "UDP echo"),
-    ("UDP, 1024", "vector env, 1024"),
-    ("a2c, 64", "sb3-a2c, 64"),
-    ("a2c, 1", "sb3-a2c, 1"),
-    ("vector env, 4096", "vector env, 64"),
+    Ratio(
+        name="time of a step, UDP, 1 ÷ (mj_step + UDP echo)",
+        of=lambda r: (1 / r["UDP, 1"]) / (1 / r["mj_step"] + 1 / r["UDP echo"]),
+        target=1.7,
+        at_most=True,
+    ),
+    _over("Batch.step, 1024", "Batch.step at 5 ms, 1024", 1.9),
+    _over("vector env, 1024", "Batch.step, 1024", 0.95),
+    _over("env", "mj_step", 0.6),
+    _over("UDP, 1024", "vector env, 1024", 0.92),
+    _over("a2c, 64", "sb3-a2c, 64"),
+    _over("a2c, 1", "sb3-a2c, 1"),
+    _over("vector env, 4096", "vector env, 64"),
 )
-"""Pairs of layers whose rates are compared: numerator, denominator."""
+"""Figures of rates, with what they should reach."""
+
+PARTS: Final = (
+    "simulate",
+    "encode State",
+    "decode State",
+    "decide",
+    "encode Command",
+    "decode Command",
+    "UDP echo",
+)
+"""Layers of which a lock-step step of one drone consists: once each."""
 
 _ECHO: Final = """
 import socket, sys
@@ -78,9 +148,9 @@ class BenchConfig:
 
     def __post_init__(self) -> None:
         if self.rounds < 1:
-            raise ValueError(f"rounds: expected at least 1, got {self.rounds}")
+            raise InputError(f"rounds: expected at least 1, got {self.rounds}")
         if not 0 < self.seconds <= 60:
-            raise ValueError(f"seconds: expected more than 0 and at most 60, got {self.seconds}")
+            raise InputError(f"seconds: expected more than 0 and at most 60, got {self.seconds}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,21 +205,23 @@ def bench(
     return layers
 
 
-def ratio_of(layers: list[Layer], numerator: str, denominator: str) -> float:
-    """Median over the rounds of one layer's rate over another's."""
-    of = {layer.name: layer.rates for layer in layers}
-    pairs = zip(of[numerator], of[denominator], strict=True)
-    return statistics.median(a / b for a, b in pairs)
+def parts_of(layers: Sequence[Layer]) -> list[tuple[str, float]]:
+    """Median time of each part of a lock-step step of one drone, of the rest and of all, s."""
+    of = {layer.name: layer for layer in layers}
+    whole = statistics.median(1 / rate for rate in of["UDP, 1"].rates)
+    whole += 1 / of["decide"].rate  # the layer flies without a policy
+    parts = [(name, 1 / of[name].rate) for name in PARTS]
+    return [*parts, ("links", whole - sum(seconds for _, seconds in parts)), ("step", whole)]
 
 
 def layers_of(folder: Path) -> list[Layer]:
-    """What `bench` wrote. Raises `ValueError` if it is not there."""
+    """What `bench` wrote. Raises `InputError` if it is not there."""
     path = folder / "bench.json"
     try:
         content = json.loads(path.read_text())
         return [Layer(**{**layer, "rates": tuple(layer["rates"])}) for layer in content["layers"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: expected what rotorgram bench writes: {error!r}") from None
+        raise InputError(f"{path}: expected what rotorgram bench writes: {error!r}") from None
 
 
 def _write(layers: list[Layer], config: BenchConfig, folder: Path) -> None:
@@ -157,12 +229,12 @@ def _write(layers: list[Layer], config: BenchConfig, folder: Path) -> None:
         **asdict(config),
         "layers": [asdict(layer) for layer in layers],
         "medians": {layer.name: layer.rate for layer in layers},
-        "ratios": {f"{a} / {b}": round(ratio_of(layers, a, b), 3) for a, b in RATIOS},
-        "machine": {
-            "platform": platform.platform(),
-            "processor": platform.machine(),
-            "cores": cpu_count(),
+        "ratios": {
+            ratio.name: {"value": round(ratio.value(layers), 3), "target": ratio.target_text}
+            for ratio in RATIOS
         },
+        "microseconds": {name: round(1e6 * seconds, 2) for name, seconds in parts_of(layers)},
+        "machine": machine(),
         "versions": software_versions(),
     }
     write_whole(folder / "bench.json", (json.dumps(content, indent=2) + "\n").encode())
@@ -173,9 +245,9 @@ def _write(layers: list[Layer], config: BenchConfig, folder: Path) -> None:
 
 @contextmanager
 def _mj_step() -> Iterator[Slice]:
-    model = load_model(visual=False)
+    vehicle = Vehicle.load()
+    model, substeps = vehicle.model, vehicle.substeps(_PERIOD)
     data = mujoco.MjData(model)
-    substeps = ElevationConfig().substeps
 
     def fly() -> int:
         # Every turn begins in the air: how long it lasts must not matter.
@@ -185,19 +257,23 @@ def _mj_step() -> Iterator[Slice]:
 
     def prepare() -> None:
         mujoco.mj_resetData(model, data)
-        data.qpos[2], data.ctrl[:] = 5.0, HOVER_THRUST
+        data.qpos[2], data.ctrl[:] = 5.0, vehicle.hover_thrust
 
     yield _for_a_while(fly, prepare)
 
 
 @contextmanager
-def _batch_step(drones: int) -> Iterator[Slice]:
-    batch = Batch(load_model(visual=False), drones)
-    substeps = ElevationConfig().substeps
+def _batch_step(drones: int, timestep: float | None = None) -> Iterator[Slice]:
+    vehicle = Vehicle.load()
+    model = vehicle.model
+    if timestep is not None:
+        model = copy.deepcopy(model)
+        model.opt.timestep = timestep
+    batch, substeps = Batch(model, drones), round(_PERIOD / model.opt.timestep)
 
     def prepare() -> None:
         batch.reset()
-        batch.qpos[:, 2], batch.ctrl[:] = 5.0, HOVER_THRUST
+        batch.qpos[:, 2], batch.ctrl[:] = 5.0, vehicle.hover_thrust
 
     def fly() -> int:
         batch.step(nstep=substeps)
@@ -214,28 +290,84 @@ def _env() -> Iterator[Slice]:
 
 @contextmanager
 def _udp_single() -> Iterator[Slice]:
-    with socket_pair(ElevationConfig()) as env:
+    with socket_pair(ENV_ID) as env:
         yield _single(env)
 
 
 @contextmanager
 def _vector_env(drones: int) -> Iterator[Slice]:
-    with closing(ElevationVectorEnv(drones)) as env:
+    with closing(gym.make_vec(ENV_ID, num_envs=drones).unwrapped) as env:
         yield _vector(env)
 
 
 @contextmanager
 def _udp_batch(drones: int) -> Iterator[Slice]:
-    with socket_pair(ElevationConfig(), num_envs=drones) as env:
+    with socket_pair(ENV_ID, num_envs=drones) as env:
         yield _vector(env)
+
+
+@contextmanager
+def _simulate() -> Iterator[Slice]:
+    """What a simulator does between a Command and a State."""
+    loop = Loop(ENV_ID)
+    dice = np.random.default_rng(0)
+    actions = dice.uniform(-0.1, 0.1, (_STEPS_AT_ONCE, 1, 1)).astype(np.float32)
+    everyone = np.ones(1, bool)
+    loop.advance(actions[0], everyone)
+
+    def fly() -> int:
+        for action in actions:
+            loop.advance(action, everyone if loop.done[0] else None)
+            loop.telemetry  # noqa: B018  # made when it is asked for
+        return _STEPS_AT_ONCE
+
+    with closing(loop):
+        yield _for_a_while(fly)
+
+
+def _messages() -> tuple[Any, State, Command]:
+    """A State and a Command of one drone, and their layout."""
+    loop = Loop(ENV_ID)
+    loop.advance(np.zeros((1, 1), np.float32), np.ones(1, bool))
+    state = State(
+        session=1,
+        sequence=2,
+        time=0.02,
+        observations=tuple(loop.observations.values()),
+        rewards=loop.rewards,
+        terminated=loop.terminated,
+        truncated=loop.truncated,
+        telemetry=tuple(loop.telemetry.values()),
+    )
+    command = Command(
+        session=1, sequence=2, actions=np.zeros((1, 1), np.float32), orders=np.zeros(1, np.uint8)
+    )
+    loop.close()
+    return layout_of(loop.spec, 1), state, command
+
+
+@contextmanager
+def _codec(name: str) -> Iterator[Slice]:
+    layout, state, command = _messages()
+    what, message = name.split()[0], state if name.endswith("State") else command
+    datagram = binary.encode(message, layout)
+
+    def fly() -> int:
+        for _ in range(_STEPS_AT_ONCE):
+            if what == "encode":
+                binary.encode(message, layout)
+            else:
+                binary.decode(datagram, layout)
+        return _STEPS_AT_ONCE
+
+    yield _for_a_while(fly)
 
 
 @contextmanager
 def _echo() -> Iterator[Slice]:
     """A blocking Python client and server; datagrams of the sizes of a State and a Command."""
-    with closing(gym.make(ENV_ID)) as env:
-        hello = describe(env)
-    state, command = binary.state_size(hello), binary.command_size(hello) - 8
+    layout, *messages = _messages()
+    state, command = (len(binary.encode(message, layout)) for message in messages)
     words = [sys.executable, "-c", _ECHO, str(command)]
     with subprocess.Popen(words, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -265,16 +397,15 @@ def _policy(drones: int) -> Iterator[Slice]:
         "output.bias": np.zeros(1),
         "log_std": np.zeros(1),
     }
-    policy = NetworkPolicy({name: array.astype(np.float32) for name, array in weights.items()})
+    policy = NetworkPolicy(
+        {name: array.astype(np.float32) for name, array in weights.items()}, env_spec(ENV_ID)
+    )
     observations = dice.normal(size=(drones, 3)).astype(np.float32)
     noise = policy.draw_noise(dice, drones)
 
     def fly() -> int:
         for _ in range(_STEPS_AT_ONCE):
-            if drones == 1:
-                policy.to_env(policy.sample(observations[0], noise[0]))
-            else:
-                policy.to_envs(policy.samples(observations, noise))
+            policy.actions.to_envs(policy.sample(observations, noise))
         return drones * _STEPS_AT_ONCE
 
     yield _for_a_while(fly)
@@ -285,12 +416,11 @@ def _training(algorithm: str, drones: int) -> Iterator[Slice]:
     run = Run(
         algorithm=algorithm,
         config=preset(algorithm, "tuned", **({} if drones == 1 else _BATCH[algorithm])),
-        env=ElevationConfig(),
         seed=0,
         env_steps=10**9,
         num_envs=drones,
     )
-    with socket_pair(run.env, num_envs=drones) as env:
+    with socket_pair(**run.env, num_envs=drones) as env:
         training = Training(run, env)
 
         def fly(seconds: float) -> int:
@@ -336,8 +466,8 @@ def _vector(env: Any) -> Slice:
 
     def fly() -> int:
         nonlocal number
-        resets = env.terminated | env.truncated
-        env.advance(actions[number % 16], resets)
+        resets = env.done
+        env.advance(actions[number % 16], resets if resets.any() else None)
         number += 1
         return int((~resets).sum())
 
@@ -356,18 +486,28 @@ def _for_a_while(fly: Callable[[], int], prepare: Callable[[], None] = lambda: N
 
 
 _MANY: Final = (64, 1024, 4096)
+_CODEC: Final = ("encode State", "decode State", "encode Command", "decode Command")
 _LAYERS: Final[list[tuple[str, str, int, Callable[[], Any]]]] = [
     ("mj_step", "a loop over mj_step, substeps of one control step", 1, _mj_step),
-    ("env", "ElevationEnv.step", 1, _env),
+    ("env", "the single env's step", 1, _env),
     ("Batch.step, 1024", "mujoco.batch, the same substeps", 1024, lambda: _batch_step(1024)),
-    *((f"vector env, {n}", "ElevationVectorEnv", n, lambda n=n: _vector_env(n)) for n in _MANY),
+    (
+        "Batch.step at 5 ms, 1024",
+        "the same with the first version's physics step",
+        1024,
+        lambda: _batch_step(1024, _OLD_TIMESTEP),
+    ),
+    *((f"vector env, {n}", "the vector env", n, lambda n=n: _vector_env(n)) for n in _MANY),
     ("UDP echo", "blocking sockets in Python, datagrams of the same sizes", 1, _echo),
     ("UDP, 1", "RemoteEnv and a simulator", 1, _udp_single),
     *(
         (f"UDP, {n}", "RemoteVectorEnv and a simulator", n, lambda n=n: _udp_batch(n))
         for n in _MANY
     ),
-    *((f"policy, {n}", "16 units, sampled", n, lambda n=n: _policy(n)) for n in (1, 1024)),
+    ("simulate", "physics, task and telemetry of one drone", 1, _simulate),
+    *((name, "of one drone, binary", 1, lambda name=name: _codec(name)) for name in _CODEC),
+    ("decide", "16 units, sampled", 1, lambda: _policy(1)),
+    ("policy, 1024", "16 units, sampled", 1024, lambda: _policy(1024)),
     *(
         (f"{a}, {n}", "training over UDP", n, lambda a=a, n=n: _training(a, n))
         for n in (1, 64)

@@ -1,102 +1,84 @@
 """The comparison: every agent, over the same seeds and env steps, each through a socket pair."""
 
 import shutil
-from dataclasses import asdict, dataclass
+from contextlib import AbstractContextManager
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from ..agents import preset
 from ..agents.checkpoints import Checkpoint, store
-from ..agents.episodes import EpisodeLog
 from ..agents.pid import PID
-from ..agents.policies import NetworkPolicy
-from ..envs import ElevationConfig
-from .evaluate import Flight, evaluation_row, fly_episodes
-from .pairs import socket_pair
+from ..agents.policies import NetworkPolicy, Policy
+from ..envs.loop import Loop
+from ..envs.registry import env_spec, options_type
+from ..envs.spec import EnvSpec, canonical_id
+from ..models.errors import InputError
+from ..models.vehicle import Vehicle
+from .bounds import elevation_bounds
+from .errors import ResultsError
+from .folders import locked
+from .metrics import Headline
+from .pairs import shared_pair
 from .progress import OnProgress, ProgressSender
-from .records import CONFIG_FILE, RecordsError, read_config
-from .runs import config_env, train_run, write_config
-from .training import Run, Training
-from .workers import WorkersConfig, open_workers
-from .writing import RunRecord, episode_row, flight_steps, join_parts, training_steps
+from .results import (
+    CONFIG_FILE,
+    RunResults,
+    episode_row,
+    evaluation_row,
+    evaluation_steps,
+    join_parts,
+    read_config,
+    step_table,
+    write_config,
+)
+from .settings import CompareConfig, EnvConfig, Run
+from .training import Training, train_run
+from .trajectories import Trajectory, evaluation_seed, fly_episodes
+from .workers import open_workers
 
-__all__ = ["PARTS", "CompareConfig", "compare", "read_compare_config"]
+__all__ = ["PARTS", "CompareConfig", "compare", "evaluation_pair", "read_compare_config"]
 
-AGENTS: Final = ("vpg", "a2c", "sb3-a2c")
 PARTS: Final = "parts"
 """Folder of what the runs of an unfinished comparison left behind."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareConfig(WorkersConfig):
-    """What is compared, and who flies it."""
-
-    agents: tuple[str, ...] = AGENTS
-    """Agents to train. The PID is always evaluated beside them, where the env allows it."""
-    seeds: int = 5
-    """Seeds 0 ... seeds - 1, the same for every agent."""
-    env_steps: int = 200_000
-    """Env steps of each training."""
-    preset: str = "tuned"
-    """`paper` or `tuned`."""
-    env: ElevationConfig
-    """The task."""
-    snapshots: int = 10
-    """Policies kept during each training, for the learning curves."""
-    curve_episodes: int = 10
-    """Evaluation episodes of each of them."""
-    episodes: int = 20
-    """Evaluation episodes of the final policies."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("seeds", "env_steps", "snapshots", "curve_episodes", "episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        if not self.agents:
-            raise ValueError("agents: expected at least one")
-        if len(set(self.agents)) != len(self.agents):
-            raise ValueError(f"agents: expected each once, got {', '.join(self.agents)}")
-        self.runs()  # wrong names and numbers are told before anything is trained
-
-    def runs(self) -> list[Run]:
-        """Every training, in the order in which they start: SB3's first, which take longest."""
-        return [
-            Run(
-                algorithm=agent,
-                config=preset(agent, self.preset),
-                env=self.env,
-                seed=seed,
-                env_steps=self.env_steps,
-            )
-            for agent in sorted(self.agents, key=lambda agent: agent != "sb3-a2c")
-            for seed in range(self.seeds)
-        ]
+MAX_BATCH: Final = 64
+"""Most evaluation episodes that are flown at a time."""
 
 
 def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnProgress) -> None:
-    """Train and evaluate everything, and write the records into `folder`.
+    """Train and evaluate everything, and write the results into `folder`.
 
     Each run leaves a part behind when it is done, so that a comparison that was interrupted, or of
     which a run failed, goes on where it was: call it again with the same folder (and the config of
     `read_compare_config`). Figures, table and verdicts are drawn from the joined parts: see
     `report.write_report`.
 
+    Args:
+        config: What is compared.
+        folder: One that exists, and no other process writes to: see `folders.new_folder`.
+        command: What the user typed, for `config.json`.
+        on_progress: Told how far it is.
+
     Raises:
         RunsFailed: Some runs failed; the others are done, and their parts kept.
-        ValueError: There is no Ray, or no such cluster; nothing is written.
+        InputError: The env names no metric, another process writes to the folder, or there is no
+            such Ray cluster; nothing is written.
     """
+    spec = env_spec(**config.env)
+    headline = Headline.of(spec)
     parts = folder / PARTS
-    with open_workers(config, on_progress) as workers:
-        parts.mkdir(parents=True, exist_ok=True)
-        _write_config(config, folder, command)
+    with open_workers(config, on_progress) as workers, locked(folder):
+        parts.mkdir(exist_ok=True)
+        _write_config(config, spec, folder, command)
         for unfinished in parts.glob(".*"):
             shutil.rmtree(unfinished)
-        runs: list[Run | None] = [*config.runs(), *([None] if _pid_flies(config.env) else [])]
+        runs: list[Run | None] = [*config.runs(), *([None] if _pid(spec) else [])]
         jobs = {_name(run): run for run in runs if not (parts / _part(run)).exists()}
-        workers.fly_all(partial(_fly, config), jobs, partial(_keep, folder))
-    join_parts(parts, folder)
+        workers.fly_all(partial(_fly, config), jobs, partial(_keep, folder), config)
+        join_parts(parts, folder, headline.name)
 
 
 def _name(run: Run | None) -> str:
@@ -109,17 +91,17 @@ def _part(run: Run | None) -> str:
     return f"{run.algorithm}-seed{run.seed}" if run else "pid-seed0"
 
 
-def _keep(folder: Path, run: Run | None, flown: tuple[RunRecord, Checkpoint | None]) -> None:
+def _keep(folder: Path, run: Run | None, done: tuple[RunResults, Checkpoint | None]) -> None:
     """Write checkpoint and part; the part last, for with it the run is done."""
-    record, checkpoint = flown
+    results, checkpoint = done
     if checkpoint:
         store(checkpoint, folder / "checkpoints" / f"{_part(run)}.safetensors")
-    record.write(folder / PARTS)
+    results.write(folder / PARTS)
 
 
 def _fly(
     config: CompareConfig, run: Run | None, progress: ProgressSender
-) -> tuple[RunRecord, Checkpoint | None]:
+) -> tuple[RunResults, Checkpoint | None]:
     """Train and evaluate (in a worker process)."""
     if run is None:
         return _evaluate_pid(config), None
@@ -128,92 +110,134 @@ def _fly(
 
 def _train(
     run: Run, config: CompareConfig, progress: ProgressSender
-) -> tuple[RunRecord, Checkpoint]:
-    with socket_pair(run.env) as env:
-        training, row = train_run(run, env, progress, config.snapshots)
+) -> tuple[RunResults, Checkpoint]:
+    with shared_pair(**run.env, num_envs=run.num_envs) as env:
+        training, row = train_run(run, env, progress, config.snapshots, keep_steps=True)
         checkpoint = training.checkpoint()
-        rows, flights = _evaluate(training, config, env)
     log = training.log
-    assert isinstance(log, EpisodeLog)  # of one drone
-    record = RunRecord(
+    headline = Headline.of(log.spec)
+    rows, trajectories = _evaluate(training, config, headline)
+    steps = log.steps()
+    steps["step"] = np.arange(1, len(steps["episode"]) + 1)
+    training_steps = step_table(
+        headline.name, agent=run.algorithm, seed=run.seed, phase="train", **steps
+    )
+    results = RunResults(
         agent=run.algorithm,
         seed=run.seed,
-        episodes=[episode_row(episode) for episode in log.episodes],
+        metric=headline.name,
+        episodes=[episode_row(one, run.num_envs, log.env_steps) for one in log.episodes],
         evaluations=rows,
         runs=[row],
-        steps=[training_steps(run.algorithm, log), *flight_steps(run.algorithm, run.seed, flights)],
+        steps=[
+            training_steps,
+            *evaluation_steps(run.algorithm, run.seed, headline, trajectories),
+        ],
     )
-    return record, checkpoint
+    return results, checkpoint
+
+
+def evaluation_pair(config: EnvConfig, episodes: int) -> AbstractContextManager[Any]:
+    """A remote env that flies that many episodes at a time, or `MAX_BATCH`."""
+    return shared_pair(
+        config.env_id, config.options, vehicle=config.vehicle, num_envs=min(episodes, MAX_BATCH)
+    )
 
 
 def _evaluate(
-    training: Training, config: CompareConfig, env: Any
-) -> tuple[list[dict[str, Any]], list[Flight]]:
+    training: Training, config: CompareConfig, headline: Headline
+) -> tuple[list[dict[str, Any]], list[Trajectory]]:
     rows: list[dict[str, Any]] = []
-    flights: list[Flight] = []
-    for snapshot in training.taken:
-        final = snapshot is training.taken[-1]
-        count = config.episodes if final else config.curve_episodes
-        flights = fly_episodes(env, NetworkPolicy(snapshot.actor), count)
-        behind = {"env_steps": snapshot.env_steps, "seconds": snapshot.seconds}
-        rows += [
-            {**behind, **evaluation_row(flight, episode, config.env.control_period)}
-            for episode, flight in enumerate(flights)
-        ]
-    return rows, flights
+    trajectories: list[Trajectory] = []
+    *earlier, last = training.taken
+    with evaluation_pair(config, max(config.curve_episodes, config.episodes)) as env:
+        for snapshot in [*earlier, last]:
+            policy = NetworkPolicy(snapshot.actor, training.log.spec)
+            if snapshot is last:
+                trajectories = flown = fly_episodes(env, policy, config.episodes, "final")
+            else:
+                flown = fly_episodes(env, policy, config.curve_episodes, "curve")
+            behind = {"env_steps": snapshot.env_steps, "seconds": snapshot.seconds}
+            rows += [{**behind, **evaluation_row(one, headline)} for one in flown]
+    return rows, trajectories
 
 
-def _evaluate_pid(config: CompareConfig) -> RunRecord:
-    with socket_pair(config.env) as env:
-        flights = fly_episodes(env, PID(config.env), config.episodes)
+def _evaluate_pid(config: CompareConfig) -> RunResults:
+    with evaluation_pair(config, config.episodes) as env:
+        policy = _pid(env.env_spec)
+        assert policy is not None
+        trajectories = fly_episodes(env, policy, config.episodes, "final")
+        headline = Headline.of(env.env_spec)
     behind = {"env_steps": 0, "seconds": 0.0}
-    return RunRecord(
+    return RunResults(
         agent="pid",
         seed=0,
+        metric=headline.name,
         episodes=[],
-        evaluations=[
-            {**behind, **evaluation_row(flight, episode, config.env.control_period)}
-            for episode, flight in enumerate(flights)
-        ],
+        evaluations=[{**behind, **evaluation_row(one, headline)} for one in trajectories],
         runs=[],
-        steps=flight_steps("pid", 0, flights),
+        steps=evaluation_steps("pid", 0, headline, trajectories),
     )
 
 
-def _pid_flies(env: ElevationConfig) -> bool:
+def _pid(spec: EnvSpec) -> Policy | None:
+    """The PID, where it can fly the env."""
     try:
-        PID(env)
-    except ValueError:
-        return False
-    return True
+        return PID(spec)
+    except InputError:
+        return None
+
+
+def _bounds(config: CompareConfig) -> dict[str, float]:
+    """Mean returns over the final evaluation's episodes, of the flights of `bounds`."""
+    if canonical_id(config.env_id) != "rotorgram/Elevation-v0":
+        return {}
+    options: Any = options_type(config.env_id).from_options(config.options)
+    loop = Loop(config.env_id, config.episodes, vehicle=config.vehicle, options=config.options)
+    everyone = np.ones(config.episodes, bool)
+    actions = np.zeros((config.episodes, 1), np.float32)
+    seeds = [evaluation_seed(episode, "final") for episode in range(config.episodes)]
+    loop.advance(actions, everyone, seeds)
+    starts = np.array(loop.telemetry["metrics"][:, 0])
+    loop.close()
+    vehicle = Vehicle.load(config.vehicle, linear_drag=options.linear_drag)
+    return elevation_bounds(options, vehicle, starts)
 
 
 def read_compare_config(folder: Path) -> CompareConfig:
-    """What a comparison was to compare, from its `config.json`. Raises `RecordsError`."""
+    """What a comparison was to compare, from its `config.json`. Raises `ResultsError`."""
     content = read_config(folder)
     try:
         return CompareConfig(
             agents=tuple(content["agents"]),
             seeds=len(content["seeds"]),
+            first_seed=content["seeds"][0],
             env_steps=content["env_steps"],
+            num_envs=content["num_envs"],
             preset=content["preset"],
-            env=config_env(content),
+            env_id=content["spec"]["env_id"],
+            options=content["spec"]["options"],
+            vehicle=content["vehicle"],
             **content["evaluation"],
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise RecordsError(f"{folder / CONFIG_FILE}: expected a comparison's: {error!r}") from None
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise ResultsError(f"{folder / CONFIG_FILE}: expected a comparison's: {error!r}") from None
 
 
-def _write_config(config: CompareConfig, folder: Path, command: str) -> None:
+def _write_config(config: CompareConfig, spec: EnvSpec, folder: Path, command: str) -> None:
+    if (folder / CONFIG_FILE).exists():
+        return
     content = {
         "preset": config.preset,
-        "seeds": list(range(config.seeds)),
+        "seeds": list(config.all_seeds),
         "env_steps": config.env_steps,
+        "num_envs": config.num_envs,
         "agents": {agent: asdict(preset(agent, config.preset)) for agent in config.agents},
         "evaluation": {
             "snapshots": config.snapshots,
             "curve_episodes": config.curve_episodes,
             "episodes": config.episodes,
         },
+        "bounds": _bounds(config),
     }
-    write_config(folder, command, config.env, content)
+    write_config(folder, command, spec, config.vehicle, content)

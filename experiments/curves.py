@@ -1,4 +1,4 @@
-"""The curves of a comparison, from its records: what the figures and the report's page both draw.
+"""The curves of a comparison, from its files: what the figures and the report's page both draw.
 
 Lines are interquartile means over seeds; bands are the quartiles over seeds (from four seeds on) or
 the range from the lowest to the highest seed. Curves of one agent's seeds end where the shortest of
@@ -7,14 +7,15 @@ them ends. An agent without any data for a curve is not in that curve's dictiona
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 
+from ..models.errors import require
 from .metrics import (
     Curve,
+    Headline,
     Spread,
     average_return,
     episode_ends,
@@ -22,34 +23,40 @@ from .metrics import (
     spread_over_seeds,
     training_runs,
 )
-from .records import Records, read_steps, sort_agents
+from .palette import sort_agents
+from .results import Results, read_steps
+
+if TYPE_CHECKING:
+    import pandas as pd
+else:
+    pd = require("pandas", "train", "comparing agents")
 
 __all__ = [
     "AVERAGING_SHARE",
     "Curves",
     "Fan",
-    "Flights",
+    "Flown",
     "cumulative_returns",
-    "error_fan",
-    "flown_error",
+    "flown_sizes",
     "learning_curves",
     "make_curves",
-    "pick_flights",
+    "pick_trajectories",
     "return_curves",
+    "value_fan",
 ]
 
 AVERAGING_SHARE: Final = 0.05
 """Share of training over which the average reward is a running mean."""
 
 _MAX_STEP_ROWS: Final = 400_000
-_MAX_FLIGHTS: Final = 40
+_MAX_TRAJECTORIES: Final = 40
 _MAX_MOMENTS: Final = 500
 
 FloatArray = npt.NDArray[np.float64]
 
 
 class Fan(NamedTuple):
-    """Quantiles of E over windows of training, each of shape (windows,); x in env steps, E in m."""
+    """Quantiles of the metric over windows of training, shape (windows,); x in env steps."""
 
     x: FloatArray
     low: FloatArray
@@ -64,13 +71,13 @@ class Fan(NamedTuple):
     """95 %."""
 
 
-class Flights(NamedTuple):
-    """Some flights of an agent's final evaluations."""
+class Flown(NamedTuple):
+    """Some trajectories of an agent's final evaluations."""
 
     shown: list[Curve]
-    """E (m) over the time in the episode (s)."""
+    """The metric over the time in the episode (s)."""
     total: int
-    """How many flights there are."""
+    """How many there are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,40 +90,43 @@ class Curves:
     """Sum of all rewards since training began, over env steps."""
     return_by_episode: dict[str, Spread]
     """The same over training episodes."""
-    training_error: dict[str, Fan]
-    """E in training, all seeds together."""
-    flights: dict[str, Flights]
-    """E over time in the final evaluation."""
-    flown_error: dict[str, Spread]
-    """|E| (m) over time (s) in the final evaluation, all flights of all seeds together."""
+    training_values: dict[str, Fan]
+    """The metric in training, all seeds together."""
+    flown: dict[str, Flown]
+    """The metric over time in the final evaluation."""
+    flown_sizes: dict[str, Spread]
+    """Its size over time (s) in the final evaluation, all trajectories of all seeds together."""
     learning: dict[str, Spread]
-    """Steady-state |E| (m) of the snapshots over env steps."""
+    """Steady-state size of the snapshots over env steps."""
     levels: dict[str, float]
-    """Steady-state |E| (m) of the agents that were not trained."""
+    """Steady-state size of the agents that were not trained."""
 
 
-def make_curves(folder: Path | str, records: Records) -> Curves:
+def make_curves(folder: Path | str, results: Results) -> Curves:
     """Make all curves of a comparison.
 
     Args:
-        folder: Where `rotorgram compare` wrote its records; the step rows are read from it.
-        records: What `records.read_records(folder)` gave.
+        folder: Where `rotorgram compare` wrote; the step rows are read from it.
+        results: What `results.read_results(folder)` gave.
 
     Raises:
-        RecordsError: If the step rows are missing or are not what they should be.
+        ResultsError: The step rows are missing or are not what they should be.
     """
-    by_step, by_episode = cumulative_returns(records.episodes)
-    learning, levels = learning_curves(records.evaluations)
-    training = read_steps(folder, "train", ("agent", "step", "error"), max_rows=_MAX_STEP_ROWS)
-    flown = read_steps(folder, "evaluation")
-    period = float(records.config["env"]["control_period"])
+    by_step, by_episode = cumulative_returns(results.episodes)
+    learning, levels = learning_curves(results.evaluations)
+    metric, period = results.headline.name, results.spec.control_period
+    columns = ("agent", "step", "value")
+    training = read_steps(folder, metric, "train", columns, max_rows=_MAX_STEP_ROWS)
+    flown = read_steps(folder, metric, "evaluation")
     return Curves(
-        average_return=return_curves(records.episodes),
+        average_return=return_curves(results.episodes),
         return_by_step=by_step,
         return_by_episode=by_episode,
-        training_error={name: error_fan(rows) for name, rows in _by_agent(training)},
-        flights={name: pick_flights(rows, period) for name, rows in _by_agent(flown)},
-        flown_error={name: flown_error(rows, period) for name, rows in _by_agent(flown)},
+        training_values={name: value_fan(rows) for name, rows in _by_agent(training)},
+        flown={name: pick_trajectories(rows, period) for name, rows in _by_agent(flown)},
+        flown_sizes={
+            name: flown_sizes(rows, period, results.headline) for name, rows in _by_agent(flown)
+        },
         learning=learning,
         levels=levels,
     )
@@ -151,49 +161,49 @@ def _runs(episodes: pd.DataFrame) -> list[tuple[str, list[pd.DataFrame]]]:
     return [(agent, training_runs(episodes, agent)) for agent in agents]
 
 
-def error_fan(steps: pd.DataFrame) -> Fan:
-    """Quantiles of E over at most 100 windows of env steps.
+def value_fan(steps: pd.DataFrame) -> Fan:
+    """Quantiles of the metric over at most 100 windows of env steps.
 
     Args:
-        steps: Training steps of one agent, columns `step` and `error`; at least one row.
+        steps: Training steps of one agent, columns `step` and `value`; at least one row.
     """
     step = steps["step"].to_numpy()
     windows = min(100, max(1, len(steps) // 50))
     width = (float(step.max()) + 1) / windows
     window = np.minimum((step / width).astype(np.int64), windows - 1)
-    quantiles = steps["error"].groupby(window).quantile([0.05, 0.25, 0.5, 0.75, 0.95]).unstack()
+    quantiles = steps["value"].groupby(window).quantile([0.05, 0.25, 0.5, 0.75, 0.95]).unstack()
     return Fan((quantiles.index.to_numpy() + 0.5) * width, *quantiles.to_numpy().T)
 
 
-def pick_flights(steps: pd.DataFrame, control_period: float) -> Flights:
-    """Pick at most 40 flights, at random but always the same ones.
+def pick_trajectories(steps: pd.DataFrame, control_period: float) -> Flown:
+    """Pick at most 40 trajectories, at random but always the same ones.
 
     Args:
-        steps: Evaluation steps of one agent, columns `seed`, `episode`, `step` and `error`.
+        steps: Evaluation steps of one agent, columns `seed`, `episode`, `step` and `value`.
         control_period: Time between two control steps, s.
     """
-    flights = [flight for _, flight in steps.groupby(["seed", "episode"], sort=True)]
+    found = [one for _, one in steps.groupby(["seed", "episode"], sort=True)]
     # At random: every n-th would be the same few start positions for every seed.
-    order = np.random.default_rng(0).permutation(len(flights))[:_MAX_FLIGHTS]
-    chosen = [flights[index] for index in order]
-    curves = [Curve(one["step"].to_numpy() * control_period, one["error"].to_numpy())
-              for one in chosen]  # fmt: skip
-    return Flights(curves, len(flights))
+    order = np.random.default_rng(0).permutation(len(found))[:_MAX_TRAJECTORIES]
+    curves = [Curve(one["step"].to_numpy() * control_period, one["value"].to_numpy())
+              for one in (found[index] for index in order)]  # fmt: skip
+    return Flown(curves, len(found))
 
 
-def flown_error(steps: pd.DataFrame, control_period: float) -> Spread:
-    """Interquartile mean and spread of |E| over flights, at most at 500 moments of the episode.
+def flown_sizes(steps: pd.DataFrame, control_period: float, headline: Headline) -> Spread:
+    """Interquartile mean and spread of the size over trajectories, at most at 500 moments.
 
-    A flight that crashed counts as long as it lasted.
+    A trajectory that crashed counts as long as it lasted.
 
     Args:
-        steps: Evaluation steps of one agent, columns `step` and `error`; at least one row.
+        steps: Evaluation steps of one agent, columns `step` and `value`; at least one row.
         control_period: Time between two control steps, s.
+        headline: Says what the size is.
     """
     last = int(steps["step"].max())
     moments = np.unique(np.linspace(0, last, min(last + 1, _MAX_MOMENTS)).round().astype(np.int64))
     shown = steps[steps["step"].isin(moments)]
-    groups = [np.abs(rows.to_numpy(np.float64)) for _, rows in shown.groupby("step")["error"]]
+    groups = [headline.size(rows.to_numpy()) for _, rows in shown.groupby("step")["value"]]
     ends = np.array([_ends(values) for values in groups])
     x = np.unique(shown["step"]) * control_period
     return Spread(x, np.array([iqm(values) for values in groups]), ends[:, 0], ends[:, 1])
@@ -206,7 +216,7 @@ def _ends(values: FloatArray) -> FloatArray:
 
 
 def learning_curves(evaluations: pd.DataFrame) -> tuple[dict[str, Spread], dict[str, float]]:
-    """Steady-state |E| of the snapshots of each agent over env steps.
+    """Steady-state size of the snapshots of each agent over env steps.
 
     Returns:
         The curves of the agents that were trained, and the interquartile means over seeds of those
@@ -215,15 +225,15 @@ def learning_curves(evaluations: pd.DataFrame) -> tuple[dict[str, Spread], dict[
     curves: dict[str, Spread] = {}
     levels: dict[str, float] = {}
     for agent in sort_agents(evaluations["agent"]):
-        own = evaluations[evaluations["agent"] == agent].dropna(subset="steady_error")
+        own = evaluations[evaluations["agent"] == agent].dropna(subset="steady")
         if own.empty:
             continue
-        means = own.groupby(["seed", "env_steps"])["steady_error"].mean().reset_index()
+        means = own.groupby(["seed", "env_steps"])["steady"].mean().reset_index()
         if means["env_steps"].max() == 0:
-            levels[agent] = iqm(means["steady_error"].to_numpy())
+            levels[agent] = iqm(means["steady"].to_numpy())
             continue
         runs = [
-            Curve(run["env_steps"].to_numpy(float), run["steady_error"].to_numpy(float))
+            Curve(run["env_steps"].to_numpy(float), run["steady"].to_numpy(float))
             for _, run in means.groupby("seed")
         ]
         curves[agent] = spread_over_seeds(runs, np.unique(means["env_steps"]))

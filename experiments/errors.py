@@ -1,7 +1,13 @@
-"""What can go wrong in an experiment."""
+"""What can go wrong with runs and with the files that they leave. Imports no other package."""
 
-__all__ = ["RunsFailed"]
+from ..models.errors import InputError
+
+__all__ = ["ResultsError", "RunsFailed"]
 
 
 class RunsFailed(RuntimeError):
-    """Some runs of a comparison or a sweep failed."""
+    """Some runs failed; the message names each with its reason. The others are kept."""
+
+
+class ResultsError(InputError):
+    """A file of results is missing or is not what it should be."""

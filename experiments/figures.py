@@ -6,44 +6,36 @@ object interface, so that no display or global state is involved.
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import pandas as pd
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from matplotlib.ticker import EngFormatter
+from ..models.errors import require
+from .curves import Curves, Fan, Flown, make_curves
+from .metrics import Headline, Spread, episode_ends, training_runs
+from .palette import agent_color, agent_label, sort_agents
+from .results import Results, read_results
 
-from .curves import Curves, Fan, Flights, make_curves
-from .metrics import HOLD_THRESHOLD, Spread, episode_ends, training_runs
-from .records import Records, read_records, sort_agents
+if TYPE_CHECKING:
+    import pandas as pd
+else:
+    pd = require("pandas", "train", "comparing agents")
+require("matplotlib", "report", "drawing figures")
 
-__all__ = ["FIGURE_FILES", "agent_color", "agent_label", "draw_figures"]
+from matplotlib import rc_context  # noqa: E402
+from matplotlib.axes import Axes  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+from matplotlib.lines import Line2D  # noqa: E402
+from matplotlib.patches import Patch  # noqa: E402
+from matplotlib.ticker import EngFormatter  # noqa: E402
+
+__all__ = ["FIGURE_FILES", "draw_figures"]
 
 FIGURE_FILES: Final = (
     "fig6_reward.png",
     "fig7_cumulative_reward.png",
-    "fig8_elevation_error.png",
+    "fig8_error.png",
     "learning_curve.png",
 )
 
-_LABELS: Final = {"vpg": "VPG", "a2c": "A2C", "sb3-a2c": "SB3 A2C", "pid": "PID"}
-# Okabe and Ito's palette: told apart by readers with colour-blindness.
-_COLORS: Final = {"vpg": "#D55E00", "a2c": "#0072B2", "sb3-a2c": "#009E73", "pid": "#555555"}
-_SPARE_COLORS: Final = ("#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
-# The same hues, lighter, where the ground is dark.
-_DARK_COLORS: Final = {
-    "#D55E00": "#F58A3C",
-    "#0072B2": "#55B0F0",
-    "#009E73": "#2CC998",
-    "#555555": "#B4BCC4",
-    "#CC79A7": "#E29AC3",
-    "#E69F00": "#F0B840",
-    "#56B4E9": "#7CC8F2",
-    "#8C564B": "#C9938A",
-}
 _MAX_POINTS: Final = 2000
 _OUTER: Final = 0.18  # opacity of the 5–95 % band
 _INNER: Final = 0.38  # and of the 25–75 % band
@@ -74,47 +66,31 @@ _TIGHT: Final[dict[str, Any]] = {
 }
 
 
-def agent_label(agent: str) -> str:
-    """Give the name under which an agent is shown."""
-    return _LABELS.get(agent, agent)
-
-
-def agent_color(agent: str, dark: bool = False) -> str:
-    """Give an agent's colour, the same in every figure and every report.
-
-    Args:
-        agent: Its name.
-        dark: Whether it is drawn on a dark ground.
-    """
-    spare = _SPARE_COLORS[sum(agent.encode()) % len(_SPARE_COLORS)]
-    color = _COLORS.get(agent, spare)
-    return _DARK_COLORS[color] if dark else color
-
-
 def draw_figures(
-    folder: Path | str, records: Records | None = None, curves: Curves | None = None
+    folder: Path | str, results: Results | None = None, curves: Curves | None = None
 ) -> list[Path]:
     """Draw all figures of a comparison into `figures/` inside its folder.
 
     Agents or runs that are missing are left out of the figures; a panel with nothing in it says so.
 
     Args:
-        folder: Where `rotorgram compare` wrote its records.
-        records: What `read_records(folder)` gave, where it is at hand.
-        curves: What `make_curves(folder, records)` gave, where they are at hand.
+        folder: Where `rotorgram compare` wrote.
+        results: What `read_results(folder)` gave, where it is at hand.
+        curves: What `make_curves(folder, results)` gave, where they are at hand.
 
     Returns:
         The PNG files, in the order of `FIGURE_FILES`.
     """
-    records = records or read_records(folder)
-    drawn = curves or make_curves(folder, records)
+    results = results or read_results(folder)
+    drawn = curves or make_curves(folder, results)
+    headline = results.headline
     target = Path(folder) / "figures"
     target.mkdir(exist_ok=True)
     draw: tuple[Callable[[], Figure], ...] = (
-        lambda: _draw_reward(records.episodes, drawn),
+        lambda: _draw_reward(results.episodes, drawn),
         lambda: _draw_cumulative(drawn),
-        lambda: _draw_error(sort_agents(records.evaluations["agent"]), drawn),
-        lambda: _draw_learning_curve(records.evaluations, drawn),
+        lambda: _draw_error(sort_agents(results.evaluations["agent"]), drawn, headline),
+        lambda: _draw_learning_curve(results.evaluations, drawn, headline),
     )
     paths = []
     with rc_context(_STYLE):
@@ -171,23 +147,23 @@ def _draw_cumulative(curves: Curves) -> Figure:
     return figure
 
 
-def _draw_error(agents: Sequence[str], curves: Curves) -> Figure:
-    """Draw figure 8: E in training (above) and in the final evaluation (below), per agent."""
+def _draw_error(agents: Sequence[str], curves: Curves, headline: Headline) -> Figure:
+    """Draw figure 8: the metric in training (above) and in the final evaluation, per agent."""
     figure = Figure(figsize=(max(5.0, 3.1 * len(agents)), 5.6), dpi=110)
     axes = figure.subplots(2, max(1, len(agents)), squeeze=False, sharey="row")
     for (above, below), agent in zip(axes.T, agents, strict=False):
-        _training_error(above, curves.training_error.get(agent), agent)
-        _flown_error(below, curves.flights.get(agent), agent)
+        _training_values(above, curves.training_values.get(agent), agent)
+        _flown_values(below, curves.flown.get(agent), agent, headline)
         above.set_title(agent_label(agent))
         below.set_xlabel("time in the episode (s)")
-    _explain_quantiles(figure)
-    axes[0, 0].set_ylabel("training: E (m)")
-    axes[1, 0].set_ylabel("final evaluation: E (m)")
+    _explain_quantiles(figure, headline)
+    axes[0, 0].set_ylabel(f"training: {headline.labelled(headline.symbol)}")
+    axes[1, 0].set_ylabel(f"final evaluation: {headline.labelled(headline.symbol)}")
     return figure
 
 
-def _training_error(axis: Axes, fan: Fan | None, agent: str) -> None:
-    """Draw quantiles of E over windows of env steps, pooled over the agent's seeds."""
+def _training_values(axis: Axes, fan: Fan | None, agent: str) -> None:
+    """Draw quantiles of the metric over windows of env steps, pooled over the agent's seeds."""
     if fan is None:
         _say(axis, "no training")
         return
@@ -199,31 +175,33 @@ def _training_error(axis: Axes, fan: Fan | None, agent: str) -> None:
     axis.axhline(0.0, color="#333333", lw=0.7, ls=":")
 
 
-def _flown_error(axis: Axes, flights: Flights | None, agent: str) -> None:
-    """Draw E over time of some episodes of the agent's final evaluations."""
-    if flights is None:
+def _flown_values(axis: Axes, flown: Flown | None, agent: str, headline: Headline) -> None:
+    """Draw the metric over time of some episodes of the agent's final evaluations."""
+    if flown is None:
         _say(axis, "not evaluated")
         return
-    shown, total = flights
-    for time, error in shown:
-        axis.plot(time, error, color=agent_color(agent), lw=0.8, alpha=0.45)
-    axis.axhspan(-HOLD_THRESHOLD, HOLD_THRESHOLD, color="#333333", alpha=0.12, lw=0)
+    shown, total = flown
+    for time, value in shown:
+        axis.plot(time, value, color=agent_color(agent), lw=0.8, alpha=0.45)
+    if (held := headline.metric.held) is not None:
+        low = axis.get_ylim()[1] if headline.high else -held if headline.signed else 0.0
+        axis.axhspan(low, held, color="#333333", alpha=0.12, lw=0)
     count = f"{len(shown)} of {total}" if len(shown) < total else total
-    axis.set_title(f"{count} flights", fontsize=8.5, color="#444444")
+    axis.set_title(f"{count} trajectories", fontsize=8.5, color="#444444")
 
 
-def _explain_quantiles(figure: Figure) -> None:
+def _explain_quantiles(figure: Figure, headline: Headline) -> None:
     """Explain the bands in grey, once for all agents' colours."""
     handles = [
         Patch(color="#444444", alpha=_OUTER, lw=0, label="5–95 %"),
         Patch(color="#444444", alpha=_INNER, lw=0, label="25–75 %"),
-        Line2D([], [], color="#444444", lw=1.2, label="median of E in training"),
+        Line2D([], [], color="#444444", lw=1.2, label=f"median of {headline.symbol} in training"),
     ]
     figure.legend(handles=handles, loc="outside upper right", ncols=3, fontsize=8.5)
 
 
-def _draw_learning_curve(evaluations: pd.DataFrame, curves: Curves) -> Figure:
-    """Draw the steady-state |E| of the snapshots over training; agents without any as a line."""
+def _draw_learning_curve(evaluations: pd.DataFrame, curves: Curves, headline: Headline) -> Figure:
+    """Draw the steady state of the snapshots over training; agents without any as a line."""
     figure, (axis,) = _panels(1)
     for agent in sort_agents((*curves.learning, *curves.levels)):
         if agent in curves.levels:
@@ -231,9 +209,12 @@ def _draw_learning_curve(evaluations: pd.DataFrame, curves: Curves) -> Figure:
             axis.axhline(level, color=agent_color(agent), ls="--", label=label)
         else:
             _plot(axis, curves.learning[agent], agent, marker="o")
-    axis.axhline(HOLD_THRESHOLD, color="#333333", lw=0.9, ls=":", label=f"{HOLD_THRESHOLD} m")
-    axis.set_yscale("log")
-    axis.set_ylabel("steady-state |E| in evaluation (m)")
+    if (held := headline.metric.held) is not None:
+        label = headline.amount(f"{held:g}")
+        axis.axhline(held, color="#333333", lw=0.9, ls=":", label=label)
+    if not headline.high:
+        axis.set_yscale("log")
+    axis.set_ylabel(headline.labelled(f"steady-state {headline.size_symbol} in evaluation"))
     _env_steps_axis(axis)
     if evaluations["env_steps"].max() == 0:
         axis.set_xticks([0])

@@ -1,38 +1,83 @@
-"""Films of flights: a frame shows the control step of its time; several flights side by side."""
+"""Films of trajectories: a frame shows the control step of its time; several side by side."""
 
+import logging
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ..rendering import Camera, Canvas, Stage, World
-from ..rendering.film import QUALITY, check_film, write_film
-from ..rendering.overlay import Overlay
-from .flights import Track
+from ..agents.checkpoints import load
+from ..agents.pid import PID
+from ..agents.policies import Policy
+from ..models.errors import InputError
+from ..rendering import Camera, Canvas, Moment, NoOpenGL, Stage, World
+from ..rendering.film import QUALITY, check_film, poster, write_film
+from ..rendering.overlay import Overlay, graph_scale
+from .palette import agent_color, agent_label, sort_agents
+from .trajectories import Trajectory, flown_trajectories
 
-__all__ = ["Film", "OnFrame", "Shot", "film", "grid"]
+if TYPE_CHECKING:
+    from .results import Results
+
+__all__ = ["Film", "OnFrame", "Shot", "film", "film_comparison", "grid", "moments"]
 
 OnFrame = Callable[[int, int], None]
 """Called with frames drawn, and frames in all."""
 
+MOST_FRAMES: Final = 1_000_000
+"""Of a film: 11 hours of it."""
 _SPACE: Final = 2  # pixels between panes
 _DARK: Final = (13, 18, 26)
-_ASPECT: Final = 1.2  # of a pane that shows a craft and its strip well
-_BANDS: Final = (0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0)
+_ASPECT: Final = 1.2  # of a pane that shows a craft and its graph well
+_COMPARISON_SIZE: Final = (1280, 400)
+_COMPARISON_QUALITY: Final = 27
+"""Small enough for a page that holds the film in itself."""
+
+
+def moments(trajectory: Trajectory) -> list[Moment]:
+    """What a trajectory looks like after each control step, and at its start.
+
+    Raises:
+        InputError: Its telemetry does not tell where the craft is.
+    """
+    missing = [name for name in ("position", "attitude", "thrust")
+               if name not in trajectory.telemetry]  # fmt: skip
+    if missing:
+        raise InputError(
+            f"pictures: expected telemetry of {', '.join(missing)}, "
+            f"{trajectory.spec.env_id} tells none"
+        )
+    metrics = [(one.name, one.unit, one.symbol) for one in trajectory.spec.metrics]
+    return [
+        Moment.of(
+            {name: array[step] for name, array in trajectory.telemetry.items()},
+            metrics,
+            reward=float(trajectory.rewards[step - 1]) if step else 0.0,
+            step=step,
+            episode=trajectory.episode,
+        )
+        for step in range(len(trajectory) + 1)
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """One pane: who flies, and what was flown."""
+    """One pane: a name, and what was flown under it."""
 
     name: str
     color: str
     """Of name and curve, "#RRGGBB"."""
-    tracks: list[Track]
+    trajectories: list[Trajectory]
     """One after the other."""
+
+    @cached_property
+    def moments(self) -> list[list[Moment]]:
+        """Of each trajectory."""
+        return [moments(one) for one in self.trajectories]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +92,10 @@ class Film:
     speed: float = 1.0
     """Seconds of flight per second of film."""
     world: World = "airport"
+    vehicle: str | None = None
+    """MJCF file of what flies; None: the paper's."""
     overlay: bool = True
-    """Whether numbers and error curves are drawn. Of several panes the names always are."""
+    """Whether numbers and graphs are drawn. Of several panes the names always are."""
     at: float | None = None
     """Only the picture at this time of the first episode, s."""
     fast: bool = False
@@ -58,18 +105,18 @@ class Film:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.speed) and 0.001 <= self.speed <= 1000):
-            raise ValueError(f"speed: expected 0.001 to 1000, got {self.speed:g}")
+            raise InputError(f"speed: expected 0.001 to 1000, got {self.speed:g}")
         if self.at is not None and not (math.isfinite(self.at) and self.at >= 0):
-            raise ValueError(f"at: expected a time of 0 s or more, got {self.at:g}")
+            raise InputError(f"at: expected a time of 0 s or more, got {self.at:g}")
 
 
 def film(path: Path, shots: Sequence[Shot], config: Film, on_frame: OnFrame | None = None) -> int:
-    """Film flights side by side.
+    """Film trajectories side by side.
 
     Args:
         path: As of `write_film`. A `.png` is the picture at `config.at`, or the last.
-        shots: One or more, each with as many tracks. An episode lasts until the longest flight of
-            it has ended; one that ended before stays on its last picture.
+        shots: One or more, each with as many trajectories. An episode lasts until the longest
+            trajectory of it has ended; one that ended before stays on its last picture.
         config: How.
         on_frame: Told how far it is.
 
@@ -78,7 +125,8 @@ def film(path: Path, shots: Sequence[Shot], config: Film, on_frame: OnFrame | No
 
     Raises:
         NoOpenGL: There is nothing to draw with.
-        ValueError: The name, the size or the rate is not what it should be.
+        InputError: The name, the size or the rate is not what it should be, or the film would be
+            longer than any film.
         OSError: It cannot be written.
     """
     check_film(path, config.width, config.height, config.fps)
@@ -100,15 +148,22 @@ def film(path: Path, shots: Sequence[Shot], config: Film, on_frame: OnFrame | No
 
 def _times(shots: Sequence[Shot], config: Film, *, still: bool) -> list[tuple[int, float]]:
     """Episode and time of flight of every frame, from its start to its end."""
-    if not shots or len({len(shot.tracks) for shot in shots}) != 1 or not shots[0].tracks:
-        raise ValueError("shots: expected one or more, with as many episodes each")
-    lengths = [max(track.seconds for track in tracks)
-               for tracks in zip(*(shot.tracks for shot in shots), strict=True)]  # fmt: skip
+    counts = {len(shot.trajectories) for shot in shots}
+    if len(counts) != 1 or not shots[0].trajectories:
+        raise InputError("shots: expected one or more, with as many episodes each")
+    episodes = zip(*(shot.trajectories for shot in shots), strict=True)
+    lengths = [max(one.seconds for one in flown) for flown in episodes]
     if config.at is not None:
         return [(0, config.at)]
     if still:
         return [(len(lengths) - 1, lengths[-1])]
     step = config.speed / config.fps
+    frames = sum(lengths) / step
+    if frames > MOST_FRAMES:
+        raise InputError(
+            f"film: expected at most {MOST_FRAMES:,} frames, got {frames:,.0f} for "
+            f"{sum(lengths):,.0f} s of flight; choose a higher speed"
+        )
     return [
         (episode, number * step)
         for episode, length in enumerate(lengths)
@@ -143,14 +198,13 @@ class _Studio:
             ((width + _SPACE) * (i % columns), (height + _SPACE) * (i // columns))
             for i in range(len(shots))
         ]
-        stage = Stage(config.world)
+        stage = Stage(config.world, vehicle=config.vehicle)
         self._canvas = Canvas(stage, width, height, fast=config.fast)
-        tracks = [track for shot in shots for track in shot.tracks]
-        seconds = max(track.seconds for track in tracks)
-        band = _band(tracks)
+        flown = [one for shot in shots for one in shot.trajectories]
+        seconds, scale = max(one.seconds for one in flown), _scale(flown)
         try:
             self._panes = [
-                _Pane(shot, config, self._canvas, stage.twin(), seconds, band, len(shots) > 1)
+                _Pane(shot, config, self._canvas, stage.twin(), seconds, scale, len(shots) > 1)
                 for shot in shots
             ]
         except BaseException:
@@ -182,7 +236,7 @@ class _Pane:
         canvas: Canvas,
         stage: Stage,
         seconds: float,
-        band: float,
+        scale: tuple[float, float],
         named: bool,
     ) -> None:
         self._shot, self._config = shot, config
@@ -195,43 +249,130 @@ class _Pane:
             canvas.height,
             title=shot.name,
             color=shot.color,
-            period=shot.tracks[0].control_period,
+            like=shot.moments[0][0],
+            vehicle=stage.vehicle,
+            period=shot.trajectories[0].control_period,
             seconds=seconds,
-            band=band,
+            scale=scale,
             numbers=config.overlay,
         )
 
     def picture(self, episode: int, seconds: float) -> np.ndarray:
-        track = self._shot.tracks[episode]
-        step = track.step_at(seconds)
+        trajectory = self._shot.trajectories[episode]
+        step = trajectory.step_at(seconds)
         if (episode, step) != self._shown:
             begin = self._shown[1] + 1 if episode == self._shown[0] else 0
-            for moment in track.moments[begin : step + 1]:  # its path has no gaps
+            for moment in self._shot.moments[episode][begin : step + 1]:  # its path has no gaps
                 self._stage.show(moment)
             self._shown = episode, step
-            self._picture = self._draw(track, step)
+            self._picture = self._draw(episode, step)
         return self._picture
 
-    def _draw(self, track: Track, step: int) -> np.ndarray:
+    def _draw(self, episode: int, step: int) -> np.ndarray:
         picture = self._canvas.draw(self._config.camera, self._stage)
         if self._bare:
             return picture
-        ended = (
-            self._config.overlay and step == len(track.moments) - 1 and track.ending != "truncated"
-        )
-        note = track.ending if ended else ""
-        return self._overlay.draw(picture, track.moments[step], track.errors[: step + 1], note)
+        trajectory = self._shot.trajectories[episode]
+        ended = self._config.overlay and step == len(trajectory)
+        note = trajectory.ending if ended and trajectory.ending != "truncated" else ""
+        values = trajectory.headline[: step + 1].tolist()
+        return self._overlay.draw(picture, self._shot.moments[episode][step], values, note)
 
 
-def _band(tracks: Sequence[Track]) -> float:
-    """A round number of metres that holds E.
+def _scale(flown: Sequence[Trajectory]) -> tuple[float, float]:
+    """Ends of the graph that hold the headline metric.
 
     Of a crash it holds the start only, for the others to be seen, unless all crashed.
     """
-    crashed = [track.ending == "terminated" for track in tracks]
-    largest = max(
-        abs(error)
-        for track, ended in zip(tracks, crashed, strict=True)
-        for error in (track.errors[:1] if ended and not all(crashed) else track.errors)
+    all_crashed = all(one.terminated for one in flown)
+    return graph_scale(
+        value
+        for one in flown
+        for value in one.headline[: 1 if one.terminated and not all_crashed else None].tolist()
     )
-    return next((band for band in _BANDS if largest <= band), math.ceil(largest))
+
+
+# ---- the film of a comparison
+
+
+def film_comparison(
+    folder: Path,
+    out: Path,
+    on_frame: OnFrame | None = None,
+    *,
+    picture: Path | None = None,
+    world: World = "airport",
+) -> bool:
+    """Film what a comparison trained: each agent and the PID, the same episode side by side.
+
+    Of an agent's seeds the middle one flies, by the steady state in the final evaluation (of an
+    even number the better of the two in the middle). Of the episodes of that evaluation they fly
+    the one that starts furthest from its goal. It is filmed without shadows: a few seconds where
+    software draws.
+
+    Args:
+        folder: Where `rotorgram compare` wrote.
+        out: The film; one that exists is replaced.
+        on_frame: Told how far it is.
+        picture: JPEG of a moment of the film, written beside it; what a page shows before it plays.
+        world: Where.
+
+    Returns:
+        Whether there is a film. Without OpenGL there is none, and a line in the log says why.
+
+    Raises:
+        InputError: The folder is not a comparison's.
+        OSError: The film cannot be written.
+    """
+    from .results import read_results
+
+    results = read_results(folder)
+    width, height = _COMPARISON_SIZE
+    config = Film(
+        width=width,
+        height=height,
+        camera="front",
+        world=world,
+        vehicle=results.config["vehicle"],
+        fast=True,
+        quality=_COMPARISON_QUALITY,
+    )
+    fresh = out.with_name(f".fresh-{out.name}")
+    fresh.unlink(missing_ok=True)
+    try:
+        film(fresh, _comparison_shots(folder, results), config, on_frame)
+    except NoOpenGL as error:
+        logging.getLogger(__name__).info("no film of the agents: %s", error)
+        return False
+    if picture is not None:
+        picture.write_bytes(poster(fresh))
+    fresh.replace(out)
+    return True
+
+
+def _comparison_shots(folder: Path, results: "Results") -> list[Shot]:
+    from .metrics import final_per_run
+
+    spec, vehicle = results.spec, results.config["vehicle"]
+    final = final_per_run(results.evaluations, results.headline)
+    last = results.evaluations.groupby("agent")["env_steps"].transform("max")
+    shown = results.evaluations[results.evaluations["env_steps"] == last]
+    starts = results.headline.size(shown["start"].to_numpy())
+    episode = int(shown["episode"].iloc[int(np.argmax(starts))])
+    shots = []
+    for agent in sort_agents(final["agent"]):
+        order = not results.headline.high
+        runs = final[final["agent"] == agent].sort_values("steady", ascending=order, kind="stable")
+        seed = int(runs["seed"].iloc[(len(runs) - 1) // 2])
+        name = agent_label(agent)
+        policy: Policy
+        if agent == "pid":
+            policy = PID(spec)
+        else:
+            policy = load(folder / "checkpoints" / f"{agent}-seed{seed}.safetensors").policy()
+            name += f", seed {seed}" if len(runs) > 1 else ""
+        flown = flown_trajectories(
+            policy, spec.env_id, spec.options, [episode], vehicle=vehicle, of="final"
+        )
+        shots.append(Shot(name=name, color=agent_color(agent, dark=True), trajectories=flown))
+    return shots

@@ -1,54 +1,55 @@
-"""What is measured of a flight and of a set of runs: pure functions of arrays and frames.
+"""What is measured of a trajectory and of a set of runs: pure functions of arrays and frames.
 
-Over an episode: `steady_state_error`, `settling_time`, `overshoot`. Over seeds: the interquartile
-mean (`iqm`) with a percentile-bootstrap interval, as Agarwal et al. ("Deep Reinforcement Learning
-at the Edge of the Statistical Precipice", 2021) recommend for few runs. `results_table` puts them
-together.
+Over an episode: `steady_state`, `settling_time`, `overshoot` of the headline metric. Over seeds:
+the interquartile mean (`iqm`) with a percentile-bootstrap interval, as Agarwal et al. ("Deep
+Reinforcement Learning at the Edge of the Statistical Precipice", 2021) recommend for few runs,
+the share of seeds that hold their goal, and the worst seed. `results_table` puts them together.
 
-How episodes that end early (a crash) enter: the steady-state error, the overshoot and the return
-are those of what was flown; the settling time is missing, and the table says how many episodes
-settled and how many crashed; a snapshot with a crash in it does not count as holding the target.
+How episodes that end early (a crash) enter: the steady state, the overshoot and the return are
+those of what was flown; the settling time is missing, and the table says how many episodes
+settled and how many crashed; a run with a crash in its evaluation does not hold its goal.
 """
 
-from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
-from scipy import stats
 
-from .records import sort_agents
+from ..envs.spec import EnvSpec, Metric
+from ..models.errors import InputError, require
+from .palette import sort_agents
+
+if TYPE_CHECKING:
+    import pandas as pd
+else:
+    pd = require("pandas", "train", "comparing agents")
 
 __all__ = [
-    "HOLD_THRESHOLD",
-    "SETTLING_TOLERANCE",
     "Curve",
+    "Headline",
     "Spread",
     "average_return",
     "bootstrap_difference",
     "bootstrap_interval",
-    "env_steps_to_reach",
     "episode_ends",
     "final_evaluations",
     "final_per_run",
+    "first_lasting_snapshot",
     "iqm",
     "overshoot",
     "results_table",
-    "seconds_to_reach",
     "settling_time",
     "spread_over_seeds",
-    "steady_state_error",
+    "steady_state",
     "training_runs",
+    "trimmed_mean",
 ]
 
-SETTLING_TOLERANCE: Final = 0.05
-"""|E| below which an episode counts as settled, m. Ours: the paper gives none."""
-
-HOLD_THRESHOLD: Final = 0.1
-"""Steady-state |E| below which an agent counts as holding its target, m. Ours."""
-
 _RESAMPLES: Final = 2000
+_COUNTS: Final = ("seeds", "episodes", "settled", "crashed")
 
 FloatArray = npt.NDArray[np.floating[Any]]
 Values = Sequence[float] | npt.NDArray[np.floating[Any]]
@@ -70,30 +71,111 @@ class Spread(NamedTuple):
     high: npt.NDArray[np.float64]
 
 
-def steady_state_error(errors: FloatArray) -> float:
-    """Mean |E| in the last quarter of an episode (at least its last step), m.
+@dataclass(frozen=True, kw_only=True)
+class Headline:
+    """The metric that decides, and how its numbers are read.
+
+    The *size* of an error (goal `zero`) is its magnitude; of a metric that is to be high, its
+    value.
+    """
+
+    metric: Metric
+    signed: bool
+    """Whether it can be negative; only then an overshoot is defined."""
+
+    @classmethod
+    def of(cls, spec: EnvSpec) -> "Headline":
+        """The headline metric of an env. Raises `InputError` where the env names none."""
+        if spec.headline is None:
+            raise InputError(f"env: expected one that names a metric, got {spec.env_id}")
+        (array,) = (one for one in spec.telemetry if one.name == "metrics")
+        signed = spec.headline.goal == "zero" and float(array.bounds()[0].flat[0]) < 0
+        return cls(metric=spec.headline, signed=signed)
+
+    @property
+    def name(self) -> str:
+        """Column of files, key of `info`."""
+        return self.metric.name
+
+    @property
+    def symbol(self) -> str:
+        """Of the value, as E."""
+        return self.metric.symbol or self.metric.name
+
+    @property
+    def size_symbol(self) -> str:
+        """Of the size, as |E|."""
+        return f"|{self.symbol}|" if self.signed else self.symbol
+
+    @property
+    def unit(self) -> str:
+        """Empty where it has none."""
+        return self.metric.unit
+
+    @property
+    def high(self) -> bool:
+        """Whether more is better."""
+        return self.metric.goal == "high"
+
+    def labelled(self, text: str) -> str:
+        """A heading with the unit: "steady |E| (m)"."""
+        return f"{text} ({self.unit})" if self.unit else text
+
+    def amount(self, number: str) -> str:
+        """A number with the unit: "0.1 m"."""
+        return f"{number} {self.unit}" if self.unit else number
+
+    @property
+    def held_text(self) -> str:
+        """What holding its goal means: "|E| < 0.1 m"; empty where it means nothing."""
+        if self.metric.held is None:
+            return ""
+        sign = "≥" if self.high else "<"
+        return f"{self.size_symbol} {sign} {self.amount(f'{self.metric.held:g}')}"
+
+    def size(self, values: Values) -> npt.NDArray[np.float64]:
+        """Magnitude of an error, value of what is to be high; same shape, float64."""
+        array = np.asarray(values, dtype=np.float64)
+        return array if self.high else np.abs(array)
+
+    def holds(self, sizes: Values) -> npt.NDArray[np.bool_]:
+        """Whether each mean size counts as holding the goal; false for nan, or without a bound."""
+        held = self.metric.held
+        array = np.asarray(sizes, dtype=np.float64)
+        if held is None:
+            return np.zeros(array.shape, bool)
+        return np.asarray(array >= held if self.high else array < held)
+
+    def worst(self, sizes: Values) -> float:
+        """The worst of the values that are not missing; nan if there is none."""
+        finite = _finite(sizes)
+        if not finite.size:
+            return math.nan
+        return float(finite.min() if self.high else finite.max())
+
+
+def steady_state(sizes: FloatArray) -> float:
+    """Mean size in the last quarter of an episode (at least its last step), in the metric's unit.
 
     Args:
-        errors: E at every control step, shape (T,), m.
+        sizes: `Headline.size` after every control step, shape (T,).
 
     Returns:
         nan for an episode without steps.
     """
-    values = np.abs(np.asarray(errors, dtype=np.float64))
+    values = np.asarray(sizes, dtype=np.float64)
     if values.size == 0:
-        return float("nan")
+        return math.nan
     return float(values[-max(1, values.size // 4) :].mean())
 
 
-def settling_time(
-    errors: FloatArray, control_period: float, tolerance: float = SETTLING_TOLERANCE
-) -> float:
-    """Time from which |E| stays below the tolerance until the episode ends, s.
+def settling_time(errors: FloatArray, control_period: float, tolerance: float) -> float:
+    """Time from which the error stays inside the tolerance until the episode ends, s.
 
     Args:
-        errors: E at every control step, shape (T,), m; `errors[0]` is at time 0.
+        errors: The metric at every control step, shape (T,); `errors[0]` is at time 0.
         control_period: Time between two control steps, s.
-        tolerance: Half width of the band around the target, m.
+        tolerance: Half width of the band around zero, in the metric's unit.
 
     Returns:
         nan if the last error lies outside the band, or if there is none. An episode that crashes
@@ -101,24 +183,24 @@ def settling_time(
     """
     outside = ~(np.abs(np.asarray(errors, dtype=np.float64)) < tolerance)
     if outside.size == 0 or outside[-1]:
-        return float("nan")
+        return math.nan
     return float(outside.nonzero()[0][-1] + 1) * control_period if outside.any() else 0.0
 
 
 def overshoot(errors: FloatArray) -> float:
-    """How far the craft passed its target, m: the largest -sign(E_0)·E, at least 0.
+    """How far the craft passed its target: the largest -sign(E_0)·E, at least 0.
 
     An episode that begins exactly on its target has no side to pass to: its largest |E| counts.
 
     Args:
-        errors: E at every control step, shape (T,), m.
+        errors: A signed error at every control step, shape (T,).
 
     Returns:
-        nan for an episode without steps.
+        In the metric's unit; nan for an episode without steps.
     """
     values = np.asarray(errors, dtype=np.float64)
     if values.size == 0:
-        return float("nan")
+        return math.nan
     if values[0] == 0.0:
         return float(np.abs(values).max())
     return max(0.0, float((-np.sign(values[0]) * values).max()))
@@ -129,18 +211,26 @@ def _finite(values: Values) -> npt.NDArray[np.float64]:
     return array[np.isfinite(array)]
 
 
+def trimmed_mean(values: FloatArray, axis: int = -1) -> npt.NDArray[np.float64]:
+    """Mean along an axis without the lowest and the highest quarter; below four nothing is cut."""
+    ordered = np.sort(np.asarray(values, dtype=np.float64), axis=axis)
+    count = ordered.shape[axis]
+    cut = count // 4
+    middle = np.take(ordered, np.arange(cut, count - cut), axis=axis)
+    return np.asarray(middle.mean(axis=axis))
+
+
 def iqm(values: Values) -> float:
     """Interquartile mean: the mean without the lowest and the highest quarter of the values.
 
     Below four values nothing is cut. Missing values are left out; nan if none is left.
     """
     finite = _finite(values)
-    return float(stats.trim_mean(finite, 0.25)) if finite.size else float("nan")
+    return float(trimmed_mean(finite)) if finite.size else math.nan
 
 
 def _resampled_iqms(values: FloatArray, rng: np.random.Generator) -> npt.NDArray[np.float64]:
-    samples = rng.choice(values, size=(_RESAMPLES, values.size), replace=True)
-    return np.asarray(stats.trim_mean(samples, 0.25, axis=1), dtype=np.float64)
+    return trimmed_mean(rng.choice(values, size=(_RESAMPLES, values.size), replace=True), axis=1)
 
 
 def bootstrap_interval(
@@ -159,9 +249,8 @@ def bootstrap_interval(
     """
     finite = _finite(values)
     if finite.size < 2:
-        return float("nan"), float("nan")
-    means = _resampled_iqms(finite, np.random.default_rng(seed))
-    return _ends(means, confidence)
+        return math.nan, math.nan
+    return _ends(_resampled_iqms(finite, np.random.default_rng(seed)), confidence)
 
 
 def bootstrap_difference(
@@ -180,7 +269,7 @@ def bootstrap_difference(
     one, other = _finite(first), _finite(second)
     difference = iqm(one) - iqm(other)
     if min(one.size, other.size) < 2:
-        return difference, float("nan"), float("nan")
+        return difference, math.nan, math.nan
     rng = np.random.default_rng(seed)
     return difference, *_ends(_resampled_iqms(one, rng) - _resampled_iqms(other, rng), confidence)
 
@@ -191,15 +280,17 @@ def _ends(means: npt.NDArray[np.float64], confidence: float) -> tuple[float, flo
 
 
 def training_runs(episodes: pd.DataFrame, agent: str) -> list[pd.DataFrame]:
-    """Split an agent's training episodes into one frame per seed, in order."""
-    own = episodes[episodes["agent"] == agent].sort_values(["seed", "first_step"], kind="stable")
+    """Split an agent's training episodes into one frame per seed, in the order of their ends.
+
+    Episodes of several drones overlap: their env steps count from the run's when they began.
+    """
+    own = episodes[episodes["agent"] == agent].sort_values(["seed", "last_step"], kind="stable")
     return [run for _, run in own.groupby("seed")]
 
 
 def episode_ends(episodes: pd.DataFrame) -> npt.NDArray[np.float64]:
     """Env step of the run at which each training episode ended, shape (episodes,)."""
-    ends = episodes["first_step"].to_numpy() + episodes["length"].to_numpy()
-    return np.asarray(ends, dtype=np.float64)
+    return episodes["last_step"].to_numpy(np.float64)
 
 
 def average_return(run: pd.DataFrame, share: float) -> Curve:
@@ -240,43 +331,38 @@ def spread_over_seeds(
     values = np.stack([np.interp(x, curve.x, curve.y) for curve in curves])
     quartiles = (0.25, 0.75) if len(curves) >= 4 else (0.0, 1.0)
     low, high = np.quantile(values, quartiles, axis=0)
-    return Spread(x, np.asarray(stats.trim_mean(values, 0.25, axis=0)), low, high)
+    return Spread(x, trimmed_mean(values, axis=0), low, high)
 
 
-def env_steps_to_reach(evaluations: pd.DataFrame, threshold: float = HOLD_THRESHOLD) -> float:
-    """Training after which one run holds its target for good, env steps.
+def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tuple[float, float]:
+    """Training after which one run holds its goal for good.
 
     A snapshot is judged by few episodes, in which even an untrained network can pass by luck:
     hence a snapshot counts only if none after it fails.
 
     Args:
         evaluations: The evaluation episodes of one run (one agent, one seed).
-        threshold: Bound on a snapshot's mean steady-state |E|, m.
+        headline: Says what holding means.
 
     Returns:
-        `env_steps` of the first snapshot from which on every snapshot stays below the threshold
+        Env steps and seconds of training of the first snapshot from which on every snapshot holds
         without a crash; nan if there is none.
     """
-    return _first_lasting_snapshot(evaluations, "env_steps", threshold)
-
-
-def seconds_to_reach(evaluations: pd.DataFrame, threshold: float = HOLD_THRESHOLD) -> float:
-    """As `env_steps_to_reach`, in seconds of training."""
-    return _first_lasting_snapshot(evaluations, "seconds", threshold)
-
-
-def _first_lasting_snapshot(evaluations: pd.DataFrame, column: str, threshold: float) -> float:
-    # A crash, or an error that is missing, must not vanish in a mean that skips it.
-    held = evaluations["steady_error"].fillna(np.inf).mask(evaluations["terminated"], np.inf)
+    # A crash, or a value that is missing, must not vanish in a mean that skips it.
+    never = -np.inf if headline.high else np.inf
+    steady = evaluations["steady"].fillna(never).mask(evaluations["terminated"], never)
     snapshots = (
-        evaluations.assign(held=held)
+        evaluations.assign(steady=steady)
         .groupby("env_steps", sort=True)
-        .agg(held=("held", "mean"), seconds=("seconds", "max"))
+        .agg(steady=("steady", "mean"), seconds=("seconds", "max"))
         .reset_index()
     )
-    misses = (~(snapshots["held"].to_numpy() < threshold)).nonzero()[0]
+    misses = (~headline.holds(snapshots["steady"].to_numpy())).nonzero()[0]
     first = int(misses[-1]) + 1 if misses.size else 0
-    return float(snapshots[column].iloc[first]) if first < len(snapshots) else float("nan")
+    if first >= len(snapshots):
+        return math.nan, math.nan
+    row = snapshots.iloc[first]
+    return float(row["env_steps"]), float(row["seconds"])
 
 
 def final_evaluations(evaluations: pd.DataFrame) -> pd.DataFrame:
@@ -285,70 +371,94 @@ def final_evaluations(evaluations: pd.DataFrame) -> pd.DataFrame:
     return evaluations[evaluations["env_steps"] == last]
 
 
-def final_per_run(evaluations: pd.DataFrame) -> pd.DataFrame:
+def final_per_run(evaluations: pd.DataFrame, headline: Headline) -> pd.DataFrame:
     """One row per run (agent, seed): the means over the episodes of its final evaluation.
 
     `settling_time` is the mean over the episodes that settled (nan if none did); `episodes`,
-    `settled` and `crashed` count them.
+    `settled` and `crashed` count them. `held`: whether its mean steady state holds the goal, with
+    a value in every episode and without a crash.
     """
     final = final_evaluations(evaluations)
     final = final.assign(
-        # The records leave a crash's settling time empty; a value there would be a mistake.
-        settling_time=final["settling_time"].mask(final["terminated"])
+        # Files leave a crash's settling time empty; a value there would be a mistake.
+        settling_time=final["settling_time"].mask(final["terminated"]),
+        missing=final["steady"].isna(),
     )
-    groups = final.groupby(["agent", "seed"], sort=True)
-    return groups.agg(
-        **{name: (name, "mean") for name in ("steady_error", "settling_time", "overshoot")},
+    rows = final.groupby(["agent", "seed"], sort=True).agg(
+        **{name: (name, "mean") for name in ("steady", "settling_time", "overshoot")},
         **{"return": ("return", "mean")},
         episodes=("episode", "size"),
         settled=("settling_time", "count"),
         crashed=("terminated", "sum"),
-    ).reset_index()
+        missing=("missing", "sum"),
+    ).reset_index()  # fmt: skip
+    whole = (rows["crashed"] == 0) & (rows.pop("missing") == 0)
+    return rows.assign(held=headline.holds(rows["steady"].to_numpy()) & whole)
 
 
-def results_table(evaluations: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
+def results_table(
+    evaluations: pd.DataFrame,
+    runs: pd.DataFrame,
+    headline: Headline,
+    bounds: Mapping[str, float] | None = None,
+) -> pd.DataFrame:
     """Tabulate the final evaluations and the training of all agents.
 
     Args:
-        evaluations: As of `records.read_evaluations`.
-        runs: As of `records.read_runs`.
+        evaluations: As of `results.read_evaluations`.
+        runs: As of `results.read_runs`.
+        headline: The metric that decides.
+        bounds: Mean returns that no agent reached but physics or idleness gives, by name.
 
     Returns:
-        One row per agent, indexed by `agent`. For each of steady_error (m), settling_time (s),
-        overshoot (m) and return: the interquartile mean over seeds, and `_low` and `_high` of its
-        95 % interval. Counts: seeds, episodes, settled, crashed. For agents that were trained:
+        One row per agent, then one per bound, indexed by `agent`. For each of steady,
+        settling_time (s), overshoot and return: the interquartile mean over seeds, and `_low` and
+        `_high` of its 95 % interval. `held`: seeds that hold the goal; `worst`: the worst seed's
+        steady state. Counts: seeds, episodes, settled, crashed. For agents that were trained:
         env_steps_to_reach and seconds_to_reach (interquartile mean over the `reached` of `seeds`
-        seeds that hold |E| < 0.1 m for good) and steps_per_second; nan for the others.
+        seeds that hold the goal for good) and steps_per_second; nan for the others. A bound has
+        a return and nothing else; its counts are 0.
     """
-    final = final_per_run(evaluations)
-    rows = {}
+    final = final_per_run(evaluations, headline)
+    rows: dict[str, dict[str, float]] = {}
     for agent in sort_agents(evaluations["agent"]):
         own = evaluations[evaluations["agent"] == agent]
         trained = runs[(runs["agent"] == agent) & (runs["env_steps"] > 0)]
-        rows[agent] = _final_row(final[final["agent"] == agent]) | _training_row(own, trained)
+        rows[agent] = _final_row(final[final["agent"] == agent], headline)
+        rows[agent] |= _training_row(own, trained, headline)
+    for name, value in (bounds or {}).items():
+        counts = dict.fromkeys(_COUNTS, 0)
+        nothing = dict.fromkeys(next(iter(rows.values())), math.nan)
+        rows[name] = {**nothing, **counts, "return": value}
     table = pd.DataFrame.from_dict(rows, orient="index")
+    table = table.astype(dict.fromkeys(_COUNTS, "int64"))
     table.index.name = "agent"
     return table
 
 
-def _final_row(final: pd.DataFrame) -> dict[str, float]:
+def _final_row(final: pd.DataFrame, headline: Headline) -> dict[str, float]:
     row: dict[str, float] = {"seeds": len(final)}
-    for name in ("steady_error", "settling_time", "overshoot", "return"):
+    for name in ("steady", "settling_time", "overshoot", "return"):
         values = final[name].to_numpy()
         row[name] = iqm(values)
         row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(values)
-    return row | {name: int(final[name].sum()) for name in ("episodes", "settled", "crashed")}
+    row["held"] = math.nan if headline.metric.held is None else int(final["held"].sum())
+    row["worst"] = headline.worst(final["steady"].to_numpy())
+    return row | {name: int(final[name].sum()) for name in _COUNTS[1:]}
 
 
-def _training_row(evaluations: pd.DataFrame, runs: pd.DataFrame) -> dict[str, float]:
-    if runs.empty:
-        names = ("reached", "env_steps_to_reach", "seconds_to_reach", "steps_per_second")
-        return dict.fromkeys(names, float("nan"))
-    own_runs = [run for _, run in evaluations.groupby("seed")]
-    steps = [env_steps_to_reach(run) for run in own_runs]
+def _training_row(
+    evaluations: pd.DataFrame, runs: pd.DataFrame, headline: Headline
+) -> dict[str, float]:
+    if runs.empty or headline.metric.held is None:
+        names = ("reached", "env_steps_to_reach", "seconds_to_reach")
+        nothing = dict.fromkeys(names, math.nan)
+        return {**nothing, "steps_per_second": iqm(runs["steps_per_second"].to_numpy())}
+    reached = [first_lasting_snapshot(run, headline) for _, run in evaluations.groupby("seed")]
+    steps, seconds = np.array(reached).T
     return {
         "reached": int(np.isfinite(steps).sum()),
         "env_steps_to_reach": iqm(steps),
-        "seconds_to_reach": iqm([seconds_to_reach(run) for run in own_runs]),
+        "seconds_to_reach": iqm(seconds),
         "steps_per_second": iqm(runs["steps_per_second"].to_numpy()),
     }

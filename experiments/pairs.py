@@ -1,20 +1,20 @@
 """A socket pair: an agent's remote env here and a simulator in a process of its own."""
 
+import atexit
 import json
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, Final
 
-from ..envs import ElevationConfig
 from ..udp import PeerClosed, PeerSilent, RemoteEnv, RemoteVectorEnv
+from .settings import EnvConfig
 
-__all__ = ["socket_pair"]
+__all__ = ["close_shared_pairs", "shared_pair", "socket_pair"]
 
 _START_TIMEOUT: Final = 60.0
 _ANSWER_TIMEOUT: Final = 10.0
@@ -24,24 +24,34 @@ _POLL: Final = 0.5
 
 @contextmanager
 def socket_pair(
-    config: ElevationConfig, *, num_envs: int = 1, record: Path | None = None
+    env_id: str = "rotorgram/Elevation-v0",
+    options: Mapping[str, Any] | None = None,
+    *,
+    num_envs: int = 1,
+    vehicle: str | Path | None = None,
+    record: Path | None = None,
 ) -> Iterator[Any]:
     """A connected remote env, on free ports of the loopback interface.
 
     The simulator ends with this process, however this one ends.
 
     Args:
-        config: Options of the env.
+        env_id: Of an env that is registered here.
+        options: Of the env.
         num_envs: Drones: one makes a `RemoteEnv`, more a `RemoteVectorEnv` without autoreset.
+        vehicle: MJCF file; None: the paper's.
         record: MCAP file for the agent's journal.
 
     Raises:
         PeerClosed: The simulator did not start, or ended; the sentence holds what it said.
         PeerSilent: The simulator runs and does not answer.
     """
-    options = asdict(config)
+    config = EnvConfig(
+        env_id=env_id, options=options or {}, vehicle=None if vehicle is None else str(vehicle)
+    )
     settings: dict[str, Any] = {
-        "options": options,
+        "env_id": env_id,
+        "options": config.options,
         "connect": False,
         "connect_timeout": _POLL,
         "timeout": _ANSWER_TIMEOUT,
@@ -53,7 +63,9 @@ def socket_pair(
         env = RemoteEnv(here, **settings)
     else:
         env = RemoteVectorEnv(here, num_envs=num_envs, autoreset_mode="Disabled", **settings)
-    arguments = {"server": env.address, "bind": here, "num_envs": num_envs, **options}
+    arguments = {"server": env.address, "bind": here, "num_envs": num_envs, "env": env_id}
+    arguments |= {"vehicle": config.vehicle, "options": config.options}
+    arguments |= {"module": config.module} if config.module else {}
     command = [sys.executable, "-m", "rotorgram.udp", json.dumps(arguments)]
     with TemporaryFile("w+") as said:
         process = subprocess.Popen(
@@ -94,3 +106,35 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
+
+
+_shared: dict[str, tuple[Any, ExitStack]] = {}
+
+
+@contextmanager
+def shared_pair(
+    env_id: str, options: Mapping[str, Any], *, num_envs: int = 1, vehicle: str | None = None
+) -> Iterator[Any]:
+    """As `socket_pair`, but the pair stays open for the next run of this process.
+
+    To start a simulator takes as long as a short training. A pair whose block fails is closed. The
+    others are closed by `close_shared_pairs`, or with the process.
+    """
+    key = json.dumps([env_id, options, num_envs, vehicle], sort_keys=True)
+    if key not in _shared:
+        stack = ExitStack()
+        pair = socket_pair(env_id, options, num_envs=num_envs, vehicle=vehicle)
+        _shared[key] = stack.enter_context(pair), stack
+    env, stack = _shared[key]
+    try:
+        yield env
+    except BaseException:
+        _shared.pop(key)[1].close()
+        raise
+
+
+@atexit.register
+def close_shared_pairs() -> None:
+    """Close what `shared_pair` left open."""
+    while _shared:
+        _shared.popitem()[1][1].close()

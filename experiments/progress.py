@@ -1,4 +1,4 @@
-"""Progress of runs in other processes: one small datagram now and then, to whoever shows it.
+"""Progress of runs in other processes: one small datagram now and then, to what shows it.
 
 A lost one matters nothing: the next tells the same. No process, pipe or lock has to be shared, and
 a run goes on where nobody listens any more. Datagrams stay on this machine: runs on another tell
@@ -32,14 +32,20 @@ class Progress:
     seconds: float
     mean_return: float
     """Of the last 20 episodes; NaN before the first has ended. TensorBoard's curve is over 100."""
-    mean_abs_error: float
-    """Of the last 20 episodes, m."""
+    mean_size: float
+    """Mean size of the headline metric, of the last 20 episodes; NaN if there is none."""
+    symbol: str = ""
+    """Of that metric."""
+    unit: str = ""
 
     def words(self) -> str:
         """How it goes, for a progress bar."""
         if math.isnan(self.mean_return):
             return ""
-        return f"return {self.mean_return:.0f}, |E| {self.mean_abs_error:.2f} m"
+        text = f"return {self.mean_return:.0f}"
+        if math.isnan(self.mean_size):
+            return text
+        return f"{text}, |{self.symbol}| {self.mean_size:.2f} {self.unit}".rstrip()
 
 
 class ProgressSender:

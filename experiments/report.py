@@ -7,33 +7,36 @@ nothing outside itself.
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import pandas as pd
-
-from .claims import judge_claims
+from ..envs.spec import canonical_id
+from .claims import Verdict, judge_claims, judge_no_worse
 from .curves import make_curves
 from .figures import FIGURE_FILES, draw_figures
 from .metrics import results_table
 from .page import FolderFile, render_page
-from .records import (
+from .results import (
     CONFIG_FILE,
     EPISODES_FILE,
     EVALUATIONS_FILE,
     RUNS_FILE,
     STEPS_FILE,
-    Records,
-    read_records,
+    Results,
+    read_results,
 )
-from .tables import markdown_table, result_rows, terminal_table
+from .tables import markdown_table, terminal_table
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = [
     "CLAIMS_FILE",
+    "POSTER_FILE",
     "REPORT_FILE",
     "RESULTS_CSV",
     "RESULTS_MARKDOWN",
     "VIDEO_FILE",
-    "result_rows",
+    "table_of",
     "terminal_table",
     "write_report",
 ]
@@ -44,6 +47,10 @@ RESULTS_MARKDOWN: Final = "results.md"
 CLAIMS_FILE: Final = "claims.json"
 VIDEO_FILE: Final = "video.mp4"
 """The agents side by side; the page has it in itself where it lies in the folder."""
+POSTER_FILE: Final = "video.jpg"
+"""What the page shows of the film before it is played."""
+PAPERS_TASK: Final = "rotorgram/Elevation-v0"
+"""The paper's claims are about this task."""
 
 _FILES: Final = (
     (CONFIG_FILE, "every setting, the seeds, the versions and the machine"),
@@ -57,43 +64,63 @@ _FILES: Final = (
     (CLAIMS_FILE, "the verdicts with their definitions and evidence"),
     *((f"figures/{name}", "a figure, as a picture") for name in FIGURE_FILES),
     (VIDEO_FILE, "the agents side by side"),
+    (POSTER_FILE, "a picture of the film"),
 )
 
 
-def write_report(
-    folder: Path | str, records: Records | None = None, results: pd.DataFrame | None = None
-) -> Path:
+def table_of(results: Results) -> "pd.DataFrame":
+    """The table of results, with the bounds of the task behind the agents."""
+    bounds = results.config.get("bounds")
+    return results_table(results.evaluations, results.runs, results.headline, bounds)
+
+
+def verdicts_of(results: Results) -> list[Verdict]:
+    """The paper's claims, for the paper's task; and whether our A2C is no worse than SB3's."""
+    preset, headline = results.config["preset"], results.headline
+    verdicts = []
+    if canonical_id(results.spec.env_id) == PAPERS_TASK:
+        verdicts = judge_claims(results.episodes, results.evaluations, preset, headline)
+    if headline.metric.held is not None:
+        trained = set(results.runs["agent"])
+        verdicts.append(judge_no_worse(results.evaluations, trained, preset, headline))
+    return verdicts
+
+
+def write_report(folder: Path | str, results: Results | None = None) -> Path:
     """Draw the figures and write the page, the table and the verdicts into the folder.
 
     Args:
-        folder: Where `rotorgram compare` wrote its records.
-        records: What `records.read_records(folder)` gave, where it is at hand.
-        results: What `metrics.results_table` made of them, where it is at hand.
+        folder: Where `rotorgram compare` wrote.
+        results: What `results.read_results(folder)` gave, where it is at hand.
 
     Returns:
         The path of the page.
 
     Raises:
-        RecordsError: If a file or a column of the records is missing.
+        ResultsError: A file or a column is missing.
     """
     folder = Path(folder)
-    records = records or read_records(folder)
-    if results is None:
-        results = results_table(records.evaluations, records.runs)
-    verdicts = judge_claims(records.episodes, records.evaluations, records.config["preset"])
-    curves = make_curves(folder, records)
-    draw_figures(folder, records, curves)
-    results.to_csv(folder / RESULTS_CSV)
-    (folder / RESULTS_MARKDOWN).write_text(markdown_table(results), encoding="utf-8")
+    results = results or read_results(folder)
+    table, verdicts = table_of(results), verdicts_of(results)
+    curves = make_curves(folder, results)
+    draw_figures(folder, results, curves)
+    table.to_csv(folder / RESULTS_CSV)
+    (folder / RESULTS_MARKDOWN).write_text(
+        markdown_table(table, results.headline), encoding="utf-8"
+    )
     claims = json.dumps([asdict(verdict) for verdict in verdicts], indent=2, ensure_ascii=False)
     (folder / CLAIMS_FILE).write_text(claims + "\n", encoding="utf-8")
-    video = folder / VIDEO_FILE
+    video, poster = (
+        path.read_bytes() if (path := folder / name).is_file() else None
+        for name in (VIDEO_FILE, POSTER_FILE)
+    )
     page = render_page(
-        records.config,
         results,
+        table,
         verdicts,
         curves,
-        video=video.read_bytes() if video.is_file() else None,
+        video=video,
+        poster=poster,
         files=[FolderFile(name, text) for name, text in _FILES if (folder / name).exists()],
     )
     report = folder / REPORT_FILE

@@ -1,62 +1,78 @@
 """The table of results: in words, for the terminal and as Markdown."""
 
 import math
+import re
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-import pandas as pd
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from .figures import agent_label
-from .metrics import HOLD_THRESHOLD, SETTLING_TOLERANCE
+from .metrics import Headline
+from .palette import agent_label
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = [
-    "HEADINGS",
     "NOTHING",
-    "TABLE_NOTE",
     "Cell",
     "count_text",
+    "headings",
     "markdown_table",
     "number_text",
     "result_rows",
+    "table_note",
     "terminal_table",
 ]
 
 NOTHING: Final = "–"
 """Shown where there is no value."""
 
-_TERMINAL_HEADINGS: Final = (
-    "Agent",
-    "Steady\n|E| (m)",
-    "Settling\n(s)",
-    "Overshoot\n(m)",
-    "Return",
-    f"Env steps to\n|E| < {HOLD_THRESHOLD} m",
-    "Time to\nit (s)",
-    "Env\nsteps/s",
-)
 
-HEADINGS: Final = (
-    "Agent",
-    "Steady |E| (m)",
-    f"Settling to {SETTLING_TOLERANCE:.2g} m (s)",
-    "Overshoot (m)",
-    "Return",
-    f"Env steps to |E| < {HOLD_THRESHOLD} m",
-    "Training time to it (s)",
-    "Env steps per s",
-)
+def headings(headline: Headline, short: bool = False) -> tuple[str, ...]:
+    """Headings of the columns; short ones, in lines, for the terminal."""
+    size, unit, goal = headline.size_symbol, headline.labelled("Overshoot"), headline.held_text
+    settled = headline.metric.settled
+    if short:
+        settling = "Settling\n(s)"
+        texts = (headline.labelled(f"Steady\n{size}"), "Hold\nit", settling, unit)
+        texts = (*texts, "Return", f"Env steps to\n{goal}", "Env\nsteps/s")
+        return ("Agent", *(text.replace("Overshoot (", "Overshoot\n(") for text in texts))
+    band = f" to {headline.amount(f'{settled:.2g}')}" if settled is not None else ""
+    return (
+        "Agent",
+        headline.labelled(f"Steady {size}"),
+        f"Seeds that hold {goal}" if goal else "Seeds that hold",
+        f"Settling{band} (s)",
+        unit,
+        "Return",
+        f"Env steps to {goal}" if goal else "Env steps to hold",
+        "Env steps per s",
+    )
 
-TABLE_NOTE: Final = (
-    "Interquartile means over seeds with 95 % bootstrap intervals, from the deterministic "
-    "evaluation after training. Steady |E|: mean |E| in the last quarter of an episode. Settling: "
-    f"until |E| stays below {SETTLING_TOLERANCE:.2g} m, over the episodes that settle. Env steps "
-    f"and training time: up to the first snapshot from which on all hold |E| < {HOLD_THRESHOLD} m, "
-    "over the seeds that get there. A crashed episode counts with what was flown of it and has "
-    "not settled."
-)
+
+def table_note(headline: Headline) -> str:
+    """What the columns are."""
+    size, goal, settled = headline.size_symbol, headline.held_text, headline.metric.settled
+    parts = [
+        "Interquartile means over seeds with 95 % bootstrap intervals, from the deterministic "
+        "evaluation after training, on episodes of its own. "
+        f"Steady {size}: mean {size} in the last quarter of an episode."
+    ]
+    if goal:
+        parts.append(
+            f"Seeds that hold: those with a mean steady state of {goal} and without a crash in "
+            "that evaluation; below it the worst seed's steady state. Env steps and training "
+            f"time: up to the first snapshot from which on all hold {goal}, over the seeds that "
+            "get there."
+        )
+    if settled is not None and not headline.high:
+        band = headline.amount(f"{settled:.2g}")
+        parts.append(f"Settling: until {size} stays below {band}, over the episodes that settle.")
+    parts.append("A crashed episode counts with what was flown of it and has not settled.")
+    return " ".join(parts)
 
 
 class Cell(NamedTuple):
@@ -66,52 +82,69 @@ class Cell(NamedTuple):
     details: tuple[str, ...] = ()
 
 
-def terminal_table(results: pd.DataFrame) -> Table:
+def terminal_table(table: "pd.DataFrame", headline: Headline) -> Table:
     """Make a table of at most 100 columns for the terminal from `metrics.results_table`."""
-    table = Table(
+    shown = Table(
         box=box.SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
         show_edge=False,
         pad_edge=False,
-        caption="Below a value: its 95 % interval, and how many flights (or seeds) got there.",
+        caption="Below a value: its 95 % interval, and how many episodes (or seeds) got there.",
         caption_justify="left",
     )
-    for place, heading in enumerate(_TERMINAL_HEADINGS):
-        table.add_column(heading, justify="left" if place == 0 else "right", overflow="fold")
-    for row in result_rows(results):
-        table.add_row(*(_terminal_cell(cell) for cell in row), end_section=True)
-    return table
+    for place, heading in enumerate(headings(headline, short=True)):
+        shown.add_column(heading, justify="left" if place == 0 else "right", overflow="fold")
+    for row in result_rows(table):
+        shown.add_row(*(_terminal_cell(cell) for cell in row), end_section=True)
+    return shown
 
 
 def _terminal_cell(cell: Cell) -> Text:
     # Text, not markup: an agent's name may hold brackets. The last words would cost the width.
-    details = (detail.removesuffix(" settled") for detail in cell.details)
+    details = (re.sub(r"( of \d+) (settled|seeds?)$", r"\1", one) for one in cell.details)
     return Text("\n".join((cell.value, *details)))
 
 
-def result_rows(results: pd.DataFrame) -> list[tuple[Cell, ...]]:
-    """Put the results into words: a cell for each of `HEADINGS`, a row per agent."""
-    return [_row(str(agent), row) for agent, row in results.iterrows()]
+def result_rows(table: "pd.DataFrame") -> list[tuple[Cell, ...]]:
+    """Put the results into words: a cell for each of `headings`, a row per agent."""
+    return [_row(str(agent), row) for agent, row in table.iterrows()]
 
 
 def _row(agent: str, row: Mapping[str, Any]) -> tuple[Cell, ...]:
     seeds, episodes = int(row["seeds"]), int(row["episodes"])
-    settled = (f"{int(row['settled'])} of {episodes} settled",)
+    if not seeds:
+        nothing = (Cell(NOTHING),)
+        value = Cell(number_text(row["return"]))
+        return (Cell(agent, ("not flown",)), *nothing * 4, value, *nothing * 2)
     crashed = (f"{int(row['crashed'])} of {episodes} crashed",) if row["crashed"] else ()
-    if math.isnan(row["reached"]):
-        reached: tuple[str, ...] = ()
-    else:
-        reached = (f"{int(row['reached'])} of {seeds} seed{'s' * (seeds != 1)}",)
+    settled = (f"{int(row['settled'])} of {episodes} settled",)
+    reached: tuple[str, ...] = ()
+    if not math.isnan(row["reached"]):
+        reached = (_seeds(int(row["reached"]), seeds),)
+        if row["reached"]:
+            reached += (f"{number_text(row['seconds_to_reach'])} s",)
     return (
         Cell(agent_label(agent), (f"{seeds} seed{'s' * (seeds != 1)}",)),
-        _measured(row, "steady_error", crashed),
+        _measured(row, "steady", crashed),
+        _held(row, seeds),
         _measured(row, "settling_time", settled),
         _measured(row, "overshoot"),
         _measured(row, "return"),
         Cell(count_text(row["env_steps_to_reach"]), reached),
-        Cell(number_text(row["seconds_to_reach"])),
         Cell(count_text(row["steps_per_second"])),
     )
+
+
+def _held(row: Mapping[str, Any], seeds: int) -> Cell:
+    worst = () if math.isnan(row["worst"]) else (f"worst {number_text(row['worst'])}",)
+    if math.isnan(row["held"]):
+        return Cell(NOTHING, worst)
+    held = int(row["held"])
+    return Cell(f"{held / seeds:.0%}".replace("%", " %"), (_seeds(held, seeds), *worst))
+
+
+def _seeds(count: int, total: int) -> str:
+    return f"{count} of {total} seed{'s' * (total != 1)}"
 
 
 def _measured(row: Mapping[str, Any], name: str, details: tuple[str, ...] = ()) -> Cell:
@@ -139,13 +172,14 @@ def count_text(value: float) -> str:
     return NOTHING if math.isnan(value) else f"{value:,.0f}"
 
 
-def markdown_table(results: pd.DataFrame) -> str:
+def markdown_table(table: "pd.DataFrame", headline: Headline) -> str:
     """Make a Markdown table from `metrics.results_table`, with its note below."""
-    lines = [HEADINGS, ("---", *["---:"] * (len(HEADINGS) - 1))]
-    for row in result_rows(results):
+    titles = headings(headline)
+    lines = [titles, ("---", *["---:"] * (len(titles) - 1))]
+    for row in result_rows(table):
         lines.append(tuple(_markdown_cell(cell) for cell in row))
-    table = "".join(f"| {' | '.join(cells)} |\n" for cells in _escape_bars(lines))
-    return f"{table}\n{TABLE_NOTE}\n"
+    text = "".join(f"| {' | '.join(cells)} |\n" for cells in _escape_bars(lines))
+    return f"{text}\n{table_note(headline)}\n"
 
 
 def _markdown_cell(cell: Cell) -> str:

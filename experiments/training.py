@@ -3,56 +3,32 @@
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 
-from ..agents import A2CConfig, VPGConfig, make_agent, preset
+from ..agents import A2CConfig, make_agent, preset
 from ..agents.checkpoints import Checkpoint, CheckpointError, store
-from ..agents.episodes import Episode, EpisodeLog, ResumeError
-from ..agents.learner import AnyLog
-from ..agents.vector_episodes import VectorEpisodeLog
-from ..envs import ElevationConfig
+from ..agents.episodes import EpisodeLog, ResumeError
 from ..envs.autoreset import AdvancingVectorEnv
-from .progress import Progress
+from ..models.errors import InputError, require
+from .progress import Progress, ProgressSender
+from .settings import Run
 
-__all__ = ["AnyEnv", "Run", "Snapshot", "Training", "is_finished"]
+if TYPE_CHECKING:
+    import torch
+else:
+    torch = require("torch", "train", "training")
 
-AnyEnv = gym.Env[np.ndarray, Any] | AdvancingVectorEnv
+__all__ = ["AnyEnv", "Run", "Snapshot", "Training", "is_finished", "train_run"]
+
+AnyEnv = gym.Env[Any, Any] | AdvancingVectorEnv
 
 # Episodes to average over, or as many as there are drones, if that is more: of those that began
 # together the shortest end first, so that the last few to end are those that flew longest.
 _RECENT = 20  # in a progress report: it tells how it goes now
 _WINDOW = 100  # in a point of a curve: SB3's `stats_window_size`
-
-
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """What is trained: everything that the numbers follow from, but for the software."""
-
-    algorithm: str
-    config: VPGConfig | A2CConfig
-    env: ElevationConfig
-    seed: int
-    env_steps: int
-    """Of all drones together."""
-    num_envs: int = 1
-    """Drones that train it at the same time."""
-
-    def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise ValueError(f"seed: expected 0 or more, got {self.seed}")
-        if self.num_envs < 1:
-            raise ValueError(f"num_envs: expected 1 or more, got {self.num_envs}")
-        least = 1
-        if isinstance(self.config, A2CConfig):
-            least = self.config.rollout_size(self.num_envs)
-        elif self.num_envs > 1:  # a whole episode of each
-            least = self.num_envs * self.env.episode_length
-        if self.env_steps < least:
-            raise ValueError(f"env_steps: expected at least {least}, got {self.env_steps}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,11 +57,13 @@ class Training:
         env: Local or remote, a vector env where the run has many drones; not closed here.
         snapshots: How many times, evenly spread, the policy is kept for later evaluation, besides
             the untrained one.
+        keep_steps: Whether `log.steps()` is asked for.
     """
 
     run: Run
     env: AnyEnv
     snapshots: int = 0
+    keep_steps: bool = False
     taken: list[Snapshot] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -93,27 +71,25 @@ class Training:
         torch.set_num_threads(1)
         drones = getattr(self.env, "num_envs", 1)
         if drones != self.run.num_envs:
-            raise ValueError(f"env: expected one of {self.run.num_envs} drones, got {drones}")
-        self.log: AnyLog
-        if isinstance(self.env, AdvancingVectorEnv):
-            self.log = VectorEpisodeLog(self.env, self.run.seed)
-        else:
-            self.log = EpisodeLog(self.env, self.run.seed)
+            raise InputError(f"env: expected one of {self.run.num_envs} drones, got {drones}")
+        self.log = EpisodeLog(self.env, self.run.seed, keep_steps=self.keep_steps)
         self.agent = make_agent(self.run.algorithm, self.log, self.run.config, self.run.seed)
 
     @classmethod
-    def resume(cls, kept: Checkpoint, env: AnyEnv, episodes: list[Episode]) -> "Training":
-        """Go on from a checkpoint. `episodes` are those that ended before it.
+    def resume(cls, kept: Checkpoint, env: AnyEnv) -> "Training":
+        """Go on from a checkpoint.
 
         Raises:
             CheckpointError: The checkpoint's parts do not fit together.
-            ResumeError: The env does not repeat the episode that was interrupted.
+            ResumeError: The env does not repeat the episode that was interrupted, or flies another
+                vehicle.
         """
         try:
             run = Run(
                 algorithm=kept.algorithm,
                 config=preset(kept.algorithm, "paper", **kept.config),
-                env=ElevationConfig.from_options(kept.env),
+                env_id=kept.env_id,
+                options=kept.options,
                 seed=kept.seed,
                 env_steps=kept.env_steps,
                 num_envs=kept.num_envs,
@@ -123,13 +99,13 @@ class Training:
         except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
             reason = " ".join(f"{error!r:.300}".split())
             raise CheckpointError(f"checkpoint: its parts do not fit together: {reason}") from None
-        hello = getattr(env, "hello", None)
-        if kept.model_hash and hello and hello.model_hash != kept.model_hash:
+        flown = training.log.spec.vehicle_hash
+        if flown != kept.vehicle_hash:
             raise ResumeError(
-                f"resume: expected a simulator of the model {kept.model_hash}, "
-                f"got one of {hello.model_hash}"
+                f"resume: expected a simulator of the vehicle {kept.vehicle_hash}, "
+                f"got one of {flown}"
             )
-        training.log.resume(kept.position, episodes)
+        training.log.resume(kept.position)
         return training
 
     def train(self, on_update: Callable[[], bool] = lambda: True) -> bool:
@@ -151,12 +127,15 @@ class Training:
     def progress(self) -> Progress:
         """Where the training stands."""
         recent = self.log.episodes[-max(_RECENT, self.run.num_envs) :]
+        headline = self.log.spec.headline
         return Progress(
             env_steps=self.log.env_steps,
             total=self.run.env_steps,
             seconds=self.log.seconds,
             mean_return=float(np.mean([e.total_reward for e in recent])) if recent else np.nan,
-            mean_abs_error=float(np.mean([e.mean_abs_error for e in recent])) if recent else np.nan,
+            mean_size=float(np.mean([e.mean_size for e in recent])) if recent else np.nan,
+            symbol=(headline.symbol or headline.name) if headline else "",
+            unit=headline.unit if headline else "",
         )
 
     def scalars(self) -> dict[str, float]:
@@ -174,22 +153,19 @@ class Training:
         if recent := log.episodes[-max(_WINDOW, self.run.num_envs) :]:
             numbers["rollout/ep_rew_mean"] = float(np.mean([e.total_reward for e in recent]))
             numbers["rollout/ep_len_mean"] = float(np.mean([e.length for e in recent]))
-            numbers["rollout/ep_error_mean"] = float(np.mean([e.mean_abs_error for e in recent]))
+            numbers["rollout/ep_error_mean"] = float(np.mean([e.mean_size for e in recent]))
         if (statistics := getattr(self.env, "statistics", None)) is not None:
             numbers |= {f"wire/{name}": value for name, value in statistics.numbers().items()}
         return {name: value for name, value in numbers.items() if np.isfinite(value)}
 
     def checkpoint(self) -> Checkpoint:
         """Everything that resuming needs. To be taken at an update."""
-        hello = getattr(self.env, "hello", None)
         return Checkpoint(
             algorithm=self.run.algorithm,
             config=asdict(self.run.config),
-            env=asdict(self.run.env),
+            spec=self.log.spec,
             seed=self.run.seed,
             env_steps=self.run.env_steps,
-            num_envs=self.run.num_envs,
-            model_hash=hello.model_hash if hello else "",
             actor=self.agent.actor(),
             state=self.agent.state(),
             position=self.log.position(),
@@ -208,3 +184,37 @@ class Training:
                 env_steps=self.log.env_steps, seconds=self.log.seconds, actor=self.agent.actor()
             )
         )
+
+
+def train_run(
+    run: Run,
+    env: AnyEnv,
+    progress: ProgressSender,
+    snapshots: int = 0,
+    keep_steps: bool = False,
+) -> tuple[Training, dict[str, Any]]:
+    """Train to the end, as comparisons and sweeps do.
+
+    Args:
+        run: What to train.
+        env: Of as many drones as the run has.
+        progress: Told how far it is.
+        snapshots, keep_steps: As of `Training`.
+
+    Returns:
+        The training, and how long it took: `env_steps`, `seconds` and `steps_per_second`.
+    """
+    training = Training(run, env, snapshots=snapshots, keep_steps=keep_steps)
+
+    def on_update() -> bool:
+        progress.rarely(training.progress)
+        return True
+
+    training.train(on_update)
+    env_steps, seconds = training.log.env_steps, training.log.seconds
+    progress(run.env_steps, run.env_steps, "evaluating")
+    return training, {
+        "env_steps": env_steps,
+        "seconds": seconds,
+        "steps_per_second": env_steps / seconds,
+    }

@@ -1,37 +1,37 @@
-"""Workers that fly jobs: the cores of this machine, by joblib's loky, or a Ray cluster.
+"""Workers that do jobs: the cores of this machine, by joblib's loky, or a Ray cluster.
 
-A job is anything that can be pickled, flown by a function that can be pickled too. Workers may
-share no folder with the main process, so what a job brings home comes back as a value; and one
-that fails comes back as a sentence, so that the others go on.
+A job is anything that can be pickled, done by a function that can be pickled too. Workers may share
+no folder with the main process, so the result of a job comes back as a value; and a job that fails
+comes back as a sentence, so that the others go on. A worker of this machine ends with the process
+that started it, however that ends, and its simulators end with the worker.
 """
 
 import logging
+import os
 import signal
 import socket
+import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from itertools import islice
-from multiprocessing import current_process
-from typing import Any, Final, Literal, TypeVar
-
-from joblib import Parallel, cpu_count, delayed
-from joblib.externals.loky import get_reusable_executor
-from joblib.externals.loky.process_executor import TerminatedWorkerError
+from threading import Thread
+from typing import Any, Final, TypeVar
 
 from ..agents.checkpoints import software_versions
+from ..envs.registry import load
+from ..models.errors import InputError, require
 from .errors import RunsFailed
+from .pairs import close_shared_pairs
 from .progress import OnProgress, ProgressListener, ProgressSender
+from .settings import EnvConfig, WorkersConfig
 
-__all__ = ["Backend", "Result", "Workers", "WorkersConfig", "open_workers"]
+__all__ = ["Result", "Workers", "WorkersConfig", "open_workers"]
 
-Backend = Literal["loky", "ray"]
-"""What flies the jobs: the cores of this machine, or a Ray cluster."""
-
-_KNOCK_TIMEOUT: Final = 5.0  # s
+_LISTENING_TIMEOUT: Final = 5.0  # s
+_WATCH_EVERY: Final = 0.5  # s
 
 _Job = TypeVar("_Job")
 _Value = TypeVar("_Value")
@@ -39,29 +39,8 @@ _Function = Callable[[_Job, ProgressSender], _Value]
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorkersConfig:
-    """Who flies, and how many at a time."""
-
-    jobs: int | None = None
-    """Jobs at a time; None: one for each core of the machine or of the cluster."""
-    backend: Backend = "loky"
-    """`loky`: processes of this machine. `ray`: a Ray cluster."""
-    address: str | None = None
-    """The cluster's: `ray://HOST:PORT` of its client server from anywhere, `HOST:PORT` or None on
-    one of its machines."""
-
-    def __post_init__(self) -> None:
-        if self.jobs is not None and self.jobs < 1:
-            raise ValueError(f"jobs: expected at least 1, got {self.jobs}")
-        if self.backend not in ("loky", "ray"):
-            raise ValueError(f"backend: expected loky or ray, got {self.backend}")
-        if self.address is not None and self.backend != "ray":
-            raise ValueError(f"address: expected it with backend ray, got it with {self.backend}")
-
-
-@dataclass(frozen=True, kw_only=True)
 class Result:
-    """What a job brings home."""
+    """The end of a job."""
 
     name: str
     """Of the job."""
@@ -72,42 +51,57 @@ class Result:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Task:
+class _Order:
     """A job with all that a worker needs, on this machine or another."""
 
     name: str
     job: Any
     function: _Function[Any, Any]
+    task: str | None
+    """`module:id` of a task of the user's own, which the worker has to import."""
     home: tuple[str, int]
     """Of the `ProgressListener`."""
     versions: dict[str, str]
     """Software of the main process."""
+    parent: int | None
+    """Process that the worker ends with; None: another machine's."""
 
 
-_Crew = Callable[[list[_Task]], Generator[Result, None, None]]
-"""Flies tasks, as many at a time as there are workers."""
+_Do = Callable[[list[_Order]], Generator[Result, None, None]]
+"""Does jobs, as many at a time as there are workers."""
 
 
 class Workers:
-    """Fly jobs: made by `open_workers`."""
+    """Do jobs: made by `open_workers`."""
 
-    def __init__(self, crew: _Crew, listener: ProgressListener) -> None:
-        self._crew = crew
+    def __init__(self, do: _Do, listener: ProgressListener, parent: int | None) -> None:
+        self._do = do
         self._listener = listener
+        self._parent = parent
 
     def fly(
-        self, function: _Function[_Job, Any], jobs: Mapping[str, _Job]
+        self, function: _Function[_Job, Any], jobs: Mapping[str, _Job], env: EnvConfig | None = None
     ) -> Generator[Result, None, None]:
         """Give results as they come. To be closed: what still flies then is ended.
 
         Args:
             function: Called in a worker, with a job and what tells its progress.
             jobs: By name.
+            env: What is flown: a worker imports the module of a task of the user's own.
         """
         home, versions = self._listener.home, software_versions()
-        return self._crew(
+        task = f"{env.module}:{env.env_id}" if env and env.module else None
+        return self._do(
             [
-                _Task(name=name, job=job, function=function, home=home, versions=versions)
+                _Order(
+                    name=name,
+                    job=job,
+                    function=function,
+                    task=task,
+                    home=home,
+                    versions=versions,
+                    parent=self._parent,
+                )
                 for name, job in jobs.items()
             ]
         )
@@ -117,14 +111,15 @@ class Workers:
         function: _Function[_Job, _Value],
         jobs: Mapping[str, _Job],
         keep: Callable[[_Job, _Value], None],
+        env: EnvConfig | None = None,
     ) -> None:
-        """Fly all jobs, and hand each with what it brings home to `keep` (in this process).
+        """Do all jobs, and hand each with its result to `keep` (in this process).
 
         Raises:
             RunsFailed: Some failed; the others were kept.
         """
         failures = []
-        with closing(self.fly(function, jobs)) as results:
+        with closing(self.fly(function, jobs, env)) as results:
             for result in self._telling(results, len(jobs)):
                 if result.failure:
                     failures.append(result.failure)
@@ -146,25 +141,40 @@ class Workers:
 
 @contextmanager
 def open_workers(config: WorkersConfig, on_progress: OnProgress) -> Iterator[Workers]:
-    """Workers, to the end of the block. Raises `ValueError`: there is no Ray, or no such cluster.
+    """Workers, to the end of the block.
 
     Args:
-        config: Who flies.
+        config: Which, and how many.
         on_progress: Told how far the jobs on this machine are, and which are done.
+
+    Raises:
+        InputError: There is no such Ray cluster.
+        MissingPackage: There is no joblib, or no Ray.
     """
-    with _crew(config) as crew, ProgressListener(on_progress) as listener:
-        yield Workers(crew, listener)
+    parent = os.getpid() if config.backend == "loky" else None
+    with _opened(config) as do, ProgressListener(on_progress) as listener:
+        yield Workers(do, listener, parent)
 
 
-def _crew(config: WorkersConfig) -> AbstractContextManager[_Crew]:
-    if config.backend == "ray":
-        return _ray(config)
-    return nullcontext(partial(_fly_by_loky, workers=config.jobs or cpu_count()))
+def _opened(config: WorkersConfig) -> AbstractContextManager[_Do]:
+    return _ray(config) if config.backend == "ray" else _loky(config)
 
 
-def _fly_by_loky(tasks: list[_Task], workers: int) -> Generator[Result, None, None]:
-    parallel = Parallel(n_jobs=workers, return_as="generator_unordered")
-    results = parallel(delayed(_fly)(task) for task in tasks)
+@contextmanager
+def _loky(config: WorkersConfig) -> Iterator[_Do]:
+    joblib = require("joblib", "train", "running several trainings")
+    try:
+        yield partial(_do_by_loky, joblib=joblib, workers=config.jobs or joblib.cpu_count())
+    finally:
+        close_shared_pairs()  # of a single worker, which is this process
+
+
+def _do_by_loky(orders: list[_Order], joblib: Any, workers: int) -> Generator[Result, None, None]:
+    from joblib.externals.loky import get_reusable_executor
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    parallel = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")
+    results = parallel(joblib.delayed(_done)(order) for order in orders)
     try:
         # `yield from` would close it without the care below.
         for result in results:  # noqa: UP028
@@ -183,46 +193,41 @@ def _fly_by_loky(tasks: list[_Task], workers: int) -> Generator[Result, None, No
 
 
 @contextmanager
-def _ray(config: WorkersConfig) -> Iterator[_Crew]:
-    """Connect to the cluster. Raises `ValueError`."""
-    try:
-        ray: Any = import_module("ray")
-    except ImportError:
-        raise ValueError(
-            "backend: expected Ray to be installed (pip install 'rotorgram[ray]'), got none"
-        ) from None
+def _ray(config: WorkersConfig) -> Iterator[_Do]:
+    """Connect to the cluster. Raises `InputError`."""
+    ray: Any = require("ray", "ray", "the backend ray")
     address = config.address or "auto"
     try:
-        _knock(address)
+        _check_listening(address)
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, RuntimeError, ValueError) as error:
         words = str(getattr(error, "strerror", None) or error).rpartition("Error: ")[2]
         reason = " ".join(words.split())  # without the traceback of the client server
-        raise ValueError(f"address: expected a Ray cluster at {address}, got: {reason}") from None
+        raise InputError(f"address: expected a Ray cluster at {address}, got: {reason}") from None
     try:
         cores = int(ray.cluster_resources().get("CPU", 0))  # 0: it starts machines when asked to
-        yield partial(_fly_by_ray, ray=ray, workers=config.jobs or max(cores, 1))
+        yield partial(_do_by_ray, ray=ray, workers=config.jobs or max(cores, 1))
     finally:
         ray.shutdown()
 
 
-def _knock(address: str) -> None:
-    """Whether anybody listens: Ray itself takes minutes to find out that nobody does."""
+def _check_listening(address: str) -> None:
+    """Raise `OSError` if nothing listens: Ray itself takes minutes to find that out."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
-        socket.create_connection((host, int(port)), _KNOCK_TIMEOUT).close()
+        socket.create_connection((host, int(port)), _LISTENING_TIMEOUT).close()
 
 
-def _fly_by_ray(tasks: list[_Task], workers: int, ray: Any) -> Generator[Result, None, None]:
-    # Ray's own backend for joblib gives results when all are there, so that whoever is interrupted
+def _do_by_ray(orders: list[_Order], workers: int, ray: Any) -> Generator[Result, None, None]:
+    # Ray's own backend for joblib gives results when all are there, so that an interrupt
     # would lose every run; and it deals runs out in turn, to workers that are busy.
-    remote = ray.remote(num_cpus=1)(_fly)
-    waiting = iter(tasks)
+    remote = ray.remote(num_cpus=1)(_done)
+    waiting = iter(orders)
     flying: dict[Any, str] = {}
     try:
         while True:
             more = islice(waiting, workers - len(flying))
-            flying |= {remote.remote(task): task.name for task in more}
+            flying |= {remote.remote(order): order.name for order in more}
             if not flying:
                 return
             (landed,), _ = ray.wait(list(flying))
@@ -238,23 +243,43 @@ def _fly_by_ray(tasks: list[_Task], workers: int, ray: Any) -> Generator[Result,
             ray.cancel(reference, force=True)
 
 
-def _fly(task: _Task) -> Result:
-    """Fly a job (in a worker process)."""
-    if current_process().name != "MainProcess":  # but one of loky's, with our terminal
+def _done(order: _Order) -> Result:
+    """Do a job (in a worker process)."""
+    if order.parent is not None and os.getpid() != order.parent:  # one of loky's
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's affair
+        _watch(order.parent)
     try:
-        _check_software(task.versions)
-        with ProgressSender(task.name, task.home) as progress:
-            return Result(name=task.name, value=task.function(task.job, progress))
+        _check_software(order.versions)
+        if order.task:
+            load(order.task)
+        with ProgressSender(order.name, order.home) as progress:
+            return Result(name=order.name, value=order.function(order.job, progress))
     except Exception as error:
-        return Result(name=task.name, failure=f"{task.name}: {type(error).__name__}: {error}")
+        return Result(name=order.name, failure=f"{order.name}: {type(error).__name__}: {error}")
+
+
+_watched: set[int] = set()
+
+
+def _watch(parent: int) -> None:
+    """End this process as soon as its parent has ended, by whatever signal."""
+    if parent in _watched or os.getppid() != parent:
+        return
+    _watched.add(parent)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_WATCH_EVERY)
+        os._exit(1)  # its simulators see their standard input close
+
+    Thread(target=watch, daemon=True).start()
 
 
 def _check_software(expected: dict[str, str]) -> None:
     """The config that is written tells one version of each."""
     for name, here in software_versions().items():
         if here != expected[name]:
-            raise ValueError(
+            raise InputError(
                 f"{name}: expected version {expected[name]} as on the machine of the command, "
                 f"got {here} on {socket.gethostname()}"
             )

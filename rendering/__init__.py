@@ -1,7 +1,6 @@
-"""Pictures of flights: the world as it is looked at, drawn without a window or in a viewer.
+"""Pictures of flights, drawn without a window or in a viewer.
 
-Nothing here is imported before something is to be drawn: training never touches OpenGL. Importing
-the package alone imports none of its modules.
+Importing this package imports none of its modules and no OpenGL: training never draws.
 """
 
 from importlib import import_module
@@ -10,12 +9,27 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from .canvas import Canvas
     from .gl import NoOpenGL
-    from .moment import Moment
+    from .moment import MetricValue, Moment
     from .stage import CAMERAS, WORLDS, Camera, Stage, World
 
-__all__ = ["CAMERAS", "WORLDS", "Camera", "Canvas", "Moment", "NoOpenGL", "Stage", "World"]
+__all__ = [
+    "CAMERAS",
+    "WORLDS",
+    "Camera",
+    "Canvas",
+    "MetricValue",
+    "Moment",
+    "NoOpenGL",
+    "Stage",
+    "World",
+]
 
-_MODULES: Final = {"Canvas": "canvas", "NoOpenGL": "gl", "Moment": "moment"}
+_MODULES: Final = {
+    "Canvas": "canvas",
+    "MetricValue": "moment",
+    "Moment": "moment",
+    "NoOpenGL": "gl",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -5,6 +5,7 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 
+from ..models.errors import InputError
 from .gl import NoOpenGL, offscreen_context
 from .stage import Camera, Stage, scene_geoms
 
@@ -15,7 +16,7 @@ _SAMPLES = 4  # of every pixel, for smooth edges; software has no more
 
 
 class Canvas:
-    """Pictures of a stage, of one size.
+    """Pictures of a stage, all of one size.
 
     Args:
         stage: What is drawn.
@@ -24,6 +25,7 @@ class Canvas:
 
     Raises:
         NoOpenGL: There is nothing to draw with.
+        InputError: Width or height is not 16 to 8192.
     """
 
     def __init__(
@@ -31,7 +33,7 @@ class Canvas:
     ) -> None:
         for name, pixels in (("width", width), ("height", height)):
             if not 16 <= pixels <= 8192:
-                raise ValueError(f"{name}: expected 16 to 8192 pixels, got {pixels}")
+                raise InputError(f"{name}: expected 16 to 8192 pixels, got {pixels}")
         self.stage, self.width, self.height = stage, width, height
         self._gl: Any = offscreen_context(width, height)
         model = stage.model
@@ -50,11 +52,17 @@ class Canvas:
         self._option, self._rect = mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
 
     def draw(self, camera: Camera = "chase", stage: Stage | None = None) -> np.ndarray:
-        """The stage as it is now: uint8, shape (height, width, 3), the caller's own.
+        """Draw the stage as it is now.
 
         Args:
             camera: From where.
-            stage: Another than the canvas was made for: a twin of it.
+            stage: A twin of the canvas's stage, to be drawn in its place.
+
+        Returns:
+            A new array, uint8, shape (height, width, 3).
+
+        Raises:
+            NoOpenGL: The context was lost.
         """
         stage = stage or self.stage
         if stage.model is not self.stage.model:
@@ -65,16 +73,19 @@ class Canvas:
         for light in scene.lights[: scene.nlight]:
             if light.headlight and camera == "top":  # it would add itself to the sun
                 light.diffuse[:] = 0.0
-        # From on board, at the target, its disc would fill the lower half.
-        stage.decorate(scene_geoms(scene), discs=camera != "onboard")
+        # From on board, at the goal, its disc would fill the lower half.
+        stage.decorate(scene_geoms(scene), goals=camera != "onboard")
         pixels = np.empty((self.height, self.width, 3), np.uint8)
-        with self._gl.as_current():
-            mujoco.mjr_render(self._rect, scene, self._context)
-            mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
+        try:
+            with self._gl.as_current():
+                mujoco.mjr_render(self._rect, scene, self._context)
+                mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
+        except (mujoco.FatalError, RuntimeError) as error:  # the driver was restarted
+            raise NoOpenGL(f"OpenGL: expected a context to draw with, lost it: {error}") from None
         return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
 
     def close(self) -> None:
-        """Give back the context. A second call does nothing."""
+        """Free the context. A second call does nothing."""
         if self._gl is not None:
             with self._gl.as_current():
                 self._context.free()

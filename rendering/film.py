@@ -1,5 +1,6 @@
 """Films of pictures: MP4, GIF, PNGs. A film is there whole or not at all."""
 
+import io
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -10,9 +11,11 @@ from pathlib import Path
 from typing import IO, Final
 
 import numpy as np
-from PIL import Image
 
-__all__ = ["QUALITY", "SUFFIXES", "check_film", "write_film"]
+from ..models.errors import InputError, require
+from ._pillow import Image
+
+__all__ = ["QUALITY", "SUFFIXES", "check_film", "poster", "write_film"]
 
 SUFFIXES: Final = (".mp4", ".gif", ".png", "")
 """What a film may be; no suffix is a folder of PNGs."""
@@ -21,22 +24,22 @@ QUALITY: Final = 20
 
 
 def check_film(path: Path, width: int, height: int, fps: float) -> None:
-    """Tell before anything is drawn what `write_film` could not write. Raises `ValueError`."""
+    """Check, before anything is drawn, what `write_film` is to write. Raises `InputError`."""
     if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(
+        raise InputError(
             f"film: expected a name that ends in .mp4, .gif or .png, or a folder's name without a "
             f"dot, got {path}"
         )
     if path.exists():
-        raise ValueError(f"film: {path} is there already; choose another name")
+        raise InputError(f"film: {path} is there already; choose another name")
     if not (0.01 <= fps <= 1000):
-        raise ValueError(f"fps: expected 0.01 to 1000 pictures per second, got {fps:g}")
+        raise InputError(f"fps: expected 0.01 to 1000 pictures per second, got {fps:g}")
     if path.suffix.lower() == ".mp4" and (width % 2 or height % 2):
-        raise ValueError(
+        raise InputError(
             f"film: expected an even width and an even height for MP4, got {width}x{height}"
         )
     if path.suffix.lower() == ".gif" and abs(100 / fps - round(100 / fps)) > 1e-6:
-        raise ValueError(
+        raise InputError(
             "fps: expected 100 divided by a whole number (50, 25, 20, 10) for GIF, which counts "
             f"hundredths of a second, got {fps:g}"
         )
@@ -45,7 +48,7 @@ def check_film(path: Path, width: int, height: int, fps: float) -> None:
 def write_film(
     path: Path, frames: Iterable[np.ndarray], fps: float, *, quality: int = QUALITY
 ) -> int:
-    """Write a film of a kind that its name says.
+    """Write a film. Its name says which kind.
 
     `.mp4` is H.264 that every browser plays and that starts before it is loaded whole; `.gif`
     repeats for ever; `.png` is the last frame alone; a name without a dot becomes a folder of
@@ -62,13 +65,14 @@ def write_film(
         How many frames were taken.
 
     Raises:
-        ValueError: The name, the size or the rate is not what it should be; there are no frames.
+        InputError: The name, the size or the rate is not what it should be; there are no frames.
         OSError: It cannot be written, or the encoder failed.
+        MissingPackage: Pillow or imageio-ffmpeg is not installed.
     """
     taken = iter(frames)
     first = next(taken, None)
     if first is None:
-        raise ValueError("film: expected at least one frame, got none")
+        raise InputError("film: expected at least one frame, got none")
     check_film(path, first.shape[1], first.shape[0], fps)
     counted = _Counted(chain((first,), taken))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -91,7 +95,7 @@ def write_film(
 
 
 class _Counted:
-    """Hands frames on, all of the size of the first, and counts them."""
+    """Counts frames, and checks that all have the size of the first."""
 
     def __init__(self, frames: Iterator[np.ndarray]) -> None:
         self._frames = frames
@@ -138,18 +142,41 @@ def _write_mp4(path: Path, frames: _Counted, fps: float, quality: int) -> None:
             encoder.write(np.ascontiguousarray(frame).data)
 
 
+def poster(path: Path, share: float = 0.3) -> bytes:
+    """A picture to show in place of a film that does not play yet: JPEG.
+
+    Args:
+        path: An MP4.
+        share: Of the film's length, 0 to 1: where the picture is taken from.
+
+    Raises:
+        OSError: It cannot be read.
+        MissingPackage: Pillow or imageio-ffmpeg is not installed.
+    """
+    ffmpeg = require("imageio_ffmpeg", "render", "a film's poster")
+    try:
+        frames, seconds = ffmpeg.count_frames_and_secs(str(path))
+    except RuntimeError as error:
+        raise OSError(f"{path}: expected a film, got none that ffmpeg reads") from error
+    start = share * seconds * (frames - 1) / max(frames, 1)
+    words = ("-v", "error", "-ss", f"{start:.6f}", "-i", str(path), "-frames:v", "1")
+    done = subprocess.run(
+        [_ffmpeg(), *words, "-f", "image2pipe", "-c:v", "png", "-"],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        check=False,
+    )
+    if done.returncode or not done.stdout:
+        raise OSError(f"{path}: expected a picture of the film, got none from ffmpeg")
+    jpeg = io.BytesIO()
+    Image.open(io.BytesIO(done.stdout)).convert("RGB").save(jpeg, "JPEG", quality=80)
+    return jpeg.getvalue()
+
+
 @contextmanager
 def _encoder(words: list[str]) -> Iterator[IO[bytes]]:
-    """FFmpeg, to which raw frames are written. Raises `OSError` with its words where it fails."""
-    from imageio_ffmpeg import get_ffmpeg_exe  # type: ignore[import-untyped]
-
-    try:
-        program = get_ffmpeg_exe()
-    except RuntimeError:
-        raise OSError(
-            "ffmpeg: expected one that imageio-ffmpeg brings or finds, got none; "
-            "write a .gif or a folder of PNGs"
-        ) from None
+    """FFmpeg, to which raw frames are written. Raises `OSError` with its words if it fails."""
+    program = _ffmpeg()
     with tempfile.TemporaryFile() as said:
         # In a session of its own: Ctrl-C is for us, who then end it.
         with subprocess.Popen(
@@ -174,3 +201,13 @@ def _encoder(words: list[str]) -> Iterator[IO[bytes]]:
             said.seek(0)
             why = " ".join(said.read().decode(errors="replace").split())
             raise OSError(f"ffmpeg: the film could not be written: {why:.300}")
+
+
+def _ffmpeg() -> str:
+    try:
+        return str(require("imageio_ffmpeg", "render", "an MP4 film").get_ffmpeg_exe())
+    except RuntimeError:
+        raise OSError(
+            "ffmpeg: expected one that imageio-ffmpeg brings or finds, got none; "
+            "write a .gif or a folder of PNGs"
+        ) from None

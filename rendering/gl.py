@@ -1,13 +1,19 @@
 """An OpenGL context that needs no window."""
 
+import ctypes.util
 import os
 import sys
 from importlib import import_module
 from typing import Any, Final
 
-__all__ = ["NoOpenGL", "offscreen_context"]
+__all__ = ["NoOpenGL", "offscreen_context", "tolerate_gl_setting"]
 
 _OFF: Final = ("disable", "disabled", "off", "false", "0")
+_ON: Final = ("enable", "enabled", "on", "true", "1", "glfw", "glx", "wgl")
+_LIBRARIES: Final = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "OpenGL"}
+
+_setting: str | None = None
+"""`MUJOCO_GL` as the user set it, if `tolerate_gl_setting` has hidden it from MuJoCo."""
 
 
 class NoOpenGL(RuntimeError):
@@ -17,10 +23,24 @@ class NoOpenGL(RuntimeError):
     """Of a command that had to draw."""
 
 
-def offscreen_context(width: int, height: int) -> Any:
-    """A context of MuJoCo's for pictures of so many pixels, to be made current by whoever draws.
+def tolerate_gl_setting() -> None:
+    """Let MuJoCo be imported although `MUJOCO_GL` names no OpenGL, or one that is not installed.
 
-    `MUJOCO_GL` decides where it is set (egl, osmesa, glfw; MuJoCo itself reads it once, when it is
+    MuJoCo itself raises where it is imported, in commands that draw nothing too. Call this before
+    MuJoCo is imported; `offscreen_context` raises where something is to be drawn.
+    """
+    global _setting
+    wanted = _wanted()
+    library = _LIBRARIES.get(wanted, "")
+    if wanted in ("", *_OFF, *_ON) or (library and ctypes.util.find_library(library)):
+        return
+    _setting, os.environ["MUJOCO_GL"] = wanted, "disable"
+
+
+def offscreen_context(width: int, height: int) -> Any:
+    """A context of MuJoCo's for pictures of so many pixels, which is not current yet.
+
+    `MUJOCO_GL` decides if it is set (egl, osmesa, glfw; MuJoCo itself reads it once, when it is
     imported). Otherwise it is EGL on Linux, with a display or without; a window that is hidden
     where there is a display and no EGL; elsewhere the system's own.
 
@@ -43,6 +63,10 @@ def offscreen_context(width: int, height: int) -> Any:
     )
 
 
+def _wanted() -> str:
+    return (_setting or os.environ.get("MUJOCO_GL", "")).lower().strip()
+
+
 def _why(error: Exception) -> str:
     if isinstance(error, AttributeError):  # PyOpenGL's way to say so
         return "its library is not installed"
@@ -51,13 +75,15 @@ def _why(error: Exception) -> str:
 
 
 def _candidates() -> tuple[str, ...]:
-    wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
+    wanted = _wanted()
     if wanted in _OFF:
         return ()
-    if wanted in ("egl", "osmesa", "cgl"):
+    if wanted in _LIBRARIES:
         return (wanted,)
-    if wanted:  # MuJoCo's other words all mean this one
+    if wanted in _ON:
         return ("glfw",)
+    if wanted:
+        raise NoOpenGL(f"MUJOCO_GL: expected egl, osmesa, glfw or disable, got {wanted!r:.80}")
     if sys.platform == "darwin":
         return ("cgl", "glfw")
     if sys.platform != "linux":

@@ -1,33 +1,59 @@
-"""Flights as they are flown: the latest moment in a window or a browser.
+"""Live views: the latest moment in a window or a browser.
 
-Whoever flies hands over a moment and goes on at once; a thread draws the latest one. So a slow
-machine draws fewer pictures, and flies no slower but for the processor that both share.
+`LiveView.draw` returns at once, and a thread draws the latest moment. A slow machine draws fewer
+pictures; the simulation goes on, slowed only by the processor that both share.
 """
 
 import time
 from threading import Event, Thread
 from typing import Final, Literal, Protocol, Self
 
+import mujoco
+import numpy as np
+
+from ..models.errors import InputError
 from .moment import Moment
 from .pace import Pace
 from .stage import Stage
 
-__all__ = ["MOST_DRONES", "Lines", "LiveView", "Surface", "lines_over", "open_surface"]
+__all__ = ["MOST_DRONES", "Aim", "Lines", "LiveView", "Surface", "lines_over", "open_surface"]
 
 MOST_DRONES: Final = 16
-"""Craft that are shown side by side; of more, the first ones."""
+"""Most craft side by side; of more, the first ones are shown."""
 DEFAULT_PORT: Final = 8080
 _PICTURES: Final = 30.0
-"""At most so many a second."""
+"""Most pictures a second."""
 _NAP: Final = 0.02
-"""Longest sleep between two looks at the keys, s."""
+"""Longest sleep before keys are looked at again, s."""
 
 Lines = list[tuple[str, str]]
 """Names and values."""
 
 
+class Aim:
+    """Turns a viewer's camera towards the goal once; afterwards moves it as the goal moves.
+
+    Without a goal it follows the craft.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self._focus: np.ndarray | None = None
+
+    def apply(self, camera: mujoco.MjvCamera) -> None:
+        """Turn or move a free camera."""
+        focus = self._stage.focus
+        if self._focus is None:
+            view = self._stage.camera("free")
+            for name in ("azimuth", "elevation", "distance", "lookat"):
+                setattr(camera, name, getattr(view, name))
+        else:  # what the mouse has turned and moved stays so
+            camera.lookat[:] += focus - self._focus
+        self._focus = focus
+
+
 class Surface(Protocol):
-    """What a stage is drawn on: a window, or a page."""
+    """A window or a page on which a stage is drawn."""
 
     where: str
     """Where to look, for a sentence."""
@@ -39,20 +65,20 @@ class Surface(Protocol):
         """Whether it is still open."""
 
     def is_watched(self) -> bool:
-        """Whether somebody has begun to look."""
+        """Whether somebody looks."""
 
     def close(self) -> None:
         """Close it."""
 
 
 class LiveView:
-    """Shows what it is given, in a thread of its own.
+    """Draws the latest moments in a thread of its own.
 
     Args:
-        stage: What is drawn. Nobody else shows anything on it.
+        stage: What is drawn. The view alone shows moments on it.
         surface: What it is drawn on.
-        pace: Told in the overlay.
-        of: How many drones there are, if more than are shown.
+        pace: Its speed is a line of the overlay.
+        of: Number of drones, if more than are shown.
     """
 
     def __init__(self, stage: Stage, surface: Surface, pace: Pace, of: int | None = None) -> None:
@@ -67,7 +93,7 @@ class LiveView:
 
     @property
     def is_running(self) -> bool:
-        """Whether there is still something to look at. Raises what drawing has raised."""
+        """Whether the surface is open. Raises the error with which drawing ended."""
         if self._error is not None:
             error, self._error = self._error, None
             raise error
@@ -75,23 +101,23 @@ class LiveView:
 
     @property
     def is_watched(self) -> bool:
-        """Whether somebody has begun to look: with a page, whether a browser has come."""
+        """Whether somebody looks: of a page, whether a browser has opened it."""
         return self.surface.is_watched()
 
     @property
     def wants(self) -> bool:
-        """Whether the last moments are drawn, so that others would be."""
+        """Whether the latest moments are drawn, so that new ones would be."""
         return not self._fresh.is_set()
 
     def draw(self, *moments: Moment) -> None:
-        """Have these drawn, one of each craft, and go on. Older ones that wait are dropped."""
+        """Leave moments to be drawn, one of each craft. Older ones that wait are dropped."""
         if len(moments) != self.stage.drones:
-            raise ValueError(f"moments: expected {self.stage.drones}, got {len(moments)}")
+            raise InputError(f"moments: expected {self.stage.drones}, got {len(moments)}")
         self._latest = moments
         self._fresh.set()
 
     def draw_in_time(self, *moments: Moment) -> bool:
-        """`draw`, when the pace has them due, paused or slow; False if it is closed before."""
+        """Wait until the pace has them due, and `draw`; False if the surface is closed before."""
         while (left := self.pace.wait(time.monotonic())) != 0.0:
             if not self.is_running:
                 return False
@@ -101,7 +127,7 @@ class LiveView:
         return self.is_running
 
     def close(self) -> None:
-        """Stop drawing and close what it was drawn on. A second call does nothing."""
+        """Stop drawing and close the surface. A second call does nothing."""
         if not self._closing.is_set():
             self._closing.set()
             try:
@@ -126,7 +152,7 @@ class LiveView:
                 except Exception:
                     if self.surface.is_running():  # otherwise it was closed meanwhile
                         raise
-                # What is handed over meanwhile waits, so that `wants` bounds the work for it.
+                # Moments that come meanwhile wait, so that `wants` limits their number.
                 self._closing.wait(max(0.0, 1 / _PICTURES - (time.monotonic() - began)))
         except Exception as error:
             self._error = error
@@ -140,12 +166,20 @@ class LiveView:
         self._said = self.pace.words
         if fresh:
             self.stage.show(*moments)
-        self.surface.show(lines_over(moments, self._said, self._of))
+        high = float(self.stage.vehicle.thrust_high.max())
+        self.surface.show(lines_over(moments, high, self._said, self._of))
 
 
-def lines_over(moments: tuple[Moment, ...], pace: str, drones: int) -> Lines:
-    """What is written over a picture: of the first craft, if there are many."""
-    lines = [*moments[0].lines(), ("speed", pace)]
+def lines_over(moments: tuple[Moment, ...], thrust_high: float, pace: str, drones: int) -> Lines:
+    """The lines of an overlay: those of the first craft, and the speed.
+
+    Args:
+        moments: Of the craft that are shown.
+        thrust_high: Largest thrust of a rotor, N.
+        pace: The speed in words.
+        drones: Number of drones, shown or not.
+    """
+    lines = [*moments[0].lines(thrust_high), ("speed", pace)]
     if drones > 1:
         shown = f"{len(moments)} of {drones}" if drones > len(moments) else str(drones)
         lines.insert(0, ("drones", f"{shown} shown, numbers of the first"))
@@ -159,10 +193,10 @@ def open_surface(
 
     Raises:
         NoDisplay: There is no display for a window.
-        ValueError: The port cannot be had.
+        InputError: The port is in use, or none.
     """
     if kind == "window":
-        from .passive import Window
+        from .window import Window
 
         return Window(stage, pace)
     from .web import WebPage

@@ -1,28 +1,55 @@
-"""What there is to see of a craft after one control step."""
+"""One craft after one control step, as pictures show it."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from ..models.frames import pose_in_mujoco_frame
 
-__all__ = ["Moment"]
+__all__ = ["MetricValue", "Moment"]
+
+Vector = tuple[float, float, float]
+
+
+class MetricValue(NamedTuple):
+    """A metric of a task, and its value."""
+
+    name: str
+    value: float
+    unit: str = ""
+    symbol: str = ""
+    """Short symbol; empty: the name."""
+
+    @property
+    def label(self) -> str:
+        """Its symbol, or its name."""
+        return self.symbol or self.name.replace("_", " ")
+
+    @property
+    def text(self) -> str:
+        """Value with four digits, and unit."""
+        whole = len(f"{abs(self.value):.0f}")
+        number = f"{self.value:.{max(4 - whole, 0)}f}" if self.unit else f"{self.value:.4g}"
+        return f"{number} {self.unit}".strip()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """One craft, one control step. Everything is as the wire's telemetry has it."""
+    """One craft after one control step. Positions are in the paper's frame."""
 
-    position: tuple[float, float, float]
-    """X, Y, Z in the paper's frame, m."""
-    attitude: tuple[float, float, float]
+    position: Vector
+    """X, Y, Z, m."""
+    attitude: Vector
     """phi, theta, psi, degrees."""
-    thrusts: tuple[float, float, float, float]
-    """F1 ... F4, N."""
-    error: float
-    """E, desired minus measured elevation, m."""
+    thrusts: tuple[float, ...]
+    """F1 to FR, N."""
+    goal: Vector | None = None
+    """Where the craft should be, X, Y, Z, m; None if the task has no such place."""
+    metrics: tuple[MetricValue, ...] = ()
+    """The headline first."""
     reward: float = 0.0
     """Of the step that led here."""
     step: int = 0
@@ -31,40 +58,77 @@ class Moment:
     """Episodes before this one."""
 
     @classmethod
-    def of(cls, telemetry: Mapping[str, Any], error: float, **rest: Any) -> Self:
-        """From an env's `info`, or telemetry by its names."""
-        values = [float(telemetry[name]) for name in _NAMES]
-        x, y, z, phi, theta, psi, f1, f2, f3, f4 = values
+    def of(
+        cls,
+        telemetry: Mapping[str, Any],
+        metrics: Sequence[tuple[str, str, str]] = (),
+        **rest: Any,
+    ) -> Self:
+        """Read one drone's telemetry.
+
+        Args:
+            telemetry: Arrays by name: `position` (3,), `attitude` (3,), `thrust` (R,), `metrics`
+                (M,) and, if the task has one, `goal` (3,). Others are ignored.
+            metrics: Name, unit and symbol of each of the M metrics.
+            rest: Fields that telemetry does not have: `reward`, `step`, `episode`.
+        """
+        values = np.asarray(telemetry["metrics"]).tolist() if metrics else []
         return cls(
-            position=(x, y, z),
-            attitude=(phi, theta, psi),
-            thrusts=(f1, f2, f3, f4),
-            error=float(error),
+            position=_vector(telemetry["position"]),
+            attitude=_vector(telemetry["attitude"]),
+            thrusts=tuple(np.asarray(telemetry["thrust"], float).tolist()),
+            goal=_vector(telemetry["goal"]) if "goal" in telemetry else None,
+            metrics=tuple(
+                MetricValue(name, float(value), unit, symbol)
+                for (name, unit, symbol), value in zip(metrics, values, strict=True)
+            ),
             **rest,
         )
-
-    @property
-    def target(self) -> float:
-        """Desired elevation Y, m."""
-        return self.position[1] + self.error
 
     @property
     def qpos(self) -> np.ndarray:
         """Pose of the free joint in MuJoCo's frame, float64, shape (7,)."""
         return pose_in_mujoco_frame(self.position, self.attitude)
 
-    def lines(self) -> list[tuple[str, str]]:
-        """What an overlay says: names and values."""
-        thrusts = " ".join(f"{thrust:.0f}" for thrust in self.thrusts)
-        return [
-            ("target", f"{self.target:.2f} m"),
-            ("elevation", f"{self.position[1]:.2f} m"),
-            ("E", f"{self.error:+.3f} m"),
-            ("F1 to F4", f"{thrusts} N"),
+    @property
+    def goal_point(self) -> np.ndarray | None:
+        """The goal in MuJoCo's frame, float64, shape (3,), m."""
+        return None if self.goal is None else pose_in_mujoco_frame(self.goal, (0, 0, 0))[:3]
+
+    def lines(self, thrust_high: float) -> list[tuple[str, str]]:
+        """Names and values for an overlay.
+
+        Args:
+            thrust_high: Largest thrust of a rotor, N: it sets the number of digits.
+        """
+        lines = [(metric.label, metric.text) for metric in self.metrics[:_MOST_METRICS]]
+        lines.append(("elevation", f"{self.position[1]:.2f} m"))
+        if self.goal is not None:
+            lines.append(("goal", f"{self.goal[1]:.2f} m"))
+        unit, scale = ("N", 1.0) if thrust_high >= 1 else ("mN", 1e3)
+        decimals = max(0, 2 - math.floor(math.log10(thrust_high * scale)))
+        rotors = len(self.thrusts)
+        name = f"F1 to F{rotors}" if rotors > 1 else "F1"
+        if rotors > _MOST_THRUSTS:
+            name, shown = f"{name}, mean", (float(np.mean(self.thrusts)),)
+        else:
+            shown = self.thrusts
+        thrusts = " ".join(f"{scale * thrust:.{decimals}f}" for thrust in shown)
+        lines += [
+            (name, f"{thrusts} {unit}"),
             ("reward", f"{self.reward:+.3f}"),
             ("step", str(self.step)),
             ("episode", str(self.episode)),
         ]
+        return lines
 
 
-_NAMES = ("X", "Y", "Z", "phi", "theta", "psi", "F1", "F2", "F3", "F4")
+_MOST_METRICS = 4
+"""Metrics with a line of their own."""
+_MOST_THRUSTS = 4
+"""Rotors with a number of their own."""
+
+
+def _vector(values: Any) -> Vector:
+    x, y, z = np.asarray(values, float).tolist()
+    return x, y, z

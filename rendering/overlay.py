@@ -1,18 +1,20 @@
-"""What is written on a picture: whose flight it is, its numbers, and its error over time."""
+"""Text and graphs on pictures: a title, the numbers of a moment, and a metric over time."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
-from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from ..models.constants import HOVER_THRUST, MAX_THRUST
+from ..models.errors import InputError
+from ..models.vehicle import Vehicle
+from ._pillow import Image, ImageColor, ImageDraw, ImageFont
 from .moment import Moment
 
-__all__ = ["Overlay"]
+__all__ = ["Overlay", "graph_scale"]
 
 _GROUND: Final = (13, 18, 26, 150)
 """Of panels: dark, and some of the picture shows through."""
@@ -24,18 +26,12 @@ _LIMIT: Final = (84, 96, 110)
 _ALARM: Final = (255, 107, 96)
 _BAR: Final = (120, 190, 255)
 _BAR_GROUND: Final = (70, 82, 98)
-_WIDEST: Final = Moment(
-    position=(0.0, -10.0, 0.0),
-    attitude=(0.0, 0.0, 0.0),
-    thrusts=(MAX_THRUST,) * 4,
-    error=-10.0,
-    reward=-10.0,
-    step=100_000,
-    episode=100_000,
-)
-"""What a panel has room for."""
+_STEPS: Final = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
+"""Round numbers for the ends of a graph."""
+_LEAST: Final = 0.1
+"""Smallest end of a graph, in the metric's unit."""
 _STRIP_SIZE: Final = 160, 240
-"""Width and height of the smallest picture with a strip, pixels."""
+"""Width and height of the smallest picture with a graph, pixels."""
 _NUMBERS_HEIGHT: Final = 160
 """Of the smallest picture with numbers, pixels."""
 _NUMBERS_SHARE: Final = 0.4
@@ -56,26 +52,38 @@ class Box(NamedTuple):
     lower: int
 
 
-class Overlay:
-    """Draws on the pictures of one flight: a panel of numbers, and a strip of E over time.
+def graph_scale(values: Iterable[float]) -> tuple[float, float]:
+    """Round ends of a graph that holds the values: from 0, or symmetrical if one is negative."""
+    finite = [value for value in values if math.isfinite(value)]
+    largest = max(map(abs, finite), default=0.0)
+    decade = 10.0 ** math.floor(math.log10(max(largest, _LEAST)))
+    high = next(step * decade for step in _STEPS if largest <= step * decade * (1 + 1e-9))
+    return (-high if min(finite, default=0.0) < 0 else 0.0), high
 
-    Everything scales with the picture. A small one has no strip, and a smaller one only the title.
+
+class Overlay:
+    """Draws on the pictures of one flight: a panel of numbers, and a graph of the headline metric.
+
+    Everything scales with the picture. A small one has no graph, and a smaller one only the title.
 
     Args:
         width, height: Of the pictures, pixels.
-        title: Who flies.
-        color: The title's and the curve's, as "#RRGGBB": light, the ground is dark.
-        period: Between two errors of the strip, s.
-        seconds: Length of the strip's time axis, s.
-        band: The strip reaches from -band to +band, m. What is beyond is not drawn: a triangle
-            marks where the curve leaves.
+        title: Name of the flight.
+        color: Of title and curve, "#RRGGBB"; light, the ground is dark.
+        like: A moment of the flight: its metrics, its goal and its rotors say which lines there
+            are.
+        vehicle: What flies: it gives the limits of the thrusts.
+        period: Time between two values of the graph, s.
+        seconds: Length of the graph's time axis, s.
+        scale: Lower and upper end of the graph, in the metric's unit. What is beyond is not drawn:
+            a triangle marks where the curve leaves.
         numbers: Whether there is more than the title.
 
     Attributes:
         has_numbers: Whether the panel has numbers.
-        has_strip: Whether there is a strip.
+        has_strip: Whether there is a graph.
         panel: Where title and numbers are.
-        strip: Where the strip is, if there is one.
+        strip: Where the graph is, if there is one.
         plot: Where in it the curve is.
     """
 
@@ -86,44 +94,50 @@ class Overlay:
         *,
         title: str,
         color: str = "#7CC8F2",
+        like: Moment,
+        vehicle: Vehicle,
         period: float,
         seconds: float,
-        band: float,
+        scale: tuple[float, float],
         numbers: bool = True,
     ) -> None:
         self._size = width, height
         self._title, self._color = title, ImageColor.getrgb(color)[:3]
-        self._period, self._seconds, self._band = period, max(seconds, period), band
+        self._period, self._seconds, self._scale = period, max(seconds, period), scale
+        self._vehicle, self._high = vehicle, float(vehicle.thrust_high.max())
+        self._widest = _widest(like, self._high).lines(self._high)
+        self._metric = like.metrics[0] if like.metrics else None
         unit = max(7.0, min(height / 30, width / 34))
         self._unit, self._gap = unit, max(2, round(0.55 * unit))
         self._line = round(1.28 * unit)
         self._small, self._font, self._large = (_font(unit * share) for share in (0.85, 1, 1.25))
         self.has_numbers = numbers and self._have_room()
-        self.has_strip = numbers and width >= _STRIP_SIZE[0] and height >= _STRIP_SIZE[1]
+        large = width >= _STRIP_SIZE[0] and height >= _STRIP_SIZE[1]
+        self.has_strip = numbers and large and self._metric is not None
         self.panel = self._panel_box(self.has_numbers)
         self.strip, self.plot = self._strip_boxes()
         boxes = (self.panel, self.strip) if self.has_strip else (self.panel,)
         self._grounds = [(box, _ground(box, self._gap)) for box in boxes]
 
     def draw(
-        self, picture: np.ndarray, moment: Moment, errors: Sequence[float], note: str = ""
+        self, picture: np.ndarray, moment: Moment, values: Sequence[float], note: str = ""
     ) -> np.ndarray:
-        """A picture with everything on it.
+        """Return a copy of a picture with everything on it.
 
         Args:
-            picture: uint8, shape (height, width, 3). It stays as it is.
-            moment: What its panel tells.
-            errors: E from the episode's start to this moment, m, one for each period.
+            picture: uint8, shape (height, width, 3).
+            moment: For the panel.
+            values: The headline metric from the episode's start to this moment, one each period.
             note: What happened, such as "terminated".
         """
         image = Image.fromarray(picture)
         if image.size != self._size:
-            raise ValueError(f"picture: expected {self._size} pixels, got {image.size}")
+            raise InputError(f"picture: expected {self._size} pixels, got {image.size}")
         for box, ground in self._grounds:
             image.paste(ground, box[:2], ground)
         _enlarged(image, self.panel, lambda draw: self._write_panel(draw, moment))
         if self.has_strip:
-            _enlarged(image, self.strip, lambda draw: self._write_strip(draw, errors))
+            _enlarged(image, self.strip, lambda draw: self._write_strip(draw, values))
         if note:
             box = self._note_box(note)
             _enlarged(image, box, lambda draw: self._write_note(draw, box, note))
@@ -134,7 +148,7 @@ class Overlay:
 
     def _numbers_width(self) -> int:
         """Of a panel in which every name and its value fit beside each other."""
-        lines = ((name, _spaced(value)) for name, value in _WIDEST.lines())
+        lines = ((name, _spaced(value)) for name, value in self._widest)
         texts = max(sum(map(self._font.getlength, line)) for line in lines) / _TIMES
         return round(texts + self._unit + 4 * self._gap)
 
@@ -151,7 +165,7 @@ class Overlay:
         title = math.ceil(self._large.getlength(self._title) / _TIMES + 1.2 * self._unit) + 1
         lower, right = 3 * gap + round(1.6 * self._unit), 5 * gap + title
         if numbers:
-            lower += len(_WIDEST.lines()) * self._line + 3 * gap
+            lower += len(self._widest) * self._line + 3 * gap
             right = max(right, gap + self._numbers_width())
         return Box(gap, gap, min(right, width - gap), min(lower, height - gap))
 
@@ -164,28 +178,31 @@ class Overlay:
         title = _fitted(self._title, self._large, right - left - 1.2 * unit)
         draw.text((left + 1.2 * unit, middle), title, self._color, self._large, anchor="lm")
         y += round(1.6 * unit) + gap // 2
-        for name, value in moment.lines() if self.has_numbers else ():
+        for name, value in moment.lines(self._high) if self.has_numbers else ():
             draw.text((left, y), name, _NAMES, self._font)
             draw.text((right, y), _spaced(value), _VALUES, self._font, anchor="ra")
             y += line
-            if name.startswith("F1"):
+            if "F1" in name:
                 y += gap // 2
                 self._draw_bars(draw, Box(left, y, right, y + gap), moment.thrusts)
                 y += round(1.5 * gap)
 
-    def _draw_bars(
-        self, draw: ImageDraw.ImageDraw, box: Box, thrusts: tuple[float, float, float, float]
-    ) -> None:
-        """The thrusts side by side, with a mark at hover."""
-        gap = self._gap * _TIMES
-        long, thick = (box.right - box.left - 3 * gap) / 4, max(1, round(self._unit / 7))
-        for number, thrust in enumerate(thrusts):
+    def _draw_bars(self, draw: ImageDraw.ImageDraw, box: Box, thrusts: Sequence[float]) -> None:
+        """The thrusts side by side, from the least to the largest, with a mark at hover."""
+        gap = min(self._gap * _TIMES, (box.right - box.left) // (3 * len(thrusts)))
+        long = (box.right - box.left - gap * (len(thrusts) - 1)) / len(thrusts)
+        thick = max(1, round(self._unit / 7))
+        vehicle = self._vehicle
+        limits = zip(vehicle.thrust_low, vehicle.thrust_high, vehicle.hover_thrust, strict=True)
+        for number, (thrust, (low, high, hover)) in enumerate(zip(thrusts, limits, strict=True)):
             start = box.left + number * (long + gap)
-            full = start + long * min(max(thrust / MAX_THRUST, 0.0), 1.0)
+            full, mark = (
+                start + long * min(max((value - low) / (high - low), 0.0), 1.0)
+                for value in (thrust, hover)
+            )
             draw.rectangle((start, box.upper, start + long, box.lower), _BAR_GROUND)
             if full > start:
                 draw.rectangle((start, box.upper, full, box.lower), _BAR)
-            mark = start + long * HOVER_THRUST / MAX_THRUST
             draw.line((mark, box.upper - _TIMES, mark, box.lower + _TIMES), _VALUES, thick)
 
     def _strip_boxes(self) -> tuple[Box, Box]:
@@ -198,13 +215,16 @@ class Overlay:
         return strip, Box(left, upper, max(left, right), max(upper, lower))
 
     def _levels(self) -> tuple[tuple[str, float], ...]:
-        """What stands at the lines of the strip, and where they are: shares of the band."""
-        return (f"+{self._band:g}", 1.0), ("0", 0.0), (f"-{self._band:g}", -1.0)
+        """Labels of the graph's lines, and their heights, -1 to 1."""
+        low, high = self._scale
+        return (f"{high:g}", 1.0), (f"{(low + high) / 2:g}", 0.0), (f"{low:g}", -1.0)
 
-    def _write_strip(self, draw: ImageDraw.ImageDraw, errors: Sequence[float]) -> None:
+    def _write_strip(self, draw: ImageDraw.ImageDraw, values: Sequence[float]) -> None:
         unit, gap = self._unit * _TIMES, self._gap * _TIMES
-        draw.text((2 * gap, gap), "E over time, m", _NAMES, self._font)
-        time = f"{max(len(errors) - 1, 0) * self._period:.2f} s"
+        assert self._metric is not None
+        words = [f"{self._metric.label} over time", *filter(None, [self._metric.unit])]
+        draw.text((2 * gap, gap), ", ".join(words), _NAMES, self._font)
+        time = f"{max(len(values) - 1, 0) * self._period:.2f} s"
         end = (self.strip.right - self.strip.left) * _TIMES - 2 * gap
         draw.text((end, gap), time, _VALUES, self._font, anchor="ra")
         dx, dy = self.strip.left, self.strip.upper
@@ -212,14 +232,16 @@ class Overlay:
             (edge - (dx, dy)[number % 2]) * _TIMES for number, edge in enumerate(self.plot)
         )
         for label, share in self._levels():
-            y, color = lower - (lower - upper) * (1 + share) / 2, _LIMIT if share else _ZERO
+            y = lower - (lower - upper) * (1 + share) / 2
+            color = _ZERO if label == "0" else _LIMIT
             draw.line((left, y, right, y), color, max(1, round(unit / 14)))
             if share or lower - upper > 2.4 * unit:  # there is room for the zero too
                 draw.text((left - gap, y), label, _NAMES, self._small, anchor="rm")
-        self._draw_curve(draw, Box(left, upper, right, lower), errors)
+        self._draw_curve(draw, Box(left, upper, right, lower), values)
 
-    def _draw_curve(self, draw: ImageDraw.ImageDraw, box: Box, errors: Sequence[float]) -> None:
-        shares = np.asarray(errors, float) / self._band
+    def _draw_curve(self, draw: ImageDraw.ImageDraw, box: Box, values: Sequence[float]) -> None:
+        low, high = self._scale
+        shares = (np.asarray(values, float) - (low + high) / 2) / ((high - low) / 2)
         across = (box.right - box.left) * self._period / self._seconds
         xs = np.minimum(box.left + across * np.arange(len(shares)), box.right)
         points = list(zip(xs.tolist(), shares.tolist(), strict=True))
@@ -270,7 +292,7 @@ def _ground(box: Box, radius: int) -> Image.Image:
 
 
 def _within(points: Sequence[Point]) -> tuple[list[list[Point]], list[Point]]:
-    """What of a line is between -1 and +1, in pieces, and where it leaves."""
+    """Pieces of a line between -1 and +1, and the points at which it leaves."""
     pieces: list[list[Point]] = []
     exits = [(x, math.copysign(1.0, y)) for x, y in points[:1] if abs(y) > 1]
     connected = False
@@ -290,8 +312,22 @@ def _within(points: Sequence[Point]) -> tuple[list[list[Point]], list[Point]]:
     return pieces, exits
 
 
+def _widest(like: Moment, thrust_high: float) -> Moment:
+    """A moment whose lines are as wide as any of the flight."""
+    return replace(
+        like,
+        position=(0.0, -100.0, 0.0),
+        thrusts=(thrust_high,) * len(like.thrusts),
+        goal=like.goal and (0.0, -100.0, 0.0),
+        metrics=tuple(metric._replace(value=-1.001) for metric in like.metrics),
+        reward=-10.0,
+        step=100_000,
+        episode=100_000,
+    )
+
+
 def _spaced(value: str) -> str:
-    """Numbers of a row further apart than a number from its unit."""
+    """The same with more space between numbers than between number and unit."""
     words = value.split()
     return " ".join(("  ".join(words[:-1]), words[-1])) if len(words) > 2 else " ".join(words)
 

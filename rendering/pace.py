@@ -1,38 +1,40 @@
-"""How fast a flight is shown: arithmetic alone, the time is passed in."""
+"""The speed at which a flight is shown. Reads no clock: the time is passed in."""
 
 from queue import Empty, SimpleQueue
 from typing import Final, Literal
 
+from ..models.errors import InputError
+
 __all__ = ["FASTEST", "SLOWEST", "SPEEDS", "Pace", "Press"]
 
 Press = Literal["pause", "step", "slower", "faster"]
-"""What an onlooker may ask for."""
+"""What a key or a button does."""
 
 SPEEDS: Final = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
-"""What `slower` and `faster` lead through; 1 is real time."""
+"""Steps of `slower` and `faster`; 1 is real time."""
 SLOWEST, FASTEST = SPEEDS[0], SPEEDS[-1]
 _CATCH_UP: Final = 0.1
-"""Longest delay that later steps make up for, s: a machine that is too slow does not hurry."""
+"""Longest delay that later steps make up for, s."""
 
 
 class Pace:
     """When the next control step is due, in seconds of any clock.
 
     Args:
-        period: Time between two steps, s; 0 for as fast as can be.
+        period: Time between two steps, s; 0 for as fast as possible.
         speed: 2 is twice as fast as real time.
 
     Attributes:
-        speed: As it is now.
-        paused: Whether steps wait to be asked for one by one.
+        speed: The present one.
+        paused: Whether each step waits for a press of `step`.
 
     Raises:
-        ValueError: The speed is beyond `SPEEDS`.
+        InputError: The speed is beyond `SPEEDS`.
     """
 
     def __init__(self, period: float, speed: float = 1.0) -> None:
         if not SLOWEST <= speed <= FASTEST:
-            raise ValueError(f"speed: expected {SLOWEST:g} to {FASTEST:g}, got {speed:g}")
+            raise InputError(f"speed: expected {SLOWEST:g} to {FASTEST:g}, got {speed:g}")
         self.period, self.speed, self.paused = period, speed, False
         self._presses: SimpleQueue[Press] = SimpleQueue()
         self._asked = 0  # steps that a pause lets pass
@@ -47,7 +49,7 @@ class Pace:
         return f"{speed}, paused" if self.paused else speed
 
     def press(self, press: Press) -> None:
-        """Ask for something; `wait` does it. May be called from any thread."""
+        """Tell of a press, which `wait` then obeys. May be called from any thread."""
         self._presses.put(press)
 
     def wait(self, now: float) -> float | None:

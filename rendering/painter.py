@@ -1,6 +1,7 @@
 """Gymnasium's render modes: one picture, one for each of many craft, or a window."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -18,16 +19,20 @@ _OF_MANY: Final = (240, 180)
 
 
 class Painter:
-    """What the `render` of an env gives or shows. Nothing is opened before the first call.
+    """What the `render` of an env returns or shows. Nothing is opened before the first call.
 
     Args:
         mode: `rgb_array`, or `human`.
         drones: Craft of the env.
         control_period: Time between two moments, s: a window shows them in real time.
+        vehicle: MJCF file of the craft; None is the paper's.
     """
 
-    def __init__(self, mode: str, drones: int, control_period: float) -> None:
+    def __init__(
+        self, mode: str, drones: int, control_period: float, vehicle: Path | str | None = None
+    ) -> None:
         self._mode, self._drones, self._period = mode, drones, control_period
+        self._vehicle = vehicle
         self._canvas: Canvas | None = None
         self._view: LiveView | None = None
         self._shown: Sequence[Moment] = ()
@@ -43,7 +48,8 @@ class Painter:
             return None
         if self._canvas is None:
             one = self._drones == 1
-            self._canvas = Canvas(Stage(trail=one), *(_ONE if one else _OF_MANY))
+            stage = Stage(vehicle=self._vehicle, trail=one)
+            self._canvas = Canvas(stage, *(_ONE if one else _OF_MANY))
         return tuple(self._draw(self._canvas, moment) for moment in moments)
 
     def close(self) -> None:
@@ -59,7 +65,8 @@ class Painter:
 
     def _show(self, moments: Sequence[Moment]) -> None:
         if self._view is None:
-            stage, pace = Stage(drones=len(moments)), Pace(self._period)
+            stage = Stage(drones=len(moments), vehicle=self._vehicle)
+            pace = Pace(self._period)
             surface = open_surface("window", stage, pace)
             self._view = LiveView(stage, surface, pace, of=self._drones)
         if moments != self._shown:  # `step` shows by itself, and a script may ask once more

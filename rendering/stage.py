@@ -1,75 +1,108 @@
-"""The world as it is looked at: craft, targets, paths and cameras."""
+"""Craft in their world, with goals, paths and cameras."""
 
 import copy
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Final, Literal, get_args
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
 
 import mujoco
 import numpy as np
 
-from ..models import QUAD_XML, SCENE_XML, attach_airport
+from ..models.errors import InputError
+from ..models.scene import SCENE_PREFIX, World, build_scene
+from ..models.vehicle import Vehicle
 from .moment import Moment
 
 __all__ = ["CAMERAS", "WORLDS", "Camera", "NextGeom", "Stage", "World", "scene_geoms"]
 
 Camera = Literal["chase", "front", "side", "top", "onboard"]
-World = Literal["airport", "plain"]
 CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
 WORLDS: Final[tuple[World, ...]] = get_args(World)
 
 NextGeom = Callable[[], mujoco.MjvGeom | None]
-"""Gives a geom to be filled in, or None where there is no more room."""
+"""Returns a geom to fill in, or None if the scene is full."""
 
-_SPACING: Final = 4.0
-"""Between craft that fly side by side, m."""
 _TRAIL: Final = 150
-"""Control steps that a path reaches back."""
+"""Length of a path, control steps."""
 _EVERY: Final = 3
 """Control steps of one piece of a path."""
 _DISC = (0.13, 0.78, 0.52, 0.30)
 _PATH = (1.0, 0.85, 0.25)
-_LOWER: Final = 0.75
-"""How far below the target front and side look, m: the strip of E covers the picture's lower end,
-and a craft 3 m below its target is still above it."""
-_VIEWS: Final[dict[str, tuple[float, float, float]]] = {
-    "chase": (0.0, -17.0, 7.0),
-    "front": (180.0, -7.0, 12.5),  # from a little above the target: its disc is seen
-    "side": (90.0, -7.0, 12.5),
-    "top": (0.0, -89.9, 10.0),
+
+# Lengths below are in radii of the craft.
+_SPACING: Final = 2.2
+"""Between craft that fly side by side."""
+_NEAR: Final = 0.14
+"""Largest distance at which drawing begins."""
+_LOWER: Final = 0.06
+"""Front and side look this far below the goal, as a share of their distance: the graph covers the
+picture's lower end."""
+_VIEWS: Final[dict[str, tuple[float, float, float, float]]] = {
+    "chase": (0.0, -17.0, 3.85, math.inf),
+    "front": (180.0, -7.0, 6.9, 1.65),  # from a little above the goal: its disc is seen
+    "side": (90.0, -7.0, 6.9, 1.65),
+    "top": (0.0, -89.9, 5.5, math.inf),
+    "free": (0.0, -17.0, 3.85, 0.8),
 }
-"""Azimuth and elevation in degrees, distance in m."""
+"""Azimuth and elevation in degrees, distance, and the distance between craft and goal that the
+picture holds: if they are further apart, the camera is further away."""
+_BACK: Final = 2.6
+"""Distance of a camera per distance between craft and goal."""
+_FOVY: Final = 50.0
+"""Vertical field of view of every camera but `onboard`, degrees."""
+_FAR: Final = 10.0
+"""Cameras move back until craft and goal are so far apart, or as far as at the episode's start."""
 
 
 class Stage:
-    """Craft over an airport or a plain floor. It flies nothing: it shows what was flown.
+    """Craft over an airport or a plain floor. It simulates nothing: it shows moments.
 
     Args:
         world: `airport` or `plain`.
-        drones: Craft side by side, each with a target and a path.
+        drones: Craft side by side, each with a goal and a path.
+        vehicle: MJCF file of the craft; None is the paper's.
         trail: Whether paths are drawn.
 
     Attributes:
+        vehicle: What flies.
+        radius: Of a sphere about the body's origin that holds the craft, m. Cameras, goals and
+            paths scale with it.
         model: With everything that is only looked at.
         data: Poses of what was shown last.
         moments: What was shown last.
+
+    Raises:
+        InputError: One of these is not what it should be.
     """
 
-    def __init__(self, world: World = "airport", drones: int = 1, *, trail: bool = True) -> None:
-        if world not in WORLDS:
-            raise ValueError(f"world: expected {' or '.join(WORLDS)}, got {world!r}")
+    def __init__(
+        self,
+        world: World = "airport",
+        drones: int = 1,
+        *,
+        vehicle: Path | str | None = None,
+        trail: bool = True,
+    ) -> None:
         if drones < 1:
-            raise ValueError(f"drones: expected 1 or more, got {drones}")
-        self.drones = drones
-        self._offsets = _grid(drones)
-        self.model = _compile(world, self._offsets)
+            raise InputError(f"drones: expected 1 or more, got {drones}")
+        self.drones, self.vehicle = drones, Vehicle.load(vehicle)
+        spec = build_scene(self.vehicle.path, world)
+        self.radius, top = _size(spec.compile())
+        self._offsets = _grid(drones, _SPACING * self.radius)
+        self._spread = float(np.ptp(self._offsets, axis=0).max())
+        _add_onboard_camera(spec, self.radius, top)
+        for number, offset in enumerate(self._offsets[1:], 1):
+            _add_craft(spec, self.vehicle.path, offset, f"{number}/")
+        self.model = spec.compile()
+        _scale_drawing(self.model, self.radius, self._spread)
         self.data = mujoco.MjData(self.model)
         self.moments: tuple[Moment, ...] = ()
-        self._paths: list[deque[np.ndarray]] = [
-            deque(maxlen=_TRAIL // _EVERY if trail else 0) for _ in range(drones)
-        ]
+        length = _TRAIL // _EVERY if trail else 0
+        self._paths: list[deque[np.ndarray]] = [deque(maxlen=length) for _ in range(drones)]
+        self._reach = np.zeros(drones)
         mujoco.mj_forward(self.model, self.data)
 
     def twin(self) -> "Stage":
@@ -77,59 +110,103 @@ class Stage:
         twin = copy.copy(self)
         twin.data, twin.moments = mujoco.MjData(self.model), ()
         twin._paths = [deque(maxlen=path.maxlen) for path in self._paths]
+        twin._reach = np.zeros(self.drones)
         mujoco.mj_forward(twin.model, twin.data)
         return twin
 
     def show(self, *moments: Moment) -> None:
-        """Put every craft where its moment has it, and go on with its path."""
+        """Put every craft where its moment has it, and extend its path.
+
+        Raises:
+            InputError: There are not as many moments as craft, or their craft is another vehicle.
+        """
         if len(moments) != self.drones:
-            raise ValueError(f"moments: expected {self.drones}, got {len(moments)}")
+            raise InputError(f"moments: expected {self.drones}, got {len(moments)}")
+        if (rotors := len(moments[0].thrusts)) != self.vehicle.num_rotors:
+            raise InputError(
+                f"vehicle: expected a file with {rotors} rotors, as in the flight, got "
+                f"{self.vehicle.path.name} with {self.vehicle.num_rotors}"
+            )
         before, self.moments = self.moments or moments, moments
         poses = self.data.qpos.reshape(self.drones, 7)
         for i, (moment, last) in enumerate(zip(moments, before, strict=True)):
             pose, path = poses[i], self._paths[i]
             pose[:] = moment.qpos
-            pose[:2] += self._offsets[i]
+            pose[:3] += self._offsets[i]
             if moment.step == 0 or moment.step < last.step or moment.episode != last.episode:
                 path.clear()
+                self._reach[i] = 0.0
             if moment.step // _EVERY != last.step // _EVERY or not path:  # steps may be left out
                 path.append(pose[:3].copy())
-        self.data.ctrl[:] = np.concatenate([moment.thrusts for moment in moments])
+            self._reach[i] = self._reached(i, pose[:3])
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)  # what cameras and lights follow
         mujoco.mj_camlight(self.model, self.data)
 
-    def camera(self, name: Camera) -> mujoco.MjvCamera:
-        """Where to look from now. All but `onboard` see every craft; front and side stand still."""
+    def camera(self, name: Camera | Literal["free"]) -> mujoco.MjvCamera:
+        """A camera for what is shown now. All but `onboard` see every craft.
+
+        `chase` and `top` go with the craft; `front`, `side` and `free`, where a viewer's camera
+        begins, look at the goal if there is one, and move back from a craft that is far from it.
+
+        Raises:
+            InputError: There is no such camera.
+        """
         camera = mujoco.MjvCamera()
         if name == "onboard":
             camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-            camera.fixedcamid = self.model.camera("onboard").id
+            camera.fixedcamid = self.model.camera(_ONBOARD).id
             return camera
         if name not in _VIEWS:
-            raise ValueError(f"camera: expected one of {', '.join(CAMERAS)}, got {name!r}")
-        centres = self.data.qpos.reshape(self.drones, 7)[:, :3]
-        camera.lookat[:] = centres.mean(axis=0)
-        if name in ("front", "side") and self.moments:
-            target = sum(moment.target for moment in self.moments) / self.drones
-            camera.lookat[2] = max(target - _LOWER, 0.0)  # the camera stays above the ground
-        camera.azimuth, camera.elevation, camera.distance = _VIEWS[name]
-        camera.distance += np.ptp(self._offsets, axis=0).max()
+            raise InputError(f"camera: expected one of {', '.join(CAMERAS)}, got {name!r}")
+        camera.azimuth, camera.elevation, distance, holds = _VIEWS[name]
+        camera.distance = distance * self.radius + self._spread
+        if holds == math.inf:
+            camera.lookat[:] = self._points().mean(axis=0)
+        else:
+            camera.distance += _BACK * max(float(self._reach.max()) - holds * self.radius, 0.0)
+            camera.lookat[:] = self.focus
+        if name in ("front", "side"):  # above the ground
+            camera.lookat[2] = max(camera.lookat[2] - _LOWER * camera.distance, 0.0)
         return camera
 
-    def decorate(self, next_geom: NextGeom, *, discs: bool = True) -> None:
-        """Add the discs that mark the targets, unless they are not wanted, and the fading paths."""
-        for moment, offset, path in zip(self.moments, self._offsets, self._paths, strict=False):
-            here = moment.qpos[:3] + np.array((*offset, 0.0))
-            if discs:
-                _disc(next_geom, np.array((here[0], here[1], moment.target)))
-            points = [*path, here]
+    @property
+    def focus(self) -> np.ndarray:
+        """Mean of the goals, or of the craft if there are none, MuJoCo's frame, shape (3,), m."""
+        goals = [goal for i in range(self.drones) if (goal := self._goal(i)) is not None]
+        return np.mean(goals or self._points(), axis=0)
+
+    def decorate(self, next_geom: NextGeom, *, goals: bool = True) -> None:
+        """Add the discs that mark the goals, if they are wanted, and the fading paths."""
+        for i, path in enumerate(self._paths if self.moments else ()):
+            goal = self._goal(i)
+            if goals and goal is not None:
+                size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
+                _decoration(next_geom, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, _DISC)
+            points = [*path, self._points()[i]]
             for number, (start, end) in enumerate(pairwise(points), 1):
-                _piece(next_geom, start, end, number / len(path))
+                _piece(next_geom, start, end, 0.019 * self.radius, number / len(path))
+
+    def _points(self) -> np.ndarray:
+        """Positions of the craft, MuJoCo's frame, shape (drones, 3), m."""
+        points: np.ndarray = self.data.qpos.reshape(self.drones, 7)[:, :3]
+        return points
+
+    def _goal(self, i: int) -> np.ndarray | None:
+        goal = self.moments[i].goal_point if self.moments else None
+        return None if goal is None else goal + self._offsets[i]
+
+    def _reached(self, i: int, here: np.ndarray) -> float:
+        """Distance between craft i and its goal for which a camera makes room, m."""
+        before, goal = float(self._reach[i]), self._goal(i)
+        if goal is None:
+            return 0.0
+        now = float(np.linalg.norm(goal - here))
+        return max(before, now if before == 0.0 else min(now, _FAR * self.radius))
 
 
 def scene_geoms(scene: mujoco.MjvScene) -> NextGeom:
-    """What gives the next free geom of a scene."""
+    """A function that returns the next free geom of a scene."""
 
     def next_geom() -> mujoco.MjvGeom | None:
         if scene.ngeom == scene.maxgeom:
@@ -140,52 +217,92 @@ def scene_geoms(scene: mujoco.MjvScene) -> NextGeom:
     return next_geom
 
 
-def _compile(world: World, offsets: Sequence[tuple[float, float]]) -> mujoco.MjModel:
-    spec = mujoco.MjSpec.from_file(str(SCENE_XML))
-    if world == "airport":
-        attach_airport(spec)
-    elif len(offsets) == 1:
-        spec.visual.map.shadowclip = 0.6  # further out the floor would shade itself, in speckles
-    # Above the canopy and a little downwards: nose, front rotors and horizon are in the picture.
-    spec.body("quad").add_camera(
-        name="onboard", pos=(0.05, 0.0, 0.45), xyaxes=(0, -1, 0, 0.30, 0, 0.954), fovy=70
+_ONBOARD: Final = "stage/onboard"
+
+
+def _free_body(spec: mujoco.MjSpec) -> Any:
+    """The craft, `MjsBody`. `Vehicle.load` has checked that there is one."""
+    free = mujoco.mjtJoint.mjJNT_FREE
+    return next(body for body in spec.bodies if any(joint.type == free for joint in body.joints))
+
+
+def _size(model: mujoco.MjModel) -> tuple[float, float]:
+    """Radius of the craft about its body's origin, and height of its top above it, m."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
+    mujoco.mj_kinematics(model, data)
+    craft = model.body_rootid[model.geom_bodyid] == model.jnt_bodyid[0]
+    drawn = craft & (model.geom_group <= 2)
+    chosen = drawn if drawn.any() else craft
+    if not chosen.any():
+        return 1.0, 0.0
+    centres, bounds = data.geom_xpos[chosen], model.geom_rbound[chosen]
+    boxes, turns = model.geom_aabb[chosen], data.geom_xmat[chosen].reshape(-1, 3, 3)
+    tops = centres[:, 2] + (
+        np.einsum("ij,ij->i", turns[:, 2], boxes[:, :3])
+        + np.einsum("ij,ij->i", abs(turns[:, 2]), boxes[:, 3:])
     )
-    for number in range(1, len(offsets)):
-        frame = spec.worldbody.add_frame(pos=(*offsets[number], 0.0))
-        spec.attach(mujoco.MjSpec.from_file(str(QUAD_XML)), frame=frame, prefix=f"{number}/")
-    # Software draws them too: finer ones cost more than they show.
-    spec.visual.quality.shadowsize = min(spec.visual.quality.shadowsize, 2048)
-    spec.visual.quality.offsamples = 4
-    return spec.compile()
+    radius = float((np.linalg.norm(centres, axis=1) + bounds).max())
+    return max(radius, 1e-3), float(tops.max())
 
 
-def _grid(drones: int) -> list[tuple[float, float]]:
-    """Places of so many craft, x and y in m: rows as square as can be, the first at the origin."""
-    columns = math.isqrt(drones - 1) + 1
-    return [(-_SPACING * (i // columns), -_SPACING * (i % columns)) for i in range(drones)]
+def _add_onboard_camera(spec: mujoco.MjSpec, radius: float, top: float) -> None:
+    """Above the craft and a little downwards: nose, front rotors and horizon are seen."""
+    _free_body(spec).add_camera(
+        name=_ONBOARD,
+        pos=(0.03 * radius, 0.0, top + 0.154 * radius),
+        xyaxes=(0, -1, 0, 0.30, 0, 0.954),
+        fovy=70,
+    )
 
 
-def _disc(next_geom: NextGeom, centre: np.ndarray) -> None:
-    size = (1.7, 0.006, 0.0)  # radius, half of its height
-    _decoration(next_geom, mujoco.mjtGeom.mjGEOM_CYLINDER, size, centre, _DISC)
+def _add_craft(spec: mujoco.MjSpec, vehicle: Path, offset: np.ndarray, prefix: str) -> None:
+    frame = spec.worldbody.add_frame(pos=offset)
+    craft = mujoco.MjSpec.from_file(str(vehicle))  # must outlive its body
+    frame.attach_body(_free_body(craft), prefix, "")
 
 
-def _piece(next_geom: NextGeom, start: np.ndarray, end: np.ndarray, freshness: float) -> None:
+def _scale_drawing(model: mujoco.MjModel, radius: float, spread: float) -> None:
+    """Set the near end of drawing, the shadow's fineness and the floor's squares for the craft.
+
+    Ground and light that the vehicle's file brings stay as they are.
+    """
+    visual, extent = model.vis, model.stat.extent
+    visual.global_.fovy = _FOVY
+    visual.map.znear = min(visual.map.znear * extent, _NEAR * radius) / extent
+    # Software draws shadows too: finer ones cost more than they show.
+    visual.quality.shadowsize = min(visual.quality.shadowsize, 2048)
+    floor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{SCENE_PREFIX}floor")
+    if floor >= 0:
+        model.mat_texrepeat[floor] *= 10.0 ** -round(math.log10(radius))
+        # Further out the floor would shade itself, in speckles.
+        visual.map.shadowclip = min(visual.map.shadowclip, (2.0 * radius + spread) / extent)
+
+
+def _grid(drones: int, spacing: float) -> np.ndarray:
+    """Places of the craft, shape (drones, 3), m: nearly a square, the first at the origin."""
+    rows, columns = np.divmod(np.arange(drones), math.isqrt(drones - 1) + 1)
+    return -spacing * np.stack((rows, columns, np.zeros(drones)), axis=1)
+
+
+def _piece(
+    next_geom: NextGeom, start: np.ndarray, end: np.ndarray, radius: float, freshness: float
+) -> None:
     kind, rgba = mujoco.mjtGeom.mjGEOM_CAPSULE, (*_PATH, 0.85 * freshness)
     if not np.array_equal(start, end):
         geom = _decoration(next_geom, kind, (1.0, 1.0, 1.0), start, rgba)
         if geom is not None:
-            mujoco.mjv_connector(geom, kind, 0.035, start, end)
+            mujoco.mjv_connector(geom, kind, radius, start, end)
 
 
 def _decoration(
     next_geom: NextGeom,
     kind: mujoco.mjtGeom,
-    size: tuple[float, ...],
+    size: Sequence[float],
     centre: np.ndarray,
-    rgba: tuple[float, ...],
+    rgba: Sequence[float],
 ) -> mujoco.MjvGeom | None:
-    """A geom that casts no shadow; None where there is no more room."""
+    """A geom that casts no shadow; None if the scene is full."""
     if (geom := next_geom()) is not None:
         color = np.array(rgba, np.float32)
         mujoco.mjv_initGeom(geom, kind, np.array(size), centre, np.eye(3).ravel(), color)

@@ -1,26 +1,31 @@
-"""A page for browsers: MuJoCo's web viewer, where there is no display or it is elsewhere.
+"""A page for browsers, MuJoCo's web viewer: for machines without a display.
 
 The server draws nothing: the browser gets the model once and then poses, and draws them itself.
 """
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
+from http import HTTPStatus
 from ipaddress import ip_address
 from typing import Any, Final
 
 import mujoco
 from mujoco.studio import launch_thread, messages, plugin, viewer_protocol, web_viewer
 from mujoco.studio.dear_imgui import dear_imgui as imgui
+from mujoco.studio.web import web_server
 from mujoco.studio.web.state_payload import MAX_EXTRA_GEOMS
 
-from .camera import Aim
-from .live import Lines
+from ..models.errors import InputError
+from .live import Aim, Lines
 from .pace import Pace, Press
 from .stage import Stage
 
-__all__ = ["WebPage"]
+__all__ = ["WebPage", "refusal"]
 
 _HOST: Final = "127.0.0.1"
+_NAMES: Final = ("127.0.0.1", "localhost", "[::1]")
+"""Of this machine in a browser's address, and of the near end of an `ssh -L`."""
 _KEYS: Final[tuple[tuple[Any, Press], ...]] = (
     (imgui.Key.Space, "pause"),
     (imgui.Key.RightArrow, "step"),
@@ -33,24 +38,63 @@ _COLUMN: Final = 90.0
 """Where values begin, in pixels of the panel."""
 
 
+def refusal(host: str | None, origin: str | None) -> str | None:
+    """Why a request is refused, by its headers; None if it is not.
+
+    A page of another site may open a WebSocket to this machine, and its name server may name this
+    machine's address. `Host` and `Origin` then tell the other site's name.
+
+    Args:
+        host: Of the header `Host`: the address that the browser's user opened.
+        origin: Of the header `Origin`: the page that asks. Programs that are no browsers have none.
+    """
+    name, _, port = (host or "").lower().rpartition(":")
+    if not port.isdecimal():
+        name = (host or "").lower()
+    if name not in _NAMES:
+        return f"Host: expected {', '.join(_NAMES)}, got {host!r:.80}"
+    if origin is not None and origin.lower() != f"http://{(host or '').lower()}":
+        return f"Origin: expected the page of this viewer, got {origin!r:.80}"
+    return None
+
+
+def _guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
+    """The server of MuJoCo's page, which takes every request, with `refusal` before it."""
+
+    def guarded(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        def checked(connection: Any, request: Any) -> Any:
+            hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+            reason = refusal(hosts[0] if len(hosts) == 1 else None, ", ".join(origins) or None)
+            if reason is not None:
+                return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
+            return process_request(connection, request)
+
+        return serve(*args, process_request=checked, **options)
+
+    return guarded
+
+
+web_server.serve = _guarded(web_server.serve)
+
+
 class WebPage:
     """A stage in browsers, served on this machine's loopback alone. `Surface`.
 
     Args:
         stage: What is shown.
-        pace: What the buttons and keys are for.
+        pace: What buttons and keys change.
         port: TCP port; 0 takes the first free one from 8080 on.
 
     Attributes:
-        port: The one that it got.
+        port: The TCP port.
 
     Raises:
-        ValueError: The port is in use, or none.
+        InputError: The port is in use, or none.
     """
 
     def __init__(self, stage: Stage, pace: Pace, port: int) -> None:
         if not 0 <= port <= 65535:
-            raise ValueError(f"port: expected 0 to 65535, got {port}")
+            raise InputError(f"port: expected 0 to 65535, got {port}")
         self._stage, self._panel = stage, _Panel(pace, Aim(stage))
         config = viewer_protocol.ViewerConfig(title="rotorgram", gfx="web", http_port=port)
 
@@ -64,7 +108,7 @@ class WebPage:
             while not self._panel.started.wait(0.05):
                 self._handle.is_running()  # raises what the other thread has raised
         except RuntimeError:  # its own sentence names an option that is not ours
-            raise ValueError(f"port: expected a free one, got {port}, which is in use") from None
+            raise InputError(f"port: expected a free one, got {port}, which is in use") from None
         self.port = self._panel.viewer.address[1]
         self.where = (
             f"at http://{_HOST}:{self.port}/ (from another machine after "
@@ -90,7 +134,7 @@ class WebPage:
         return bool(self._handle.is_running())
 
     def is_watched(self) -> bool:
-        """Whether a browser has come, with the pointer over the page."""
+        """Whether a browser has opened it and has the pointer over it."""
         return self._panel.watched.is_set()
 
     def close(self) -> None:
@@ -99,9 +143,9 @@ class WebPage:
 
 
 class _LoopbackViewer(web_viewer.WebViewer):  # type: ignore[misc]
-    """MuJoCo's, which binds every interface of the machine and asks nobody for a password.
+    """MuJoCo's viewer on the loopback; by itself it binds every interface of the machine.
 
-    It has no option for the address yet, only an attribute that it sets itself.
+    It has no option for the address, only an attribute that it sets itself.
     """
 
     @property
@@ -114,7 +158,7 @@ class _LoopbackViewer(web_viewer.WebViewer):  # type: ignore[misc]
 
     @property
     def address(self) -> tuple[str, int]:
-        """Where it is served."""
+        """Host and port."""
         host, port = self._http_sock.getsockname()[:2]
         return str(host), int(port)
 
@@ -129,7 +173,7 @@ class _LoopbackViewer(web_viewer.WebViewer):  # type: ignore[misc]
 
 @dataclass(frozen=True, kw_only=True)
 class _Look(messages.Snapshot):  # type: ignore[misc]
-    """What there is to see besides poses."""
+    """What is drawn besides poses."""
 
     lines: Lines
     geoms: list[mujoco.MjvGeom]

@@ -71,7 +71,7 @@ class NumpyDraw:
     Args:
         streams: Of all worlds.
         ids: Worlds that draw.
-        shape: (W, A).
+        shape: (W, A), or () for a single drone.
         chosen: By name, what a reset's options put in place of a draw: shape (W, A, *size).
     """
 
@@ -79,7 +79,7 @@ class NumpyDraw:
         self,
         streams: Streams,
         ids: Sequence[int],
-        shape: tuple[int, int],
+        shape: tuple[int, ...],
         chosen: Mapping[str, Any] | None = None,
     ) -> None:
         self._streams = streams
@@ -103,7 +103,8 @@ class NumpyDraw:
 
     def _draw(self, kind: str, parameters: Any, size: tuple[int, ...], name: str) -> Array:
         numbers = np.zeros((*self._shape, *size))
-        one_world = (self._shape[1], *size)
+        one_world = (*self._shape[1:], *size)
         for world in self._ids:
-            numbers[world] = getattr(self._streams.of(world), kind)(*parameters, one_world)
-        return self._chosen.get(name, numbers)
+            place = world if self._shape else ...
+            numbers[place] = getattr(self._streams.of(world), kind)(*parameters, one_world)
+        return self._chosen.get(name, numbers[()])

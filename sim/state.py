@@ -1,16 +1,20 @@
 """What a world is in: arrays whose first two axes are W worlds and the A drones of each.
 
+A single drone has neither axis: code that counts axes from the last, as `position[..., 2]`, serves
+both.
+
 Frames: world x, y, z with z up, right-handed; body x forward, y left, z up. SI units, quaternions
 scalar first. Arrays are NumPy's, or torch's where the backend runs on another device.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-__all__ = ["Array", "Pose", "WorldState", "clip", "constant"]
+__all__ = ["Array", "Pose", "WorldState", "clip", "component", "constant", "on_host", "stack"]
 
 Array = Any
 """A NumPy array or a torch tensor. Code for both uses operators and the namespace of the array
@@ -37,7 +41,7 @@ class WorldState:
     @property
     def tilt_cosine(self) -> Array:
         """Cosine of the angle between each body's z axis and the vertical, shape (W, A)."""
-        x, y = self.quaternion[..., 1], self.quaternion[..., 2]
+        x, y = component(self.quaternion, 1), component(self.quaternion, 2)
         return 1 - 2 * (x * x + y * y)
 
 
@@ -59,15 +63,40 @@ class Pose:
 
 def clip(array: Array, low: Any, high: Any) -> Array:
     """The nearest numbers within bounds: numbers, or arrays of the same kind."""
+    if isinstance(array, float):  # a single drone's number, NumPy's among them
+        return np.float64(low) if array < low else np.float64(high) if array > high else array
     if isinstance(array, np.ndarray):
         return np.minimum(np.maximum(array, low), high)  # a third of the time of NumPy's clip
     return array.clip(low, high)
 
 
-def constant(values: np.ndarray, like: Array) -> Array:
-    """An array of the vehicle or the task as an array of the same kind as `like`."""
+def component(array: Array, index: int) -> Array:
+    """`array[..., index]`; of a single drone a number, with which NumPy is ten times faster."""
+    return array[..., index][()]
+
+
+def stack(parts: Sequence[Any]) -> Array:
+    """Arrays along a new last axis; a number among them counts for all drones.
+
+    Of a single drone they are numbers.
+    """
+    for like in parts:
+        if getattr(like, "ndim", 0):
+            break
+    else:
+        return np.array(parts)  # an eighth of the time of NumPy's stack
     if isinstance(like, np.ndarray):
+        return np.stack([p if getattr(p, "ndim", 0) else np.full_like(like, p) for p in parts], -1)
+    import torch
+
+    return torch.stack([p if hasattr(p, "ndim") else torch.full_like(like, p) for p in parts], -1)
+
+
+def constant(values: Any, like: Array) -> Array:
+    """An array of the vehicle or the task as an array of the same kind as `like`."""
+    if isinstance(like, np.ndarray | float):
         return values
+    values = np.asarray(values, np.float64)
     return _tensor(values.tobytes(), values.shape, like.dtype, like.device)
 
 
@@ -77,3 +106,11 @@ def _tensor(raw: bytes, shape: tuple[int, ...], dtype: Any, device: Any) -> Arra
 
     array = np.frombuffer(raw).reshape(shape)
     return torch.tensor(array, dtype=dtype, device=device)
+
+
+def on_host(array: Array) -> np.ndarray:
+    """A number, array or tensor as a NumPy array; the memory may be shared. Tensors: float64."""
+    if isinstance(array, np.ndarray | np.generic | float | int):
+        return np.asarray(array)
+    copied: np.ndarray = array.detach().cpu().numpy()
+    return copied.astype(np.float64) if copied.dtype.kind == "f" else copied

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, Final, Literal, Protocol, get_args
 
-from ..models.errors import InputError
+from ..models.errors import InputError, require
 from ..models.vehicle import Vehicle
 from .random import Draw
 from .state import Array, Pose, WorldState
@@ -15,6 +15,9 @@ Backend = Literal["mujoco", "warp"]
 """`mujoco`: threads of this machine, float64. `warp`: MuJoCo Warp, float32, a GPU if there is
 one."""
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
+
+_PACKAGES: Final = {"mujoco": (), "warp": ("torch", "warp", "mujoco_warp")}
+_SETTINGS: Final = {"mujoco": "num_threads", "warp": "device"}
 
 MAX_WORLDS: Final = 1 << 16
 """Most worlds of a batch."""
@@ -33,18 +36,18 @@ class World(Protocol):
 
     Attributes:
         vehicle: What flies in each.
-        shape: (W, A).
+        shape: (W, A), the leading axes of all arrays; () for a single drone.
         state: As the last step or reset left it.
         xp: Namespace of the array API standard for the state's arrays.
     """
 
     vehicle: Vehicle
-    shape: tuple[int, int]
+    shape: tuple[int, ...]
     state: WorldState
     xp: Any
 
     def reset(self, mask: Array, pose: Pose) -> None:
-        """Begin anew in the worlds of the mask, bool, shape (W,); their poses are those given."""
+        """Begin anew in the worlds of the mask, bool, shape (W, A); their poses are those given."""
 
     def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
         """Fly for so many physics steps with constant thrusts.
@@ -52,7 +55,7 @@ class World(Protocol):
         Args:
             thrust: N, shape (W, A, R).
             substeps: Physics steps.
-            mask: Worlds that fly, bool, shape (W,); the others stay as they are. None: all fly.
+            mask: Worlds that fly, bool, shape (W, A); the others stay as they are. None: all fly.
 
         Raises:
             PhysicsError: A state is bad; reset the worlds that the message names.
@@ -62,8 +65,18 @@ class World(Protocol):
         """Seed the random streams of the worlds of a mask; a seed of None leaves its stream.
 
         Args:
-            mask: bool, shape (W,).
+            mask: bool, shape (W, A).
             seeds: Shape (W,).
+        """
+
+    def checked(self, actions: Array, width: int, choices: int, flown: Array | None) -> Array:
+        """Actions as this backend's arrays, where those are not NumPy's. Raises `InputError`.
+
+        Args:
+            actions: What the caller gave: shape (N, k), or (N,) where they are choices.
+            width: k.
+            choices: 0, or how many.
+            flown: Whose actions count, bool, shape (N,); None: all.
         """
 
     def draw(self, mask: Array, chosen: Any = None) -> Draw:
@@ -97,6 +110,14 @@ def make_world(
         raise InputError(f"backend: expected {' or '.join(BACKENDS)}, got {backend!r}")
     if type(num_worlds) is not int or not 1 <= num_worlds <= MAX_WORLDS:
         raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
+    for name, value in settings.items():
+        if name != _SETTINGS[backend]:
+            raise InputError(
+                f"{name}: expected {_SETTINGS[backend]}, the setting of the backend {backend}, "
+                f"got {name}={value!r}"
+            )
+    for package in _PACKAGES[backend]:
+        require(package, "gpu", f"the backend {backend}")
     module = import_module(f".backends.{backend}", __package__)
     world: World = module.make(vehicle, num_worlds, **settings)
     return world

@@ -1,42 +1,34 @@
-"""Flights, films and pixels for the tests of what is drawn."""
+"""Moments, films and pixels for the tests of what is drawn."""
 
 import subprocess
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from imageio_ffmpeg import (  # type: ignore[import-untyped]
     get_ffmpeg_exe,
 )
 from PIL import Image
-from rotorgram.envs import ElevationConfig
-from rotorgram.experiments.filming import Film, Shot
-from rotorgram.experiments.flights import Track
-from rotorgram.rendering import Moment
+from rotorgram.rendering import MetricValue, Moment
 
 WIDTH, HEIGHT = 160, 120
-SHORT = ElevationConfig(episode_length=25)  # half a second
-FAST = Film(width=WIDTH, height=HEIGHT, world="plain", fast=True, overlay=False)
+DATA: Final = Path(__file__).parent / "data"
+HEXA: Final = DATA / "meadow_hexa.xml"
+"""Six rotors of up to 30 N, 0.62 m from centre to tip, with a ground of its own."""
+TINY: Final = DATA / "tiny.xml"
+"""27 g, four rotors of up to 0.15 N, 0.069 m from centre to tip."""
 
 
-def at(elevation: float, error: float = 0.0, **rest: Any) -> Moment:
-    """A level craft over the origin."""
-    return Moment(
-        position=(0.0, elevation, 0.0),
-        attitude=(0.0, 0.0, 0.0),
-        thrusts=(49.0, 49.0, 49.0, 49.0),
-        error=error,
-        **rest,
-    )
-
-
-def track(*elevations: float, target: float = 5.0, ending: Any = "truncated") -> Track:
-    moments = [at(y, target - y, step=step) for step, y in enumerate(elevations)]
-    return Track(moments=moments, control_period=0.02, ending=ending)
-
-
-def shot(*tracks: Track, name: str = "PID") -> Shot:
-    return Shot(name=name, color="#7CC8F2", tracks=list(tracks))
+def at(elevation: float, error: float = 0.0, *, goal: Any = True, **rest: Any) -> Moment:
+    """A level craft over the origin, whose goal is `error` metres higher; goal=None: no goal."""
+    fields: dict[str, Any] = {
+        "position": (0.0, elevation, 0.0),
+        "attitude": (0.0, 0.0, 0.0),
+        "thrusts": (49.0, 49.0, 49.0, 49.0),
+        "goal": (0.0, elevation + error, 0.0) if goal is True else goal,
+        "metrics": (MetricValue("elevation_error", error, "m", "E"),),
+    }
+    return Moment(**{**fields, **rest})
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -52,11 +44,11 @@ def decoded(path: Path, width: int, height: int) -> np.ndarray:
 
 
 def same(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two pictures are one, drawn twice: drivers round now so, now so."""
+    """Whether two pictures show the same: drivers round differently from time to time."""
     return one.shape == other.shape and int(abs(one.astype(int) - other).max()) <= 3
 
 
-def told_of(path: Path) -> str:
-    """What ffmpeg tells of a film."""
+def ffmpeg_facts(path: Path) -> str:
+    """What ffmpeg prints about a film."""
     words = [get_ffmpeg_exe(), "-i", str(path)]
     return subprocess.run(words, capture_output=True, text=True, check=False).stderr

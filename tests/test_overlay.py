@@ -1,14 +1,29 @@
 """What is written on a picture, and where."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
-from pictures import at
-from rotorgram.rendering import Moment
-from rotorgram.rendering.overlay import Overlay
+from pictures import HEXA, TINY, at
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.rendering import MetricValue
+from rotorgram.rendering.overlay import Overlay, graph_scale
+
+QUAD = Vehicle.load()
+
+
+def overlay_of(width: int, height: int, **settings: Any) -> Overlay:
+    """An overlay for the paper's craft, 1 s long, from -1 to 1 m."""
+    defaults: dict[str, Any] = {
+        "title": "x", "color": "#00FF00", "like": at(5.0), "vehicle": QUAD, "period": 0.02,
+        "seconds": 1.0, "scale": (-1.0, 1.0),
+    }  # fmt: skip
+    return Overlay(width, height, **{**defaults, **settings})
 
 
 def test_the_curve_has_the_colour_of_the_flight_and_the_place_of_its_errors() -> None:
-    overlay = Overlay(640, 360, title="A2C", color="#00FF00", period=0.02, seconds=5.0, band=1.0)
+    overlay = overlay_of(640, 360, title="A2C", seconds=5.0)
     picture = np.zeros((360, 640, 3), np.uint8)
     drawn = overlay.draw(picture, at(5.0, step=125), [0.5] * 126)  # 2.5 s of 5 s
     strip = np.zeros((360, 640), bool)
@@ -34,7 +49,7 @@ def lit(overlay: Overlay, errors: list[float], height: int, width: int) -> np.nd
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_curve_that_leaves_its_scale_has_no_plateau(side: float) -> None:
-    overlay = Overlay(640, 360, title="x", color="#00FF00", period=0.02, seconds=2.0, band=0.5)
+    overlay = overlay_of(640, 360, seconds=2.0, scale=(-0.5, 0.5))
     rising = [side * step / 50 for step in range(101)]  # reaches the edge after 0.5 s of 2 s
     green = lit(overlay, rising, 360, 640)
     columns, middle = np.nonzero(green)[1], green.shape[0] // 2
@@ -52,7 +67,7 @@ def test_a_curve_that_leaves_its_scale_has_no_plateau(side: float) -> None:
 
 
 def test_a_step_across_the_scale_is_drawn_and_marked_where_it_leaves() -> None:
-    overlay = Overlay(640, 360, title="x", color="#00FF00", period=0.02, seconds=0.04, band=1.0)
+    overlay = overlay_of(640, 360, seconds=0.04)
     green = lit(overlay, [0.0, 2.0, -2.0], 360, 640)
     high, wide = green.shape
     assert green[high // 2, round(0.7 * wide) : round(0.8 * wide)].any()  # through 0 after 0.03 s
@@ -61,7 +76,7 @@ def test_a_step_across_the_scale_is_drawn_and_marked_where_it_leaves() -> None:
 
 
 def test_errors_beyond_the_band_stay_inside_the_strip() -> None:
-    overlay = Overlay(320, 240, title="x", color="#00FF00", period=0.02, seconds=1.0, band=0.5)
+    overlay = overlay_of(320, 240, scale=(-0.5, 0.5))
     drawn = overlay.draw(np.zeros((240, 320, 3), np.uint8), at(1.0), [0.0, 90.0, -90.0])
     rows = np.nonzero((drawn[120:, :, 1] > 200) & (drawn[120:, :, 0] < 60))[0] + 120
     assert rows.min() >= overlay.plot[1] - 1
@@ -70,10 +85,10 @@ def test_errors_beyond_the_band_stay_inside_the_strip() -> None:
 
 @pytest.mark.parametrize("size", [(640, 360), (320, 400), (320, 240), (1280, 720)])
 def test_full_thrusts_do_not_lie_on_their_name(size: tuple[int, int]) -> None:
-    overlay = Overlay(*size, title="x", period=0.02, seconds=1.0, band=1.0)
+    overlay = overlay_of(*size)
 
     def drawn(thrust: float) -> np.ndarray:
-        moment = Moment(position=(0, 5, 0), attitude=(0, 0, 0), thrusts=(thrust,) * 4, error=0.0)
+        moment = at(5.0, thrusts=(thrust,) * 4)
         return overlay.draw(np.zeros((*size[::-1], 3), np.uint8), moment, [0.0]).astype(int)
 
     nothing, full = drawn(0.0), drawn(100.0)
@@ -90,8 +105,8 @@ def test_full_thrusts_do_not_lie_on_their_name(size: tuple[int, int]) -> None:
 
 def test_bars_grow_with_the_thrust() -> None:
     def bar_pixels(thrust: float) -> int:
-        overlay = Overlay(640, 360, title="x", period=0.02, seconds=1.0, band=1.0)
-        moment = Moment(position=(0, 5, 0), attitude=(0, 0, 0), thrusts=(thrust,) * 4, error=0.0)
+        overlay = overlay_of(640, 360)
+        moment = at(5.0, thrusts=(thrust,) * 4)
         drawn = overlay.draw(np.zeros((360, 640, 3), np.uint8), moment, [0.0])
         return int((np.abs(drawn.astype(int) - (120, 190, 255)).max(axis=2) < 4).sum())
 
@@ -115,25 +130,97 @@ def test_bars_grow_with_the_thrust() -> None:
 def test_what_is_too_small_to_be_read_is_left_out(
     size: tuple[int, int], numbers: bool, strip: bool
 ) -> None:
-    overlay = Overlay(*size, title="PID", color="#00FF00", period=0.02, seconds=1.0, band=1.0)
+    overlay = overlay_of(*size, title="PID")
     assert (overlay.has_numbers, overlay.has_strip) == (numbers, strip)
     drawn = overlay.draw(np.zeros((*size[::-1], 3), np.uint8), at(5.0), [0.0, 0.5, 0.0])
     green = (drawn[..., 1] > 150) & (drawn[..., 0] < 80)
     assert green[: overlay.panel.lower].any()  # the title
     assert green[overlay.panel.lower :].any() == strip
     assert (drawn[..., 0] > 220).any() == (numbers or strip)
-    alone = Overlay(*size, title="PID", period=0.02, seconds=1.0, band=1.0, numbers=False)
+    alone = overlay_of(*size, title="PID", numbers=False)
     assert (alone.has_numbers, alone.has_strip) == (False, False)
 
 
 def test_an_overlay_covers_little_and_fits_any_size() -> None:
     grey = np.full((360, 640, 3), 128, np.uint8)
-    overlay = Overlay(640, 360, title="x" * 200, period=0.02, seconds=1.0, band=1.0)
+    overlay = overlay_of(640, 360, title="x" * 200)
     drawn = overlay.draw(grey, at(5.0), [0.0], note="terminated")
     assert (drawn[200:260] == grey[200:260]).all()  # where the craft is
     for width, height in ((16, 16), (160, 120), (100, 900), (900, 100)):
-        small = Overlay(width, height, title="name", period=0.02, seconds=1.0, band=1.0)
+        small = overlay_of(width, height, title="name")
         picture = np.zeros((height, width, 3), np.uint8)
         assert small.draw(picture, at(5.0), [0.1, 0.2], "terminated").shape == picture.shape
     with pytest.raises(ValueError, match="picture: expected"):
         overlay.draw(np.zeros((10, 10, 3), np.uint8), at(5.0), [0.0])
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([], (0.0, 0.1)),
+        ([0.0, 0.05], (0.0, 0.1)),
+        ([0.0, 0.11], (0.0, 0.15)),
+        ([-0.7, 0.2], (-1.0, 1.0)),
+        ([1.6], (0.0, 2.0)),
+        ([-3.0], (-3.0, 3.0)),
+        ([179.0], (0.0, 200.0)),
+        ([float("nan"), 4.0], (0.0, 5.0)),
+    ],
+)
+def test_a_graph_ends_at_round_numbers(values: list[float], expected: tuple[float, float]) -> None:
+    assert graph_scale(values) == pytest.approx(expected)
+
+
+def test_a_graph_from_zero_has_zero_at_its_lower_end() -> None:
+    overlay = overlay_of(640, 360, scale=(0.0, 2.0))
+    green = lit(overlay, [1.0] * 51, 360, 640)
+    assert np.nonzero(green)[0].mean() == pytest.approx(green.shape[0] / 2, abs=2)
+    green = lit(overlay, [0.0] * 51, 360, 640)
+    assert np.nonzero(green)[0].mean() == pytest.approx(green.shape[0] - 1, abs=3)
+
+
+def test_lines_follow_the_task_and_the_vehicle() -> None:
+    hover = at(1.0, 0.25, metrics=(MetricValue("position_error", 0.25, "m", "e"),
+                                   MetricValue("heading_error", -12.345, "deg"),
+                                   MetricValue("gates_passed", 3.0)))  # fmt: skip
+    assert hover.lines(100.0) == [
+        ("e", "0.250 m"),
+        ("heading error", "-12.35 deg"),
+        ("gates passed", "3"),
+        ("elevation", "1.00 m"),
+        ("goal", "1.25 m"),
+        ("F1 to F4", "49 49 49 49 N"),
+        ("reward", "+0.000"),
+        ("step", "0"),
+        ("episode", "0"),
+    ]
+    free = at(1.0, goal=None, metrics=(), thrusts=(0.066,) * 4).lines(0.15)
+    assert free[:2] == [("elevation", "1.00 m"), ("F1 to F4", "66 66 66 66 mN")]
+    assert at(1.0, thrusts=(3.25,)).lines(13.0)[3] == ("F1", "3.2 N")
+    six = at(1.0, thrusts=(5.0, 7.0, 5.0, 7.0, 5.0, 7.0)).lines(30.0)
+    assert six[3] == ("F1 to F6, mean", "6.0 N")
+
+
+@pytest.mark.parametrize(("file", "rotors"), [(HEXA, 6), (TINY, 4)])
+def test_there_is_a_bar_for_each_rotor_with_its_own_limits(file: Path, rotors: int) -> None:
+    vehicle = Vehicle.load(file)
+    thrusts = tuple(vehicle.thrust_high / 2)
+    overlay = overlay_of(640, 360, vehicle=vehicle, like=at(1.0, thrusts=thrusts))
+    black = np.zeros((360, 640, 3), np.uint8)
+    drawn = overlay.draw(black, at(1.0, thrusts=thrusts), [0.0]).astype(int)
+    bars, rest = (
+        np.abs(drawn - color).max(axis=2) < 4 for color in ((120, 190, 255), (70, 82, 98))
+    )
+    row = bars.sum(axis=1).argmax()
+    begins = np.diff(np.nonzero(bars[row])[0], prepend=-99)
+    assert (begins > 6).sum() == rotors  # the mark at hover is thinner
+    assert bars[row].sum() == pytest.approx(rest[row].sum(), rel=0.35)  # half full
+
+
+def test_without_metrics_there_is_no_graph() -> None:
+    overlay = overlay_of(640, 360, like=at(5.0, metrics=()))
+    assert (overlay.has_numbers, overlay.has_strip) == (True, False)
+    picture = np.zeros((360, 640, 3), np.uint8)
+    drawn = overlay.draw(picture, at(5.0, metrics=()), [])
+    assert drawn[: overlay.panel.lower].any()
+    assert not drawn[overlay.panel.lower :].any()

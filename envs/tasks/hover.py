@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from ...models.errors import InputError
-from ...sim import Array, Draw, Pose, RotorThrust, WorldState, clip, constant
+from ...sim import Array, Draw, Pose, RotorThrust, WorldState, clip, component, constant, stack
 from ..spec import ArraySpec, Metric
 from .task import Outcome, Task, TaskOptions, check_number, finite
 
@@ -161,8 +161,8 @@ class Hover(Task):
         # First tilted about a horizontal axis, then turned about the vertical.
         w, x, y = xp.cos(tilt), xp.sin(tilt) * xp.cos(azimuth), xp.sin(tilt) * xp.sin(azimuth)
         c, s = xp.cos(heading), xp.sin(heading)
-        quaternion = xp.stack((c * w, c * x - s * y, c * y + s * x, s * w), axis=-1)
-        goal = xp.stack([0.0 * tilt + value for value in options.goal], axis=-1)
+        quaternion = stack((c * w, c * x - s * y, c * y + s * x, s * w))
+        goal = stack([0.0 * tilt + value for value in options.goal])
         return Pose(position=goal + offset, quaternion=quaternion)
 
     def observe(self, state: WorldState) -> dict[str, Array]:
@@ -181,11 +181,11 @@ class Hover(Task):
         offset = self.goal(state) - state.position
         distance = xp.sqrt(xp.sum(offset * offset, axis=-1))
         nose, _ = _axes(xp, state.quaternion)
-        off = xp.atan2(nose[..., 1], nose[..., 0]) - self._wanted
+        off = xp.atan2(component(nose, 1), component(nose, 0)) - self._wanted
         heading = xp.atan2(xp.sin(off), xp.cos(off)) * (180 / math.pi)
         rates = xp.sqrt(xp.sum(state.body_rates * state.body_rates, axis=-1))
         outside = distance > self.options.flight_band
-        terminated = outside | state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
+        terminated = outside | state.touching[()] | (state.tilt_cosine < LEAST_TILT_COSINE)
         return Outcome(
             reward={
                 "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
@@ -199,8 +199,8 @@ class Hover(Task):
 
     def goal(self, state: WorldState) -> Array:
         """The same for every drone."""
-        zero = 0.0 * state.position[..., 0]
-        return self.xp.stack([zero + value for value in self.options.goal], axis=-1)
+        zero = 0.0 * component(state.position, 0)
+        return stack([zero + value for value in self.options.goal])
 
     def _turned(self, vectors: Array) -> Array:
         """World vectors in the world frame turned by the wanted heading, shape (..., 3)."""
@@ -208,12 +208,12 @@ class Hover(Task):
             return vectors
         c, s = math.cos(self._wanted), math.sin(self._wanted)
         x, y = vectors[..., 0], vectors[..., 1]
-        return self.xp.stack((c * x + s * y, c * y - s * x, vectors[..., 2]), axis=-1)
+        return stack((c * x + s * y, c * y - s * x, vectors[..., 2]))
 
 
 def _axes(xp: Any, quaternion: Array) -> tuple[Array, Array]:
     """Directions of body x and body z in the world frame, shape (..., 3) each."""
-    w, x, y, z = (quaternion[..., i] for i in range(4))
+    w, x, y, z = (component(quaternion, i) for i in range(4))
     nose = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
     up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-    return xp.stack(nose, axis=-1), xp.stack(up, axis=-1)
+    return stack(nose), stack(up)

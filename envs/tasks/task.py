@@ -1,8 +1,9 @@
 """What a task is. One class serves every backend, one drone or thousands, in process or over UDP.
 
-A task is written for arrays whose first two axes are W worlds and the A drones of each, with
-operators and the functions of `self.xp` (the array API standard: NumPy, or torch on a GPU), and
-never changes an array in place.
+A task is written for arrays with any leading axes: W worlds and the A drones of each, or none for a
+single drone. It counts axes from the last (`position[..., 2]`), uses operators, `stack` and the
+functions of `self.xp` (the array API standard: NumPy, or torch on a GPU), and never changes an
+array in place.
 """
 
 import math
@@ -90,7 +91,7 @@ class Task:
     Attributes:
         options: An instance of `Options`.
         vehicle: What flies.
-        shape: (W, A).
+        shape: (W, A), or () for a single drone.
         xp: Namespace of the array API standard.
         controller: What an action means; set by `setup`.
         observation: What an agent sees, as specs of one drone; set by `setup`.
@@ -104,7 +105,7 @@ class Task:
     observation: tuple[ArraySpec, ...]
 
     def __init__(
-        self, options: Any, vehicle: Vehicle, shape: tuple[int, int] = (1, 1), xp: Any = np
+        self, options: Any, vehicle: Vehicle, shape: tuple[int, ...] = (), xp: Any = np
     ) -> None:
         self.options = options
         self.vehicle = vehicle
@@ -120,7 +121,7 @@ class Task:
         """Begin episodes: draw what they need, and say where the drones start.
 
         Args:
-            mask: Worlds that begin one, bool, shape (W, 1). The first call has all of them. Keep
+            mask: Worlds that begin one, bool, shape (W, A). The first call has all of them. Keep
                 what belongs to the others: `self.xp.where(mask, new, self.old)`.
             draw: Draws numbers of shape (W, A, ...).
         """

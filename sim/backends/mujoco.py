@@ -1,7 +1,7 @@
 """MuJoCo on the threads of this machine, float64.
 
-`mujoco.batch.Batch` gives each world the bits that a loop over single ones gives it, with any number
-of threads.
+`mujoco.batch.Batch` gives each world the bits that a loop over single ones gives it, with any
+number of threads.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,6 +34,8 @@ class MujocoWorld:
     `PhysicsError`, because a silent reset would be learnt from, and that file is switched off for
     the whole process; a log file of another name stays on.
 
+    A single world has no leading axes: NumPy's scalars are ten times faster than its arrays of one.
+
     Args:
         vehicle: What flies.
         num_worlds: W.
@@ -45,85 +47,91 @@ class MujocoWorld:
     def __init__(self, vehicle: Vehicle, num_worlds: int, num_threads: int = 0) -> None:
         _switch_off_log_file()
         self.vehicle = vehicle
-        self.shape = (num_worlds, 1)
+        self.shape: tuple[int, ...] = (num_worlds, 1) if num_worlds > 1 else ()
         self._streams = Streams(num_worlds)
         self._check = contact_check(vehicle.timestep)
         threads = 1 if num_worlds == 1 else num_threads
         self._batch = batch = Batch(vehicle.model, num_worlds, threads)
         # Live views of simulator memory, made once.
-        self._qpos: np.ndarray = batch.bind("qpos")
-        self._qvel: np.ndarray = batch.bind("qvel")
+        qpos: np.ndarray = batch.bind("qpos")
+        qvel: np.ndarray = batch.bind("qvel")
         self._ctrl: np.ndarray = batch.bind("ctrl")
         self._contacts: np.ndarray = batch.bind("ncon")
         self._warnings: np.ndarray = batch.warning[:, :, 1]  # counts, beside the last info
         self._no_warnings = self._warnings.tobytes()
         newtons = np.array([rotor.newtons for rotor in vehicle.rotors])
-        self._controls_per_newton = None if (newtons == 1.0).all() else 1.0 / newtons
+        self._newtons = None if (newtons == 1.0).all() else newtons
+        # Where controls are newtons, they are the thrusts.
+        self._thrust = self._ctrl if self._newtons is None else np.zeros_like(self._ctrl)
+        self._touching = np.zeros(num_worlds, bool)
+        lead = self.shape
         self.state = WorldState(
-            position=self._qpos[:, None, :3],
-            quaternion=self._qpos[:, None, 3:],
-            velocity=self._qvel[:, None, :3],
-            body_rates=self._qvel[:, None, 3:],
-            thrust=np.zeros((num_worlds, 1, vehicle.num_rotors)),
-            touching=np.zeros((num_worlds, 1), bool),
+            position=qpos[:, :3].reshape((*lead, 3)),
+            quaternion=qpos[:, 3:].reshape((*lead, 4)),
+            velocity=qvel[:, :3].reshape((*lead, 3)),
+            body_rates=qvel[:, 3:].reshape((*lead, 3)),
+            thrust=self._thrust.reshape((*lead, -1)),
+            touching=self._touching.reshape(lead),
         )
+        assert np.shares_memory(self.state.position, qpos)
 
     def reset(self, mask: Array, pose: Pose) -> None:
         """As `World.reset`."""
-        ids, state, hover = np.flatnonzero(mask), self.state, self.vehicle.hover_thrust
+        ids = self._ids(mask)
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        state.position[ids] = pose.position[ids]
-        state.quaternion[ids] = (1, 0, 0, 0) if pose.quaternion is None else pose.quaternion[ids]
-        state.velocity[ids] = 0 if pose.velocity is None else pose.velocity[ids]
-        state.body_rates[ids] = 0 if pose.body_rates is None else pose.body_rates[ids]
-        state.thrust[ids] = hover if pose.thrust is None else pose.thrust[ids]
+        state, here = self.state, () if self.shape == () else ids
+        state.position[here] = pose.position[here]
+        for name, plain in (
+            ("quaternion", (1, 0, 0, 0)),
+            ("velocity", 0),
+            ("body_rates", 0),
+            ("thrust", self.vehicle.hover_thrust),
+        ):
+            given = getattr(pose, name)
+            getattr(state, name)[here] = plain if given is None else given[here]
         self._apply_thrust()
         self._batch.forward(ids)
-        state.touching[ids, 0] = self._contacts[ids] > 0
+        self._touching[ids] = self._contacts[ids] > 0
 
     def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
         """As `World.step`."""
-        state, ids = self.state, None
-        if mask is None:
-            state.thrust[:] = thrust
-        else:
-            ids = np.flatnonzero(mask)
-            state.thrust[ids] = thrust[ids]
+        ids = None if mask is None else self._ids(mask)
+        here = ... if ids is None or self.shape == () else ids
+        self.state.thrust[here] = thrust[here]
         self._apply_thrust()
-        touching = None
+        some = ... if ids is None else ids
+        touching = self._touching
+        touching[some] = False
         while substeps > 0:
             try:
                 self._batch.step(ids, nstep=min(substeps, self._check))
             except SimulationError as error:
                 raise PhysicsError(f"{error}: reset the env") from None
-            here = self._contacts > 0
-            touching = here if touching is None else touching | here
+            if np.count_nonzero(self._contacts):
+                touching[some] |= self._contacts[some] > 0
             substeps -= self._check
-        if mask is None:
-            state.touching[:, 0] = touching
-        else:
-            np.copyto(state.touching[:, 0], touching, where=mask)
         if self._warnings.tobytes() != self._no_warnings:
             raise PhysicsError(self._describe_warnings())
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """As `World.seed`."""
-        ids = np.flatnonzero(mask).tolist()
+        ids = self._ids(mask).tolist()
         self._streams.seed(ids, [seeds[i] for i in ids])
 
     def draw(self, mask: Array, chosen: Mapping[str, Any] | None = None) -> Draw:
         """As `World.draw`."""
-        return NumpyDraw(self._streams, np.flatnonzero(mask).tolist(), self.shape, chosen)
+        return NumpyDraw(self._streams, self._ids(mask).tolist(), self.shape, chosen)
 
     def close(self) -> None:
         """Nothing is held but memory."""
 
+    def _ids(self, mask: Array) -> np.ndarray:
+        """Numbers of the worlds of a mask of the leading shape, or of shape (W,)."""
+        return np.flatnonzero(mask)
+
     def _apply_thrust(self) -> None:
-        thrust = self.state.thrust[:, 0]
-        if self._controls_per_newton is None:
-            self._ctrl[:] = thrust
-        else:
-            np.multiply(thrust, self._controls_per_newton, out=self._ctrl)
+        if self._newtons is not None:
+            np.divide(self._thrust, self._newtons, out=self._ctrl)
 
     def _describe_warnings(self) -> str:
         # Take the warnings off, so that a reset gives usable worlds again.

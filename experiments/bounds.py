@@ -1,0 +1,160 @@
+"""What the elevation task allows at most, and what doing nothing earns: rows beside the agents'.
+
+**Time-optimal flight.** From rest at the start to rest on the target in the least time that
+gravity and the action's limits allow. For a double integrator, and for one whose acceleration has a
+limited change per step, that is bang-bang control: everything towards the target up to one moment,
+everything against it up to a second, and, where the change of thrust is limited, everything back to
+hover. The two moments follow from the two conditions at the end, no speed and no distance, by
+bisection within bisection. They may lie inside a control step; that step gets the mean action.
+The thrust is exact, the model is free of noise and the first step already knows the target: an
+agent comes near this return and does not exceed it by more than what one control step is worth.
+
+**Hover in place.** The thrust stays at hover: E stays what it was at the start.
+"""
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from ..agents.pid import SHARES
+from ..envs.tasks.elevation import ERROR_SCALE, ElevationOptions
+from ..models.vehicle import Vehicle
+
+__all__ = ["bang_bang", "elevation_bounds", "elevation_reward"]
+
+_HALVINGS: Final = 24
+
+Floats = npt.NDArray[np.float64]
+
+
+def elevation_bounds(
+    options: ElevationOptions, vehicle: Vehicle, starts: Floats
+) -> dict[str, float]:
+    """Mean returns of the two flights over episodes, by name.
+
+    Args:
+        options: Of `rotorgram/Elevation-v0`.
+        vehicle: What flies.
+        starts: E at the start of each episode, m, shape (n,).
+    """
+    steps, period = options.episode_length, options.control_period
+    up, down, change = _limits(options, vehicle)
+    rising = starts > 0
+    left = bang_bang(
+        np.abs(starts),
+        steps,
+        period,
+        np.where(rising, up, down),
+        np.where(rising, down, up),
+        change,
+        options.linear_drag,
+    )
+    fastest = elevation_reward(left).sum(axis=1)
+    return {
+        "time-optimal flight": float(fastest.mean()),
+        "hover in place": float((steps * elevation_reward(starts)).mean()),
+    }
+
+
+def _limits(options: ElevationOptions, vehicle: Vehicle) -> tuple[float, float, float]:
+    """Largest accelerations up and down, m/s², and the largest change of one in a control step."""
+    up = float(vehicle.thrust_high.sum()) / vehicle.mass - vehicle.gravity
+    down = vehicle.gravity - float(vehicle.thrust_low.sum()) / vehicle.mass
+    newtons = options.thrust_scale or SHARES[options.action_mode] * float(vehicle.thrust_high.max())
+    scale = vehicle.num_rotors * newtons / vehicle.mass
+    if options.action_mode == "increment":
+        return up, down, scale
+    return min(up, scale), min(down, scale), np.inf
+
+
+def elevation_reward(errors: Floats) -> Floats:
+    """(s - |E|) / (s + |E|) for E in m; same shape."""
+    sizes = np.abs(errors)
+    return np.asarray((ERROR_SCALE - sizes) / (ERROR_SCALE + sizes))
+
+
+def bang_bang(
+    distance: Floats,
+    steps: int,
+    period: float,
+    towards: Floats,
+    against: Floats,
+    change: float = np.inf,
+    drag: float = 0.0,
+) -> Floats:
+    """Distance left after each control step of the time-optimal flight between two rests.
+
+    Args:
+        distance: To go, m, shape (n,), 0 or more.
+        steps: Number of control steps.
+        period: Of one, s.
+        towards: Largest acceleration towards the goal, m/s², shape (n,).
+        against: Largest acceleration away from it, m/s², shape (n,).
+        change: Largest change of the acceleration from one step to the next, m/s².
+        drag: Linear drag, 1/s.
+
+    Returns:
+        m, shape (n, steps).
+    """
+    limits = towards, against, change, drag, period
+    # More than enough: without and with limited changes of the acceleration, and at a speed that
+    # drag limits.
+    weakest = float(np.minimum(towards, against).min())
+    furthest = float(distance.max(initial=0.0))
+    seconds = 3 * np.sqrt(furthest / weakest) + 2 * furthest * drag / weakest
+    seconds += 0.0 if np.isinf(change) else 5 * np.cbrt(furthest * period / change)
+    horizon = 4 + int(seconds / period)
+    longest = np.full(len(distance), float(horizon))
+
+    def braked(first: Floats) -> Floats:
+        """The second moment for a first one: so that the speed is 0 at the end."""
+        return _bisected(
+            lambda second: _flown(first, second, horizon, *limits)[1] > 0, first, longest
+        )
+
+    first = _bisected(
+        lambda moment: _flown(moment, braked(moment), horizon, *limits)[0][:, -1] < distance,
+        np.zeros(len(distance)),
+        longest,
+    )
+    way, _ = _flown(first, braked(first), max(horizon, steps), *limits)
+    return np.asarray(distance[:, None] - way[:, :steps])
+
+
+def _bisected(too_low: Any, low: Floats, high: Floats) -> Floats:
+    low, high = low.copy(), high.copy()
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        below = too_low(middle)
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return low
+
+
+def _flown(
+    first: Floats, second: Floats, steps: int, towards: Floats, against: Floats, change: float,
+    drag: float, period: float,
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """Way after each step, m, shape (n, steps), and the last speed, m/s, for two moments in steps.
+
+    Flight starts at rest with no acceleration. From the second moment on the acceleration returns
+    to 0, and the speed that is left is that of the moment in which it has.
+    """
+    decay = np.exp(-drag * period)
+    gain = period if drag == 0 else (1 - decay) / drag
+    drift = period**2 / 2 if drag == 0 else (period - gain) / drag
+    way, speed, acceleration = (np.zeros(len(first)) for _ in range(3))
+    ways = np.empty((len(first), steps))
+    for step in range(steps):
+        one = np.clip(first - step, 0.0, 1.0)
+        two = np.clip(second - step, 0.0, 1.0) - one
+        if np.isinf(change):
+            acceleration = one * towards - two * against
+        else:
+            acceleration = np.clip(acceleration + change * (one - two), -against, towards)
+            back = change * (1.0 - one - two)
+            acceleration += np.clip(-acceleration, -back, back)
+        way = way + speed * gain + acceleration * drift
+        speed = speed * decay + acceleration * gain
+        ways[:, step] = way
+    return ways, speed

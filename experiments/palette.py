@@ -1,0 +1,45 @@
+"""How agents are shown everywhere: their order, their names and their colours."""
+
+from collections.abc import Iterable
+from typing import Final
+
+__all__ = ["agent_color", "agent_label", "sort_agents"]
+
+_LABELS: Final = {"vpg": "VPG", "a2c": "A2C", "sb3-a2c": "SB3 A2C", "pid": "PID"}
+# Okabe and Ito's palette: told apart by readers with colour-blindness.
+_COLORS: Final = {"vpg": "#D55E00", "a2c": "#0072B2", "sb3-a2c": "#009E73", "pid": "#555555"}
+_SPARE_COLORS: Final = ("#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
+# The same hues, lighter, for a dark ground.
+_DARK_COLORS: Final = {
+    "#D55E00": "#F58A3C",
+    "#0072B2": "#55B0F0",
+    "#009E73": "#2CC998",
+    "#555555": "#B4BCC4",
+    "#CC79A7": "#E29AC3",
+    "#E69F00": "#F0B840",
+    "#56B4E9": "#7CC8F2",
+    "#8C564B": "#C9938A",
+}
+
+
+def agent_label(agent: str) -> str:
+    """Give the name under which an agent is shown."""
+    return _LABELS.get(agent, agent)
+
+
+def agent_color(agent: str, dark: bool = False) -> str:
+    """Give an agent's colour, the same in every figure and every report.
+
+    Args:
+        agent: Its name.
+        dark: Whether it is drawn on a dark ground.
+    """
+    spare = _SPARE_COLORS[sum(agent.encode()) % len(_SPARE_COLORS)]
+    color = _COLORS.get(agent, spare)
+    return _DARK_COLORS[color] if dark else color
+
+
+def sort_agents(names: Iterable[str]) -> list[str]:
+    """Put agents in the order in which they are shown: the paper's, the reference, others."""
+    known = {name: place for place, name in enumerate(_LABELS)}
+    return sorted(set(names), key=lambda name: (known.get(name, len(known)), name))

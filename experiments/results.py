@@ -1,0 +1,445 @@
+"""The files of a comparison: their names, their columns, writing and reading them.
+
+`rotorgram compare` writes one folder. Everything that is drawn, tabulated or judged is read back
+from it, so these column tables are the contract between the side that trains and the side that
+reports.
+
+| file | one row per |
+|---|---|
+| `config.json` | (the comparison's configuration, the env's spec, versions and machine) |
+| `episodes.csv` | training episode |
+| `steps.parquet` | environment step of training and of the final evaluation |
+| `evaluations.csv` | deterministic evaluation episode of a policy snapshot |
+| `runs.csv` | training run (agent and seed) |
+
+The column of the headline metric has the metric's own name, such as `elevation_error`; its unit
+stands in `config.json`. In the frames that are read it has the name that says what it is: `steady`
+(mean size in the last quarter of an evaluation episode), `mean_size` (over a training episode) or
+`value` (after a step).
+"""
+
+import json
+import platform
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from ..agents.checkpoints import software_versions, write_whole
+from ..envs.spec import EnvSpec, SpecError
+from ..models.errors import require
+from .errors import ResultsError
+from .metrics import Headline, overshoot, settling_time, steady_state
+from .trajectories import Trajectory
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+    import pyarrow.dataset as pads
+    import pyarrow.parquet as pq
+else:
+    pd = require("pandas", "train", "comparing agents")
+    pa = require("pyarrow", "train", "comparing agents")
+    pads = require("pyarrow.dataset", "train", "comparing agents")
+    pq = require("pyarrow.parquet", "train", "comparing agents")
+
+__all__ = [
+    "CONFIG_FILE",
+    "CONFIG_KEYS",
+    "EPISODES_FILE",
+    "EPISODE_COLUMNS",
+    "EVALUATIONS_FILE",
+    "EVALUATION_COLUMNS",
+    "RUNS_FILE",
+    "RUN_COLUMNS",
+    "STEPS_FILE",
+    "Results",
+    "RunResults",
+    "episode_row",
+    "evaluation_row",
+    "evaluation_steps",
+    "join_parts",
+    "machine",
+    "read_config",
+    "read_results",
+    "read_spec",
+    "read_steps",
+    "step_table",
+    "write_config",
+]
+
+CONFIG_FILE: Final = "config.json"
+EPISODES_FILE: Final = "episodes.csv"
+STEPS_FILE: Final = "steps.parquet"
+EVALUATIONS_FILE: Final = "evaluations.csv"
+RUNS_FILE: Final = "runs.csv"
+
+CONFIG_KEYS: Final = (
+    "created",
+    "command",
+    "preset",
+    "seeds",
+    "env_steps",
+    "spec",
+    "vehicle",
+    "agents",
+    "versions",
+    "machine",
+)
+
+EPISODE_COLUMNS: Final[Mapping[str, str]] = {
+    "agent": "str",
+    "seed": "int64",
+    "episode": "int64",
+    "first_step": "int64",  # env steps of the run, of all drones, before the episode began
+    "last_step": "int64",  # and when it ended
+    "length": "int64",  # control steps
+    "return": "float64",
+    "mean_size": "float64",  # in the file under the metric's name: mean size, metric's unit
+    "terminated": "bool",
+    "truncated": "bool",
+    "seconds": "float64",  # training wall time when the episode ended
+}
+
+EVALUATION_COLUMNS: Final[Mapping[str, str]] = {
+    "agent": "str",
+    "seed": "int64",
+    "env_steps": "int64",  # training behind the snapshot
+    "seconds": "float64",  # training wall time behind the snapshot
+    "episode": "int64",
+    "length": "int64",  # control steps
+    "return": "float64",
+    "start": "float64",  # the metric before the first step
+    "steady": "float64",  # in the file under the metric's name: mean size in the last quarter
+    "settling_time": "float64",  # s; empty if the error never settled
+    "overshoot": "float64",  # metric's unit; empty if the metric has no sign
+    "terminated": "bool",
+}
+
+RUN_COLUMNS: Final[Mapping[str, str]] = {
+    "agent": "str",
+    "seed": "int64",
+    "env_steps": "int64",
+    "seconds": "float64",
+    "steps_per_second": "float64",
+}
+
+_TABLES: Final = {
+    EPISODES_FILE: EPISODE_COLUMNS,
+    EVALUATIONS_FILE: EVALUATION_COLUMNS,
+    RUNS_FILE: RUN_COLUMNS,
+}
+_OWN_NAMES: Final = ("mean_size", "steady", "value")
+"""Columns that have the headline metric's name in the files."""
+
+
+def _in_file(column: str, metric: str) -> str:
+    return metric if column in _OWN_NAMES else column
+
+
+def step_schema(metric: str) -> "pa.Schema":
+    """Columns of `steps.parquet`, the headline metric by its name."""
+    return pa.schema(
+        [
+            ("agent", pa.dictionary(pa.int32(), pa.string())),
+            ("seed", pa.int32()),
+            ("phase", pa.dictionary(pa.int32(), pa.string())),  # "train" or "evaluation"
+            ("episode", pa.int32()),  # within the run; -1: one that the end of training cut
+            ("step", pa.int32()),  # of the run for train, of the episode for evaluation; from 1
+            (metric, pa.float32()),
+            ("reward", pa.float32()),
+            ("thrust", pa.float32()),  # mean over the rotors, N
+        ]
+    )
+
+
+# ---- config.json
+
+
+def write_config(
+    folder: Path,
+    command: str,
+    spec: EnvSpec,
+    vehicle: str | None,
+    content: Mapping[str, Any],
+) -> None:
+    """Write `config.json`: the content, and what the numbers depend on besides.
+
+    Args:
+        folder: Where to; a file that exists stays: a resumed run keeps its settings.
+        command: What the user typed.
+        spec: Of the env.
+        vehicle: Path of the vehicle's file; None: the paper's.
+        content: Settings of the comparison or the sweep; with them all of `CONFIG_KEYS` are there.
+    """
+    path = folder / CONFIG_FILE
+    if path.exists():
+        return
+    whole = {
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": command,
+        **content,
+        "spec": json.loads(spec.to_json()),
+        "vehicle": vehicle,
+        "versions": software_versions(),
+        "machine": machine(),
+    }
+    write_whole(path, (json.dumps(whole, indent=2) + "\n").encode())
+
+
+def machine() -> dict[str, Any]:
+    """What runs on which a time depends."""
+    joblib = require("joblib", "train", "counting cores")
+    return {
+        "platform": platform.platform(),
+        "processor": platform.machine(),
+        "cores": joblib.cpu_count(),
+    }
+
+
+def read_config(folder: Path | str) -> dict[str, Any]:
+    """Read `config.json` and check that the keys of `CONFIG_KEYS` are there."""
+    path = _existing(folder, CONFIG_FILE)
+    try:
+        config = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ResultsError(f"{path} is not JSON: {error}") from error
+    if not isinstance(config, dict):
+        raise ResultsError(f"{path} should hold an object, not a {type(config).__name__}")
+    _check_names(path, "key", CONFIG_KEYS, config)
+    return config
+
+
+def read_spec(folder: Path | str, config: Mapping[str, Any]) -> EnvSpec:
+    """The env's spec from `config.json`. Raises `ResultsError`."""
+    try:
+        return EnvSpec.from_json(json.dumps(config["spec"]))
+    except SpecError as error:
+        raise ResultsError(f"{Path(folder) / CONFIG_FILE}: {error}") from None
+
+
+# ---- writing
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunResults:
+    """What one run leaves behind."""
+
+    agent: str
+    seed: int
+    metric: str
+    """Name of the headline metric."""
+    episodes: list[dict[str, Any]]
+    """Rows of `episodes.csv`, without agent and seed."""
+    evaluations: list[dict[str, Any]]
+    """Rows of `evaluations.csv`, without agent and seed."""
+    runs: list[dict[str, Any]]
+    """Its row of `runs.csv`, without agent and seed; none if nothing was trained."""
+    steps: "list[pa.Table]"
+    """Tables of `steps.parquet`."""
+
+    def write(self, parts: Path) -> None:
+        """Write a part: a folder that is there whole or not at all."""
+        part = parts / f"{self.agent}-seed{self.seed}"
+        unfinished = part.with_name(f".{part.name}")
+        unfinished.mkdir(parents=True)
+        label = {"agent": self.agent, "seed": self.seed}
+        for name, columns in _TABLES.items():
+            rows = [{**label, **row} for row in getattr(self, name.removesuffix(".csv"))]
+            table = pd.DataFrame(rows, columns=list(columns))
+            table.columns = [_in_file(column, self.metric) for column in columns]
+            table.to_csv(unfinished / name, index=False)
+        pq.write_table(pa.concat_tables(self.steps), unfinished / STEPS_FILE, compression="zstd")
+        unfinished.rename(part)
+
+
+def join_parts(parts: Path, folder: Path, metric: str) -> None:
+    """Make the tables of a comparison out of the parts of its runs, and remove these."""
+    names = sorted(p.name for p in parts.iterdir() if not p.name.startswith("."))
+    for table in _TABLES:
+        lines = [(parts / name / table).read_text().splitlines(keepends=True) for name in names]
+        body = [line for part in lines for line in part[1:]]
+        (folder / table).write_text("".join([lines[0][0], *body]))
+    schema = step_schema(metric)
+    with pq.ParquetWriter(folder / STEPS_FILE, schema, compression="zstd") as writer:
+        for name in names:
+            writer.write_table(pq.read_table(parts / name / STEPS_FILE, schema=schema))
+    # Whole or not at all: a half-removed part would look like one to resume from.
+    shutil.rmtree(parts.rename(parts.with_name(f".{parts.name}")))
+
+
+def episode_row(episode: Any, num_envs: int, env_steps: int) -> dict[str, Any]:
+    """A training episode as a row of `episodes.csv`, without agent and seed.
+
+    Args:
+        episode: An `agents.episodes.Episode`.
+        num_envs: Drones of the run. While one flies a step, each of the others does.
+        env_steps: Of the run.
+    """
+    last = min(episode.first_step + episode.length * num_envs, env_steps)
+    row = {**asdict(episode), "return": episode.total_reward, "last_step": last}
+    return row | {"mean_size": episode.mean_size}
+
+
+def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]:
+    """A trajectory as a row of `evaluations.csv`, but for the columns that name the run."""
+    values = trajectory.values(headline.name)
+    settled = over = np.nan
+    if headline.metric.settled is not None and not headline.high and not trajectory.terminated:
+        settled = settling_time(values, trajectory.control_period, headline.metric.settled)
+    if headline.signed:
+        over = overshoot(values)
+    return {
+        "episode": trajectory.episode,
+        "length": len(trajectory),
+        "return": float(trajectory.rewards.sum()),
+        "start": float(values[0]),
+        "steady": steady_state(headline.size(values[1:])),
+        "settling_time": settled,
+        "overshoot": over,
+        "terminated": trajectory.terminated,
+    }
+
+
+def evaluation_steps(
+    agent: str, seed: int, headline: Headline, trajectories: Sequence[Trajectory]
+) -> "list[pa.Table]":
+    """Every env step of evaluation trajectories."""
+    return [
+        step_table(
+            headline.name,
+            agent=agent,
+            seed=seed,
+            phase="evaluation",
+            episode=np.full(len(one), one.episode),
+            step=np.arange(1, len(one) + 1),
+            value=one.values(headline.name)[1:],
+            reward=one.rewards,
+            thrust=one.mean_thrust[1:],
+        )
+        for one in trajectories
+    ]
+
+
+def step_table(
+    metric: str, *, agent: str, seed: int, phase: str, **columns: np.ndarray
+) -> "pa.Table":
+    """Rows of `steps.parquet` from `episode`, `step`, `value`, `reward` and `thrust`, (T,) each."""
+    count = len(columns["step"])
+    named = {_in_file(name, metric): values for name, values in columns.items()}
+    named |= {"agent": [agent] * count, "seed": np.full(count, seed), "phase": [phase] * count}
+    schema = step_schema(metric)
+    arrays = [
+        pa.array(np.asarray(named[f.name], np.float32) if f.type == pa.float32() else named[f.name])
+        .cast(f.type)
+        for f in schema
+    ]  # fmt: skip
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+# ---- reading
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """What a comparison's folder holds, less the step rows (see `read_steps`)."""
+
+    config: dict[str, Any]
+    """`config.json`."""
+    spec: EnvSpec
+    headline: Headline
+    episodes: "pd.DataFrame"
+    """Training episodes, `EPISODE_COLUMNS`; one that the end of training cut is not there."""
+    evaluations: "pd.DataFrame"
+    """Evaluation episodes, `EVALUATION_COLUMNS`."""
+    runs: "pd.DataFrame"
+    """Training runs, `RUN_COLUMNS`."""
+
+
+def read_results(folder: Path | str) -> Results:
+    """Read all files of a comparison but the step rows. Raises `ResultsError`."""
+    config = read_config(folder)
+    spec = read_spec(folder, config)
+    headline = Headline.of(spec)
+    tables = {name.removesuffix(".csv"): _read_csv(folder, name, headline.name) for name in _TABLES}
+    return Results(config=config, spec=spec, headline=headline, **tables)
+
+
+def read_steps(
+    folder: Path | str,
+    metric: str,
+    phase: str,
+    columns: Iterable[str] = ("agent", "seed", "episode", "step", "value"),
+    max_rows: int | None = None,
+) -> "pd.DataFrame":
+    """Read some columns of one phase of `steps.parquet`.
+
+    Args:
+        folder: The comparison's folder.
+        metric: Name of the headline metric; its column is `value` in the frame.
+        phase: "train" or "evaluation".
+        columns: Others are not read from the disk.
+        max_rows: Keep about this many rows. The rows are picked at random (always the same ones),
+            not by a stride: a stride that divides the episode length would show the same moments
+            of every episode.
+
+    Returns:
+        The rows, in the order of the file; `agent` is a category.
+    """
+    path = _existing(folder, STEPS_FILE)
+    try:
+        dataset = pads.dataset(path, format="parquet")
+    except pa.ArrowInvalid as error:
+        raise ResultsError(f"{path} is not a Parquet file: {error}") from error
+    whole = step_schema(metric)
+    _check_names(path, "column", whole.names, dataset.schema.names)
+    keep = 1.0
+    if max_rows is not None:
+        keep = min(1.0, max_rows / max(1, pq.read_metadata(path).num_rows))
+    names = [_in_file(column, metric) for column in columns]
+    schema = pa.schema([whole.field(name) for name in names])
+    rng = np.random.default_rng(0)
+    kept = []
+    for batch in dataset.to_batches(columns=names, filter=pads.field("phase") == phase):
+        if keep < 1.0:
+            batch = batch.filter(pa.array(rng.random(batch.num_rows) < keep))
+        kept.append(pa.Table.from_batches([batch]).cast(schema))
+    table = pa.concat_tables(kept) if kept else schema.empty_table()
+    frame: pd.DataFrame = table.unify_dictionaries().to_pandas()
+    return frame.rename(columns={metric: "value"})
+
+
+def _existing(folder: Path | str, name: str) -> Path:
+    path = Path(folder) / name
+    if not path.is_file():
+        raise ResultsError(f"{path} is missing: is {folder} the folder of a comparison or a sweep?")
+    return path
+
+
+def _check_names(path: Path, kind: str, wanted: Iterable[str], present: Iterable[str]) -> None:
+    missing = [name for name in wanted if name not in set(present)]
+    if missing:
+        raise ResultsError(
+            f"{path} lacks the {kind}{'s' if len(missing) > 1 else ''} {', '.join(missing)}; "
+            f"it has {', '.join(present) or 'none'}"
+        )
+
+
+def _read_csv(folder: Path | str, name: str, metric: str) -> "pd.DataFrame":
+    path = _existing(folder, name)
+    columns = _TABLES[name]
+    types = {_in_file(column, metric): kind for column, kind in columns.items()}
+    try:
+        present = list(pd.read_csv(path, nrows=0).columns)
+        _check_names(path, "column", types, present)
+        frame = pd.read_csv(path, usecols=list(types), dtype=dict(types))[list(types)]
+    except ResultsError:
+        raise
+    except ValueError as error:  # an empty file, or a value that is not of the column's type
+        raise ResultsError(f"{path} cannot be read: {error}") from error
+    frame.columns = list(columns)
+    return frame

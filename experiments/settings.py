@@ -1,0 +1,244 @@
+"""What a run, a comparison and a sweep are to do: checked as they are made, before anything flies.
+
+Imports neither torch nor pandas.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from itertools import product
+from typing import Any, Final, Literal
+
+from ..agents.presets import A2CConfig, VPGConfig, preset
+from ..envs.registry import is_known, options_type, task_type
+from ..models.errors import InputError
+
+__all__ = ["AGENTS", "Backend", "CompareConfig", "EnvConfig", "Run", "SweepConfig", "SweepRun",
+           "WorkersConfig"]  # fmt: skip
+
+AGENTS: Final = ("vpg", "a2c", "sb3-a2c")
+
+Backend = Literal["loky", "ray"]
+"""What flies the jobs: the cores of this machine, or a Ray cluster."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConfig:
+    """The env that is flown."""
+
+    env_id: str = "rotorgram/Elevation-v0"
+    """Id of a registered task."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Options of the env by name. Those that are not given have their defaults."""
+    vehicle: str | None = None
+    """MJCF file of the vehicle; None: the paper's."""
+
+    def __post_init__(self) -> None:
+        options: dict[str, Any] = dict(self.options)
+        if is_known(self.env_id):
+            options = asdict(options_type(self.env_id).from_options(options))
+        object.__setattr__(self, "options", json.loads(json.dumps(options)))
+
+    @property
+    def module(self) -> str | None:
+        """What another process has to import to know the task; None for ours."""
+        if not is_known(self.env_id):
+            return None
+        name = task_type(self.env_id).__module__
+        return None if name.startswith("rotorgram.") or name == "__main__" else name
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run(EnvConfig):
+    """What is trained: everything that the numbers follow from, but for the software."""
+
+    algorithm: str
+    config: VPGConfig | A2CConfig
+    seed: int
+    env_steps: int
+    """Of all drones together."""
+    num_envs: int = 1
+    """Drones that train it at the same time."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.seed < 0:
+            raise InputError(f"seed: expected 0 or more, got {self.seed}")
+        if self.num_envs < 1:
+            raise InputError(f"num_envs: expected 1 or more, got {self.num_envs}")
+        least = 1
+        if isinstance(self.config, A2CConfig):
+            least = self.config.rollout_size(self.num_envs)
+        elif self.num_envs > 1:  # a whole episode of each
+            least = self.num_envs * int(self.options.get("episode_length", 1))
+        if self.env_steps < least:
+            raise InputError(f"env_steps: expected at least {least}, got {self.env_steps}")
+
+    @property
+    def env(self) -> dict[str, Any]:
+        """Keyword arguments of `EnvConfig` and `pairs.socket_pair`."""
+        return {"env_id": self.env_id, "options": self.options, "vehicle": self.vehicle}
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkersConfig:
+    """Which workers fly, and how many at a time."""
+
+    jobs: int | None = None
+    """Jobs at a time; None: one for each core of the machine or of the cluster."""
+    backend: Backend = "loky"
+    """`loky`: processes of this machine. `ray`: a Ray cluster."""
+    address: str | None = None
+    """The cluster's: `ray://HOST:PORT` of its client server from anywhere, `HOST:PORT` or None on
+    one of its machines."""
+
+    def __post_init__(self) -> None:
+        if self.jobs is not None and self.jobs < 1:
+            raise InputError(f"jobs: expected at least 1, got {self.jobs}")
+        if self.backend not in ("loky", "ray"):
+            raise InputError(f"backend: expected loky or ray, got {self.backend}")
+        if self.address is not None and self.backend != "ray":
+            raise InputError(f"address: expected it with backend ray, got it with {self.backend}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ManyRuns(WorkersConfig, EnvConfig):
+    """What comparisons and sweeps have in common."""
+
+    preset: str = "tuned"
+    """`paper` or `tuned`."""
+    seeds: int = 5
+    """How many seeds, the same for every agent or point."""
+    first_seed: int = 0
+    """The first of them."""
+    env_steps: int = 200_000
+    """Env steps of each training."""
+    num_envs: int = 1
+    """Drones of each training."""
+    episodes: int = 20
+    """Evaluation episodes of the final policies."""
+
+    def __post_init__(self) -> None:
+        WorkersConfig.__post_init__(self)
+        EnvConfig.__post_init__(self)
+        self._check_counts("seeds", "env_steps", "episodes")
+        if self.first_seed < 0:
+            raise InputError(f"first_seed: expected 0 or more, got {self.first_seed}")
+
+    def _check_counts(self, *names: str) -> None:
+        for name in names:
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
+
+    @property
+    def env(self) -> dict[str, Any]:
+        """Keyword arguments of `EnvConfig` and `pairs.socket_pair`."""
+        return {"env_id": self.env_id, "options": self.options, "vehicle": self.vehicle}
+
+    @property
+    def all_seeds(self) -> range:
+        """The seeds."""
+        return range(self.first_seed, self.first_seed + self.seeds)
+
+    def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:
+        return Run(
+            algorithm=algorithm,
+            config=preset(algorithm, self.preset, **changes),
+            seed=seed,
+            env_steps=self.env_steps,
+            num_envs=self.num_envs,
+            **self.env,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareConfig(_ManyRuns):
+    """What is compared, and which workers fly it."""
+
+    agents: tuple[str, ...] = AGENTS
+    """Agents to train. The PID is always evaluated beside them, where it can fly the env."""
+    snapshots: int = 10
+    """Policies kept during each training, for the learning curves."""
+    curve_episodes: int = 10
+    """Evaluation episodes of each of them."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_counts("snapshots", "curve_episodes")
+        if not self.agents:
+            raise InputError("agents: expected at least one")
+        if len(set(self.agents)) != len(self.agents):
+            raise InputError(f"agents: expected each once, got {', '.join(self.agents)}")
+        self.runs()  # wrong names and numbers are told before anything is trained
+
+    def runs(self) -> list[Run]:
+        """Every training, in the order in which they start: SB3's first, which take longest."""
+        return [
+            self._run(agent, seed)
+            for agent in sorted(self.agents, key=lambda agent: agent != "sb3-a2c")
+            for seed in self.all_seeds
+        ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepRun:
+    """A training of the sweep."""
+
+    point: int
+    """Of the grid."""
+    settings: dict[str, Any]
+    """What the point changes of the preset."""
+    run: Run
+
+    @property
+    def name(self) -> str:
+        """What the run is called."""
+        words = " ".join(f"{name}={value}" for name, value in self.settings.items())
+        return f"{words} seed {self.run.seed}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepConfig(_ManyRuns):
+    """What is tried, and which workers fly it. Its seeds are not those of a comparison."""
+
+    algorithm: str
+    """`vpg`, `a2c` or `sb3-a2c`."""
+    grid: Mapping[str, tuple[Any, ...]]
+    """Values of hyperparameters, by name: every combination is a point."""
+    seeds: int = 3
+    first_seed: int = 1000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.grid:
+            raise InputError("grid: expected at least one hyperparameter, got none")
+        for name, values in self.grid.items():
+            if not values:
+                raise InputError(f"grid: expected at least one value of {name}, got none")
+        self.runs()  # wrong names and numbers are told before anything is trained
+        for name, values in self.grid.items():
+            for place, value in enumerate(values):
+                if value in values[:place]:
+                    raise InputError(f"grid: expected each {name} once, got {value!r} twice")
+
+    def points(self) -> list[dict[str, Any]]:
+        """Settings of every point; the value that is named last changes fastest."""
+        return [
+            dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())
+        ]
+
+    def runs(self) -> list[SweepRun]:
+        """Every training, in the order in which they start.
+
+        All points with the first seed, then all with the second: a sweep that is stopped has seen
+        every point.
+        """
+        return [
+            SweepRun(
+                point=point,
+                settings=settings,
+                run=self._run(self.algorithm, seed, **settings),
+            )
+            for seed in self.all_seeds
+            for point, settings in enumerate(self.points())
+        ]

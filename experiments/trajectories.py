@@ -1,0 +1,377 @@
+"""Trajectories: flown by a policy without exploration, over any env, or read from a journal."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import gymnasium as gym
+import numpy as np
+
+from ..agents.policies import Policy
+from ..envs.autoreset import AdvancingVectorEnv
+from ..envs.spec import Discrete, EnvSpec, component_names
+from ..models.errors import InputError
+
+__all__ = [
+    "Ending",
+    "EpisodeSet",
+    "Trajectory",
+    "evaluation_seed",
+    "flown_trajectories",
+    "fly",
+    "fly_episodes",
+    "recorded_trajectories",
+]
+
+_EVALUATION: Final = 20230324  # the day the paper appeared
+
+EpisodeSet = Literal["final", "curve", "tuning"]
+"""Evaluation episodes that share no start: `final` for the figures that are reported, `curve` for
+snapshots during training and whatever else looks at a policy, `tuning` for choosing settings."""
+
+_SETS: Final[tuple[EpisodeSet, ...]] = ("final", "curve", "tuning")
+
+Ending = Literal["terminated", "truncated", "cut off"]
+"""`cut off`: the journal, or its agent, ended it."""
+
+
+def evaluation_seed(episode: int, of: EpisodeSet = "curve") -> int:
+    """Seed of an evaluation episode: the same for every agent.
+
+    Training seeds are spawned by another key from another number, so that no run's seed meets one
+    of these.
+    """
+    sequence = np.random.SeedSequence(_EVALUATION, spawn_key=(_SETS.index(of), episode))
+    return int(sequence.generate_state(1, np.uint64)[0])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trajectory:
+    """One episode of one drone, T control steps."""
+
+    spec: EnvSpec
+    telemetry: Mapping[str, np.ndarray]
+    """Every telemetry array by name, float64, shape (T + 1, *shape): row k is what k control steps
+    led to, row 0 the start. Units and frames are those of the spec."""
+    rewards: np.ndarray
+    """float64, shape (T,)."""
+    ending: Ending
+    episode: int = 0
+    """Its number."""
+
+    def __len__(self) -> int:
+        """T."""
+        return len(self.rewards)
+
+    @property
+    def control_period(self) -> float:
+        """Between two rows, s."""
+        return self.spec.control_period
+
+    @property
+    def seconds(self) -> float:
+        """From its start to its end."""
+        return len(self) * self.control_period
+
+    @property
+    def terminated(self) -> bool:
+        """Whether it ended by a crash or the like, not by the clock."""
+        return self.ending == "terminated"
+
+    def values(self, metric: str) -> np.ndarray:
+        """A metric by name, float64, shape (T + 1,)."""
+        names = [one.name for one in self.spec.metrics]
+        column: np.ndarray = self.telemetry["metrics"].reshape(len(self) + 1, -1)
+        return column[:, names.index(metric)]
+
+    @property
+    def headline(self) -> np.ndarray:
+        """The metric that decides, shape (T + 1,); nan where the env names none."""
+        if self.spec.headline is None:
+            return np.full(len(self) + 1, np.nan)
+        return self.values(self.spec.headline.name)
+
+    @property
+    def mean_thrust(self) -> np.ndarray:
+        """Mean over the rotors, N, shape (T + 1,); nan where the env does not tell it."""
+        if "thrust" not in self.telemetry:
+            return np.full(len(self) + 1, np.nan)
+        thrust: np.ndarray = self.telemetry["thrust"].reshape(len(self) + 1, -1).mean(axis=1)
+        return thrust
+
+    def step_at(self, seconds: float) -> int:
+        """Number of the row that is seen at that time; the last, from its end on."""
+        # A time that is a whole number of periods but for its last bits belongs to that step.
+        return min(max(int(seconds / self.control_period + 1e-6), 0), len(self))
+
+
+# ---- flown
+
+
+def fly(env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int = 0) -> Trajectory:
+    """One episode of a policy in an env of one drone; once more, if its simulator was lost.
+
+    Args:
+        env: Local or remote.
+        policy: None draws actions at random, the same for the same seed.
+        seed: Of the episode.
+        episode: Its number, for the trajectory.
+    """
+    while (flown := _fly(env, policy, seed, episode)) is None:
+        pass
+    return flown
+
+
+def _fly(
+    env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int
+) -> Trajectory | None:
+    from ..udp import LOST
+
+    observation, info = env.reset(seed=seed)
+    if policy is None:
+        env.action_space.seed(seed)
+    else:
+        policy.reset()
+    spec: EnvSpec = env.get_wrapper_attr("env_spec")
+    names = [name for array in spec.telemetry for name in component_names(array)]
+    rows, rewards = [[info[name] for name in names]], []
+    terminated = truncated = False
+    while not (terminated or truncated):
+        action = env.action_space.sample() if policy is None else policy.act(observation)
+        observation, reward, terminated, truncated, info = env.step(action)
+        if LOST in info:
+            return None
+        rows.append([info[name] for name in names])
+        rewards.append(float(reward))
+    table = np.array(rows, np.float64)
+    ends = np.cumsum([array.size for array in spec.telemetry])[:-1]
+    columns = np.split(table, ends, axis=1) if spec.telemetry else []
+    return Trajectory(
+        spec=spec,
+        telemetry={
+            array.name: part.reshape(len(rows), *array.shape)
+            for array, part in zip(spec.telemetry, columns, strict=True)
+        },
+        rewards=np.array(rewards),
+        ending="terminated" if terminated else "truncated",
+        episode=episode,
+    )
+
+
+def fly_episodes(
+    env: Any, policy: Policy, episodes: int, of: EpisodeSet = "curve"
+) -> list[Trajectory]:
+    """The first so many evaluation episodes of a policy, in their order.
+
+    A vector env flies as many at a time as it has drones, each bit as if they were flown one after
+    the other.
+
+    Args:
+        env: Of one drone, or a vector env without autoreset.
+        policy: What flies. Every drone of a vector env gets a copy.
+        episodes: How many.
+        of: Which.
+    """
+    seeds = [evaluation_seed(episode, of) for episode in range(episodes)]
+    if not isinstance(env, AdvancingVectorEnv):
+        return [fly(env, policy, seed, episode) for episode, seed in enumerate(seeds)]
+    found: dict[int, Trajectory] = {}
+    while missing := [episode for episode in range(episodes) if episode not in found]:
+        batch = missing[: env.num_envs]  # again, where a simulator was lost
+        found |= _fly_batch(env, policy, {episode: seeds[episode] for episode in batch})
+    return [found[episode] for episode in range(episodes)]
+
+
+def _fly_batch(
+    env: AdvancingVectorEnv, policy: Policy, seeds: Mapping[int, int]
+) -> dict[int, Trajectory]:
+    """At most N episodes, one in each drone; those of a lost simulator are missing."""
+    spec, count = env.env_spec, env.num_envs
+    policies = [copy.deepcopy(policy) for _ in seeds]
+    for one in policies:
+        one.reset()
+    actions = (
+        np.zeros(count, np.int64)
+        if isinstance(spec.action, Discrete)
+        else np.zeros((count, *spec.action.shape), np.float32)
+    )
+    env.reset(seed=[*seeds.values(), *[0] * (count - len(seeds))])
+    rows, rewards = [_copied(env.telemetry)], []
+    lengths, terminated = np.zeros(count, int), np.zeros(count, bool)
+    done, lost = np.arange(count) >= len(seeds), env.lost.copy()
+    done |= lost
+    while not done.all():
+        for drone in np.flatnonzero(~done).tolist():
+            actions[drone] = policies[drone].act(_observation(env, drone))
+        env.advance(actions, np.zeros(count, bool), None, done)
+        rows.append(_copied(env.telemetry))
+        rewards.append(env.rewards.copy())
+        lengths += ~done
+        terminated |= env.terminated & ~done
+        lost |= env.lost & ~done
+        done = done | env.terminated | env.truncated
+    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    totals = np.array(rewards, np.float64).reshape(len(rewards), count)
+    return {
+        episode: Trajectory(
+            spec=spec,
+            telemetry={name: array[: lengths[drone] + 1, drone] for name, array in arrays.items()},
+            rewards=totals[: lengths[drone], drone],
+            ending="terminated" if terminated[drone] else "truncated",
+            episode=episode,
+        )
+        for drone, episode in enumerate(seeds)
+        if not lost[drone]
+    }
+
+
+def _copied(telemetry: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: np.array(array, np.float64) for name, array in telemetry.items()}
+
+
+def _observation(env: AdvancingVectorEnv, drone: int) -> Any:
+    if isinstance(env.observations, dict):
+        return {name: array[drone] for name, array in env.observations.items()}
+    return env.observations[drone]
+
+
+def flown_trajectories(
+    policy: Policy | None,
+    env_id: str,
+    options: Mapping[str, Any],
+    episodes: Sequence[int],
+    *,
+    vehicle: str | Path | None = None,
+    of: EpisodeSet = "curve",
+) -> list[Trajectory]:
+    """Evaluation episodes by number, flown in process without exploration.
+
+    Args:
+        policy: What flies; None draws actions at random, the same for the same episode.
+        env_id: A registered env.
+        options: Of the env.
+        episodes: Their numbers.
+        vehicle: MJCF file; None: the paper's.
+        of: Which evaluation episodes.
+    """
+    made = gym.make(env_id, disable_env_checker=True, vehicle=vehicle, **options)
+    with closing(made.unwrapped) as env:
+        return [fly(env, policy, evaluation_seed(episode, of), episode) for episode in episodes]
+
+
+# ---- recorded
+
+
+def recorded_trajectories(
+    path: Path,
+    episodes: Sequence[int] | None = None,
+    *,
+    session: int | None = None,
+    drone: int = 0,
+) -> list[Trajectory]:
+    """Episodes of one drone of one session of a journal.
+
+    Args:
+        path: What `--record` wrote; cut off by a crash it is read up to the cut.
+        episodes: Their numbers; None for all. They count, from 0, the episodes of which a step is
+            recorded, those that were given up and one that the journal's end cut off among them.
+        session: As `rotorgram replay` counts them, from 1. None: the first with a step in it.
+        drone: Of the session, from 0.
+
+    Raises:
+        InputError: It is no journal, or has no such session, drone or episode.
+        OSError: It cannot be read.
+    """
+    from ..udp.journal.reader import read_journal
+
+    if not path.is_file():
+        raise InputError(f"{path}: expected a journal (.mcap), got no such file")
+    readers: dict[int, _Reader] = {}
+    for item in read_journal(path):
+        found = item.session
+        reader = readers.setdefault(found.index, _Reader(found.spec, found.num_envs, drone))
+        if session in (None, found.index):
+            reader.take(item.message)
+    if session is not None and session not in readers:
+        known = f"1 to {len(readers)}" if readers else "a journal with sessions"
+        raise InputError(f"session: expected {known}, got {session} for {path}")
+    flown = [readers[index] for index in sorted(readers) if readers[index].steps]
+    if not flown:
+        raise InputError(f"{path}: expected an episode with a step in it, got none")
+    return flown[0].chosen(episodes, path)
+
+
+class _Reader:
+    """Makes trajectories of what a journal has of one session. It keeps one drone's numbers."""
+
+    def __init__(self, spec: EnvSpec, num_envs: int, drone: int) -> None:
+        self._spec, self._num_envs, self._drone = spec, num_envs, drone
+        self._command: Any = None
+        self._rows: list[dict[str, np.ndarray]] = []
+        self._rewards: list[float] = []
+        self._found: list[Trajectory] = []
+        self.steps = 0
+        """Of any drone."""
+
+    def take(self, message: Any) -> None:
+        """The next message of the session."""
+        from ..udp.protocol.messages import Command, State
+
+        if isinstance(message, Command):
+            self._command = message
+        elif isinstance(message, State):
+            self.steps += self._command is not None and not bool(self._command.resets.all())
+            if 0 <= self._drone < self._num_envs:
+                self._take_state(message, self._command)
+
+    def chosen(self, episodes: Sequence[int] | None, path: Path) -> list[Trajectory]:
+        """Episodes by number, or all, once all is read. Raises `InputError`."""
+        if not 0 <= self._drone < self._num_envs:
+            last = self._num_envs - 1
+            raise InputError(f"drone: expected 0 to {last} in {path}, got {self._drone}")
+        self._keep("cut off")
+        found = self._found
+        if not found:
+            raise InputError(f"{path}: expected an episode of drone {self._drone}, got none")
+        if episodes is None:
+            return found
+        for episode in episodes:
+            if not 0 <= episode < len(found):
+                last = len(found) - 1
+                raise InputError(f"episode: expected 0 to {last} in {path}, got {episode}")
+        return [found[episode] for episode in episodes]
+
+    def _take_state(self, state: Any, command: Any) -> None:
+        drone = self._drone
+        begins = command is None or bool(command.resets[drone])
+        if command is not None and command.frozen[drone]:
+            return
+        if begins:
+            self._keep("cut off")
+        elif not self._rows:  # stepped after its end: no episode
+            return
+        named = zip(self._spec.telemetry, state.telemetry, strict=True)
+        self._rows.append({array.name: np.array(told[drone], np.float64) for array, told in named})
+        if not begins:
+            self._rewards.append(float(state.rewards[drone]))
+            if state.terminated[drone] or state.truncated[drone]:
+                self._keep("terminated" if state.terminated[drone] else "truncated")
+
+    def _keep(self, ending: Ending) -> None:
+        """The episode has ended; it counts if it has a step."""
+        if self._rewards:
+            self._found.append(
+                Trajectory(
+                    spec=self._spec,
+                    telemetry={
+                        name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]
+                    },
+                    rewards=np.array(self._rewards),
+                    ending=ending,
+                    episode=len(self._found),
+                )
+            )
+        self._rows, self._rewards = [], []

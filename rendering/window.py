@@ -1,0 +1,154 @@
+"""A window on this machine's display: MuJoCo's passive viewer."""
+
+import atexit
+import os
+import sys
+import threading
+import warnings
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+import mujoco
+
+from .gl import NoOpenGL
+from .live import Aim, Lines
+from .pace import Pace, Press
+from .stage import Stage, scene_geoms
+
+__all__ = ["KEYS", "NoDisplay", "Window"]
+
+KEYS: Final[dict[int, Press]] = {
+    32: "pause",  # space
+    262: "step",  # arrow to the right
+    45: "slower",  # -
+    333: "slower",  # - of the number pad
+    61: "faster",  # = and +
+    334: "faster",  # + of the number pad
+}
+"""GLFW's keys. MuJoCo's passive viewer uses none of them."""
+_HELP: Final = [("space", "pause"), ("right arrow", "one step"), ("- and +", "slower, faster")]
+_INSTEAD: Final = (
+    "look from a browser instead (--web, or --view web with rotorgram sim) or make a film "
+    "(rotorgram render)"
+)
+
+_NICENESS: Final = 10
+"""Of the threads that draw: the simulation comes first."""
+
+
+class NoDisplay(NoOpenGL):
+    """There is no display for a window. The sentence names other ways to look."""
+
+
+class Window:
+    """A stage in a window. `Surface`.
+
+    Args:
+        stage: What is shown.
+        pace: What the keys change.
+
+    Raises:
+        NoDisplay: There is no display, or none that OpenGL can draw on.
+    """
+
+    where = "in the window"
+
+    def __init__(self, stage: Stage, pace: Pace) -> None:
+        before = _tasks()
+        viewer = _viewer()
+        self._stage, self._pace, self._aim = stage, pace, Aim(stage)
+        others = set(threading.enumerate())
+        try:
+            self._handle = viewer.launch_passive(
+                stage.model,
+                stage.data,
+                key_callback=self._press,
+                show_left_ui=False,
+                show_right_ui=False,
+            )
+        except RuntimeError as error:  # on macOS windows belong to the main thread
+            raise NoDisplay(
+                f"window: expected mjpython -m rotorgram.cli in place of rotorgram, got {error}; "
+                f"or {_INSTEAD}"
+            ) from None
+        self._threads = set(threading.enumerate()) - others
+        # If it is never closed: MuJoCo's thread must have ended before GLFW does.
+        atexit.register(self.close)
+        # Threads that began meanwhile draw, on the processor if there is no GPU.
+        for task in _tasks() - before:
+            with suppress(OSError):  # it has ended
+                os.setpriority(os.PRIO_PROCESS, task, _NICENESS)
+
+    def show(self, lines: Lines) -> None:
+        """Draw the stage as it is now, with these lines over it."""
+        handle = self._handle
+        with handle.lock():
+            self._aim.apply(handle.cam)
+            handle.user_scn.ngeom = 0
+            self._stage.decorate(scene_geoms(handle.user_scn))
+        keys = _HELP if self._pace.period else _HELP[:2]
+        top, bottom = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
+        handle.set_texts([_text(top, lines), _text(bottom, keys)])
+        handle.sync()
+
+    def is_running(self) -> bool:
+        """Whether it is open."""
+        return bool(self._handle.is_running())
+
+    def is_watched(self) -> bool:
+        """Whether somebody looks: a window is looked at from its start."""
+        return True
+
+    def close(self) -> None:
+        """Close it, and wait for the thread that draws it: Python must not end before."""
+        self._handle.close()
+        for thread in self._threads:
+            thread.join(timeout=10)
+        atexit.unregister(self.close)
+
+    def _press(self, key: int) -> None:
+        if (press := KEYS.get(key)) is not None:
+            self._pace.press(press)
+
+
+def _text(place: mujoco.mjtGridPos, lines: Lines) -> tuple[Any, ...]:
+    names, values = ("\n".join(column) for column in zip(*lines, strict=True))
+    return mujoco.mjtFontScale.mjFONTSCALE_100, place, names, values
+
+
+def _tasks() -> set[int]:
+    """Numbers of this process's threads; empty on systems without /proc."""
+    folder = Path("/proc/self/task")
+    return {int(task.name) for task in folder.iterdir()} if folder.is_dir() else set()
+
+
+def _viewer() -> Any:
+    """MuJoCo's module. Raises `NoDisplay` first: without a display MuJoCo would wait forever."""
+    on_x = sys.platform == "linux"
+    if on_x and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise NoDisplay(f"window: expected a display, got none (DISPLAY is not set): {_INSTEAD}")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # GLFW's; the sentence below says what is wrong
+            import glfw
+            from mujoco import viewer
+
+            if on_x and not _draws(glfw):
+                raise RuntimeError("none that OpenGL can draw on")
+    except (ImportError, RuntimeError) as error:
+        raise NoDisplay(f"window: expected a display, got {error}: {_INSTEAD}") from None
+    return viewer
+
+
+def _draws(glfw: Any) -> bool:
+    """Whether a window can be made."""
+    if not glfw.init():
+        return False
+    glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
+    window = glfw.create_window(16, 16, "", None, None)
+    glfw.default_window_hints()
+    if not window:
+        return False
+    glfw.destroy_window(window)
+    return True
