@@ -1,50 +1,45 @@
-"""Sockets: opening them, with a clear sentence for what can be wrong, and waiting on them."""
+"""Sockets: opening them, with a clear sentence for what can be wrong, and waiting on them.
+
+A wait is a blocking read. A loop of non-blocking reads that yields in between saves some
+microseconds on an idle machine, and takes three times as long as soon as another process wants the
+processor.
+"""
 
 import errno
 import ipaddress
 import logging
-import os
 import selectors
 import socket
 import sys
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from contextlib import suppress
 from typing import Any, Final
 
-from .binary import MAX_DATAGRAM
-from .link import Address
-from .statistics import Statistics
+from ...models.errors import InputError
+from ..protocol.client import Address
+from ..protocol.statistics import Statistics
 
 __all__ = [
-    "LARGE",
+    "LONGEST_WAIT",
     "Port",
     "address_text",
     "is_loopback",
     "log_notices",
     "open_socket",
-    "pause_between_parts",
-    "receive",
     "resolve",
 ]
 
+LONGEST_WAIT: Final = 0.1
+"""Longest wait in one go, s: flags that other threads and signals set are looked at as often."""
+
 _log: Final = logging.getLogger("rotorgram.udp")
-_ATTENTION: Final = 300e-6
-"""How long a wait looks again and again before it sleeps, s."""
 _STRANGERS_EVERY: Final = 0.01
-"""While every place is taken, a datagram of a stranger is looked at so often, s."""
+"""While every slot is taken, a datagram of a stranger is looked at so often, s."""
 _BUFFER: Final = 1 << 22
 """Bytes of datagrams that a socket may hold until they are looked at."""
-LARGE: Final = 16_384
-"""Datagrams of more bytes are not sent many at once."""
-_AT_ONCE: Final = 3
-"""Datagrams of a message in parts that are sent without a pause: as many as fit into the smallest
-buffer that systems give, and"""
-_PAUSE: Final = 200e-6
-"""how long they are given to be taken out, s."""
-_LONGEST: Final = 3600.0
-"""Longest wait in one go, s: the system counts milliseconds in an int, and longer ones wrap."""
-_give_way: Final[Callable[[], None]] = getattr(os, "sched_yield", lambda: time.sleep(0))
+_MAX_DATAGRAM: Final = 65507
+"""Largest payload of a UDP datagram over IPv4, bytes."""
 
 
 def address_text(address: Address) -> str:
@@ -64,7 +59,7 @@ def resolve(address: Address, *, insecure: bool) -> Address:
         insecure: Allow any address; otherwise loopback ones only. Set where a key protects.
 
     Raises:
-        ValueError: It is not an address, or not a loopback one and `insecure` is not set.
+        InputError: It is not an address, or not a loopback one and `insecure` is not set.
     """
     try:
         host, port = address
@@ -72,14 +67,14 @@ def resolve(address: Address, *, insecure: bool) -> Address:
     except (TypeError, ValueError):
         valid = False
     if not valid:
-        raise ValueError(f"address: expected (host, port from 0 to 65535), got {address!r}")
+        raise InputError(f"address: expected (host, port from 0 to 65535), got {address!r}")
     try:
         found = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)
     except (socket.gaierror, UnicodeError):
-        raise ValueError(f"host: expected a name or IPv4 address, got {host!r}") from None
+        raise InputError(f"host: expected a name or IPv4 address, got {host!r}") from None
     number = str(found[0][4][0])
     if not insecure and not is_loopback((number, port)):
-        raise ValueError(
+        raise InputError(
             f"{host} is not a loopback address: expected 127.0.0.1, or a key that both sides share "
             "(key_file, --key-file), or insecure=True (--insecure) where everybody who reaches "
             "this port may fly the drone"
@@ -88,12 +83,12 @@ def resolve(address: Address, *, insecure: bool) -> Address:
 
 
 def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -> socket.socket:
-    """A UDP socket bound to an address, to be read with `receive`; port 0 takes a free one.
+    """A UDP socket bound to an address, to be read with `receive`. Port 0 takes a free one.
 
     With a resolved `peer` it is connected: the kernel drops what others send.
 
     Raises:
-        ValueError: The address is not one of this machine's, or is not loopback and `insecure` is
+        InputError: The address is not one of this machine's, or is not loopback and `insecure` is
             not set.
         OSError: The port is taken or may not be bound, or the peer cannot be reached from here.
     """
@@ -109,7 +104,7 @@ def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -
         sock.close()
         raise OSError(error.errno, f"cannot {what}: {_explain(error)}") from None
     _enlarge_buffer(sock)
-    sock.setblocking(False)
+    sock.settimeout(LONGEST_WAIT)
     return sock
 
 
@@ -132,26 +127,17 @@ def _explain(error: OSError) -> str:
 def receive(sock: socket.socket, timeout: float) -> tuple[bytes, Address]:
     """The next datagram and where it came from.
 
-    In lock-step the answer is mostly a few dozen microseconds away, and a processor that falls
-    asleep meanwhile takes longer than that to wake up. So this looks again for a moment, giving
-    way to whoever else wants the processor, before it sleeps.
-
     Raises:
-        TimeoutError: Nothing came within `timeout`, s, or an hour: look at the clock.
+        TimeoutError: Nothing came within `timeout`, s, or `LONGEST_WAIT`: look at the clock.
         OSError: An earlier datagram came back, or the socket is closed.
     """
-    # Not time.monotonic, which ticks every 16 ms on Windows.
-    until = time.perf_counter() + min(timeout, _ATTENTION)
-    while time.perf_counter() < until:
+    if timeout < LONGEST_WAIT:  # else the socket's own will do: to set it is a system call
+        sock.settimeout(max(timeout, 1e-6))
         try:
-            return sock.recvfrom(MAX_DATAGRAM)
-        except BlockingIOError:
-            _give_way()
-    try:
-        sock.settimeout(min(max(timeout - _ATTENTION, _ATTENTION), _LONGEST))
-        return sock.recvfrom(MAX_DATAGRAM)
-    finally:
-        sock.setblocking(False)
+            return sock.recvfrom(_MAX_DATAGRAM)
+        finally:
+            sock.settimeout(LONGEST_WAIT)
+    return sock.recvfrom(_MAX_DATAGRAM)
 
 
 class Port:
@@ -161,11 +147,12 @@ class Port:
     own, and nobody else can fill the one of a simulator, however fast he sends.
 
     Raises:
-        ValueError, OSError: As `open_socket`.
+        InputError, OSError: As `open_socket`.
     """
 
     def __init__(self, address: Address, *, insecure: bool) -> None:
         self._everybody = open_socket(address, insecure=insecure)
+        self._everybody.setblocking(False)
         self._own: dict[Address, socket.socket] = {}
         self._simulators = selectors.DefaultSelector()
         self._all = selectors.DefaultSelector()
@@ -202,16 +189,13 @@ class Port:
         Raises:
             TimeoutError, OSError: As the function `receive`; a wait may end early.
         """
-        if not self._own:
-            return receive(self._everybody, timeout)
-        if strangers or self._missing:
+        if strangers or self._missing or not self._own:
             return _receive_any(self._all, timeout)
-        now = time.perf_counter()
+        now = time.monotonic()
         if now >= self._next_look:
             self._next_look = now + _STRANGERS_EVERY
             with suppress(BlockingIOError):
-                return self._everybody.recvfrom(MAX_DATAGRAM)
-        timeout = min(timeout, _STRANGERS_EVERY)
+                return self._everybody.recvfrom(_MAX_DATAGRAM)
         if len(self._own) > 1:
             return _receive_any(self._simulators, timeout)
         (only,) = self._own.values()
@@ -234,18 +218,18 @@ class Port:
         except OSError:  # too many open files
             return
         try:
-            # Only for this moment: the port is nobody else's.
+            # Not SO_REUSEADDR, with which another user could take the port in this moment.
             for one in (self._everybody, sock):
-                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
             sock.bind(self._everybody.getsockname())
             sock.connect(peer)
         except OSError:  # then its datagrams come to the socket for everybody
             sock.close()
             return
         finally:
-            self._everybody.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+            self._everybody.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
         _enlarge_buffer(sock)
-        sock.setblocking(False)
+        sock.settimeout(LONGEST_WAIT)
         self._own[peer] = sock
         for selector in (self._simulators, self._all):
             selector.register(sock, selectors.EVENT_READ)
@@ -253,27 +237,11 @@ class Port:
 
 def _receive_any(selector: selectors.BaseSelector, timeout: float) -> tuple[bytes, Address]:
     """As `receive`, from any of several sockets."""
-    until = time.perf_counter() + min(timeout, _ATTENTION)
-    ready = selector.select(0)
-    while not ready and time.perf_counter() < until:
-        _give_way()
-        ready = selector.select(0)
-    ready = ready or selector.select(min(max(timeout - _ATTENTION, _ATTENTION), _LONGEST))
-    for key, _ in ready:
+    for key, _ in selector.select(min(timeout, LONGEST_WAIT)):
         sock: Any = key.fileobj
-        datagram, address = sock.recvfrom(MAX_DATAGRAM)
+        datagram, address = sock.recvfrom(_MAX_DATAGRAM)
         return datagram, address
     raise TimeoutError
-
-
-def pause_between_parts(number: int) -> None:
-    """Wait a moment after every few datagrams that are sent in one go.
-
-    Args:
-        number: Of the datagram that is about to be sent, from 0.
-    """
-    if number and number % _AT_ONCE == 0:
-        time.sleep(_PAUSE)
 
 
 def log_notices(statistics: Statistics, now: float) -> None:

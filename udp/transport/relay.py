@@ -1,6 +1,6 @@
 """A bad network on purpose: a seeded relay between simulators (clients) and an agent (server).
 
-`Faults` decides what becomes of a datagram, without a socket or a clock; `Relay` carries it out.
+`Faults` decides the fate of a datagram, without a socket or a clock; `Relay` carries it out.
 """
 
 import itertools
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Final
 
+from ...models.errors import InputError
 from .sockets import is_loopback, open_socket, resolve
 
 __all__ = ["FaultConfig", "Faults", "Relay"]
@@ -21,22 +22,25 @@ __all__ = ["FaultConfig", "Faults", "Relay"]
 _NAP: Final = 0.04
 """Longest wait before the relay looks whether it was stopped, s."""
 _IDLE: Final = 600.0
-"""A client that nothing came from or went to for this long is forgotten, s."""
-_MOST_CLIENTS: Final = 200
+"""A client without a datagram in either direction for this long is forgotten, s."""
+_MAX_CLIENTS: Final = 200
 """Beyond, the longest idle one is forgotten: each takes a file, and some systems lend only 256."""
-_MOST_HELD: Final = 16_384
-"""Datagrams that are held back at one time; what is more is not sent."""
+_MAX_HELD: Final = 16_384
+"""Most datagrams that are held back at one time; more are not sent."""
 _LARGEST: Final = 65_535  # bytes that a datagram can have
+_IP_HEADER: Final = 20
+_UDP_HEADER: Final = 8
+_MAX_MTU: Final = 65_535
 
 
 @dataclass(frozen=True, kw_only=True)
 class FaultConfig:
-    """What happens to datagrams: for each one, in both directions alike."""
+    """Faults of a network: the same for both directions, drawn for each datagram."""
 
     drop: float = 0.0
-    """Probability that a datagram is lost, 0 to 1."""
+    """Probability that a packet is lost, 0 to 1: a datagram, or each fragment of it (`mtu`)."""
     duplicate: float = 0.0
-    """Probability that it comes twice, 0 to 1: the second copy up to `reorder_by` later."""
+    """Probability that a datagram comes twice, 0 to 1: the second up to `reorder_by` later."""
     reorder: float = 0.0
     """Probability that it is held back, 0 to 1, so that later ones overtake it."""
     truncate: float = 0.0
@@ -49,12 +53,22 @@ class FaultConfig:
     """Longest time that it is held in addition, s: uniform from 0."""
     reorder_by: float = 0.002
     """Longest time that a reordered one or a second copy is held in addition, s: uniform from 0."""
+    mtu: int = 0
+    """Largest IP packet of the path, bytes, 68 to 65,535; 0: no limit. A larger datagram travels in
+    several packets and is lost if one of them is lost."""
+    black_hole: bool = False
+    """Whether a datagram larger than `mtu` is always lost, as behind a router that drops
+    fragments."""
     seed: int = 0
     """The same seed gives each client's datagrams the same fates, by their order."""
 
     def __post_init__(self) -> None:
         if type(self.seed) is not int:
-            raise ValueError(f"seed: expected a whole number, got {self.seed!r}")
+            raise InputError(f"seed: expected a whole number, got {self.seed!r}")
+        if type(self.mtu) is not int or not (self.mtu == 0 or 68 <= self.mtu <= _MAX_MTU):
+            raise InputError(f"mtu: expected 0 or 68 to {_MAX_MTU} bytes, got {self.mtu!r}")
+        if self.black_hole and not self.mtu:
+            raise InputError("black_hole: expected an mtu with it, got none")
         for name in ("drop", "duplicate", "reorder", "truncate", "corrupt"):
             self._check(name, 1, "a probability from 0 to 1")
         for name in ("delay", "jitter", "reorder_by"):
@@ -63,11 +77,11 @@ class FaultConfig:
     def _check(self, name: str, most: float, expected: str) -> None:
         value = getattr(self, name)
         if not (isinstance(value, int | float) and 0 <= value <= most):
-            raise ValueError(f"{name}: expected {expected}, got {value!r}")
+            raise InputError(f"{name}: expected {expected}, got {value!r}")
 
 
 class Faults:
-    """What becomes of the datagrams of one stream: one direction of one client.
+    """Decides the fates of the datagrams of one stream: one direction of one client.
 
     `counters` holds `received`, `forwarded` (copies that come out: received − dropped +
     duplicated), `dropped`, `duplicated`, `reordered`, `truncated` and `corrupted`.
@@ -87,7 +101,7 @@ class Faults:
         self._random = random.Random(f"{config.seed}/{stream}").random
 
     def fate(self, datagram: bytes) -> list[tuple[float, bytes]]:
-        """What comes out of a datagram: delays, s, and bytes. Nothing if it is dropped.
+        """The copies that come out of a datagram: delay, s, and bytes. None if it is dropped.
 
         Both copies of a duplicated datagram hold the same bytes.
         """
@@ -97,7 +111,9 @@ class Faults:
             self._random() for _ in range(14)
         ]
         count["received"] += 1
-        if drop < config.drop:
+        packets = _packets(len(datagram), config.mtu)
+        blocked = config.black_hole and packets > 1
+        if blocked or drop < 1 - (1 - config.drop) ** packets:
             count["dropped"] += 1
             return []
         if truncate < config.truncate and datagram:
@@ -118,6 +134,12 @@ class Faults:
         return out
 
 
+def _packets(size: int, mtu: int) -> int:
+    """Number of IP packets that carry a datagram of so many bytes."""
+    whole = size + _UDP_HEADER  # fragments but the last carry a multiple of 8 bytes
+    return 1 if not mtu or whole <= mtu - _IP_HEADER else -(-whole // ((mtu - _IP_HEADER) & ~7))
+
+
 def _flip(datagram: bytes, places: list[float]) -> bytes:
     """Flip the bits at these places, 0 to 1 of the length; the same bit twice is flipped once."""
     flipped = bytearray(datagram)
@@ -129,9 +151,9 @@ def _flip(datagram: bytes, places: list[float]) -> bytes:
 def _reachable(address: tuple[str, int], insecure: bool) -> tuple[str, int]:
     found = resolve(address, insecure=True)
     if not (insecure or is_loopback(found)):
-        raise ValueError(
+        raise InputError(
             f"{address[0]} is not a loopback address: expected 127.0.0.1, or insecure=True "
-            "(--insecure) where everybody who reaches the relay may send through it"
+            "(--insecure) where everybody that reaches the relay may send through it"
         )
     return found
 
@@ -152,18 +174,18 @@ class Relay:
     Each client has a socket of its own towards the server, as behind a NAT, so that the server
     tells them apart. Clients are numbered from 1 as they come; number and direction name a stream.
 
-    `counters` holds those of `Faults`, over all clients and both directions, and of what was to
-    go out and is as good as lost: `unreachable` (ICMP errors: nobody listens there) and `unsent`
-    (the system would not send, a full buffer for example, or too much is held back).
+    `counters` holds those of `Faults`, over all clients and both directions, and two more of lost
+    datagrams: `unreachable` (ICMP errors: no program listens there) and `unsent` (the system
+    did not send, because of a full buffer for example, or too much is held back).
 
     Args:
         listen: Address (host, port) that clients send to; port 0 takes a free port.
         server: Address of the agent.
         config: The faults; by default none.
-        insecure: Allow addresses that are not loopback: datagrams are not authenticated.
+        insecure: Allow addresses that are not loopback; the relay authenticates no datagram.
 
     Raises:
-        ValueError: An address is not what it should be.
+        InputError: An address is wrong.
         OSError: The port is in use.
     """
 
@@ -179,9 +201,9 @@ class Relay:
         self.counters: Counter[str] = Counter()
         self.server = _reachable(server, insecure)
         if self.server[1] == 0:
-            raise ValueError("server: expected the port of the agent, 1 to 65535, got 0")
+            raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
         if self.server == _reachable(listen, insecure):
-            raise ValueError(f"listen: expected another address than the server's, got {listen}")
+            raise InputError(f"listen: expected another address than the server's, got {listen}")
         self._any = ("0.0.0.0" if insecure else "127.0.0.1", 0)
         self._clients: OrderedDict[tuple[str, int], _Client] = OrderedDict()
         self._client_numbers = itertools.count(1)
@@ -203,7 +225,7 @@ class Relay:
     def run(self) -> None:
         """Carry datagrams until `stop` is called, by another thread or a signal handler.
 
-        A relay runs once. What is held back at its end is lost.
+        A relay runs once. Datagrams that are held back at its end are lost.
         """
         with self._running:
             while not self._stopped.is_set():
@@ -237,7 +259,7 @@ class Relay:
                 datagram, upward = client.upstream.recv(_LARGEST), False
             else:
                 datagram, address = self._socket.recvfrom(_LARGEST)
-                client, upward = self._clients.get(address) or self._welcome(address), True
+                client, upward = self._clients.get(address) or self._new_client(address), True
         except BlockingIOError:  # its checksum was wrong
             return
         except OSError:  # ICMP says that an earlier one did not arrive
@@ -248,14 +270,14 @@ class Relay:
         now = client.seen = time.perf_counter()
         self._clients.move_to_end(client.address)
         for delay, copy in client.faults[upward].fate(datagram):
-            if len(self._held) >= _MOST_HELD:
+            if len(self._held) >= _MAX_HELD:
                 self.counters["unsent"] += 1
                 continue
             number = next(self._held_numbers)  # those of the same time leave as they came
             heappush(self._held, (now + delay, number, copy, client, upward))
 
     def _send_due(self) -> float:
-        """Send what is due; the time to wait for more, s."""
+        """Send what is due. Returns the time until more is due, s."""
         while self._held:
             left = self._held[0][0] - time.perf_counter()
             if left > 0:
@@ -272,7 +294,7 @@ class Relay:
                 self.counters["unsent"] += 1
         return _NAP
 
-    def _welcome(self, address: tuple[str, int]) -> _Client | None:
+    def _new_client(self, address: tuple[str, int]) -> _Client | None:
         try:
             upstream = open_socket(self._any, insecure=self._any[0] == "0.0.0.0", peer=self.server)
         except OSError:  # too many open files, or no way there
@@ -290,7 +312,7 @@ class Relay:
         now = time.perf_counter()
         while self._clients:
             client = next(iter(self._clients.values()))
-            if len(self._clients) <= _MOST_CLIENTS and now - client.seen <= _IDLE:
+            if len(self._clients) <= _MAX_CLIENTS and now - client.seen <= _IDLE:
                 return
             del self._clients[client.address]
             self._selector.unregister(client.upstream)

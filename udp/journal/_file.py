@@ -1,23 +1,31 @@
-"""An MCAP file that stays readable, whatever ends the program that writes it.
+"""MCAP files: written so that a killed program leaves a readable file, and read in bounded memory.
 
-The records are those of `mcap.writer.Writer`. Around it: messages wait in a list, which costs the
-exchange next to nothing, and a chunk of them is written at once.
+The records are those of the package `mcap`. Messages wait in a list, which costs the exchange
+next to nothing, and a chunk of them is written at once.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from errno import EFBIG, EINTR
+from io import BytesIO
 from pathlib import Path
 from threading import RLock
-from typing import Final
+from typing import BinaryIO, Final
 
+import zstandard
+from mcap.records import Chunk, McapRecord
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
-__all__ = ["MAGIC", "Entry", "McapFile"]
+__all__ = ["MAGIC", "MAX_CHUNK", "Entry", "McapFile", "read_records"]
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-_NEVER: Final = 1 << 40  # bytes; `flush` says when a chunk ends
-_MOST_CHANNELS: Final = 0xFFFF
+MAX_CHUNK: Final = 1 << 26
+"""Most bytes of a record or of a decompressed chunk that is read. Ours are of 64 KiB, or of one
+message and 256 KiB where that is longer."""
+_NEVER: Final = 1 << 40  # bytes; `flush` decides where a chunk ends
+_MAX_CHANNELS: Final = 0xFFFF
 
 Entry = tuple[int, int, int, bytes]
 """A message that waits to be written: channel, nanoseconds since 1970, sequence number, data."""
@@ -26,8 +34,8 @@ Entry = tuple[int, int, int, bytes]
 class McapFile:
     """Appends to a new file, in whole records.
 
-    A write that an exception interrupts (a full device, Ctrl-C) may have left half of one. Then
-    nothing more can be written, and `abandon` closes the file behind the last that is whole.
+    A write that an exception interrupts (a full device, Ctrl-C) may leave half a record. Then
+    nothing more can be written, and `abandon` closes the file after the last whole record.
 
     Attributes:
         pending: Messages of the next chunk. Append to it; `encode` and `flush` take them.
@@ -37,7 +45,7 @@ class McapFile:
         library: Name and version of the program that writes.
 
     Raises:
-        FileExistsError: It does.
+        FileExistsError: The file exists.
         OSError: It cannot be written. All other methods raise this too.
     """
 
@@ -65,10 +73,10 @@ class McapFile:
             return number
 
     def add_channel(self, topic: str, encoding: str, schema: int) -> int:
-        """Its id. A file has 65,535 of them at most."""
+        """Its id. A file has at most 65,535 channels."""
         with self._lock:
-            if self._channels == _MOST_CHANNELS:
-                raise OSError(EFBIG, f"more than {_MOST_CHANNELS} channels")
+            if self._channels == _MAX_CHANNELS:
+                raise OSError(EFBIG, f"more than {_MAX_CHANNELS} channels")
             self._broken = True
             number: int = self._writer.register_channel(topic, encoding, schema)
             self._channels += 1
@@ -96,7 +104,9 @@ class McapFile:
     def encode(self) -> None:
         """Put the pending messages into the chunk that is written next."""
         with self._lock:
-            if self._busy or self._file.closed:  # busy: a signal's handler, in the midst of this
+            if (
+                self._busy or self._file.closed
+            ):  # busy: called by a signal handler that interrupted us
                 return
             if self._broken:
                 raise OSError(EINTR, "a write was interrupted")
@@ -120,7 +130,7 @@ class McapFile:
                 self._settle()
 
     def finish(self) -> None:
-        """Write what is pending and the summary, and close the file. May be called again."""
+        """Write pending messages and the summary, and close the file. May be called again."""
         with self._lock:
             if self._busy or self._file.closed:
                 return
@@ -130,17 +140,52 @@ class McapFile:
             self._file.close()
 
     def abandon(self) -> None:
-        """Close the file behind its last whole record. What is pending is lost."""
+        """Close the file after its last whole record. Pending messages are lost."""
         with self._lock:
             if self._file.closed:
                 return
-            raw = self._file.raw  # not by its buffer, which has what a full device has refused
+            raw = self._file.raw  # its buffer still holds the bytes that a full device refused
             with suppress(OSError):
                 raw.truncate(self._end)
             raw.close()
 
     def _settle(self) -> None:
-        """What was written until here is whole."""
+        """Take note that all records up to here are whole."""
         self._file.flush()
         self._end = self._file.tell()
         self._broken = False
+
+
+def read_records(file: BinaryIO) -> Iterator[McapRecord]:
+    """The records of an MCAP file, those in chunks too, in order.
+
+    Raises:
+        ValueError: A record or chunk is larger than `MAX_CHUNK`, or compressed in another way.
+        OSError: The file cannot be read.
+        Exception: Any other, of the package `mcap`, where the file is damaged or cut off.
+    """
+    reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_CHUNK)
+    for record in reader.records:
+        if isinstance(record, Chunk):
+            yield from breakup_chunk(_decompressed(record), validate_crc=True)
+        else:
+            yield record
+
+
+def _decompressed(chunk: Chunk) -> Chunk:
+    """The same chunk without compression. A short chunk can decompress to any number of bytes."""
+    if not chunk.compression:
+        return chunk
+    if chunk.compression != "zstd":
+        raise ValueError(f"expected a chunk compressed by zstd, got {chunk.compression!r:.80}")
+    if chunk.uncompressed_size > MAX_CHUNK:
+        size = chunk.uncompressed_size
+        raise ValueError(f"expected chunks of at most {MAX_CHUNK} bytes, got one of {size}")
+    stream = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK).stream_reader(
+        BytesIO(chunk.data)
+    )
+    data = stream.read(chunk.uncompressed_size + 1)
+    if len(data) != chunk.uncompressed_size:
+        size = chunk.uncompressed_size
+        raise ValueError(f"expected a chunk of {size} bytes, got one of another size")
+    return replace(chunk, compression="", data=data)

@@ -6,47 +6,75 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 from mcap import records
-from mcap.stream_reader import StreamReader
 
-from . import binary
-from ._mcap import MAGIC
-from .errors import DecodeError
-from .journal import ABOUT, FORMAT
-from .messages import Close, Command, Hello, Message, Refuse, State, Unknown, Welcome
+from ...envs.spec import EnvSpec
+from ...models.errors import InputError
+from ..layouts import layout_of
+from ..protocol import binary
+from ..protocol.errors import DecodeError
+from ..protocol.layout import Layout
+from ..protocol.messages import (
+    FLY,
+    Close,
+    Command,
+    Hello,
+    Message,
+    Refuse,
+    State,
+    Unknown,
+    Welcome,
+)
+from ._file import MAGIC, read_records
+from .writer import ABOUT, FORMAT
 
 __all__ = [
-    "Flight",
     "Item",
     "Recording",
+    "Session",
     "SessionSummary",
     "Summary",
     "count_of",
+    "printable",
     "read_journal",
     "summarize",
 ]
 
-_TOPIC: Final = re.compile(r"/place([0-9]{1,9})/(state|command|events)")
-_LARGEST: Final = 1 << 28
-"""Bytes of a record. Ours are a thousand times smaller."""
+_TOPIC: Final = re.compile(r"/slot([0-9]{1,9})/(state|command|events)")
 
 
 @dataclass(eq=False)
-class Flight:
-    """A session: what one simulator flew at one place, from its Hello on."""
+class Session:
+    """One simulator at one slot of an agent, from its Hello on."""
 
     index: int
     """Counts the sessions of the file, from 1."""
-    place: int
+    slot: int
     hello: Hello
-    """By text none was said. Then it is what the agent knows, of session 0."""
+    """The text codec has no Hello. Then it is what the recording side knows, of session 0."""
     codec: str
     """`binary` or `text`."""
     welcome: Welcome | None = None
+
+    @cached_property
+    def spec(self) -> EnvSpec:
+        """Of the env that is flown."""
+        return EnvSpec.from_json(self.hello.spec)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Of the States and Commands."""
+        return layout_of(self.spec, self.hello.worlds)
+
+    @property
+    def num_envs(self) -> int:
+        """Number of drones."""
+        return self.layout.drones
 
     @property
     def seed(self) -> int | None:
@@ -56,33 +84,35 @@ class Flight:
         return self.hello.session if self.hello.session or self.codec == "binary" else None
 
     def __str__(self) -> str:
-        return f"session {self.index} (place {self.place}, {self.hello.session:016x})"
+        return f"session {self.index} (slot {self.slot}, {self.hello.session:016x})"
 
 
 class Item(NamedTuple):
     """A message of the journal."""
 
-    flight: Flight
+    session: Session
     time: int
     """When it was sent or taken, nanoseconds since 1970."""
     message: Message
     datagram: bytes
-    """Its binary datagram, not sealed."""
+    """Its binary datagram, not sealed and not cut into fragments."""
 
 
 class Recording:
     """The messages of a journal, in the order in which they were written. May be iterated again.
 
+    Nothing that the file names is imported or made: a spec is data.
+
     Attributes:
         path: The file.
-        about: What its head says: side, env id, options, versions.
+        about: Metadata of its head: side, env id, options, versions.
         attachments: Files in its head, by name.
-        complete: Whether the file was finished, and all of it could be read, as far as was tried.
-        ending: In words what it ends with.
+        complete: Whether the file was finished, and could be read as far as was tried.
+        ending: How it ends, in words.
 
     Raises:
         OSError: The file cannot be read.
-        ValueError: It is no journal, or one of another version.
+        InputError: It is not a journal, or one of another version.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -92,7 +122,7 @@ class Recording:
         with self.path.open("rb") as file:
             head = file.read(len(MAGIC))
             if head != MAGIC[: len(head)]:
-                raise ValueError(f"{self.path}: expected an MCAP file, got another")
+                raise InputError(f"{self.path}: expected an MCAP file, got another")
             file.seek(-min(len(MAGIC), os.fstat(file.fileno()).st_size), os.SEEK_END)
             self.complete = file.read() == MAGIC
         self.ending = "complete" if self.complete else "cut off before its end"
@@ -104,57 +134,59 @@ class Recording:
             elif not isinstance(record, records.Header):
                 break
         if self.about.get("format", FORMAT) != FORMAT or (self.complete and not self.about):
-            raise ValueError(
-                f"{self.path}: expected a journal of format {FORMAT}, "
-                f"got {self.about.get('format', 'another MCAP file')}"
-            )
+            got = self.about.get("format", "another MCAP file")
+            raise InputError(f"{self.path}: expected a journal of format {FORMAT}, got {got!r:.80}")
 
     def __iter__(self) -> Iterator[Item]:
-        places: dict[int, tuple[int, str]] = {}
-        flights: dict[int, Flight] = {}
+        topics: dict[int, tuple[int, str]] = {}
+        sessions: dict[int, Session] = {}
         count = 0
         for record in self._records():
             if isinstance(record, records.Channel):
                 if match := _TOPIC.fullmatch(record.topic):
-                    places[record.id] = int(match[1]), match[2]
-            elif isinstance(record, records.Message) and record.channel_id in places:
-                place, kind = places[record.channel_id]
-                message, datagram, codec = self._message(kind, record.data)
+                    topics[record.id] = int(match[1]), match[2]
+            elif isinstance(record, records.Message) and record.channel_id in topics:
+                slot, topic = topics[record.channel_id]
+                session = sessions.get(slot)
+                message, datagram, codec = self._message(topic, record.data, session)
                 if isinstance(message, Hello):
                     count += 1
-                    flights[place] = Flight(count, place, message, codec)
-                flight = flights.get(place)
-                if flight is None or message.session != flight.hello.session:
-                    raise ValueError(
+                    session = sessions[slot] = Session(count, slot, message, codec)
+                elif session is None or message.session != session.hello.session:
+                    raise InputError(
                         f"{self.path}: expected a message of the session of the last Hello, "
                         f"got a {type(message).__name__} of {message.session:016x}"
                     )
                 if isinstance(message, Welcome):
-                    flight.welcome = message
-                yield Item(flight, record.log_time, message, datagram)
+                    session.welcome = message
+                yield Item(session, record.log_time, message, datagram)
 
-    def _message(self, kind: str, data: bytes) -> tuple[Message, bytes, str]:
+    def _message(
+        self, topic: str, data: bytes, session: Session | None
+    ) -> tuple[Message, bytes, str]:
         codec = ""
         try:
-            if kind == "events":
+            if topic == "events":
                 words = json.loads(data)
-                data, codec = bytes.fromhex(words["datagram"]), words.get("codec", "")
-            return binary.decode(data), data, codec
+                data, codec = bytes.fromhex(words["datagram"]), str(words.get("codec", ""))
+            message = binary.decode(data, session.layout if session else None)
+            if isinstance(message, Hello):
+                layout_of(EnvSpec.from_json(message.spec), message.worlds)
+            return message, data, codec
         except (ValueError, KeyError, TypeError, AttributeError, DecodeError) as error:
-            raise ValueError(f"{self.path}: a message that cannot be read: {error}") from None
+            raise InputError(f"{self.path}: a message that cannot be read: {error}") from None
 
     def _records(self) -> Iterator[records.McapRecord]:
         with self.path.open("rb") as file:
-            reader = StreamReader(file, validate_crcs=True, record_size_limit=_LARGEST)
-            all_records = reader.records
+            following = read_records(file)
             while True:
                 try:
-                    record = next(all_records)
+                    record = next(following)
                 except StopIteration:
                     return
                 except OSError:
                     raise
-                except Exception as error:  # whatever half a record makes of its reader
+                except Exception as error:  # half a record raises anything
                     what = f"damaged ({error})" if self.complete else "cut off"
                     self.complete = False
                     self.ending = f"{what} at or before byte {file.tell()}"
@@ -163,7 +195,12 @@ class Recording:
 
 
 def read_journal(path: Path | str) -> Recording:
-    """The messages of a journal. One that was cut off, by a crash, is read up to the cut."""
+    """The messages of a journal. One that a crash cut off is read up to the cut.
+
+    Raises:
+        OSError: The file cannot be read.
+        InputError: It is not a journal; while iterating: a message in it cannot be read.
+    """
     return Recording(path)
 
 
@@ -172,19 +209,19 @@ def read_journal(path: Path | str) -> Recording:
 
 @dataclass(kw_only=True)
 class SessionSummary:
-    """What happened in one session."""
+    """Counts of one session."""
 
-    flight: Flight
+    session: Session
     first: int
     """Time of its first message, nanoseconds since 1970."""
     last: int
     states: int = 0
     steps: int = 0
-    """Of all drones together; resets are none."""
+    """Of all drones together; resets do not count."""
     episodes: int = 0
-    """Those that ended."""
+    """Episodes that ended."""
     returns: float = 0.0
-    """Sum over them of the rewards of each."""
+    """Sum of their returns."""
     ending: str = "not closed"
     """How it was closed or refused, in words."""
 
@@ -194,19 +231,18 @@ class SessionSummary:
         return (self.last - self.first) / 1e9
 
     def __str__(self) -> str:
-        flight, hello = self.flight, self.flight.hello
-        drones = "1 drone" if hello.num_drones == 1 else f"{hello.num_drones} drones"
+        session = self.session
         mean = f", mean return {self.returns / self.episodes:.2f}" if self.episodes else ""
         return (
-            f"{flight}: {drones} of {hello.env_id}, {flight.codec}, {_clock(self.first)}, "
-            f"{self.seconds:.1f} s, {self.steps} steps, {self.episodes} episodes{mean}; "
-            f"{self.ending}"
+            f"{session}: {count_of(session.num_envs, 'drone')} of {session.spec.env_id}, "
+            f"{session.codec}, {_clock(self.first)}, {self.seconds:.1f} s, {self.steps} steps, "
+            f"{self.episodes} episodes{mean}; {self.ending}"
         )
 
 
 @dataclass(kw_only=True)
 class Summary:
-    """What is in a journal."""
+    """Counts of a journal."""
 
     path: Path
     side: str
@@ -222,19 +258,19 @@ class Summary:
 
     @property
     def episodes(self) -> int:
-        """Those that ended, of all sessions."""
+        """Episodes that ended, of all sessions."""
         return sum(session.episodes for session in self.sessions)
 
     @property
     def mean_return(self) -> float | None:
-        """Of the episodes that ended; None if none did."""
+        """Of the episodes that ended; None without one."""
         total = sum(session.returns for session in self.sessions)
         return total / self.episodes if self.episodes else None
 
     def __str__(self) -> str:
         side = f"written by the {self.side}, " if self.side else ""
         head = f"{self.path}: {side}{self.ending}, {count_of(len(self.sessions), 'session')}"
-        return "\n".join([head, *map(str, self.sessions)])
+        return printable([head, *map(str, self.sessions)])
 
 
 class _Tally:
@@ -242,7 +278,7 @@ class _Tally:
 
     def __init__(self, summary: SessionSummary) -> None:
         self.summary = summary
-        self._returns = np.zeros(summary.flight.hello.num_drones)
+        self._returns = np.zeros(summary.session.num_envs)
         self._command: Command | None = None
 
     def take(self, item: Item) -> None:
@@ -266,7 +302,7 @@ class _Tally:
         summary, command = self.summary, self._command
         summary.states += 1
         resets = np.ones(len(state.rewards), bool) if command is None else command.resets
-        stepped = ~resets if command is None or command.holds is None else ~resets & ~command.holds
+        stepped = ~resets if command is None else command.orders == FLY
         self._returns[resets] = 0.0
         self._returns += np.where(stepped, state.rewards, 0.0)
         summary.steps += int(stepped.sum())
@@ -276,14 +312,14 @@ class _Tally:
 
 
 def summarize(path: Path | str) -> Summary:
-    """What is in a journal. Raises `ValueError` if it is none, `OSError` if it cannot be read."""
+    """Counts of a journal. Raises as `read_journal`."""
     recording = read_journal(path)
     tallies: dict[int, _Tally] = {}
     for item in recording:
-        if item.flight.index not in tallies:
-            summary = SessionSummary(flight=item.flight, first=item.time, last=item.time)
-            tallies[item.flight.index] = _Tally(summary)
-        tallies[item.flight.index].take(item)
+        if item.session.index not in tallies:
+            summary = SessionSummary(session=item.session, first=item.time, last=item.time)
+            tallies[item.session.index] = _Tally(summary)
+        tallies[item.session.index].take(item)
     return Summary(
         path=recording.path,
         side=recording.about.get("side", ""),
@@ -298,5 +334,13 @@ def _clock(time: int) -> str:
 
 
 def count_of(count: int, what: str) -> str:
-    """So many of something, in words."""
+    """A number and a noun: 1 session, 2 sessions."""
     return f"1 {what}" if count == 1 else f"{count} {what}s"
+
+
+def printable(lines: list[str]) -> str:
+    """Lines for a terminal. A journal can hold any text: no control character of it is shown."""
+    return "\n".join(
+        "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
+        for line in lines
+    )
