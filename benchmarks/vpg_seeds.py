@@ -1,6 +1,6 @@
 """When VPG begins to hold the target, seed by seed, and what its policy has learnt by then.
 
-    python benchmarks/vpg_seeds.py [--baseline linear] [--first-seed 200] [--seeds 20]
+    python benchmarks/vpg_seeds.py [--first-seed 200] [--seeds 20]
 
 Every 10,000 env steps the policy flies six episodes without exploration. It holds from the first
 such time on from which none of them crashes and the mean size of the error over their last 60
@@ -42,14 +42,13 @@ def gains(policy: NetworkPolicy) -> list[float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--baseline", choices=("time", "linear"), default="linear")
     parser.add_argument("--first-seed", type=int, default=200)
     parser.add_argument("--seeds", type=int, default=20)
     args = parser.parse_args()
     torch.set_num_threads(1)
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         log = EpisodeLog(gym.make(ENV, disable_env_checker=True), seed)
-        agent = make_agent("vpg", log, preset("vpg", "tuned", baseline=args.baseline), seed)
+        agent = make_agent("vpg", log, preset("vpg", "tuned"), seed)
         rows: list[tuple[int, int, float]] = []
 
         def look(log=log, agent=agent, rows=rows, seed=seed) -> bool:
