@@ -1,6 +1,7 @@
-"""Gymnasium environments: importing this package registers `rotorgram/Elevation-v0` and `Hover-v0`.
+"""Gymnasium environments: `rotorgram/Elevation-v0`, `rotorgram/Hover-v0`, and tasks of your own.
 
-Gymnasium 1.0 stopped reading the entry point `gymnasium.envs`, so one of these makes the envs known:
+Importing this package registers them. Gymnasium 1.0 stopped reading the entry point
+`gymnasium.envs`, so one of these makes them known:
 
     import rotorgram.envs; gym.make("rotorgram/Elevation-v0")
     gym.make("rotorgram.envs:rotorgram/Elevation-v0")  # imports by itself

@@ -32,7 +32,6 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         terminated, truncated: bool, shape (N,).
         done: bool, shape (N,): the episode has ended and the next has not begun.
         lost: bool, shape (N,): the episode was truncated because its simulator was lost.
-        telemetry: By name, float64, shape (N, *shape).
     """
 
     env_spec: EnvSpec
@@ -43,7 +42,11 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
     truncated: np.ndarray
     done: np.ndarray
     lost: np.ndarray
-    telemetry: Mapping[str, np.ndarray]
+
+    @property
+    @abstractmethod
+    def telemetry(self) -> Mapping[str, np.ndarray]:
+        """By name, float64, shape (N, *shape)."""
 
     @abstractmethod
     def reset(

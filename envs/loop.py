@@ -120,6 +120,7 @@ class Loop:
         rewards: float64, shape (N,); 0 for a drone that did not fly.
         terminated, truncated: bool, shape (N,).
         done: bool, shape (N,): the episode has ended and the next has not begun.
+        terms: Terms of the last rewards by name, with the leading axes of the world.
 
     Raises:
         InputError: An argument, seed or action is not what it should be; nothing has changed.
@@ -160,10 +161,11 @@ class Loop:
         self._anyone_waits = True
         self._begun = False
         self._outcome: Outcome | None = None
-        self._terms: dict[str, Array] = {}
+        self.terms: dict[str, Array] = {}
         self._telemetry: np.ndarray | None = None
         self._goal: tuple[Any, Any] = (None, None)
         self._columns = _columns(self.spec)
+        self._told = len(draft.metrics)
 
     def advance(
         self,
@@ -251,11 +253,12 @@ class Loop:
             for name, shape, dtype in self._dtypes
         }
         self._outcome = outcome = task.outcome(state)
-        ended, total = outcome.terminated, 0.0
+        ended: Array = outcome.terminated
+        total: Array = 0.0
         late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b
         for term in outcome.reward.values():
             total = total + term
-        self._terms = outcome.reward
+        self.terms = outcome.reward
         if not self.world.shape:  # a single drone's numbers
             self.rewards = np.array((total,))
             self.terminated, self.truncated = np.array((ended,)), np.array((late,))
@@ -318,7 +321,7 @@ class Loop:
     @property
     def reward_terms(self) -> dict[str, Array]:
         """Terms of the last rewards by name, each of shape (N,)."""
-        return {name: self._per_drone(term) for name, term in self._terms.items()}
+        return {name: self._per_drone(term) for name, term in self.terms.items()}
 
     @property
     def metrics(self) -> dict[str, Array]:
@@ -335,24 +338,43 @@ class Loop:
     @property
     def telemetry_table(self) -> np.ndarray:
         """All telemetry side by side, float64, shape (N, T), T in the order of `spec.telemetry`."""
-        if self._telemetry is not None:
-            return self._telemetry
+        if self._telemetry is None:
+            alone = not self.world.shape
+            self._telemetry = np.array((self._row(),)) if alone else self._table()
+        return self._telemetry
+
+    def _table(self) -> np.ndarray:
         state, n, at = self.world.state, self.num_envs, self._columns
-        self._telemetry = told = np.empty((n, at[self.spec.telemetry[-1].name].stop))
-        position, quaternion = _on_host(state.position), _on_host(state.quaternion)
-        positions_in_paper_frame(position.reshape(n, 3), told[:, :3])
-        attitudes_in_paper_frame(quaternion.reshape(n, 4), told[:, 3:6])
+        told = np.empty((n, at[self.spec.telemetry[-1].name].stop))
+        positions_in_paper_frame(_on_host(state.position).reshape(n, 3), told[:, :3])
+        attitudes_in_paper_frame(_on_host(state.quaternion).reshape(n, 4), told[:, 3:6])
         told[:, at["thrust"]] = _on_host(state.thrust).reshape(n, -1)
         if self._has_goal:
             goal = self.task.goal(state)
             if goal is not self._goal[0]:  # many goals stay as they are
                 self._goal = goal, positions_in_paper_frame(_on_host(goal).reshape(n, 3))
             told[:, at["goal"]] = self._goal[1]
-        if self.task.metrics and self._outcome is not None:
-            for column, metric in enumerate(self.task.metrics, at["metrics"].start):
-                values = self._outcome.metrics[metric.name]
-                told[:, column] = values if not self.world.shape else _on_host(values).reshape(n)
+        if self._outcome is not None:
+            for column, metric in enumerate(self.task.metrics, told.shape[1] - self._told):
+                told[:, column] = _on_host(self._outcome.metrics[metric.name]).reshape(n)
         return told
+
+    def _row(self) -> list[float]:
+        """The table of a single drone: the same numbers, a third of the time."""
+        state = self.world.state
+        x, y, z = state.position.tolist()
+        row = [0.0 - y, z, x]
+        quaternion = state.quaternion
+        turned = any(quaternion[1:].tolist())
+        row += attitudes_in_paper_frame(quaternion).tolist() if turned else (0.0, 0.0, 0.0)
+        row += state.thrust.tolist()
+        if self._has_goal:
+            x, y, z = self.task.goal(state).tolist()
+            row += (0.0 - y, z, x)
+        if self._outcome is not None:
+            metrics = self._outcome.metrics
+            row += [metrics[metric.name] for metric in self.task.metrics]
+        return row
 
     def close(self) -> None:
         """Let go of threads and memory."""

@@ -1,16 +1,17 @@
 """Render modes of the envs. What draws is imported when something is to be drawn, not before."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from ..models.errors import InputError
+from .spec import EnvSpec
 
 if TYPE_CHECKING:
     from ..rendering import Moment
     from ..rendering.painter import Painter
     from .loop import Loop
 
-__all__ = ["RENDER_MODES", "checked_render_mode", "moments", "painter"]
+__all__ = ["RENDER_MODES", "checked_render_mode", "moment", "moments", "painter"]
 
 RENDER_MODES: Final = ["human", "rgb_array"]
 
@@ -26,13 +27,33 @@ def painter(mode: str, loop: "Loop") -> "Painter":
     """Draws what a loop is to show."""
     from ..rendering.painter import Painter
 
-    return Painter(mode, loop.num_envs, loop.spec.control_period)
+    return Painter(mode, loop.num_envs, loop.spec.control_period, loop.vehicle.path)
 
 
 def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
     """What there is to see of every drone now; `episodes` are numbers of their episodes."""
+    steps, rewards = loop.steps, loop.rewards
+    return [
+        moment(
+            loop.spec,
+            {name: values[i] for name, values in loop.telemetry.items()},
+            reward=float(rewards[i]),
+            step=int(steps[i]),
+            episode=episode,
+        )
+        for i, episode in enumerate(episodes)
+    ]
+
+
+def moment(spec: EnvSpec, telemetry: Mapping[str, Any], **rest: Any) -> "Moment":
+    """What there is to see of one drone.
+
+    Args:
+        spec: Of its env.
+        telemetry: Its arrays, by name.
+        rest: `reward`, `step` and `episode`, as `rendering.Moment` has them.
+    """
     from ..rendering import Moment
 
-    told: Any = loop.telemetry
-    del told, Moment, episodes
-    raise NotImplementedError
+    metrics = [(metric.name, metric.unit, metric.symbol) for metric in spec.metrics]
+    return Moment.of(telemetry, metrics, **rest)

@@ -145,8 +145,8 @@ class SingleEnv(gym.Env[Any, Any]):
     def _info(self) -> dict[str, Any]:
         loop = self._loop
         info = dict(zip(self._names, loop.telemetry_table[0].tolist(), strict=True))
-        for name, term in loop.reward_terms.items():
-            info[f"reward_{name}"] = term.item()
+        for name, term in loop.terms.items():
+            info[f"reward_{name}"] = float(term)
         return info
 
     def __deepcopy__(self, memo: Any) -> Any:

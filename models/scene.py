@@ -5,6 +5,7 @@ Physics notices the ground alone. A vehicle file that brings a ground of its own
 
 from pathlib import Path
 from typing import Any, Final, Literal
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -22,6 +23,9 @@ AIRPORT_PREFIX: Final = "airport/"
 
 SCENE_PREFIX: Final = "scene/"
 """What the name of everything begins with that `build_scene` adds."""
+
+MOST_HEIGHTS: Final = 4096
+"""Most rows and columns of a height field: 16.8 million points, 0.3 GB."""
 
 _GROUNDS: Final = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 _HIDDEN_GROUP: Final = 3  # viewers and renderers draw groups 0 to 2 unless told otherwise
@@ -47,12 +51,14 @@ def build_scene(
             faster.
 
     Raises:
-        InputError: The world is not one of these.
+        InputError: The world is not one of these, or a height field is too large.
         ValueError: The file is no MJCF.
     """
     if world not in ("plain", "airport"):
         raise InputError(f"world: expected 'plain' or 'airport', got {world!r}")
-    spec = mujoco.MjSpec.from_file(str(vehicle if vehicle is not None else QUAD_XML))
+    path = Path(vehicle if vehicle is not None else QUAD_XML)
+    _check_height_fields(path, set())
+    spec = mujoco.MjSpec.from_file(str(path))
     if not any(geom.type in _GROUNDS for geom in spec.worldbody.geoms):
         scene = mujoco.MjSpec.from_file(str(SCENE_XML))
         _copy_settings(scene.visual, spec.visual)
@@ -62,6 +68,31 @@ def build_scene(
         attach_airport(spec)
     spec.compiler.discardvisual = not visual
     return spec
+
+
+def _check_height_fields(path: Path, seen: set[Path]) -> None:
+    """Raise `InputError` for a large height field in a file or what it includes.
+
+    MuJoCo takes the memory for it while it reads, and ends the process where there is none.
+    """
+    seen.add(path)
+    try:
+        elements = list(ElementTree.parse(path).iter())
+    except (OSError, ElementTree.ParseError):
+        return  # MuJoCo says what is wrong with it
+    for element in elements:
+        if element.tag == "hfield":
+            sides = [element.get(side, "0") for side in ("nrow", "ncol")]
+            if any(side.isdecimal() and int(side) > MOST_HEIGHTS for side in sides):
+                raise InputError(
+                    f"vehicle: expected a height field of at most {MOST_HEIGHTS} × {MOST_HEIGHTS} "
+                    f"points, got {' × '.join(sides)}"
+                )
+        elif (
+            element.tag == "include"
+            and (inner := path.parent / element.get("file", "")) not in seen
+        ):
+            _check_height_fields(inner, seen)
 
 
 def _copy_settings(source: Any, target: Any) -> None:

@@ -26,6 +26,8 @@ __all__ = ["Rotor", "Vehicle"]
 
 LEAST_TIMESTEP: Final = 1e-5
 """Smallest physics step, s: a control step of 0.02 s then takes a hundredth of a second."""
+MOST_HEIGHT: Final = 1e4
+"""Height above which no craft may touch anything, m."""
 MOST_DRAG: Final = 100.0
 """Largest linear drag, 1/s. RK4 at 10 ms is within 0.1 % there, and unstable above 278 /s."""
 
@@ -83,7 +85,7 @@ class Vehicle:
     """Height of the body's origin when it touches level ground, m."""
 
     @classmethod
-    def load(cls, path: Path | str | None = None, *, linear_drag: float = 0.0) -> Self:
+    def load(cls, path: Path | str | None = None, *, linear_drag: float = 0.0) -> "Vehicle":
         """The vehicle of an MJCF file; None is the paper's.
 
         The same path and drag give the same object until the file changes.
@@ -106,8 +108,7 @@ class Vehicle:
             changed = file.stat().st_mtime_ns
         except OSError as error:
             raise InputError(f"vehicle: cannot read {path}: {error.strerror}") from None
-        vehicle: Self = _load(cls, file, drag, changed)
-        return vehicle
+        return _load(file, drag, changed)
 
     @property
     def num_rotors(self) -> int:
@@ -162,10 +163,11 @@ def _again(path: str, drag: float) -> Vehicle:
 
 
 @lru_cache(maxsize=32)
-def _load(cls: type[Vehicle], path: Path, drag: float, changed: int) -> Any:
+def _load(path: Path, drag: float, changed: int) -> Vehicle:
     del changed  # a file that was written anew is another key
     try:
         spec = build_scene(path, visual=False)
+        spec.comment = ""
         text = spec.to_xml()
         model = spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
@@ -192,7 +194,7 @@ def _load(cls: type[Vehicle], path: Path, drag: float, changed: int) -> Any:
     rotors = tuple(_rotor(model, data, i, body) for i in range(model.nu))
     allocation = _allocation(rotors, center)
     model.dof_damping[0:3] = drag * mass
-    return cls(
+    return Vehicle(
         path=path,
         name=str(spec.modelname),
         hash=_hash(spec, text, path, drag),
@@ -300,13 +302,21 @@ def _inertia(model: mujoco.MjModel, data: Any, body: int) -> np.ndarray:
 
 
 def _rest_height(model: mujoco.MjModel, data: Any) -> float:
-    """Height at which the level body first touches anything, by bisection; 0 if it never does."""
+    """Height at which the level body first touches anything, by bisection; 0 if it never does.
+
+    Raises `InputError` if it touches something at any height, like a wall.
+    """
     high = max(float(model.stat.extent), 1e-3)
     low = 0.0
     if not _touches(model, data, low):
         return 0.0
     while _touches(model, data, high):
         high *= 2
+        if high > MOST_HEIGHT:
+            raise InputError(
+                f"vehicle: expected a craft that is free above the ground, "
+                f"got one that touches something at {high:.0f} m"
+            )
     while high - low > 1e-10 * high:
         middle = (low + high) / 2
         if _touches(model, data, middle):

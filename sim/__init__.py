@@ -5,7 +5,7 @@ Knows nothing of tasks, rewards or Gymnasium.
 
 from .control import CollectiveThrust, Controller, RotorThrust
 from .random import Draw
-from .state import Array, Pose, WorldState, clip, constant, stack
+from .state import Array, Pose, WorldState, clip, component, constant, stack
 from .world import BACKENDS, Backend, PhysicsError, World, make_world
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "World",
     "WorldState",
     "clip",
+    "component",
     "constant",
     "make_world",
     "stack",

@@ -7,7 +7,7 @@ action has k numbers within bounds, or is one of some choices.
 from typing import Final, Protocol
 
 from ..models.vehicle import Vehicle
-from .state import Array, WorldState, clip, constant
+from .state import Array, WorldState, clip, component, constant
 
 __all__ = ["CollectiveThrust", "Controller", "RotorThrust"]
 
@@ -46,21 +46,33 @@ class CollectiveThrust:
     def __init__(
         self, vehicle: Vehicle, newtons: float, *, increment: bool, discrete: bool = False
     ) -> None:
-        self.low, self.high = (-1.0,), (1.0,)
-        self.components = ("decrease", "hold", "increase") if discrete else ("collective",)
+        self.low: tuple[float, ...] = (-1.0,)
+        self.high: tuple[float, ...] = (1.0,)
+        self.components: tuple[str, ...] = (
+            ("decrease", "hold", "increase") if discrete else ("collective",)
+        )
         self.choices = 3 if discrete else 0
-        hover = vehicle.hover_thrust
-        self._hover: Final = hover
-        self._per_action: Final = newtons * (hover / hover.mean())
-        self._limits: Final = (vehicle.thrust_low, vehicle.thrust_high)
+        hover, low, high = vehicle.hover_thrust, vehicle.thrust_low, vehicle.thrust_high
+        alike = all((values == values[0]).all() for values in (hover, low, high))
+        # Rotors that are alike need one number for all of them.
+        self._rotors: Final = 0 if alike else slice(None)
+        self._hover: Final = hover[self._rotors]
+        self._per_action: Final = newtons * (hover / hover.mean())[self._rotors]
+        self._limits: Final = (low[self._rotors], high[self._rotors])
         self._increment = increment
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
-        share = action - 1.0 if self.choices else clip(action, -1.0, 1.0)
-        base = state.thrust if self._increment else constant(self._hover, state.thrust)
-        low, high = (constant(limit, state.thrust) for limit in self._limits)
-        return clip(base + constant(self._per_action, state.thrust) * share, low, high)
+        share = component(action, 0)
+        share = share - 1.0 if self.choices else clip(share, -1.0, 1.0)
+        if self._rotors == 0:
+            return self._clipped(component(state.thrust, 0), share)[..., None]
+        return self._clipped(state.thrust, share[..., None])
+
+    def _clipped(self, thrust: Array, share: Array) -> Array:
+        base = thrust if self._increment else constant(self._hover, thrust)
+        low, high = (constant(limit, thrust) for limit in self._limits)
+        return clip(base + constant(self._per_action, thrust) * share, low, high)
 
 
 class RotorThrust:

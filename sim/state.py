@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Array", "Pose", "WorldState", "clip", "constant", "stack"]
+__all__ = ["Array", "Pose", "WorldState", "clip", "component", "constant", "stack"]
 
 Array = Any
 """A NumPy array or a torch tensor. Code for both uses operators and the namespace of the array
@@ -40,7 +40,7 @@ class WorldState:
     @property
     def tilt_cosine(self) -> Array:
         """Cosine of the angle between each body's z axis and the vertical, shape (W, A)."""
-        x, y = self.quaternion[..., 1], self.quaternion[..., 2]
+        x, y = component(self.quaternion, 1), component(self.quaternion, 2)
         return 1 - 2 * (x * x + y * y)
 
 
@@ -62,9 +62,16 @@ class Pose:
 
 def clip(array: Array, low: Any, high: Any) -> Array:
     """The nearest numbers within bounds: numbers, or arrays of the same kind."""
-    if isinstance(array, np.ndarray | np.generic):
+    if isinstance(array, float):  # a single drone's number, NumPy's among them
+        return low if array < low else high if array > high else array
+    if isinstance(array, np.ndarray):
         return np.minimum(np.maximum(array, low), high)  # a third of the time of NumPy's clip
     return array.clip(low, high)
+
+
+def component(array: Array, index: int) -> Array:
+    """`array[..., index]`; of a single drone a number, with which NumPy is ten times faster."""
+    return array[..., index][()]
 
 
 def stack(parts: Any) -> Array:
@@ -79,10 +86,11 @@ def stack(parts: Any) -> Array:
     return torch.stack(parts, dim=-1)
 
 
-def constant(values: np.ndarray, like: Array) -> Array:
+def constant(values: Any, like: Array) -> Array:
     """An array of the vehicle or the task as an array of the same kind as `like`."""
-    if isinstance(like, np.ndarray | np.generic):
+    if isinstance(like, np.ndarray | float):
         return values
+    values = np.asarray(values, np.float64)
     return _tensor(values.tobytes(), values.shape, like.dtype, like.device)
 
 

@@ -13,7 +13,7 @@ from rotorgram.rendering import MetricValue, Moment
 
 WIDTH, HEIGHT = 160, 120
 DATA: Final = Path(__file__).parent / "data"
-HEXA: Final = DATA / "hexa.xml"
+HEXA: Final = DATA / "meadow_hexa.xml"
 """Six rotors of up to 30 N, 0.62 m from centre to tip, with a ground of its own."""
 TINY: Final = DATA / "tiny.xml"
 """27 g, four rotors of up to 0.15 N, 0.069 m from centre to tip."""

@@ -1,6 +1,7 @@
 """The paper's frame against signs worked out by hand and against rotation matrices."""
 
 import math
+import timeit
 
 import numpy as np
 import pytest
@@ -150,14 +151,15 @@ def attitudes(count: int) -> np.ndarray:
 
 def test_a_row_has_the_same_bits_alone_and_among_others() -> None:
     quaternions = attitudes(100_000)
-    positions = np.random.default_rng(4).normal(scale=50.0, size=(len(quaternions), 3))
     angles = attitudes_in_paper_frame(quaternions)
-    places = positions_in_paper_frame(positions)
-    poses = pose_in_mujoco_frame(places, angles)
-    for i, (quaternion, position) in enumerate(zip(quaternions, positions, strict=True)):
-        assert attitudes_in_paper_frame(quaternion).tobytes() == angles[i].tobytes()
-        assert positions_in_paper_frame(position).tobytes() == places[i].tobytes()
-        assert pose_in_mujoco_frame(places[i], angles[i]).tobytes() == poses[i].tobytes()
+    alone = [attitudes_in_paper_frame(quaternion) for quaternion in quaternions]
+    assert np.array(alone).tobytes() == angles.tobytes()
+    positions = np.random.default_rng(4).normal(scale=50.0, size=(10_000, 3))
+    poses = pose_in_mujoco_frame(positions, angles[:10_000])
+    assert positions_in_paper_frame(poses[:, :3]).tobytes() == positions.tobytes()
+    for pose, position, attitude in zip(poses, positions, angles[:10_000], strict=True):
+        assert positions_in_paper_frame(pose[:3]).tobytes() == position.tobytes()
+        assert pose_in_mujoco_frame(position, attitude).tobytes() == pose.tobytes()
 
 
 @pytest.mark.parametrize("shape", [(1,), (7,), (3, 5), (2, 1, 4), (0,)])
@@ -177,3 +179,12 @@ def test_any_leading_axes_and_any_memory(shape: tuple[int, ...]) -> None:
 
 def test_nan_stays_nan_and_is_no_warning() -> None:
     assert np.isnan(attitudes_in_paper_frame([[np.nan] * 4, [1.0, 0.0, 0.0, 0.0]])[0]).all()
+
+
+def test_tilted_craft_are_not_converted_one_by_one() -> None:
+    quaternions = attitudes(1024)
+
+    def seconds(rows: np.ndarray) -> float:
+        return min(timeit.repeat(lambda: attitudes_in_paper_frame(rows), number=10, repeat=20))
+
+    assert seconds(quaternions) < 100 * seconds(quaternions[:1])

@@ -1,40 +1,59 @@
-"""The vehicle flies by the closed forms, and the examination notices when it does not."""
+"""Vehicles fly by the closed forms, and the examination notices when one does not."""
 
 import math
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pytest
-from rotorgram.models import SCENE_XML, load_model
-from rotorgram.models._measure import fly, ready
-from rotorgram.models.checks import Check, closed_form_inertia, examine
-from rotorgram.models.convergence import STEPS, convergence, observed_order
+from rotorgram.models import QUAD_XML, InputError, Vehicle
+from rotorgram.models.checks import Check, examine
+from rotorgram.models.checks.accuracy import accuracy, markdown, read, write
+from rotorgram.models.checks.paper import closed_form_inertia
 
-CHECKS = examine(load_model())
+ROOT = Path(__file__).parent.parent
+DATA = Path(__file__).parent / "data"
+CHECKS = {
+    name: examine(Vehicle.load(path))
+    for name, path in (("paper", None), ("hexa", DATA / "hexa.xml"), ("small", DATA / "small.xml"))
+}
+EVERY = [
+    pytest.param(check, id=f"{vehicle}: {check.name}")
+    for vehicle, checks in CHECKS.items()
+    for check in checks
+]
 
 
-def _failed(model: mujoco.MjModel) -> set[str]:
-    return {check.name for check in examine(model) if not check.passed}
-
-
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
+@pytest.mark.parametrize("check", EVERY)
 def test_check_passes(check: Check) -> None:
     assert check.passed, check
 
 
 def test_names_are_unique_and_every_value_is_sourced() -> None:
-    assert len({check.name for check in CHECKS}) == len(CHECKS)
-    assert all(check.source for check in CHECKS)
+    for checks in CHECKS.values():
+        assert len({check.name for check in checks}) == len(checks)
+        assert all(check.source for check in checks)
+
+
+def test_every_vehicle_has_the_same_checks_and_the_papers_has_more() -> None:
+    paper, hexa, small = (
+        {check.name for check in checks if "per newton" not in check.name}
+        for checks in CHECKS.values()
+    )
+    assert hexa == small < paper
+    rotors = [sum("torques per newton" in c.name for c in checks) for checks in CHECKS.values()]
+    assert rotors == [4, 6, 4]
 
 
 @pytest.mark.parametrize(
     ("measured", "passed"), [(1.0, True), (1.25, True), (1.26, False), (math.nan, False)]
 )
 def test_passing_is_within_tolerance_and_never_nan(measured: float, passed: bool) -> None:
-    check = Check(
-        name="x", expected=1.0, measured=measured, tolerance=0.25, unit="m", source="hand"
-    )
+    check = Check("x", 1.0, measured, "m", "hand", tolerance=0.25)
     assert check.passed is passed
 
 
@@ -51,12 +70,22 @@ def test_inertia_by_hand() -> None:
 
 
 def test_examination_leaves_the_model_alone() -> None:
-    model = load_model(0.25)
-    examine(model)
-    assert model.dof_damping.tolist() == [5.0, 5.0, 5.0, 0.0, 0.0, 0.0]
+    vehicle = Vehicle.load(DATA / "small.xml", linear_drag=0.25)
+    before = vehicle.model.dof_damping.copy(), vehicle.model.opt.density
+    examine(vehicle)
+    assert vehicle.model.dof_damping.tolist() == before[0].tolist()
+    assert vehicle.model.opt.density == before[1] == 1.225
+    assert vehicle.model.opt.disableflags == 0
 
 
-# --- broken models --------------------------------------------------------------------------------
+def test_the_page_tells_every_check_of_the_papers_vehicle() -> None:
+    page = (ROOT / "docs" / "physics.md").read_text()
+    for check in CHECKS["paper"]:
+        assert f"| {check.name} | {check.expected:.7g} |" in page
+        assert f"| {check.tolerance:.0e} | {check.unit} | {check.source} |" in page
+
+
+# --- damaged models -------------------------------------------------------------------------------
 
 
 def _gravity(spec: mujoco.MjSpec) -> None:
@@ -80,9 +109,9 @@ def _euler(spec: mujoco.MjSpec) -> None:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
 
 
-def _no_limits(spec: mujoco.MjSpec) -> None:
+def _other_limits(spec: mujoco.MjSpec) -> None:
     for actuator in spec.actuators:
-        actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        actuator.ctrlrange = [-60.0, 160.0]
 
 
 def _off_centre(spec: mujoco.MjSpec) -> None:
@@ -98,70 +127,139 @@ def _no_skids(spec: mujoco.MjSpec) -> None:
         spec.geom(name).contype = spec.geom(name).conaffinity = 0
 
 
+def _weak_motors(spec: mujoco.MjSpec) -> None:
+    for actuator in spec.actuators:
+        actuator.forcelimited, actuator.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [0, 80]
+
+
+def _armature(spec: mujoco.MjSpec) -> None:
+    spec.joint("free").armature = 0.1
+
+
+DAMAGES: list[tuple[Callable[[mujoco.MjSpec], None], set[str]]] = [
+    (_gravity, {"2 s at no thrust: acceleration", "2 s at 49 N each: acceleration"}),
+    (_yaw_like_roll, {"rank of the allocation matrix", "rear left rotor: yaw torque per newton"}),
+    (
+        _swapped_rotors,
+        {f"front {side} rotor: roll torque per newton" for side in ("left", "right")},
+    ),
+    (_too_heavy, {"mass of the paper", "inertia Izz", "2 s at 100 N each: acceleration"}),
+    (_euler, {"free fall in 2 s", "tumbling 10 s: relative change of energy"}),
+    (_other_limits, {f"thrust of all four when asked for {x} N each" for x in (150, -50)}),
+    (_off_centre, {"inertia Iyy", "centre of mass off the geometrical centre"}),
+    (_air, {"2 s at no thrust: acceleration"}),
+    (_no_skids, {"height of rest"}),
+    (_weak_motors, {"thrust of all when asked for more than they have"}),
+    (_armature, {"mass", "inertia: difference of the matrices"}),
+]
+
+
 @pytest.mark.parametrize(
-    ("damage", "noticed"),
-    [
-        (_gravity, {"free fall in 2 s", "hover: acceleration", "climb at full thrust"}),
-        (_yaw_like_roll, {"rank of the allocation matrix", "rotor 3: yaw torque per newton"}),
-        (_swapped_rotors, {"rotor 1: roll torque per newton", "rotor 2: roll torque per newton"}),
-        (_too_heavy, {"mass", "inertia Izz", "hover: acceleration", "climb at full thrust"}),
-        (_euler, {"free fall in 2 s", "tumbling 10 s: relative change of energy"}),
-        (
-            _no_limits,
-            {
-                "thrust of all four with controls at 150 N",
-                "thrust of all four with controls at −50 N",
-            },
-        ),
-        (_off_centre, {"hover: angular acceleration", "inertia Iyy"}),
-        (_air, {"free fall in 2 s"}),
-        (_no_skids, {"at rest on the floor: height"}),
-    ],
-    ids=lambda value: value.__name__.strip("_") if callable(value) else "",
+    ("damage", "noticed"), DAMAGES, ids=[damage.__name__.strip("_") for damage, _ in DAMAGES]
 )
-def test_examination_notices(damage: Callable[[mujoco.MjSpec], None], noticed: set[str]) -> None:
-    spec = mujoco.MjSpec.from_file(str(SCENE_XML))
+def test_examination_notices(
+    tmp_path: Path, damage: Callable[[mujoco.MjSpec], None], noticed: set[str]
+) -> None:
+    spec = mujoco.MjSpec.from_file(str(QUAD_XML))
+    spec.delete(spec.key("hover"))
     damage(spec)
-    assert noticed <= _failed(spec.compile())
+    spec.compile()
+    spec.to_file(str(tmp_path / "damaged.xml"))
+    checks = examine(Vehicle.load(tmp_path / "damaged.xml"), paper=True)
+    assert noticed <= {check.name for check in checks if not check.passed}
 
 
 def test_drag_is_noticed_by_the_frictionless_checks() -> None:
-    assert "free fall in 2 s" in _failed(load_model(0.1))
+    failed = {check.name for check in examine(Vehicle.load(linear_drag=0.1)) if not check.passed}
+    assert "2 s at no thrust: acceleration" in failed
 
 
-def test_examination_refuses_what_is_no_quadcopter() -> None:
-    pendulum = mujoco.MjModel.from_xml_string(
-        "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>"
-    )
-    with pytest.raises(ValueError, match=r"expected one free joint and 4 actuators: .* got \(1, 1"):
-        examine(pendulum)
+def test_a_hexacopter_is_not_the_papers() -> None:
+    with pytest.raises(InputError, match="vehicle: expected the 4 rotors of the paper, got 6"):
+        examine(Vehicle.load(DATA / "hexa.xml"), paper=True)
+
+
+def _changed(folder: Path, old: str, new: str) -> Path:
+    text = (DATA / "hexa.xml").read_text()
+    assert old in text
+    (folder / "changed.xml").write_text(text.replace(old, new))
+    return folder / "changed.xml"
+
+
+def test_a_tiny_physics_step_is_refused_before_any_flight(tmp_path: Path) -> None:
+    vehicle = Vehicle.load(_changed(tmp_path, 'timestep="0.005"', 'timestep="0.00005"'))
+    with pytest.raises(InputError, match=r"at least 0\.0001 s to be examined, got 5e-05"):
+        examine(vehicle)
 
 
 def test_a_flight_with_warnings_is_no_measurement(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo logs the warning into the working folder
-    model = load_model()
-    data = ready(model)
-    data.qvel[0] = math.nan
-    with pytest.raises(RuntimeError, match="without warnings, got mjWARN_BADQVEL"):
-        fly(model, data, 0.1)
+    path = _changed(tmp_path, 'timestep="0.005"', 'timestep="0.05"')
+    vehicle = Vehicle.load(path, linear_drag=100.0)  # RK4 is unstable above 2.78 / 0.05 s
+    with pytest.raises(InputError, match="vehicle: expected a flight without warnings, got mjWARN"):
+        examine(vehicle)
 
 
-# --- the choice of integrator ---------------------------------------------------------------------
+def test_ctrl_c_ends_an_examination(tmp_path: Path) -> None:
+    path = _changed(tmp_path, 'timestep="0.005"', 'timestep="0.0001"')
+    code = (
+        "import threading, signal, sys\n"
+        "from rotorgram.models import Vehicle\n"
+        "from rotorgram.models.checks import examine\n"
+        "vehicle = Vehicle.load(sys.argv[1])\n"
+        "threading.Timer(0.2, signal.raise_signal, [signal.SIGINT]).start()\n"
+        "examine(vehicle)\n"
+        "print('examined')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (-signal.SIGINT, "")
+    assert done.stderr.endswith("KeyboardInterrupt\n")
 
 
-def test_rk4_is_exact_under_constant_force_and_of_fourth_order_in_tumbling() -> None:
-    misses = convergence("RK4")
-    assert max(miss.constant for miss in misses) < 1e-12
-    assert observed_order([miss.tumbling for miss in misses]) == pytest.approx(4.0, abs=0.1)
-    assert observed_order([miss.turning for miss in misses]) == pytest.approx(4.0, abs=0.1)
-    assert misses[STEPS.index(0.005)].tumbling < 1e-8
+# --- accuracy against cost ------------------------------------------------------------------------
+
+COMMITTED = ROOT / "docs" / "results" / "physics" / "accuracy.csv"
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
-def test_the_cheaper_integrators_are_of_first_order(integrator: str) -> None:
-    misses = convergence(integrator)
-    for miss in misses:  # semi-implicit: a h t / 2 with a = 10.2 m/s², t = 1 s
-        assert miss.constant == pytest.approx(10.2 * miss.timestep / 2, rel=1e-9)
-    assert observed_order([miss.tumbling for miss in misses]) == pytest.approx(1.0, abs=0.1)
+def _order(integrator: str, steps: tuple[float, ...]) -> float:
+    """Slope of log(error) over log(step)."""
+    rows = accuracy(Vehicle.load(), [integrator], steps)
+    return float(np.polyfit(np.log(steps), np.log([row.position_m for row in rows]), 1)[0])
+
+
+def test_rk4_is_of_fourth_order_in_tumbling_flight() -> None:
+    assert _order("RK4", (0.004, 0.005, 0.01, 0.02)) == pytest.approx(4.0, abs=0.1)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast"])
+def test_the_others_are_of_first_order(integrator: str) -> None:
+    assert _order(integrator, (0.002, 0.004, 0.005, 0.01)) == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
+    rows = accuracy(Vehicle.load(DATA / "small.xml"), ["RK4"], [0.01, 0.02])
+    write(tmp_path / "new" / "table.csv", rows)
+    assert read(tmp_path / "new" / "table.csv") == rows
+
+
+def test_the_committed_table_is_of_this_vehicle_and_on_the_page() -> None:
+    rows = read(COMMITTED)
+    assert markdown(rows) in (ROOT / "docs" / "physics.md").read_text()
+    again = accuracy(Vehicle.load(), ["RK4", "Euler"], [0.005, 0.01])
+    told = {(row.integrator, row.step_ms): row for row in rows}
+    for row in again:
+        committed = told[row.integrator, row.step_ms]
+        assert row.position_m == pytest.approx(committed.position_m, rel=0.05)
+        assert row.attitude_deg == pytest.approx(committed.attitude_deg, rel=0.05)
+        assert row.sinks_mm == pytest.approx(committed.sinks_mm, rel=1e-3)
+
+
+def test_the_step_of_the_papers_vehicle_is_as_true_as_the_page_says() -> None:
+    rows = {(row.integrator, row.step_ms): row for row in read(COMMITTED)}
+    ours = rows["RK4", Vehicle.load().timestep * 1e3]
+    assert ours.position_m < 1e-6
+    assert ours.sinks_mm == pytest.approx(rows["RK4", 2].sinks_mm, rel=0.02)
+    assert ours.cost_us < 0.6 * rows["RK4", 5].cost_us
+    assert rows["Euler", 5].position_m > 0.1

@@ -7,7 +7,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 
 from ...models.errors import InputError
-from ...sim import Array, CollectiveThrust, Draw, Pose, WorldState, stack
+from ...sim import Array, CollectiveThrust, Draw, Pose, WorldState, component, stack
 from ..spec import ArraySpec, Metric
 from .task import Outcome, Task, TaskOptions, check_choice, check_number, finite
 
@@ -175,19 +175,19 @@ class Elevation(Task):
 
     def observe(self, state: WorldState) -> dict[str, Array]:
         """E, its rate and the thrust; or E alone."""
-        error = self.target - state.position[..., 2]
+        error = self.target - component(state.position, 2)
         if self.options.observation == "error":
             return {"observation": error[..., None]}
-        rate = 0.0 - state.velocity[..., 2]
-        thrust = state.thrust[..., 0] / self._hover - 1.0
+        rate = 0.0 - component(state.velocity, 2)
+        thrust = component(state.thrust, 0) / self._hover - 1.0
         return {"observation": stack((error, rate, thrust))}
 
     def outcome(self, state: WorldState) -> Outcome:
         """Nearness to the target; the end at a crash, a flip-over, or outside the band."""
-        error = self.target - state.position[..., 2]
+        error = self.target - component(state.position, 2)
         distance = abs(error)
         outside = distance > self.options.flight_band
-        terminated = outside | state.touching | (state.tilt_cosine < MAX_TILT_COSINE)
+        terminated = outside | state.touching[()] | (state.tilt_cosine < MAX_TILT_COSINE)
         elevation = (ERROR_SCALE - distance) / (ERROR_SCALE + distance)
         termination = terminated * TERMINATION_REWARD + 0.0  # no negative zeros
         return Outcome(
@@ -210,7 +210,8 @@ class Elevation(Task):
         then for one period more: sqrt((a T / 2)² + 2 a · 2 flight_band) + a T.
         """
         a, period = self.vehicle.max_acceleration, self.options.control_period
-        return math.hypot(a * period / 2, math.sqrt(4 * a * self.options.flight_band)) + a * period
+        out = math.sqrt(4 * a * self.options.flight_band)
+        return float(math.hypot(a * period / 2, out) + a * period)
 
     @property
     def error_bound(self) -> float:

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from ...models.errors import InputError
-from ...sim import Array, Draw, Pose, RotorThrust, WorldState, clip, constant, stack
+from ...sim import Array, Draw, Pose, RotorThrust, WorldState, clip, component, constant, stack
 from ..spec import ArraySpec, Metric
 from .task import Outcome, Task, TaskOptions, check_number, finite
 
@@ -181,11 +181,11 @@ class Hover(Task):
         offset = self.goal(state) - state.position
         distance = xp.sqrt(xp.sum(offset * offset, axis=-1))
         nose, _ = _axes(xp, state.quaternion)
-        off = xp.atan2(nose[..., 1], nose[..., 0]) - self._wanted
+        off = xp.atan2(component(nose, 1), component(nose, 0)) - self._wanted
         heading = xp.atan2(xp.sin(off), xp.cos(off)) * (180 / math.pi)
         rates = xp.sqrt(xp.sum(state.body_rates * state.body_rates, axis=-1))
         outside = distance > self.options.flight_band
-        terminated = outside | state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
+        terminated = outside | state.touching[()] | (state.tilt_cosine < LEAST_TILT_COSINE)
         return Outcome(
             reward={
                 "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
@@ -199,7 +199,7 @@ class Hover(Task):
 
     def goal(self, state: WorldState) -> Array:
         """The same for every drone."""
-        zero = 0.0 * state.position[..., 0]
+        zero = 0.0 * component(state.position, 0)
         return stack([zero + value for value in self.options.goal])
 
     def _turned(self, vectors: Array) -> Array:
@@ -213,7 +213,7 @@ class Hover(Task):
 
 def _axes(xp: Any, quaternion: Array) -> tuple[Array, Array]:
     """Directions of body x and body z in the world frame, shape (..., 3) each."""
-    w, x, y, z = (quaternion[..., i] for i in range(4))
+    w, x, y, z = (component(quaternion, i) for i in range(4))
     nose = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
     up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
     return stack(nose), stack(up)

@@ -1,7 +1,7 @@
 """MuJoCo on the threads of this machine, float64.
 
-`mujoco.batch.Batch` gives each world the bits that a loop over single ones gives it, with any number
-of threads.
+`mujoco.batch.Batch` gives each world the bits that a loop over single ones gives it, with any
+number of threads.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -61,7 +61,8 @@ class MujocoWorld:
         self._no_warnings = self._warnings.tobytes()
         newtons = np.array([rotor.newtons for rotor in vehicle.rotors])
         self._newtons = None if (newtons == 1.0).all() else newtons
-        self._thrust = np.zeros((num_worlds, vehicle.num_rotors))
+        # Where controls are newtons, they are the thrusts.
+        self._thrust = self._ctrl if self._newtons is None else np.zeros_like(self._ctrl)
         self._touching = np.zeros(num_worlds, bool)
         lead = self.shape
         self.state = WorldState(
@@ -98,16 +99,17 @@ class MujocoWorld:
         here = ... if ids is None or self.shape == () else ids
         self.state.thrust[here] = thrust[here]
         self._apply_thrust()
-        touching: Any = None
+        some = ... if ids is None else ids
+        touching = self._touching
+        touching[some] = False
         while substeps > 0:
             try:
                 self._batch.step(ids, nstep=min(substeps, self._check))
             except SimulationError as error:
                 raise PhysicsError(f"{error}: reset the env") from None
-            touching = self._contacts > 0 if touching is None else touching | (self._contacts > 0)
+            if np.count_nonzero(self._contacts):
+                touching[some] |= self._contacts[some] > 0
             substeps -= self._check
-        some = ... if ids is None else ids
-        self._touching[some] = touching[some]
         if self._warnings.tobytes() != self._no_warnings:
             raise PhysicsError(self._describe_warnings())
 
@@ -128,9 +130,7 @@ class MujocoWorld:
         return np.flatnonzero(mask)
 
     def _apply_thrust(self) -> None:
-        if self._newtons is None:
-            self._ctrl[:] = self._thrust
-        else:
+        if self._newtons is not None:
             np.divide(self._thrust, self._newtons, out=self._ctrl)
 
     def _describe_warnings(self) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from rotorgram.models import AIRPORT_XML, SCENE_XML, attach_airport, load_model, model_hash
+from rotorgram.models import AIRPORT_XML, InputError, attach_airport, build_scene
 
 STEPS = 2_000
 OTHER = """
@@ -29,10 +29,6 @@ OTHER = """
 """
 
 
-def scene() -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_file(str(SCENE_XML))
-
-
 def other() -> mujoco.MjSpec:
     return mujoco.MjSpec.from_string(OTHER)
 
@@ -46,14 +42,14 @@ def with_airport(make: Callable[[], mujoco.MjSpec], discard: bool = False) -> mu
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return with_airport(scene)
+    return with_airport(build_scene)
 
 
 @pytest.fixture(scope="module")
 def airport(model: mujoco.MjModel) -> np.ndarray:
     """Indices of the airport's geoms: all that the world body has beside the scene's floor."""
     ours = model.geom_bodyid == 0
-    ours[model.geom("floor").id] = False
+    ours[model.geom("scene/floor").id] = False
     return np.flatnonzero(ours)
 
 
@@ -72,7 +68,7 @@ def fly(model: mujoco.MjModel) -> tuple[bytes, set[int]]:
     return np.array(states).tobytes(), contacts
 
 
-@pytest.mark.parametrize("make", [scene, other])
+@pytest.mark.parametrize("make", [build_scene, other])
 @pytest.mark.parametrize("discard", [False, True])
 def test_motion_is_the_same_to_the_last_bit(
     make: Callable[[], mujoco.MjSpec], discard: bool
@@ -84,7 +80,7 @@ def test_motion_is_the_same_to_the_last_bit(
 
 
 def test_nothing_is_added_but_geoms(model: mujoco.MjModel, airport: np.ndarray) -> None:
-    alone = load_model()
+    alone = build_scene().compile()
     for count in ("nbody", "njnt", "nq", "nv", "nu", "nsensor", "nsite", "nmocap", "neq", "npair"):
         assert getattr(model, count) == getattr(alone, count), count
     assert (model.nmesh, model.nhfield, model.nflex, model.nskin) == (0, 0, 0, 0)
@@ -98,7 +94,7 @@ def test_the_airport_stands_still_and_touches_nothing(
 ) -> None:
     spec = mujoco.MjSpec.from_file(str(AIRPORT_XML))
     assert len(airport) == len(spec.geoms)  # all of them in the world body, which is static
-    assert model.ngeom == load_model().ngeom + len(airport)
+    assert model.ngeom == build_scene().compile().ngeom + len(airport)
     assert not model.geom_contype[airport].any()
     assert not model.geom_conaffinity[airport].any()
     assert set(model.geom_group[airport]) == {2}
@@ -106,17 +102,18 @@ def test_the_airport_stands_still_and_touches_nothing(
 
 
 def test_discardvisual_drops_all_of_it() -> None:
-    spec = scene()
+    spec = build_scene()
     spec.compiler.discardvisual = True
-    alone, model = spec.compile(), with_airport(scene, discard=True)
+    alone, model = spec.compile(), with_airport(build_scene, discard=True)
     assert (model.ngeom, model.nmat, model.ntex) == (alone.ngeom, alone.nmat, alone.ntex)
 
 
-def test_the_model_that_everyone_flies_has_no_airport() -> None:
-    before = model_hash()
-    with_airport(scene)
-    assert model_hash() == before
-    assert load_model().ngeom == scene().compile().ngeom
+@pytest.mark.parametrize("visual", [True, False])
+def test_a_scene_has_the_airport_that_was_asked_for(visual: bool) -> None:
+    model = build_scene(world="airport", visual=visual).compile()
+    assert model.ngeom == with_airport(build_scene, discard=not visual).ngeom
+    with pytest.raises(InputError, match="world: expected 'plain' or 'airport', got 'mars'"):
+        build_scene(world="mars")
 
 
 def test_only_the_floor_is_hidden() -> None:
@@ -125,7 +122,7 @@ def test_only_the_floor_is_hidden() -> None:
     assert model.geom("floor").contype[0] == 1
 
 
-@pytest.mark.parametrize("make", [scene, other])
+@pytest.mark.parametrize("make", [build_scene, other])
 def test_the_scenes_own_scale_stays(make: Callable[[], mujoco.MjSpec]) -> None:
     alone, model = make().compile(), with_airport(make)
     assert model.stat.extent == alone.stat.extent
@@ -135,15 +132,15 @@ def test_the_scenes_own_scale_stays(make: Callable[[], mujoco.MjSpec]) -> None:
 
 
 def test_one_sky() -> None:
-    model = with_airport(scene)
+    model = with_airport(build_scene)
     skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     assert [model.tex(i).name for i in skies] == ["airport/sky"]
 
 
 def test_a_second_airport_is_refused() -> None:
-    spec = scene()
+    spec = build_scene()
     attach_airport(spec)
-    with pytest.raises(ValueError, match="spec: expected a scene without an airport"):
+    with pytest.raises(InputError, match="spec: expected a scene without an airport"):
         attach_airport(spec)
 
 
@@ -191,9 +188,8 @@ import sys
 try:
     import mujoco
     import numpy as np
-    from rotorgram.models import SCENE_XML, attach_airport
-    spec = mujoco.MjSpec.from_file(str(SCENE_XML))
-    attach_airport(spec)
+    from rotorgram.models import build_scene
+    spec = build_scene(world="airport")
     # 12 m behind the craft and 2 m above it, looking forward: the horizon is the middle row
     spec.worldbody.add_camera(name="eye", pos=[-12, 0, 4], quat=[0.5, 0.5, -0.5, -0.5], fovy=50)
     model = spec.compile()
@@ -262,4 +258,4 @@ def test_colours(model: mujoco.MjModel, drawn: tuple[np.ndarray, np.ndarray]) ->
     assert green > red > blue
     red, green, blue = picture[geoms == model.geom("airport/apron").id].mean(axis=0)
     assert max(red, green, blue) - min(red, green, blue) < 20  # grey
-    assert not (geoms == model.geom("floor").id).any()  # hidden by the airport's own ground
+    assert not (geoms == model.geom("scene/floor").id).any()  # hidden by the airport's own ground
