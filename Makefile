@@ -1,42 +1,46 @@
 # Everything a user needs: `make demo` and `make test` set themselves up in .venv and run.
 PYTHON ?= python3
 BIN := .venv/bin
-PACKAGES := models rendering envs udp agents experiments cli
+PACKAGES := models sim envs udp agents rendering experiments cli
 
 .PHONY: install demo test lint types docs clean
 
-install: .venv/.installed
+# What trains, draws, reports and records; Ray, Warp and the tools of `make test` are left out.
+install: .venv/.train,record,render,report
 
-.venv/.installed: pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and \
-	  "rotorgram needs Python 3.11 or newer, this is %s; name one: make PYTHON=python3.12" % sys.version.split()[0])'
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
-	  --constraint constraints.txt --editable '.[dev]'
-	@mkdir -p .venv/types/rotorgram
-	@for p in $(PACKAGES); do ln -sfn ../../../$$p .venv/types/rotorgram/$$p; done
-	@touch $@
-
-# A short comparison: three agents, three seeds; about three minutes on two cores. Too short and too
-# few seeds to decide the paper's claims: docs/results.md has the long one.
-demo: install
+# A short comparison: three agents, three seeds; about a minute on two cores. Too short and too few
+# seeds to decide the paper's claims: docs/results.md has the long one.
+demo: .venv/.train,render,report
 	$(BIN)/rotorgram compare --seeds 3 --env-steps 80000 --episodes 10
 
+# First what may share the two cores, then what measures time, by itself.
 test: lint types docs
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not quiet" -n auto --dist loadfile
+	$(BIN)/python -m pytest -m quiet
 
-lint: install
+lint: .venv/.dev
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 
 # mypy does not follow editable installs; .venv/types shows it the packages under their names.
-types: install
+types: .venv/.dev
+	@mkdir -p .venv/types/rotorgram
+	@for p in $(PACKAGES); do ln -sfn ../../../$$p .venv/types/rotorgram/$$p; done
 	MYPYPATH=.venv/types $(BIN)/mypy
 
 # The pages as a site, in build/site: python -m http.server -d build/site. A warning fails it.
-docs: install
+docs: .venv/.dev
 	$(BIN)/python docs/stage.py
 	$(BIN)/zensical build --strict --clean
+
+# .venv/.EXTRA,EXTRA marks that these extras of pyproject.toml are installed.
+.venv/.%: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and \
+	  "rotorgram needs Python 3.11 or newer, this is %s; name one: make PYTHON=python3.12" % sys.version.split()[0])'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+	  --constraint constraints.txt --editable '.[$*]'
+	@touch $@
 
 clean:
 	rm -rf .venv *.egg-info build dist .cache .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -32,7 +32,7 @@ PERIOD = 0.005  # s: one physics step for each control step, so that the wire is
 
 RELAY = """
 import json, signal, sys
-from rotorgram.udp.faults import FaultConfig, Relay
+from rotorgram.udp.transport.relay import FaultConfig, Relay
 signal.signal(signal.SIGINT, signal.default_int_handler)  # in a shell's background it is ignored
 settings = json.loads(sys.argv[1])
 with Relay(("127.0.0.1", 0), tuple(settings["server"]), FaultConfig(**settings["faults"])) as relay:

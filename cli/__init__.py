@@ -1,50 +1,175 @@
-"""The command `rotorgram`."""
+"""The command `rotorgram`: one module for each command, imported when it is chosen.
 
+Exit statuses: 0 done; 1 something that the user, the other side or the system did, in one sentence,
+or a check that failed; 2 a wrong flag, or no OpenGL for a command that draws; 130 Ctrl-C;
+141 nobody reads standard output any more; 143 SIGTERM. A bug of ours keeps its traceback.
+"""
+
+import ast
 import atexit
 import gc
+import io
 import logging
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from errno import ENOSPC, EPIPE
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeGuard, cast
 
-__all__ = ["main"]
+if TYPE_CHECKING:
+    from ._flags import Command
+
+__all__ = ["COMMANDS", "EXTRAS", "main"]
+
+COMMANDS: Final = {
+    "sim": "Sim",
+    "train": "Train",
+    "serve": "Serve",
+    "evaluate": "Evaluate",
+    "view": "View",
+    "compare": "Compare",
+    "sweep": "Sweep",
+    "report": "Report",
+    "render": "Render",
+    "bench": "Bench",
+    "check-model": "CheckModel",
+    "key": "Key",
+    "relay": "Relay",
+    "replay": "Replay",
+}
+"""Class of each command, in the module of the command's name."""
+
+EXTRAS: Final = {
+    "train": ("torch", "stable_baselines3", "tensorboard", "safetensors", "joblib", "pandas",
+              "pyarrow", "scipy"),
+    "record": ("mcap",),
+    "render": ("PIL", "imageio_ffmpeg"),
+    "report": ("matplotlib", "jinja2"),
+    "ray": ("ray",),
+    "gpu": ("mujoco_warp", "warp"),
+}  # fmt: skip
+"""Import names of the packages of each extra, as pyproject.toml lists them."""
+
+_ABOUT: Final = "A MuJoCo drone simulator that reinforcement-learning agents fly over UDP."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; its exit status.
 
     What the user or the other side did wrong is one sentence on standard error, without traceback;
-    with ROTORGRAM_TRACEBACK set, for whoever looks for a bug of ours, with it.
+    with ROTORGRAM_TRACEBACK set, with it.
     """
-    # To be terminated is no reason to leave the other side without a word.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    _prepare_streams()
     _show_log()
-    # At the end Python looks through everything for garbage: with torch half a second for nothing.
+    # A terminated command says Close to the other side before it ends.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    # At exit Python collects garbage: with torch half a second for nothing.
     atexit.register(gc.freeze)
     try:
-        import tyro
-
-        from .commands import COMMANDS
-
-        command = tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="rotorgram",
-            description="A MuJoCo quadcopter that reinforcement-learning agents fly over UDP.",
-            args=arguments,
-            config=(tyro.conf.FlagCreatePairsOff,),
-        )
-        return int(command.run())
+        status = _run(words)
+        sys.stdout.flush()
     except KeyboardInterrupt:
         print("rotorgram: interrupted", file=sys.stderr)
         return 128 + signal.SIGINT
     except Exception as error:
-        from .commands import user_errors
-
-        if not isinstance(error, user_errors()) or "ROTORGRAM_TRACEBACK" in os.environ:
+        if _is_of_stdout(error):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is left
+            if isinstance(error, BrokenPipeError):
+                return 128 + signal.SIGPIPE
+            error.filename = "standard output"
+        sentence = _sentence(error)
+        if sentence is None or "ROTORGRAM_TRACEBACK" in os.environ:
             raise
-        print(f"rotorgram: {_sentence(error)}", file=sys.stderr)
+        print(f"rotorgram: {sentence}", file=sys.stderr)
         return getattr(error, "exit_status", 1)
+    return status
+
+
+def _run(words: list[str]) -> int:
+    name = words[0] if words else ""
+    if name in ("", "-h", "--help"):
+        print(_help(), file=sys.stdout if name else sys.stderr)
+        return 0 if name else 2
+    if name == "--version":
+        from importlib.metadata import version
+
+        print(f"rotorgram {version('rotorgram')}")
+        return 0
+    if name not in COMMANDS:
+        known = ", ".join(COMMANDS)
+        print(f"rotorgram: expected a command of {known}, got {name}", file=sys.stderr)
+        return 2
+    from ..rendering.gl import tolerate_gl_setting
+    from ._flags import parse
+
+    tolerate_gl_setting()  # MuJoCo raises at import, in commands that draw nothing too
+    with _wide_enough():
+        command = parse(_class_of(name), f"rotorgram {name}", words[1:])
+    return command.run()
+
+
+def _class_of(name: str) -> "type[Command]":
+    kind: type[Command] = getattr(import_module(f".{_module(name)}", __name__), COMMANDS[name])
+    return kind
+
+
+def _module(command: str) -> str:
+    return command.replace("-", "_")
+
+
+def _help() -> str:
+    lines = ["usage: rotorgram [-h] [--version] COMMAND ...", "", _ABOUT, "", "commands:"]
+    for name, kind in COMMANDS.items():
+        source = Path(__file__).with_name(f"{_module(name)}.py")  # read, not imported: for speed
+        (node,) = (n for n in ast.parse(source.read_bytes()).body if getattr(n, "name", "") == kind)
+        summary = ast.get_docstring(cast(ast.ClassDef, node)) or ""
+        lines.append(f"  {name:12} {summary.partition(chr(10))[0]}")
+    return "\n".join([*lines, "", "rotorgram COMMAND --help lists the flags of a command."])
+
+
+@contextmanager
+def _wide_enough() -> Iterator[None]:
+    """Flags are told to a terminal of 40 columns at least: tyro does not end on narrower ones."""
+    from shutil import get_terminal_size
+
+    before = os.environ.get("COLUMNS")
+    if get_terminal_size().columns < 40:
+        os.environ["COLUMNS"] = "40"
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.environ["COLUMNS"] = before
+        else:
+            os.environ.pop("COLUMNS", None)
+
+
+def _prepare_streams() -> None:
+    """Printing never fails for a stream that is closed or knows ASCII alone."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115  for as long as we run
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def _is_of_stdout(error: Exception) -> TypeGuard[OSError]:
+    """Whether standard output takes no more: its reader is gone, or its disk is full."""
+    if not isinstance(error, OSError) or error.filename or error.errno not in (EPIPE, ENOSPC):
+        return False
+    try:
+        os.write(sys.stdout.fileno(), b"\n")
+    except io.UnsupportedOperation:  # it is no file
+        return False
+    except OSError:
+        return True
+    return False
 
 
 class _ToStandardError(logging.Handler):
@@ -59,7 +184,15 @@ def _show_log() -> None:
     log.handlers = [_ToStandardError()]
 
 
-def _sentence(error: Exception) -> str:
-    if not (isinstance(error, OSError) and error.strerror):
+def _sentence(error: Exception) -> str | None:
+    """What the user is told; None for a bug of ours. Our own classes of errors are sentences."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if isinstance(error, OSError) or type(error).__module__.startswith("rotorgram."):
         return str(error)
-    return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        top = error.name.partition(".")[0]
+        for extra, modules in EXTRAS.items():
+            if top in modules:
+                return f"the package {top} is missing: pip install 'rotorgram[{extra}]'"
+    return None

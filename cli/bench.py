@@ -1,63 +1,92 @@
-"""`rotorgram bench`: measure the layers, print a table, draw a plot."""
+"""`rotorgram bench`: what bounds a training on this machine, layer by layer."""
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from matplotlib.figure import Figure
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
-from ..experiments.bench import RATIOS, BenchConfig, Layer, ratio_of
-from ..experiments.bench import bench as measure
-from .inputs import new_folder
-from .progress import bars
+from ..models.errors import require
+from ._flags import Command
+from ._inputs import folder_to_write
 
 if TYPE_CHECKING:
-    from .measuring import Bench
+    from ..experiments.bench import Layer
 
-__all__ = ["bench"]
-
-
-def bench(command: "Bench") -> int:
-    """Measure, print and draw."""
-    config = BenchConfig(rounds=command.rounds, seconds=command.seconds)
-    logging.getLogger("rotorgram").setLevel(logging.WARNING)  # no reports of every wire each minute
-    folder = new_folder(command.out, "bench")
-    with bars() as progress:
-        layers = measure(config, folder, lambda name, at, of: progress("bench", at, of, name))
-        turns = (config.rounds + 1) * len(layers)
-        progress("bench", turns, turns, "done")
-    console = Console()
-    console.print(_rates(layers))
-    console.print(_ratios(layers))
-    _draw(layers, folder / "bench.png")
-    print(f"written: {folder / 'bench.json'}, {folder / 'bench.png'}")
-    return 0
+__all__ = ["Bench"]
 
 
-def _rates(layers: list[Layer]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD)
-    for name, where in (("layer", "left"), ("what", "left"), ("env steps/s", "right"),
-                        ("µs per env step", "right")):  # fmt: skip
-        table.add_column(name, justify=where)  # type: ignore[arg-type]
+@dataclass(frozen=True, kw_only=True)
+class Bench(Command):
+    """Measure what bounds a training on this machine, from raw physics to an update."""
+
+    rounds: int = 7
+    """Turns of every layer, besides one to warm up; medians count."""
+    seconds: float = 0.5
+    """Length of a turn."""
+    out: Path | None = None
+    """Folder to write to. Default: runs/bench-TIME."""
+
+    def run(self) -> int:
+        """Measure, print and draw."""
+        from rich.console import Console
+
+        from ..experiments.bench import BenchConfig, bench
+        from ._progress import bars
+
+        require("matplotlib", "report", "drawing")  # before anything is measured
+        config = BenchConfig(rounds=self.rounds, seconds=self.seconds)
+        logging.getLogger("rotorgram").setLevel(logging.WARNING)  # no counters of every wire
+        with folder_to_write(self.out, "bench") as folder, bars() as progress:
+            layers = bench(config, folder, lambda name, at, of: progress("bench", at, of, name))
+            turns = (config.rounds + 1) * len(layers)
+            progress("bench", turns, turns, "done")
+        console = Console()
+        console.print(_rates(layers))
+        console.print(_parts(layers))
+        console.print(_ratios(layers))
+        _draw(layers, folder / "bench.png")
+        print(f"written: {folder / 'bench.json'}, {folder / 'bench.png'}")
+        return 0
+
+
+def _rates(layers: "list[Layer]") -> Table:
+    table = Table("layer", "what", box=box.SIMPLE_HEAD)
+    for name in ("env steps/s", "µs per env step"):
+        table.add_column(name, justify="right")
     for layer in layers:
         table.add_row(layer.name, layer.about, f"{layer.rate:,.0f}", f"{1e6 / layer.rate:.2f}")
     return table
 
 
-def _ratios(layers: list[Layer]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("ratio of rates")
-    table.add_column("median", justify="right")
-    for numerator, denominator in RATIOS:
-        ratio = ratio_of(layers, numerator, denominator)
-        table.add_row(f"{numerator} ÷ {denominator}", f"{ratio:.2f}")
+def _ratios(layers: "list[Layer]") -> Table:
+    from ..experiments.bench import RATIOS
+
+    table = Table("ratio", box=box.SIMPLE_HEAD)
+    for name in ("median", "target"):
+        table.add_column(name, justify="right")
+    for ratio in RATIOS:
+        value = ratio.value(layers)
+        mark = "" if ratio.reached(value) else "[red]"
+        table.add_row(ratio.name, f"{mark}{value:.2f}", ratio.target_text)
     return table
 
 
-def _draw(layers: list[Layer], path: Path) -> None:
+def _parts(layers: "list[Layer]") -> Table:
+    from ..experiments.bench import parts_of
+
+    table = Table("part of a lock-step step of one drone", box=box.SIMPLE_HEAD)
+    table.add_column("µs", justify="right")
+    for name, seconds in parts_of(layers):
+        table.add_row(name, f"{1e6 * seconds:.1f}")
+    return table
+
+
+def _draw(layers: "list[Layer]", path: Path) -> None:
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(7, 0.28 * len(layers) + 1), layout="constrained")
     axes = figure.subplots()
     shown = layers[::-1]

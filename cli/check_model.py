@@ -1,37 +1,45 @@
-"""`rotorgram check-model`: examine a quadcopter model, print a table of the checks."""
+"""`rotorgram check-model`: examine a vehicle's model, print a table of the checks."""
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from pathlib import Path
 
-import mujoco
-from rich.console import Console
-from rich.table import Table
+from tyro.conf import Positional
 
-from ..models import load_model
-from ..models.checks import examine
+from ._flags import Command
 
-if TYPE_CHECKING:
-    from .measuring import CheckModel
-
-__all__ = ["check_model"]
+__all__ = ["CheckModel"]
 
 
-def check_model(command: "CheckModel") -> int:
-    """Print every check; exit status 1 if one fails."""
-    xml = command.xml
-    if xml is not None and not xml.is_file():
-        raise ValueError(f"xml: no file {xml}")
-    checks = examine(load_model() if xml is None else mujoco.MjModel.from_xml_path(str(xml)))
-    table = Table("", "check", "expected", "measured - expected", "tolerance", "source")
-    for check in checks:
-        table.add_row(
-            "[green]ok" if check.passed else "[red]FAILED",
-            check.name,
-            f"{check.expected:.7g} {check.unit}",
-            f"{check.measured - check.expected:.1e}",
-            f"{check.tolerance:.0e}",
-            check.source,
-        )
-    Console().print(table)
-    failed = sum(not check.passed for check in checks)
-    print(f"{len(checks) - failed} of {len(checks)} checks passed")
-    return 1 if failed else 0
+@dataclass(frozen=True, kw_only=True)
+class CheckModel(Command):
+    """Examine the model of a vehicle: mass, inertia, hover, free fall, torques, momentum, contact.
+
+    Exit status 1 if a check fails.
+    """
+
+    xml: Positional[Path | None] = None
+    """MJCF file. Default: the paper's quadcopter."""
+
+    def run(self) -> int:
+        """Print every check."""
+        from rich.console import Console
+        from rich.table import Table
+
+        from ..models.checks import examine
+        from ..models.vehicle import Vehicle
+
+        checks = examine(Vehicle.load(self.xml))
+        table = Table("", "check", "expected", "measured - expected", "tolerance", "source")
+        for check in checks:
+            table.add_row(
+                "[green]ok" if check.passed else "[red]FAILED",
+                check.name,
+                f"{check.expected:.7g} {check.unit}",
+                f"{check.measured - check.expected:.1e}",
+                f"{check.tolerance:.0e}",
+                check.source,
+            )
+        Console().print(table)
+        failed = sum(not check.passed for check in checks)
+        print(f"{len(checks) - failed} of {len(checks)} checks passed")
+        return 1 if failed else 0

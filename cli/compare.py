@@ -1,80 +1,75 @@
-"""`rotorgram compare` and `rotorgram report`."""
+"""`rotorgram compare`: train several agents over the same seeds and steps, and report."""
 
-import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from rich.console import Console
+from ..models.errors import InputError, require
+from ._flags import AlgorithmName, PresetName
+from ._inputs import refuse_settings
+from ._runs import RESUMED, RunsFlags, command_line, report_comparison, runs_folder
 
-from ..experiments.compare import PARTS, CompareConfig, read_compare_config
-from ..experiments.compare import compare as run_comparison
-from ..experiments.metrics import results_table
-from ..experiments.records import read_records
-from ..experiments.report import VIDEO_FILE, terminal_table, write_report
-from .inputs import new_folder, refuse_settings
-from .progress import bars
-from .workers import WORKERS, command_line, showing, workers
-
-if TYPE_CHECKING:
-    from .training import Compare
-
-__all__ = ["compare", "report"]
+__all__ = ["Compare"]
 
 
-def compare(command: "Compare") -> int:
-    """Train, evaluate and report."""
-    if command.resume:
-        folder = command.resume
-        refuse_settings(command, folder, free=("resume", "film", *WORKERS))
-        config = replace(read_compare_config(folder), **workers(command))
-        if not (folder / PARTS).is_dir():
-            raise ValueError(
-                f"resume: expected an interrupted comparison, {folder} is finished; "
-                f"draw its report with: rotorgram report {folder}"
+@dataclass(frozen=True, kw_only=True)
+class Compare(RunsFlags):
+    """Train VPG, A2C and SB3's A2C over the same seeds and steps, and report.
+
+    Every run has a simulator process and a socket pair of its own. Writes one folder: results,
+    checkpoints, figures and report.html.
+    """
+
+    agents: tuple[AlgorithmName, ...] = ("vpg", "a2c", "sb3-a2c")
+    """Algorithms to train; the PID flies beside them."""
+    preset: PresetName = "tuned"
+    """Hyperparameters: the paper's, or ours."""
+    seeds: int = 5
+    """Number of seeds, the same for every agent. Fewer than 5 decide no claim."""
+    first_seed: int = 0
+    """The first of them."""
+    env_steps: int = 200_000
+    """Env steps of each training; a learning rate that falls, falls over all of them."""
+    snapshots: int = 10
+    """Policies kept during each training, for the learning curves."""
+    episodes: int = 20
+    """Evaluation episodes of each final policy."""
+    film: bool = True
+    """Whether the agents are filmed side by side for the report, where there is OpenGL."""
+    out: Path | None = None
+    """Folder to write; it must not exist. Default: runs/compare-TIME."""
+    resume: Path | None = None
+    """Folder of an interrupted comparison to go on with; it keeps its settings."""
+
+    def run(self) -> int:
+        """Compare, report, print the table."""
+        for module in ("matplotlib", "jinja2"):  # before hours of training
+            require(module, "report", "a comparison's report")
+        from ..experiments.compare import PARTS, compare, read_compare_config
+        from ..experiments.settings import CompareConfig
+
+        if self.resume:
+            refuse_settings(self, self.resume, free=("film", *RESUMED))
+            config = replace(read_compare_config(self.resume), **self.workers())
+            if not (self.resume / PARTS).is_dir():
+                raise InputError(
+                    f"resume: expected an interrupted comparison, {self.resume} is finished; "
+                    f"draw its report with: rotorgram report {self.resume}"
+                )
+        else:
+            config = CompareConfig(
+                agents=self.agents,
+                seeds=self.seeds,
+                first_seed=self.first_seed,
+                env_steps=self.env_steps,
+                preset=self.preset,
+                env_id=self.env,
+                options=self.options,
+                vehicle=self.vehicle,
+                snapshots=self.snapshots,
+                episodes=self.episodes,
+                **self.workers(),
             )
-    else:
-        config = CompareConfig(
-            agents=command.agents,
-            seeds=command.seeds,
-            env_steps=command.env_steps,
-            preset=command.preset,
-            env=command.env.checked(),
-            snapshots=command.snapshots,
-            episodes=command.episodes,
-            **workers(command),
-        )
-        folder = new_folder(command.out, "compare")
-    with showing("compare", command, folder) as progress:
-        run_comparison(config, folder, command_line(), progress)
-    report(folder, film=command.film)
-    return 0
-
-
-def report(folder: Path, *, film: bool = True) -> None:
-    """Write figures, film and report from the folder's files, and print the table."""
-    records = read_records(folder)
-    results = results_table(records.evaluations, records.runs)
-    page = write_report(folder, records, results)
-    Console(width=100).print(terminal_table(results))
-    # Only now: whatever becomes of the film, there is a report.
-    if film and not (folder / VIDEO_FILE).exists() and _film(folder):
-        write_report(folder, records, results)
-    print(f"report: {page}")
-
-
-def _film(folder: Path) -> bool:
-    """Whether there is a film of the agents for the report. A report without one is a report."""
-    # OpenGL is loaded when everything is trained, not before.
-    from ..experiments.comparison_film import film_comparison
-
-    try:
-        with bars() as progress:
-
-            def on_frame(done: int, total: int) -> None:
-                progress(VIDEO_FILE, done, total, "done" if done == total else "film of the agents")
-
-            return film_comparison(folder, folder / VIDEO_FILE, on_frame)
-    except (OSError, ValueError) as error:
-        logging.getLogger(__name__).info("no film of the agents: %s", error)
-        return False
+        with runs_folder("compare", self, self.resume, self.out) as (folder, progress):
+            compare(config, folder, command_line(), progress)
+        report_comparison(folder, film=self.film)
+        return 0

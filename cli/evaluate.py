@@ -1,33 +1,58 @@
 """`rotorgram evaluate`: fly episodes without exploration, print the means."""
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Annotated
 
-import numpy as np
+from tyro.conf import Positional, arg
 
-from ..experiments.evaluate import evaluation_row, fly_episodes
-from .inputs import load_policy, remote_env
+from ._flags import AgentFlags
+from ._inputs import check_count
 
-if TYPE_CHECKING:
-    from .flying import Evaluate
-
-__all__ = ["evaluate"]
+__all__ = ["Evaluate"]
 
 
-def evaluate(command: "Evaluate") -> int:
-    """Fly and print the means; the exit status."""
-    if command.episodes < 1:
-        raise ValueError(f"episodes: expected at least 1, got {command.episodes}")
-    policy, config = load_policy(command.policy, command.env.checked())
-    with remote_env(config, command) as env:
-        flights = fly_episodes(env, policy, command.episodes)
-    rows = [evaluation_row(f, k, config.control_period) for k, f in enumerate(flights)]
-    settled = [r["settling_time"] for r in rows if not np.isnan(r["settling_time"])]
-    crashes = sum(r["terminated"] for r in rows)
-    settling = f"{np.mean(settled):.2f} s" if settled else "never"
-    print(f"policy            {command.policy}")
-    print(f"episodes          {len(rows)}, {crashes} terminated")
-    print(f"return            {np.mean([r['return'] for r in rows]):.1f}")
-    print(f"steady-state |E|  {np.mean([r['steady_error'] for r in rows]):.4f} m")
-    print(f"settling to 5 cm  {settling} ({len(settled)} of {len(rows)} episodes)")
-    print(f"overshoot         {np.mean([r['overshoot'] for r in rows]):.3f} m")
-    return 0
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(AgentFlags):
+    """Measure a trained policy or the PID over episodes without exploration."""
+
+    policy: Positional[Annotated[str, arg(metavar="POLICY")]]
+    """Checkpoint, folder of a training, or pid."""
+    episodes: int = 20
+    """Episodes to fly, from seeds that no training uses."""
+
+    def run(self) -> int:
+        """Fly and print the means."""
+        import numpy as np
+
+        from ..experiments.metrics import Headline
+        from ..experiments.results import evaluation_row
+        from ..experiments.trajectories import fly_episodes
+        from ._env import chosen_env, load_checkpoint, policy_for, remote_env
+
+        check_count("episodes", self.episodes)
+        checkpoint = load_checkpoint(self.policy)
+        required = checkpoint is not None or bool(self.options) or "env" in self.given
+        with remote_env(self, *chosen_env(self, checkpoint), required=required) as env:
+            headline = Headline.of(env.env_spec)
+            policy = policy_for(checkpoint, env.env_spec)
+            trajectories = fly_episodes(env, policy, self.episodes, "final")
+        rows = [evaluation_row(trajectory, headline) for trajectory in trajectories]
+
+        def mean(name: str) -> float:
+            return float(np.nanmean([row[name] for row in rows]))
+
+        def amount(name: str) -> str:
+            return headline.amount(f"{mean(name):.4f}")
+
+        print(f"policy     {self.policy} on {trajectories[0].spec.env_id}")
+        print(f"episodes   {len(rows)}, {sum(row['terminated'] for row in rows)} terminated")
+        print(f"return     {mean('return'):.1f}")
+        print(f"steady     {headline.size_symbol} {amount('steady')}")
+        if (bound := headline.metric.settled) is not None and not headline.high:
+            count = sum(not np.isnan(row["settling_time"]) for row in rows)
+            when = f"{mean('settling_time'):.2f} s" if count else "never"
+            bound_text = headline.amount(f"{bound:g}")
+            print(f"settling   to {bound_text}: {when} ({count} of {len(rows)} episodes)")
+        if headline.signed:
+            print(f"overshoot  {amount('overshoot')}")
+        return 0

@@ -2,112 +2,154 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from ..envs import ElevationConfig
-from ..experiments.figures import agent_color, agent_label
-from ..experiments.filming import Film, Shot, film
-from ..experiments.flights import Track, flown_tracks, recorded_tracks
-from ..rendering.film import check_film
-from ..rendering.gl import offscreen_context
-from .inputs import CHECKPOINT, load_policy
-from .progress import bars
+from tyro.conf import Positional
+
+from ..models.errors import InputError
+from ._flags import EnvFlags
+from ._inputs import check_count
 
 if TYPE_CHECKING:
-    from .looking import Render
+    from ..experiments.filming import Shot
+    from ..experiments.trajectories import Trajectory
 
-__all__ = ["parse_size", "render"]
+__all__ = ["Render", "parse_size"]
 
 
-def render(command: "Render") -> int:
-    """Film what the command names."""
-    width, height = parse_size(command.size)
-    config = Film(
-        width=width,
-        height=height,
-        camera=command.camera,
-        fps=command.fps,
-        speed=command.speed,
-        world=command.world,
-        overlay=command.overlay,
-        at=command.at,
-        fast=command.fast,
-    )
-    check_film(command.out, width, height, command.fps)
-    if command.at is not None and command.out.suffix.lower() != ".png":
-        raise ValueError(f"at: expected it with a picture, --out NAME.png, got {command.out}")
-    offscreen_context(16, 16).free()  # to fly takes longer than to say that there is no OpenGL
-    shots = _shots(command)
-    longest = max(shot.tracks[0].seconds for shot in shots)
-    if command.at is not None and command.at > longest:
-        raise ValueError(f"at: expected 0 to {longest:g} s, the flight's end, got {command.at:g}")
-    with bars() as progress:
-        frames = film(
-            command.out,
-            shots,
-            config,
-            lambda done, total: progress(
-                command.out.name, done, total, "done" if done == total else "frames"
-            ),
+@dataclass(frozen=True, kw_only=True)
+class Render(EnvFlags):
+    """Film flights: a policy's, or those of a journal; several side by side.
+
+    Needs no display. Exit status 2 where there is no OpenGL.
+    """
+
+    what: Positional[tuple[str, ...]]
+    """Checkpoint, folder of a training, pid, random, or a journal (.mcap). Policies fly evaluation
+    episodes without exploration."""
+    out: Path
+    """film.mp4, film.gif, picture.png, or a folder for pictures 0001.png and so on. It must not
+    exist."""
+    camera: Literal["chase", "front", "side", "top", "onboard"] = "chase"
+    """Front and side stand still, the others follow."""
+    episode: int = 0
+    """The first episode, from 0: of an evaluation, or of those in the journal."""
+    episodes: int = 1
+    """Number of episodes."""
+    size: str = "1280x720"
+    """WIDTHxHEIGHT of the picture with all its panes, pixels."""
+    fps: float = 25.0
+    """Pictures per second."""
+    speed: float = 1.0
+    """Seconds of flight per second of film: 0.25 is slow motion."""
+    at: float | None = None
+    """With a .png: the time of the picture in the first episode, s. Default: its end."""
+    world: Literal["airport", "plain"] = "airport"
+    """What is around the drones in the picture; it changes no flight."""
+    overlay: bool = True
+    """Whether numbers and curves are on the picture. Of several flights the names always are."""
+    fast: bool = False
+    """Without shadows and smooth edges: several times as fast where software draws."""
+    names: tuple[str, ...] = ()
+    """Titles, one for each flight. Default: what flies."""
+    session: int | None = None
+    """With a journal: which session, from 1, as rotorgram replay counts. Default: the first that
+    flew."""
+    drone: int = 0
+    """With a journal: which drone of the session, from 0."""
+
+    def run(self) -> int:
+        """Fly or read, draw, and say where."""
+        from ..experiments.filming import Film, film
+        from ..rendering.film import check_film
+        from ..rendering.gl import offscreen_context
+        from ._progress import bars
+
+        width, height = parse_size(self.size)
+        config = Film(
+            width=width,
+            height=height,
+            camera=self.camera,
+            fps=self.fps,
+            speed=self.speed,
+            world=self.world,
+            vehicle=self.vehicle,
+            overlay=self.overlay,
+            at=self.at,
+            fast=self.fast,
         )
-    pictures = "1 picture" if frames == 1 else f"{frames} pictures"
-    print(f"film: {command.out} ({pictures} of {width}x{height})")
-    return 0
+        check_film(self.out, width, height, self.fps)
+        if self.at is not None and self.out.suffix.lower() != ".png":
+            raise InputError(f"at: expected it with a picture, --out NAME.png, got {self.out}")
+        offscreen_context(16, 16).free()  # flying takes longer than finding no OpenGL
+        shots = self._shots()
+        longest = max(shot.trajectories[0].seconds for shot in shots)
+        if self.at is not None and self.at > longest:
+            raise InputError(f"at: expected 0 to {longest:g} s, the flight's end, got {self.at:g}")
+        with bars() as progress:
+
+            def on_frame(done: int, total: int) -> None:
+                progress(self.out.name, done, total, "done" if done == total else "frames")
+
+            frames = film(self.out, shots, config, on_frame)
+        pictures = "1 picture" if frames == 1 else f"{frames} pictures"
+        print(f"film: {self.out} ({pictures} of {width}x{height})")
+        return 0
+
+    def _shots(self) -> "list[Shot]":
+        from ..experiments.filming import Shot
+
+        if not self.what:
+            raise InputError("what: expected a checkpoint, pid, random or a journal, got nothing")
+        if self.names and len(self.names) != len(self.what):
+            raise InputError(
+                f"names: expected one for each of {len(self.what)} flights, got {len(self.names)}"
+            )
+        if self.episode < 0:
+            raise InputError(f"episode: expected 0 or more, got {self.episode}")
+        check_count("episodes", self.episodes)
+        journals = [Path(words).suffix == ".mcap" for words in self.what]
+        if not any(journals) and (self.session is not None or self.drone):
+            raise InputError("session, drone: expected them with a journal (.mcap), got none")
+        if self.options and all(journals):
+            raise InputError("env: expected no options with a journal, which has its own")
+        found = [self._find(what) for what in self.what]
+        names = self.names or _told_apart([name for _, name, _ in found], self.what)
+        colors = _colors([agent for agent, _, _ in found])
+        return [
+            Shot(name=name, color=color, trajectories=trajectories)
+            for name, color, (_, _, trajectories) in zip(names, colors, found, strict=True)
+        ]
+
+    def _find(self, what: str) -> "tuple[str, str, list[Trajectory]]":
+        """Agent, name and trajectories of what the user named."""
+        from ..experiments.palette import agent_label
+        from ..experiments.trajectories import flown_trajectories, recorded_trajectories
+        from ._env import chosen_env, load_checkpoint, local_spec, policy_for
+
+        episodes = range(self.episode, self.episode + self.episodes)
+        path = Path(what)
+        if path.suffix == ".mcap":
+            recorded = recorded_trajectories(path, episodes, session=self.session, drone=self.drone)
+            return path.stem, path.stem, recorded
+        policy = checkpoint = None
+        if what != "random":
+            checkpoint = load_checkpoint(what)
+            policy = policy_for(checkpoint, local_spec(self, checkpoint))
+        agent = checkpoint.algorithm if checkpoint else what
+        env = chosen_env(self, checkpoint)
+        flown = flown_trajectories(policy, *env, episodes, vehicle=self.vehicle)
+        return agent, what if what == "random" else agent_label(agent), flown
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """WIDTHxHEIGHT as a pair. Raises `ValueError`."""
+    """WIDTHxHEIGHT as a pair. Raises `InputError`."""
     match = re.fullmatch(r"([0-9]{2,4})x([0-9]{2,4})", text)
     if not match or not all(16 <= int(pixels) <= 8192 for pixels in match.groups()):
-        raise ValueError(f"size: expected WIDTHxHEIGHT of 16 to 8192 pixels each, got {text!r}")
+        raise InputError(f"size: expected WIDTHxHEIGHT of 16 to 8192 pixels each, got {text!r}")
     return int(match[1]), int(match[2])
-
-
-def _shots(command: "Render") -> list[Shot]:
-    if not command.what:
-        raise ValueError("what: expected a checkpoint, pid, random or a journal, got nothing")
-    if command.names and len(command.names) != len(command.what):
-        raise ValueError(
-            f"names: expected one for each of {len(command.what)} flights, got {len(command.names)}"
-        )
-    if command.episode < 0:
-        raise ValueError(f"episode: expected 0 or more, got {command.episode}")
-    if command.episodes < 1:
-        raise ValueError(f"episodes: expected at least 1, got {command.episodes}")
-    journals = [Path(words).suffix == ".mcap" for words in command.what]
-    if not any(journals) and (command.session is not None or command.drone):
-        raise ValueError("session, drone: expected them with a journal (.mcap), got none")
-    env = command.env.checked()
-    if env != ElevationConfig() and all(journals):
-        raise ValueError("env: expected no options with a journal, which has its own")
-    found = [_find(what, command, env) for what in command.what]
-    names = command.names or _told_apart([name for _, name, _ in found], command.what)
-    colors = _colors([agent for agent, _, _ in found])
-    return [
-        Shot(name=name, color=color, tracks=tracks)
-        for name, color, (_, _, tracks) in zip(names, colors, found, strict=True)
-    ]
-
-
-def _find(what: str, command: "Render", env: ElevationConfig) -> tuple[str, str, list[Track]]:
-    """Agent, name and flights of what the user named."""
-    episodes = range(command.episode, command.episode + command.episodes)
-    path = Path(what)
-    if path.suffix == ".mcap":
-        tracks = recorded_tracks(path, episodes, session=command.session, drone=command.drone)
-        return path.stem, path.stem, tracks
-    if what == "random":
-        return what, what, flown_tracks(None, env, episodes)
-    policy, config = load_policy(what, env)
-    agent = "pid" if what == "pid" else _algorithm(path)
-    return agent, agent_label(agent), flown_tracks(policy, config, episodes)
-
-
-def _algorithm(path: Path) -> str:
-    from ..agents.checkpoints import load
-
-    return load(path / CHECKPOINT if path.is_dir() else path).algorithm
 
 
 def _told_apart(names: Sequence[str], what: Sequence[str]) -> list[str]:
@@ -120,6 +162,8 @@ def _told_apart(names: Sequence[str], what: Sequence[str]) -> list[str]:
 
 def _colors(agents: Sequence[str]) -> list[str]:
     """Each agent's own; where that is taken, one that is free."""
+    from ..experiments.palette import agent_color
+
     colors: list[str] = []
     spare = [agent_color(name, dark=True) for name in ("vpg", "a2c", "sb3-a2c", "pid")]
     spare += ["#E29AC3", "#F0B840", "#7CC8F2", "#C9938A"]

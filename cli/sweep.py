@@ -1,123 +1,111 @@
-"""`rotorgram sweep`, and `rotorgram report` of a sweep."""
+"""`rotorgram sweep`: train an algorithm over a grid of hyperparameters."""
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
-import pandas as pd
-from rich import box
-from rich.console import Console
-from rich.table import Table
+from tyro.conf import Positional, UseAppendAction, arg
 
-from ..experiments.errors import RunsFailed
-from ..experiments.sweep import (
-    SWEEP_FILE,
-    SweepConfig,
-    missing_runs,
-    read_sweep_config,
-    read_sweep_runs,
-    write_sweep_table,
-)
-from ..experiments.sweep import sweep as run_sweep
-from .inputs import new_folder, parse_changes, refuse_settings
-from .workers import WORKERS, command_line, showing, workers
+from ..models.errors import InputError
+from ._flags import AlgorithmName, PresetName, parse_value
+from ._inputs import refuse_settings
+from ._runs import RESUMED, RunsFlags, command_line, report_sweep, runs_folder
 
-if TYPE_CHECKING:
-    from .training import Sweep
-
-__all__ = ["parse_grid", "report", "sweep"]
+__all__ = ["Sweep"]
 
 
-def sweep(command: "Sweep") -> int:
-    """Train, evaluate and print the table."""
-    if command.resume:
-        folder = command.resume
-        config = _resumed(command, folder)
-    else:
-        config = SweepConfig(
-            algorithm=command.algorithm,
-            grid=parse_grid(word for words in command.grid for word in words),
-            preset=command.preset,
-            seeds=command.seeds,
-            env_steps=command.env_steps,
-            num_envs=command.num_envs,
-            episodes=command.episodes,
-            env=command.env.checked(),
-            **workers(command),
-        )
-        folder = new_folder(command.out, f"sweep-{config.algorithm}")
-    try:
-        with showing(f"sweep {config.algorithm}", command, folder) as progress:
-            run_sweep(config, folder, command_line(), progress)
-    except RunsFailed:  # which a point may well do for good: the others are to be seen
-        report(folder)
-        raise
-    report(folder)
-    return 0
+@dataclass(frozen=True, kw_only=True)
+class Sweep(RunsFlags):
+    """Train an algorithm over a grid of hyperparameters, every point on the same seeds.
 
+    Every run has a simulator process and a socket pair of its own. Ctrl-C keeps the runs that are
+    done; --resume flies the others.
+    """
 
-def _resumed(command: "Sweep", folder: Path) -> SweepConfig:
-    config = replace(read_sweep_config(folder), **workers(command))
-    if config.algorithm != command.algorithm:
-        raise ValueError(
-            f"resume: expected a sweep of {command.algorithm}, "
-            f"{folder} holds one of {config.algorithm}"
-        )
-    refuse_settings(command, folder, free=("algorithm", "resume", *WORKERS))
-    if not missing_runs(config, read_sweep_runs(folder, config)):
-        raise ValueError(
-            f"resume: expected an interrupted sweep, {folder} is finished; "
-            f"show it with: rotorgram report {folder}"
-        )
-    return config
+    algorithm: Positional[AlgorithmName]
+    """vpg, a2c or sb3-a2c."""
+    grid: UseAppendAction[
+        Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE,... ...")]
+    ] = ()
+    """Values to try, such as learning_rate=0.003,0.01 steps_per_update=64,256: every combination
+    is a point."""
+    preset: PresetName = "tuned"
+    """Hyperparameters that the grid does not name: the paper's, or ours."""
+    seeds: int = 3
+    """Number of seeds, the same for every point."""
+    first_seed: int = 1000
+    """The first of them: by default none that a comparison uses."""
+    env_steps: int = 200_000
+    """Env steps of each training, of all its drones together."""
+    num_envs: int = 1
+    """Drones that fly at the same time, in lock-step, in each training."""
+    episodes: int = 20
+    """Evaluation episodes of each final policy."""
+    out: Path | None = None
+    """Folder to write; it must not exist. Default: runs/sweep-ALGORITHM-TIME."""
+    resume: Path | None = None
+    """Folder of an interrupted sweep to go on with; it keeps its settings."""
+
+    def run(self) -> int:
+        """Sweep, and print the table."""
+        from ..experiments.errors import RunsFailed
+        from ..experiments.settings import SweepConfig
+        from ..experiments.sweep import sweep
+
+        if self.resume:
+            config = self._resumed(self.resume)
+        else:
+            config = SweepConfig(
+                algorithm=self.algorithm,
+                grid=parse_grid(word for words in self.grid for word in words),
+                preset=self.preset,
+                seeds=self.seeds,
+                first_seed=self.first_seed,
+                env_steps=self.env_steps,
+                num_envs=self.num_envs,
+                episodes=self.episodes,
+                env_id=self.env,
+                options=self.options,
+                vehicle=self.vehicle,
+                **self.workers(),
+            )
+        name = f"sweep {config.algorithm}"
+        try:
+            with runs_folder(name, self, self.resume, self.out) as (folder, progress):
+                sweep(config, folder, command_line(), progress)
+        except RunsFailed:  # the other points are reported all the same
+            report_sweep(folder)
+            raise
+        report_sweep(folder)
+        return 0
+
+    def _resumed(self, folder: Path) -> Any:
+        from ..experiments.sweep import missing_runs, read_sweep_config, read_sweep_runs
+
+        config = replace(read_sweep_config(folder), **self.workers())
+        if config.algorithm != self.algorithm:
+            raise InputError(
+                f"resume: expected a sweep of {self.algorithm}, "
+                f"{folder} holds one of {config.algorithm}"
+            )
+        refuse_settings(self, folder, free=RESUMED)
+        if not missing_runs(config, read_sweep_runs(folder, config)):
+            raise InputError(
+                f"resume: expected an interrupted sweep, {folder} is finished; "
+                f"show it with: rotorgram report {folder}"
+            )
+        return config
 
 
 def parse_grid(words: Iterable[str]) -> dict[str, tuple[Any, ...]]:
-    """Values by the name of their hyperparameter. Raises `ValueError`."""
+    """Values by the name of their hyperparameter. Raises `InputError`."""
     grid: dict[str, tuple[Any, ...]] = {}
     for word in words:
         name, equals, values = word.partition("=")
         if not equals:
-            raise ValueError(f"grid: expected NAME=VALUE,VALUE,…, got {word!r}")
+            raise InputError(f"grid: expected NAME=VALUE,VALUE,…, got {word!r}")
         if name in grid:
-            raise ValueError(f"grid: expected each name once, got {name} twice")
-        grid[name] = tuple(parse_changes((f"{name}={v}",))[name] for v in values.split(","))
+            raise InputError(f"grid: expected each name once, got {name} twice")
+        grid[name] = tuple(map(parse_value, values.split(",")))
     return grid
-
-
-def report(folder: Path) -> None:
-    """Write `sweep.csv` from the folder's files, and print it."""
-    config = read_sweep_config(folder)
-    results = write_sweep_table(config, folder)
-    Console(width=100).print(_table(results, config))
-    print(f"{results['seeds'].sum()} of {len(config.runs())} runs done")
-    band = f"{config.env.flight_band:g} m"
-    print(
-        f"ranked by the worst seed: steady |E| + share of crashed episodes × flight band ({band})"
-    )
-    print(f"table: {folder / SWEEP_FILE}")
-
-
-def _table(results: pd.DataFrame, config: SweepConfig) -> Table:
-    table = Table(box=box.SIMPLE_HEAD)
-    for name in config.grid:
-        table.add_column(name.replace("_", "\n"), overflow="fold")
-    for heading in (
-        "Steady |E|,\nworst (m)", "median\n(m)", "Return,\nmedian", "Settled", "Crashed",
-        "Seeds", "Training\n(s)", "Env\nsteps/s",
-    ):  # fmt: skip
-        table.add_column(heading, justify="right")
-    for row in results.to_dict("records"):
-        table.add_row(
-            *(str(row[name]) for name in config.grid),
-            f"{row['worst_error']:.3g}",
-            f"{row['median_error']:.3g}",
-            f"{row['return']:.0f}",
-            f"{row['settled']} of {row['episodes']}",
-            str(row["crashed"]),
-            str(row["seeds"]),
-            f"{row['seconds']:.1f}",
-            f"{row['steps_per_second']:,.0f}",
-        )
-    return table

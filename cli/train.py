@@ -1,71 +1,195 @@
 """`rotorgram train`: one run with a progress bar, checkpoints, and Ctrl-C that loses nothing."""
 
-import io
-import json
 import math
+import shlex
 import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import pandas as pd
+from tyro.conf import Positional, UseAppendAction, arg
 
-from ..agents import A2CConfig, preset
-from ..agents.checkpoints import load, software_versions, write_whole
-from ..agents.episodes import Episode
-from ..envs import ElevationConfig
-from ..experiments.training import Run, Training, is_finished
-from .inputs import CHECKPOINT, new_folder, parse_changes, refuse_settings, remote_env
-from .progress import bars
-from .scalars import ScalarWriter
+from ..models.errors import InputError
+from ._flags import AgentFlags, AlgorithmName, PresetName, parse_value
+from ._inputs import folder_to_write, refuse_settings
 
 if TYPE_CHECKING:
-    from .training import Train
+    from ..experiments.settings import Run
+    from ..experiments.training import Training
 
-__all__ = ["train"]
+__all__ = ["Train"]
 
 EPISODES: Final = "episodes.csv"
-_NOT_KEPT: Final = ("listen", "num_simulators", "key_file", "insecure", "record", "store_every")
+_FREE: Final = ("resume", "listen", "num_simulators", "key_file", "insecure", "record",
+                "store_every", "env", "vehicle")  # fmt: skip
+"""Flags that a resumed training may be given."""
 _UPDATE_WITHIN: Final = 0.7  # s
 _SHOW_EVERY: Final = 0.2  # s
 _LEAST_STEPS: Final = 16  # of each drone for an update of A2C
 _LEAST_UPDATES: Final = 30  # of VPG
 
 
-def train(command: "Train") -> int:
-    """Train by the command's settings, or by those of the folder to resume."""
-    if not (math.isfinite(command.store_every) and command.store_every > 0):
-        raise ValueError(f"store-every: expected seconds > 0, got {command.store_every}")
-    if command.resume:
-        return _resume(command, command.resume)
-    run = Run(
-        algorithm=command.algorithm,
-        config=preset(
-            command.algorithm,
-            command.preset,
-            **parse_changes(word for words in command.set for word in words),
-        ),
-        env=command.env.checked(),
-        seed=command.seed,
-        env_steps=command.env_steps,
-        num_envs=command.num_envs,
-    )
-    if advice := _advice(run):
-        print(f"note: {advice}", flush=True)
-    folder = new_folder(command.out, f"{run.algorithm}-seed{run.seed}")
-    with remote_env(run.env, command, run.num_envs, command.num_simulators) as env:
-        training = Training(run, env)
-        _write_config(training, folder)
-        return _train(training, folder, command)
+@dataclass(frozen=True, kw_only=True)
+class Train(AgentFlags):
+    """Train an agent: the UDP server.
+
+    Starts a simulator process of its own, or waits for one with --listen. Ctrl-C stops at the next
+    update with everything written; --resume goes on to the same numbers.
+    """
+
+    algorithm: Positional[AlgorithmName]
+    """vpg, a2c or sb3-a2c."""
+    preset: PresetName = "tuned"
+    """Hyperparameters: the paper's, or ours."""
+    set: UseAppendAction[Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE …")]] = ()
+    """Changes to the preset, such as gamma=0.99 steps_per_update=64."""
+    seed: int = 0
+    """Seed of weights, actions and episodes."""
+    env_steps: int = 200_000
+    """Env steps to train for."""
+    num_envs: int = 1
+    """Drones that fly at the same time, in lock-step. Env steps count all of them."""
+    num_simulators: int = 1
+    """With --listen: simulators to wait for, each with its share of the drones."""
+    out: Path | None = None
+    """Folder to write to. Default: runs/ALGORITHM-seedSEED-TIME."""
+    resume: Path | None = None
+    """Folder of a training to go on with; it keeps its settings."""
+    store_every: float = 10.0
+    """Seconds between two checkpoints; what is flown after the last one is flown again."""
+
+    def run(self) -> int:
+        """Train by these settings, or by those of the folder to resume."""
+        from ..models.errors import require
+
+        require("torch", "train", "training")
+        require("tensorboard", "train", "training")
+        if not (math.isfinite(self.store_every) and self.store_every > 0):
+            raise InputError(f"store-every: expected seconds > 0, got {self.store_every}")
+        return self._resume(self.resume) if self.resume else self._begin()
+
+    def _begin(self) -> int:
+        from ..agents import preset
+        from ..experiments.folders import locked
+        from ..experiments.settings import Run
+        from ..experiments.training import Training
+        from ._env import chosen_env, remote_env
+
+        changes = dict(_change(word) for words in self.set for word in words)
+        env_id, options = chosen_env(self)
+        run = Run(
+            algorithm=self.algorithm,
+            config=preset(self.algorithm, self.preset, **changes),
+            env_id=env_id,
+            options=options,
+            vehicle=self.vehicle,
+            seed=self.seed,
+            env_steps=self.env_steps,
+            num_envs=self.num_envs,
+        )
+        if advice := _advice(run):
+            print(f"note: {advice}", flush=True)
+        required = bool(options) or "env" in self.given
+        with (
+            folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
+            remote_env(self, env_id, options, required=required, num_envs=run.num_envs,
+                       num_simulators=self.num_simulators) as env,
+            locked(folder),
+        ):  # fmt: skip
+            spec = env.env_spec  # of the simulator that came
+            training = Training(replace(run, env_id=spec.env_id, options=spec.options), env)
+            _write_config(training, folder)
+            return self._train(training, folder)
+
+    def _resume(self, folder: Path) -> int:
+        from ..agents import load
+        from ..experiments.folders import locked
+        from ..experiments.training import Training, is_finished
+        from ._env import CHECKPOINT, remote_env
+
+        with locked(folder):
+            kept = load(folder / CHECKPOINT)
+            if kept.algorithm != self.algorithm:
+                raise InputError(
+                    f"resume: expected a training of {self.algorithm}, "
+                    f"{folder} holds one of {kept.algorithm}"
+                )
+            refuse_settings(self, folder, free=("algorithm", *_FREE))
+            if "env" in self.given and self.env != kept.env_id:
+                raise InputError(f"resume: expected --env {kept.env_id}, got {self.env}")
+            if is_finished(kept):
+                print(
+                    f"already trained {kept.position.env_steps:,} of {kept.env_steps:,} env steps"
+                )
+                print(f"checkpoint: {folder / CHECKPOINT}")
+                return 0
+            for name, (then, now) in kept.other_versions().items():
+                print(f"note: {name} was {then} and is {now}: the numbers may differ", flush=True)
+            with remote_env(self, kept.env_id, kept.options, required=True, num_envs=kept.num_envs,
+                            num_simulators=self.num_simulators) as env:  # fmt: skip
+                return self._train(Training.resume(kept, env), folder)
+
+    def _train(self, training: "Training", folder: Path) -> int:
+        from ._env import CHECKPOINT
+
+        before = training.log.env_steps
+        go_on = f"go on with: {self._resuming(folder)}"
+        keeper = _Keeper(training, folder, self.store_every)
+        try:
+            with _stop_at_update() as stop, _showing(training) as show:
+
+                def on_update() -> bool:
+                    show()
+                    stopping = stop.reached()
+                    keeper.keep(now=stopping)
+                    return not stopping
+
+                finished = training.train(on_update)
+                if finished:
+                    stop.reached()
+                    keeper.keep(now=True, last=True)
+        except BaseException:  # a full disk and SIGTERM too
+            with suppress(OSError):
+                keeper.close()
+            if (folder / CHECKPOINT).exists():
+                print(go_on)
+            raise
+        keeper.close()
+        flown = training.log.env_steps - before
+        what = ("trained" if flown else "already trained") if finished else "stopped after"
+        print(f"{what} {training.log.env_steps:,} of {training.run.env_steps:,} env steps")
+        if flown:
+            print(f"{training.log.env_steps / training.log.seconds:,.0f} env steps per second")
+        print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)
+        return 0 if finished else 128 + signal.SIGINT
+
+    def _resuming(self, folder: Path) -> str:
+        """The command that goes on."""
+        words: list[Any] = ["rotorgram", "train", self.algorithm, "--resume", folder]
+        for flag in ("env", "vehicle", "listen", "num_simulators", "key_file"):
+            if flag in self.given:
+                words += [f"--{flag.replace('_', '-')}", getattr(self, flag)]
+        words += ["--insecure"] if self.insecure else []
+        return shlex.join(map(str, words))
 
 
-def _advice(run: Run) -> str:
-    """What to set where the other settings leave too little for so many drones; or nothing."""
+def _change(word: str) -> tuple[str, Any]:
+    """NAME=VALUE of a hyperparameter. Raises `InputError`."""
+    name, equals, value = word.partition("=")
+    if not equals:
+        raise InputError(f"set: expected NAME=VALUE, got {word!r}")
+    return name, parse_value(value)
+
+
+def _advice(run: "Run") -> str:
+    """What to set if an update has too little data of so many drones; empty if not."""
+    from ..agents import A2CConfig
+
     drones, config = run.num_envs, run.config
-    if drones == 1:
+    if drones == 1 or "episode_length" not in run.options:
         return ""
     if isinstance(config, A2CConfig):
         steps = config.rollout_size(drones) // drones
@@ -77,7 +201,7 @@ def _advice(run: Run) -> str:
             f"little from fewer than {_LEAST_STEPS}: try --set steps_per_update={better}, a higher "
             f"learning_rate, and --env-steps {100 * better} or more"
         )
-    whole = -(-config.episodes_per_update // drones) * drones * run.env.episode_length
+    whole = -(-config.episodes_per_update // drones) * drones * run.options["episode_length"]
     updates = run.env_steps // whole
     if updates >= _LEAST_UPDATES:
         return ""
@@ -88,63 +212,6 @@ def _advice(run: Run) -> str:
     )
 
 
-def _resume(command: "Train", folder: Path) -> int:
-    kept = load(folder / CHECKPOINT)
-    if kept.algorithm != command.algorithm:
-        raise ValueError(
-            f"resume: expected a training of {command.algorithm}, "
-            f"{folder} holds one of {kept.algorithm}"
-        )
-    refuse_settings(command, folder, free=("algorithm", "resume", *_NOT_KEPT))
-    episodes = _read_episodes(folder / EPISODES, kept.position.episode)
-    if is_finished(kept):
-        print(f"already trained {kept.position.env_steps:,} of {kept.env_steps:,} env steps")
-        print(f"checkpoint: {folder / CHECKPOINT}")
-        return 0
-    options = ElevationConfig.from_options(kept.env)
-    with remote_env(options, command, kept.num_envs, command.num_simulators) as env:
-        return _train(Training.resume(kept, env, episodes), folder, command)
-
-
-def _train(training: Training, folder: Path, command: "Train") -> int:
-    before = training.log.env_steps
-    go_on = f"go on with: rotorgram train {training.run.algorithm} --resume {folder}"
-    if command.listen:
-        go_on += f" --listen {command.listen}"
-        if command.num_simulators > 1:
-            go_on += f" --num-simulators {command.num_simulators}"
-        go_on += f" --key-file {command.key_file}" if command.key_file else ""
-        go_on += " --insecure" if command.insecure else ""
-    keeper = _Keeper(training, folder, command.store_every)
-    try:
-        with _stop_at_update() as stop, _showing(training) as show:
-
-            def on_update() -> bool:
-                show()
-                stopping = stop.reached()
-                keeper.keep(now=stopping)
-                return not stopping
-
-            finished = training.train(on_update)
-            if finished:
-                stop.reached()
-                keeper.keep(now=True, last=True)
-    except BaseException:  # a full disk and SIGTERM too
-        with suppress(OSError):
-            keeper.close()
-        if (folder / CHECKPOINT).exists():
-            print(go_on)
-        raise
-    keeper.close()
-    flown = training.log.env_steps - before
-    what = ("trained" if flown else "already trained") if finished else "stopped after"
-    print(f"{what} {training.log.env_steps:,} of {training.run.env_steps:,} env steps")
-    if flown:
-        print(f"{training.log.env_steps / training.log.seconds:,.0f} env steps per second")
-    print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)
-    return 0 if finished else 130
-
-
 class _Keeper:
     """Stores a training at its first update, then every so many seconds, and when told to.
 
@@ -152,7 +219,9 @@ class _Keeper:
     training that was stopped and resumed stand at the same steps as those of an unbroken one.
     """
 
-    def __init__(self, training: Training, folder: Path, every: float) -> None:
+    def __init__(self, training: "Training", folder: Path, every: float) -> None:
+        from ._scalars import ScalarWriter
+
         self._training = training
         self._folder = folder
         self._every = every
@@ -162,11 +231,13 @@ class _Keeper:
         )
 
     def keep(self, *, now: bool, last: bool = False) -> None:
+        from ._env import CHECKPOINT
+
         at = self._training.log.env_steps
         if self._scalars.due(at, last=last):
             self._scalars.write(at, self._training.scalars())
         if now or time.monotonic() >= self._due:
-            # First the rest: a checkpoint takes the episodes and the curves that end before it.
+            # First the rest: a checkpoint takes the curves that end before it.
             self._write_episodes()
             self._scalars.flush()
             self._training.store(self._folder / CHECKPOINT)
@@ -178,39 +249,34 @@ class _Keeper:
         self._scalars.close()
 
     def _write_episodes(self) -> None:
+        import pandas as pd
+
+        from ..agents.checkpoints import write_whole
+        from ..agents.episodes import Episode
+
         rows = [asdict(episode) for episode in self._training.log.episodes]
         table = pd.DataFrame(rows, columns=[f.name for f in fields(Episode)])
         write_whole(self._folder / EPISODES, table.to_csv(index=False).encode())
 
 
-def _read_episodes(path: Path, count: int) -> list[Episode]:
-    """The first so many episodes. Raises `ValueError`."""
-    try:
-        table = pd.read_csv(io.BytesIO(path.read_bytes()))
-        episodes = [
-            Episode(**{str(k): v for k, v in row.items()}) for row in table.to_dict("records")
-        ]
-        whole = len({episode.episode for episode in episodes[:count]}) == count
-    except (FileNotFoundError, TypeError, ValueError):
-        whole = False
-    if not whole:
-        raise ValueError(f"{path}: expected the {count} episodes before the checkpoint")
-    return episodes[:count]
+def _write_config(training: "Training", folder: Path) -> None:
+    import json
 
+    from ..agents.checkpoints import software_versions, write_whole
 
-def _write_config(training: Training, folder: Path) -> None:
-    hello = getattr(training.env, "hello", None)
     content = {
         **asdict(training.run),
-        "model_hash": hello.model_hash if hello else "",
+        "vehicle_hash": training.log.spec.vehicle_hash,
         "versions": software_versions(),
     }
     write_whole(folder / "config.json", (json.dumps(content, indent=2) + "\n").encode())
 
 
 @contextmanager
-def _showing(training: Training) -> Iterator[Callable[[], None]]:
+def _showing(training: "Training") -> Iterator[Callable[[], None]]:
     """A function that shows the progress, unless it was shown a moment ago."""
+    from ._progress import bars
+
     name = f"{training.run.algorithm} seed {training.run.seed}"
     due = 0.0
     with bars() as progress:

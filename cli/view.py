@@ -1,62 +1,84 @@
-"""`rotorgram view`: flies a policy in process, for those who look."""
+"""`rotorgram view`: flights live, flown in process or read from a journal."""
 
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import chain, count, islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from ..envs import ElevationConfig
-from ..rendering.live import LiveView, open_surface
-from ..rendering.pace import Pace
-from ..rendering.stage import Stage
-from .inputs import load_policy
+from tyro.conf import Positional
+
+from ..models.errors import InputError
+from ._flags import EnvFlags
+from ._inputs import check_count
 
 if TYPE_CHECKING:
-    from ..experiments.flights import Track
-    from .looking import View
+    from ..experiments.trajectories import Trajectory
 
-__all__ = ["view"]
-
-
-def view(command: "View") -> int:
-    """Show episode after episode; the exit status."""
-    if command.episodes is not None and command.episodes < 1:
-        raise ValueError(f"episodes: expected at least 1, got {command.episodes}")
-    tracks = islice(_tracks(command), command.episodes)
-    first = next(tracks)
-    pace, stage = Pace(first.control_period, command.speed), Stage(command.world)
-    surface = open_surface("web" if command.web else "window", stage, pace, command.port)
-    with LiveView(stage, surface, pace) as live:
-        print(f"showing {command.what} {surface.where} (Ctrl-C ends)", flush=True)
-        while live.is_running and not live.is_watched:
-            time.sleep(0.02)
-        for track in chain((first,), tracks):
-            if not all(live.draw_in_time(moment) for moment in track.moments):
-                break
-            last = track.moments[-1]
-            total = sum(moment.reward for moment in track.moments)
-            print(
-                f"episode {last.episode}: return {total:.1f}, last |E| {abs(last.error):.3f} m",
-                flush=True,
-            )
-        while live.is_running and not live.wants:  # the last picture is still to come
-            time.sleep(0.02)
-    return 0
+__all__ = ["View"]
 
 
-def _tracks(command: "View") -> Iterator["Track"]:
-    """Episode after episode, as long as there are any."""
-    from ..experiments.flights import flown_tracks, recorded_tracks
+@dataclass(frozen=True, kw_only=True)
+class View(EnvFlags):
+    """Look at flights, in real time or slower: in a window, or on a page for browsers.
 
-    config = command.env.checked()
-    if (path := Path(command.what)).suffix == ".mcap":
-        if config != ElevationConfig():
-            raise ValueError("env: expected no options with a journal, which has its own")
-        yield from recorded_tracks(path)
-        return
-    policy = None
-    if command.what != "random":
-        policy, config = load_policy(command.what, config)
-    for episode in count():
-        yield flown_tracks(policy, config, [episode])[0]
+    Keys: space pauses, the arrow to the right takes one step, - and + change the speed.
+    """
+
+    what: Positional[str]
+    """Checkpoint, folder of a training, pid, random, or a journal (.mcap)."""
+    web: bool = False
+    """Serve a page for browsers, for a machine without a display."""
+    port: int = 8080
+    """TCP port of the page, on this machine's loopback; 0 takes the first free one."""
+    world: Literal["airport", "plain"] = "airport"
+    """What is around the drone."""
+    speed: float = 1.0
+    """1 is real time, from 1/16 to 8."""
+    episodes: int | None = None
+    """End after so many episodes. Default: go on until it is closed."""
+
+    def run(self) -> int:
+        """Fly and show, episode after episode."""
+        from ..experiments.filming import moments
+        from ..rendering.live import LiveView, open_surface
+        from ..rendering.pace import Pace
+        from ..rendering.stage import Stage
+        from ._env import words_of
+
+        check_count("episodes", self.episodes)
+        trajectories = islice(self._trajectories(), self.episodes)
+        first = next(trajectories)
+        pace = Pace(first.control_period, self.speed)
+        stage = Stage(self.world, vehicle=self.vehicle)
+        surface = open_surface("web" if self.web else "window", stage, pace, self.port)
+        with LiveView(stage, surface, pace) as live:
+            print(f"showing {self.what} {surface.where} (Ctrl-C ends)", flush=True)
+            while live.is_running and not live.is_watched:
+                time.sleep(0.02)
+            for trajectory in chain((first,), trajectories):
+                if not all(live.draw_in_time(moment) for moment in moments(trajectory)):
+                    break
+                print(f"episode {trajectory.episode}: {words_of(trajectory)}", flush=True)
+            while live.is_running and not live.wants:  # the last picture is still to come
+                time.sleep(0.02)
+        return 0
+
+    def _trajectories(self) -> "Iterator[Trajectory]":
+        """Episode after episode, as long as there are any."""
+        from ..experiments.trajectories import flown_trajectories, recorded_trajectories
+        from ._env import chosen_env, load_checkpoint, local_spec, policy_for
+
+        if (path := Path(self.what)).suffix == ".mcap":
+            if self.options:
+                raise InputError("env: expected no options with a journal, which has its own")
+            yield from recorded_trajectories(path)
+            return
+        policy = checkpoint = None
+        if self.what != "random":
+            checkpoint = load_checkpoint(self.what)
+            policy = policy_for(checkpoint, local_spec(self, checkpoint))
+        env = chosen_env(self, checkpoint)
+        for episode in count():
+            yield from flown_trajectories(policy, *env, [episode], vehicle=self.vehicle)

@@ -51,6 +51,8 @@ _VIEWS: Final[dict[str, tuple[float, float, float, float]]] = {
 picture holds: if they are further apart, the camera is further away."""
 _BACK: Final = 2.6
 """Distance of a camera per distance between craft and goal."""
+_FOVY: Final = 50.0
+"""Vertical field of view of every camera but `onboard`, degrees."""
 _FAR: Final = 10.0
 """Cameras move back until craft and goal are so far apart, or as far as at the episode's start."""
 
@@ -84,8 +86,6 @@ class Stage:
         vehicle: Path | str | None = None,
         trail: bool = True,
     ) -> None:
-        if world not in WORLDS:
-            raise InputError(f"world: expected {' or '.join(WORLDS)}, got {world!r}")
         if drones < 1:
             raise InputError(f"drones: expected 1 or more, got {drones}")
         self.drones, self.vehicle = drones, Vehicle.load(vehicle)
@@ -97,7 +97,7 @@ class Stage:
         for number, offset in enumerate(self._offsets[1:], 1):
             _add_craft(spec, self.vehicle.path, offset, f"{number}/")
         self.model = spec.compile()
-        _scale_drawing(self.model, self.radius, world, self._spread)
+        _scale_drawing(self.model, self.radius, self._spread)
         self.data = mujoco.MjData(self.model)
         self.moments: tuple[Moment, ...] = ()
         length = _TRAIL // _EVERY if trail else 0
@@ -262,12 +262,13 @@ def _add_craft(spec: mujoco.MjSpec, vehicle: Path, offset: np.ndarray, prefix: s
     frame.attach_body(_free_body(craft), prefix, "")
 
 
-def _scale_drawing(model: mujoco.MjModel, radius: float, world: World, spread: float) -> None:
+def _scale_drawing(model: mujoco.MjModel, radius: float, spread: float) -> None:
     """Set the near end of drawing, the shadow's fineness and the floor's squares for the craft.
 
     Ground and light that the vehicle's file brings stay as they are.
     """
     visual, extent = model.vis, model.stat.extent
+    visual.global_.fovy = _FOVY
     visual.map.znear = min(visual.map.znear * extent, _NEAR * radius) / extent
     # Software draws shadows too: finer ones cost more than they show.
     visual.quality.shadowsize = min(visual.quality.shadowsize, 2048)
@@ -275,8 +276,7 @@ def _scale_drawing(model: mujoco.MjModel, radius: float, world: World, spread: f
     if floor >= 0:
         model.mat_texrepeat[floor] *= 10.0 ** -round(math.log10(radius))
         # Further out the floor would shade itself, in speckles.
-        reach = (2.0 if world == "plain" else 4.0) * radius + spread
-        visual.map.shadowclip = min(visual.map.shadowclip, reach / extent)
+        visual.map.shadowclip = min(visual.map.shadowclip, (2.0 * radius + spread) / extent)
 
 
 def _grid(drones: int, spacing: float) -> np.ndarray:

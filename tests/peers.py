@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 from rotorgram.udp import Simulator
-from rotorgram.udp.faults import FaultConfig, Relay
+from rotorgram.udp.transport.relay import FaultConfig, Relay
 
 ANY = ("127.0.0.1", 0)
 ENV_ID = "rotorgram/Elevation-v0"

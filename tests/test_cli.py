@@ -13,15 +13,15 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from rotorgram.agents.checkpoints import load
-from rotorgram.cli import main
-from rotorgram.experiments.records import read_records, read_steps
+from rotorgram.agents import load
+from rotorgram.cli import COMMANDS, main
+from rotorgram.cli._flags import AlgorithmName, PresetName, parse
+from rotorgram.cli._scalars import ScalarWriter
+from rotorgram.cli.serve import Serve
+from rotorgram.cli.sim import Sim
+from rotorgram.experiments.results import read_steps
+from rotorgram.models import QUAD_XML
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-COMMANDS = [
-    "sim", "train", "serve", "evaluate", "compare", "sweep", "report", "check-model",
-    "key", "relay", "replay", "bench", "render", "view",
-]  # fmt: skip
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -37,7 +37,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
 def start(*arguments: object) -> subprocess.Popen[str]:
     """A command in a process of its own, in a terminal's process group of its own."""
     return subprocess.Popen(
-        [sys.executable, "-m", "rotorgram.cli", *map(str, arguments)],
+        [sys.executable, "-P", "-m", "rotorgram.cli", *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -52,7 +52,7 @@ def free_port() -> int:
         return port
 
 
-@pytest.mark.parametrize("command", [[], *[[c] for c in COMMANDS]], ids=["rotorgram", *COMMANDS])
+@pytest.mark.parametrize("command", [[], *[[c] for c in COMMANDS]], ids=" ".join)
 def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = run(capsys, *command, "--help")
     assert status == 0
@@ -65,18 +65,24 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["evaluate", "nowhere.safetensors"], "there is no file nowhere.safetensors"),
         (["evaluate", "pid", "--episodes", "0"], "episodes: expected at least 1, got 0"),
         (["evaluate", "pid", "--env.observation", "error"], "pid: expected observation='full'"),
+        (["evaluate", "pid", "--env", "rotorgram/Hover-v0"], "pid: expected the env rotorgram/El"),
         (["train", "a2c", "--set", "gamma"], "set: expected NAME=VALUE, got 'gamma'"),
         (["train", "a2c", "--set", "speed=1"], "hyperparameters: expected some of"),
+        (["train", "a2c", "--set", "gamma=[[["], "gamma: expected a number from 0 to 1, got '[[['"),
+        (["train", "a2c", "--set", "gamma=" + 9999 * "["], "gamma: expected a number from 0 to 1"),
         (["train", "vpg", "--listen", "8001"], "address: expected HOST:PORT"),
         (["train", "vpg", "--listen", "192.0.2.1:8001"], "is not a loopback address"),
         (["train", "vpg", "--resume", "nowhere"], "checkpoint: no file"),
         (["sim", "--server", "127.0.0.1:99999"], "address: expected HOST:PORT"),
         (["sim", "--bind", "127.0.0.1:0", "--env.target", "1"], "target: expected"),
+        (["sim", "--env", "rotorgram/Nothing-v0"], "env: expected a registered id"),
+        (["sim", "--env", "nowhere:Nothing-v0"], "env: expected a module nowhere here, got none"),
+        (["sim", "--vehicle", "nowhere.xml"], "vehicle: cannot read nowhere.xml"),
         (["compare", "--seeds", "0"], "seeds: expected at least 1, got 0"),
         (["compare", "--agents", "vpg", "vpg"], "agents: expected each once"),
-        (["compare", "--out", "."], "is there already"),
+        (["compare", "--out", "."], "expected a new folder"),
         (["report", "nowhere"], "nowhere"),
-        (["check-model", "nowhere.xml"], "xml: no file nowhere.xml"),
+        (["check-model", "nowhere.xml"], "vehicle: cannot read nowhere.xml"),
         (["sim", "--num-envs", "0", "--bind", "127.0.0.1:0"], "num_envs: expected 1 to 65536"),
         (["sim", "--num-envs", "2", "--codec", "text"], "codec: expected 'binary' for 2 drones"),
         (["sim", "--key-file", "nowhere"], "key file: cannot read nowhere"),
@@ -108,6 +114,158 @@ def test_wrong_flags_name_what_was_expected(
     assert status == 2
     assert "Traceback" not in out + err
     assert arguments[-1] in out + err or arguments[-2] in out + err
+
+
+def test_no_command_and_an_unknown_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys)[0] == 2
+    status, _, err = run(capsys, "fly")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "expected a command of sim, train, " in err
+    status, out, _ = run(capsys, "--version")
+    assert status == 0
+    assert re.fullmatch(r"rotorgram \d+\.\d+\.\d+\n", out)
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NumPy raises ValueError for our bugs too."""
+
+    def broken(self: Sim) -> int:
+        raise ValueError("operands could not be broadcast together")
+
+    monkeypatch.setattr(Sim, "run", broken)
+    with pytest.raises(ValueError, match="broadcast"):
+        main(["sim"])
+
+
+def test_algorithms_and_presets_are_those_of_the_agents() -> None:
+    from rotorgram.agents import presets
+
+    assert AlgorithmName == presets.AlgorithmName
+    assert PresetName == presets.PresetName
+
+
+def test_flags_that_are_set_to_their_default_are_set() -> None:
+    words = ["--env.target", "5", "--num-envs=1", "--no-realtime", "--env.action_mode", "offset"]
+    command = parse(Sim, "rotorgram sim", words)
+    assert command.given == {"env.target", "num_envs", "realtime", "env.action_mode"}
+    assert command.options == {"target": 5.0, "action_mode": "offset"}
+    assert parse(Sim, "rotorgram sim", []).options == {}
+
+
+def test_options_are_those_of_the_task(capsys: pytest.CaptureFixture[str]) -> None:
+    _, out, _ = run(capsys, "sim", "--env", "rotorgram/Hover-v0", "--help")
+    assert "--env.start-tilt" in out
+    assert "--env.target" not in out
+    command = parse(Sim, "rotorgram sim", ["--env.target", "4", "6"])
+    assert command.options == {"target": [4.0, 6.0]}, "as JSON gives it"
+
+
+def test_requirements_of_a_task_that_is_not_known_here() -> None:
+    words = ["pid", "--env", "other/Race-v3", "--env.num-gates=3", "--env.wind", "[0.5, 1]"]
+    command = parse(Serve, "rotorgram serve", [*words, "--env.track", "long", "--episodes", "2"])
+    assert (command.env, command.episodes) == ("other/Race-v3", 2)
+    assert command.options == {"num_gates": 3, "wind": [0.5, 1], "track": "long"}
+
+
+@pytest.mark.parametrize("words", [["--help"], ["sim", "--help"], ["sim", "--speed", "2"]])
+def test_a_narrow_terminal(words: list[str]) -> None:
+    """In five columns tyro takes gigabytes."""
+    limited = "import resource as r, sys; r.setrlimit(r.RLIMIT_AS, (4 << 30, 4 << 30));"
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            limited + "from rotorgram.cli import main; sys.exit(main())",
+            *words,
+        ],
+        env={**os.environ, "COLUMNS": "5"},
+        capture_output=True,
+        text=True,
+        timeout=30,
+    )
+    assert done.returncode == (0 if "--help" in words else 2), done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def shell(command: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """A command line, with `rotorgram` for the command."""
+    words = f"{sys.executable} -P -m rotorgram.cli"
+    return subprocess.run(
+        ["bash", "-c", "set -o pipefail; " + command.replace("rotorgram", words)],
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+@pytest.mark.parametrize(
+    ("command", "status", "error"),
+    [
+        ("rotorgram --help >&-", 0, ""),
+        ("rotorgram sim --help >&- 2>&-", 0, ""),
+        ("rotorgram check-model > /dev/full", 1, "rotorgram: standard output: No space left"),
+        ("(sleep 1; rotorgram --help) | true", 141, ""),
+    ],
+)
+def test_standard_output_that_takes_nothing(command: str, status: int, error: str) -> None:
+    done = shell(command)
+    assert done.returncode == status, done.stderr
+    assert done.stderr.startswith(error)
+    assert done.stderr.count("\n") == bool(error)
+
+
+def test_standard_output_in_ascii() -> None:
+    for command in ("rotorgram --help", "rotorgram render --help", "rotorgram check-model"):
+        done = shell(command, PYTHONIOENCODING="ascii")
+        assert (done.returncode, done.stderr) == (0, ""), command
+
+
+def test_an_opengl_that_does_not_exist() -> None:
+    """It is told to commands that draw; others go on."""
+    assert shell("rotorgram check-model", MUJOCO_GL="nonsense").returncode == 0
+    done = shell("rotorgram render random --out /nowhere/a.mp4", MUJOCO_GL="nonsense")
+    assert "Traceback" not in done.stderr
+    assert done.returncode in (1, 2)
+
+
+def test_a_folder_of_that_name_in_the_working_directory(tmp_path: Path) -> None:
+    """The simulators that a command starts import the package, not that folder."""
+    (tmp_path / "rotorgram").mkdir()
+    (tmp_path / "rotorgram" / "__init__.py").write_text("raise SystemExit('the wrong one')")
+    done = shell(f"cd {tmp_path} && rotorgram evaluate pid --episodes 1")
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_model_with_a_tiny_time_step(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = QUAD_XML.read_text(encoding="utf-8").replace('timestep="0.01"', 'timestep="1e-8"')
+    (tmp_path / "quad.xml").write_text(model)
+    status, _, err = run(capsys, "check-model", tmp_path / "quad.xml")
+    assert status == 1
+    assert "expected a physics step of at least" in err
+
+
+def test_a_key_on_a_full_disk(capsys: pytest.CaptureFixture[str]) -> None:
+    status, _, err = run(capsys, "key", "/dev/full")
+    assert (status, err.count("\n")) == (1, 1)
+
+
+def test_curves_go_on_after_the_clock_went_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = ScalarWriter(tmp_path, 1000)
+    for step in range(100, 600, 100):
+        first.write(step, {"x": 1.0})
+    first.close()
+    monkeypatch.setattr(time, "time", lambda: 1e9)
+    resumed = ScalarWriter(tmp_path, 1000, behind=300)
+    for step in range(400, 800, 100):
+        resumed.write(step, {"x": 2.0})
+    resumed.close()
+    board = EventAccumulator(str(tmp_path))
+    board.Reload()
+    points = [(point.step, point.value) for point in board.Scalars("x")]
+    assert points == [(100, 1), (200, 1), (300, 1), (400, 2), (500, 2), (600, 2), (700, 2)]
 
 
 def test_port_in_use(capsys: pytest.CaptureFixture[str]) -> None:
@@ -172,8 +330,8 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "trained 1,200 of 1,200 env steps" in out
     kept = load(folder / "checkpoint.safetensors")
     assert (kept.algorithm, kept.config["steps_per_update"]) == ("a2c", 100)
-    assert kept.env["episode_length"] == 60
-    assert len(kept.model_hash) == 32
+    assert kept.options["episode_length"] == 60
+    assert len(kept.vehicle_hash) == 32
     assert json.loads((folder / "config.json").read_text())["seed"] == 0
     assert len(pd.read_csv(folder / "episodes.csv")) >= 20
     status, out, _ = run(capsys, "evaluate", folder / "checkpoint.safetensors", "--episodes", 3)

@@ -11,8 +11,9 @@ from math import inf, nan, sqrt
 
 import pytest
 from peers import ANY, running
-from rotorgram.udp import faults
-from rotorgram.udp.faults import FaultConfig, Faults, Relay
+from rotorgram.models.errors import InputError
+from rotorgram.udp.transport import relay as relay_module
+from rotorgram.udp.transport.relay import FaultConfig, Faults, Relay
 
 COUNT = 20_000
 
@@ -168,7 +169,7 @@ def test_a_corrupted_datagram_is_never_the_same() -> None:
 @pytest.mark.parametrize("name", ["drop", "duplicate", "reorder", "truncate", "corrupt"])
 @pytest.mark.parametrize("value", [-0.1, 1.1, nan, "1", None])
 def test_wrong_probability(name: str, value: object) -> None:
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(InputError) as caught:
         FaultConfig(**{name: value})  # type: ignore[arg-type]
     assert str(caught.value) == f"{name}: expected a probability from 0 to 1, got {value!r}"
 
@@ -176,13 +177,45 @@ def test_wrong_probability(name: str, value: object) -> None:
 @pytest.mark.parametrize("name", ["delay", "jitter", "reorder_by"])
 @pytest.mark.parametrize("value", [-1, inf, nan, "1"])
 def test_wrong_time(name: str, value: object) -> None:
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(InputError) as caught:
         FaultConfig(**{name: value})  # type: ignore[arg-type]
     assert str(caught.value) == f"{name}: expected seconds from 0 to 3600, got {value!r}"
 
 
+@pytest.mark.parametrize(
+    ("mtu", "size", "packets"),
+    [(1500, 1472, 1), (1500, 1473, 2), (1500, 2952, 2), (1500, 2953, 3), (1500, 65_507, 45),
+     (576, 548, 1), (576, 549, 2), (576, 1200, 3), (0, 65_507, 1)],
+)  # fmt: skip
+def test_a_datagram_is_lost_with_one_of_its_fragments(mtu: int, size: int, packets: int) -> None:
+    # Of 1,500 bytes 20 are the IP header; 8 more in the first packet are the UDP header.
+    stream = Faults(FaultConfig(drop=0.03, mtu=mtu, seed=4))
+    for _ in range(COUNT):
+        stream.fate(bytes(size))
+    assert within(stream.counters["dropped"], COUNT, 1 - 0.97**packets)
+
+
+@pytest.mark.parametrize(("mtu", "largest"), [(1500, 1472), (576, 548)])
+def test_a_black_hole_lets_small_datagrams_through(mtu: int, largest: int) -> None:
+    stream = Faults(FaultConfig(mtu=mtu, black_hole=True))
+    assert len(stream.fate(bytes(largest))) == 1
+    assert stream.fate(bytes(largest + 1)) == []
+
+
+@pytest.mark.parametrize("mtu", [-1, 67, 65_536, 1500.0, True])
+def test_wrong_mtu(mtu: object) -> None:
+    with pytest.raises(InputError) as caught:
+        FaultConfig(mtu=mtu)  # type: ignore[arg-type]
+    assert str(caught.value) == f"mtu: expected 0 or 68 to 65535 bytes, got {mtu!r}"
+
+
+def test_a_black_hole_needs_an_mtu() -> None:
+    with pytest.raises(InputError, match=r"^black_hole: expected an mtu with it, got none$"):
+        FaultConfig(black_hole=True)
+
+
 def test_wrong_seed() -> None:
-    with pytest.raises(ValueError, match=r"^seed: expected a whole number, got 0\.5$"):
+    with pytest.raises(InputError, match=r"^seed: expected a whole number, got 0\.5$"):
         FaultConfig(seed=0.5)  # type: ignore[arg-type]
 
 
@@ -321,7 +354,7 @@ def test_a_client_that_has_gone() -> None:
 
 
 def test_idle_clients_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(faults, "_IDLE", 0.05)
+    monkeypatch.setattr(relay_module, "_IDLE", 0.05)
     with through(FaultConfig()) as (client, server, _):
         client.send(b"a")
         _, before = server.recvfrom(9)
@@ -338,7 +371,7 @@ def test_idle_clients_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_longest_idle_client_goes_when_there_are_too_many(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(faults, "_MOST_CLIENTS", 2)
+    monkeypatch.setattr(relay_module, "_MAX_CLIENTS", 2)
     with (
         through(FaultConfig()) as (one, server, relay),
         client_of(relay) as two,
@@ -353,7 +386,7 @@ def test_the_longest_idle_client_goes_when_there_are_too_many(
 
 
 def test_what_is_held_back_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(faults, "_MOST_HELD", 10)
+    monkeypatch.setattr(relay_module, "_MAX_HELD", 10)
     with through(FaultConfig(delay=60)) as (client, _, relay):
         for _ in range(15):
             client.send(b"a")
@@ -394,13 +427,13 @@ def test_an_idle_relay_does_not_spin() -> None:
 
 
 def test_wrong_addresses() -> None:
-    with pytest.raises(ValueError, match=r"^server: expected the port of the agent, 1 to 65535"):
+    with pytest.raises(InputError, match=r"^server: expected the port of the agent, 1 to 65535"):
         Relay(ANY, ANY)
-    with pytest.raises(ValueError, match=r"^listen: expected another address than the server's"):
+    with pytest.raises(InputError, match=r"^listen: expected another address than the server's"):
         Relay(("127.0.0.1", 8001), ("127.0.0.1", 8001))
-    with pytest.raises(ValueError, match="is not a loopback address"):
+    with pytest.raises(InputError, match="is not a loopback address"):
         Relay(ANY, ("192.0.2.1", 8001))
-    with pytest.raises(ValueError, match="is not a loopback address"):
+    with pytest.raises(InputError, match="is not a loopback address"):
         Relay(("0.0.0.0", 0), ("127.0.0.1", 8001))
     with udp() as taken, pytest.raises(OSError, match="the port is in use"):
         Relay(taken.getsockname(), ("127.0.0.1", 8001))

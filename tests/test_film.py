@@ -1,6 +1,10 @@
 """Films: every frame at its time, whole or not at all, panes side by side."""
 
+import io
 import math
+import subprocess
+import sys
+import textwrap
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -11,11 +15,39 @@ import pytest
 from imageio_ffmpeg import (  # type: ignore[import-untyped]
     count_frames_and_secs,
 )
-from pictures import FAST, HEIGHT, WIDTH, decoded, pixels, same, shot, told_of, track
+from pictures import HEIGHT, WIDTH, decoded, ffmpeg_facts, pixels, same
 from PIL import Image
+from rotorgram.envs.registry import env_spec
 from rotorgram.experiments.filming import Film, Shot, film, grid
-from rotorgram.rendering.film import check_film, write_film
+from rotorgram.experiments.trajectories import Trajectory
+from rotorgram.models import InputError, Vehicle
+from rotorgram.rendering.film import check_film, poster, write_film
 from rotorgram.rendering.overlay import Overlay
+
+FAST = Film(width=WIDTH, height=HEIGHT, world="plain", fast=True, overlay=False)
+
+
+def trajectory(*elevations: float, ending: Any = "truncated") -> Trajectory:
+    """A level craft at these elevations, one each 0.02 s, with its goal at 5 m."""
+    heights = np.array(elevations)
+    zeros, steps = np.zeros_like(heights), len(heights)
+    telemetry = {
+        "position": np.stack((zeros, heights, zeros), axis=1),
+        "attitude": np.zeros((steps, 3)),
+        "thrust": np.full((steps, 4), 49.0),
+        "goal": np.tile((0.0, 5.0, 0.0), (steps, 1)),
+        "metrics": (5.0 - heights)[:, np.newaxis],
+    }
+    return Trajectory(
+        spec=env_spec("rotorgram/Elevation-v0", {}),
+        telemetry=telemetry,
+        rewards=np.zeros(steps - 1),
+        ending=ending,
+    )
+
+
+def shot(*trajectories: Trajectory, name: str = "PID") -> Shot:
+    return Shot(name=name, color="#7CC8F2", trajectories=list(trajectories))
 
 
 def greys(count: int, width: int = 64, height: int = 48) -> Iterator[np.ndarray]:
@@ -27,7 +59,7 @@ def greys(count: int, width: int = 64, height: int = 48) -> Iterator[np.ndarray]
 def test_mp4_has_every_frame_at_its_time(tmp_path: Path) -> None:
     path = tmp_path / "new" / "grey.mp4"
     assert write_film(path, greys(30), 25.0) == 30
-    told = told_of(path)
+    told = ffmpeg_facts(path)
     for fact in ("Video: h264", "yuv420p", "64x48", "25 fps"):
         assert fact in told
     frames = decoded(path, 64, 48).mean(axis=(1, 2, 3))
@@ -36,6 +68,51 @@ def test_mp4_has_every_frame_at_its_time(tmp_path: Path) -> None:
     assert (count, seconds) == (30, pytest.approx(1.2, abs=0.01))
     data = path.read_bytes()
     assert data.index(b"moov") < data.index(b"mdat")  # plays before it is loaded whole
+
+
+def test_a_poster_is_a_picture_from_within_the_film(tmp_path: Path) -> None:
+    path = tmp_path / "grey.mp4"
+    write_film(path, greys(31), 25.0)  # from 20 to 140
+    for share, brightness in ((0.0, 20), (0.3, 56), (1.0, 140)):
+        with Image.open(io.BytesIO(poster(path, share))) as picture:
+            assert (picture.format, picture.size) == ("JPEG", (64, 48))
+            assert np.asarray(picture).mean() == pytest.approx(brightness, abs=8)
+    (tmp_path / "no.mp4").write_bytes(b"no film")
+    for name in ("no.mp4", "nowhere.mp4"):
+        with pytest.raises(OSError, match=f"{name}: expected a film"):
+            poster(tmp_path / name)
+
+
+def test_the_first_frame_of_a_film_shows_the_flight(opengl: None, tmp_path: Path) -> None:
+    path = tmp_path / "film.mp4"
+    film(path, [shot(trajectory(*[5.0] * 6))], FAST)
+    first, *_ = decoded(path, WIDTH, HEIGHT)
+    assert first.mean() > 100
+    assert first.std() > 20
+
+
+@pytest.mark.parametrize(
+    ("package", "module"), [("PIL", "film"), ("PIL", "overlay"), ("imageio_ffmpeg", "film")]
+)
+def test_a_missing_package_is_one_sentence(package: str, module: str, tmp_path: Path) -> None:
+    code = f"""
+        import sys
+        import numpy as np
+        sys.modules[{package!r}] = None
+        from pathlib import Path
+        from rotorgram.models import MissingPackage
+        try:
+            import rotorgram.rendering.{module} as module
+            module.write_film(Path("film.mp4"), [np.zeros((16, 16, 3), np.uint8)], 25.0)
+        except MissingPackage as error:
+            print(error)
+        """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        cwd=tmp_path, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert f"needs the package {package}: pip install 'rotorgram[render]'" in done.stdout
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_gif_repeats_with_every_frame(tmp_path: Path) -> None:
@@ -89,8 +166,9 @@ def test_what_is_no_film_is_one_sentence(
     name: str, frames: Iterator[np.ndarray], fps: float, sentence: str, tmp_path: Path
 ) -> None:
     (tmp_path / "there").mkdir()
-    with pytest.raises(ValueError, match=sentence):
+    with pytest.raises(ValueError, match=sentence) as raised:
         write_film(tmp_path / name, frames, fps)
+    assert isinstance(raised.value, InputError) == ("frames of uint8" not in sentence)
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 
@@ -141,8 +219,8 @@ def filmed(folder: Path, *shots: Shot, **settings: Any) -> list[np.ndarray]:
 
 
 def test_a_frame_shows_the_step_of_its_time(opengl: None, tmp_path: Path) -> None:
-    flight = shot(track(*(4.0 + step / 10 for step in range(11))))  # 0.2 s
-    assert [flight.tracks[0].step_at(t) for t in (0, 0.019, 0.02, 0.06, 0.2, 9)] == [
+    flight = shot(trajectory(*(4.0 + step / 10 for step in range(11))))  # 0.2 s
+    assert [flight.trajectories[0].step_at(t) for t in (0, 0.019, 0.02, 0.06, 0.2, 9)] == [
         0, 0, 1, 3, 10, 10,
     ]  # fmt: skip
     every = filmed(tmp_path, flight, fps=50.0)
@@ -159,7 +237,7 @@ def test_a_frame_shows_the_step_of_its_time(opengl: None, tmp_path: Path) -> Non
 
 
 def test_panes_are_the_single_pictures_side_by_side(opengl: None, tmp_path: Path) -> None:
-    one, other = track(5.0, 5.1, 5.2), track(4.0, 3.9, 3.8)
+    one, other = trajectory(5.0, 5.1, 5.2), trajectory(4.0, 3.9, 3.8)
     both = filmed(tmp_path, shot(one), shot(other), width=2 * WIDTH + 2)
     for number, frame in enumerate(both):
         assert frame.shape == (HEIGHT, 2 * WIDTH + 2, 3)
@@ -176,8 +254,8 @@ def alarms_in(picture: np.ndarray) -> int:
 
 
 def test_a_flight_that_ended_stays_on_its_last_picture(opengl: None, tmp_path: Path) -> None:
-    crash = track(5.0, 4.0, 3.0, ending="terminated")  # 0.04 s
-    long = track(*[5.0] * 11)  # 0.2 s
+    crash = trajectory(5.0, 4.0, 3.0, ending="terminated")  # 0.04 s
+    long = trajectory(*[5.0] * 11)  # 0.2 s
     frames = filmed(tmp_path, shot(crash), shot(long), width=642, height=240, overlay=True)
     panes = [frame[:, :320] for frame in frames]
     assert len(frames) == 6
@@ -190,12 +268,14 @@ def test_a_flight_that_ended_stays_on_its_last_picture(opengl: None, tmp_path: P
 
 
 def test_the_scale_holds_crashes_if_there_is_nothing_else(opengl: None, tmp_path: Path) -> None:
-    crash = track(*(5.0 - 0.03 * step for step in range(101)), ending="terminated")  # E to 3 m
-    hovers = track(*[5.0] * 101)
+    crash = trajectory(*(5.0 - 0.03 * step for step in range(101)), ending="terminated")  # E to 3 m
+    hovers = trajectory(*[5.0] * 101)
     size = {"height": 240, "overlay": True, "fps": 0.5}
     alone = filmed(tmp_path, shot(crash), width=320, **size)[-1]
     beside = filmed(tmp_path, shot(crash), shot(hovers), width=642, **size)[-1][:, :320]
-    strip = Overlay(320, 240, title="PID", period=0.02, seconds=2.0, band=3.0).plot
+    (first, *_), vehicle = shot(hovers).moments[0], Vehicle.load()
+    strip = Overlay(320, 240, title="PID", like=first, vehicle=vehicle, period=0.02, seconds=2.0,
+                    scale=(0.0, 3.0)).plot  # fmt: skip
     columns = [
         np.nonzero(np.abs(part[190:].astype(int) - (124, 200, 242)).max(axis=2) < 40)[1]
         for part in (alone, beside)
@@ -207,7 +287,7 @@ def test_the_scale_holds_crashes_if_there_is_nothing_else(opengl: None, tmp_path
 def test_episodes_follow_one_another_and_pictures_are_of_a_time(
     opengl: None, tmp_path: Path
 ) -> None:
-    flight = shot(track(5.0, 5.1, 5.2), track(4.0, 3.9, 3.8, 3.7, 3.6))
+    flight = shot(trajectory(5.0, 5.1, 5.2), trajectory(4.0, 3.9, 3.8, 3.7, 3.6))
     frames = filmed(tmp_path, flight)
     assert len(frames) == 2 + 3
     for settings, expected in (({}, frames[-1]), ({"at": 0.04}, frames[1])):
@@ -222,8 +302,8 @@ def test_wrong_films_are_one_sentence(tmp_path: Path) -> None:
         ({"speed": math.inf}, "speed: expected"),
         ({"at": -1.0}, "at: expected"),
     ):
-        with pytest.raises(ValueError, match=sentence):
+        with pytest.raises(InputError, match=sentence):
             Film(**settings)  # type: ignore[arg-type]
-    for shots in ([], [shot()], [shot(track(5.0)), shot(track(5.0), track(5.0))]):
-        with pytest.raises(ValueError, match="shots: expected one or more"):
+    for shots in ([], [shot()], [shot(trajectory(5.0)), shot(trajectory(5.0), trajectory(5.0))]):
+        with pytest.raises(InputError, match="shots: expected one or more"):
             film(tmp_path / "film.gif", shots, FAST)

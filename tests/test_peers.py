@@ -1,5 +1,6 @@
 """Peers that were written from docs/protocol.md alone, in C and C#, against ours."""
 
+import json
 import math
 import os
 import re
@@ -19,10 +20,13 @@ from random import Random
 
 import numpy as np
 import pytest
-from rotorgram.envs import ElevationEnv
+from rotorgram.envs.loop import Loop
+from rotorgram.envs.registry import env_spec
+from rotorgram.envs.spec import EnvSpec
 from rotorgram.udp import RemoteEnv
-from rotorgram.udp.faults import FaultConfig, Relay
+from rotorgram.udp.transport.relay import FaultConfig, Relay
 
+ENV_ID = "rotorgram/Elevation-v0"
 ROOT = Path(__file__).parent.parent
 PEERS = ROOT / "examples" / "peers"
 LOSSY = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.1, seed=1)
@@ -146,7 +150,7 @@ def test_agent_flies_the_same_whatever_the_network_does(agent: list[str]) -> Non
     assert flown(agent, LOSSY, 60) == flown(agent, None, 60)
 
 
-TELEMETRY = ",0,5,0,0,0,0,49,49,49,49"
+TELEMETRY = ",0,5,0,0,0,0,49,49,49,49,0,5,0,0.5"
 JUNK_LINES = [
     b"",
     b"\n",
@@ -170,6 +174,7 @@ JUNK_LINES = [
     b"-42,1,0,0,1,0,0" + TELEMETRY.encode(),
     b"18446744073709551658,1,0,0,1,0,0" + TELEMETRY.encode(),  # 42 modulo 2^64
     b"000000000000000000042,1,0,0,1,0,0" + TELEMETRY.encode(),  # 21 digits
+    b"042,1,0,0,1,0,0" + TELEMETRY.encode(),
     b"42,1,0,0,1,0,0" + TELEMETRY.encode() + b"\n\n",
     b"42,1,0,0,1,0,0" + TELEMETRY.encode() + b"\x00",
     b"42,1,0,0,1,0,0." + b"0" * 1024 + TELEMETRY.encode(),
@@ -221,7 +226,7 @@ def test_agent_answers_by_the_rules(agent: list[str]) -> None:
 def test_agent_says_why_it_gives_up(agent: list[str]) -> None:
     with running(agent, 0, 1, 0, 1) as process, udp() as sock:
         sock.connect(waiting(process))
-        sock.send(golden()["Hello"])
+        sock.send(bytes.fromhex(golden("hello")))
         status, _, err = ended(process)
     assert status == 1
     assert err == (
@@ -245,33 +250,47 @@ def test_agent_says_why_it_gives_up(agent: list[str]) -> None:
 # The simulator in C#.
 
 
-def golden() -> dict[str, bytes]:
-    """The golden datagrams of the page by their names, without the two 18 bytes and the key."""
-    page = (ROOT / "docs" / "protocol.md").read_text()
-    section = page.split("### Golden datagrams")[1].split("\n## ")[0]
-    blocks = [bytes.fromhex(b) for b in re.findall(r"```text\n([0-9a-f\s]+)```", section)]
-    names = ["?", "Hello", "Welcome", "Refuse", "State", "Command", "Close", "Wait", "Unknown"]
-    return {names[b[3]]: b for b in blocks if b[:2] == b"\xa7\x52"}
+GOLDEN = json.loads((ROOT / "docs" / "golden.json").read_text("utf-8"))
+
+
+def golden(name: str) -> str:
+    return next(case["bytes"] for case in GOLDEN["messages"] if case["name"] == name)
 
 
 def test_simulator_writes_and_reads_the_golden_datagrams(simulator: list[str]) -> None:
-    datagrams = golden()
-    assert len(datagrams) == 8
-    given = [datagrams[n] for n in ("Welcome", "Command", "Refuse", "Close", "Wait", "Unknown")]
-    cut = [d[:-1] for d in given]
-    flipped = [d[:-1] + bytes([d[-1] ^ 1]) for d in given]
-    with running(simulator[:2], "--self-test", *(d.hex() for d in given + cut + flipped)) as test:
+    read = {
+        "welcome": "Welcome 0123456789abcdef 0 fedcba9876543210 False 0",
+        "welcome with a seed": "Welcome 0123456789abcdef 0 fedcba9876543210 True 7",
+        "welcome with a critical extension": "malformed",
+        "refuse": "Refuse 0123456789abcdef 0 busy",
+        "wait": "Wait 0123456789abcdef 0",
+        "unknown": "Unknown 0123456789abcdef 1",
+        "command to fly choice 2": "Command 0123456789abcdef 1 2 Fly 0",
+        "command to reset, with a seed": "Command 0123456789abcdef 1 0 Reset 18446744073709551615",
+        "command: fly, freeze": "Command 0123456789abcdef 3 0.5 -1 Fly Freeze 0 0",
+        "command: reset, fly; with seeds": (
+            "Command 0123456789abcdef 3 0.5 -1 Reset Fly 18446744073709551615 5"
+        ),
+        "close": "Close 0123456789abcdef 1 done",
+    }
+    envs = {case["name"]: case["env"] for case in GOLDEN["messages"]}
+    given = [f"{envs[name]}:{golden(name)}" for name in read]
+    # What concerns a simulator, and can be told without the state of a link.
+    wrong = [
+        f"{case['env']}:{case['bytes']}"
+        for case in GOLDEN["malformed"]
+        if not ("Hello" in case["name"] or "State" in case["name"] or "Missing" in case["name"])
+    ]
+    assert len(wrong) > 15
+    spec = json.dumps(GOLDEN["envs"]["one"]["spec"], separators=(",", ":"))
+    with running(simulator[:2], "--self-test", spec, *given, *wrong) as test:
         status, out, err = ended(test)
     assert (status, err) == (0, "")
+    written = ["hello", "state 1 echoes the nonce", "state, truncated", "close"]
     assert out.splitlines() == [
-        *(f"{n.lower()} {datagrams[n].hex()}" for n in ("Hello", "State", "Close")),
-        "Welcome 0123456789abcdef 0 fedcba9876543210 True 7",
-        "Command 0123456789abcdef 1 0.5 -1 True False 18446744073709551615 5",
-        "Refuse 0123456789abcdef 0 busy",
-        "Close 0123456789abcdef 1 done",
-        "Wait 0123456789abcdef 0",
-        "Unknown 0123456789abcdef 1",
-        *["malformed"] * 12,
+        *(f"{name} {golden(name)}" for name in written),
+        *read.values(),
+        *["malformed"] * len(wrong),
     ]
 
 
@@ -302,8 +321,12 @@ def flights(simulator: list[str], config: FaultConfig | None, steps: int) -> lis
     return seen
 
 
+def fly(loop: Loop, action: float, *, reset: bool = False) -> None:
+    loop.advance(np.array([[action]], np.float32), np.array([reset]), None, None)
+
+
 def test_simulator_flies_the_closed_form_and_our_drone(simulator: list[str]) -> None:
-    seen, ours = flights(simulator, None, 250), ElevationEnv()
+    seen, ours = flights(simulator, None, 250), Loop(ENV_ID, options={})
     assert len(seen) == 2 * 251
     for i, (action, observation, reward, *ends, info) in enumerate(seen):
         step = i % 251
@@ -311,15 +334,19 @@ def test_simulator_flies_the_closed_form_and_our_drone(simulator: list[str]) -> 
             y, v, thrust = info["Y"], 0.0, 49.0
             assert abs(5 - y) <= 1
             # Ours starts elsewhere, which moves the whole flight by as much.
-            moved = y - ours.reset(seed=0)[1]["Y"]
+            fly(ours, 0.0, reset=True)
+            moved = y - ours.telemetry["position"][0, 1]
         else:
             thrust = min(100.0, max(0.0, thrust + 5 * min(1.0, max(-1.0, action))))
             u = 4 * thrust / 20 - 9.8
             y, v = y + v * 0.02 + u * 0.02**2 / 2, v + u * 0.02
-            there = ours.step(np.array([action], np.float32))[4]
-            assert info["Y"] == pytest.approx(there["Y"] + moved, abs=1e-9)
-            assert info["F1"] == pytest.approx(there["F1"], abs=1e-9)
+            fly(ours, action)
+            height = ours.telemetry["position"][0, 1]
+            assert info["Y"] == pytest.approx(height + moved, abs=1e-9)
+            assert info["F1"] == pytest.approx(ours.telemetry["thrust"][0, 0], abs=1e-9)
         assert [info[n] for n in ("X", "Z", "phi", "theta", "psi")] == [0.0] * 5
+        assert [info[n] for n in ("X_goal", "Y_goal", "Z_goal")] == [0.0, 5.0, 0.0]
+        assert info["elevation_error"] == 5.0 - info["Y"]
         assert [info[n] for n in ("Y", "F1", "F2", "F3", "F4")] == pytest.approx(
             [y, thrust, thrust, thrust, thrust], abs=1e-9
         )
@@ -385,6 +412,8 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 # By hand: the agent's datagrams as the page has them.
 
+NONCE = 0xFEDCBA9876543210
+
 
 def datagram(kind: int, session: int, sequence: int, body: bytes = b"", version: int = 2) -> bytes:
     head, rest = bytes([0xA7, 0x52, version, kind]), struct.pack("<QQ", session, sequence) + body
@@ -392,15 +421,16 @@ def datagram(kind: int, session: int, sequence: int, body: bytes = b"", version:
 
 
 def welcome(session: int, seed: int | None = None) -> bytes:
-    body = struct.pack("<QB7xQ", 99, seed is not None, seed or 0)
-    return datagram(2, session, 0, body)
+    return datagram(2, session, 0, struct.pack("<QQBB6x", NONCE, seed or 0, seed is not None, 2))
 
 
 def command(
-    session: int, sequence: int, action: float = 0.0, reset: int = 0, seeds: tuple[int, ...] = ()
+    session: int, sequence: int, action: float = 0.0, order: int = 0, seeds: tuple[int, ...] = ()
 ) -> bytes:
-    body = struct.pack("<IH6xI", 1, 1, len(seeds)) + struct.pack(f"<{len(seeds)}Q", *seeds)
-    return datagram(5, session, sequence, body + struct.pack("<fB", action, reset))
+    body = struct.pack("<I4xf4xB", len(seeds), action, order)
+    return datagram(
+        5, session, sequence, body + ((seeds and struct.pack(f"<7x{len(seeds)}Q", *seeds)) or b"")
+    )
 
 
 def text_field(reason: str) -> bytes:
@@ -443,29 +473,25 @@ class Hand:
         session, sequence = struct.unpack_from("<QQ", got, 8)
         assert (session not in (0, self.session), sequence) == (True, 0)
         self.session = session
-        assert struct.unpack_from("<IHHHHd", got, 24) == (1, 3, 1, 0, 0, 0.02)
-        assert got[44:60] == bytes(16)
-        names = text_field("rotorgram/Elevation-v0")
-        telemetry = text_field("X,Y,Z,phi,theta,psi,F1,F2,F3,F4")
-        assert got[60:] == self.spaces() + names + telemetry + text_field("")
-
-    @staticmethod
-    def spaces() -> bytes:
-        env = ElevationEnv()
-        box, action = env.observation_space, env.action_space
-        env.close()
-        return b"".join(
-            a.astype("<f4").tobytes() for a in (box.low, box.high, action.low, action.high)
+        low, high, worlds, size = struct.unpack_from("<BB2xII", got, 24)
+        assert (low, high, worlds, len(got)) == (2, 2, 1, 40 + size)
+        assert EnvSpec.from_json(got[40:].decode()) == replace(
+            env_spec(ENV_ID, {}), vehicle="point mass", vehicle_hash="0" * 32
         )
 
     def state(self, sequence: int) -> tuple[float, tuple[float, ...], tuple[float, ...], int, int]:
         got = self.next()
-        assert len(got) == 24 + 8 + 8 + 80 + 12 + 2
+        assert len(got) == 72 + 8 * 14
         assert got[:4] == b"\xa7\x52\x02\x04"
-        assert struct.unpack_from("<QQIHH", got, 8) == (self.session, sequence, 1, 3, 10)
-        (reward,) = struct.unpack_from("<d", got, 32)
-        telemetry = struct.unpack_from("<10d", got, 40)
-        return reward, telemetry, struct.unpack_from("<3f", got, 120), got[-2], got[-1]
+        assert struct.unpack_from("<QQ", got, 8) == (self.session, sequence)
+        time, nonce = struct.unpack_from("<dQ", got, 24)
+        assert time == pytest.approx(0.02 * (sequence - 1))
+        assert nonce == (NONCE if sequence == 1 else 0)
+        observation, (reward,) = (
+            struct.unpack_from("<3f", got, 40),
+            struct.unpack_from("<d", got, 56),
+        )
+        return reward, struct.unpack_from("<14d", got, 72), observation, got[64], got[65]
 
     def closed(self, sequence: int, reason: str = "") -> None:
         assert self.next() == datagram(6, self.session, sequence, text_field(reason))
@@ -489,12 +515,12 @@ def junk(hand: Hand, sequence: int) -> list[bytes]:
         command(session, sequence + 1, 0.5),
         command(session, sequence, math.nan),
         command(session, sequence, -math.inf, 1),
-        command(session, sequence, 0.5, 2),
+        command(session, sequence, 0.5, 3),
         command(session, sequence, 0.5, 1, (1, 2)),
         datagram(5, session, sequence, good[24:], version=3),
-        datagram(5, session, sequence, struct.pack("<IH6xI2fB", 1, 2, 0, 0, 0, 0)),
-        datagram(5, session, sequence, struct.pack("<IH6xI2f2B", 2, 1, 0, 0, 0, 0, 0)),
-        datagram(5, session, sequence, struct.pack("<IH6xIfB", 1, 1, 2**32 - 1, 0, 0)),
+        datagram(5, session, sequence, struct.pack("<I4xf4xB", 1, 0, 0)),
+        datagram(5, session, sequence, struct.pack("<I4xf4xB", 2**32 - 1, 0, 0)),
+        datagram(5, session, sequence, struct.pack("<I4x2f2B", 0, 0, 0, 0, 0)),
         datagram(1, session, 0, b"hello"),
         datagram(3, session, 0, reason),
         datagram(4, session, sequence, bytes(100)),
@@ -509,6 +535,7 @@ def junk(hand: Hand, sequence: int) -> list[bytes]:
         datagram(8, session, sequence, b"\x00"),
         datagram(8, session ^ 1, sequence),
         datagram(9, session, sequence),
+        datagram(11, session, sequence),
         welcome(session, 3),
     ]
 
@@ -527,7 +554,9 @@ def test_simulator_obeys_the_rules(simulator: list[str]) -> None:
         first = hand.state(1)
         reward, telemetry, observation, *ends = first
         assert (reward, ends) == (0, [0, 0])
-        assert telemetry[0:1] + telemetry[2:] == (0.0,) * 5 + (49.0,) * 4
+        y, error = telemetry[1], telemetry[13]
+        assert telemetry == (0, y, 0, 0, 0, 0, 49, 49, 49, 49, 0, 5, 0, error)
+        assert error == 5 - y
         assert observation == pytest.approx((5 - telemetry[1], 0, 0))
         hand.send(*junk(hand, 1))
         hand.repeat()
@@ -537,18 +566,23 @@ def test_simulator_obeys_the_rules(simulator: list[str]) -> None:
         # The seed of the Welcome is that of the first reset. A reset without one goes on.
         hand.send(command(hand.session, 1, 1.0, 1, (7,)), command(hand.session, 1, 1.0))
         assert hand.state(2) == first
-        hand.send(command(hand.session, 2, reset=1))
+        hand.send(command(hand.session, 2, order=1))
         assert hand.state(3)[2] != observation
         # One step for one Command, however often it comes.
         hand.send(command(hand.session, 3, 0.5), *[command(hand.session, 3, 0.5)] * 3)
-        assert hand.state(4)[1][6:] == (51.5,) * 4
+        assert hand.state(4)[1][6:10] == (51.5,) * 4
         hand.send(*junk(hand, 4))
         hand.repeat()
+        # A frozen drone stays as it is, without a reward.
+        before = hand.last
+        hand.send(command(hand.session, 4, 1.0, 2))
+        frozen = hand.state(5)
+        assert (frozen[0], hand.last[72:]) == (0, before[72:])
         # An agent that knows nothing of it: a new session.
         old = hand.session
-        hand.send(datagram(8, hand.session, 4))
+        hand.send(datagram(8, hand.session, 5))
         hand.hello()
-        hand.send(command(old, 4, 0.5), datagram(8, old, 4), datagram(6, old, 4, text_field("")))
+        hand.send(command(old, 5, 0.5), datagram(8, old, 5), datagram(6, old, 5, text_field("")))
         hand.repeat()
         hand.send(welcome(hand.session))
         begun = hand.state(1)
@@ -558,7 +592,7 @@ def test_simulator_obeys_the_rules(simulator: list[str]) -> None:
         hand.closed(2)
         status, out, err = ended(process)
     assert (status, err) == (0, "")
-    assert out.startswith("enough\n6 states, 2 sessions;")
+    assert out.startswith("enough\n7 states, 2 sessions;")
 
 
 def test_simulator_ends_as_the_rules_say(simulator: list[str]) -> None:

@@ -5,10 +5,13 @@ No pixel is compared with a stored one: drivers differ.
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from pictures import HEIGHT, WIDTH, at, same
+from pictures import HEIGHT, HEXA, TINY, WIDTH, at, same
+from rotorgram.models import InputError
 from rotorgram.rendering import CAMERAS, Camera, Canvas, Stage
 from rotorgram.rendering.overlay import Overlay
 
@@ -27,7 +30,7 @@ def canvas(stage: Stage) -> Iterator[Canvas]:
 def craft_in(canvas: Canvas, camera: Camera) -> np.ndarray:
     """Where the picture changes when the craft is hidden: bool, shape (HEIGHT, WIDTH)."""
     model = canvas.stage.model
-    geoms = model.geom_bodyid == model.body("quad").id
+    geoms = model.geom_bodyid > 0  # all that is not of the world
     groups = model.geom_group.copy()
     there = canvas.draw(camera).astype(int)
     model.geom_group[geoms] = 5  # is not drawn
@@ -51,7 +54,7 @@ def test_the_craft_is_in_the_midst_of_the_picture_and_as_large_as_it_should_be(
     rows, columns = np.nonzero(craft_in(canvas, camera))
     assert columns.mean() == pytest.approx(WIDTH / 2, abs=3)
     lower = 0.75 * pixels_per_metre(stage, camera) if camera in ("front", "side") else 0.0
-    assert rows.mean() == pytest.approx(HEIGHT / 2 - lower, abs=8)  # they look below the target
+    assert rows.mean() == pytest.approx(HEIGHT / 2 - lower, abs=8)  # they look below the goal
     wide = 2.8 * pixels_per_metre(stage, camera)  # rotors of 0.8 m on a square of 2 m
     assert np.ptp(columns) == pytest.approx(wide, rel=0.25)  # what is nearer is larger
     if camera == "top":
@@ -85,7 +88,7 @@ def test_onboard_sees_the_front_rotors_to_both_sides(stage: Stage, canvas: Canva
 
 @pytest.mark.parametrize("camera", ["chase", "front", "side", "onboard"])
 def test_the_sky_is_above_the_ground(camera: Camera, stage: Stage, canvas: Canvas) -> None:
-    stage.show(at(5.0, error=50.0 if camera in ("chase", "onboard") else 0.0))
+    stage.show(at(5.0, goal=None))
     picture = canvas.draw(camera).astype(int)
     edges = picture[:, [0, WIDTH // 2, -1] if camera != "onboard" else [WIDTH // 2]]
     blue = edges[..., 2] - edges[..., 0]
@@ -115,11 +118,13 @@ def green_in(picture: np.ndarray) -> np.ndarray:
     ("camera", "size"), [("front", (320, 400)), ("side", (640, 360)), ("side", (1280, 720))]
 )
 @pytest.mark.parametrize("error", [-3.0, 3.0])
-def test_a_craft_3_m_from_its_target_is_above_the_strip(
+def test_a_craft_3_m_from_its_goal_is_above_the_strip(
     error: float, camera: Camera, size: tuple[int, int], stage: Stage, canvas: Canvas
 ) -> None:
-    overlay = Overlay(*size, title="PID", period=0.02, seconds=5.0, band=1.0)
-    stage.show(at(5.0 - error, error))
+    moment = at(5.0 - error, error)
+    overlay = Overlay(*size, title="PID", like=moment, vehicle=stage.vehicle, period=0.02,
+                      seconds=5.0, scale=(-1.0, 1.0))  # fmt: skip
+    stage.show(moment)
     rows, columns = np.nonzero(craft_in(canvas, camera))
     scale = size[1] / HEIGHT  # the height says how large things are
     assert rows.min() * scale > 0.05 * size[1]
@@ -143,29 +148,112 @@ def test_onboard_has_no_disc_in_its_way(stage: Stage, canvas: Canvas) -> None:
 
 
 @pytest.mark.parametrize("camera", ["chase", "front", "side", "top"])
-def test_the_disc_marks_the_target(camera: Camera, stage: Stage, canvas: Canvas) -> None:
+def test_the_disc_marks_the_goal(camera: Camera, stage: Stage, canvas: Canvas) -> None:
     stage.show(at(5.0, error=-0.2))
     assert green_in(canvas.draw(camera)).sum() > 20
     assert green_in(canvas.draw(camera, stage.twin())).sum() == 0  # nothing shown yet
 
 
-def test_a_craft_below_its_target_is_so_far_below_the_disc(stage: Stage, canvas: Canvas) -> None:
+def test_a_craft_below_its_goal_is_so_far_below_the_disc(stage: Stage, canvas: Canvas) -> None:
     stage.show(at(4.0, error=1.0))
     disc = np.nonzero(green_in(canvas.draw("side")))[0].mean()
     craft = np.nonzero(craft_in(canvas, "side"))[0].mean()
     assert craft - disc == pytest.approx(pixels_per_metre(stage, "side"), abs=4)
 
 
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_without_a_goal_there_is_no_disc_and_the_craft_is_in_the_middle(
+    camera: Camera, stage: Stage, canvas: Canvas
+) -> None:
+    stage.show(at(7.0, goal=None, position=(3.0, 7.0, -2.0)))
+    assert green_in(canvas.draw(camera)).sum() == 0
+    if camera != "onboard":
+        assert np.nonzero(craft_in(canvas, camera))[1].mean() == pytest.approx(WIDTH / 2, abs=3)
+
+
+def test_a_goal_may_be_anywhere(stage: Stage, canvas: Canvas) -> None:
+    stage.show(at(5.0, goal=(2.0, 5.0, 0.0)))  # 2 m to the right of the craft
+    disc = np.nonzero(green_in(canvas.draw("chase")))[1].mean()
+    craft = np.nonzero(craft_in(canvas, "chase"))[1].mean()
+    assert disc - craft == pytest.approx(2 * pixels_per_metre(stage, "chase"), rel=0.2)
+
+
+@pytest.mark.parametrize("world", ["plain", "airport"])
+@pytest.mark.parametrize(("file", "span"), [(HEXA, 1.24), (TINY, 0.13)])
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_a_craft_of_any_size_fills_the_picture_as_ours_does(
+    camera: Camera, file: Path, span: float, world: Any, opengl: None
+) -> None:
+    shares = []
+    for vehicle in (None, file):
+        stage = Stage(world, vehicle=vehicle)
+        thrusts = tuple(stage.vehicle.hover_thrust)
+        stage.show(at(3 * stage.radius, thrusts=thrusts))
+        with Canvas(stage, WIDTH, HEIGHT, fast=True) as canvas:
+            seen = craft_in(canvas, camera)
+            rows, columns = np.nonzero(seen)
+            assert seen.sum() > 30
+            assert columns.mean() == pytest.approx(WIDTH / 2, abs=3)
+            shares.append((np.ptp(columns), rows.mean()))
+    (width, row), (other_width, other_row) = shares
+    assert 0.8 * width < other_width < 1.7 * width  # of 1.5, 1.9 and 1.6 radii
+    assert other_row == pytest.approx(row, abs=0.12 * HEIGHT)
+    if camera == "top":
+        assert other_width == pytest.approx(span * pixels_per_metre(stage, "top"), rel=0.2)
+
+
+def test_front_backs_off_from_a_small_craft_that_is_far_from_its_goal(opengl: None) -> None:
+    stage = Stage("plain", vehicle=TINY)  # 0.069 m
+    stage.show(at(1.5, thrusts=(0.066,) * 4, error=-0.5))
+    with Canvas(stage, WIDTH, HEIGHT, fast=True) as canvas:
+        rows, _ = np.nonzero(craft_in(canvas, "front"))
+        disc, _ = np.nonzero(green_in(canvas.draw("front")))
+    assert rows.size > 3
+    assert disc.size > 3
+    assert rows.mean() < disc.mean() - HEIGHT / 8
+
+
+def test_a_crash_does_not_move_the_camera_out_of_sight(stage: Stage) -> None:
+    stage.show(at(5.0))
+    near = stage.camera("front").distance
+    for step in range(1, 60):  # falls for ever
+        stage.show(at(5.0 - 2.0 * step, error=2.0 * step, step=step))
+    far = stage.camera("front").distance
+    assert near < far < near + 3 * 10 * stage.radius
+    stage.show(at(5.0, episode=1))
+    assert stage.camera("front").distance == near
+
+
+def test_craft_side_by_side_stand_as_far_apart_as_their_size_asks(opengl: None) -> None:
+    for vehicle, gap in ((None, 4.0), (HEXA, 1.37), (TINY, 0.153)):
+        stage = Stage("plain", 5, vehicle=vehicle)
+        thrusts = tuple(stage.vehicle.hover_thrust)
+        stage.show(*[at(3 * stage.radius, thrusts=thrusts)] * 5)
+        places = stage.data.qpos.reshape(5, 7)[:, :2]
+        apart = np.linalg.norm(places[:, None] - places, axis=2)
+        assert apart[~np.eye(5, dtype=bool)].min() == pytest.approx(gap, rel=0.01)
+        with Canvas(stage, WIDTH, HEIGHT, fast=True) as canvas:
+            for camera in ("chase", "front", "side", "top"):
+                rows, columns = np.nonzero(craft_in(canvas, camera))
+                assert 0 < columns.min() <= columns.max() < WIDTH - 1
+                assert 0 < rows.min() <= rows.max() < HEIGHT - 1
+
+
+def test_a_moment_of_another_vehicle_is_one_sentence() -> None:
+    with pytest.raises(InputError, match=r"vehicle: expected a file with 4 rotors.*hexa\.xml"):
+        Stage("plain", vehicle=HEXA).show(at(5.0))
+
+
 def test_the_path_leads_to_where_it_was(stage: Stage, canvas: Canvas) -> None:
     for step in range(61):
-        stage.show(at(3.0 + step / 40, error=50.0, step=step))  # 1.5 m upwards, no disc in sight
+        stage.show(at(3.0 + step / 40, goal=None, step=step))  # 1.5 m upwards
     red, _, blue = np.moveaxis(canvas.draw("chase").astype(int), 2, 0)
     hidden = craft_in(canvas, "chase")
     path = (red > blue + 40) & ~hidden
     rows = np.nonzero(path)[0]
     assert rows.size > 10
     assert rows.mean() > np.nonzero(hidden)[0].mean()  # below the craft
-    stage.show(at(4.5, error=50.0, step=0))  # another episode
+    stage.show(at(4.5, goal=None, step=0))  # another episode
     red, _, blue = np.moveaxis(canvas.draw("chase").astype(int), 2, 0)
     assert ((red > blue + 40) & ~hidden).sum() < 5
 
@@ -184,7 +272,7 @@ def test_twins_share_a_canvas_and_nothing_else(stage: Stage, canvas: Canvas) -> 
 
 def test_shadows_and_smooth_edges_are_there_unless_it_is_to_be_fast(opengl: None) -> None:
     stage = Stage("plain")
-    stage.show(at(1.0, error=50.0))
+    stage.show(at(1.0, goal=None))
     with Canvas(stage, WIDTH, HEIGHT) as canvas:
         smooth = canvas.draw("chase").astype(int)
     with Canvas(stage, WIDTH, HEIGHT, fast=True) as canvas:

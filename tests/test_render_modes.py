@@ -1,12 +1,15 @@
 """Gymnasium's render modes: pictures of what flies, and the same physics with and without."""
 
 from threading import Thread
+from typing import Any
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from rotorgram.envs import ENV_ID, ElevationEnv, ElevationVectorEnv
+from pictures import HEXA, at
+from rotorgram.envs import LocalVectorEnv, SingleEnv
+from rotorgram.models import InputError
 from rotorgram.rendering import Moment, NoOpenGL, painter
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.rendering.stage import Stage
@@ -17,18 +20,21 @@ except NoOpenGL as error:
     pytest.skip(str(error), allow_module_level=True)
 
 
-def moment(y: float = 5.0, **rest: object) -> Moment:
-    return Moment(position=(0, y, 0), attitude=(0, 0, 0), thrusts=(49,) * 4, error=5 - y, **rest)
+ENV_ID = "rotorgram/Elevation-v0"
+IDS = (ENV_ID, "rotorgram/Hover-v0")
 
 
-def test_a_picture_of_one_drone_and_the_same_bits() -> None:
-    env, plain = gym.make(ENV_ID, render_mode="rgb_array"), gym.make(ENV_ID)
+@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("vehicle", [None, HEXA])
+def test_a_picture_of_one_drone_and_the_same_bits(env_id: str, vehicle: Any) -> None:
+    env = gym.make(env_id, render_mode="rgb_array", vehicle=vehicle)
+    plain = gym.make(env_id, vehicle=vehicle)
     first, _ = env.reset(seed=3)
     other, _ = plain.reset(seed=3)
     assert first.tobytes() == other.tobytes()
     before = env.render()
+    full = env.action_space.high
     for _ in range(40):
-        full = np.array([1.0], np.float32)
         one, two = env.step(full), plain.step(full)
         assert one[0].tobytes() == two[0].tobytes()
         assert one[1:4] == two[1:4]
@@ -107,7 +113,7 @@ def test_a_window_shows_a_moment_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_no_picture_without_a_mode(caplog: pytest.LogCaptureFixture) -> None:
-    for env in (ElevationEnv(), ElevationVectorEnv(2)):
+    for env in (SingleEnv(ENV_ID), LocalVectorEnv(ENV_ID, 2)):
         env.reset(seed=0)
         with pytest.warns(UserWarning, match="render: expected render_mode"):
             assert env.render() is None
@@ -123,35 +129,38 @@ def test_a_path_begins_anew_with_each_episode() -> None:
         stage.decorate(lambda: geoms.append(mujoco.MjvGeom()) or geoms[-1])
         return len(geoms)
 
-    stage.show(moment())
+    stage.show(at(5.0))
     assert count() == 1, "the disc"
     for step in range(1, 10):
-        stage.show(moment(5 + 0.1 * step, step=step))
+        stage.show(at(5 + 0.1 * step, step=step))
     assert count() == 1 + 3, "pieces from steps 0, 3, 6; the one that begins at 9 has no length"
-    stage.show(moment(6.5, step=10))
+    stage.show(at(6.5, step=10))
     assert count() == 1 + 4
-    stage.show(moment(4.0, step=2, episode=1))  # whoever draws now and then misses its start
+    stage.show(at(4.0, step=2, episode=1))  # steps are left out, the start among them
     assert count() == 1
+    stage.show(at(4.0, step=2, episode=2, goal=None))
+    assert count() == 0
 
 
 def test_many_stand_side_by_side() -> None:
     stage = Stage("plain", drones=5)
-    stage.show(*[moment(3.0 + i) for i in range(5)])
+    stage.show(*[at(3.0 + i) for i in range(5)])
     places = stage.data.qpos.reshape(5, 7)[:, :3]
     assert places[:, 2].tolist() == [3.0, 4.0, 5.0, 6.0, 7.0]
     gaps = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=2)
-    assert gaps[~np.eye(5, dtype=bool)].min() == 4.0
-    with pytest.raises(ValueError, match="moments: expected 5, got 1"):
-        stage.show(moment())
+    assert gaps[~np.eye(5, dtype=bool)].min() == pytest.approx(4.0, abs=0.01)
+    with pytest.raises(InputError, match="moments: expected 5, got 1"):
+        stage.show(at(5.0))
 
 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ({"world": "moon"}, "world: expected airport or plain, got 'moon'"),
+        ({"world": "moon"}, "world: expected 'plain' or 'airport', got 'moon'"),
         ({"drones": 0}, "drones: expected 1 or more, got 0"),
+        ({"vehicle": "nowhere.xml"}, "vehicle: cannot read nowhere.xml"),
     ],
 )
-def test_wrong_stages(arguments: dict[str, object], expected: str) -> None:
-    with pytest.raises(ValueError, match=expected):
+def test_wrong_stages(arguments: dict[str, Any], expected: str) -> None:
+    with pytest.raises(InputError, match=expected):
         Stage(**arguments)

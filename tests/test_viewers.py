@@ -23,7 +23,7 @@ for step in range(20):
     height = 5.0 + step / 20
     live.draw(*[
         Moment(position=(0.0, height, 0.0), attitude=(0.0, 0.0, 0.0), thrusts=(49.0,) * 4,
-               error=-step / 20, step=step)
+               goal=(0.0, 5.0, 0.0), step=step)
     ] * 2)
     time.sleep(0.05)
 end = time.monotonic() + 60
@@ -109,6 +109,7 @@ def on_a_screen(script: str, folder: Path) -> str:
 
 
 PAGE = """
+import socket
 import time
 from urllib.request import urlopen
 import mujoco
@@ -130,9 +131,36 @@ def answers(url):
         return False
     return True
 
+SAME, EVIL = "http://127.0.0.1:{port}", "http://evil.example"
+HERE = "Host: 127.0.0.1:{port}"
+REQUESTS = [
+    ("/state", [HERE], 101),  # a program that is no browser
+    ("/state", [HERE, "Origin: " + SAME], 101),
+    ("/ui", [HERE, "Origin: " + SAME], 101),
+    ("/state", ["Host: localhost:9000", "Origin: http://localhost:9000"], 101),  # ssh -L 9000:
+    ("/state", [HERE, "Origin: " + EVIL], 403),
+    ("/ui", [HERE, "Origin: " + EVIL], 403),
+    ("/drop", [HERE, "Origin: null"], 403),
+    ("/ui", [HERE, "Origin: http://127.0.0.1:3000"], 403),  # another page of this machine
+    ("/state", ["Host: evil.example:{port}", "Origin: http://evil.example:{port}"], 403),
+    ("/model", ["Host: evil.example:{port}"], 403),  # its name server names this machine
+    ("/model", [HERE, "Origin: " + EVIL], 403),
+    ("/model", [HERE], 200),
+    ("/", ["Host: evil.example"], 403),
+]
+
+def upgrade(port, path, headers):
+    lines = [f"GET {path} HTTP/1.1", *(h.format(port=port) for h in headers)]
+    if path in ("/state", "/ui", "/drop"):
+        lines += ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13",
+                  "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
+        connection.sendall("\\r\\n".join([*lines, "", ""]).encode())
+        return int(connection.makefile("rb").readline().split()[1])
+
 def look(stage, pace, page, live):
     live.draw(Moment(position=(0.0, 5.0, 0.0), attitude=(0.0, 0.0, 0.0), thrusts=(49.0,) * 4,
-                     error=0.5, step=3))
+                     goal=(0.0, 5.5, 0.0), step=3))
     url = f"http://127.0.0.1:{page.port}/"
     assert url in page.where
     wait_until(lambda: answers(url))
@@ -141,6 +169,9 @@ def look(stage, pace, page, live):
     viewer = page._panel.viewer
     wait_until(lambda: page._panel._lines)
     assert ("step", "3") in page._panel._lines
+    for path, headers, status in REQUESTS:
+        answer = upgrade(page.port, path, headers)
+        assert answer == status, (path, headers, answer)
     assert viewer.address == ("127.0.0.1", page.port)
     assert viewer.extra_geoms[0].type == mujoco.mjtGeom.mjGEOM_CYLINDER
     assert viewer.extra_geoms[0].pos.tolist() == [0.0, 0.0, 5.5]

@@ -1,14 +1,15 @@
 """The wire: simulators (UDP clients) and an agent (UDP server) in lock-step.
 
-`messages`, `binary`, `text`, `keys` and the links are the protocol, free of sockets, clocks and
-simulators.
+`protocol` is free of sockets and clocks; `transport` puts it on sockets; `remote` makes Gymnasium
+envs of it, and `journal` files.
 """
 
-from .errors import DecodeError, LinkError, PeerClosed, PeerSilent, Refused
-from .link import Address, LinkConfig
-from .remote import LOST, RemoteEnv
-from .remote_vector import RemoteVectorEnv
-from .simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, Simulator
+from .protocol.client import Address, LinkConfig
+from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Refused
+from .remote.env import RemoteEnv
+from .remote.served import LOST
+from .remote.vector import RemoteVectorEnv
+from .transport.simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, Simulator
 
 __all__ = [
     "DEFAULT_AGENT",

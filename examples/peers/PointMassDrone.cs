@@ -8,22 +8,50 @@ namespace Rotorgram
     /// move it, a subclass overrides Place and Move.</summary>
     public class PointMassDrone : IRotorgramEnv
     {
-        protected const double Mass = 20, Gravity = 9.8, PhysicsStep = 0.005;
-        protected const int Substeps = 4; // in a control period
+        protected const double Mass = 20, Gravity = 9.8, PhysicsStep = 0.01;
+        protected const int Substeps = 2; // in a control period
         const double MostThrust = 100, HoverThrust = Mass * Gravity / 4, ThrustPerAction = 5;
         const double Target = 5, StartBand = 1, FlightBand = 3, RewardScale = 0.5, Crash = 20;
         const int EpisodeLength = 250;
 
+        // What docs/protocol.md calls the EnvSpec. Every option of the task is in it.
+        const string Json = @"{
+            'env_id': 'rotorgram/Elevation-v0',
+            'options': {
+                'episode_length': 250, 'control_period': 0.02, 'linear_drag': 0.0, 'target': 5.0,
+                'start_band': 1.0, 'flight_band': 3.0, 'action_mode': 'increment',
+                'action_type': 'continuous', 'observation': 'full', 'thrust_scale': null},
+            'control_period': 0.02,
+            'vehicle': 'point mass',
+            'observation': [{
+                'name': 'observation', 'shape': [3], 'unit': ['m', 'm/s', '1'], 'frame': 'world, up',
+                'low': [-3.225358724594116, -11.267924308776855, -1.0000001192092896],
+                'high': [3.225358724594116, 11.267924308776855, 1.0408164262771606],
+                'components': ['elevation error', 'rate of the error', 'thrust over hover']}],
+            'action': {
+                'name': 'action', 'shape': [1], 'low': -1, 'high': 1, 'components': ['collective']},
+            'telemetry': [
+                {'name': 'position', 'shape': [3], 'dtype': 'float64', 'unit': 'm',
+                 'frame': 'paper', 'components': ['X', 'Y', 'Z']},
+                {'name': 'attitude', 'shape': [3], 'dtype': 'float64', 'unit': 'deg',
+                 'frame': 'paper', 'components': ['phi', 'theta', 'psi']},
+                {'name': 'thrust', 'shape': [4], 'dtype': 'float64', 'low': 0, 'high': 100,
+                 'unit': 'N', 'components': ['F1', 'F2', 'F3', 'F4']},
+                {'name': 'goal', 'shape': [3], 'dtype': 'float64', 'unit': 'm', 'frame': 'paper',
+                 'components': ['X_goal', 'Y_goal', 'Z_goal']},
+                {'name': 'metrics', 'shape': [1], 'dtype': 'float64', 'unit': ['m'],
+                 'components': ['elevation_error']}],
+            'metrics': [{
+                'name': 'elevation_error', 'unit': 'm', 'goal': 'zero',
+                'settled': 0.05, 'held': 0.1, 'symbol': 'E'}]
+        }";
+
         readonly RotorgramSpec spec = new RotorgramSpec
         {
-            EnvId = "rotorgram/Elevation-v0",
-            Telemetry = "X,Y,Z,phi,theta,psi,F1,F2,F3,F4",
-            Period = Substeps * PhysicsStep,
-            // An agent refuses spaces that differ by a bit: these are those of rotorgram.envs.
-            ObservationLow = new[] { -3.2253587f, -11.267924f, -1.0000001f },
-            ObservationHigh = new[] { 3.2253587f, 11.267924f, 1.0408164f },
-            ActionLow = new[] { -1f },
-            ActionHigh = new[] { 1f }
+            Json = Json.Replace('\'', '"'),
+            Observations = 3,
+            Telemetry = 14,
+            Period = Substeps * PhysicsStep
         };
 
         protected double Height, ClimbRate; // m, m/s
@@ -35,16 +63,19 @@ namespace Rotorgram
 
         public void Advance(RotorgramCommand command, RotorgramState state)
         {
-            if (command.Reset[0])
+            if (command.Orders[0] != Order.Fly)
+            {
+                state.Terminated[0] = state.Truncated[0] = false;
+                state.Rewards[0] = 0;
+            }
+            if (command.Orders[0] == Order.Reset)
             {
                 if (command.HasSeeds) generator = command.Seeds[0];
                 Place(Target + StartBand * (2 * Random() - 1));
                 thrust = HoverThrust;
                 steps = 0;
-                state.Terminated[0] = state.Truncated[0] = false;
-                state.Rewards[0] = 0;
             }
-            else
+            else if (command.Orders[0] == Order.Fly)
             {
                 double action = Math.Max(-1, Math.Min(1, command.Actions[0]));
                 thrust = Math.Max(0, Math.Min(MostThrust, thrust + ThrustPerAction * action));
@@ -61,6 +92,8 @@ namespace Rotorgram
             state.Observations[2] = (float)(thrust / HoverThrust - 1);
             state.Telemetry[1] = Height; // X, Z and the angles stay 0
             for (int rotor = 6; rotor < 10; rotor++) state.Telemetry[rotor] = thrust;
+            state.Telemetry[11] = Target;
+            state.Telemetry[13] = Target - Height;
         }
 
         /// <summary>Put the craft there, level and at rest.</summary>

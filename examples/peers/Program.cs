@@ -74,44 +74,37 @@ namespace Rotorgram
         }
     }
 
-    /// <summary>The golden datagrams of docs/protocol.md: prints Hello, State and Close as they are
-    /// written here, and what is read from a Welcome and a Command that are given in hexadecimal.</summary>
+    /// <summary>Golden datagrams: prints Hello, a State and Close of the env `one` of docs/golden.json,
+    /// whose spec is given, as they are written here. Then what is read from each one:BYTES or
+    /// two:BYTES in hexadecimal.</summary>
     static class SelfTest
     {
         public static int Run(string[] args)
         {
-            const ulong session = 0x0123456789abcdef;
-            var one = new RotorgramSpec
-            {
-                EnvId = "a/B-v0", Telemetry = "X,F1", Options = "{\"a\":1}", Period = 0.02, DiscreteActions = 3,
-                Model = Bytes("00112233445566778899aabbccddeeff"),
-                ObservationLow = new[] { -1f }, ObservationHigh = new[] { 1f },
-                ActionLow = new[] { 0f }, ActionHigh = new[] { 2f }
-            };
+            const ulong session = 0x0123456789abcdef, nonce = 0xfedcba9876543210;
+            var one = new RotorgramSpec { Json = args[1], Observations = 3, Choices = 3, Telemetry = 4 };
+            var two = new RotorgramSpec { Drones = 2, Observations = 1 };
             var datagram = new Datagram();
             datagram.WriteHello(session, one);
             Print("hello", datagram);
 
-            var three = new RotorgramSpec
-            {
-                Telemetry = "X,F1", ObservationLow = new float[3], ActionLow = new float[1]
-            };
-            var state = new RotorgramState(three);
-            state.Rewards[0] = 0.5;
-            state.Telemetry[0] = 1;
-            state.Telemetry[1] = -2;
+            var state = new RotorgramState(one);
             state.Observations[0] = 0.25f;
             state.Observations[1] = -0f;
             state.Observations[2] = 1.5f;
+            new[] { 1, 5, -2, 0.25 }.CopyTo(state.Telemetry, 0);
+            datagram.WriteState(session, 1, 0, nonce, state);
+            Print("state 1 echoes the nonce", datagram);
+            state.Rewards[0] = 0.5;
             state.Truncated[0] = true;
-            datagram.WriteState(session, 1, three, state);
-            Print("state", datagram);
+            datagram.WriteState(session, 2, 0.02, 0, state);
+            Print("state, truncated", datagram);
 
             datagram.WriteClose(session, 1, "done");
             Print("close", datagram);
 
-            var two = new RotorgramSpec { Drones = 2, ObservationLow = new float[1], ActionLow = new float[1] };
-            for (int i = 1; i < args.Length; i++) Console.WriteLine(Read(Bytes(args[i]), two));
+            for (int i = 2; i < args.Length; i++)
+                Console.WriteLine(Read(Bytes(args[i].Substring(4)), args[i].StartsWith("one:") ? one : two));
             return 0;
         }
 
@@ -121,28 +114,30 @@ namespace Rotorgram
             Array.Copy(bytes, datagram.Bytes, bytes.Length);
             if (!datagram.HeaderIsRight()) return "malformed";
             string header = datagram.Type + " " + datagram.Session.ToString("x16") + " " + datagram.Sequence;
-            if (datagram.Type == MessageType.Welcome)
+            switch (datagram.Type)
             {
-                ulong nonce, seed;
-                bool hasSeed;
-                bool right = datagram.ReadWelcome(out nonce, out hasSeed, out seed);
-                return right ? header + " " + nonce.ToString("x16") + " " + hasSeed + " " + seed : "malformed";
+                case MessageType.Welcome:
+                    ulong nonce, seed;
+                    bool hasSeed;
+                    bool right = datagram.ReadWelcome(out nonce, out hasSeed, out seed);
+                    return right ? header + " " + nonce.ToString("x16") + " " + hasSeed + " " + seed : "malformed";
+                case MessageType.Command:
+                    var c = new RotorgramCommand(spec);
+                    if (!datagram.ReadCommand(spec, c)) return "malformed";
+                    foreach (float f in c.Actions) header += " " + f.ToString("r", CultureInfo.InvariantCulture);
+                    foreach (Order order in c.Orders) header += " " + order;
+                    foreach (ulong u in c.Seeds) header += " " + u;
+                    return header;
+                case MessageType.Refuse:
+                case MessageType.Close:
+                    string reason = datagram.ReadReason();
+                    return reason == null ? "malformed" : header + " " + reason;
+                case MessageType.Wait:
+                case MessageType.Unknown:
+                    return datagram.IsHeaderAlone() ? header : "malformed";
+                default:
+                    return "malformed";
             }
-            if (datagram.Type == MessageType.Command)
-            {
-                var c = new RotorgramCommand(spec);
-                if (!datagram.ReadCommand(spec, c)) return "malformed";
-                foreach (float f in c.Actions) header += " " + f.ToString("r", CultureInfo.InvariantCulture);
-                foreach (bool b in c.Reset) header += " " + b;
-                foreach (ulong u in c.Seeds) header += " " + u;
-                return header;
-            }
-            if (datagram.Type == MessageType.Refuse || datagram.Type == MessageType.Close)
-            {
-                string reason = datagram.ReadReason();
-                return reason == null ? "malformed" : header + " " + reason;
-            }
-            return datagram.IsHeaderAlone() ? header : "malformed";
         }
 
         static void Print(string name, Datagram datagram)

@@ -8,27 +8,24 @@ namespace Rotorgram
 {
     public enum MessageType : byte
     {
-        Hello = 1, Welcome, Refuse, State, Command, Close, Wait, Unknown
+        Hello = 1, Welcome, Refuse, State, Command, Close, Wait, Unknown, Alive, Missing
     }
 
-    /// <summary>What Hello says of an env. The arrays have one entry for each number.</summary>
+    /// <summary>The drones of a simulator. Observation and action are one array of float32 each, or
+    /// the action is one of Choices.</summary>
     public sealed class RotorgramSpec
     {
-        public string EnvId = "";
-        public string Telemetry = ""; // names, joined by commas
-        public string Options = "";
+        public string Json = ""; // the EnvSpec, as Hello carries it
         public int Drones = 1;
-        public int DiscreteActions; // 0: continuous
-        public double Period;
-        public byte[] Model = new byte[16];
-        public float[] ObservationLow, ObservationHigh, ActionLow, ActionHigh;
-
-        public int Observations { get { return ObservationLow.Length; } }
-        public int Actions { get { return ActionLow.Length; } }
-        public int Channels { get { return Telemetry == "" ? 0 : Telemetry.Split(',').Length; } }
+        public int Observations; // numbers of one drone
+        public int Actions = 1; // numbers of one drone
+        public int Choices; // 0: actions are numbers
+        public int Telemetry; // numbers of one drone, of all arrays together
+        public double Period; // s
     }
 
-    /// <summary>What the drones tell after a step or a reset, drone by drone.</summary>
+    /// <summary>What the drones tell after a step or a reset. Observations are drone by drone.
+    /// Telemetry is array by array, and in each drone by drone.</summary>
     public sealed class RotorgramState
     {
         public readonly double[] Rewards, Telemetry;
@@ -38,25 +35,30 @@ namespace Rotorgram
         public RotorgramState(RotorgramSpec spec)
         {
             Rewards = new double[spec.Drones];
-            Telemetry = new double[spec.Drones * spec.Channels];
+            Telemetry = new double[spec.Drones * spec.Telemetry];
             Observations = new float[spec.Drones * spec.Observations];
             Terminated = new bool[spec.Drones];
             Truncated = new bool[spec.Drones];
         }
     }
 
-    /// <summary>What the drones shall do: each is reset or stepped.</summary>
+    public enum Order : byte
+    {
+        Fly, Reset, Freeze
+    }
+
+    /// <summary>What the drones shall do: each flies, is reset, or stays as it is.</summary>
     public sealed class RotorgramCommand
     {
-        public readonly float[] Actions;
-        public readonly bool[] Reset;
+        public readonly float[] Actions; // a choice as its number
+        public readonly Order[] Orders;
         public readonly ulong[] Seeds; // of those that are reset, if HasSeeds
         public bool HasSeeds;
 
         public RotorgramCommand(RotorgramSpec spec)
         {
             Actions = new float[spec.Drones * spec.Actions];
-            Reset = new bool[spec.Drones];
+            Orders = new Order[spec.Drones];
             Seeds = new ulong[spec.Drones];
         }
     }
@@ -65,7 +67,7 @@ namespace Rotorgram
     /// the strings of Hello, Refuse and Close.</summary>
     public sealed class Datagram
     {
-        public const int HeaderSize = 24, LongestText = 512, LongestDatagram = 65489, Version = 2;
+        public const int HeaderSize = 24, LongestText = 512, LongestDatagram = 65483, Version = 2;
 
         public readonly byte[] Bytes = new byte[65536];
         public int Length;
@@ -86,34 +88,30 @@ namespace Rotorgram
         public void WriteHello(ulong session, RotorgramSpec spec)
         {
             Begin(MessageType.Hello, session, 0);
-            Put((ulong)spec.Drones, 4);
-            Put((ulong)spec.Observations, 2);
-            Put((ulong)spec.Actions, 2);
-            Put((ulong)spec.DiscreteActions, 2);
+            Put(Version, 1); // lowest and highest version
+            Put(Version, 1);
             Put(0, 2);
-            Put(spec.Period);
-            foreach (byte b in spec.Model) Put(b, 1);
-            foreach (float f in spec.ObservationLow) Put(f);
-            foreach (float f in spec.ObservationHigh) Put(f);
-            foreach (float f in spec.ActionLow) Put(f);
-            foreach (float f in spec.ActionHigh) Put(f);
-            Put(spec.EnvId);
-            Put(spec.Telemetry);
-            Put(spec.Options);
+            Put((ulong)spec.Drones, 4);
+            Put((ulong)Utf8.GetByteCount(spec.Json), 4);
+            Put(0, 4);
+            at += Utf8.GetBytes(spec.Json, 0, spec.Json.Length, Bytes, at);
             End();
         }
 
-        public void WriteState(ulong session, ulong sequence, RotorgramSpec spec, RotorgramState s)
+        /// <param name="time">Simulated since the session began, s.</param>
+        /// <param name="nonce">That of the Welcome in State 1, 0 in all others.</param>
+        public void WriteState(ulong session, ulong sequence, double time, ulong nonce, RotorgramState s)
         {
             Begin(MessageType.State, session, sequence);
-            Put((ulong)s.Rewards.Length, 4);
-            Put((ulong)spec.Observations, 2);
-            Put((ulong)(s.Telemetry.Length / s.Rewards.Length), 2);
-            foreach (double d in s.Rewards) Put(d);
-            foreach (double d in s.Telemetry) Put(d);
+            Put(time);
+            Put(nonce, 8);
             foreach (float f in s.Observations) Put(f);
+            Align();
+            foreach (double d in s.Rewards) Put(d);
             foreach (bool b in s.Terminated) Put(b ? 1u : 0u, 1);
             foreach (bool b in s.Truncated) Put(b ? 1u : 0u, 1);
+            if (s.Telemetry.Length > 0) Align();
+            foreach (double d in s.Telemetry) Put(d);
             End();
         }
 
@@ -147,6 +145,12 @@ namespace Rotorgram
                 "a datagram of " + Length + " bytes is too long: fly fewer drones");
             at = 4;
             Put(Crc(), 4);
+        }
+
+        /// <summary>Every array begins at a multiple of 8 bytes.</summary>
+        void Align()
+        {
+            while (at % 8 != 0) Bytes[at++] = 0;
         }
 
         void Put(ulong value, int size)
@@ -185,47 +189,63 @@ namespace Rotorgram
 
         public bool IsHeaderAlone() { return Length == HeaderSize; }
 
+        /// <summary>False if it is malformed, or asks for an extension or a version that is not here.</summary>
         public bool ReadWelcome(out ulong nonce, out bool hasSeed, out ulong seed)
         {
-            at = HeaderSize;
             nonce = seed = 0;
             hasSeed = false;
-            if (Length != 48 || Sequence != 0 || Bytes[32] > 1) return false;
-            at = 24;
+            if (Length < 48 || Sequence != 0 || Bytes[40] > 1 || Bytes[41] != Version) return false;
+            at = HeaderSize;
             nonce = Take(8);
-            hasSeed = Bytes[32] == 1;
-            at = 40;
             seed = Take(8);
+            hasSeed = Bytes[40] == 1;
+            for (at = 48; at < Length;)
+            {
+                if (Length < at + 4) return false;
+                bool critical = Take(2) >> 15 == 1;
+                int size = (int)Take(2);
+                if (critical || size > LongestText || Length < at + size) return false;
+                at += size;
+            }
             return true;
         }
 
-        /// <summary>False leaves the command half read: it is of no use then.</summary>
+        /// <summary>False if it is malformed, or of other sizes.</summary>
         public bool ReadCommand(RotorgramSpec spec, RotorgramCommand c)
         {
-            int drones = c.Reset.Length, actions = c.Actions.Length;
-            if (Length < 40) return false;
-            at = 24;
-            if (Take(4) != (ulong)drones || Take(2) != (ulong)(actions / drones)) return false;
-            at = 36;
-            ulong seeds = Take(4);
-            c.HasSeeds = seeds > 0;
-            if (c.HasSeeds && seeds != (ulong)drones) return false;
-            if (Length != 40 + (c.HasSeeds ? 8 * drones : 0) + 4 * actions + drones) return false;
-            for (int i = 0; i < drones; i++) c.Seeds[i] = c.HasSeeds ? Take(8) : 0;
+            int drones = spec.Drones, actions = c.Actions.Length;
+            int orders = Aligned(32 + (spec.Choices > 0 ? 8 : 4) * actions);
+            int seeds = Aligned(orders + drones);
+            if (Length < 32) return false;
+            at = HeaderSize;
+            ulong count = Take(4);
+            c.HasSeeds = count > 0;
+            if (c.HasSeeds && count != (ulong)drones) return false;
+            if (Length != (c.HasSeeds ? seeds + 8 * drones : orders + drones)) return false;
+            at = 32;
             for (int i = 0; i < actions; i++)
             {
+                if (spec.Choices > 0)
+                {
+                    ulong choice = Take(8);
+                    if (choice >= (ulong)spec.Choices) return false;
+                    c.Actions[i] = choice;
+                    continue;
+                }
                 float a = c.Actions[i] = new FloatBits { Bits = (uint)Take(4) }.Value;
                 if (float.IsNaN(a) || float.IsInfinity(a)) return false;
-                if (spec.DiscreteActions > 0 && !(a >= 0 && a < spec.DiscreteActions && a == (int)a))
-                    return false;
             }
             for (int i = 0; i < drones; i++)
             {
-                if (Bytes[at] > 1) return false;
-                c.Reset[i] = Bytes[at++] == 1;
+                if (Bytes[orders + i] > 2) return false;
+                c.Orders[i] = (Order)Bytes[orders + i];
             }
+            at = seeds;
+            for (int i = 0; i < drones; i++) c.Seeds[i] = c.HasSeeds ? Take(8) : 0;
             return true;
         }
+
+        static int Aligned(int at) { return (at + 7) / 8 * 8; }
 
         /// <summary>The reason of a Refuse or Close, or null if it is malformed.</summary>
         public string ReadReason()

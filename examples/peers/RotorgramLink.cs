@@ -18,9 +18,9 @@ namespace Rotorgram
     {
         RotorgramSpec Spec { get; }
 
-        /// <summary>Reset the drones whose flag is set (with their seed, if there are seeds), step the
-        /// others by one control period with their action, and write what they tell. A drone that
-        /// was reset tells reward 0 and neither flag.</summary>
+        /// <summary>Follow the order of each drone: reset it (with its seed, if there are seeds), fly
+        /// it for one control period with its action, or leave it as it is. Then write what it
+        /// tells. A drone that was not flown tells reward 0 and neither flag.</summary>
         void Advance(RotorgramCommand command, RotorgramState state);
     }
 
@@ -44,7 +44,8 @@ namespace Rotorgram
         readonly Datagram output = new Datagram(), input = new Datagram();
         readonly RandomNumberGenerator random = RandomNumberGenerator.Create();
 
-        ulong session, sequence;
+        ulong session, sequence, nonce;
+        double time; // simulated in this session, s
         bool resentOnce;
         double sentAt, dueAt, wait, giveUpAt;
         double roundTrip = -1, variation;
@@ -149,14 +150,15 @@ namespace Rotorgram
 
         bool Welcomed()
         {
-            ulong nonce, seed; // the nonce is for keys, which this simulator does not have
+            ulong number, seed;
             bool hasSeed;
-            if (!input.ReadWelcome(out nonce, out hasSeed, out seed)) { Malformed++; return false; }
+            if (!input.ReadWelcome(out number, out hasSeed, out seed)) { Malformed++; return false; }
             if (State != LinkState.Hello) { Stale++; return false; }
+            nonce = number; // State 1 echoes it; with a key it would enter that of the session
             Measure();
             for (int i = 0; i < spec.Drones; i++)
             {
-                command.Reset[i] = true;
+                command.Orders[i] = Order.Reset;
                 command.Seeds[i] = unchecked((hasSeed ? seed : session) + (ulong)i);
             }
             command.HasSeeds = true;
@@ -170,7 +172,7 @@ namespace Rotorgram
             Measure();
             for (int i = 0; i < spec.Drones; i++)
             {
-                if (command.Reset[i] || !(state.Terminated[i] || state.Truncated[i])) continue;
+                if (command.Orders[i] != Order.Fly || !(state.Terminated[i] || state.Truncated[i])) continue;
                 Failed = true;
                 Close("drone " + i + " was flown on after its episode's end: send a reset");
                 return false;
@@ -225,6 +227,7 @@ namespace Rotorgram
                 session = BitConverter.ToUInt64(bytes, 0);
             } while (session == 0);
             sequence = 0;
+            time = -spec.Period; // State 1 is at 0
             Sessions++;
             State = LinkState.Hello;
             output.WriteHello(session, spec);
@@ -239,7 +242,8 @@ namespace Rotorgram
                 Check(state.Rewards);
                 Check(state.Telemetry);
                 foreach (float f in state.Observations) Check(f);
-                output.WriteState(session, sequence + 1, spec, state);
+                time += spec.Period;
+                output.WriteState(session, sequence + 1, time, sequence == 0 ? nonce : 0, state);
             }
             catch (Exception error)
             {

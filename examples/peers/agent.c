@@ -24,8 +24,9 @@
 #include <time.h>
 #include <unistd.h>
 
-/* Of rotorgram/Elevation-v0: E, its rate, thrust / hover - 1; X, Y, Z, three angles, F1 to F4. */
-enum { OBSERVATIONS = 3, TELEMETRY = 10, MOST_BYTES = 1024 };
+/* Of rotorgram/Elevation-v0: E, its rate, thrust / hover - 1; X, Y, Z, three angles, F1 to F4,
+ * the goal X, Y, Z, and E again as the metric. */
+enum { OBSERVATIONS = 3, TELEMETRY = 14, MOST_BYTES = 1024 };
 
 typedef struct {
     uint64_t sequence;
@@ -57,8 +58,8 @@ static bool digits(const char **at)
 static bool whole(const char **at, uint64_t *out)
 {
     const char *first = *at;
-    if (!digits(at) || *at - first > 20)
-        return false;
+    if (!digits(at) || *at - first > 20 || (*first == '0' && *at - first > 1))
+        return false; /* no leading zeros: a number is written in one way */
     errno = 0;
     *out = strtoull(first, NULL, 10);
     return errno == 0; /* else it is 2^64 or more */
@@ -183,7 +184,7 @@ static int fly(uint64_t episodes, uint64_t seed, double patience)
         if (!next || m.close || wrong_start) {
             dropped++;
             binary = binary || (length > 0 && (unsigned char)line[0] == 0xa7);
-            if (legal && begun && !ours && !m.close) { /* another simulator: no place is free */
+            if (legal && begun && !ours && !m.close) { /* another simulator: no slot is free */
                 snprintf(line, sizeof line, "%" PRIu64 ",close", m.sequence);
                 reply(&from, line);
             }
@@ -191,12 +192,12 @@ static int fly(uint64_t episodes, uint64_t seed, double patience)
         }
 
         double error = m.values[0], rate = m.values[1], thrust = m.values[2];
-        bool over = !begun; /* the simulator's own start has a seed of its own: reset it with ours */
+        bool done = !begun; /* the simulator's own start has a seed of its own: reset it with ours */
         if (begun && !fresh) {
             steps++;
             total += m.reward;
-            over = m.terminated || m.truncated;
-            if (over) {
+            done = m.terminated || m.truncated;
+            if (done) {
                 printf("episode %" PRIu64 ": %" PRIu64 " steps, return %.12g, last |E| %.6f m, %s\n",
                        ++episode, steps, total, fabs(error),
                        m.terminated ? "terminated" : "truncated");
@@ -205,7 +206,7 @@ static int fly(uint64_t episodes, uint64_t seed, double patience)
         }
         if (episode == episodes) {
             snprintf(answer, sizeof answer, "%" PRIu64 ",close", m.sequence);
-        } else if (over) {
+        } else if (done) {
             snprintf(answer, sizeof answer, "%" PRIu64 ",reset,%" PRIu64, m.sequence, seed + episode);
             steps = 0;
             total = 0;
@@ -215,7 +216,7 @@ static int fly(uint64_t episodes, uint64_t seed, double patience)
         }
         simulator = from;
         begun = true;
-        fresh = over;
+        fresh = done;
         last = m.sequence;
         deadline = now() + patience;
         reply(&simulator, answer);

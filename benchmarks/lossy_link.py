@@ -1,0 +1,199 @@
+"""Flights between two machines over a bad network, on Linux: MTU, delay and loss of IP packets.
+
+    sudo python benchmarks/lossy_link.py [--drones 1024] [--mtu 1500] [--delay 0.001]
+                                         [--loss 0 0.01 0.05 0.1] [--seconds 10] [--out FILE.json]
+
+Agent and simulator run in network namespaces of their own. A TUN device in each is the only way
+between them, and this program carries the IP packets from one to the other: it delays each, and
+loses each with the given probability, fragments of large datagrams too. Every answer of the
+simulator is compared with the same flight in process, bit for bit.
+"""
+
+import argparse
+import fcntl
+import json
+import os
+import random
+import select
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+AGENT_ADDRESS, SIMULATOR_ADDRESS = "10.77.0.1", "10.77.0.2"
+PORT = 8001
+
+AGENT = """
+import json, sys, time
+import numpy as np
+from rotorgram.envs.loop import Loop
+from rotorgram.udp import RemoteVectorEnv
+drones, seconds, key, host, port = json.loads(sys.argv[1])
+env_id = "rotorgram/Elevation-v0"
+loop = Loop(env_id, drones, options={})
+everybody = np.ones(drones, bool)
+with RemoteVectorEnv((host, port), env_id=env_id, num_envs=drones, key_file=key,
+                     autoreset_mode="Disabled", timeout=60) as env:
+    dice, seeds = np.random.default_rng(0), np.arange(drones, dtype=np.uint64)
+    actions = np.zeros((drones, 1), np.float32)
+    steps, began = -1, 0.0
+    while steps < 0 or time.perf_counter() - began < seconds:
+        resets = everybody if steps < 0 else loop.done.copy()
+        env.advance(actions, resets, seeds if steps < 0 else None)
+        loop.advance(actions, resets, seeds if steps < 0 else None)
+        (ours,) = loop.observations.values()
+        assert env.observations.tobytes() == ours.tobytes(), f"step {steps}: observations differ"
+        assert env.rewards.tobytes() == loop.rewards.tobytes(), f"step {steps}: rewards differ"
+        assert (env.terminated == loop.terminated).all(), f"step {steps}: ends differ"
+        if steps < 0:
+            began = time.perf_counter()
+        steps += 1
+        actions = dice.uniform(-1, 1, (drones, 1)).astype(np.float32)
+    seconds = time.perf_counter() - began
+    print(json.dumps({"steps": steps, "seconds": seconds, "statistics": env.statistics.numbers()}))
+"""
+
+SIMULATE = """
+import json, sys
+from rotorgram.udp import Simulator
+drones, key, server, bind = json.loads(sys.argv[1])
+with Simulator(server=tuple(server), bind=tuple(bind), num_envs=drones, key_file=key) as simulator:
+    simulator.run()
+"""
+
+
+class Wire:
+    """Carries packets between two TUN devices in a thread, until it is closed.
+
+    Args:
+        ends: File descriptors of the devices.
+        loss: Probability that a packet is lost, 0 to 1.
+        delay: Time that each is held, s.
+    """
+
+    def __init__(self, ends: tuple[int, int], loss: float, delay: float) -> None:
+        self.packets = self.lost = 0
+        self._ends, self._loss, self._delay = ends, loss, delay
+        self._dice = random.Random(0).random
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._carry)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closed.set()
+        self._thread.join()
+
+    def _carry(self) -> None:
+        held: deque[tuple[float, int, bytes]] = deque()
+        while not self._closed.is_set():
+            wait = min(max(held[0][0] - time.perf_counter(), 0), 0.05) if held else 0.05
+            for end in select.select(self._ends, [], [], wait)[0]:
+                packet, other = os.read(end, 65_536), self._ends[end == self._ends[0]]
+                self.packets += 1
+                if self._dice() < self._loss:
+                    self.lost += 1
+                else:
+                    held.append((time.perf_counter() + self._delay, other, packet))
+            while held and held[0][0] <= time.perf_counter():
+                _, end, packet = held.popleft()
+                os.write(end, packet)
+
+
+def run(*words: object) -> None:
+    subprocess.run([str(word) for word in words], check=True)
+
+
+def open_tun(name: str) -> int:
+    tunsetiff, tun_without_header = 0x400454CA, 0x1001
+    end = os.open("/dev/net/tun", os.O_RDWR)
+    fcntl.ioctl(end, tunsetiff, struct.pack("16sH22x", name.encode(), tun_without_header))
+    return end
+
+
+@contextmanager
+def two_machines(mtu: int) -> Iterator[tuple[tuple[str, int], tuple[str, int]]]:
+    """The name of the namespace and the device of the agent, and of the simulator."""
+    made: list[tuple[str, int]] = []
+    try:
+        for number, address in enumerate((AGENT_ADDRESS, SIMULATOR_ADDRESS)):
+            name = f"rg{os.getpid()}-{number}"
+            run("ip", "netns", "add", name)
+            end = open_tun(name)
+            made.append((name, end))
+            run("ip", "link", "set", name, "netns", name)
+            inside = ("ip", "-n", name)
+            run(*inside, "link", "set", name, "mtu", mtu, "txqueuelen", 10_000)
+            run(*inside, "addr", "add", f"{address}/24", "dev", name)
+            run(*inside, "link", "set", name, "up")
+            run(*inside, "link", "set", "lo", "up")
+        yield made[0], made[1]
+    finally:
+        for name, end in made:
+            os.close(end)
+            run("ip", "netns", "del", name)
+
+
+def launch(namespace: str, code: str, settings: list[Any]) -> subprocess.Popen[str]:
+    words = ["ip", "netns", "exec", namespace, sys.executable, "-c", code, json.dumps(settings)]
+    return subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+
+
+def fly(drones: int, mtu: int, delay: float, loss: float, seconds: float) -> dict[str, Any]:
+    """The rate and counts of one flight. Raises `CalledProcessError` if it fails."""
+    from rotorgram.udp.protocol.keys import write_key
+
+    with tempfile.TemporaryDirectory() as folder, two_machines(mtu) as (here, there):
+        key = str(Path(folder) / "key")
+        write_key(Path(key))
+        wire = Wire((here[1], there[1]), loss, delay)
+        agent = launch(here[0], AGENT, [drones, seconds, key, AGENT_ADDRESS, PORT])
+        server, bind = (AGENT_ADDRESS, PORT), (SIMULATOR_ADDRESS, 0)
+        simulator = launch(there[0], SIMULATE, [drones, key, server, bind])
+        try:
+            out, _ = agent.communicate(timeout=seconds + 300)
+            simulator.wait(timeout=30)
+        finally:
+            for process in (agent, simulator):
+                process.kill()
+            wire.close()
+        if agent.returncode:
+            raise subprocess.CalledProcessError(agent.returncode, "the agent")
+    told = json.loads(out)
+    return {
+        "drones": drones, "mtu": mtu, "delay": delay, "loss": loss, "steps": told["steps"],
+        "steps_per_second": round(told["steps"] / told["seconds"], 1),
+        "packets": wire.packets, "packets_lost": wire.lost, "agent": told["statistics"],
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--drones", type=int, nargs="+", default=[1, 64, 1024])
+    parser.add_argument("--mtu", type=int, nargs="+", default=[1500, 576])
+    parser.add_argument("--delay", type=float, default=0.001)
+    parser.add_argument("--loss", type=float, nargs="+", default=[0.0, 0.01, 0.05, 0.1])
+    parser.add_argument("--seconds", type=float, default=10)
+    parser.add_argument("--out", type=Path, default=Path("docs/results/reliability/link.json"))
+    args = parser.parse_args()
+    flights = []
+    print("| drones | MTU | loss | steps/s |\n|---:|---:|---:|---:|")
+    for drones in args.drones:
+        for mtu in args.mtu:
+            for loss in args.loss:
+                one = fly(drones, mtu, args.delay, loss, args.seconds)
+                flights.append(one)
+                print(f"| {drones} | {mtu} | {loss:.0%} | {one['steps_per_second']} |", flush=True)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    result = {"flights": flights, "machine": {"cores": os.cpu_count()}}
+    args.out.write_text(json.dumps(result, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

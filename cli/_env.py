@@ -1,0 +1,191 @@
+"""Envs and policies that flags name: a task's id and options, checkpoints, remote envs."""
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from ..models.errors import InputError
+from ._flags import AgentFlags, EnvFlags
+from ._inputs import parse_address
+
+if TYPE_CHECKING:
+    from ..agents.checkpoints import Checkpoint
+    from ..agents.policies import Policy
+    from ..envs.spec import EnvSpec
+    from ..experiments.trajectories import Trajectory
+    from ..udp import RemoteEnv, RemoteVectorEnv
+
+__all__ = [
+    "CHECKPOINT",
+    "chosen_env",
+    "load_checkpoint",
+    "local_spec",
+    "policy_for",
+    "remote_env",
+    "words_of",
+]
+
+CHECKPOINT: Final = "checkpoint.safetensors"
+_CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
+
+
+def load_checkpoint(name: str) -> "Checkpoint | None":
+    """The checkpoint of a policy by its file or its training's folder; None for `pid`.
+
+    Raises:
+        InputError: There is none.
+    """
+    if name == "pid":
+        return None
+    from ..agents.checkpoints import load
+
+    path = Path(name)
+    file = path / CHECKPOINT if path.is_dir() else path
+    if not file.is_file():
+        inside = f": look into {path / 'checkpoints'}" if (path / "checkpoints").is_dir() else ""
+        raise InputError(
+            f"policy: expected pid, a checkpoint or the folder of a training, got {name}, where "
+            f"there is no file {file}{inside}"
+        )
+    return load(file)
+
+
+def chosen_env(
+    command: EnvFlags, checkpoint: "Checkpoint | None" = None
+) -> tuple[str, dict[str, Any]]:
+    """Id of the task, and its options that are not the default.
+
+    A checkpoint brings those that it was trained with; options that the user set win.
+
+    Raises:
+        InputError: The options are of another task than the checkpoint's.
+    """
+    if checkpoint is None or ("env" in command.given and command.env != checkpoint.env_id):
+        return command.env, command.options
+    if command.options and command.env != checkpoint.env_id:
+        raise InputError(
+            f"env: expected --env {checkpoint.env_id} with options of the task that the policy "
+            f"was trained on, got options of {command.env}"
+        )
+    return checkpoint.env_id, {**checkpoint.options, **command.options}
+
+
+def local_spec(command: EnvFlags, checkpoint: "Checkpoint | None") -> "EnvSpec":
+    """The chosen env as it is flown here. Raises `InputError`."""
+    from ..envs import registry
+
+    return registry.env_spec(*chosen_env(command, checkpoint), vehicle=command.vehicle)
+
+
+def policy_for(checkpoint: "Checkpoint | None", spec: "EnvSpec") -> "Policy":
+    """The policy of a checkpoint, or the PID. Raises `InputError` if it does not fit the env."""
+    from ..agents import PID
+
+    return checkpoint.policy(spec) if checkpoint else PID(spec)
+
+
+def words_of(trajectory: "Trajectory") -> str:
+    """Return of an episode, and the metric that decides at its end."""
+    words = f"return {trajectory.rewards.sum():.1f}"
+    if (metric := trajectory.spec.headline) is None:
+        return words
+    value = f"{trajectory.headline[-1]:.3f} {metric.unit}".rstrip()
+    return f"{words}, last {metric.symbol or metric.name} {value}"
+
+
+@contextmanager
+def remote_env(
+    command: AgentFlags,
+    env_id: str,
+    options: dict[str, Any],
+    *,
+    required: bool,
+    num_envs: int = 1,
+    num_simulators: int = 1,
+) -> Iterator[Any]:
+    """A remote env with a simulator of its own, or those that come to `command.listen`.
+
+    One drone is a `RemoteEnv`, more are a `RemoteVectorEnv` without autoreset. At the end the
+    counters of the wire are printed.
+
+    Args:
+        command: Says where, and with which key.
+        env_id: Task.
+        options: Its options that are not the default.
+        required: Whether simulators that come must fly this task with these options; otherwise the
+            first that comes decides.
+        num_envs: Drones.
+        num_simulators: Simulators to wait for.
+
+    Raises:
+        InputError: Flags that contradict each other.
+    """
+    if num_simulators > 1 and command.listen is None:
+        raise InputError(f"num-simulators: expected 1 without --listen, got {num_simulators}")
+    if command.listen is not None:
+        required_env = (env_id, options) if required else (None, None)
+        opened = _waiting(command, *required_env, num_envs, num_simulators)
+    else:
+        if command.key_file or command.insecure:
+            raise InputError(
+                "key-file, insecure: expected them with --listen, got them for a simulator of "
+                "our own on this machine"
+            )
+        from ..experiments.pairs import socket_pair
+
+        opened = socket_pair(
+            env_id, options, num_envs=num_envs, vehicle=command.vehicle, record=command.record
+        )
+    with opened as env:
+        try:
+            yield env
+        finally:
+            print(f"wire: {env.statistics}", flush=True)
+
+
+@contextmanager
+def _waiting(
+    command: AgentFlags,
+    env_id: str | None,
+    options: dict[str, Any] | None,
+    num_envs: int,
+    num_simulators: int,
+) -> "Iterator[RemoteEnv | RemoteVectorEnv]":
+    from ..udp import RemoteEnv, RemoteVectorEnv
+
+    vehicle_hash = None
+    if command.vehicle is not None:
+        from ..models.vehicle import Vehicle
+
+        vehicle_hash = Vehicle.load(command.vehicle).hash
+    assert command.listen is not None
+    address = parse_address(command.listen)
+    settings: dict[str, Any] = {
+        "env_id": env_id,
+        "options": options,
+        "vehicle_hash": vehicle_hash,
+        "connect": False,
+        "connect_timeout": _CONNECT_TIMEOUT,
+        "key_file": command.key_file,
+        "insecure": command.insecure,
+        "record": command.record,
+    }
+    remote: RemoteEnv | RemoteVectorEnv
+    if num_envs == num_simulators == 1:
+        remote = RemoteEnv(address, **settings)
+    else:
+        remote = RemoteVectorEnv(
+            address,
+            num_envs=num_envs,
+            num_simulators=num_simulators,
+            autoreset_mode="Disabled",
+            **settings,
+        )
+    with closing(remote):
+        waited = "a simulator" if num_simulators == 1 else f"{num_simulators} simulators"
+        share = f" of {num_envs // num_simulators} drones" if num_envs > num_simulators else ""
+        here = "{}:{}".format(*remote.address)
+        print(f"waiting for {waited}{share} at {here} (Ctrl-C ends)", flush=True)
+        remote.connect()
+        yield remote

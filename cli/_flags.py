@@ -1,0 +1,194 @@
+"""What every command declares and how its flags are parsed: tyro, plus the options of any task."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, make_dataclass, replace
+from itertools import zip_longest
+from pathlib import Path
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import tyro
+from tyro.conf import Fixed, Suppress, arg
+
+from ..models.errors import InputError
+
+__all__ = [
+    "DEFAULT_ENV",
+    "AgentFlags",
+    "AlgorithmName",
+    "Command",
+    "EnvFlags",
+    "PresetName",
+    "parse",
+    "parse_value",
+]
+
+DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
+
+# As in agents/presets.py, which is not imported for them before the flags are checked.
+AlgorithmName = Literal["vpg", "a2c", "sb3-a2c"]
+PresetName = Literal["paper", "tuned"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """What every command is: its fields are the flags, their docstrings the help."""
+
+    given: Suppress[Fixed[frozenset]] = frozenset()  # type: ignore[type-arg]
+    """Names of the fields that the user set, if only to their default; those of options of the
+    task begin with `env.`."""
+
+    def run(self) -> int:
+        """Do it; the exit status."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvFlags(Command):
+    """A command that takes any task."""
+
+    env: str = DEFAULT_ENV
+    """Task by its id, or module:Name-v0 for one that a module of the working directory registers.
+    Its options are flags --env.NAME."""
+    vehicle: Annotated[str | None, arg(metavar="FILE.xml")] = None
+    """MJCF file of a multirotor. Default: the paper's quadcopter."""
+    options: Suppress[Fixed[dict]] = field(default_factory=dict)  # type: ignore[type-arg]
+    """Options of the task. A checkpoint brings those that it was trained with."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentFlags(EnvFlags):
+    """A command that flies over the wire: the UDP server."""
+
+    listen: Annotated[str | None, arg(metavar="HOST:PORT")] = None
+    """Wait here for a simulator instead of starting one."""
+    key_file: Path | None = None
+    """Key that the simulator has too (rotorgram key): needed beyond this machine."""
+    insecure: bool = False
+    """Allow an address beyond this machine without a key: anyone who reaches it may take part."""
+    record: Path | None = None
+    """MCAP file to write every message to."""
+
+
+C = TypeVar("C", bound=Command)
+
+
+def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
+    """A command from its words. A wrong flag exits with status 2, `--help` with 0.
+
+    Raises:
+        InputError: The task or one of its options is not what it should be.
+    """
+    given = _given(words)
+    if not issubclass(kind, EnvFlags):
+        plain: C = tyro.cli(_for_tyro(kind), prog=prog, args=words)
+        return replace(plain, given=given)
+    env_id = _value(words, "--env") or DEFAULT_ENV
+    from ..envs import registry
+
+    if _listens(kind, given) and ":" not in env_id and not registry.is_known(env_id):
+        words, required = _without_requirements(words)
+        command = tyro.cli(_for_tyro(kind), prog=prog, args=words)
+        return cast(C, replace(command, given=given, options=required))
+    env_id = registry.load(env_id)
+    options_type = registry.options_type(env_id)
+    # Wrong values are refused by the options themselves, below, as every other wrong input.
+    raw = _for_tyro(options_type, __post_init__=lambda self: None, __doc__=f"Options of {env_id}.")
+    typed = make_dataclass(
+        kind.__name__,
+        [("options", Annotated[raw, arg(name="env")], field(default_factory=raw))],
+        bases=(_for_tyro(kind),),
+        namespace={"__doc__": kind.__doc__},
+        frozen=True,
+        kw_only=True,
+    )
+    command = tyro.cli(typed, prog=prog, args=words)
+    names = sorted(name.removeprefix("env.") for name in given if name.startswith("env."))
+    options = {name: getattr(command.options, name) for name in names}
+    checked = options_type.from_options(options)
+    chosen = json.loads(json.dumps({name: getattr(checked, name) for name in names}))
+    return cast(C, replace(command, given=given, env=env_id, options=chosen))
+
+
+def _for_tyro(kind: type[Any], **namespace: Any) -> type[Any]:
+    """A dataclass with `Union[X, Y]` in place of `X | Y`: for the latter, and Python before 3.14,
+    tyro imports typeguard, which takes as long as all else.
+    """
+    hints = get_type_hints(kind, include_extras=True)
+    changed = {
+        one.name: hint
+        for one in fields(kind)
+        if (hint := _with_union(hints[one.name])) is not hints[one.name]
+    }
+    made = type(kind.__name__, (kind,), {"__annotations__": changed, "__doc__": kind.__doc__,
+                                         **namespace})  # fmt: skip
+    return dataclass(frozen=True, kw_only=True)(made)
+
+
+def _with_union(hint: Any) -> Any:
+    if isinstance(hint, UnionType):
+        return Union[get_args(hint)]  # noqa: UP007
+    if get_origin(hint) is Annotated and isinstance(get_args(hint)[0], UnionType):
+        first, *rest = get_args(hint)
+        return Annotated[_with_union(first), *rest]
+    return hint
+
+
+def _listens(kind: type[Command], given: frozenset[str]) -> bool:
+    return "listen" in given or any(f.name == "listen" and f.default for f in fields(kind))
+
+
+def parse_value(text: str) -> Any:
+    """A value as JSON; what is no JSON is a text. Python's True and False are taken too."""
+    try:
+        return json.loads({"True": "true", "False": "false", "None": "null"}.get(text, text))
+    except (ValueError, RecursionError):
+        return text
+
+
+def _given(words: Sequence[str]) -> frozenset[str]:
+    """Names of the flags among the words, as fields are named."""
+    flags = (word[2:].partition("=")[0].replace("-", "_") for word in words if word[:2] == "--")
+    return frozenset(
+        prefix + dot + name.removeprefix("no_")
+        for prefix, dot, name in (flag.rpartition(".") for flag in flags)
+    )
+
+
+def _value(words: Sequence[str], flag: str) -> str | None:
+    """The last value of a flag, `--flag VALUE` or `--flag=VALUE`; None where it is not set."""
+    found = None
+    for word, following in zip_longest(words, words[1:], fillvalue=""):
+        name, equals, value = word.partition("=")
+        if name == flag:
+            found = value if equals else following
+    return found
+
+
+def _without_requirements(words: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    """The words without `--env.NAME VALUE`, and these: JSON values of a task not known here."""
+    kept: list[str] = []
+    required: dict[str, Any] = {}
+    rest = iter(words)
+    for word in rest:
+        name, equals, value = word.partition("=")
+        if not name.startswith("--env."):
+            kept.append(word)
+            continue
+        text = value if equals else next(rest, None)
+        if text is None:
+            raise InputError(f"{name}: expected a value, got none")
+        required[name.removeprefix("--env.").replace("-", "_")] = parse_value(text)
+    return kept, required

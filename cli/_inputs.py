@@ -1,0 +1,53 @@
+"""What commands make of their flags: addresses, counts, folders, and what a resumed run keeps."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from ..models.errors import InputError
+from ._flags import Command
+
+__all__ = ["check_count", "folder_to_write", "parse_address", "refuse_settings"]
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """HOST:PORT as a pair. Raises `InputError`."""
+    host, _, port = text.rpartition(":")
+    if not (host and port.isascii() and port.isdecimal() and int(port) <= 65535):
+        raise InputError(f"address: expected HOST:PORT with a port up to 65535, got {text!r}")
+    return host, int(port)
+
+
+def check_count(name: str, value: int | None) -> None:
+    """Raises `InputError` for a number that is given and less than 1."""
+    if value is not None and value < 1:
+        raise InputError(f"{name}: expected at least 1, got {value}")
+
+
+@contextmanager
+def folder_to_write(out: Path | None, name: str) -> Iterator[Path]:
+    """A new folder for the block, by default named by the time. A block that fails before it has
+    written anything leaves none. Raises `InputError` if `out` exists.
+    """
+    from ..experiments.folders import new_folder
+
+    folder = new_folder(out, name)
+    try:
+        yield folder
+    except BaseException:
+        with suppress(OSError):  # it holds something
+            folder.rmdir()
+        raise
+
+
+def refuse_settings(command: Command, folder: Path, *, free: tuple[str, ...]) -> None:
+    """Raises `InputError` if a setting was given, if only its default: a resumed run keeps its own.
+
+    Args:
+        command: The command that resumes.
+        folder: Of the run.
+        free: Names of the fields that may be set.
+    """
+    if changed := sorted(name for name in command.given if name not in free):
+        flags = ", ".join("--" + name.replace("_", "-") for name in changed)
+        raise InputError(f"resume: expected the settings of {folder}, got others by {flags}")

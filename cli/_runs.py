@@ -1,0 +1,163 @@
+"""What commands of many runs share: flags of their workers, progress, how to resume, reports."""
+
+import logging
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+from tyro.conf import arg
+
+from ._flags import EnvFlags
+from ._inputs import folder_to_write
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from ..experiments.metrics import Headline
+    from ..experiments.progress import OnProgress
+    from ..experiments.settings import SweepConfig
+
+__all__ = [
+    "RESUMED",
+    "RunsFlags",
+    "command_line",
+    "report_comparison",
+    "report_sweep",
+    "runs_folder",
+]
+
+_WORKERS: Final = ("jobs", "backend", "address")
+RESUMED: Final = (*_WORKERS, "resume", "env")
+"""Flags that a resumed command may be given: they change no number. `--env` imports the module of a
+task."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunsFlags(EnvFlags):
+    """A command of many runs, on the cores of this machine or on many machines."""
+
+    jobs: int | None = None
+    """Runs at a time. Default: one for each core of this machine, or of the cluster."""
+    backend: Literal["loky", "ray"] = "loky"
+    """loky: processes of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
+    address: Annotated[str | None, arg(metavar="ray://HOST:PORT")] = None
+    """The Ray cluster. Default: the one that this machine is part of."""
+
+    def workers(self) -> dict[str, Any]:
+        """Fields of `WorkersConfig`."""
+        return {name: getattr(self, name) for name in _WORKERS}
+
+
+def command_line() -> str:
+    """The command as the user typed it."""
+    return shlex.join(["rotorgram", *sys.argv[1:]])
+
+
+@contextmanager
+def runs_folder(
+    name: str, command: RunsFlags, resume: Path | None, out: Path | None
+) -> "Iterator[tuple[Path, OnProgress]]":
+    """The folder to write to, and what shows the progress. If the runs fail, it says how to resume.
+
+    Args:
+        name: The command and its positional arguments.
+        command: Says which workers run.
+        resume: Folder to go on with.
+        out: Otherwise, folder to make.
+    """
+    from ._progress import bars
+
+    making = nullcontext(resume) if resume else folder_to_write(out, name.replace(" ", "-"))
+    with making as folder:
+        try:
+            with bars() as progress:
+                yield folder, progress
+        except BaseException:
+            if any(folder.iterdir()):
+                where = f" --backend {command.backend}" if command.backend != "loky" else ""
+                where += f" --address {command.address}" if command.address else ""
+                print(f"go on with: rotorgram {name} --resume {shlex.quote(str(folder))}{where}")
+            raise
+
+
+def report_comparison(folder: Path, *, film: bool = True) -> None:
+    """Write figures, film and report from the folder's files, and print the table."""
+    from rich.console import Console
+
+    from ..experiments.report import VIDEO_FILE, table_of, terminal_table, write_report
+    from ..experiments.results import read_results
+
+    results = read_results(folder)
+    page = write_report(folder, results)
+    Console(width=100).print(terminal_table(table_of(results), results.headline))
+    # Only now: if the film fails, there is a report.
+    if film and not (folder / VIDEO_FILE).exists() and _film(folder):
+        write_report(folder, results)
+    print(f"report: {page}")
+
+
+def _film(folder: Path) -> bool:
+    """Whether there is a film of the agents for the report."""
+    from ..experiments.filming import film_comparison
+    from ..experiments.report import VIDEO_FILE
+    from ..models.errors import InputError
+    from ._progress import bars
+
+    try:
+        with bars() as progress:
+
+            def on_frame(done: int, total: int) -> None:
+                progress(VIDEO_FILE, done, total, "done" if done == total else "film of the agents")
+
+            return film_comparison(folder, folder / VIDEO_FILE, on_frame)
+    except (OSError, InputError, ImportError) as error:
+        logging.getLogger(__name__).info("no film of the agents: %s", error)
+        return False
+
+
+def report_sweep(folder: Path) -> None:
+    """Write `sweep.csv` from the folder's files, and print it."""
+    from rich.console import Console
+
+    from ..experiments.metrics import Headline
+    from ..experiments.results import read_config, read_spec
+    from ..experiments.sweep import SWEEP_FILE, read_sweep_config, write_sweep_table
+
+    config = read_sweep_config(folder)
+    headline = Headline.of(read_spec(folder, read_config(folder)))
+    results = write_sweep_table(config, folder)
+    Console(width=100).print(_sweep_table(results, config, headline))
+    print(f"{results['seeds'].sum()} of {len(config.runs())} runs done")
+    print(f"table: {folder / SWEEP_FILE}")
+
+
+def _sweep_table(results: Any, config: "SweepConfig", headline: "Headline") -> "Table":
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD)
+    for name in config.grid:
+        table.add_column(name.replace("_", "\n"), overflow="fold")
+    steady = headline.labelled(f"Steady {headline.size_symbol},\nworst")
+    for heading in (
+        steady, "median", "Return,\nmedian", "Settled", "Crashed", "Seeds", "Training\n(s)",
+        "Env\nsteps/s",
+    ):  # fmt: skip
+        table.add_column(heading, justify="right")
+    for row in results.to_dict("records"):
+        table.add_row(
+            *(str(row[name]) for name in config.grid),
+            f"{row['worst']:.3g}",
+            f"{row['median']:.3g}",
+            f"{row['return']:.0f}",
+            f"{row['settled']} of {row['episodes']}",
+            str(row["crashed"]),
+            str(row["seeds"]),
+            f"{row['seconds']:.1f}",
+            f"{row['steps_per_second']:,.0f}",
+        )
+    return table

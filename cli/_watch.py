@@ -1,0 +1,125 @@
+"""`rotorgram sim --view`: shows what is flown while an agent flies."""
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Literal
+
+import numpy as np
+
+from ..envs.rendering import moment
+from ..rendering.live import MOST_DRONES, LiveView, open_surface
+from ..rendering.moment import Moment
+from ..rendering.pace import Pace
+from ..rendering.stage import Stage, World
+from ..udp.protocol.messages import Command, Message, State
+from ..udp.transport.simulator import Observer, Simulator
+
+__all__ = ["Realtime", "Watcher", "watched"]
+
+_log = logging.getLogger(__name__)
+
+
+class Watcher:
+    """Shows a live view what a simulator steps, as often as the view draws: an observer.
+
+    Lock-step never waits for it. A pause freezes the picture alone: an agent that got no answer
+    would take the simulator for lost. If the view is closed or fails, the simulator goes on.
+
+    Args:
+        live: Shows the first so many drones.
+        simulator: What it flies.
+    """
+
+    def __init__(self, live: LiveView, simulator: Simulator) -> None:
+        self._live: LiveView | None = live
+        self._spec, self._stepped = simulator.spec, simulator.stepped
+        self._count = live.stage.drones
+        self._steps = np.zeros(self._count, np.int64)
+        self._episodes = np.zeros(self._count, np.int64)
+
+    def __call__(self, cause: Message | None, state: State) -> None:
+        """See one State, and what led to it."""
+        self._count_steps(cause)
+        live = self._live
+        if live is None or not live.wants or not self._is_open(live):
+            return
+        now = time.monotonic()
+        if live.pace.wait(now) is not None:
+            live.draw(*self._moments())
+            live.pace.stepped(now)
+
+    def _count_steps(self, cause: Message | None) -> None:
+        """Steps since each drone's reset; episodes in which something was flown."""
+        steps, resets = self._steps, np.ones(self._count, bool)
+        if isinstance(cause, Command):
+            resets = cause.resets[: self._count]
+            steps += ~(resets | cause.frozen[: self._count])
+        self._episodes += resets & (steps > 0)
+        steps[resets] = 0
+
+    def _moments(self) -> Iterator[Moment]:
+        telemetry, rewards = self._stepped.telemetry, self._stepped.rewards
+        for drone in range(self._count):
+            step = int(self._steps[drone])
+            yield moment(
+                self._spec,
+                {name: array[drone] for name, array in telemetry.items()},
+                reward=float(rewards[drone]) if step else 0.0,
+                step=step,
+                episode=int(self._episodes[drone]),
+            )
+
+    def _is_open(self, live: LiveView) -> bool:
+        try:
+            if live.is_running:
+                return True
+            _log.info("the view was closed; the simulator goes on")
+        except Exception as error:  # no error of drawing stops a training
+            _log.warning("the view failed, the simulator goes on: %s", error)
+        self._live = None
+        return False
+
+
+class Realtime:
+    """Holds lock-step to real time, by sleeping while the agent thinks: an observer."""
+
+    def __init__(self, control_period: float) -> None:
+        self._pace = Pace(control_period)
+
+    def __call__(self, cause: Message | None, state: State) -> None:
+        """Wait until the next step may be taken."""
+        time.sleep(self._pace.wait(time.monotonic()) or 0.0)
+        self._pace.stepped(time.monotonic())
+
+
+@contextmanager
+def watched(
+    simulator: Simulator,
+    kind: Literal["window", "web"] | None,
+    port: int,
+    world: World,
+    vehicle: str | None,
+    *,
+    realtime: bool,
+) -> Iterator[None]:
+    """Show a simulator, or hold it to real time, during the block."""
+    observers: list[Observer] = []
+    with ExitStack() as opened:
+        if kind is not None:
+            pace, drones = Pace(0.0), simulator.stepped.num_envs
+            stage = Stage(world, min(drones, MOST_DRONES), vehicle=vehicle)
+            surface = open_surface(kind, stage, pace, port)
+            live = opened.enter_context(LiveView(stage, surface, pace, of=drones))
+            print(f"shown {surface.where}", flush=True)
+            observers.append(Watcher(live, simulator))
+        if realtime:
+            observers.append(Realtime(simulator.spec.control_period))
+
+        def observe(cause: Message | None, state: State) -> None:
+            for observer in observers:
+                observer(cause, state)
+
+        simulator.observer = observe
+        yield

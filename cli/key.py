@@ -1,0 +1,26 @@
+"""`rotorgram key`: a key for both sides of the wire."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from ._flags import Command
+
+__all__ = ["Key"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Key(Command):
+    """Write a new key for both sides of the wire. Copy it to the other machine by a safe way."""
+
+    file: Positional[Path]
+    """File to write; it must not exist."""
+
+    def run(self) -> int:
+        """Write it."""
+        from ..udp.protocol.auth import write_key
+
+        write_key(self.file)
+        print(f"key: {self.file} (give it to both sides with --key-file)")
+        return 0

@@ -1,0 +1,41 @@
+"""`rotorgram replay`: what a journal holds, and whether it simulates to the same bits."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from ._flags import Command
+
+__all__ = ["Replay"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay(Command):
+    """Tell what a journal holds, and simulate it again."""
+
+    file: Positional[Path]
+    """MCAP file that --record wrote; after a crash it is read up to where it was cut."""
+    verify: bool = False
+    """Simulate every session again and compare every bit; exit status 1 if one differs."""
+    env: str | None = None
+    """module:Name-v0 to import a module of the working directory that registers the journal's
+    task. What a journal names is never imported."""
+    vehicle: str | None = None
+    """MJCF file that was flown. Default: the paper's quadcopter."""
+
+    def run(self) -> int:
+        """Print the summary and the verdict."""
+        from ..udp.journal.reader import summarize
+        from ..udp.journal.replay import verify
+
+        print(summarize(self.file))
+        if not self.verify:
+            return 0
+        if self.env:
+            from ..envs import registry
+
+            registry.load(self.env)
+        verdict = verify(self.file, vehicle=self.vehicle)
+        print(verdict)
+        return 0 if verdict.identical else 1

@@ -1,0 +1,31 @@
+"""`rotorgram report`: draw what a folder of results holds."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from ._flags import Command
+
+__all__ = ["Report"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Command):
+    """Draw a comparison's figures, table and report again from its files, or a sweep's table."""
+
+    folder: Positional[Path]
+    """Folder that `rotorgram compare` or `rotorgram sweep` wrote."""
+    film: bool = True
+    """Whether a comparison's agents are filmed, if there is no film yet, where there is OpenGL."""
+
+    def run(self) -> int:
+        """Write what is drawn from the files, and print the table."""
+        from ..experiments.sweep import is_sweep
+        from ._runs import report_comparison, report_sweep
+
+        if is_sweep(self.folder):
+            report_sweep(self.folder)
+        else:
+            report_comparison(self.folder, film=self.film)
+        return 0

@@ -1,0 +1,54 @@
+"""`rotorgram serve`: a policy as a UDP server, for simulators that come."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from ._flags import AgentFlags
+from ._inputs import check_count
+
+__all__ = ["Serve"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Serve(AgentFlags):
+    """Fly simulators that come, one after the other, with a trained policy or the PID."""
+
+    policy: Positional[str]
+    """Checkpoint, folder of a training, or pid."""
+    listen: Annotated[str | None, arg(metavar="HOST:PORT")] = "127.0.0.1:8001"
+    """Address to wait at."""
+    episodes: int | None = None
+    """End after so many episodes. Default: go on until Ctrl-C."""
+
+    def run(self) -> int:
+        """Fly episode after episode."""
+        from ..experiments.trajectories import evaluation_seed, fly
+        from ._env import chosen_env, load_checkpoint, policy_for, remote_env, words_of
+
+        check_count("episodes", self.episodes)
+        checkpoint = load_checkpoint(self.policy)
+        required = checkpoint is not None or bool(self.options) or "env" in self.given
+        episode = 0
+        with remote_env(self, *chosen_env(self, checkpoint), required=required) as env:
+            policy = policy_for(checkpoint, env.env_spec)
+            while self.episodes is None or episode < self.episodes:
+                with _next_simulator():
+                    flown = fly(env, policy, evaluation_seed(episode), episode)
+                    print(f"episode {episode}: {words_of(flown)}", flush=True)
+                    episode += 1
+        return 0
+
+
+@contextmanager
+def _next_simulator() -> Iterator[None]:
+    """A simulator that leaves is no error to an agent that waits for the next."""
+    from ..udp import LinkError
+
+    try:
+        yield
+    except LinkError as error:
+        print(error, flush=True)

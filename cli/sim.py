@@ -1,0 +1,85 @@
+"""`rotorgram sim`: the simulator, a UDP client."""
+
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from ._flags import EnvFlags
+from ._inputs import parse_address
+
+if TYPE_CHECKING:
+    from ..udp import Simulator
+
+__all__ = ["Sim"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sim(EnvFlags):
+    """Simulate drones for an agent: the UDP client.
+
+    Waits for the agent, flies by its commands and ends when it closes. An agent that is killed and
+    started again within the timeout finds it waiting.
+    """
+
+    server: str = "127.0.0.1:8001"
+    """Address of the agent, HOST:PORT."""
+    bind: str = "127.0.0.1:8000"
+    """Address of this side, HOST:PORT; port 0 takes a free one."""
+    num_envs: int = 1
+    """Drones."""
+    codec: Literal["binary", "text"] = "binary"
+    """binary, or the paper's text."""
+    timeout: float = 120.0
+    """Give up when the agent has been silent for so many seconds."""
+    key_file: Path | None = None
+    """Key that the agent has too (rotorgram key): needed beyond this machine."""
+    insecure: bool = False
+    """Allow addresses beyond this machine without a key: anyone who reaches them may take part."""
+    record: Path | None = None
+    """MCAP file to write every message to."""
+    view: Literal["window", "web"] | None = None
+    """Show what is flown, up to 16 drones: in a window, or on a page for browsers. Lock-step does
+    not wait for it. Keys: docs/viewing.md."""
+    view_port: int = 8080
+    """TCP port of the page, on this machine's loopback; 0 takes the first free one."""
+    world: Literal["airport", "plain"] = "airport"
+    """What is around the drones in the view."""
+    realtime: bool = False
+    """Fly no faster than real time, for viewers."""
+
+    def run(self) -> int:
+        """Simulate until the agent closes."""
+        from ..udp import LinkConfig, Simulator
+
+        simulator = Simulator(
+            self.env,
+            server=parse_address(self.server),
+            num_envs=self.num_envs,
+            bind=parse_address(self.bind),
+            codec=self.codec,
+            vehicle=self.vehicle,
+            config=LinkConfig(timeout=self.timeout),
+            key_file=self.key_file,
+            insecure=self.insecure,
+            record=self.record,
+            **self.options,
+        )
+        with simulator, self._watched(simulator):
+            here = "{}:{}".format(*simulator.address)
+            print(f"simulating at {here} for the agent at {self.server} (Ctrl-C ends)", flush=True)
+            try:
+                print(simulator.run())
+            finally:
+                print(f"wire: {simulator.link.statistics}", flush=True)
+        return 0
+
+    def _watched(self, simulator: "Simulator") -> AbstractContextManager[None]:
+        """Viewers; without any, nothing that draws is imported."""
+        if self.view is None and not self.realtime:
+            return nullcontext()
+        from ._watch import watched
+
+        return watched(
+            simulator, self.view, self.view_port, self.world, self.vehicle, realtime=self.realtime
+        )

@@ -1,0 +1,191 @@
+"""MCAP files: written so that a killed program leaves a readable file, and read in bounded memory.
+
+The records are those of the package `mcap`. Messages wait in a list, which costs the exchange
+next to nothing, and a chunk of them is written at once.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from errno import EFBIG, EINTR
+from io import BytesIO
+from pathlib import Path
+from threading import RLock
+from typing import BinaryIO, Final
+
+import zstandard
+from mcap.records import Chunk, McapRecord
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, Writer
+
+__all__ = ["MAGIC", "MAX_CHUNK", "Entry", "McapFile", "read_records"]
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+MAX_CHUNK: Final = 1 << 26
+"""Most bytes of a record or of a decompressed chunk that is read. Ours are of 64 KiB, or of one
+message and 256 KiB where that is longer."""
+_NEVER: Final = 1 << 40  # bytes; `flush` decides where a chunk ends
+_MAX_CHANNELS: Final = 0xFFFF
+
+Entry = tuple[int, int, int, bytes]
+"""A message that waits to be written: channel, nanoseconds since 1970, sequence number, data."""
+
+
+class McapFile:
+    """Appends to a new file, in whole records.
+
+    A write that an exception interrupts (a full device, Ctrl-C) may leave half a record. Then
+    nothing more can be written, and `abandon` closes the file after the last whole record.
+
+    Attributes:
+        pending: Messages of the next chunk. Append to it; `encode` and `flush` take them.
+
+    Args:
+        path: The file; it must not exist.
+        library: Name and version of the program that writes.
+
+    Raises:
+        FileExistsError: The file exists.
+        OSError: It cannot be written. All other methods raise this too.
+    """
+
+    def __init__(self, path: Path, library: str) -> None:
+        self.pending: list[Entry] = []
+        self._file = path.open("xb")
+        self._lock = RLock()
+        self._broken, self._busy = True, False
+        self._end = self._channels = 0
+        self._writer = Writer(self._file, chunk_size=_NEVER, compression=CompressionType.ZSTD)
+        try:
+            self._writer.start(profile="", library=library)
+            self._settle()
+        except BaseException:
+            self.abandon()
+            path.unlink()
+            raise
+
+    def add_schema(self, name: str, encoding: str, text: str) -> int:
+        """Its id."""
+        with self._lock:
+            self._broken = True
+            number: int = self._writer.register_schema(name, encoding, text.encode())
+            self._settle()
+            return number
+
+    def add_channel(self, topic: str, encoding: str, schema: int) -> int:
+        """Its id. A file has at most 65,535 channels."""
+        with self._lock:
+            if self._channels == _MAX_CHANNELS:
+                raise OSError(EFBIG, f"more than {_MAX_CHANNELS} channels")
+            self._broken = True
+            number: int = self._writer.register_channel(topic, encoding, schema)
+            self._channels += 1
+            self._settle()
+            return number
+
+    def add_metadata(self, name: str, words: Mapping[str, str]) -> None:
+        """Names and values, after all messages before."""
+        with self._lock:
+            self.flush()
+            self._broken = True
+            self._writer.add_metadata(name, dict(words))
+            self._settle()
+
+    def add_attachment(self, name: str, media_type: str, data: bytes, time: int) -> None:
+        """A whole file."""
+        with self._lock:
+            self.flush()
+            self._broken = True
+            self._writer.add_attachment(
+                create_time=0, log_time=time, name=name, media_type=media_type, data=data
+            )
+            self._settle()
+
+    def encode(self) -> None:
+        """Put the pending messages into the chunk that is written next."""
+        with self._lock:
+            if (
+                self._busy or self._file.closed
+            ):  # busy: called by a signal handler that interrupted us
+                return
+            if self._broken:
+                raise OSError(EINTR, "a write was interrupted")
+            self._broken = self._busy = True
+            count = len(self.pending)  # another thread may append meanwhile
+            try:
+                for channel, time, sequence, data in self.pending[:count]:
+                    self._writer.add_message(channel, time, data, time, sequence & 0xFFFFFFFF)
+            finally:
+                self._busy = False
+            del self.pending[:count]
+            self._broken = False
+
+    def flush(self) -> None:
+        """Write all messages as one chunk."""
+        with self._lock:
+            self.encode()
+            if not self._busy and not self._file.closed:
+                self._broken = True
+                self._writer.flush()  # type: ignore[no-untyped-call]
+                self._settle()
+
+    def finish(self) -> None:
+        """Write pending messages and the summary, and close the file. May be called again."""
+        with self._lock:
+            if self._busy or self._file.closed:
+                return
+            self.flush()
+            self._broken = True
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file after its last whole record. Pending messages are lost."""
+        with self._lock:
+            if self._file.closed:
+                return
+            raw = self._file.raw  # its buffer still holds the bytes that a full device refused
+            with suppress(OSError):
+                raw.truncate(self._end)
+            raw.close()
+
+    def _settle(self) -> None:
+        """Take note that all records up to here are whole."""
+        self._file.flush()
+        self._end = self._file.tell()
+        self._broken = False
+
+
+def read_records(file: BinaryIO) -> Iterator[McapRecord]:
+    """The records of an MCAP file, those in chunks too, in order.
+
+    Raises:
+        ValueError: A record or chunk is larger than `MAX_CHUNK`, or compressed in another way.
+        OSError: The file cannot be read.
+        Exception: Any other, of the package `mcap`, where the file is damaged or cut off.
+    """
+    reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_CHUNK)
+    for record in reader.records:
+        if isinstance(record, Chunk):
+            yield from breakup_chunk(_decompressed(record), validate_crc=True)
+        else:
+            yield record
+
+
+def _decompressed(chunk: Chunk) -> Chunk:
+    """The same chunk without compression. A short chunk can decompress to any number of bytes."""
+    if not chunk.compression:
+        return chunk
+    if chunk.compression != "zstd":
+        raise ValueError(f"expected a chunk compressed by zstd, got {chunk.compression!r:.80}")
+    if chunk.uncompressed_size > MAX_CHUNK:
+        size = chunk.uncompressed_size
+        raise ValueError(f"expected chunks of at most {MAX_CHUNK} bytes, got one of {size}")
+    stream = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK).stream_reader(
+        BytesIO(chunk.data)
+    )
+    data = stream.read(chunk.uncompressed_size + 1)
+    if len(data) != chunk.uncompressed_size:
+        size = chunk.uncompressed_size
+        raise ValueError(f"expected a chunk of {size} bytes, got one of another size")
+    return replace(chunk, compression="", data=data)

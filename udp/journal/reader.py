@@ -1,0 +1,346 @@
+"""Reads a journal, whole or cut off, and tells what is in it."""
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from mcap import records
+
+from ...envs.spec import EnvSpec
+from ...models.errors import InputError
+from ..layouts import layout_of
+from ..protocol import binary
+from ..protocol.errors import DecodeError
+from ..protocol.layout import Layout
+from ..protocol.messages import (
+    FLY,
+    Close,
+    Command,
+    Hello,
+    Message,
+    Refuse,
+    State,
+    Unknown,
+    Welcome,
+)
+from ._file import MAGIC, read_records
+from .writer import ABOUT, FORMAT
+
+__all__ = [
+    "Item",
+    "Recording",
+    "Session",
+    "SessionSummary",
+    "Summary",
+    "count_of",
+    "printable",
+    "read_journal",
+    "summarize",
+]
+
+_TOPIC: Final = re.compile(r"/slot([0-9]{1,9})/(state|command|events)")
+
+
+@dataclass(eq=False)
+class Session:
+    """One simulator at one slot of an agent, from its Hello on."""
+
+    index: int
+    """Counts the sessions of the file, from 1."""
+    slot: int
+    hello: Hello
+    """The text codec has no Hello. Then it is what the recording side knows, of session 0."""
+    codec: str
+    """`binary` or `text`."""
+    welcome: Welcome | None = None
+
+    @cached_property
+    def spec(self) -> EnvSpec:
+        """Of the env that is flown."""
+        return EnvSpec.from_json(self.hello.spec)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Of the States and Commands."""
+        return layout_of(self.spec, self.hello.worlds)
+
+    @property
+    def num_envs(self) -> int:
+        """Number of drones."""
+        return self.layout.drones
+
+    @property
+    def seed(self) -> int | None:
+        """Of the reset before the first State. None if only the simulator knows it."""
+        if self.welcome and self.welcome.seed is not None:
+            return self.welcome.seed
+        return self.hello.session if self.hello.session or self.codec == "binary" else None
+
+    def __str__(self) -> str:
+        return f"session {self.index} (slot {self.slot}, {self.hello.session:016x})"
+
+
+class Item(NamedTuple):
+    """A message of the journal."""
+
+    session: Session
+    time: int
+    """When it was sent or taken, nanoseconds since 1970."""
+    message: Message
+    datagram: bytes
+    """Its binary datagram, not sealed and not cut into fragments."""
+
+
+class Recording:
+    """The messages of a journal, in the order in which they were written. May be iterated again.
+
+    Nothing that the file names is imported or made: a spec is data.
+
+    Attributes:
+        path: The file.
+        about: Metadata of its head: side, env id, options, versions.
+        attachments: Files in its head, by name.
+        complete: Whether the file was finished, and could be read as far as was tried.
+        ending: How it ends, in words.
+
+    Raises:
+        OSError: The file cannot be read.
+        InputError: It is not a journal, or one of another version.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.about: dict[str, str] = {}
+        self.attachments: dict[str, bytes] = {}
+        with self.path.open("rb") as file:
+            head = file.read(len(MAGIC))
+            if head != MAGIC[: len(head)]:
+                raise InputError(f"{self.path}: expected an MCAP file, got another")
+            file.seek(-min(len(MAGIC), os.fstat(file.fileno()).st_size), os.SEEK_END)
+            self.complete = file.read() == MAGIC
+        self.ending = "complete" if self.complete else "cut off before its end"
+        for record in self._records():
+            if isinstance(record, records.Metadata) and record.name == ABOUT:
+                self.about = record.metadata
+            elif isinstance(record, records.Attachment):
+                self.attachments[record.name] = record.data
+            elif not isinstance(record, records.Header):
+                break
+        if self.about.get("format", FORMAT) != FORMAT or (self.complete and not self.about):
+            got = self.about.get("format", "another MCAP file")
+            raise InputError(f"{self.path}: expected a journal of format {FORMAT}, got {got!r:.80}")
+
+    def __iter__(self) -> Iterator[Item]:
+        topics: dict[int, tuple[int, str]] = {}
+        sessions: dict[int, Session] = {}
+        count = 0
+        for record in self._records():
+            if isinstance(record, records.Channel):
+                if match := _TOPIC.fullmatch(record.topic):
+                    topics[record.id] = int(match[1]), match[2]
+            elif isinstance(record, records.Message) and record.channel_id in topics:
+                slot, topic = topics[record.channel_id]
+                session = sessions.get(slot)
+                message, datagram, codec = self._message(topic, record.data, session)
+                if isinstance(message, Hello):
+                    count += 1
+                    session = sessions[slot] = Session(count, slot, message, codec)
+                elif session is None or message.session != session.hello.session:
+                    raise InputError(
+                        f"{self.path}: expected a message of the session of the last Hello, "
+                        f"got a {type(message).__name__} of {message.session:016x}"
+                    )
+                if isinstance(message, Welcome):
+                    session.welcome = message
+                yield Item(session, record.log_time, message, datagram)
+
+    def _message(
+        self, topic: str, data: bytes, session: Session | None
+    ) -> tuple[Message, bytes, str]:
+        codec = ""
+        try:
+            if topic == "events":
+                words = json.loads(data)
+                data, codec = bytes.fromhex(words["datagram"]), str(words.get("codec", ""))
+            message = binary.decode(data, session.layout if session else None)
+            if isinstance(message, Hello):
+                layout_of(EnvSpec.from_json(message.spec), message.worlds)
+            return message, data, codec
+        except (ValueError, KeyError, TypeError, AttributeError, DecodeError) as error:
+            raise InputError(f"{self.path}: a message that cannot be read: {error}") from None
+
+    def _records(self) -> Iterator[records.McapRecord]:
+        with self.path.open("rb") as file:
+            following = read_records(file)
+            while True:
+                try:
+                    record = next(following)
+                except StopIteration:
+                    return
+                except OSError:
+                    raise
+                except Exception as error:  # half a record raises anything
+                    what = f"damaged ({error})" if self.complete else "cut off"
+                    self.complete = False
+                    self.ending = f"{what} at or before byte {file.tell()}"
+                    return
+                yield record
+
+
+def read_journal(path: Path | str) -> Recording:
+    """The messages of a journal. One that a crash cut off is read up to the cut.
+
+    Raises:
+        OSError: The file cannot be read.
+        InputError: It is not a journal; while iterating: a message in it cannot be read.
+    """
+    return Recording(path)
+
+
+# ---- what is in it
+
+
+@dataclass(kw_only=True)
+class SessionSummary:
+    """Counts of one session."""
+
+    session: Session
+    first: int
+    """Time of its first message, nanoseconds since 1970."""
+    last: int
+    states: int = 0
+    steps: int = 0
+    """Of all drones together; resets do not count."""
+    episodes: int = 0
+    """Episodes that ended."""
+    returns: float = 0.0
+    """Sum of their returns."""
+    ending: str = "not closed"
+    """How it was closed or refused, in words."""
+
+    @property
+    def seconds(self) -> float:
+        """From its first message to its last."""
+        return (self.last - self.first) / 1e9
+
+    def __str__(self) -> str:
+        session = self.session
+        mean = f", mean return {self.returns / self.episodes:.2f}" if self.episodes else ""
+        return (
+            f"{session}: {count_of(session.num_envs, 'drone')} of {session.spec.env_id}, "
+            f"{session.codec}, {_clock(self.first)}, {self.seconds:.1f} s, {self.steps} steps, "
+            f"{self.episodes} episodes{mean}; {self.ending}"
+        )
+
+
+@dataclass(kw_only=True)
+class Summary:
+    """Counts of a journal."""
+
+    path: Path
+    side: str
+    """`simulator` or `agent`."""
+    complete: bool
+    ending: str
+    sessions: list[SessionSummary] = field(default_factory=list)
+
+    @property
+    def steps(self) -> int:
+        """Of all drones of all sessions."""
+        return sum(session.steps for session in self.sessions)
+
+    @property
+    def episodes(self) -> int:
+        """Episodes that ended, of all sessions."""
+        return sum(session.episodes for session in self.sessions)
+
+    @property
+    def mean_return(self) -> float | None:
+        """Of the episodes that ended; None without one."""
+        total = sum(session.returns for session in self.sessions)
+        return total / self.episodes if self.episodes else None
+
+    def __str__(self) -> str:
+        side = f"written by the {self.side}, " if self.side else ""
+        head = f"{self.path}: {side}{self.ending}, {count_of(len(self.sessions), 'session')}"
+        return printable([head, *map(str, self.sessions)])
+
+
+class _Tally:
+    """Counts the steps, episodes and returns of one session."""
+
+    def __init__(self, summary: SessionSummary) -> None:
+        self.summary = summary
+        self._returns = np.zeros(summary.session.num_envs)
+        self._command: Command | None = None
+
+    def take(self, item: Item) -> None:
+        summary, message = self.summary, item.message
+        summary.last = item.time
+        match message:
+            case Command():
+                self._command = message
+            case State():
+                self._take_state(message)
+            case Close(reason=reason) if reason:
+                summary.ending = f"closed: {reason}"
+            case Close() if not summary.ending.startswith("closed"):
+                summary.ending = "closed"
+            case Refuse(reason=reason):
+                summary.ending = f"refused: {reason}"
+            case Unknown():
+                summary.ending = "the agent does not know this session"
+
+    def _take_state(self, state: State) -> None:
+        summary, command = self.summary, self._command
+        summary.states += 1
+        resets = np.ones(len(state.rewards), bool) if command is None else command.resets
+        stepped = ~resets if command is None else command.orders == FLY
+        self._returns[resets] = 0.0
+        self._returns += np.where(stepped, state.rewards, 0.0)
+        summary.steps += int(stepped.sum())
+        ended = (state.terminated | state.truncated) & stepped
+        summary.episodes += int(ended.sum())
+        summary.returns += float(self._returns[ended].sum())
+
+
+def summarize(path: Path | str) -> Summary:
+    """Counts of a journal. Raises as `read_journal`."""
+    recording = read_journal(path)
+    tallies: dict[int, _Tally] = {}
+    for item in recording:
+        if item.session.index not in tallies:
+            summary = SessionSummary(session=item.session, first=item.time, last=item.time)
+            tallies[item.session.index] = _Tally(summary)
+        tallies[item.session.index].take(item)
+    return Summary(
+        path=recording.path,
+        side=recording.about.get("side", ""),
+        complete=recording.complete,
+        ending=recording.ending,
+        sessions=[tally.summary for tally in tallies.values()],
+    )
+
+
+def _clock(time: int) -> str:
+    return datetime.fromtimestamp(time // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def count_of(count: int, what: str) -> str:
+    """A number and a noun: 1 session, 2 sessions."""
+    return f"1 {what}" if count == 1 else f"{count} {what}s"
+
+
+def printable(lines: list[str]) -> str:
+    """Lines for a terminal. A journal can hold any text: no control character of it is shown."""
+    return "\n".join(
+        "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
+        for line in lines
+    )

@@ -1,0 +1,381 @@
+"""Writes the journal of a flight: every message once, in an MCAP file. See `docs/journal.md`.
+
+A State or a Command is written as its whole binary message, which is a valid ROS 1 message of
+arrays: the schema fixes their lengths, and any viewer of MCAP reads it. All other messages are
+JSON with the message in it as hexadecimal digits.
+"""
+
+import json
+import logging
+import platform
+import re
+import time
+import weakref
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Final
+
+from ...envs.spec import EnvSpec
+from ..layouts import layout_of
+from ..protocol import binary
+from ..protocol.layout import COMMAND_ARRAYS_AT, STATE_ARRAYS_AT, Layout, Slot
+from ..protocol.messages import Close, Command, Hello, Message, Refuse, State, Welcome
+from ..protocol.statistics import Statistics
+from ._file import McapFile
+
+__all__ = ["ABOUT", "FORMAT", "MODEL", "Journal", "model_of", "software"]
+
+ABOUT: Final = "rotorgram"
+"""Name of the metadata about the whole file; those of each session are named `session`."""
+FORMAT: Final = "2"
+"""Version of the content of the file, beside the protocol's version in each datagram."""
+MODEL: Final = "model.xml"
+"""Name of the attachment that is the whole vehicle of the simulator, as MJCF."""
+
+_CHUNK: Final = 1 << 16  # bytes; 2 ms to write
+_SECOND: Final = 10**9
+_STATISTICS: Final = 10 * _SECOND
+_SEEDED: Final = binary.COMMAND | 0x100
+"""Kind of a Command with seeds: its ROS 1 message has one more array."""
+_ONE: Final = object()
+_PACKAGES: Final = ("rotorgram", "mujoco", "gymnasium", "numpy", "mcap")
+
+_log: Final = logging.getLogger("rotorgram.udp")
+
+_HEADER: Final = (
+    "uint8[2] magic",
+    "uint8 version",
+    "uint8 type",
+    "uint32 crc",
+    "uint64 session",
+    "uint64 sequence",
+)
+_ROS_TYPES: Final = {"b": "bool", "f": "float", "i": "int", "u": "uint"}
+_EVENT: Final = (
+    "rotorgram.Event",
+    json.dumps(
+        {
+            "type": "object",
+            "required": ["type", "session", "datagram"],
+            "properties": {
+                "type": {"type": "string"},
+                "session": {"type": "string", "description": "number, hexadecimal"},
+                "sequence": {"type": "integer"},
+                "reason": {"type": "string"},
+                "datagram": {"type": "string", "description": "its binary message, hexadecimal"},
+            },
+        }
+    ),
+)
+_NUMBERS: Final = (
+    "rotorgram.Statistics",
+    json.dumps({"type": "object", "additionalProperties": {"type": "number"}}),
+)
+
+
+class Journal:
+    """Writes every message that the tap of a link sees. A flight goes on when its journal cannot.
+
+    At most one second of messages is in memory only. The file is complete after `close`, and when
+    the journal is garbage-collected or the program ends; otherwise it can be read up to its end.
+
+    Args:
+        path: The file; it must not exist.
+        side: `simulator` or `agent`.
+        text_hello: Stands for the Hello that the text codec does not have. An agent gives it the
+            session 0.
+        model: MJCF of the vehicle, to keep in the file.
+    """
+
+    def __init__(
+        self, path: Path | str, *, side: str, text_hello: Hello | None = None, model: str = ""
+    ) -> None:
+        self._path = Path(path)
+        self._side = side
+        self._model = model
+        self._text_hello = text_hello
+        self._text_layout = _layout_of(text_hello) if text_hello else None
+        self._slots: Sequence[object] = ()
+        self._holders: dict[int, object] = {}
+        self._schemas: dict[str, dict[str, int]] = {}
+        self._topics: dict[tuple[str, int], int] = {}
+        self._channels: dict[tuple[int, int], int] = {}
+        """Channel by slot and kind: State, Command, or Command with seeds."""
+        self._size = self._sessions = 0
+        self._open = False
+
+    def start(self, statistics: Statistics, slots: Sequence[object] = ()) -> None:
+        """Make the file. Nothing is written before.
+
+        Args:
+            statistics: Those of the link. They are written every 10 s, and at the end.
+            slots: Who holds each slot of an agent; another holder is another session. Only the
+                text codec needs it, where all sessions have the same number.
+
+        Raises:
+            FileExistsError: The file exists.
+            OSError: It cannot be written.
+        """
+        now = self._flushed = self._counted = time.time_ns()
+        versions = software()
+        about = {f"version of {name}": number for name, number in versions.items()}
+        try:
+            file = McapFile(self._path, f"rotorgram {versions.get('rotorgram', '')}")
+        except FileExistsError:
+            raise FileExistsError(
+                f"record: expected a file that does not exist yet, got {self._path}"
+            ) from None
+        try:
+            file.add_metadata(ABOUT, {"format": FORMAT, "side": self._side, **about})
+            if self._model:
+                file.add_attachment(MODEL, "application/xml", self._model.encode(), now)
+        except BaseException:
+            file.abandon()
+            self._path.unlink()
+            raise
+        self._file, self._pending = file, file.pending
+        self._statistics, self._slots = statistics, slots
+        self._finalizer = weakref.finalize(self, _finish, file, self._path)
+        self._open = True
+
+    def tap(self, slot: int, message: Message, datagram: bytes) -> None:
+        """Take note of a message. `write` pays for writing it.
+
+        Args:
+            slot: Of the agent; 0 at a simulator.
+            message: Any message.
+            datagram: Its whole binary message, not sealed. Empty for one by text.
+        """
+        now = time.time_ns()
+        if not self._open:
+            return
+        try:
+            if not isinstance(message, Hello) and (
+                not message.session or (slot, binary.STATE) not in self._channels
+            ):
+                self._begin_by_text(slot, now)
+                datagram = datagram or binary.encode(message, self._text_layout)
+            if isinstance(message, State | Command):
+                seeded = isinstance(message, Command) and message.seeds is not None
+                channel = self._channels[slot, _SEEDED if seeded else datagram[3]]
+                self._pending.append((channel, now, message.sequence, datagram))
+            else:
+                if isinstance(message, Hello):
+                    self._begin(slot, message, "binary", now)
+                words = _words(message, datagram)
+                self._add_json(f"/slot{slot}/events", _EVENT, words, now)
+            self._size += len(datagram)
+            if self._size > 4 * _CHUNK:  # nobody calls `write`
+                self._flush(now)
+        except OSError as error:
+            self._give_up(error)
+
+    def write(self) -> None:
+        """Write the messages. Call it when there is time: while the other side is at work."""
+        if not self._open:
+            return
+        now = time.time_ns()
+        try:
+            self._file.encode()
+            # Clocks are set back at times.
+            if self._size > _CHUNK or not 0 <= now - self._flushed < _SECOND:
+                self._flush(now)
+        except OSError as error:
+            self._give_up(error)
+
+    def close(self) -> None:
+        """Write all, and finish the file. May be called again."""
+        if not self._open:
+            return
+        try:
+            self._count(time.time_ns())
+        except OSError as error:
+            self._give_up(error)
+        self._open = False
+        _finish(self._file, self._path)
+        self._finalizer.detach()  # not before: Ctrl-C may have come in between
+
+    def _flush(self, now: int) -> None:
+        if not 0 <= now - self._counted < _STATISTICS:
+            self._count(now)
+        self._file.flush()
+        self._size, self._flushed = 0, now
+
+    def _give_up(self, error: OSError) -> None:
+        self._open = False
+        _abandon(self._file, self._path, error)
+        self._finalizer.detach()  # not before: Ctrl-C may have come in between
+
+    # ---- sessions
+
+    def _begin_by_text(self, slot: int, now: int) -> None:
+        """Begin a session if this is the first message of a new text simulator."""
+        hello = self._text_hello
+        assert hello is not None, "the text codec needs a text_hello"
+        holder = self._slots[slot] if self._slots else _ONE  # a simulator has one agent
+        if holder is not self._holders.get(slot):
+            self._holders[slot] = holder
+            self._begin(slot, hello, "text", now)
+            words = _words(hello, binary.encode(hello)) | {"codec": "text"}
+            self._add_json(f"/slot{slot}/events", _EVENT, words, now)
+
+    def _begin(self, slot: int, hello: Hello, codec: str, now: int) -> None:
+        """Take note of a new session, whose messages may have another layout."""
+        self._flush(now)
+        self._sessions += 1
+        spec = EnvSpec.from_json(hello.spec)
+        layout = _layout_of(hello)
+        words = {
+            "index": str(self._sessions),
+            "slot": str(slot),
+            "session": f"{hello.session:016x}",
+            "codec": codec,
+            "drones": str(layout.drones),
+            "spec": hello.spec,
+        }
+        self._file.add_metadata("session", words)
+        for kind, topic, name, text in (
+            (binary.STATE, "state", "State", _state_schema(spec, layout)),
+            (binary.COMMAND, "command", "Command", _command_schema(layout, seeded=False)),
+            (_SEEDED, "command", "SeededCommand", _command_schema(layout, seeded=True)),
+        ):
+            schema = self._schema(f"rotorgram/{name}", "ros1msg", text)
+            self._channels[slot, kind] = self._topic(f"/slot{slot}/{topic}", "ros1", schema)
+
+    def _count(self, now: int) -> None:
+        self._counted = now
+        self._add_json("/statistics", _NUMBERS, self._statistics.numbers(), now)
+
+    def _add_json(
+        self, topic: str, schema: tuple[str, str], words: Mapping[str, Any], now: int
+    ) -> None:
+        name, text = schema
+        channel = self._topic(topic, "json", self._schema(name, "jsonschema", text))
+        self._pending.append((channel, now, 0, json.dumps(words).encode()))
+
+    def _schema(self, name: str, encoding: str, text: str) -> int:
+        """Id of a schema. A second one of the same name, of another layout, is numbered."""
+        known = self._schemas.setdefault(name, {})
+        if text not in known:
+            number = f"{len(known) + 1}" if known else ""
+            known[text] = self._file.add_schema(name + number, encoding, text)
+        return known[text]
+
+    def _topic(self, topic: str, encoding: str, schema: int) -> int:
+        if (topic, schema) not in self._topics:
+            self._topics[topic, schema] = self._file.add_channel(topic, encoding, schema)
+        return self._topics[topic, schema]
+
+
+def software() -> dict[str, str]:
+    """Versions of the software that the numbers depend on, and the machine."""
+    versions = {"python": platform.python_version(), "machine": platform.machine()}
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return versions
+
+
+def model_of(stepped: Any) -> str:
+    """The whole MJCF of what a simulator steps, its includes resolved; "" if it has none."""
+    task = getattr(stepped, "task", None)
+    if task is not None:
+        from ...models.scene import build_scene
+
+        return str(build_scene(task.vehicle.path, visual=False).to_xml())
+    # As the MuJoCo envs of Gymnasium have it.
+    path = getattr(stepped.envs[0].unwrapped, "fullpath", None)
+    if not isinstance(path, str):
+        return ""
+    try:
+        import mujoco
+
+        return str(mujoco.MjSpec.from_file(path).to_xml())
+    except (ImportError, ValueError, OSError):
+        return ""
+
+
+# ---- ROS 1 messages
+
+
+def _state_schema(spec: EnvSpec, layout: Layout) -> str:
+    """A State of this layout as a ROS 1 message."""
+    observation = _field_names("observation", (array.name for array in spec.observation))
+    telemetry = _field_names("telemetry", (array.name for array in spec.telemetry))
+    slots = (*layout.observation_slots, layout.rewards, *layout.flags, *layout.telemetry_slots)
+    names = (*observation, "rewards", "terminated", "truncated", *telemetry)
+    fixed = ("float64 time", "uint64 nonce")
+    return _schema_text(fixed, STATE_ARRAYS_AT, zip(names, slots, strict=True))
+
+
+def _command_schema(layout: Layout, *, seeded: bool) -> str:
+    """A Command of this layout as a ROS 1 message."""
+    arrays = [("actions", layout.actions), ("orders", layout.orders), ("seeds", layout.seeds)]
+    fixed = ("uint32 seed_count", "uint8[4] reserved")
+    return _schema_text(fixed, COMMAND_ARRAYS_AT, arrays if seeded else arrays[:2])
+
+
+def _schema_text(fixed: Iterable[str], at: int, arrays: Iterable[tuple[str, Slot]]) -> str:
+    lines = [*_HEADER, *fixed]
+    for name, slot in arrays:
+        if slot.at > at:
+            lines.append(f"uint8[{slot.at - at}] padding{at}")
+        dtype = slot.dtype
+        bits = "" if dtype.kind == "b" else str(8 * dtype.itemsize)
+        count = (slot.end - slot.at) // dtype.itemsize
+        lines.append(f"{_ROS_TYPES[dtype.kind]}{bits}[{count}] {name}")
+        at = slot.end
+    return "\n".join(lines) + "\n"
+
+
+def _field_names(prefix: str, names: Iterable[str]) -> list[str]:
+    """Names made into different ones that ROS 1 allows."""
+    fields: list[str] = []
+    for name in names:
+        field = f"{prefix}_{re.sub(r'[^a-zA-Z0-9_]', '_', name)}"
+        while field in fields:
+            field += "_"
+        fields.append(field)
+    return fields
+
+
+def _layout_of(hello: Hello) -> Layout:
+    return layout_of(EnvSpec.from_json(hello.spec), hello.worlds)
+
+
+def _words(message: Message, datagram: bytes) -> dict[str, Any]:
+    """A message for readers, and its datagram for programs."""
+    words: dict[str, Any] = {"type": type(message).__name__, "session": f"{message.session:016x}"}
+    match message:
+        case Hello():
+            words |= {"codec": "binary", "worlds": message.worlds, "spec": message.spec}
+        case Welcome(seed=seed):
+            words["seed"] = None if seed is None else str(seed)
+        case Close(sequence=sequence, reason=reason):
+            words |= {"sequence": sequence, "reason": reason}
+        case Refuse(reason=reason):
+            words["reason"] = reason
+    return words | {"datagram": datagram.hex()}
+
+
+# ---- the end
+
+
+def _finish(file: McapFile, path: Path) -> None:
+    """Finish a file, also when its program ends."""
+    try:
+        file.finish()
+    except OSError as error:
+        _abandon(file, path, error)
+
+
+def _abandon(file: McapFile, path: Path, error: OSError) -> None:
+    _log.warning(
+        "record: writing %s failed (%s): the flight goes on, its journal ends here",
+        path,
+        error.strerror or error,
+    )
+    with suppress(OSError):  # what was written can be read
+        file.abandon()

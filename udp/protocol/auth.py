@@ -1,0 +1,162 @@
+"""A shared key: datagrams that only those who hold it can make.
+
+A sealed datagram is an envelope of 24 bytes before the message:
+
+    0   2 bytes   magic a7 53
+    2   6 bytes   id of the key: so that an agent may hold several while they are changed
+    8   16 bytes  tag: keyed BLAKE2b (RFC 7693) of the message, `person` of the sender's side
+
+What opens a session is tagged with the shared key; all that follows with a key that both sides'
+random numbers enter, so that nothing of another session is ever taken. Nothing is hidden: sealing
+authenticates, it does not encrypt.
+"""
+
+import os
+import secrets
+import stat
+from contextlib import suppress
+from hashlib import blake2b
+from hmac import compare_digest
+from pathlib import Path
+from typing import Final, Literal
+
+from ...models.errors import InputError
+from .errors import Forged
+
+__all__ = [
+    "KEY_SIZE",
+    "OVERHEAD",
+    "Key",
+    "is_sealed",
+    "key_id",
+    "message_of",
+    "read_keys",
+    "write_key",
+]
+
+KEY_SIZE: Final = 32
+"""Bytes of a shared key."""
+OVERHEAD: Final = 24
+"""Bytes that sealing adds to a datagram."""
+
+_MAGIC: Final = b"\xa7S"
+_ID_SIZE: Final = 6
+_TAG_AT: Final = 2 + _ID_SIZE
+_TAG_SIZE: Final = 16
+_LONGEST_FILE: Final = 1 << 12
+"""Bytes."""
+
+Side = Literal["simulator", "agent"]
+
+
+class Key:
+    """Seals and opens datagrams. Each side's tags are its own: none can be sent back to it.
+
+    Args:
+        secret: `KEY_SIZE` bytes that both sides hold.
+        side: The side that is here.
+        id_: Id in the envelope; empty: that of this secret.
+    """
+
+    def __init__(self, secret: bytes, side: Side, *, id_: bytes = b"") -> None:
+        if len(secret) != KEY_SIZE:
+            raise InputError(f"key: expected {KEY_SIZE} bytes, got {len(secret)}")
+        self._secret = secret
+        self.id = id_ or blake2b(key=secret, digest_size=_ID_SIZE, person=b"key id").digest()
+        """Of the shared key, 6 bytes; a session's key has that of the shared one."""
+        self._envelope = _MAGIC + self.id
+        self._side = side
+        there = "agent" if side == "simulator" else "simulator"
+        # A keyed state is copied for each datagram: half the price of making one anew.
+        self._ours = blake2b(key=secret, digest_size=_TAG_SIZE, person=side.encode())
+        self._theirs = blake2b(key=secret, digest_size=_TAG_SIZE, person=there.encode())
+
+    def for_session(self, session: int, nonce: int) -> "Key":
+        """The key of one session, from the random numbers of both sides, 64 bits each."""
+        numbers = session.to_bytes(8, "little") + nonce.to_bytes(8, "little")
+        secret = blake2b(numbers, key=self._secret, digest_size=KEY_SIZE, person=b"session")
+        return Key(secret.digest(), self._side, id_=self.id)
+
+    def seal(self, message: bytes, asked: bytes = b"") -> bytes:
+        """The datagram that carries a message. Only who has sent `asked` takes it for an answer."""
+        tag = self._ours.copy()
+        tag.update(message + asked)
+        return self._envelope + tag.digest() + message
+
+    def open(self, datagram: bytes, asked: bytes = b"") -> bytes:
+        """The message in a sealed datagram. Raises `Forged` if the key is another one."""
+        message = message_of(datagram)
+        tag = self._theirs.copy()
+        tag.update(message + asked)
+        envelope, theirs = datagram[:_TAG_AT], datagram[_TAG_AT:OVERHEAD]
+        if not (envelope == self._envelope and compare_digest(tag.digest(), theirs)):
+            raise Forged("key: the tag is not of this key and session")
+        return message
+
+
+def is_sealed(datagram: bytes) -> bool:
+    """Whether a datagram says of itself that it is sealed."""
+    return datagram[:2] == _MAGIC
+
+
+def key_id(datagram: bytes) -> bytes:
+    """The id of the key that a sealed datagram claims."""
+    return datagram[2:_TAG_AT]
+
+
+def message_of(datagram: bytes) -> bytes:
+    """The message that a sealed datagram claims to carry, not verified."""
+    return datagram[OVERHEAD:]
+
+
+def read_keys(path: Path | str) -> tuple[bytes, ...]:
+    """The shared keys of a file: one or more lines of 64 hexadecimal digits.
+
+    A simulator seals with the first. An agent takes what is sealed with any of them: to change a
+    key, add the new one to the agent's file, give it to the simulators, then remove the old one.
+
+    Raises:
+        InputError: The file cannot be read, holds something else, or is readable by others.
+    """
+    try:
+        # A FIFO would block for ever.
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+        with open(descriptor, "rb") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            text = file.read(_LONGEST_FILE) if stat.S_ISREG(mode) else b""
+    except OSError as error:
+        raise InputError(f"key file: cannot read {path}: {error.strerror}") from None
+    if os.name == "posix" and stat.S_ISREG(mode) and mode & 0o077:
+        raise InputError(
+            f"key file: expected {path} to be readable by its owner alone (chmod 600), "
+            f"got mode {mode & 0o777:o}"
+        )
+    try:
+        keys = tuple(bytes.fromhex(line) for line in text.decode("ascii").split())
+    except ValueError:
+        keys = ()
+    if not keys or any(len(key) != KEY_SIZE for key in keys):
+        raise InputError(f"key file: expected {2 * KEY_SIZE} hexadecimal digits in {path}")
+    return keys
+
+
+def write_key(path: Path) -> None:
+    """Write a new random key to a new file, readable by its owner alone.
+
+    Raises:
+        FileExistsError: There is such a file; a key is never replaced.
+        OSError: It cannot be written; then there is no file.
+    """
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+    try:
+        descriptor = os.open(path, flags, 0o600)
+    except FileExistsError as error:
+        sentence = "expected a new file, got one that is there; a key is never replaced"
+        raise FileExistsError(error.errno, sentence, str(path)) from None
+    try:
+        with open(descriptor, "w", encoding="ascii") as file:
+            file.write(secrets.token_hex(KEY_SIZE) + "\n")
+    except OSError as error:
+        with suppress(OSError):
+            os.unlink(path)
+        raise OSError(error.errno, error.strerror, str(path)) from None

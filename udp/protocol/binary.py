@@ -1,0 +1,513 @@
+"""The binary codec: messages to bytes and back, as pure functions. Little-endian throughout.
+
+Every message, and every fragment of one, begins with 24 bytes:
+
+    0   2 bytes  magic a7 52
+    2   u8       version: 2. A Hello is written in the lowest version that its simulator speaks
+    3   u8       type; plus 128 in a fragment: see `fragments`
+    4   u32      CRC-32 (zlib, PNG) of bytes 0-3 followed by bytes 8-end
+    8   u64      session
+    16  u64      sequence number; 0 in Hello, Welcome, Refuse and Wait
+
+    Hello 1, simulator to agent       24  u8   lowest version that it speaks
+                                      25  u8   highest
+                                      26  2 bytes reserved
+                                      28  u32  number of worlds W
+                                      32  u32  bytes of the spec L
+                                      36  4 bytes reserved
+                                      40  L bytes: the EnvSpec, JSON in UTF-8
+                                      40 + L   extensions, to the end
+    Welcome 2, agent to simulator     24  u64  nonce
+                                      32  u64  seed of the simulator's first reset
+                                      40  u8   1 if there is a seed, else 0
+                                      41  u8   version of all that follows
+                                      42  6 bytes reserved
+                                      48       extensions, to the end
+    Refuse 3, agent to simulator      24  u16 and so many bytes of UTF-8: reason
+    State 4, simulator to agent       24  f64  simulated time, s
+                                      32  u64  nonce of the Welcome in State 1; else 0
+                                      40       arrays: see `layout`
+    Command 5, agent to simulator     24  u32  number of seeds, 0 or N
+                                      28  4 bytes reserved
+                                      32       arrays: see `layout`
+    Close 6, either                   24  u16 and so many bytes of UTF-8: reason
+    Wait 7, agent to simulator        the header alone
+    Unknown 8, agent to simulator     the header alone; sequence number of the State it answers
+    Alive 9, simulator to agent       the header alone; sequence number of the Command
+    Missing 10, either                24  u8   type of the message: 1, 4 or 5
+                                      25  1 byte reserved
+                                      26  u16  number of its fragments
+                                      28  u16  fragment that bit 0 stands for
+                                      30       bitmap to the end, at least 1 byte, lowest bit first
+
+An extension is a u16 (bits 0-14 its type, bit 15 set if it is critical), a u16 length of at most
+512, and so many bytes. A side skips what it does not know; it does not go on if that is critical.
+Reserved bytes are sent as 0 and ignored. The header, the layout of a fragment, the first two fields
+of Hello and the whole of Refuse are those of every version.
+"""
+
+import struct
+import zlib
+from collections.abc import Callable
+from math import isfinite
+from typing import Any, Final
+
+import numpy as np
+
+from ...models.errors import InputError
+from .errors import DecodeError, VersionMismatch
+from .layout import COMMAND_ARRAYS_AT, MAX_MESSAGE, STATE_ARRAYS_AT, Layout, Slot
+from .messages import (
+    MAX_SPEC,
+    MAX_TEXT,
+    Alive,
+    Close,
+    Command,
+    Extension,
+    Hello,
+    Message,
+    Missing,
+    Refuse,
+    State,
+    Unknown,
+    Wait,
+    Welcome,
+)
+
+__all__ = [
+    "ALIVE",
+    "CLOSE",
+    "COMMAND",
+    "FRAGMENT",
+    "HEADER_SIZE",
+    "HELLO",
+    "MAGIC",
+    "MISSING",
+    "OF_SESSION",
+    "REFUSE",
+    "STATE",
+    "UNKNOWN",
+    "VERSION",
+    "check",
+    "decode",
+    "encode",
+    "frame",
+    "peek",
+]
+
+MAGIC: Final = b"\xa7R"
+"""Not UTF-8, so that no text datagram begins with it."""
+VERSION: Final = 2
+HEADER_SIZE: Final = 24
+
+HELLO: Final = 1
+_WELCOME: Final = 2
+REFUSE: Final = 3
+STATE: Final = 4
+COMMAND: Final = 5
+CLOSE: Final = 6
+_WAIT: Final = 7
+UNKNOWN: Final = 8
+ALIVE: Final = 9
+MISSING: Final = 10
+
+FRAGMENT: Final = 0x80
+"""Set in the type of a fragment of a message."""
+OF_SESSION: Final = frozenset({STATE, COMMAND, CLOSE, ALIVE})
+"""Types that belong to an open session, as Missing does but for that of a Hello."""
+
+_NUMBERED: Final = OF_SESSION | {UNKNOWN, MISSING}
+"""Types that have a sequence number."""
+_MAY_BE_CUT: Final = (HELLO, STATE, COMMAND)
+
+_HEADER: Final = struct.Struct("<2sBBIQQ")
+_NUMBERS: Final = struct.Struct("<QQ")  # session, sequence: the end of the header
+_HELLO_BODY: Final = struct.Struct("<BB2xII4x")
+_WELCOME_BODY: Final = struct.Struct("<QQBB6x")
+_STATE_BODY: Final = struct.Struct("<dQ")
+_COMMAND_BODY: Final = struct.Struct("<I4x")
+_MISSING_BODY: Final = struct.Struct("<BxHH")
+_EXTENSION: Final = struct.Struct("<HH")
+_LENGTH: Final = struct.Struct("<H")
+_CRITICAL: Final = 1 << 15
+_FLAGS: Final = b"\0\1"
+_ORDERS: Final = b"\0\1\2"
+_BOOL: Final = np.dtype(bool)
+_U8: Final = np.dtype(np.uint8)
+_F8: Final = np.dtype("<f8")
+_PADS: Final = tuple(bytes(size) for size in range(8))
+
+
+def encode(message: Message, layout: Layout | None = None) -> bytes:
+    """The bytes of a message, whole.
+
+    Args:
+        message: Any message.
+        layout: That of the Hello; a State or a Command needs it.
+
+    Raises:
+        InputError: A number, an array or the whole does not fit.
+    """
+    kind = type(message)
+    start, crc, encoder = _ENCODERS[kind]
+    try:
+        numbers = _NUMBERS.pack(message.session, getattr(message, "sequence", 0))
+        rest = numbers + encoder(message, layout)
+    except struct.error as error:
+        raise InputError(f"{kind.__name__}: {error}") from None
+    if len(rest) + 8 > MAX_MESSAGE:
+        got = len(rest) + 8
+        raise InputError(f"{kind.__name__}: expected at most {MAX_MESSAGE} bytes, got {got}")
+    return start + zlib.crc32(rest, crc).to_bytes(4, "little") + rest
+
+
+def frame(kind: int, session: int, sequence: int, body: bytes) -> bytes:
+    """A datagram: header and body."""
+    start, numbers = MAGIC + bytes((VERSION, kind)), _NUMBERS.pack(session, sequence)
+    crc = zlib.crc32(body, zlib.crc32(numbers, zlib.crc32(start)))
+    return b"".join((start, crc.to_bytes(4, "little"), numbers, body))
+
+
+def check(datagram: bytes) -> tuple[int, int, int]:
+    """Type, session and sequence of a datagram whose header is as it should be.
+
+    Raises `DecodeError` otherwise.
+    """
+    if len(datagram) < HEADER_SIZE:
+        raise DecodeError(f"header: expected {HEADER_SIZE} bytes, got {len(datagram)}")
+    magic, version, kind, crc, session, sequence = _HEADER.unpack_from(datagram)
+    if magic != MAGIC:
+        raise DecodeError(f"magic: expected {MAGIC.hex()}, got {magic.hex()}")
+    if zlib.crc32(datagram[8:], zlib.crc32(datagram[:4])) != crc:
+        raise DecodeError("checksum: the datagram was changed on its way")
+    if version != VERSION and kind != REFUSE:
+        raise VersionMismatch(f"protocol version: expected {VERSION}, got {version}")
+    if sequence and kind & ~FRAGMENT not in _NUMBERED:
+        raise DecodeError(f"sequence: expected 0 in type {kind}, got {sequence}")
+    return kind, session, sequence
+
+
+def decode(datagram: bytes, layout: Layout | None = None) -> Message:
+    """The message in these bytes. Raises `DecodeError`, and nothing else, for any other bytes.
+
+    Args:
+        datagram: A whole message, its fragments put together.
+        layout: That of the Hello; without it no State and no Command can be read.
+    """
+    kind, session, sequence = check(datagram)
+    decoder = _DECODERS.get(kind)
+    if decoder is None:
+        raise DecodeError(f"type: expected 1 to {len(_DECODERS)}, got {kind}")
+    try:
+        return decoder(datagram, session, sequence, layout)
+    except (ValueError, struct.error) as error:
+        raise DecodeError(f"{decoder.__name__[8:]}: {error}") from None
+
+
+def peek(datagram: bytes) -> tuple[int, int, int]:
+    """Type, session and sequence that a datagram claims, nothing verified; zeros if it has none.
+
+    The type of a fragment is that of its message.
+    """
+    if len(datagram) < HEADER_SIZE or datagram[:2] != MAGIC:
+        return 0, 0, 0
+    _, _, kind, _, session, sequence = _HEADER.unpack_from(datagram)
+    return kind & ~FRAGMENT, session, sequence
+
+
+# ---- State and Command
+
+
+def _encode_state(m: State, layout: Layout | None) -> bytes:
+    layout = _expect(layout)
+    slots = (*layout.observation_slots, layout.rewards, *layout.flags, *layout.telemetry_slots)
+    arrays = (*m.observations, m.rewards, m.terminated, m.truncated, *m.telemetry)
+    if len(arrays) != len(slots):
+        raise InputError(f"State: expected {len(slots)} arrays, got {len(arrays)}")
+    pieces = [_STATE_BODY.pack(m.time, m.nonce)]
+    at = STATE_ARRAYS_AT
+    for slot, array in zip(slots, arrays, strict=True):
+        if at != slot.at:
+            pieces.append(_PADS[slot.at - at])
+        pieces.append(_bytes_of("State", slot, array))
+        at = slot.end
+    body = b"".join(pieces)
+    numbers = layout.state_numbers
+    if numbers is None or not _adds_up(numbers.unpack_from(body)):
+        floats = (*layout.observation_slots, layout.rewards, *layout.telemetry_slots)
+        _expect_finite(_HEADERLESS + body, m.time, floats)
+    return body
+
+
+def _decode_state(data: bytes, session: int, sequence: int, layout: Layout | None) -> State:
+    layout = _expect(layout)
+    _expect_size(data, layout.state_size)
+    time, nonce = _STATE_BODY.unpack_from(data, HEADER_SIZE)
+    numbers = layout.state_numbers
+    if numbers is None or not _adds_up(numbers.unpack_from(data, HEADER_SIZE)):
+        floats = (*layout.observation_slots, layout.rewards, *layout.telemetry_slots)
+        _expect_finite(data, time, floats)
+    terminated, truncated = layout.flags
+    _expect_flags(data[terminated.at : truncated.end], _FLAGS)
+    return State(
+        session=session,
+        sequence=sequence,
+        time=time,
+        nonce=nonce,
+        observations=tuple([slot.view(data) for slot in layout.observation_slots]),
+        rewards=layout.rewards.view(data),
+        terminated=terminated.view(data),
+        truncated=truncated.view(data),
+        telemetry=tuple([slot.view(data) for slot in layout.telemetry_slots]),
+    )
+
+
+def _encode_command(m: Command, layout: Layout | None) -> bytes:
+    layout = _expect(layout)
+    actions, orders = layout.actions, layout.orders
+    pieces = [
+        _COMMAND_BODY.pack(0 if m.seeds is None else layout.drones),
+        _bytes_of("Command", actions, m.actions),
+        _PADS[orders.at - actions.end],
+        _bytes_of("Command", orders, m.orders),
+    ]
+    if m.seeds is not None:
+        pieces += [_PADS[layout.seeds.at - orders.end], _bytes_of("Command", layout.seeds, m.seeds)]
+    body = b"".join(pieces)
+    _check_command(_HEADERLESS + body, layout)
+    return body
+
+
+def _decode_command(data: bytes, session: int, sequence: int, layout: Layout | None) -> Command:
+    layout = _expect(layout)
+    (count,) = _COMMAND_BODY.unpack_from(data, HEADER_SIZE)
+    if count not in (0, layout.drones):
+        raise InputError(f"seeds: expected 0 or {layout.drones}, got {count}")
+    _expect_size(data, layout.seeds.end if count else layout.orders.end)
+    _check_command(data, layout)
+    return Command(
+        session=session,
+        sequence=sequence,
+        actions=layout.actions.view(data),
+        orders=layout.orders.view(data),
+        seeds=layout.seeds.view(data) if count else None,
+    )
+
+
+def _check_command(data: bytes, layout: Layout) -> None:
+    actions, orders = layout.actions, layout.orders
+    _expect_flags(data[orders.at : orders.end], _ORDERS)
+    if layout.choices:
+        numbers = actions.view(data)
+        wrong = (numbers < 0) | (numbers >= layout.choices)
+        if wrong.any():
+            raise InputError(
+                f"action: expected a choice 0 to {layout.choices - 1}, got {numbers[wrong][0]}"
+            )
+        return
+    quick = layout.command_numbers
+    if quick is None or not _adds_up(quick.unpack_from(data, COMMAND_ARRAYS_AT)):
+        _expect_finite(data, 0.0, (actions,))
+
+
+def _bytes_of(what: str, slot: Slot, array: np.ndarray) -> bytes:
+    """Bytes of an array that has to be that of a slot. Numbers are never converted."""
+    if array.shape != slot.shape or array.dtype != slot.dtype:
+        raise InputError(
+            f"{what}: expected {slot.dtype.name} of shape {slot.shape}, "
+            f"got {array.dtype.name} of shape {array.shape}"
+        )
+    return array.tobytes()
+
+
+def _adds_up(numbers: tuple[Any, ...]) -> bool:
+    """Whether all are finite for sure: NaN and infinity stay in a sum. Huge ones may overflow."""
+    return isfinite(sum(numbers))
+
+
+def _expect_finite(data: bytes, time: float, slots: tuple[Slot, ...]) -> None:
+    if not isfinite(time):
+        raise InputError(f"time: expected a finite number, got {time}")
+    for slot in slots:
+        if slot.dtype.kind == "f":
+            array = slot.view(data)
+            finite = np.isfinite(array)
+            if not finite.all():
+                first = np.argwhere(~finite)[0].tolist()
+                raise InputError(f"expected finite numbers, got {array[*first]} at {first}")
+
+
+def _expect(layout: Layout | None) -> Layout:
+    if layout is None:
+        raise InputError("expected a Hello before it, got none")
+    return layout
+
+
+def _expect_size(data: bytes, size: int) -> None:
+    if len(data) != size:
+        raise InputError(f"expected {size} bytes, got {len(data)}")
+
+
+def _expect_flags(flags: bytes, allowed: bytes) -> None:
+    if wrong := flags.translate(None, allowed):
+        raise InputError(f"flags: expected 0 to {len(allowed) - 1}, got {wrong[0]}")
+
+
+_HEADERLESS: Final = bytes(HEADER_SIZE)
+
+
+# ---- all others
+
+
+def _encode_hello(m: Hello, layout: Layout | None) -> bytes:
+    spec = m.spec.encode()
+    return _HELLO_BODY.pack(*m.versions, m.worlds, len(spec)) + spec + _extensions(m.extensions)
+
+
+def _decode_hello(data: bytes, session: int, sequence: int, layout: Layout | None) -> Hello:
+    low, high, worlds, size = _HELLO_BODY.unpack_from(data, HEADER_SIZE)
+    at = HEADER_SIZE + _HELLO_BODY.size
+    end = at + size
+    if size > MAX_SPEC or len(data) < end:
+        raise InputError(
+            f"spec: expected at most {min(MAX_SPEC, len(data) - at)} bytes, got {size}"
+        )
+    return Hello(
+        session=session,
+        spec=data[at:end].decode(),
+        worlds=worlds,
+        versions=(low, high),
+        extensions=_take_extensions(data, end),
+    )
+
+
+def _encode_welcome(m: Welcome, layout: Layout | None) -> bytes:
+    body = _WELCOME_BODY.pack(m.nonce, m.seed or 0, m.seed is not None, m.version)
+    return body + _extensions(m.extensions)
+
+
+def _decode_welcome(data: bytes, session: int, sequence: int, layout: Layout | None) -> Welcome:
+    nonce, seed, has_seed, version = _WELCOME_BODY.unpack_from(data, HEADER_SIZE)
+    if has_seed > 1:
+        raise InputError(f"has seed: expected 0 or 1, got {has_seed}")
+    return Welcome(
+        session=session,
+        nonce=nonce,
+        version=version,
+        seed=seed if has_seed else None,
+        extensions=_take_extensions(data, HEADER_SIZE + _WELCOME_BODY.size),
+    )
+
+
+def _encode_nothing(m: Wait | Unknown | Alive, layout: Layout | None) -> bytes:
+    return b""
+
+
+def _decode_wait(data: bytes, session: int, sequence: int, layout: Layout | None) -> Wait:
+    _expect_size(data, HEADER_SIZE)
+    return Wait(session=session)
+
+
+def _decode_unknown(data: bytes, session: int, sequence: int, layout: Layout | None) -> Unknown:
+    _expect_size(data, HEADER_SIZE)
+    return Unknown(session=session, sequence=sequence)
+
+
+def _decode_alive(data: bytes, session: int, sequence: int, layout: Layout | None) -> Alive:
+    _expect_size(data, HEADER_SIZE)
+    return Alive(session=session, sequence=sequence)
+
+
+def _encode_missing(m: Missing, layout: Layout | None) -> bytes:
+    return _MISSING_BODY.pack(m.kind, m.count, m.first) + m.bitmap
+
+
+def _decode_missing(data: bytes, session: int, sequence: int, layout: Layout | None) -> Missing:
+    kind, count, first = _MISSING_BODY.unpack_from(data, HEADER_SIZE)
+    bitmap = data[HEADER_SIZE + _MISSING_BODY.size :]
+    if kind not in _MAY_BE_CUT or (kind == HELLO) != (sequence == 0):
+        raise InputError(f"expected a Hello, State or Command, got type {kind} of {sequence}")
+    if not bitmap or first >= count or first + 8 * (len(bitmap) - 1) >= count:
+        raise InputError(f"expected a bitmap of {count} fragments, got {len(bitmap)} bytes")
+    message = Missing(
+        session=session, sequence=sequence, kind=kind, count=count, first=first, bitmap=bitmap
+    )
+    if (numbers := message.numbers()) and numbers[-1] >= count:
+        raise InputError(f"expected fragments below {count}, got {numbers[-1]}")
+    return message
+
+
+def _encode_reason(m: Refuse | Close, layout: Layout | None) -> bytes:
+    raw = m.reason.encode()
+    return _LENGTH.pack(len(raw)) + raw
+
+
+def _decode_refuse(data: bytes, session: int, sequence: int, layout: Layout | None) -> Refuse:
+    return Refuse(session=session, reason=_reason(data))
+
+
+def _decode_close(data: bytes, session: int, sequence: int, layout: Layout | None) -> Close:
+    return Close(session=session, sequence=sequence, reason=_reason(data))
+
+
+def _reason(data: bytes) -> str:
+    (size,) = _LENGTH.unpack_from(data, HEADER_SIZE)
+    at = HEADER_SIZE + _LENGTH.size
+    if size > MAX_TEXT:
+        raise InputError(f"reason: expected at most {MAX_TEXT} bytes, got {size}")
+    _expect_size(data, at + size)
+    return data[at:].decode()
+
+
+def _extensions(extensions: tuple[Extension, ...]) -> bytes:
+    return b"".join(
+        _EXTENSION.pack(e.number | (_CRITICAL if e.critical else 0), len(e.value)) + e.value
+        for e in extensions
+    )
+
+
+def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
+    extensions = []
+    while at < len(data):
+        number, size = _EXTENSION.unpack_from(data, at)
+        at += _EXTENSION.size
+        if size > len(data) - at:
+            raise InputError(f"extension: expected {size} bytes, got {len(data) - at}")
+        critical = bool(number & _CRITICAL)
+        value = data[at : at + size]
+        extensions.append(Extension(number=number & ~_CRITICAL, value=value, critical=critical))
+        at += size
+    return tuple(extensions)
+
+
+def _entry(kind: int, encoder: Callable[[Any, Layout | None], bytes]) -> tuple[Any, ...]:
+    start = MAGIC + bytes((VERSION, kind))
+    return start, zlib.crc32(start), encoder
+
+
+_ENCODERS: Final[dict[type, tuple[Any, ...]]] = {
+    Hello: _entry(HELLO, _encode_hello),
+    Welcome: _entry(_WELCOME, _encode_welcome),
+    Refuse: _entry(REFUSE, _encode_reason),
+    State: _entry(STATE, _encode_state),
+    Command: _entry(COMMAND, _encode_command),
+    Close: _entry(CLOSE, _encode_reason),
+    Wait: _entry(_WAIT, _encode_nothing),
+    Unknown: _entry(UNKNOWN, _encode_nothing),
+    Alive: _entry(ALIVE, _encode_nothing),
+    Missing: _entry(MISSING, _encode_missing),
+}
+"""First four bytes of a message, their CRC-32, and the function for what follows the header."""
+
+_DECODERS: Final[dict[int, Callable[[bytes, int, int, Layout | None], Message]]] = {
+    HELLO: _decode_hello,
+    _WELCOME: _decode_welcome,
+    REFUSE: _decode_refuse,
+    STATE: _decode_state,
+    COMMAND: _decode_command,
+    CLOSE: _decode_close,
+    _WAIT: _decode_wait,
+    UNKNOWN: _decode_unknown,
+    ALIVE: _decode_alive,
+    MISSING: _decode_missing,
+}

@@ -1,0 +1,498 @@
+"""The simulator's side of the exchange (UDP client), free of sockets and clocks.
+
+A caller hands in datagrams with the time of their arrival (seconds of any monotonic clock), sends
+what `take_outgoing` gives, and calls `handle_timer` when `next_timer` says. Exactly one State is
+outstanding at any time, so a sequence number is all it takes to step the physics once for each
+Command: the simulator repeats the same bytes until the Command of the same number comes.
+"""
+
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from math import isfinite
+from typing import Final
+
+import numpy as np
+
+from ...models.errors import InputError
+from . import binary, text
+from .auth import Key, is_sealed, message_of
+from .errors import DecodeError, Forged
+from .fragments import FAR, NEAR, Assembler, Transfer, Window, asks, is_fragment
+from .layout import Layout
+from .messages import (
+    Alive,
+    Close,
+    Command,
+    Hello,
+    Message,
+    Missing,
+    Refuse,
+    State,
+    Unknown,
+    Wait,
+    Welcome,
+    one_line,
+)
+from .statistics import Statistics
+from .transitions import SIMULATOR, SimulatorState, Way
+
+__all__ = [
+    "CLOSE_INTERVAL",
+    "CLOSE_LINGER",
+    "Address",
+    "Client",
+    "LinkConfig",
+    "RoundTrips",
+    "Tap",
+    "largest_datagram",
+    "new_session",
+]
+
+Address = tuple[str, int]
+"""IPv4 host and port."""
+
+Tap = Callable[[int, Message, bytes], None]
+"""Sees every message once, when it is first sent or taken: the number of its slot (0 at the
+simulator), the message, and its bytes in the binary codec, whole and not sealed."""
+
+CLOSE_INTERVAL: Final = 0.025
+"""A Close is repeated after so long, s, until the other side has answered it with its own."""
+CLOSE_LINGER: Final = 0.25
+"""Longest wait for that answer, s: the other side may be gone."""
+
+_FIRST_RESEND: Final = 0.2
+"""Wait before a resend while no round trip has been measured, s."""
+_GRANULARITY: Final = 0.01
+"""A system may let a process wait for so long, s: the least that is added to a round trip."""
+_LONGEST_RESEND: Final = 1.0
+"""Longest wait before a resend, s."""
+_PATIENCE: Final = 8
+"""Resends before the waits double: most that was lost was lost by chance."""
+
+
+_TOO_EARLY: Final = 1.5
+"""By so much round trips are taken for longer when an answer comes twice."""
+
+
+def new_session() -> int:
+    """A random session number, not 0."""
+    return secrets.randbits(64) or 1
+
+
+def largest_datagram(peer: Address, most: int | None = None) -> int:
+    """Bytes of the largest datagram to a peer, a seal not counted: fewer off this machine."""
+    largest = NEAR if peer[0].startswith("127.") else FAR
+    return min(largest, most or largest)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkConfig:
+    """How a simulator exchanges."""
+
+    timeout: float = 120.0
+    """It gives up when nothing has answered for this long, s: longer than an agent waits for one
+    to replace another that it has lost."""
+    max_datagram: int | None = None
+    """Largest datagram, bytes, a seal not counted. None: 65,483 on loopback, 1,200 elsewhere."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None and not (isfinite(value) and value > 0):
+                raise InputError(f"{field.name}: expected a number > 0, got {value}")
+        if self.max_datagram is not None and self.max_datagram < 256:
+            raise InputError(f"max_datagram: expected at least 256, got {self.max_datagram}")
+
+
+class RoundTrips:
+    """How long an answer takes, and so when to ask again (RFC 6298)."""
+
+    def __init__(self) -> None:
+        self._smoothed: float | None = None
+        self._variation = 0.0
+        self._sent: tuple[float, float] = (0.0, 0.0)  # the last two sendings
+
+    def sent(self, now: float, *, first: bool = False) -> None:
+        """Something was sent that wants an answer, for the first time or again."""
+        self._sent = (now, now if first else self._sent[0])
+
+    def answered(self, now: float) -> None:
+        """The answer came. It is taken for one to the last sending, unless it came too soon."""
+        last, before = self._sent
+        seconds = now - last
+        if self._smoothed is not None and seconds < self._smoothed / 2:
+            seconds = now - before
+        if self._smoothed is None:
+            self._smoothed, self._variation = seconds, seconds / 2
+        else:
+            self._variation += (abs(self._smoothed - seconds) - self._variation) / 4
+            self._smoothed += (seconds - self._smoothed) / 8
+
+    def answered_again(self) -> None:
+        """An answer came a second time: it was asked for too early."""
+        if self._smoothed is not None:
+            self._smoothed = min(_TOO_EARLY * self._smoothed, _LONGEST_RESEND)
+
+    def wait(self, tries: int) -> float:
+        """Wait for an answer before the next resend, s, after so many tries without any."""
+        if self._smoothed is None:
+            wait = _FIRST_RESEND
+        else:
+            wait = self._smoothed + max(_GRANULARITY, 4 * self._variation)
+        return min(wait * 2.0 ** min(max(tries - _PATIENCE, 0), 16), _LONGEST_RESEND)
+
+
+class Client:
+    """Says Hello, then exchanges States for Commands.
+
+    Args:
+        hello: What is simulated.
+        layout: That of the Hello.
+        config: Times of the exchange.
+        largest: Bytes of the largest datagram, a seal not counted.
+        by_text: Speak text instead of binary.
+        key: Shared with the agent. Then nothing unsealed is taken.
+        tap: Sees every message once.
+        draw_session: Gives the number of the next session.
+
+    Attributes:
+        state: See `transitions`.
+        sequence: Number of the State sent last: they count from 1.
+        sends: How often the outstanding message was sent.
+    """
+
+    def __init__(
+        self,
+        hello: Hello,
+        layout: Layout,
+        config: LinkConfig,
+        *,
+        largest: int = NEAR,
+        by_text: bool = False,
+        key: Key | None = None,
+        tap: Tap | None = None,
+        draw_session: Callable[[], int] = new_session,
+    ) -> None:
+        if by_text:
+            if key:
+                raise InputError("text codec: expected no key, got one: only binary can be sealed")
+            text.check_layout(layout)
+        self.hello = hello
+        self.layout = layout
+        self.state = SimulatorState.READY if by_text else SimulatorState.IDLE
+        self.sequence = 0
+        self.sends = self._tries = 0
+        self.statistics = Statistics()
+        self._config = config
+        self._largest = largest
+        self._text = by_text
+        self._key = key
+        self._session_key: Key | None = None
+        self._nonce = 0
+        self._tap = tap
+        self._draw_session = draw_session
+        self._is_queued = False
+        self._assembler = Assembler(layout.command_size)
+        self._window = Window()
+        self._transfer: Transfer | None = None  # of the outstanding message
+        self._transfer_key: Key | None = None
+        self._asking = b""  # the datagram that was sent last and wants an answer
+        self._outgoing: list[bytes] = []
+        self._round_trips = RoundTrips()
+        self._sent_at = self._resend_at = self._deadline = 0.0
+
+    def connect(self, now: float) -> None:
+        """Say Hello, until a Welcome or a Refuse comes. With the text codec there is none."""
+        if self.state is SimulatorState.IDLE:
+            self._send(self.hello, now)
+
+    def send_state(
+        self,
+        time: float,
+        observations: tuple[np.ndarray, ...],
+        rewards: np.ndarray,
+        terminated: np.ndarray,
+        truncated: np.ndarray,
+        telemetry: tuple[np.ndarray, ...],
+        now: float,
+    ) -> State:
+        """Send the next State: see `messages.State`. Returns it.
+
+        Raises:
+            InputError: An array is not that of the layout, or not finite; nothing was sent.
+        """
+        if self.state is not SimulatorState.READY:
+            raise ValueError(f"send_state: expected state ready, got {self.state.value}")
+        state = State(
+            session=self.hello.session,
+            sequence=self.sequence + 1,
+            time=time,
+            nonce=0 if self.sequence else self._nonce,
+            observations=observations,
+            rewards=rewards,
+            terminated=terminated,
+            truncated=truncated,
+            telemetry=telemetry,
+        )
+        self._send(state, now)
+        return state
+
+    def alive(self) -> list[bytes]:
+        """Datagrams that say that the Command of this number is being computed; maybe none.
+
+        May be called from another thread, while this one computes.
+        """
+        if self._text or self.state is not SimulatorState.READY or not self.sequence:
+            return []
+        return self._sealed(
+            [binary.encode(Alive(session=self.hello.session, sequence=self.sequence))],
+            self._session_key,
+        )
+
+    def close(self, reason: str, now: float) -> None:
+        """End the exchange. An agent that has welcomed this simulator is told, until it answers."""
+        if (self.state, Way.SENT, Close) in SIMULATOR:
+            session, number = self.hello.session, self.sequence
+            self._send(Close(session=session, sequence=number, reason=one_line(reason)), now)
+        elif self.state is not SimulatorState.CLOSING:
+            self.state = SimulatorState.CLOSED
+
+    def receive(self, datagram: bytes, now: float) -> Welcome | Refuse | Command | Close | None:
+        """Take a datagram from the agent; the message, if it moves the exchange on."""
+        self.statistics.counters["received"] += 1
+        try:
+            plain = datagram if self._key is None else self._open(datagram)
+            if self._text:
+                message: Message = text.decode_command(plain, self.layout, self.hello.session)
+            else:
+                if is_fragment(plain):
+                    whole = self._assemble(plain, now)
+                    if whole is None:
+                        return None
+                    plain = whole
+                message = binary.decode(plain, self.layout)
+        except DecodeError as error:
+            self._drop_undecoded(error, datagram, now)
+            return None
+        if message.session != self.hello.session:
+            self._drop("foreign", f"session {message.session:016x}", now)
+            return None
+        state = SIMULATOR.get((self.state, Way.RECEIVED, type(message)))
+        # There is one Close in a session, so its number does not matter.
+        is_current = (
+            isinstance(message, Close)
+            or getattr(message, "sequence", self.sequence) == self.sequence
+        )
+        if state is None or not is_current:
+            if isinstance(message, Command) and self.sequence - message.sequence <= 1:
+                self._round_trips.answered_again()
+            self._drop("stale", "", now)
+            return None
+        return self._take(message, state, plain, now)
+
+    def next_timer(self) -> float | None:
+        """When `handle_timer` wants to be called; None if never."""
+        if self._transfer is None:
+            return None
+        return min(self._resend_at, self._deadline)
+
+    def handle_timer(self, now: float) -> bool:
+        """Resend what is due. False once the agent has been silent for the whole timeout."""
+        timer = self.next_timer()
+        if timer is None or now < timer:
+            return True
+        if now >= self._deadline:
+            if self.state is SimulatorState.CLOSING:
+                self._end()
+                return True
+            self._transfer = None
+            self.close(f"no answer from the agent for {self._config.timeout:g} s", now)
+            return False
+        self.statistics.counters["resent"] += 1
+        self.sends += 1
+        self._tries += 1
+        self._round_trips.sent(now)
+        assert self._transfer is not None
+        if missing := self._assembler.missing():  # of the answer
+            self._put([binary.encode(missing)], self._session_key)
+        else:
+            self._put(self._transfer.probe(), self._transfer_key)
+        closing = self.state is SimulatorState.CLOSING
+        self._resend_at = now + (CLOSE_INTERVAL if closing else self._round_trips.wait(self._tries))
+        return True
+
+    def pardon(self, seconds: float) -> None:
+        """Move the deadline: this process was stopped for so long, and the agent could not know."""
+        self._deadline += seconds
+
+    def take_outgoing(self) -> list[bytes]:
+        """Datagrams to send to the agent, each once."""
+        outgoing, self._outgoing = self._outgoing, []
+        return outgoing
+
+    # ---- what came
+
+    def _take(
+        self, message: Message, state: SimulatorState, plain: bytes, now: float
+    ) -> Welcome | Refuse | Command | Close | None:
+        """A message that may come now."""
+        was_closing = self.state is SimulatorState.CLOSING
+        if isinstance(message, Missing):
+            self._deadline = now + self._config.timeout
+            self._resend_missing(message, now)
+            return None
+        if isinstance(message, Wait):
+            self._wait_for_slot(now)
+            return None
+        if isinstance(message, Welcome) and (reason := self._unfit(message)):
+            self._drop("malformed", reason, now)
+            return None
+        self.state = state
+        self._record(message, plain)
+        if isinstance(message, Unknown):
+            self._begin_again(now)
+            return None
+        self._transfer = None
+        if isinstance(message, Command):
+            self.statistics.round_trips.add(now - self._sent_at)
+            self._round_trips.answered(now)
+        elif isinstance(message, Welcome):
+            self.statistics.counters["sessions"] += 1
+            self._nonce = message.nonce
+            if self._key:
+                self._session_key = self._key.for_session(message.session, message.nonce)
+        elif isinstance(message, Close) and not was_closing:
+            self._answer_close()
+        assert isinstance(message, Welcome | Refuse | Command | Close)
+        return message
+
+    def _open(self, datagram: bytes) -> bytes:
+        """A datagram without its seal: the session's key, or the shared one for what opens it."""
+        key = self._key
+        assert key is not None
+        if not is_sealed(datagram):
+            message = binary.decode(datagram, self.layout)
+            words = f" that says: {message.reason}" if isinstance(message, Refuse) else ""
+            raise Forged(f"not sealed, a {type(message).__name__}{words}")
+        kind, _, sequence = binary.peek(message_of(datagram))
+        if kind == binary.UNKNOWN:  # answers this very State, not one that somebody made up
+            return key.open(datagram, self._asking)
+        if kind in binary.OF_SESSION or (kind == binary.MISSING and sequence):
+            if self._session_key is None:
+                raise Forged("a message of a session, and there is none")
+            key = self._session_key
+        return key.open(datagram)
+
+    def _assemble(self, fragment: bytes, now: float) -> bytes | None:
+        """The Command that is waited for, once all its fragments are there."""
+        kind, session, sequence = binary.check(fragment)
+        if session != self.hello.session:
+            self._drop("foreign", f"session {session:016x}", now)
+            return None
+        is_due = self.state is SimulatorState.WAITING and sequence == self.sequence
+        if not is_due or kind != binary.COMMAND | binary.FRAGMENT:
+            self._drop("stale", "", now)
+            return None
+        whole = self._assembler.take(fragment)
+        self._progress(now)
+        if whole is None and asks(fragment) and (missing := self._assembler.missing()):
+            self._round_trips.sent(now)
+            self._put([binary.encode(missing)], self._session_key)
+        return whole
+
+    def _progress(self, now: float) -> None:
+        """The agent is there and works on the outstanding message."""
+        self._tries = 1
+        self._resend_at = now + self._round_trips.wait(1)
+
+    def _resend_missing(self, missing: Missing, now: float) -> None:
+        """Send again what the agent lacks of the outstanding message."""
+        if self._transfer is None or missing.kind != binary.peek(self._transfer.message)[0]:
+            self._drop("stale", "", now)
+            return
+        self.statistics.counters["resent"] += 1
+        self._round_trips.sent(now)
+        self._put(self._transfer.resend(missing), self._transfer_key)
+        self._progress(now)
+
+    def _unfit(self, welcome: Welcome) -> str:
+        """Why a Welcome cannot be taken, or ""."""
+        low, high = self.hello.versions
+        if not low <= welcome.version <= high:
+            return f"Welcome: expected version {low} to {high}, got {welcome.version}"
+        unknown = [e.number for e in welcome.extensions if e.critical]
+        return f"Welcome: expected no critical extension {unknown[0]}" if unknown else ""
+
+    def _wait_for_slot(self, now: float) -> None:
+        """The agent is there: as long as it says so, this is no silence."""
+        self._deadline = now + self._config.timeout
+        if not self._is_queued:
+            self._is_queued = True
+            self.statistics.notice("every slot of the agent is taken; waiting for a free one")
+
+    def _begin_again(self, now: float) -> None:
+        """Say Hello to an agent that knows nothing of the session."""
+        self.statistics.notice(
+            "the agent does not know this session (any more); beginning a new one"
+        )
+        self.hello = replace(self.hello, session=self._draw_session())
+        self.sequence, self._session_key, self._is_queued = 0, None, False
+        self._assembler = Assembler(self.layout.command_size)
+        self._send(self.hello, now)
+
+    def _answer_close(self) -> None:
+        close = Close(session=self.hello.session, sequence=self.sequence, reason="")
+        data = self._encode(close)
+        self._put([data], self._session_key)
+        self.statistics.counters["sent"] += 1
+        self._record(close, data)
+
+    # ---- what is sent
+
+    def _send(self, message: Hello | State | Close, now: float) -> None:
+        """Send a message and repeat it until it is answered."""
+        data = self._encode(message)
+        self._record(message, data)
+        self._transfer = Transfer(data, self._largest, self._window)
+        self._transfer_key = self._key if isinstance(message, Hello) else self._session_key
+        self.state = SIMULATOR[self.state, Way.SENT, type(message)]
+        self.sequence = getattr(message, "sequence", 0)
+        self.sends = self._tries = 1
+        self._round_trips.sent(now, first=True)
+        self._put(self._transfer.start(), self._transfer_key)
+        closing = isinstance(message, Close)
+        self._sent_at = now
+        self._resend_at = now + (CLOSE_INTERVAL if closing else self._round_trips.wait(1))
+        self._deadline = now + (CLOSE_LINGER if closing else self._config.timeout)
+        self.statistics.counters["sent"] += 1
+
+    def _put(self, datagrams: list[bytes], key: Key | None) -> None:
+        sealed = self._sealed(datagrams, key)
+        self._outgoing += sealed
+        if sealed:
+            self._asking = sealed[-1]
+
+    @staticmethod
+    def _sealed(datagrams: list[bytes], key: Key | None) -> list[bytes]:
+        return [key.seal(datagram) for datagram in datagrams] if key else datagrams
+
+    def _encode(self, message: Hello | State | Close) -> bytes:
+        if self._text and isinstance(message, State | Close):
+            return text.encode(message)
+        return binary.encode(message, self.layout)
+
+    def _record(self, message: Message, data: bytes) -> None:
+        if self._tap:
+            self._tap(0, message, binary.encode(message, self.layout) if self._text else data)
+
+    def _end(self) -> None:
+        self.state, self._transfer = SimulatorState.CLOSED, None
+
+    def _drop_undecoded(self, error: DecodeError, datagram: bytes, now: float) -> None:
+        if self._key is None and is_sealed(datagram):
+            error = Forged("key: the agent has one, this simulator has none (--key-file)")
+        self._drop("forged" if isinstance(error, Forged) else "malformed", str(error), now)
+
+    def _drop(self, cause: str, reason: str, now: float) -> None:
+        self.statistics.drop(cause, f"from the agent: {reason}", now)

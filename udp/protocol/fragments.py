@@ -1,0 +1,215 @@
+"""Messages that are larger than a datagram: cut into fragments, and put together again.
+
+A fragment is a datagram with the header of its message, 128 added to its type, and
+
+    24  u16  number of the fragment, from 0
+    26  u16  number of fragments, 1 to 16,384
+    28  u8   1 if its sender waits for an answer after it, else 0
+    29  3 bytes reserved
+    32       a slice of the message, its header included, at least one byte
+
+A message is sent in bursts. The last fragment of a burst asks for an answer: a `Missing` with what
+has not come, or, if all has, what answers the message. So only what is missing is sent again, and
+the bursts follow each other at the pace of the round trip.
+"""
+
+import struct
+from math import ceil
+from typing import Final
+
+import numpy as np
+
+from . import binary
+from .binary import HEADER_SIZE
+from .errors import DecodeError
+from .layout import MAX_MESSAGE
+from .messages import Missing
+
+__all__ = [
+    "FAR",
+    "MAX_FRAGMENTS",
+    "NEAR",
+    "Assembler",
+    "Transfer",
+    "Window",
+    "asks",
+    "is_first",
+    "is_fragment",
+]
+
+NEAR: Final = 65_507 - 24
+"""Largest datagram of the binary codec on loopback, bytes: UDP's over IPv4, less a seal."""
+FAR: Final = 1_200
+"""The same elsewhere: less than any network's, so that no datagram is cut on its way."""
+MAX_FRAGMENTS: Final = 1 << 14
+
+_FRAGMENT: Final = struct.Struct("<HHB3x")
+_OVERHEAD: Final = HEADER_SIZE + _FRAGMENT.size
+_ASKS_AT: Final = 28
+_FIRST_BURST: Final = 3 << 16
+"""Bytes: what the smallest buffer that systems give a socket holds."""
+_LARGEST_BURST: Final = 1 << 20
+_MOST_LOST: Final = 0.25
+"""A burst of which more was lost was too large for a buffer on its way."""
+_LARGEST_BITMAP: Final = 128
+"""Bytes of the bitmap of a Missing: it says what 1,024 fragments are about."""
+
+
+class Window:
+    """How much is sent in one burst. It grows while bursts arrive, and halves if much is lost."""
+
+    def __init__(self) -> None:
+        self.size = _FIRST_BURST
+        """Bytes."""
+
+    def report(self, sent: int, lost: int) -> None:
+        """Take into account that so many fragments of a burst were lost."""
+        if lost > max(_MOST_LOST * sent, 1):
+            self.size = max(self.size // 2, _FIRST_BURST // 8)
+        elif lost == 0:
+            self.size = min(2 * self.size, _LARGEST_BURST)
+
+
+class Transfer:
+    """One message on its way: in one datagram, or in fragments.
+
+    Args:
+        message: The bytes of a message of the binary codec, or a line of text.
+        largest: Bytes of the largest datagram, a seal not counted.
+        window: Size of the bursts, of this side and peer.
+    """
+
+    def __init__(self, message: bytes, largest: int, window: Window) -> None:
+        self.message = message
+        self.count = 1
+        if len(message) > largest:
+            self.count = ceil(len(message) / (largest - _OVERHEAD))
+            self._slice = ceil(len(message) / self.count)
+            self.count = ceil(len(message) / self._slice)  # fewer, where rounding made empty ones
+        self._window = window
+        self._burst: list[int] = []
+        self._next = 0  # no fragment from this one on was sent
+
+    def start(self) -> list[bytes]:
+        """The datagrams to send first."""
+        if self.count == 1:
+            return [self.message]
+        self._next = 0
+        return self._send(list(range(self.count)))
+
+    def resend(self, missing: Missing) -> list[bytes]:
+        """The datagrams to send after the receiver has told what it lacks."""
+        if self.count != missing.count or not self._burst:
+            return []
+        numbers = missing.numbers()
+        lacking = set(numbers)
+        self._window.report(len(self._burst), sum(n in lacking for n in self._burst))
+        covered = missing.first + 8 * len(missing.bitmap)
+        numbers += range(max(self._next, covered), self.count)
+        return self._send(numbers)
+
+    def probe(self) -> list[bytes]:
+        """The datagrams that ask for an answer when none has come in time."""
+        if self.count == 1:
+            return [self.message]
+        return self._send(self._burst[-1:]) if self._burst else self.start()
+
+    def _send(self, numbers: list[int]) -> list[bytes]:
+        if not numbers:
+            return []
+        burst = numbers[: max(self._window.size // self._slice, 2)]
+        self._burst = burst
+        self._next = max(self._next, burst[-1] + 1)
+        return [self._fragment(number, asks=number == burst[-1]) for number in burst]
+
+    def _fragment(self, number: int, *, asks: bool) -> bytes:
+        kind, session, sequence = binary.peek(self.message)
+        at = number * self._slice
+        body = _FRAGMENT.pack(number, self.count, asks) + self.message[at : at + self._slice]
+        return binary.frame(kind | binary.FRAGMENT, session, sequence, body)
+
+
+def is_fragment(datagram: bytes) -> bool:
+    """Whether a datagram, not sealed, says of itself that it is a fragment."""
+    return len(datagram) > 3 and datagram[3] >= binary.FRAGMENT
+
+
+def is_first(datagram: bytes) -> bool:
+    """Whether a datagram, not sealed, is a whole message or the first fragment of one."""
+    return not is_fragment(datagram) or datagram[HEADER_SIZE : HEADER_SIZE + 2] == b"\0\0"
+
+
+def asks(datagram: bytes) -> bool:
+    """Whether a fragment's sender waits for an answer."""
+    return len(datagram) > _ASKS_AT and datagram[_ASKS_AT] == 1
+
+
+class Assembler:
+    """Puts one message after the other together, from fragments in any order, repeated ones too.
+
+    Fragments of a message that is older than the one at hand change nothing. Repeats of a message
+    have the same bytes and cuts, so fragments of several repeats make one.
+
+    Args:
+        largest: Bytes of the largest message that can come: more are never kept.
+    """
+
+    def __init__(self, largest: int) -> None:
+        self._largest = min(largest, MAX_MESSAGE)
+        self._begin((0, 0, -1), 0)
+
+    def take(self, fragment: bytes) -> bytes | None:
+        """Take a fragment whose header was checked; the message, if it is whole now.
+
+        Raises:
+            DecodeError: The fragment's numbers make no sense, or it is too much.
+        """
+        if len(fragment) <= _OVERHEAD:
+            raise DecodeError(f"fragment: expected a slice of a message, got {len(fragment)} bytes")
+        number, count, asks = _FRAGMENT.unpack_from(fragment, HEADER_SIZE)
+        if not (number < count <= MAX_FRAGMENTS and asks <= 1):
+            raise DecodeError(
+                f"fragment: expected one of at most {MAX_FRAGMENTS}, got {number} of {count}"
+            )
+        header = binary.peek(fragment)
+        if header[:2] == self._header[:2] and header[2] < self._header[2]:
+            return None
+        if (header, count) != (self._header, self._count):
+            self._begin(header, count)
+        if number in self._slices:
+            return None
+        slice_ = fragment[_OVERHEAD:]
+        if self._size + len(slice_) > self._largest:
+            self._begin(header, count)
+            raise DecodeError(f"fragments: expected at most {self._largest} bytes in all, got more")
+        self._slices[number] = slice_
+        self._size += len(slice_)
+        if len(self._slices) < count:
+            return None
+        message = b"".join([self._slices[i] for i in range(count)])
+        self._begin(header, count)
+        if is_fragment(message) or binary.peek(message) != header:
+            raise DecodeError("fragments: expected a message with the header of its fragments")
+        return message
+
+    def missing(self) -> Missing | None:
+        """What is missing of the message that is coming; None if none is."""
+        if not self._slices:
+            return None
+        first = next(i for i in range(self._count) if i not in self._slices)
+        span = min(self._count - first, 8 * _LARGEST_BITMAP)
+        lacking = np.array([first + i not in self._slices for i in range(span)])
+        kind, session, sequence = self._header
+        return Missing(
+            session=session,
+            sequence=sequence,
+            kind=kind,
+            count=self._count,
+            first=first,
+            bitmap=np.packbits(lacking, bitorder="little").tobytes(),
+        )
+
+    def _begin(self, header: tuple[int, int, int], count: int) -> None:
+        self._header, self._count = header, count
+        self._slices: dict[int, bytes] = {}
+        self._size = 0

@@ -1,0 +1,257 @@
+"""What the two sides say to each other. Imports the standard library and NumPy alone.
+
+Every array has the drone as its first axis; a single drone is N = 1. Quantities are the env's own:
+this module knows nothing of drones but their number. Short messages check themselves. A `State` or
+a `Command` means something only with the `Layout` of its Hello: the codec checks it against that.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ...models.errors import InputError
+from .layout import MAX_DRONES
+
+__all__ = [
+    "FLY",
+    "FREEZE",
+    "MAX_SPEC",
+    "MAX_TEXT",
+    "MAX_UINT64",
+    "RESET",
+    "Alive",
+    "Close",
+    "Command",
+    "Extension",
+    "Hello",
+    "Message",
+    "Missing",
+    "Refuse",
+    "State",
+    "Unknown",
+    "Wait",
+    "Welcome",
+    "one_line",
+]
+
+MAX_UINT64: Final = (1 << 64) - 1
+"""Largest session, sequence number, nonce and seed."""
+MAX_TEXT: Final = 512
+"""Longest reason, bytes of UTF-8."""
+MAX_SPEC: Final = 1 << 22
+"""Longest spec, bytes of UTF-8."""
+
+FLY: Final = 0
+RESET: Final = 1
+FREEZE: Final = 2
+"""What a drone is ordered to do: fly its action, reset instead of it, or do nothing."""
+
+_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
+
+
+def one_line(text: str) -> str:
+    """Any text made fit for a message: no control characters, at most `MAX_TEXT` bytes."""
+    raw = _CONTROL.sub(" ", text).encode(errors="replace")
+    return raw[:MAX_TEXT].decode(errors="ignore")
+
+
+def _check_text(name: str, text: str) -> None:
+    size = len(text.encode())
+    if size > MAX_TEXT:
+        raise InputError(f"{name}: expected at most {MAX_TEXT} bytes of UTF-8, got {size}")
+    if _CONTROL.search(text):
+        raise InputError(f"{name}: expected no control characters, got {text!r}")
+
+
+def _check_uint64(name: str, number: int) -> None:
+    if not 0 <= number <= MAX_UINT64:
+        raise InputError(f"{name}: expected 0 to 2^64 - 1, got {number}")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Extension:
+    """Something of a later version or of a user, in Hello or Welcome."""
+
+    number: int
+    """0 to 32,767."""
+    value: bytes
+    critical: bool = False
+    """Whether a side that does not know it must not go on."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.number < 1 << 15:
+            raise InputError(f"extension: expected a number 0 to 32767, got {self.number}")
+        if len(self.value) > MAX_TEXT:
+            raise InputError(
+                f"extension {self.number}: expected at most {MAX_TEXT} bytes, got {len(self.value)}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Hello:
+    """Simulator to agent, first: what it simulates."""
+
+    session: int
+    """Random 64-bit number, new at every start of a simulator and of its agent."""
+    spec: str
+    """The `EnvSpec` as JSON."""
+    worlds: int = 1
+    """Number of worlds W, each with every drone of the spec."""
+    versions: tuple[int, int] = (2, 2)
+    """Lowest and highest version of the protocol that the simulator speaks."""
+    extensions: tuple[Extension, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.worlds <= MAX_DRONES:
+            raise InputError(f"worlds: expected 1 to {MAX_DRONES}, got {self.worlds}")
+        low, high = self.versions
+        if not 1 <= low <= high <= 255:
+            raise InputError(f"versions: expected 1 <= lowest <= highest, got {self.versions}")
+        size = len(self.spec.encode())
+        if not 2 <= size <= MAX_SPEC:
+            raise InputError(f"spec: expected 2 to {MAX_SPEC} bytes of UTF-8, got {size}")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Welcome:
+    """Agent to simulator: the session is open."""
+
+    session: int
+    nonce: int
+    """Random 64-bit number, new for every session. State 1 echoes it; it enters the session's
+    key."""
+    version: int = 2
+    """Version of all that follows."""
+    seed: int | None = None
+    """Seed for the simulator's own first reset, where the agent sets one: drone i takes seed + i
+    (mod 2^64). Otherwise the session's number is the seed."""
+    extensions: tuple[Extension, ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_uint64("nonce", self.nonce)
+        if self.seed is not None:
+            _check_uint64("seed", self.seed)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Refuse:
+    """Agent to simulator: the session is not opened."""
+
+    session: int
+    reason: str
+
+    def __post_init__(self) -> None:
+        _check_text("reason", self.reason)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Wait:
+    """Agent to simulator: every slot is taken; go on saying Hello."""
+
+    session: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Unknown:
+    """Agent to simulator: the session of this State is not known here; say Hello again."""
+
+    session: int
+    sequence: int
+    """Number of that State."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Alive:
+    """Simulator to agent: the Command of this number came, and is still being computed."""
+
+    session: int
+    sequence: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Missing:
+    """Either side: some fragments of a message have come, and these have not."""
+
+    session: int
+    sequence: int
+    """Number of the message; 0 for a Hello."""
+    kind: int
+    """Type of the message: Hello, State or Command."""
+    count: int
+    """Number of its fragments."""
+    first: int
+    """Number of the fragment that the first bit stands for."""
+    bitmap: bytes
+    """Bit i of byte j (bit 0 is the lowest) is set if fragment first + 8 j + i is missing."""
+
+    def numbers(self) -> list[int]:
+        """Numbers of the fragments that are missing, in their order."""
+        bits = np.unpackbits(np.frombuffer(self.bitmap, np.uint8), bitorder="little")
+        numbers: list[int] = (np.flatnonzero(bits) + self.first).tolist()
+        return numbers
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class State:
+    """Simulator to agent: what every drone sees after the step that `sequence` counts."""
+
+    session: int
+    sequence: int
+    time: float
+    """Simulated since the session began, s."""
+    nonce: int = 0
+    """That of the Welcome in State 1, 0 in all others."""
+    observations: tuple[np.ndarray, ...]
+    """Each array of the layout, shape (N, *shape)."""
+    rewards: np.ndarray
+    """float64, shape (N,)."""
+    terminated: np.ndarray
+    """bool, shape (N,)."""
+    truncated: np.ndarray
+    """bool, shape (N,)."""
+    telemetry: tuple[np.ndarray, ...] = ()
+    """Each array of the layout, float64, shape (N, *shape)."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Command:
+    """Agent to simulator: what every drone does next. Answers the State of the same `sequence`."""
+
+    session: int
+    sequence: int
+    actions: np.ndarray
+    """Dtype of the layout, shape (N, *shape); int64, shape (N,), if discrete. Checked for every
+    drone, and then ignored for those that do not fly."""
+    orders: np.ndarray
+    """uint8, shape (N,): `FLY`, `RESET` or `FREEZE`."""
+    seeds: np.ndarray | None = None
+    """uint64, shape (N,): seeds of the resets in this command; a drone that is not reset ignores
+    its own. None leaves the generators as they are."""
+
+    @property
+    def resets(self) -> np.ndarray:
+        """bool, shape (N,): reset instead of flown."""
+        return self.orders == RESET
+
+    @property
+    def frozen(self) -> np.ndarray:
+        """bool, shape (N,): neither reset nor flown."""
+        return self.orders == FREEZE
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Close:
+    """Either side: the exchange ends here."""
+
+    session: int
+    sequence: int
+    """Number of the last State that the sender sent (simulator) or took (agent)."""
+    reason: str
+
+    def __post_init__(self) -> None:
+        _check_text("reason", self.reason)
+
+
+Message = Hello | Welcome | Refuse | Wait | Unknown | Alive | Missing | State | Command | Close

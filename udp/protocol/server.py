@@ -1,0 +1,680 @@
+"""The agent's side of the exchange (UDP server), free of sockets and clocks.
+
+It has slots, one for each simulator that it flies. A Hello that fits is welcomed, and takes a slot
+only when its State 1 has come with the nonce of the Welcome: a Hello that was recorded and sent
+again, or whose sender does not read, takes none. A repeated State is answered with the bytes of
+the first answer. What is kept of a simulator without a slot is bounded.
+"""
+
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from . import binary, text
+from .auth import OVERHEAD, Key, is_sealed, key_id, message_of
+from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address, Tap, largest_datagram
+from .errors import DecodeError, Forged, VersionMismatch
+from .fragments import Assembler, Transfer, Window, asks, is_fragment
+from .layout import Layout
+from .messages import (
+    MAX_SPEC,
+    Alive,
+    Close,
+    Command,
+    Hello,
+    Message,
+    Missing,
+    Refuse,
+    State,
+    Unknown,
+    Wait,
+    Welcome,
+    one_line,
+)
+from .statistics import Statistics
+from .transitions import AGENT, AgentState, Way
+
+__all__ = ["Event", "Server", "Session"]
+
+_MOST: Final = 1024
+"""Simulators that are remembered between Hello and first State, while they wait, and after."""
+_LEAST_ASSEMBLING: Final = 16
+"""Simulators without a slot of which fragments are kept; more, if there are more slots: so many
+may come at the same moment."""
+_TEXT_REMEMBERED: Final = 2.0
+"""How long a late copy of the last line of a closed text simulator is told from a new one, s."""
+_REASON_AT: Final = binary.HEADER_SIZE + 2
+"""Bytes of a Refuse or a Close before its reason."""
+
+
+class KeyMismatch(Forged):
+    """One side has a key, the other has none."""
+
+
+class NoSuchSession(DecodeError):
+    """A sealed message of a session whose key is not here."""
+
+
+class Event(NamedTuple):
+    """What a datagram brought."""
+
+    slot: int
+    message: State | Close
+    joined: bool = False
+    """The State is the first of a new session, which may have taken the slot of another."""
+
+
+@dataclass(eq=False)
+class Session:
+    """An exchange with one simulator, pinned to its address and codec."""
+
+    peer: Address
+    number: int
+    """Session number; 0 with the text codec."""
+    layout: Layout
+    hello: Hello | None
+    """None if it speaks text."""
+    state: AgentState = AgentState.NEW
+    sequence: int = 0
+    """Number of the State that came last."""
+    key: Key | None = None
+    welcome: Welcome | None = None
+    reply: Transfer | None = None
+    """The answer to the last State, or the Welcome."""
+    assembler: Assembler | None = None
+    """Of the State that is coming in fragments."""
+    window: Window = field(default_factory=Window)
+    asked_at: float | None = None
+    """When the Command was sent whose State is expected."""
+    heard_at: float = 0.0
+    """When it last said that it lives, or brought a fragment that was missing."""
+    room: int = 0
+    """Bytes that a Refuse may have, while it waits for a slot."""
+    last: bytes = b""
+    """The last line, by text."""
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it speaks the text codec."""
+        return self.hello is None
+
+    def move(self, way: Way, kind: type[Message]) -> None:
+        """Be in the state that such a message leads to. Raises `ValueError` if it may not."""
+        state = AGENT.get((self.state, way, kind))
+        if state is None:
+            raise ValueError(f"{kind.__name__}: expected another state, got {self.state.value}")
+        self.state = state
+
+
+class _Arrival(NamedTuple):
+    datagram: bytes
+    address: Address
+    now: float
+
+
+class Server:
+    """Welcomes simulators and answers each of their States once.
+
+    Args:
+        accept: Looks at a Hello and gives the layout of its messages, or the reason to refuse it.
+        text_layout: A text simulator says no Hello: its first line opens the session, and this
+            gives the layout to read it by. None, or a result of None: text is not flown.
+        slots: Simulators to fly at the same time. Others wait until a slot is free.
+        keys: Shared with the simulators, any of them. Then nothing unsealed is taken.
+        max_datagram: As `LinkConfig.max_datagram`.
+        tap: Sees every message once.
+        draw_nonce: Gives a random 64-bit number for each Welcome.
+
+    Attributes:
+        slots: Session of each slot, None where it is free.
+        takes_text: Whether a text simulator may take a free slot.
+    """
+
+    def __init__(
+        self,
+        accept: Callable[[Hello], Layout | str],
+        text_layout: Callable[[], Layout | None] | None = None,
+        *,
+        slots: int = 1,
+        keys: Sequence[Key] = (),
+        max_datagram: int | None = None,
+        tap: Tap | None = None,
+        draw_nonce: Callable[[], int] = lambda: secrets.randbits(64),
+    ) -> None:
+        self.slots: list[Session | None] = [None] * slots
+        self.closed = False
+        self.takes_text = text_layout is not None
+        self.statistics = Statistics()
+        self._accept = accept
+        self._text_layout = text_layout or (lambda: None)
+        self._keys = {key.id: key for key in keys}
+        self._max_datagram = max_datagram
+        self._tap = tap
+        self._draw_nonce = draw_nonce
+        self._slot_of: dict[Address, int] = {}
+        self._openings: OrderedDict[tuple[Address, int], Session] = OrderedDict()  # WELCOMED
+        self._queue: OrderedDict[Address, Session] = OrderedDict()  # QUEUED
+        self._ended: OrderedDict[int, None] = OrderedDict()  # numbers of sessions that had a slot
+        self._ended_text: OrderedDict[Address, tuple[bytes, int, float]] = OrderedDict()
+        self._assembling: OrderedDict[tuple[Address, int], Assembler] = OrderedDict()
+        self._outgoing: list[tuple[bytes, Address]] = []
+        self._resend_at = self._deadline = 0.0
+
+    # ---- what the caller does
+
+    def receive(self, datagram: bytes, address: Address, now: float) -> Event | None:
+        """Take a datagram; what it brought, if it moves an exchange on."""
+        self.statistics.counters["received"] += 1
+        slot = self._slot_of.get(address, -1)
+        session = self.slots[slot] if slot >= 0 else None
+        arrival = _Arrival(datagram, address, now)
+        try:
+            if text.is_text(datagram) and not self._keys and (layout := self._text_layout()):
+                return self._receive_text(slot, session, layout, arrival)
+            plain, key = (
+                (datagram, None)
+                if not (self._keys or is_sealed(datagram))
+                else self._open(arrival, session)
+            )
+            kind, number, _ = binary.peek(plain)
+            holder = session
+            if session is None or session.number != number or session.is_text:
+                holder = self._openings.get((address, number))
+            if is_fragment(plain):
+                whole = self._assemble(plain, holder, arrival, key)
+                if whole is None:
+                    return None
+                plain = whole
+            if holder is None and kind != binary.HELLO:
+                binary.check(plain)
+                self._receive_stranger(kind, plain, arrival)
+                return None
+            message = binary.decode(plain, holder.layout if holder else None)
+        except DecodeError as error:
+            self._refuse_undecoded(error, arrival)
+            return None
+        if isinstance(message, Hello):
+            self._receive_hello(message, arrival, key)
+            return None
+        assert holder is not None
+        if holder is session:
+            return self._receive_known(slot, session, message, plain, arrival)
+        if isinstance(message, State):
+            return self._join(holder, message, plain, arrival)
+        self._drop("foreign", type(message).__name__, arrival)
+        return None
+
+    def send_command(
+        self,
+        slot: int,
+        actions: np.ndarray,
+        orders: np.ndarray,
+        seeds: np.ndarray | None,
+        now: float,
+    ) -> None:
+        """Answer the last State of a slot: see `messages.Command`.
+
+        Raises:
+            InputError: An array is not that of the layout, or not finite; nothing was sent.
+        """
+        session = self.slots[slot]
+        if session is None or session.state is not AgentState.DECIDING:
+            got = session.state.value if session else "a free slot"
+            raise ValueError(f"send_command: expected a session that is deciding, got {got}")
+        command = Command(
+            session=session.number,
+            sequence=session.sequence,
+            actions=actions,
+            orders=orders,
+            seeds=seeds,
+        )
+        self._answer(slot, session, command)
+        session.asked_at = session.heard_at = now
+
+    def free(self, slot: int) -> None:
+        """Give the slot of a simulator that has fallen silent to the next that comes."""
+        session, self.slots[slot] = self.slots[slot], None
+        if session:
+            session.state = AgentState.CLOSED
+            del self._slot_of[session.peer]
+            if not session.is_text:
+                _keep(self._ended, session.number, None)
+
+    def close(self, reason: str, now: float) -> None:
+        """End every exchange and tell the simulators, until they answer."""
+        if self.closed:
+            return
+        self.closed = True
+        for slot, session in enumerate(self.slots):
+            if session:
+                self._answer(slot, session, _goodbye(session, reason))
+        for queued in self._queue.values():
+            self._refuse(queued.number, reason, queued.peer, queued.room, queued.key)
+            queued.move(Way.SENT, Refuse)
+        self._resend_at, self._deadline = now + CLOSE_INTERVAL, now + CLOSE_LINGER
+
+    def next_timer(self) -> float | None:
+        """When `handle_timer` wants to be called; None if never."""
+        if self.closed and any(self.slots):
+            return min(self._resend_at, self._deadline)
+        return None
+
+    def handle_timer(self, now: float) -> None:
+        """Repeat what is due: a Close that nobody has answered, until nobody will."""
+        timer = self.next_timer()
+        if timer is None or now < timer:
+            return
+        for slot, session in enumerate(self.slots):
+            if session and now >= self._deadline:
+                self.free(slot)
+            elif session:
+                self._repeat(session)
+        self._resend_at = now + CLOSE_INTERVAL
+
+    def take_outgoing(self) -> list[tuple[bytes, Address]]:
+        """Datagrams to send and where to, each once."""
+        taken, self._outgoing = self._outgoing, []
+        return taken
+
+    # ---- a simulator that has a slot
+
+    def _receive_known(
+        self, slot: int, session: Session, message: Message, plain: bytes, arrival: _Arrival
+    ) -> Event | None:
+        is_state = isinstance(message, State)
+        if is_state and message.sequence == session.sequence:
+            if session.state is not AgentState.DECIDING:  # else the answer is not there yet
+                self._repeat(session)
+            self._drop("duplicate", "", arrival)
+            return None
+        if is_state and message.sequence > session.sequence + 1 and not session.is_text:
+            # It went on with another agent: what opened it here came late, from before a restart.
+            self._disown(plain, arrival)
+            return None
+        number = getattr(message, "sequence", 0)
+        is_due = number == session.sequence + is_state or isinstance(message, Close)
+        state = AGENT.get((session.state, Way.RECEIVED, type(message))) if is_due else None
+        if state is None:
+            self._drop("stale", "", arrival)
+            return None
+        match message:
+            case State():
+                session.sequence, session.state = message.sequence, state
+                if session.asked_at is not None:
+                    self.statistics.round_trips.add(arrival.now - session.asked_at)
+                self._record(slot, message, plain, session)
+                return Event(slot, message)
+            case Alive():
+                session.heard_at = arrival.now
+            case Missing():
+                self._resend(session, message, arrival)
+            case Close():
+                self._record(slot, message, plain, session)
+                if session.state is not AgentState.CLOSING:
+                    self._answer(slot, session, _goodbye(session, ""))
+                if session.is_text:
+                    last = (session.last, message.sequence, arrival.now + _TEXT_REMEMBERED)
+                    _keep(self._ended_text, session.peer, last)
+                self.free(slot)
+                return Event(slot, message)
+        return None
+
+    def _resend(self, session: Session, missing: Missing, arrival: _Arrival) -> None:
+        """Send the fragments of the last Command that did not arrive."""
+        if session.reply is None or missing.kind != binary.COMMAND:
+            self._drop("stale", "", arrival)
+            return
+        self._put(session.reply.resend(missing), session.peer, session.key)
+        self.statistics.counters["resent"] += 1
+
+    # ---- a simulator that comes
+
+    def _receive_hello(self, hello: Hello, arrival: _Arrival, key: Key | None) -> None:
+        address, size = arrival.address, len(arrival.datagram)
+        opening = self._openings.get((address, hello.session))
+        if hello.session in self._ended or self._seated(hello.session):
+            self._drop("stale", "", arrival)
+        elif opening and not self.closed:
+            self._repeat(opening)
+            self._drop("duplicate", "", arrival)
+        elif isinstance(layout := self._fit(hello), str):
+            self._refuse(hello.session, layout, address, size, key)
+            self._drop("refused", layout, arrival)
+        elif None in self.slots or address in self._slot_of:
+            self._welcome(hello, layout, address, key)
+        else:
+            self._let_wait(Session(address, hello.session, layout, hello, key=key), size)
+
+    def _fit(self, hello: Hello) -> Layout | str:
+        """The layout of a simulator that may come, or why it may not."""
+        if self.closed:
+            return "the agent has closed"
+        low, high = hello.versions
+        if not low <= binary.VERSION <= high:
+            return f"expected protocol version {binary.VERSION}, got {low} to {high}"
+        if unknown := [e.number for e in hello.extensions if e.critical]:
+            return f"expected no critical extension of type {unknown[0]}"
+        return self._accept(hello)
+
+    def _welcome(self, hello: Hello, layout: Layout, address: Address, key: Key | None) -> None:
+        self._queue.pop(address, None)
+        welcome = Welcome(session=hello.session, nonce=self._draw_nonce())
+        opening = Session(address, hello.session, layout, hello, key=key, welcome=welcome)
+        opening.move(Way.SENT, Welcome)
+        opening.reply = self._transfer(binary.encode(welcome), opening)
+        self._put(opening.reply.start(), address, key)
+        self.statistics.counters["sent"] += 1
+        _keep(self._openings, (address, hello.session), opening)
+
+    def _let_wait(self, session: Session, size: int) -> None:
+        wait = binary.encode(Wait(session=session.number))
+        self._put([wait], session.peer, session.key)
+        self.statistics.counters["sent"] += 1
+        session.move(Way.SENT, Wait)
+        session.room = size - len(wait)
+        _keep(self._queue, session.peer, session)
+
+    def _join(
+        self, opening: Session, state: State, plain: bytes, arrival: _Arrival
+    ) -> Event | None:
+        """The first State of a session that was welcomed."""
+        assert opening.welcome is not None
+        assert opening.hello is not None
+        if state.sequence != 1 or state.nonce != opening.welcome.nonce:
+            # Its Hello was an old one: this simulator goes on with another agent, or a copy of
+            # its Hello came late.
+            self._forget(opening)
+            self._disown(plain, arrival)
+            return None
+        self._forget_until(opening)
+        layout = self._fit(opening.hello)  # another one may have come since its Hello
+        if isinstance(layout, str):
+            words = _cut(layout, len(plain) - _REASON_AT)
+            close = Close(session=opening.number, sequence=1, reason=words)
+            self._put([binary.encode(close)], opening.peer, self._session_key(opening))
+            self.statistics.counters["sent"] += 1
+            opening.move(Way.SENT, Close)
+            self._drop("refused", layout, arrival)
+            return None
+        if None not in self.slots and opening.peer not in self._slot_of:  # another was quicker
+            self._disown(plain, arrival)
+            return None
+        opening.key = self._session_key(opening)
+        return self._seat(opening, state, plain)
+
+    def _seat(self, session: Session, state: State, plain: bytes) -> Event:
+        """Give a session its slot: that of an earlier one of its address, or a free one."""
+        slot = self._slot_of.get(session.peer, -1)
+        if slot >= 0:
+            self.free(slot)
+        else:
+            slot = self.slots.index(None)
+        self.slots[slot] = session
+        self._slot_of[session.peer] = slot
+        session.move(Way.RECEIVED, State)
+        session.sequence = state.sequence
+        self.statistics.counters["sessions"] += 1
+        for message in (session.hello, session.welcome):
+            if message:
+                self._record(slot, message, binary.encode(message), session)
+        self._record(slot, state, plain, session)
+        return Event(slot, state, joined=True)
+
+    def _receive_stranger(self, kind: int, plain: bytes, arrival: _Arrival) -> None:
+        """A message of a session that is none here."""
+        if kind in (binary.STATE, binary.MISSING):
+            self._disown(plain, arrival)
+        else:  # the answer to a Close of ours, mostly: not worth a word
+            self.statistics.counters["foreign"] += 1
+
+    def _disown(self, plain: bytes, arrival: _Arrival) -> None:
+        """A State of a session that is none here: its simulator is to begin another.
+
+        If it took a slot that was taken meanwhile, it will be told to wait.
+        """
+        datagram, address, _ = arrival
+        _, number, sequence = binary.peek(plain)
+        if is_fragment(plain) and not asks(plain):
+            return  # one answer will do
+        if self.closed or self._seated(number, elsewhere=address):
+            # Somebody else has it, elsewhere: no word of ours shall end it.
+            self._drop("foreign", f"session {number:016x}", arrival)
+            return
+        self.statistics.counters["foreign"] += 1  # after a restart of ours, mostly: no word of it
+        reply = binary.encode(Unknown(session=number, sequence=sequence))
+        if self._keys:  # of use only to the one that has sent this State
+            key = self._keys.get(key_id(datagram))
+            if key is None:
+                return
+            reply = key.seal(reply, datagram)
+        self._outgoing.append((reply, address))
+        self.statistics.counters["sent"] += 1
+
+    def _seated(self, number: int, elsewhere: Address | None = None) -> bool:
+        """Whether a session of that number has a slot (not of this address)."""
+        return any(s and s.number == number and s.peer != elsewhere for s in self.slots)
+
+    def _forget(self, opening: Session) -> None:
+        del self._openings[opening.peer, opening.number]
+        self._assembling.pop((opening.peer, opening.number), None)
+
+    def _forget_until(self, opening: Session) -> None:
+        """Forget the opening of a State 1, and what the same address began before it.
+
+        What it began later has not ended: if this State came late, that Hello may still be said.
+        """
+        for key, other in list(self._openings.items()):
+            if key[0] == opening.peer:
+                self._forget(other)
+                if other is opening:
+                    return
+
+    # ---- text
+
+    def _receive_text(
+        self, slot: int, session: Session | None, layout: Layout, arrival: _Arrival
+    ) -> Event | None:
+        datagram, address, now = arrival
+        message = text.decode_state(datagram, layout)
+        if session and session.is_text:
+            event = self._receive_known(slot, session, message, b"", arrival)
+            if event and isinstance(message, State):
+                session.last = datagram
+            return event
+        if isinstance(message, Close):
+            self.statistics.counters["foreign"] += 1
+            return None
+        last, number, until = self._ended_text.get(address, (b"", 0, 0.0))
+        is_late = last == datagram or 1 < number == message.sequence
+        if is_late and now < until:
+            reason = "a copy of the last line of a simulator that has closed"
+        elif self.closed:
+            reason = "the agent has closed"
+        elif not self.takes_text or session:
+            reason = "text is not flown here"
+        elif None not in self.slots:
+            reason = "every slot is taken"
+        else:
+            joining = Session(address, 0, layout, None, last=datagram)
+            return self._seat(joining, message, b"")
+        line = text.encode(Close(session=0, sequence=message.sequence, reason=""))
+        self._put([line], address, None)
+        self.statistics.counters["sent"] += 1
+        self._drop("refused", reason, arrival)
+        return None
+
+    # ---- from a datagram to a message
+
+    def _open(self, arrival: _Arrival, session: Session | None) -> tuple[bytes, Key | None]:
+        """A binary datagram without its seal, and the shared key that it was sealed with.
+
+        Raises:
+            KeyMismatch: One side has a key, the other has none, or another.
+            Forged: The seal is not of that key.
+        NoSuchSession: No session of that address and number has a key here.
+        """
+        datagram, address, _ = arrival
+        if not self._keys:
+            raise KeyMismatch("key: this agent has none (--key-file), and the simulator has")
+        if not is_sealed(datagram):
+            raise KeyMismatch("key: this agent has one (--key-file), and the simulator has none")
+        shared = self._keys.get(key_id(datagram))
+        if shared is None:
+            raise Forged("key: the simulator has another one")
+        plain = message_of(datagram)
+        kind, number, sequence = binary.peek(plain)
+        if kind not in binary.OF_SESSION and not (kind == binary.MISSING and sequence):
+            return shared.open(datagram), shared
+        if session and session.number == number and session.key:
+            return session.key.open(datagram), shared
+        opening = self._openings.get((address, number))
+        if opening and (key := self._session_key(opening)):
+            # If the Welcome was for an old copy of its Hello, it is as good as none.
+            with suppress(Forged):
+                return key.open(datagram), shared
+        raise NoSuchSession(f"session {number:016x}")
+
+    def _session_key(self, opening: Session) -> Key | None:
+        assert opening.welcome is not None
+        key = opening.key
+        return key.for_session(opening.number, opening.welcome.nonce) if key else None
+
+    def _assemble(
+        self, fragment: bytes, holder: Session | None, arrival: _Arrival, key: Key | None
+    ) -> bytes | None:
+        """The message, once all its fragments are there, of who may send it now."""
+        kind, number, sequence = binary.check(fragment)
+        kind &= ~binary.FRAGMENT
+        if kind == binary.HELLO and holder is None:
+            assembler = self._assembler((arrival.address, number), MAX_SPEC + 4096)
+        elif kind == binary.HELLO and holder and holder.state is AgentState.WELCOMED:
+            if asks(fragment):
+                self._repeat(holder)
+            self._drop("duplicate", "", arrival)
+            return None
+        elif kind != binary.STATE:
+            self._drop("foreign", f"a fragment of type {kind}", arrival)
+            return None
+        elif holder is None or sequence > holder.sequence + 1:
+            self._disown(fragment, arrival)
+            return None
+        elif sequence <= holder.sequence:
+            is_repeat = sequence == holder.sequence
+            if is_repeat and asks(fragment) and holder.state is not AgentState.DECIDING:
+                self._repeat(holder)
+            self._drop("duplicate" if is_repeat else "stale", "", arrival)
+            return None
+        elif holder.state is AgentState.WELCOMED:
+            assembler = self._assembler((holder.peer, number), holder.layout.state_size)
+            key = self._session_key(holder)
+        else:
+            if holder.assembler is None:
+                holder.assembler = Assembler(holder.layout.state_size)
+            assembler, key = holder.assembler, holder.key
+            holder.heard_at = arrival.now
+        whole = assembler.take(fragment)
+        if whole is not None:
+            self._assembling.pop((arrival.address, number), None)
+        elif asks(fragment) and (missing := assembler.missing()):
+            reply = binary.encode(missing)
+            if holder is None or holder.state is AgentState.WELCOMED:  # no more bytes than came
+                body = reply[binary.HEADER_SIZE : len(fragment)]
+                reply = binary.frame(binary.MISSING, number, sequence, body)
+            self._put([reply], arrival.address, key)
+        return whole
+
+    def _assembler(self, key: tuple[Address, int], largest: int) -> Assembler:
+        """Of one without a slot: kept for the last few that have sent any fragments."""
+        assembler = self._assembling.get(key) or Assembler(largest)
+        _keep(self._assembling, key, assembler, max(_LEAST_ASSEMBLING, len(self.slots)))
+        return assembler
+
+    def _refuse_undecoded(self, error: DecodeError, arrival: _Arrival) -> None:
+        """Count it, and answer an opening if its sender can only mend it when told."""
+        datagram, address, _ = arrival
+        under_seal, size = is_sealed(datagram), len(datagram)
+        plain = message_of(datagram) if under_seal else datagram
+        kind, number, _ = binary.peek(plain)
+        if isinstance(error, NoSuchSession):
+            self._receive_stranger(kind, plain, arrival)
+            return
+        if isinstance(error, KeyMismatch | VersionMismatch) and kind == binary.HELLO:
+            trusted = under_seal and not isinstance(error, KeyMismatch)
+            key = self._keys.get(key_id(datagram)) if trusted else None
+            self._refuse(number, str(error), address, size, key)
+        elif text.is_text(datagram) and (layout := self._text_layout()) and self._keys:
+            with suppress(DecodeError):
+                line = text.decode_state(datagram, layout)
+                if isinstance(line, State):  # two agents would answer each other's Closes for ever
+                    close = Close(session=0, sequence=line.sequence, reason="")
+                    self._put([text.encode(close)], address, None)
+        cause = "forged" if isinstance(error, Forged) else "malformed"
+        self._drop(cause, str(error), arrival)
+
+    # ---- what is sent
+
+    def _answer(self, slot: int, session: Session, message: Command | Close) -> None:
+        """Send a message to a simulator that has a slot. Its bytes are kept for a repeated State.
+
+        Raises `InputError` if it cannot be encoded; then nothing has changed.
+        """
+        data = text.encode(message) if session.is_text else binary.encode(message, session.layout)
+        session.move(Way.SENT, type(message))
+        self._record(slot, message, data, session)
+        session.reply = self._transfer(data, session)
+        self._put(session.reply.start(), session.peer, session.key)
+        self.statistics.counters["sent"] += 1
+
+    def _repeat(self, session: Session) -> None:
+        """Send the last answer again, the same bytes."""
+        assert session.reply is not None
+        self._put(session.reply.start(), session.peer, session.key)
+        self.statistics.counters["resent"] += 1
+
+    def _refuse(
+        self, number: int, reason: str, address: Address, size: int, key: Key | None
+    ) -> None:
+        """Refuse a Hello that came in so many bytes, with no more than those."""
+        room = size - _REASON_AT - (OVERHEAD if key else 0)
+        if room >= 0:
+            refuse = Refuse(session=number, reason=_cut(reason, room))
+            self._put([binary.encode(refuse)], address, key)
+            self.statistics.counters["sent"] += 1
+
+    def _transfer(self, data: bytes, session: Session) -> Transfer:
+        largest = largest_datagram(session.peer, self._max_datagram)
+        return Transfer(data, largest, session.window)
+
+    def _put(self, datagrams: list[bytes], address: Address, key: Key | None) -> None:
+        self._outgoing += [(key.seal(d) if key else d, address) for d in datagrams]
+
+    def _record(self, slot: int, message: Message, data: bytes, session: Session) -> None:
+        if self._tap:
+            whole = binary.encode(message, session.layout) if session.is_text else data
+            self._tap(slot, message, whole)
+
+    def _drop(self, cause: str, reason: str, arrival: _Arrival) -> None:
+        host, port = arrival.address
+        self.statistics.drop(cause, f"from {host}:{port}: {reason}", arrival.now)
+
+
+def _goodbye(session: Session, reason: str) -> Close:
+    return Close(session=session.number, sequence=session.sequence, reason=one_line(reason))
+
+
+def _cut(reason: str, room: int) -> str:
+    """A reason that takes at most so many bytes."""
+    return one_line(reason).encode()[:room].decode(errors="ignore")
+
+
+def _keep(table: "OrderedDict[Any, Any]", key: Any, value: Any, most: int = _MOST) -> None:
+    """Put into a table that forgets its oldest entries."""
+    table[key] = value
+    table.move_to_end(key)
+    if len(table) > most:
+        table.popitem(last=False)

@@ -1,0 +1,200 @@
+"""The text codec: one drone, numbers separated by commas, at most 1024 bytes of ASCII.
+
+The paper's peers turn arrays of numbers into bytes and back (section 2.1). There is no Hello:
+
+    simulator:  sequence,reward,terminated,truncated,observation...,telemetry...
+    agent:      sequence,action...    or    sequence,reset[,seed]
+    either:     sequence,close
+
+Numbers are written as float64 with the fewest digits that read back as the same bits; a float32
+is written as the float64 of the same value.
+"""
+
+import re
+from math import isfinite, prod
+from typing import Final
+
+import numpy as np
+
+from ...models.errors import InputError
+from .errors import DecodeError
+from .layout import Layout
+from .messages import FLY, MAX_UINT64, RESET, Close, Command, State
+
+__all__ = ["MAX_LINE", "check_layout", "decode_command", "decode_state", "encode", "is_text"]
+
+MAX_LINE: Final = 1024
+_DIGITS: Final = frozenset(b"0123456789")
+_FLOAT: Final = "float32"
+_FLAGS: Final = {"0": False, "1": True}
+_WHOLE: Final = re.compile(r"0|[1-9][0-9]{0,19}")
+_NUMBER: Final = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+
+def is_text(datagram: bytes) -> bool:
+    """Whether a datagram can be a text message: every one begins with a digit."""
+    return bool(datagram) and datagram[0] in _DIGITS
+
+
+def check_layout(layout: Layout) -> None:
+    """Raise `InputError` if the messages of a layout cannot be written as text."""
+    observation, action = layout.observation, layout.action
+    if layout.drones != 1:
+        raise InputError(f"text codec: expected one drone, got {layout.drones}: use binary")
+    if len(observation) != 1 or len(observation[0].shape) != 1 or observation[0].dtype != _FLOAT:
+        raise InputError(
+            f"text codec: expected one flat array of float32 as observation, got {observation}: "
+            "use binary"
+        )
+    if action is not None and (len(action.shape) != 1 or action.dtype != _FLOAT):
+        raise InputError(f"text codec: expected flat actions of float32, got {action}: use binary")
+
+
+def encode(message: State | Command | Close) -> bytes:
+    """One line, without its end. Raises `InputError` if it is too long or cannot be told."""
+    match message:
+        case State():
+            fields = _state_fields(message)
+        case Command():
+            fields = _command_fields(message)
+        case Close():
+            fields = ["close"]
+    line = ",".join([str(message.sequence), *fields]).encode()
+    if len(line) > MAX_LINE:
+        raise InputError(f"text line: expected at most {MAX_LINE} bytes, got {len(line)}")
+    return line
+
+
+def _state_fields(message: State) -> list[str]:
+    flags = ["01"[message.terminated.item()], "01"[message.truncated.item()]]
+    arrays = (*message.observations, *message.telemetry)
+    numbers = [number for array in arrays for number in array.ravel().tolist()]
+    _expect_finite([message.rewards.item(), *numbers])
+    return [repr(message.rewards.item()), *flags, *map(repr, numbers)]
+
+
+def _command_fields(message: Command) -> list[str]:
+    order = message.orders.item()
+    if order == RESET:
+        return ["reset"] if message.seeds is None else ["reset", str(message.seeds.item())]
+    if order != FLY:
+        raise InputError("text codec: expected an action or a reset, got a frozen drone")
+    numbers = message.actions.ravel().tolist()
+    _expect_finite(numbers)
+    return [repr(action) for action in numbers]
+
+
+def _expect_finite(numbers: list[float]) -> None:
+    if not all(map(isfinite, numbers)):
+        raise InputError(f"expected finite numbers, got {numbers}")
+
+
+def decode_state(datagram: bytes, layout: Layout) -> State | Close:
+    """A simulator's line, as of session 0. Raises `DecodeError` for anything else."""
+    sequence, fields = _split(datagram)
+    if fields == ["close"]:
+        return Close(session=0, sequence=sequence, reason="the simulator closed")
+    observation, telemetry = layout.observation_slots[0], layout.telemetry_slots
+    size = observation.shape[1]
+    sizes = [prod(slot.shape) for slot in telemetry]
+    expected = 3 + size + sum(sizes)
+    if len(fields) != expected:
+        raise DecodeError(
+            f"state: expected {expected + 1} fields (sequence, reward, terminated, truncated, "
+            f"{size} of observation, {sum(sizes)} of telemetry), got {len(fields) + 1}"
+        )
+    ends = [3 + size + sum(sizes[:i]) for i in range(len(sizes) + 1)]
+    try:
+        return State(
+            session=0,
+            sequence=sequence,
+            time=0.0,
+            rewards=np.array(_floats("reward", fields[:1])),
+            terminated=np.array([_flag("terminated", fields[1])]),
+            truncated=np.array([_flag("truncated", fields[2])]),
+            observations=(_float32("observation", fields[3 : 3 + size]),),
+            telemetry=tuple(
+                np.array(_floats("telemetry", fields[at : at + count])).reshape(slot.shape)
+                for slot, at, count in zip(telemetry, ends, sizes, strict=False)
+            ),
+        )
+    except ValueError as error:
+        raise DecodeError(f"state: {error}") from None
+
+
+def decode_command(datagram: bytes, layout: Layout, session: int) -> Command | Close:
+    """An agent's line, taken as one of `session`. Raises `DecodeError` for anything else."""
+    sequence, fields = _split(datagram)
+    if fields == ["close"]:
+        return Close(session=session, sequence=sequence, reason="the agent closed")
+    actions = layout.actions
+    size = prod(actions.shape)
+    reset = fields[0] == "reset"
+    expected = f"sequence,reset[,seed] or sequence and {size} of action"
+    if len(fields) > 2 if reset else len(fields) != size:
+        raise DecodeError(f"command: expected {expected}, got {datagram[:80]!r}")
+    try:
+        seed = [_whole("seed", fields[1])] if reset and len(fields) == 2 else None
+        return Command(
+            session=session,
+            sequence=sequence,
+            actions=np.zeros(actions.shape, actions.dtype) if reset else _action(fields, layout),
+            orders=np.array([RESET if reset else FLY], np.uint8),
+            seeds=None if seed is None else np.array(seed, np.uint64),
+        )
+    except ValueError as error:
+        raise DecodeError(f"command: {error}") from None
+
+
+def _action(fields: list[str], layout: Layout) -> np.ndarray:
+    if not layout.choices:
+        return _float32("action", fields)
+    choice = _whole("action", fields[0])
+    if choice >= layout.choices:
+        raise InputError(f"action: expected a choice 0 to {layout.choices - 1}, got {choice}")
+    return np.array([choice])
+
+
+def _split(datagram: bytes) -> tuple[int, list[str]]:
+    if len(datagram) > MAX_LINE:
+        raise DecodeError(f"text line: expected at most {MAX_LINE} bytes, got {len(datagram)}")
+    try:
+        line = datagram.decode("ascii").removesuffix("\n").removesuffix("\r")
+    except UnicodeDecodeError:
+        raise DecodeError("text line: expected ASCII") from None
+    sequence, _, rest = line.partition(",")
+    if not rest:
+        raise DecodeError(f"text line: expected sequence,field..., got {line[:80]!r}")
+    try:
+        return _whole("sequence", sequence), rest.split(",")
+    except ValueError as error:
+        raise DecodeError(f"text line: {error}") from None
+
+
+def _whole(name: str, field: str) -> int:
+    number = int(field) if _WHOLE.fullmatch(field) else -1
+    if not 0 <= number <= MAX_UINT64:
+        raise InputError(f"{name}: expected a whole number below 2^64, got {field[:80]!r}")
+    return number
+
+
+def _flag(name: str, field: str) -> bool:
+    if field not in _FLAGS:
+        raise InputError(f"{name}: expected 0 or 1, got {field[:80]!r}")
+    return _FLAGS[field]
+
+
+def _floats(name: str, fields: list[str]) -> list[float]:
+    if not all(map(_NUMBER.fullmatch, fields)):
+        raise InputError(f"{name}: expected decimal numbers, got {','.join(fields)[:80]!r}")
+    numbers = [float(field) for field in fields]
+    _expect_finite(numbers)
+    return numbers
+
+
+def _float32(name: str, fields: list[str]) -> np.ndarray:
+    """Numbers of one drone, float32, shape (1, len(fields))."""
+    with np.errstate(over="ignore", under="ignore"):  # whatever the program has set
+        array: np.ndarray = np.array([_floats(name, fields)]).astype(np.float32)
+    _expect_finite(array[0].tolist())
+    return array

@@ -1,0 +1,1 @@
+"""Drones in simulators elsewhere, as Gymnasium envs of the agent's."""

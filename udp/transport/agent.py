@@ -1,0 +1,435 @@
+"""The agent's port, and the simulators that have a slot at it."""
+
+import json
+import logging
+import math
+import os
+import time
+import weakref
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import gymnasium as gym
+import numpy as np
+
+from ...envs import registry
+from ...envs.spec import EnvSpec, canonical_id
+from ...models.errors import InputError
+from ..layouts import layout_of
+from ..protocol import text
+from ..protocol.auth import Key, read_keys
+from ..protocol.client import Address
+from ..protocol.errors import PeerClosed, PeerSilent
+from ..protocol.layout import Layout
+from ..protocol.messages import Close, Hello, State
+from ..protocol.server import Event, Server
+from ..protocol.transitions import AgentState
+from .sockets import LONGEST_WAIT, Port, address_text, log_notices
+
+if TYPE_CHECKING:
+    from ..journal import Journal
+
+__all__ = ["Agent", "AgentConfig", "Order"]
+
+_log: Final = logging.getLogger("rotorgram.udp")
+_PAUSE: Final = 1.0
+"""A wait that took so much longer than it should, s: this process was stopped meanwhile."""
+
+Order = tuple[np.ndarray, np.ndarray, np.ndarray | None]
+"""Actions, orders and seeds of the drones of one simulator: see `messages.Command`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentConfig:
+    """How an agent listens, which simulators it flies, and how long it waits."""
+
+    env_id: str | None = None
+    """A simulator of another env is refused; None flies any."""
+    options: Mapping[str, Any] | None = None
+    """A simulator of other options is refused; None takes any. Those that are not here have their
+    defaults if the env is known here, and any value otherwise."""
+    vehicle_hash: str | None = None
+    """A simulator of another vehicle is refused; None takes any."""
+    worlds: int | None = None
+    """Worlds of each simulator; None: as many as the first has."""
+    slots: int = 1
+    """Simulators to fly at the same time."""
+    connect_timeout: float = 60.0
+    """Longest wait for a simulator to take a slot that is free, s."""
+    timeout: float = 30.0
+    """Longest wait for an answer from one that has a slot, s. Then its slot is free."""
+    max_datagram: int | None = None
+    """As `LinkConfig.max_datagram`."""
+    key_file: Path | str | None = None
+    insecure: bool = False
+    record: Path | str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("connect_timeout", "timeout"):
+            seconds = getattr(self, name)
+            if not (math.isfinite(seconds) and seconds > 0):
+                raise InputError(f"{name}: expected seconds > 0, got {seconds}")
+        if self.env_id is not None:
+            object.__setattr__(self, "env_id", canonical_id(self.env_id))
+            self.expected_options(self.env_id)
+
+    def expected_options(self, env_id: str) -> dict[str, Any]:
+        """The options that a simulator of this env must have, as JSON values.
+
+        Raises `InputError` if the env is known here and has no such options.
+        """
+        options = dict(self.options or {})
+        if self.options is not None and registry.is_known(env_id):
+            options = asdict(registry.options_type(env_id).from_options(options))
+        try:
+            plain: dict[str, Any] = json.loads(json.dumps(options))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"options: expected JSON values, got {options!r}: {error}") from None
+        return plain
+
+
+class Agent:
+    """Exchanges Commands for States with every simulator, all at the same time.
+
+    Attributes:
+        server: The state machine.
+        spec: Of the simulator that joined last; None before the first.
+        states: The last State of each slot; None before the first.
+        lost: For each slot why its simulator was lost during the last exchange; "" if it was not.
+
+    Raises:
+        InputError: An address, a time, an option or the key file is not what it should be.
+        OSError: The port is in use.
+    """
+
+    def __init__(self, address: Address, config: AgentConfig) -> None:
+        self.config = config
+        self.spec: EnvSpec | None = None
+        self._required = _Required(config)
+        keys = read_keys(config.key_file) if config.key_file else ()
+        journal = self._journal = self._make_journal() if config.record else None
+        self.server = Server(
+            self._required.accept,
+            self._required.text_layout,
+            slots=config.slots,
+            keys=[Key(key, "agent") for key in keys],
+            max_datagram=config.max_datagram,
+            tap=journal.tap if journal else None,
+        )
+        self.states: list[State | None] = [None] * config.slots
+        self.lost = [""] * config.slots
+        self._deadlines = [0.0] * config.slots
+        self._port = Port(address, insecure=config.insecure or bool(keys))
+        if journal:
+            try:
+                journal.start(self.server.statistics, self.server.slots)
+            except BaseException:
+                self._port.close()
+                raise
+        # Runs once: in close(), with the garbage, or when the program ends.
+        self.close = weakref.finalize(self, _leave, os.getpid(), self.server, self._port, journal)
+
+    @property
+    def address(self) -> Address:
+        """Address that this side listens on."""
+        return self._port.address
+
+    @property
+    def worlds(self) -> int:
+        """Worlds of each simulator, once one has come."""
+        return self._required.worlds or 1
+
+    def connect(self) -> None:
+        """Wait until it is the agent's turn at every slot.
+
+        Raises:
+            PeerSilent: A slot stayed free, or its simulator fell silent and no other came.
+            PeerClosed: The last simulator ended the exchange.
+        """
+        if not self.close.alive:
+            raise gym.error.ClosedEnvironmentError("expected an open env, got a closed one")
+        self._gather()
+        self.lost = [""] * len(self.lost)
+
+    def exchange(self, orders: Mapping[int, Order]) -> None:
+        """Send each slot its Command, and wait for the States of all.
+
+        A simulator that is lost meanwhile is replaced by another that comes; then `lost` says why
+        and `states` has the first State of that one.
+
+        Args:
+            orders: By the number of the slot.
+
+        Raises:
+            InputError: The first order is not of the layout, or not finite; nothing was sent.
+            PeerSilent, PeerClosed: As `connect`.
+        """
+        now = time.monotonic()
+        for slot, (actions, what, seeds) in orders.items():
+            self.server.send_command(slot, actions, what, seeds, now)
+        self.lost = [""] * len(self.lost)
+        self._gather()
+
+    def _make_journal(self) -> "Journal":
+        from ..journal import Journal
+
+        config = self.config
+        assert config.record is not None
+        hello = None
+        if spec := self._required.text_spec():
+            hello = Hello(session=0, spec=spec.to_json())
+        return Journal(config.record, side="agent", text_hello=hello)
+
+    # ---- the exchange
+
+    def _gather(self) -> None:
+        """Send what is due and answer what comes, until it is the agent's turn everywhere."""
+        server, config, slots = self.server, self.config, self.server.slots
+        now = time.monotonic()
+        for slot, session in enumerate(slots):
+            wait = config.timeout if session else config.connect_timeout
+            self._deadlines[slot] = now + wait
+        self._flush()
+        if self._journal:
+            self._journal.write()
+        while pending := self._pending():
+            left = min([self._deadlines[slot] for slot in pending]) - now
+            if left <= 0:
+                self._give_up(pending, now)
+                now = time.monotonic()
+                continue
+            try:
+                datagram, address = self._port.receive(left, strangers=None in slots)
+            except (OSError, ValueError):
+                if not self.close.alive:  # another thread has closed the env
+                    raise gym.error.ClosedEnvironmentError("the env was closed") from None
+                datagram = b""  # nothing came; or (Windows) an earlier datagram found nobody
+            before, now = now, time.monotonic()
+            if (pause := now - before - min(left, LONGEST_WAIT)) > _PAUSE:
+                # This process was stopped: what the simulators sent meanwhile was not read.
+                self._deadlines = [deadline + pause for deadline in self._deadlines]
+            if datagram:
+                event = server.receive(datagram, address, now)
+                if event:
+                    self._handle(event, address)
+                self._flush()
+
+    def _pending(self) -> list[int]:
+        """Slots at which it is not the agent's turn."""
+        return [
+            slot
+            for slot, session in enumerate(self.server.slots)
+            if session is None or session.state is not AgentState.DECIDING
+        ]
+
+    def _handle(self, event: Event, address: Address) -> None:
+        slot, message = event.slot, event.message
+        if isinstance(message, Close):
+            self._lose(slot, f"the simulator at {address_text(address)} closed: {message.reason}")
+            self._keep_sockets()
+            if not any(self.server.slots):
+                self._flush()
+                raise PeerClosed(self.lost[slot])
+            self._say_waiting(slot)
+            return
+        if event.joined:
+            self._welcome(slot, address)
+        self.states[slot] = message
+
+    def _welcome(self, slot: int, address: Address) -> None:
+        """Another simulator has this slot now."""
+        session = self.server.slots[slot]
+        assert session is not None
+        self._keep_sockets()
+        if session.hello:
+            self.server.takes_text = False
+            self.spec = _spec(session.hello.spec)
+            self._required.worlds = session.hello.worlds
+        else:
+            self.spec = self._required.text_spec()
+            self._required.worlds = 1
+        self._required.spec = self.spec
+        if self.states[slot] is not None and not self.lost[slot]:
+            self._lose(slot, f"the simulator at {address_text(address)} was started anew")
+            _log.warning("%s", self.lost[slot])
+
+    def _give_up(self, pending: list[int], now: float) -> None:
+        """Free the slots of the silent. Raises `PeerSilent` if nobody took one that was free."""
+        for slot in pending:
+            if now < self._deadlines[slot]:
+                continue
+            session = self.server.slots[slot]
+            if session is None:
+                raise PeerSilent(self._nobody_came(self.lost[slot]))
+            if now < session.heard_at + self.config.timeout:  # it lives, and computes
+                self._deadlines[slot] = session.heard_at + self.config.timeout
+                continue
+            here, there = address_text(self.address), address_text(session.peer)
+            number = session.sequence + 1
+            self.server.free(slot)
+            self._keep_sockets()
+            self._lose(
+                slot,
+                f"no datagram from the simulator at {there} for {self.config.timeout:g} s, "
+                f"waiting at {here} for State {number}{self._last_dropped()}",
+            )
+            self._say_waiting(slot)
+
+    def _keep_sockets(self) -> None:
+        self._port.keep([session.peer for session in self.server.slots if session])
+
+    def _lose(self, slot: int, reason: str) -> None:
+        self.lost[slot] = reason
+        self._deadlines[slot] = time.monotonic() + self.config.connect_timeout
+
+    def _say_waiting(self, slot: int) -> None:
+        here, wait = address_text(self.address), self.config.connect_timeout
+        long = f"{wait:g} s " if wait < 86_400 else ""  # the commands wait for a month
+        _log.warning("%s; waiting %sfor another at %s", self.lost[slot], long, here)
+
+    def _nobody_came(self, lost: str) -> str:
+        which = f"{lost}; no other" if lost else "no simulator"
+        dropped = self._last_dropped()
+        return (
+            f"{which} came to {address_text(self.address)} for {self.config.connect_timeout:g} s"
+            f"{'' if dropped in lost else dropped}"
+        )
+
+    def _last_dropped(self) -> str:
+        last = self.server.statistics.last_error
+        return f"; last datagram dropped: {last}" if last else ""
+
+    def _flush(self) -> None:
+        _flush(self.server, self._port)
+
+
+class _Required:
+    """What a simulator must be. The server holds it: an `Agent` held by its server would never
+    be garbage.
+    """
+
+    def __init__(self, config: AgentConfig) -> None:
+        self.config = config
+        self.spec: EnvSpec | None = None
+        """Of the simulator that has flown."""
+        self.worlds = config.worlds
+        self.text_spec = cache(self._text_spec)
+        self.text_layout = cache(self._text_layout)
+
+    def accept(self, hello: Hello) -> Layout | str:
+        """The layout of a simulator, or why it is refused."""
+        try:
+            spec = _spec(hello.spec)
+            return self._difference(spec, hello.worlds) or layout_of(spec, hello.worlds)
+        except InputError as error:
+            return str(error)
+
+    def _difference(self, spec: EnvSpec, worlds: int) -> str:
+        config, env_id = self.config, canonical_id(spec.env_id)
+        if config.env_id is not None and env_id != config.env_id:
+            return f"expected a simulator of {config.env_id}, got one of {env_id}"
+        if self.worlds is not None and worlds != self.worlds:
+            return f"expected a simulator of {_worlds(self.worlds)}, got one of {worlds}"
+        if config.vehicle_hash is not None and spec.vehicle_hash != config.vehicle_hash:
+            return (
+                f"expected a vehicle of hash {config.vehicle_hash}, "
+                f"got {spec.vehicle} of {spec.vehicle_hash}"
+            )
+        if config.options is not None:
+            expected = config.expected_options(env_id)
+            both_ways = registry.is_known(env_id)
+            if reason := _options_difference(expected, spec.options, both_ways=both_ways):
+                return reason
+        return _spec_difference(self.spec, spec) if self.spec else ""
+
+    def _text_spec(self) -> EnvSpec | None:
+        """Of a simulator that speaks text, for it tells none; None if text is not flown."""
+        config = self.config
+        if config.env_id is None or not registry.is_known(config.env_id):
+            return None
+        if config.worlds not in (None, 1):
+            return None
+        return registry.env_spec(config.env_id, dict(config.options or {}))
+
+    def _text_layout(self) -> Layout | None:
+        spec = self.text_spec()
+        if spec is None:
+            return None
+        layout = layout_of(spec)
+        try:
+            text.check_layout(layout)
+        except InputError:
+            return None
+        return layout
+
+
+@lru_cache(maxsize=4)
+def _spec(text: str) -> EnvSpec:
+    """Raises `SpecError`."""
+    return EnvSpec.from_json(text)
+
+
+def _worlds(count: int) -> str:
+    return "one drone" if count == 1 else f"{count} drones"
+
+
+def _options_difference(
+    ours: Mapping[str, Any], theirs: Mapping[str, Any], *, both_ways: bool
+) -> str:
+    """In which options two envs differ, in a sentence; "" if in none."""
+    names = [*ours, *(name for name in theirs if name not in ours)] if both_ways else ours
+    differing = [
+        f"{name} {_told(ours, name)}, got {_told(theirs, name)}"
+        for name in names
+        if (name in ours, ours.get(name)) != (name in theirs, theirs.get(name))
+    ]
+    return f"options: expected {'; expected '.join(differing)}" if differing else ""
+
+
+def _told(options: Mapping[str, Any], name: str) -> str:
+    return repr(options[name]) if name in options else "not to be there"
+
+
+def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
+    """In what a simulator is unlike those that have flown before, in a sentence."""
+    if reason := _options_difference(ours.options, theirs.options, both_ways=True):
+        return reason
+    for name in ("env_id", "vehicle_hash", "control_period", "agents", "observation", "action",
+                 "telemetry", "metrics"):  # fmt: skip
+        expected, got = getattr(ours, name), getattr(theirs, name)
+        if expected != got:
+            return f"{name}: expected {expected!r:.200} as before, got {got!r:.200}"
+    return ""
+
+
+def _leave(pid: int, server: Server, port: Port, journal: "Journal | None") -> None:
+    """Tell every simulator, until it has answered or will not."""
+    if os.getpid() != pid:  # a fork of the process whose flight this is
+        return
+    server.close("the agent closed", time.monotonic())
+    while True:
+        _flush(server, port)
+        timer = server.next_timer()
+        if timer is None:
+            break
+        left = max(timer - time.monotonic(), 0.0)
+        with suppress(OSError):  # nothing came
+            datagram, address = port.receive(left, strangers=False)
+            server.receive(datagram, address, time.monotonic())
+        server.handle_timer(time.monotonic())
+    port.close()
+    if journal:
+        journal.close()
+
+
+def _flush(server: Server, port: Port) -> None:
+    for datagram, address in server.take_outgoing():
+        try:
+            port.send(datagram, address)
+        except OSError:  # as good as lost: the simulator asks again, or the wait ends in time
+            server.statistics.counters["unsent"] += 1
+    log_notices(server.statistics, time.monotonic())

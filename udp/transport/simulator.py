@@ -1,0 +1,365 @@
+"""The simulator: a UDP client that steps envs by the commands of an agent."""
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import gymnasium as gym
+import numpy as np
+
+from ...models.errors import InputError
+from ..layouts import layout_of
+from ..protocol.auth import Key, read_keys
+from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
+from ..protocol.errors import LinkError, PeerSilent, Refused
+from ..protocol.messages import MAX_UINT64, Close, Command, Hello, Message, Refuse, State, Welcome
+from ..protocol.transitions import SimulatorState
+from .sockets import LONGEST_WAIT, address_text, log_notices, open_socket, receive, resolve
+from .stepped import Stepped, make_stepped
+
+if TYPE_CHECKING:
+    from ..journal import Journal
+
+__all__ = ["DEFAULT_AGENT", "DEFAULT_SIMULATOR", "Observer", "Simulator"]
+
+DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
+DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
+
+_ALIVE_EVERY: Final = 1.0
+"""While a step takes longer, the agent is told as often that it is being computed, s."""
+_PAUSE: Final = 1.0
+"""A wait that took so much longer than it should, s: this process was stopped meanwhile."""
+
+Observer = Callable[[Message | None, State], None]
+"""Is told what moved the drones, a Command or the Welcome that resets them all, and the State that
+it led to: valid during the call only. None, by text: the reset before the first State."""
+
+
+class Simulator:
+    """Simulated drones that an agent flies over UDP.
+
+    Args:
+        env: Id of a registered env, or one Gymnasium env itself: observations are a Box or a Dict
+            of Box, actions a Box or `Discrete`.
+        server: Address (host, port) of the agent.
+        num_envs: Number of worlds.
+        bind: Address of this side; port 0 takes a free port.
+        codec: `binary`, or the paper's `text`.
+        vehicle: MJCF file; None is the paper's.
+        backend: What steps the physics: `mujoco` or `warp`.
+        config: Times of the exchange.
+        key_file: File with the key that the agent has too (`rotorgram key`). With it any address
+            is allowed, for only those who hold the key can take part.
+        insecure: Allow an address that is not loopback without a key.
+        record: MCAP file to write every message to; it must not exist.
+        options: Options of the env, by name.
+
+    Attributes:
+        spec: What is simulated.
+        stepped: The loop or the envs.
+        observer: Called for every State once it is sent, while the agent thinks; None at first.
+
+    Raises:
+        InputError: An option, an address, the key file or the env's spaces are not what they
+            should be.
+        OSError: The port is in use, or the record cannot be written.
+    """
+
+    def __init__(
+        self,
+        env: str | gym.Env[Any, Any] = "rotorgram/Elevation-v0",
+        *,
+        server: Address = DEFAULT_AGENT,
+        num_envs: int = 1,
+        bind: Address = DEFAULT_SIMULATOR,
+        codec: Literal["binary", "text"] = "binary",
+        vehicle: Path | str | None = None,
+        backend: str = "mujoco",
+        config: LinkConfig | None = None,
+        key_file: Path | str | None = None,
+        insecure: bool = False,
+        record: Path | str | None = None,
+        **options: Any,
+    ) -> None:
+        if codec not in ("binary", "text"):
+            raise InputError(f"codec: expected 'binary' or 'text', got {codec!r}")
+        self._text = codec == "text"
+        key = Key(read_keys(key_file)[0], "simulator") if key_file else None
+        anywhere = insecure or key is not None
+        self.server = resolve(server, insecure=anywhere)
+        if self.server[1] == 0:
+            raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
+        self.config = config or LinkConfig()
+        self.observer: Observer | None = None
+        self._keyed = key is not None
+        self._trouble = ""
+        self._stopped = False
+        self._began_at: float | None = None  # when the step began that is being computed
+        with ExitStack() as failing:  # what is open, should a later step fail
+            self.stepped: Stepped = make_stepped(
+                env, num_envs, vehicle=vehicle, backend=backend, options=options
+            )
+            failing.callback(self.stepped.close)
+            self.spec = self.stepped.spec
+            hello = Hello(session=new_session(), spec=self.spec.to_json(), worlds=num_envs)
+            self._journal = self._make_journal(record, hello) if record else None
+            self.link = Client(
+                hello,
+                layout_of(self.spec, num_envs),
+                self.config,
+                largest=largest_datagram(self.server, self.config.max_datagram),
+                by_text=self._text,
+                key=key,
+                tap=self._journal.tap if self._journal else None,
+            )
+            self._socket = open_socket(bind, insecure=anywhere, peer=self.server)
+            failing.callback(self._socket.close)
+            if self._journal:
+                self._journal.start(self.link.statistics)
+            failing.pop_all()
+
+    @property
+    def address(self) -> Address:
+        """Address of this side."""
+        host, port = self._socket.getsockname()
+        return host, port
+
+    def run(self) -> str:
+        """Fly until the agent closes; the reason that it gave. A simulator runs once.
+
+        Whatever ends the run, an error of the env too, the agent is told at once. In the main
+        thread Ctrl-C ends it after the step that is being computed; a second one at once.
+
+        Raises:
+            PeerSilent: Nothing came from the agent within `config.timeout`.
+            Refused: The agent turned this simulator away, with a reason.
+            LinkError: The agent went on after an episode's end without a reset.
+            KeyboardInterrupt: Ctrl-C.
+        """
+        if self.link.state is SimulatorState.CLOSED or self.link.sends:
+            raise ValueError("run: expected one call for each Simulator, got another")
+        reason = "the simulator was stopped"
+        finished = threading.Event()
+        heart = threading.Thread(target=self._say_alive, args=(finished,), daemon=True)
+        with _deferred_interrupt(self.stop) as interrupted:
+            heart.start()
+            try:
+                return self._fly() or reason
+            except Exception as error:
+                reason = f"{type(error).__name__}: {error}"
+                raise
+            finally:
+                finished.set()
+                self.link.close(reason, time.monotonic())
+                self._exchange_until_closed()
+                if self._journal:
+                    self._journal.close()
+                if interrupted:
+                    raise KeyboardInterrupt
+
+    def stop(self) -> None:
+        """Make `run` tell the agent and return, after the step that is being computed.
+
+        May be called from another thread and in a signal handler, any number of times.
+        """
+        self._stopped = True
+
+    def close(self) -> None:
+        """Close the socket, the envs and the record. Not while it runs: see `stop`."""
+        self._socket.close()
+        self.stepped.close()
+        if self._journal:
+            self._journal.close()
+
+    def __enter__(self) -> "Simulator":
+        """Return the simulator, to be closed at the end of the block."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def _make_journal(self, record: Path | str, hello: Hello) -> "Journal":
+        from ..journal import Journal
+        from ..journal.writer import model_of
+
+        return Journal(record, side="simulator", text_hello=hello, model=model_of(self.stepped))
+
+    # ---- the exchange
+
+    def _fly(self) -> str:
+        """Until the agent closes: its reason. Empty if this side was stopped."""
+        link = self.link
+        link.connect(time.monotonic())
+        if self._text:  # the agent says nothing before the first State
+            self._reset(link.hello.session)
+            self._send_state(None)
+        while not self._stopped:
+            message = self._wait()
+            if message is None:
+                break
+            if isinstance(message, Close):
+                if self._text and not link.statistics.round_trips.count:
+                    raise Refused(
+                        f"the agent at {address_text(self.server)} closed before its first "
+                        "command: it has no free slot, has a key, or flies no text"
+                    )
+                return message.reason or "the agent closed"
+            self._began_at = time.monotonic()
+            if isinstance(message, Welcome):
+                self._reset(message.session if message.seed is None else message.seed)
+            elif isinstance(message, Command):
+                self._step(message)
+            self._began_at = None
+            self._send_state(message)
+        return ""
+
+    def _reset(self, seed: int) -> None:
+        """Reset every drone: drone i with seed + i, modulo 2^64."""
+        layout, count = self.link.layout, self.stepped.num_envs
+        seeds = np.array([(seed + i) & MAX_UINT64 for i in range(count)], np.uint64)
+        actions = np.zeros(layout.actions.shape, layout.actions.dtype)
+        self.stepped.advance(actions, np.ones(count, bool), seeds, None)
+
+    def _step(self, command: Command) -> None:
+        orders = command.orders
+        try:
+            if orders.any():
+                self.stepped.advance(command.actions, command.resets, command.seeds, command.frozen)
+            else:
+                self.stepped.advance(command.actions, None, None, None)
+        except gym.error.ResetNeeded as error:
+            raise LinkError(
+                f"an action came after the end of an episode: expected a reset ({error})"
+            ) from None
+
+    def _send_state(self, cause: Message | None) -> None:
+        stepped, link = self.stepped, self.link
+        state = link.send_state(
+            link.sequence * self.spec.control_period,
+            tuple(stepped.observations.values()),
+            stepped.rewards,
+            stepped.terminated,
+            stepped.truncated,
+            tuple(stepped.telemetry.values()),
+            time.monotonic(),
+        )
+        self._flush()
+        if self.observer is not None:
+            self.observer(cause, state)
+
+    def _wait(self) -> Message | None:
+        """Wait for the message that moves the exchange on. None if this side was stopped."""
+        link = self.link
+        if self._journal:
+            self._journal.write()
+        while not self._stopped:
+            self._flush()
+            timer = link.next_timer()
+            assert timer is not None
+            before = time.monotonic()
+            left = timer - before
+            if left <= 0:
+                sends = link.sends  # of what was not answered, not of the Close that follows
+                if not link.handle_timer(before):
+                    raise PeerSilent(self._silence(sends))
+                continue
+            message = self._receive(left)
+            if isinstance(message, Refuse):
+                raise Refused(f"the agent at {address_text(self.server)} refused: {message.reason}")
+            if message is not None:
+                return message
+            pause = time.monotonic() - before - min(left, LONGEST_WAIT)
+            if pause > _PAUSE:
+                link.pardon(pause)
+        return None
+
+    def _receive(self, timeout: float) -> Message | None:
+        try:
+            datagram, _ = receive(self._socket, timeout)
+        except TimeoutError:
+            return None
+        except ConnectionError:  # nothing listens there yet: the timer says when to ask again
+            self._trouble = "nothing listens on that port"
+            return None
+        except OSError as error:  # no way there, a firewall says: the same
+            if self._socket.fileno() < 0:
+                raise
+            self._trouble = f"receiving failed: {error.strerror}"
+            return None
+        self._trouble = ""
+        return self.link.receive(datagram, time.monotonic())
+
+    def _exchange_until_closed(self) -> None:
+        """Until the agent has answered our Close, or will not."""
+        while self._socket.fileno() >= 0:
+            self._flush()
+            timer = self.link.next_timer()
+            if timer is None:
+                return
+            left = timer - time.monotonic()
+            if left > 0:
+                self._receive(left)
+            else:
+                self.link.handle_timer(time.monotonic())
+
+    def _flush(self) -> None:
+        for datagram in self.link.take_outgoing():
+            self._send(datagram)
+        log_notices(self.link.statistics, time.monotonic())
+
+    def _send(self, datagram: bytes) -> None:
+        try:
+            self._socket.send(datagram)
+        except ConnectionError:
+            self.link.statistics.counters["unsent"] += 1
+            self._trouble = "nothing listens on that port"
+        except OSError as error:  # a full buffer or a network that is down: as good as lost
+            self.link.statistics.counters["unsent"] += 1
+            self._trouble = f"sending failed: {error.strerror}"
+
+    def _say_alive(self, finished: threading.Event) -> None:
+        """In a thread: tell the agent of a long step that it is being computed."""
+        while not finished.wait(_ALIVE_EVERY):
+            began_at = self._began_at
+            if began_at is not None and time.monotonic() - began_at > _ALIVE_EVERY:
+                for datagram in self.link.alive():
+                    self._send(datagram)
+
+    def _silence(self, sends: int) -> str:
+        what = "Hello" if self.link.sequence == 0 else f"State {self.link.sequence}"
+        key = ""
+        if self._keyed and what == "Hello":
+            key = "; an agent with another key does not answer"
+        why = f"; {self._trouble}" if self._trouble else ""
+        last = self.link.statistics.last_error
+        dropped = f"; last datagram dropped: {last}" if last else ""
+        return (
+            f"no answer from the agent at {address_text(self.server)} "
+            f"for {self.config.timeout:g} s, {what} sent {sends} times{why}{key}{dropped}"
+        )
+
+
+@contextmanager
+def _deferred_interrupt(stop: Callable[[], None]) -> Iterator[list[bool]]:
+    """Have Ctrl-C call `stop`, and only a second one interrupt. The list says whether it came."""
+    came: list[bool] = []
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield came
+        return
+
+    def note(*_: object) -> None:
+        came.append(True)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        stop()
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield came
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,0 +1,252 @@
+"""Sockets: opening them, with a clear sentence for what can be wrong, and waiting on them.
+
+A wait is a blocking read. A loop of non-blocking reads that yields in between saves some
+microseconds on an idle machine, and takes three times as long as soon as another process wants the
+processor.
+"""
+
+import errno
+import ipaddress
+import logging
+import selectors
+import socket
+import sys
+import time
+from collections.abc import Collection
+from contextlib import suppress
+from typing import Any, Final
+
+from ...models.errors import InputError
+from ..protocol.client import Address
+from ..protocol.statistics import Statistics
+
+__all__ = [
+    "LONGEST_WAIT",
+    "Port",
+    "address_text",
+    "is_loopback",
+    "log_notices",
+    "open_socket",
+    "resolve",
+]
+
+LONGEST_WAIT: Final = 0.1
+"""Longest wait in one go, s: flags that other threads and signals set are looked at as often."""
+
+_log: Final = logging.getLogger("rotorgram.udp")
+_STRANGERS_EVERY: Final = 0.01
+"""While every slot is taken, a datagram of a stranger is looked at so often, s."""
+_BUFFER: Final = 1 << 22
+"""Bytes of datagrams that a socket may hold until they are looked at."""
+_MAX_DATAGRAM: Final = 65507
+"""Largest payload of a UDP datagram over IPv4, bytes."""
+
+
+def address_text(address: Address) -> str:
+    """An address as it is written: host:port."""
+    return f"{address[0]}:{address[1]}"
+
+
+def is_loopback(address: Address) -> bool:
+    """Whether a resolved address reaches this machine only."""
+    return ipaddress.ip_address(address[0]).is_loopback
+
+
+def resolve(address: Address, *, insecure: bool) -> Address:
+    """The IPv4 address and port of a host name and port.
+
+    Args:
+        insecure: Allow any address; otherwise loopback ones only. Set where a key protects.
+
+    Raises:
+        InputError: It is not an address, or not a loopback one and `insecure` is not set.
+    """
+    try:
+        host, port = address
+        valid = isinstance(host, str) and type(port) is int and 0 <= port <= 65535
+    except (TypeError, ValueError):
+        valid = False
+    if not valid:
+        raise InputError(f"address: expected (host, port from 0 to 65535), got {address!r}")
+    try:
+        found = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)
+    except (socket.gaierror, UnicodeError):
+        raise InputError(f"host: expected a name or IPv4 address, got {host!r}") from None
+    number = str(found[0][4][0])
+    if not insecure and not is_loopback((number, port)):
+        raise InputError(
+            f"{host} is not a loopback address: expected 127.0.0.1, or a key that both sides share "
+            "(key_file, --key-file), or insecure=True (--insecure) where everybody who reaches "
+            "this port may fly the drone"
+        )
+    return number, port
+
+
+def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -> socket.socket:
+    """A UDP socket bound to an address, to be read with `receive`. Port 0 takes a free one.
+
+    With a resolved `peer` it is connected: the kernel drops what others send.
+
+    Raises:
+        InputError: The address is not one of this machine's, or is not loopback and `insecure` is
+            not set.
+        OSError: The port is taken or may not be bound, or the peer cannot be reached from here.
+    """
+    address = resolve(bind, insecure=insecure)
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    what = f"bind {address_text(bind)}"
+    try:
+        sock.bind(address)
+        if peer is not None:
+            what = f"send to {address_text(peer)} from {address_text(bind)}"
+            sock.connect(peer)
+    except OSError as error:
+        sock.close()
+        raise OSError(error.errno, f"cannot {what}: {_explain(error)}") from None
+    _enlarge_buffer(sock)
+    sock.settimeout(LONGEST_WAIT)
+    return sock
+
+
+def _enlarge_buffer(sock: socket.socket) -> None:
+    """Ask for room for the parts of a large message; the system gives what it allows."""
+    with suppress(OSError):
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+
+
+def _explain(error: OSError) -> str:
+    sentences = {
+        errno.EADDRINUSE: "the port is in use: choose another one, or end the program on it",
+        errno.EADDRNOTAVAIL: "this machine has no such address",
+        errno.EACCES: "ports below 1024 need more rights: choose a higher one",
+        errno.EINVAL: "a loopback address reaches this machine only: bind another one",
+    }
+    return sentences.get(error.errno or 0, str(error.strerror))
+
+
+def receive(sock: socket.socket, timeout: float) -> tuple[bytes, Address]:
+    """The next datagram and where it came from.
+
+    Raises:
+        TimeoutError: Nothing came within `timeout`, s, or `LONGEST_WAIT`: look at the clock.
+        OSError: An earlier datagram came back, or the socket is closed.
+    """
+    if timeout < LONGEST_WAIT:  # else the socket's own will do: to set it is a system call
+        sock.settimeout(max(timeout, 1e-6))
+        try:
+            return sock.recvfrom(_MAX_DATAGRAM)
+        finally:
+            sock.settimeout(LONGEST_WAIT)
+    return sock.recvfrom(_MAX_DATAGRAM)
+
+
+class Port:
+    """The agent's port: a socket for everybody and, where the system can, one for each simulator.
+
+    Those are connected, so that the system sorts the datagrams, each socket has a buffer of its
+    own, and nobody else can fill the one of a simulator, however fast he sends.
+
+    Raises:
+        InputError, OSError: As `open_socket`.
+    """
+
+    def __init__(self, address: Address, *, insecure: bool) -> None:
+        self._everybody = open_socket(address, insecure=insecure)
+        self._everybody.setblocking(False)
+        self._own: dict[Address, socket.socket] = {}
+        self._simulators = selectors.DefaultSelector()
+        self._all = selectors.DefaultSelector()
+        self._all.register(self._everybody, selectors.EVENT_READ)
+        self._missing = False  # whether a simulator's datagrams come to the socket for everybody
+        self._next_look = 0.0
+
+    @property
+    def address(self) -> Address:
+        """Address that is listened on."""
+        host, port = self._everybody.getsockname()
+        return host, port
+
+    def keep(self, peers: Collection[Address]) -> None:
+        """Have a socket for each of these, and for nobody else."""
+        for peer in self._own.keys() - set(peers):
+            sock = self._own.pop(peer)
+            for selector in (self._simulators, self._all):
+                selector.unregister(sock)
+            sock.close()
+        if sys.platform == "linux":  # others sort the datagrams of one port by other rules
+            for peer in set(peers) - self._own.keys():
+                self._add(peer)
+        self._missing = len(self._own) < len(set(peers))
+
+    def receive(self, timeout: float, *, strangers: bool) -> tuple[bytes, Address]:
+        """The next datagram and where it came from.
+
+        Args:
+            timeout: Longest wait, s.
+            strangers: Whether one from anybody is as welcome as one of a simulator. Otherwise they
+                are looked at only now and then.
+
+        Raises:
+            TimeoutError, OSError: As the function `receive`; a wait may end early.
+        """
+        if strangers or self._missing or not self._own:
+            return _receive_any(self._all, timeout)
+        now = time.monotonic()
+        if now >= self._next_look:
+            self._next_look = now + _STRANGERS_EVERY
+            with suppress(BlockingIOError):
+                return self._everybody.recvfrom(_MAX_DATAGRAM)
+        if len(self._own) > 1:
+            return _receive_any(self._simulators, timeout)
+        (only,) = self._own.values()
+        return receive(only, timeout)
+
+    def send(self, datagram: bytes, address: Address) -> None:
+        """Send a datagram. Raises `OSError`."""
+        self._everybody.sendto(datagram, address)
+
+    def close(self) -> None:
+        """Close every socket."""
+        self.keep(())
+        self._simulators.close()
+        self._all.close()
+        self._everybody.close()
+
+    def _add(self, peer: Address) -> None:
+        try:
+            sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        except OSError:  # too many open files
+            return
+        try:
+            # Not SO_REUSEADDR, with which another user could take the port in this moment.
+            for one in (self._everybody, sock):
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+            sock.bind(self._everybody.getsockname())
+            sock.connect(peer)
+        except OSError:  # then its datagrams come to the socket for everybody
+            sock.close()
+            return
+        finally:
+            self._everybody.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
+        _enlarge_buffer(sock)
+        sock.settimeout(LONGEST_WAIT)
+        self._own[peer] = sock
+        for selector in (self._simulators, self._all):
+            selector.register(sock, selectors.EVENT_READ)
+
+
+def _receive_any(selector: selectors.BaseSelector, timeout: float) -> tuple[bytes, Address]:
+    """As `receive`, from any of several sockets."""
+    for key, _ in selector.select(min(timeout, LONGEST_WAIT)):
+        sock: Any = key.fileobj
+        datagram, address = sock.recvfrom(_MAX_DATAGRAM)
+        return datagram, address
+    raise TimeoutError
+
+
+def log_notices(statistics: Statistics, now: float) -> None:
+    """Write to the log `rotorgram.udp` what there is to say: warnings, and a report each minute."""
+    for notice in statistics.take_notices():
+        _log.warning("%s", notice)
+    if statistics.report_due(now):
+        _log.info("wire: %s", statistics)

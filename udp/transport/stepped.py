@@ -1,0 +1,214 @@
+"""What a simulator steps: the loop of a registered task, or Gymnasium envs one after the other."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from ...envs import registry
+from ...envs.spaces import action_space, observation_space
+from ...envs.spec import ArraySpec, Discrete, EnvSpec, canonical_id, component_names
+from ...models.errors import InputError
+from ..protocol.layout import MAX_DRONES
+
+__all__ = ["Stepped", "make_stepped", "spec_of_gymnasium"]
+
+
+class Stepped(Protocol):
+    """N drones that take a step of the wire together: see `rotorgram.envs.Loop`."""
+
+    spec: EnvSpec
+    num_envs: int
+    observations: dict[str, np.ndarray]
+    """By name, shape (N, *shape)."""
+    rewards: np.ndarray
+    """float64, shape (N,)."""
+    terminated: np.ndarray
+    """bool, shape (N,)."""
+    truncated: np.ndarray
+    """bool, shape (N,)."""
+
+    @property
+    def telemetry(self) -> dict[str, np.ndarray]:
+        """By name, float64, shape (N, *shape)."""
+
+    def advance(
+        self,
+        actions: np.ndarray,
+        resets: np.ndarray | None,
+        seeds: np.ndarray | None,
+        frozen: np.ndarray | None,
+    ) -> None:
+        """Reset some drones, freeze some, and fly the others for one control period."""
+
+    def close(self) -> None:
+        """Free what is held."""
+
+
+def make_stepped(
+    env: str | gym.Env[Any, Any],
+    num_envs: int,
+    *,
+    vehicle: Path | str | None = None,
+    backend: str = "mujoco",
+    options: Mapping[str, Any],
+) -> Stepped:
+    """N drones of an env.
+
+    Args:
+        env: Id of a registered task, of an env of Gymnasium, or one env itself.
+        num_envs: N.
+        vehicle: MJCF file, for a registered task.
+        backend: What steps the physics of a registered task.
+        options: Of the env, by name.
+
+    Raises:
+        InputError: An argument or the env's spaces are not what they should be.
+    """
+    if type(num_envs) is not int or not 1 <= num_envs <= MAX_DRONES:
+        raise InputError(f"num_envs: expected 1 to {MAX_DRONES}, got {num_envs!r}")
+    if isinstance(env, str):
+        if registry.is_known(env):
+            from ...envs.loop import Loop
+
+            name: Any = backend
+            loop: Any = Loop(
+                canonical_id(env), num_envs, vehicle=vehicle, backend=name, options=options
+            )
+            return loop  # type: ignore[no-any-return]
+        envs = [_make(env, options) for _ in range(num_envs)]
+    else:
+        if options:
+            raise InputError(f"options {sorted(options)}: expected none with an env already made")
+        if num_envs > 1:
+            raise InputError(f"num_envs: expected 1 with an env already made, got {num_envs}")
+        envs = [env]
+    if vehicle is not None or backend != "mujoco":
+        raise InputError(f"vehicle, backend: expected none for {env!r}, which is no task of ours")
+    return _Singles(envs, options)
+
+
+def _make(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
+    try:
+        return gym.make(env_id, disable_env_checker=True, **options)
+    except (gym.error.Error, ImportError) as error:
+        raise InputError(f"env: expected a registered id, got {env_id!r}: {error}") from None
+    except TypeError as error:
+        raise InputError(f"options of {env_id}: {error}") from None
+
+
+class _Singles:
+    """Gymnasium envs, one after the other: `Stepped`."""
+
+    def __init__(self, envs: Sequence[gym.Env[Any, Any]], options: Mapping[str, Any]) -> None:
+        self.envs, self.num_envs = envs, len(envs)
+        self.spec = spec_of_gymnasium(envs[0], options)
+        count = (self.num_envs,)
+        self.observations = {
+            array.name: np.zeros(count + array.shape, array.dtype)
+            for array in self.spec.observation
+        }
+        self.telemetry = {
+            array.name: np.zeros(count + array.shape) for array in self.spec.telemetry
+        }
+        self.rewards = np.zeros(count)
+        self.terminated, self.truncated = np.zeros(count, bool), np.zeros(count, bool)
+        self._waiting = np.ones(count, bool)  # for a reset
+
+    def advance(
+        self,
+        actions: np.ndarray,
+        resets: np.ndarray | None,
+        seeds: np.ndarray | None,
+        frozen: np.ndarray | None,
+    ) -> None:
+        none = np.zeros(self.num_envs, bool)
+        resets, frozen = none if resets is None else resets, none if frozen is None else frozen
+        waiting = self._waiting & ~resets & ~frozen
+        if waiting.any():
+            raise gym.error.ResetNeeded(f"step: expected a reset of env {waiting.argmax()} first")
+        for i, env in enumerate(self.envs):
+            if frozen[i]:
+                self._keep_flags(i, 0.0, False, False)
+            elif resets[i]:
+                observation, info = env.reset(seed=None if seeds is None else int(seeds[i]))
+                self._keep(i, observation, info)
+                self._keep_flags(i, 0.0, False, False)
+                self._waiting[i] = False
+            else:
+                action = int(actions[i]) if isinstance(self.spec.action, Discrete) else actions[i]
+                observation, reward, terminated, truncated, info = env.step(action)
+                self._keep(i, observation, info)
+                self._keep_flags(i, float(reward), bool(terminated), bool(truncated))
+                self._waiting[i] = terminated or truncated
+
+    def close(self) -> None:
+        for env in self.envs:
+            env.close()
+
+    def _keep_flags(self, i: int, reward: float, terminated: bool, truncated: bool) -> None:
+        self.rewards[i] = reward
+        self.terminated[i], self.truncated[i] = terminated, truncated
+
+    def _keep(self, i: int, observation: Any, info: Mapping[str, Any]) -> None:
+        arrays = self.spec.observation
+        named = observation if isinstance(observation, dict) else {arrays[0].name: observation}
+        for array in arrays:
+            value = np.asarray(named[array.name])
+            if value.shape != array.shape or value.dtype != array.dtype:
+                raise InputError(
+                    f"observation {array.name}: expected {array.dtype} of shape {array.shape}, "
+                    f"got {value.dtype} of shape {value.shape}"
+                )
+            self.observations[array.name][i] = value
+        for array in self.spec.telemetry:
+            numbers = [info[name] for name in component_names(array)]
+            self.telemetry[array.name][i] = np.reshape(numbers, array.shape)
+
+
+def spec_of_gymnasium(env: gym.Env[Any, Any], options: Mapping[str, Any]) -> EnvSpec:
+    """The spec of any Gymnasium env: its own if it has one, else from its spaces.
+
+    Raises `InputError` if a space cannot cross the wire.
+    """
+    base: Any = env.unwrapped
+    observation = env.observation_space
+    boxes = observation.spaces if isinstance(observation, spaces.Dict) else {"": observation}
+    arrays = tuple(_array(name or "observation", box) for name, box in boxes.items())
+    action: ArraySpec | Discrete
+    if isinstance(env.action_space, spaces.Discrete) and env.action_space.start == 0:
+        action = Discrete(n=int(env.action_space.n))
+    else:
+        action = _array("action", env.action_space)
+    spec = getattr(base, "env_spec", None)
+    if isinstance(spec, EnvSpec) and (env.observation_space, env.action_space) == (
+        observation_space(spec),
+        action_space(spec),
+    ):
+        return spec
+    try:
+        json.dumps(dict(options))
+    except (TypeError, ValueError):
+        raise InputError(f"options: expected JSON values, got {options!r:.80}") from None
+    return EnvSpec(
+        env_id=canonical_id(env.spec.id) if env.spec else type(base).__name__,
+        options=dict(options),
+        control_period=float(
+            getattr(base, "control_period", 1 / (env.metadata.get("render_fps") or 50))
+        ),
+        observation=arrays,
+        action=action,
+    )
+
+
+def _array(name: str, space: Any) -> ArraySpec:
+    if not isinstance(space, spaces.Box):
+        raise InputError(f"{name} space: expected Box, a Dict of Box, or Discrete, got {space}")
+    low, high = (b.astype(np.float64).ravel().tolist() for b in (space.low, space.high))
+    return ArraySpec(
+        name=name, shape=space.shape, dtype=str(space.dtype), low=tuple(low), high=tuple(high)
+    )
