@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from hashlib import blake2b
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rotorgram.envs  # noqa: F401
+import zstandard
 from mcap import records
 from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import make_reader
@@ -32,7 +31,8 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from peers import ANY, ENV_ID, Running
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rotorgram.models import QUAD_XML, SCENE_XML
+from rotorgram.envs.loop import Loop
+from rotorgram.envs.spec import EnvSpec
 from rotorgram.udp import (
     LinkConfig,
     PeerClosed,
@@ -41,17 +41,18 @@ from rotorgram.udp import (
     RemoteEnv,
     RemoteVectorEnv,
     Simulator,
-    binary,
 )
-from rotorgram.udp import journal as journal_module
-from rotorgram.udp._mcap import McapFile
-from rotorgram.udp._schemas import field_names
-from rotorgram.udp.faults import FaultConfig, Relay
-from rotorgram.udp.journal import Journal
-from rotorgram.udp.keys import write_key
-from rotorgram.udp.messages import Close, Command, Hello, Message, State, Welcome
-from rotorgram.udp.replay import read_journal, summarize, verify
-from rotorgram.udp.statistics import Statistics
+from rotorgram.udp.journal import Journal, read_journal, summarize
+from rotorgram.udp.journal import writer as journal_module
+from rotorgram.udp.journal._file import MAX_CHUNK, McapFile
+from rotorgram.udp.journal.replay import verify
+from rotorgram.udp.layouts import layout_of
+from rotorgram.udp.protocol import binary
+from rotorgram.udp.protocol.auth import write_key
+from rotorgram.udp.protocol.layout import Layout
+from rotorgram.udp.protocol.messages import Close, Command, Hello, Message, State, Welcome
+from rotorgram.udp.protocol.statistics import Statistics
+from rotorgram.udp.transport.relay import FaultConfig, Relay
 
 PAGE = Path(__file__).parent.parent / "docs" / "journal.md"
 QUICK = LinkConfig(timeout=5)
@@ -60,9 +61,9 @@ TIMES: dict[str, Any] = {"timeout": 5, "connect_timeout": 5}
 
 def fly(remote: Any, steps: int, seed: int | None = 7) -> SimpleNamespace:
     """Fly at random; steps, episodes and returns as the agent sees them."""
+    remote.reset(seed=seed)
     remote.action_space.seed(steps)
     drones = getattr(remote, "num_envs", 1)
-    remote.reset(seed=seed)
     flown, episodes, total, running = 0, 0, 0.0, np.zeros(drones)
     ended = np.zeros(drones, bool)
     for _ in range(steps):
@@ -88,7 +89,10 @@ def pair(
     if key_file:
         write_key(key_file)
     known = options if codec == "text" else None
-    common: dict[str, Any] = {"options": known, "connect": False, "key_file": key_file, **TIMES}
+    env_id = ENV_ID if codec == "text" else None
+    common: dict[str, Any] = {
+        "env_id": env_id, "options": known, "connect": False, "key_file": key_file, **TIMES
+    }  # fmt: skip
     remote: Any
     if drones == 1:
         remote = RemoteEnv(ANY, record=files["agent"], **common)
@@ -128,6 +132,7 @@ def rewrite(source: Path, target: Path, change: Callable[[Message], Message]) ->
         for metadata in reader.iter_metadata():
             writer.add_metadata(metadata.name, metadata.metadata)
         channels: dict[int, int] = {}
+        layout: Layout | None = None
         for schema, channel, message in reader.iter_messages(log_time_order=False):
             assert schema is not None
             if channel.id not in channels:
@@ -138,10 +143,13 @@ def rewrite(source: Path, target: Path, change: Callable[[Message], Message]) ->
             data = message.data
             if channel.topic.endswith("events"):
                 words = json.loads(data)
-                changed = change(binary.decode(bytes.fromhex(words["datagram"])))
+                message_ = binary.decode(bytes.fromhex(words["datagram"]))
+                if isinstance(message_, Hello):
+                    layout = layout_of(EnvSpec.from_json(message_.spec), message_.worlds)
+                changed = change(message_)
                 data = json.dumps(words | {"datagram": binary.encode(changed).hex()}).encode()
             elif channel.message_encoding == "ros1":
-                data = binary.encode(change(binary.decode(data)))
+                data = binary.encode(change(binary.decode(data, layout)), layout)
             writer.add_message(channels[channel.id], message.log_time, data, message.publish_time)
         writer.finish()
 
@@ -152,6 +160,11 @@ def flip(array: np.ndarray, *index: int) -> np.ndarray:
     kind = {1: np.uint8, 4: np.uint32, 8: np.uint64}[copy.itemsize]
     copy.view(kind)[index] ^= 1
     return copy
+
+
+def flipped(arrays: tuple[np.ndarray, ...], which: int, *index: int) -> tuple[np.ndarray, ...]:
+    """Arrays with the last bit of one number of one of them flipped."""
+    return tuple(flip(a, *index) if i == which else a for i, a in enumerate(arrays))
 
 
 # ---- repeating
@@ -178,17 +191,17 @@ def test_both_sides_can_be_repeated_bit_for_bit(
         assert (summary.steps, summary.episodes) == (seen.steps, seen.episodes)
         assert summary.mean_return == pytest.approx(seen.returns / seen.episodes, rel=1e-12)
         (session,) = summary.sessions
-        assert session.flight.hello.num_drones == arrangement.get("drones", 1)
-        assert session.flight.codec == arrangement.get("codec", "binary")
+        assert session.session.num_envs == arrangement.get("drones", 1)
+        assert session.session.codec == arrangement.get("codec", "binary")
         assert session.ending.startswith("closed: the ")
         assert 0 < session.seconds < 60
         (compared,) = verdict.sessions
-        blind = int(side == "agent" and session.flight.codec == "text")
+        blind = int(side == "agent" and session.session.codec == "text")
         assert (compared.same, compared.unchecked) == (session.states - blind, blind)
         assert compared.notes == verdict.notes == []
         assert verdict.identical
         assert str(verdict).endswith(f"identical: {compared.same} States in 1 session")
-    assert datagrams(both.agent, State)[1][24:] == datagrams(both.simulator, State)[1][24:]
+    assert datagrams(both.agent, State)[1][40:] == datagrams(both.simulator, State)[1][40:]
 
 
 def test_both_sides_write_the_same_datagrams(flight: SimpleNamespace) -> None:
@@ -198,7 +211,37 @@ def test_both_sides_write_the_same_datagrams(flight: SimpleNamespace) -> None:
     assert len(ours) == 2 * 602 + 1  # Hello, Welcome, State 1 and its reset; the last has no answer
 
 
-def test_a_flight_of_another_env_can_be_repeated(tmp_path: Path) -> None:
+def test_nothing_that_a_journal_names_is_imported(
+    flight: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "evil.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for env_id in ("evil:Evil-v0", "CartPole-v1", "rotorgram/No-v0"):
+        path = tmp_path / "named.mcap"
+        rewrite(flight.simulator, path, changed_spec(env_id=env_id))
+        (session,) = verify(path).sessions
+        assert session.problem == (
+            f"State 1 cannot be repeated: expected a registered env id, got {env_id!r}"
+        )
+        assert summarize(path).sessions[0].session.spec.env_id == env_id
+    path = tmp_path / "named.mcap"  # a module before an id that is registered changes nothing
+    name = f"evil:{ENV_ID}"
+    rewrite(flight.simulator, path, changed_spec(env_id=name))
+    assert verify(path).identical
+
+
+def changed_spec(**values: Any) -> Callable[[Message], Message]:
+    """Changes fields of the spec of every Hello."""
+
+    def changed(message: Message) -> Message:
+        if not isinstance(message, Hello):
+            return message
+        return replace(message, spec=json.dumps(json.loads(message.spec) | values))
+
+    return changed
+
+
+def test_a_flight_of_another_env_is_recorded_and_not_repeated(tmp_path: Path) -> None:
     path = tmp_path / "pole.mcap"
     remote = RemoteEnv(ANY, env_id="CartPole-v1", connect=False, **TIMES)
     simulator = Simulator("CartPole-v1", server=remote.address, bind=ANY, config=QUICK,
@@ -207,7 +250,8 @@ def test_a_flight_of_another_env_can_be_repeated(tmp_path: Path) -> None:
     with remote:
         fly(remote, 60)
     running.join()
-    assert verify(path).identical  # with the option, of which its Hello says nothing
+    assert summarize(path).steps == 60
+    assert not verify(path).identical
     assert read_journal(path).attachments == {}
 
 
@@ -225,20 +269,24 @@ def test_a_flight_that_never_began(tmp_path: Path) -> None:
 
 def test_a_refused_simulator(tmp_path: Path) -> None:
     path = tmp_path / "refused.mcap"
-    with RemoteEnv(ANY, connect=False, timeout=5, connect_timeout=1) as remote:
+    with RemoteEnv(ANY, env_id=ENV_ID, connect=False, timeout=5, connect_timeout=1) as remote:
         simulator = Simulator("CartPole-v1", server=remote.address, bind=ANY, record=path)
         running = Running(simulator)
         with pytest.raises(PeerSilent):
             remote.connect()
         assert isinstance(running.join(), Refused)
     (session,) = summarize(path).sessions
-    assert session.ending == f"refused: expected a simulator of {ENV_ID}, got one of CartPole-v1"
+    assert session.ending.startswith("refused: ")
+    assert ENV_ID in session.ending
 
 
 CHANGES = {
     "reward": lambda s: replace(s, rewards=flip(s.rewards, 2)),
-    "telemetry theta": lambda s: replace(s, telemetry=flip(s.telemetry, 2, 4)),
-    "observation 1": lambda s: replace(s, observations=flip(s.observations, 2, 1)),
+    "telemetry theta": lambda s: replace(s, telemetry=flipped(s.telemetry, 1, 2, 1)),
+    "telemetry elevation_error": lambda s: replace(s, telemetry=flipped(s.telemetry, 4, 2, 0)),
+    "observation rate of the error": (
+        lambda s: replace(s, observations=flipped(s.observations, 0, 2, 1))
+    ),
     "terminated": lambda s: replace(s, terminated=flip(s.terminated, 2)),
     "truncated": lambda s: replace(s, truncated=flip(s.truncated, 2)),
 }
@@ -272,27 +320,28 @@ def test_one_flipped_bit_is_found(field: str, flight: SimpleNamespace, tmp_path:
 def test_other_options_and_another_model_are_noticed(
     flight: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def other(**values: str) -> Path:
+    def other(**values: Any) -> Path:
         path = tmp_path / "other.mcap"
-        rewrite(flight.simulator, path,
-                lambda m: replace(m, **values) if isinstance(m, Hello) else m)  # fmt: skip
+        rewrite(flight.simulator, path, changed_spec(**values))
         return path
 
-    options = next(iter(read_journal(flight.simulator))).flight.hello.options
-    verdict = verify(other(options=options.replace('"linear_drag":0.0', '"linear_drag":0.5')))
+    options = dict(next(iter(read_journal(flight.simulator))).session.spec.options)
+    verdict = verify(other(options=options | {"linear_drag": 0.5}))
     found = verdict.sessions[0].difference
     assert found is not None
     assert found.sequence == 3  # the resets are at rest; drag slows what moves
-    assert re.match("the model was [0-9a-f]{32}, and is", verdict.sessions[0].notes[0])
-    verdict = verify(other(model_hash="1" * 32))
+    assert re.match("the vehicle was [0-9a-f]{32}, and is", verdict.sessions[0].notes[0])
+    verdict = verify(other(vehicle_hash="1" * 32))
     assert verdict.identical
-    assert verdict.sessions[0].notes[0].startswith(f"the model was {'1' * 32}, and is ")
-    verdict = verify(other(options=options.replace('"full"', '"error"')))
-    assert "State 1 cannot be repeated: expected (observations, " in verdict.sessions[0].problem
-    verdict = verify(other(env_id="rotorgram/No-v0"))
-    assert "expected a registered id, got 'rotorgram/No-v0'" in verdict.sessions[0].problem
+    assert verdict.sessions[0].notes[0].startswith(f"the vehicle was {'1' * 32}, and is ")
+    verdict = verify(other(options=options | {"observation": "error"}))
+    assert "State 1 cannot be repeated: expected an env of the observation " in (
+        verdict.sessions[0].problem
+    )
     assert str(verdict).endswith("not identical")
-    monkeypatch.setattr("rotorgram.udp.replay.software", lambda: {"mujoco": "9.9"})
+    verdict = verify(other(options=options | {"gravity": 1}))
+    assert "State 1 cannot be repeated: " in verdict.sessions[0].problem
+    monkeypatch.setattr("rotorgram.udp.journal.replay.software", lambda: {"mujoco": "9.9"})
     assert re.match(
         "recorded with mujoco [0-9.]+, repeated with 9.9", verify(flight.simulator).notes[0]
     )
@@ -332,7 +381,7 @@ def test_simulators_that_come_and_go(tmp_path: Path) -> None:
     remote.close()
     summary = summarize(path)
     assert [s.steps for s in summary.sessions] == [30, 30, 30]
-    assert len({s.flight.hello.session for s in summary.sessions}) == 3
+    assert len({s.session.hello.session for s in summary.sessions}) == 3
     assert all(s.ending.startswith("closed") for s in summary.sessions)
     assert verify(path).identical
     assert all(verify(file).identical for file in own)
@@ -340,7 +389,9 @@ def test_simulators_that_come_and_go(tmp_path: Path) -> None:
 
 def test_text_simulators_one_after_another_are_sessions_of_their_own(tmp_path: Path) -> None:
     path = tmp_path / "agent.mcap"
-    with RemoteEnv(ANY, connect=False, record=path, timeout=1, connect_timeout=2) as remote:
+    with RemoteEnv(
+        ANY, env_id=ENV_ID, connect=False, record=path, timeout=1, connect_timeout=2
+    ) as remote:
         for seed in (1, 2):
             simulator = Simulator(server=remote.address, bind=ANY, codec="text", config=QUICK)
             running = Running(simulator)
@@ -352,7 +403,7 @@ def test_text_simulators_one_after_another_are_sessions_of_their_own(tmp_path: P
                     remote.reset()
     summary = summarize(path)
     assert len(summary.sessions) == 2
-    assert [s.flight.codec for s in summary.sessions] == ["text", "text"]
+    assert [s.session.codec for s in summary.sessions] == ["text", "text"]
     assert verify(path).identical
 
 
@@ -368,25 +419,27 @@ def test_several_simulators_at_once(tmp_path: Path) -> None:
     for one in running:
         one.join()
     summary = summarize(path)
-    assert [s.flight.place for s in summary.sessions] == [0, 1]
+    assert [s.session.slot for s in summary.sessions] == [0, 1]
     assert (summary.steps, summary.episodes) == (seen.steps, seen.episodes)
     assert verify(path).identical
     with path.open("rb") as file:
         topics = {c.topic for c in make_reader(file).get_summary().channels.values()}
     assert topics == {
         "/statistics",
-        *(f"/place{p}/{name}" for p in (0, 1) for name in ("state", "command", "events")),
+        *(f"/slot{p}/{name}" for p in (0, 1) for name in ("state", "command", "events")),
     }
 
 
 def test_an_agent_that_was_started_anew(tmp_path: Path) -> None:
     path = tmp_path / "simulator.mcap"
-    first = RemoteEnv(ANY, connect=False, **TIMES)
-    address = first.address
+    killed = launch(RECORD, 0, tmp_path / "killed.mcap", 20, "wait")
+    assert killed.stdout is not None
+    address = "127.0.0.1", int(killed.stdout.readline())
     running = Running(Simulator(server=address, bind=ANY, config=QUICK, record=path))
-    fly(first, 20)
-    first._server.close.detach()  # as if it were killed
-    first._server._port.close()
+    while not killed.stdout.readline().startswith("flown"):
+        pass
+    killed.kill()
+    killed.communicate()
     with RemoteEnv(address, connect=False, **TIMES) as second:
         fly(second, 20)
     running.join()
@@ -406,8 +459,7 @@ def test_loss_and_repetition_do_not_enter(tmp_path: Path) -> None:
     with Relay(ANY, remote.address, faults) as relay:
         thread = threading.Thread(target=relay.run)
         thread.start()
-        config = LinkConfig(timeout=5, first_resend=0.01)
-        running = Running(Simulator(server=relay.address, bind=ANY, config=config, record=theirs))
+        running = Running(Simulator(server=relay.address, bind=ANY, config=QUICK, record=theirs))
         fly(remote, 200)
         remote.close()
         running.join()
@@ -435,18 +487,18 @@ def test_it_is_valid_mcap_with_checksums_and_summary(
             reader = make_reader(file, validate_crcs=True)
             summary = reader.get_summary()
             messages = [(c.topic, m) for _, c, m in reader.iter_messages()]
-            some = [c.topic for _, c, _ in reader.iter_messages(topics=["/place0/command"])]
+            some = [c.topic for _, c, _ in reader.iter_messages(topics=["/slot0/command"])]
             assert reader.get_header().library == "rotorgram 0.1.0"
         assert summary is not None
         counts = summary.statistics
         assert counts.message_count == len(messages)
         assert counts.chunk_count == len(summary.chunk_indexes) > 10
-        assert len(some) == sum(topic == "/place0/command" for topic, _ in messages) > 300
+        assert len(some) == sum(topic == "/slot0/command" for topic, _ in messages) > 300
         assert counts.message_start_time == min(m.log_time for _, m in messages)
         assert counts.message_end_time == max(m.log_time for _, m in messages)
         times = [m.log_time for topic, m in messages]
         assert abs(times[-1] - time.time_ns()) < 60e9
-        states = [m for topic, m in messages if topic == "/place0/state"]
+        states = [m for topic, m in messages if topic == "/slot0/state"]
         assert [m.sequence for m in states] == list(range(1, len(states) + 1))
         assert crc_of_the_summary(path)
         indexed = set()
@@ -490,6 +542,9 @@ def test_states_and_commands_are_ros_messages(flight: SimpleNamespace) -> None:
     with flight.simulator.open("rb") as file:
         messages = list(make_reader(file).iter_messages())
     stores: dict[int, Any] = {}
+    decoded = (
+        i.message for i in read_journal(flight.simulator) if isinstance(i.message, State | Command)
+    )
     seen = 0
     for schema, channel, message in messages:
         assert schema is not None
@@ -503,43 +558,34 @@ def test_states_and_commands_are_ros_messages(flight: SimpleNamespace) -> None:
             types = get_types_from_msg(schema.data.decode(), name)
             stores[schema.id].register(types)
         name = schema.name.replace("/", "/msg/")
-        ros, true = (
-            stores[schema.id].deserialize_ros1(message.data, name),
-            binary.decode(message.data),
-        )
+        ros, true = stores[schema.id].deserialize_ros1(message.data, name), next(decoded)
         assert (bytes(ros.magic), ros.version) == (binary.MAGIC, binary.VERSION)
         assert (ros.session, ros.sequence) == (true.session, true.sequence)
         if isinstance(true, State):
-            assert (ros.drones, ros.observation_size, ros.telemetry_size) == (3, 3, 10)
+            assert (ros.time, ros.nonce) == (true.time, true.nonce)
             assert ros.rewards.tolist() == true.rewards.tolist()
-            assert ros.observations.tolist() == true.observations.ravel().tolist()
-            rows = [[getattr(t, n) for n in ("X", "Y", "F4")] for t in ros.telemetry]
-            assert rows == true.telemetry[:, [0, 1, 9]].tolist()
-            assert ros.terminated.tolist() == true.terminated.tolist()
-            assert ros.truncated.tolist() == true.truncated.tolist()
+            assert ros.observation_observation.tolist() == true.observations[0].ravel().tolist()
+            assert ros.telemetry_position.tolist() == true.telemetry[0].ravel().tolist()
+            assert ros.telemetry_metrics.tolist() == true.telemetry[4].ravel().tolist()
+            assert list(ros.terminated) == true.terminated.tolist()
+            assert list(ros.truncated) == true.truncated.tolist()
         else:
             assert isinstance(true, Command)
-            seeds = [] if true.seeds is None else true.seeds.tolist()
-            assert ros.seeds.tolist() == seeds
+            assert ros.seed_count == (0 if true.seeds is None else 3)
+            assert true.seeds is None or ros.seeds.tolist() == true.seeds.tolist()
             assert ros.actions.tolist() == true.actions.ravel().tolist()
-            assert ros.orders.tolist() == true.resets.tolist()
+            assert ros.orders.tolist() == true.orders.tolist()
         assert stores[schema.id].serialize_ros1(ros, name) == message.data
         seen += 1
     assert seen == 2 * 602 - 1
 
 
-def test_names_that_ros_does_not_allow() -> None:
-    names = ("X", "x y", "x-y", "1st", "_a", "θ", "X")
-    assert field_names(names) == ["X", "x_y", "x_y_", "t1st", "t_a", "t_", "X_"]
-
-
 def test_what_else_is_in_it(flight: SimpleNamespace) -> None:
     ours, theirs = read_journal(flight.agent), read_journal(flight.simulator)
-    assert ours.attachments == {f.name: f.read_bytes() for f in (QUAD_XML, SCENE_XML)}
-    hello = next(iter(theirs)).flight.hello
-    (model,) = theirs.attachments.values()
-    tag = blake2b(model + b"\0" + struct.pack("<d", 0.0), digest_size=16).hexdigest()
-    assert tag == hello.model_hash
+    assert ours.attachments == {}
+    hello = next(iter(theirs)).session.hello
+    assert list(theirs.attachments) == ["model.xml"]
+    assert b"<mujoco" in theirs.attachments["model.xml"]
     assert ours.about["side"] == "agent"
     assert theirs.about["version of mujoco"][0].isdigit()
     with flight.agent.open("rb") as file:
@@ -548,7 +594,7 @@ def test_what_else_is_in_it(flight: SimpleNamespace) -> None:
         counts = [json.loads(m.data) for _, _, m in reader.iter_messages(topics="/statistics")]
     assert [s["drones"] for s in sessions] == ["3"]
     assert sessions[0]["session"] == f"{hello.session:016x}"
-    assert json.loads(sessions[0]["options"])["control_period"] == 0.02
+    assert sessions[0]["spec"] == hello.spec
     assert [c["sessions"] for c in counts] == [1]
     assert counts[0]["sent"] >= 602
 
@@ -560,14 +606,11 @@ def test_statistics_every_ten_seconds_and_a_clock_that_is_set_back(
     monkeypatch.setattr(time, "time_ns", lambda: now[0])
     path = tmp_path / "j.mcap"
     sizes = []
-    journal = Journal(path, about={}, attachments={})
+    journal = Journal(path, side="agent")
     journal.start(Statistics())
     close = Close(session=1, sequence=1, reason="x" * 500)
-    hello = Simulator(bind=ANY, config=QUICK)
-    with hello:
-        journal.tap(0, hello.link.hello, binary.encode(hello.link.hello))
-    session = hello.link.hello.session
-    close = replace(close, session=session)
+    hello = Hello(session=1, spec=Loop(ENV_ID, options={}).spec.to_json())
+    journal.tap(0, hello, binary.encode(hello))
     for _ in range(50):
         now[0] += 5 * 10**8
         journal.tap(0, close, binary.encode(close))
@@ -584,7 +627,7 @@ def test_statistics_every_ten_seconds_and_a_clock_that_is_set_back(
     with path.open("rb") as file:
         reader = make_reader(file)
         assert len(list(reader.iter_messages(topics="/statistics"))) == 4
-        assert len(list(reader.iter_messages(topics="/place0/events"))) == 52
+        assert len(list(reader.iter_messages(topics="/slot0/events"))) == 52
 
 
 def test_a_file_that_is_there_is_left_alone(tmp_path: Path) -> None:
@@ -611,10 +654,55 @@ def test_what_is_no_journal(tmp_path: Path) -> None:
     writer.start()
     writer.finish()
     path.write_bytes(buffer.getvalue())
-    with pytest.raises(ValueError, match="expected a journal of format 1, got another MCAP file"):
+    with pytest.raises(ValueError, match="expected a journal of format 2, got 'another MCAP file'"):
         verify(path)
     with pytest.raises(FileNotFoundError):
         verify(tmp_path / "none")
+
+
+# ---- hostile files
+
+
+def test_a_chunk_that_grows_is_not_read(flight: SimpleNamespace, tmp_path: Path) -> None:
+    """A short chunk can decompress to any number of bytes: `MAX_CHUNK` bounds both sizes."""
+    head = flight.simulator.read_bytes()
+    begin = head.index(b"\x06", head.index(b"model.xml"))  # opcode of the first chunk
+    while struct.unpack_from("<BQ", head, begin)[1] > len(head):
+        begin = head.index(b"\x06", begin + 1)
+    compressed = zstandard.ZstdCompressor(level=19).compress(bytes(4 * MAX_CHUNK))
+    assert len(compressed) < 20_000
+    for size in (4 * MAX_CHUNK, MAX_CHUNK, 100):
+        body = struct.pack("<QQQII", 0, 0, size, 0, 4) + b"zstd"
+        body += struct.pack("<Q", len(compressed)) + compressed
+        path = tmp_path / "bomb.mcap"
+        path.write_bytes(head[:begin] + struct.pack("<BQ", 6, len(body)) + body)
+        program = (
+            "import resource, sys; from rotorgram.udp.journal import summarize; "
+            "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; "
+            "print(summarize(sys.argv[1]).ending); "
+            "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
+        )
+        out, errors = launch(program, path).communicate(timeout=60)
+        ending, kilobytes = out.splitlines()
+        assert (errors, ending.startswith("cut off")) == ("", True)
+        assert int(kilobytes) < 1.5 * MAX_CHUNK / 1024
+
+
+def test_terminal_escapes_are_not_printed(flight: SimpleNamespace, tmp_path: Path) -> None:
+    path = tmp_path / "escape.mcap"
+    with flight.simulator.open("rb") as old, path.open("wb") as new:
+        reader, writer = make_reader(old), Writer(new)
+        writer.start()
+        for metadata in reader.iter_metadata():
+            changed = {
+                name: "\x1b[2J\x9b31m\u202e" if name in ("side", "version of numpy") else text
+                for name, text in metadata.metadata.items()
+            }
+            writer.add_metadata(metadata.name, changed)
+        writer.finish()
+    out = str(summarize(path)) + str(verify(path))
+    assert "[2J" in out
+    assert all(character.isprintable() or character == "\n" for character in out)
 
 
 # ---- ends that nobody wished for
@@ -670,6 +758,9 @@ RECORD = """
             remote.reset()
         if step % 50 == 0:
             print("step", time.time_ns(), flush=True)
+    print("flown", flush=True)
+    if sys.argv[4:]:
+        time.sleep(60)
 """
 
 
@@ -728,7 +819,7 @@ def test_garbage_finishes_the_file(tmp_path: Path) -> None:
     assert running.join() == "the agent closed"
     assert summarize(ours).complete
     assert summarize(theirs).complete
-    journal = Journal(tmp_path / "j", about={"side": "x"}, attachments={})
+    journal = Journal(tmp_path / "j", side="x")
     journal.start(Statistics())
     del journal
     assert read_journal(tmp_path / "j").complete
@@ -817,7 +908,7 @@ def test_interrupts_at_any_moment(
     monkeypatch.setattr(journal_module, "_CHUNK", 10_000)
     items = list(read_journal(flight.agent))
     hello, state = items[0], next(i for i in items if isinstance(i.message, State)).message
-    journal = Journal(tmp_path / "j", about={"side": "agent"}, attachments={})
+    journal = Journal(tmp_path / "j", side="agent")
     journal.start(Statistics())
     journal.tap(0, hello.message, hello.datagram)
     armed, returned, interrupts = False, [], 0
@@ -831,7 +922,7 @@ def test_interrupts_at_any_moment(
     try:
         for number in range(1, 20_001):
             message = replace(state, sequence=number)
-            datagram = binary.encode(message)
+            datagram = binary.encode(message, hello.session.layout)
             try:
                 armed = True
                 journal.tap(0, message, datagram)
@@ -854,7 +945,7 @@ def test_interrupts_at_any_moment(
 
 def test_what_a_message_costs(tmp_path: Path, flight: SimpleNamespace) -> None:
     items = list(read_journal(flight.agent))
-    journal = Journal(tmp_path / "j", about={}, attachments={})
+    journal = Journal(tmp_path / "j", side="agent")
     journal.start(Statistics())
     start = time.perf_counter()
     for _ in range(10):
@@ -877,6 +968,6 @@ def test_the_snippet_of_the_page(
     assert len(code.splitlines()) <= 12
     exec(code.replace("flight.mcap", str(flight.simulator)), {})
     lines = capsys.readouterr().out.splitlines()
-    states = list(map(binary.decode, datagrams(flight.simulator, State)))
+    states = [i.message for i in read_journal(flight.simulator) if isinstance(i.message, State)]
     assert len(lines) == len(states)
-    assert float(lines[-1].split()[-1]) == states[-1].telemetry[0, 1]
+    assert float(lines[-1].split()[-1]) == states[-1].telemetry[0][0, 1]

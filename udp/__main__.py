@@ -1,69 +1,83 @@
 """A simulator process for programs: `python -m rotorgram.udp JSON [--until-stdin-closes]`.
 
-The JSON object holds the keyword arguments of `Simulator`, but for `config`. With the flag it ends
-with the program that holds its standard input, however that ends. People use `rotorgram sim`.
+The JSON object holds the keyword arguments of `Simulator`, but for `config`: the options of the env
+as `options`. `module`, which only our own command line gives, is imported first: it registers the
+env of a user. With the flag the process ends with the program that holds its standard input,
+however that ends. People use `rotorgram sim`.
 """
 
 import json
 import os
 import signal
 import sys
+from importlib import import_module
 from threading import Thread
 from typing import Any, Final
 
-from .errors import LinkError
-from .simulator import Simulator
+from ..models.errors import InputError
+from .protocol.errors import LinkError
+from .transport.simulator import Simulator
 
-_KINDS: Final = {
+_KINDS: Final[dict[str, tuple[type | tuple[type, ...], str]]] = {
+    "env": (str, "an id"),
+    "module": (str, "the name of a module"),
+    "options": (dict, "an object"),
+    "vehicle": ((str, type(None)), "a path"),
+    "num_envs": (int, "a number"),
+    "backend": (str, "a name"),
+    "codec": (str, "a name"),
     "server": (list, "[host, port]"),
     "bind": (list, "[host, port]"),
-    "env": (str, "an id"),
+    "key_file": ((str, type(None)), "a path"),
     "insecure": (bool, "true or false"),
-    "config": (type(None), "none"),
+    "record": ((str, type(None)), "a path"),
 }
-"""What JSON must hold by these names. The rest are checked as options of the env."""
 
 
 def main() -> int:
     """Fly until the agent closes. Exit status 1 and one sentence if it fell silent."""
     # The agent closes the exchange; Ctrl-C in a terminal is meant for it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Ended by it Python tells nobody; as an exception it does.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     words = sys.argv[1:]
-    if words[1:] == ["--until-stdin-closes"]:
-        words.pop()
-        Thread(target=_end_with_stdin, daemon=True).start()
+    ends_with_stdin = words[1:] == ["--until-stdin-closes"]
     try:
-        with Simulator(**parse_arguments(words)) as simulator:
+        with Simulator(**parse_arguments(words[:1] if ends_with_stdin else words)) as simulator:
+            signal.signal(signal.SIGTERM, lambda *_: simulator.stop())
+            if ends_with_stdin:
+                Thread(target=_stop_with_stdin, args=(simulator,), daemon=True).start()
             simulator.run()
-    except (LinkError, OSError, ValueError) as error:
+    except (LinkError, OSError, InputError) as error:
         print(f"rotorgram simulator: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def _end_with_stdin() -> None:
+def _stop_with_stdin(simulator: Simulator) -> None:
     while os.read(0, 1024):
         pass
-    os.kill(os.getpid(), signal.SIGTERM)
+    simulator.stop()
 
 
 def parse_arguments(words: list[str]) -> dict[str, Any]:
-    """Keyword arguments of `Simulator` from those of the program. Raises `ValueError`."""
+    """Keyword arguments of `Simulator` from those of the program. Raises `InputError`."""
     if len(words) != 1:
-        raise ValueError(f"expected one argument, a JSON object, got {len(words)}")
+        raise InputError(f"expected one argument, a JSON object, got {len(words)}")
     try:
         arguments = json.loads(words[0])
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"expected a JSON object: {error}") from None
+        raise InputError(f"expected a JSON object: {error}") from None
     if not isinstance(arguments, dict):
-        raise ValueError(f"expected a JSON object, got {words[0][:80]}")
-    for name, (kind, expected) in _KINDS.items():
-        if name in arguments and not isinstance(arguments[name], kind):
-            raise ValueError(f"{name}: expected {expected}, got {arguments[name]!r}")
+        raise InputError(f"expected a JSON object, got {words[0][:80]}")
+    for name, value in arguments.items():
+        if name not in _KINDS:
+            raise InputError(f"{name}: expected one of {', '.join(_KINDS)}")
+        kind, expected = _KINDS[name]
+        if not isinstance(value, kind):
+            raise InputError(f"{name}: expected {expected}, got {value!r}")
+    if module := arguments.pop("module", None):
+        import_module(module)
     pairs = {name: tuple(arguments[name]) for name in ("server", "bind") if name in arguments}
-    return arguments | pairs
+    return {**arguments.pop("options", {}), **arguments, **pairs}
 
 
 if __name__ == "__main__":

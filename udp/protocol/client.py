@@ -67,10 +67,12 @@ _GRANULARITY: Final = 0.01
 """A system may let a process wait for so long, s: the least that is added to a round trip."""
 _LONGEST_RESEND: Final = 1.0
 """Longest wait before a resend, s."""
-_PATIENCE: Final = 3
+_PATIENCE: Final = 8
 """Resends before the waits double: most that was lost was lost by chance."""
-_UNCLEAR: Final = 8
-"""After so many round trips in a row that cannot be measured, resends become rarer."""
+
+
+_TOO_EARLY: Final = 1.5
+"""By so much round trips are taken for longer when an answer comes twice."""
 
 
 def new_session() -> int:
@@ -109,34 +111,36 @@ class RoundTrips:
     def __init__(self) -> None:
         self._smoothed: float | None = None
         self._variation = 0.0
-        self._unclear = 0
+        self._sent: tuple[float, float] = (0.0, 0.0)  # the last two sendings
 
-    def add(self, seconds: float, *, is_clear: bool) -> None:
-        """Take a round trip into account.
+    def sent(self, now: float, *, first: bool = False) -> None:
+        """Something was sent that wants an answer, for the first time or again."""
+        self._sent = (now, now if first else self._sent[0])
 
-        Args:
-            seconds: From the first sending to the answer.
-            is_clear: Whether it was sent once. After a resend nobody knows which was answered.
-        """
-        if is_clear:
-            self._unclear = 0
-            if self._smoothed is None:
-                self._smoothed, self._variation = seconds, seconds / 2
-            else:
-                self._variation += (abs(self._smoothed - seconds) - self._variation) / 4
-                self._smoothed += (seconds - self._smoothed) / 8
-            return
-        self._unclear += 1
-        if self._unclear % _UNCLEAR == 0 and self._smoothed is not None:
-            self._smoothed = min(2 * self._smoothed, _LONGEST_RESEND)  # maybe it is that by now
+    def answered(self, now: float) -> None:
+        """The answer came. It is taken for one to the last sending, unless it came too soon."""
+        last, before = self._sent
+        seconds = now - last
+        if self._smoothed is not None and seconds < self._smoothed / 2:
+            seconds = now - before
+        if self._smoothed is None:
+            self._smoothed, self._variation = seconds, seconds / 2
+        else:
+            self._variation += (abs(self._smoothed - seconds) - self._variation) / 4
+            self._smoothed += (seconds - self._smoothed) / 8
 
-    def wait(self, sends: int) -> float:
-        """Wait for an answer before the next resend, s, after so many sends."""
+    def answered_again(self) -> None:
+        """An answer came a second time: it was asked for too early."""
+        if self._smoothed is not None:
+            self._smoothed = min(_TOO_EARLY * self._smoothed, _LONGEST_RESEND)
+
+    def wait(self, tries: int) -> float:
+        """Wait for an answer before the next resend, s, after so many tries without any."""
         if self._smoothed is None:
             wait = _FIRST_RESEND
         else:
             wait = self._smoothed + max(_GRANULARITY, 4 * self._variation)
-        return min(wait * 2.0 ** min(max(sends - _PATIENCE, 0), 16), _LONGEST_RESEND)
+        return min(wait * 2.0 ** min(max(tries - _PATIENCE, 0), 16), _LONGEST_RESEND)
 
 
 class Client:
@@ -178,7 +182,7 @@ class Client:
         self.layout = layout
         self.state = SimulatorState.READY if by_text else SimulatorState.IDLE
         self.sequence = 0
-        self.sends = 0
+        self.sends = self._tries = 0
         self.statistics = Statistics()
         self._config = config
         self._largest = largest
@@ -281,6 +285,8 @@ class Client:
             or getattr(message, "sequence", self.sequence) == self.sequence
         )
         if state is None or not is_current:
+            if isinstance(message, Command) and self.sequence - message.sequence <= 1:
+                self._round_trips.answered_again()
             self._drop("stale", "", now)
             return None
         return self._take(message, state, plain, now)
@@ -305,13 +311,15 @@ class Client:
             return False
         self.statistics.counters["resent"] += 1
         self.sends += 1
+        self._tries += 1
+        self._round_trips.sent(now)
         assert self._transfer is not None
         if missing := self._assembler.missing():  # of the answer
             self._put([binary.encode(missing)], self._session_key)
         else:
             self._put(self._transfer.probe(), self._transfer_key)
         closing = self.state is SimulatorState.CLOSING
-        self._resend_at = now + (CLOSE_INTERVAL if closing else self._round_trips.wait(self.sends))
+        self._resend_at = now + (CLOSE_INTERVAL if closing else self._round_trips.wait(self._tries))
         return True
 
     def pardon(self, seconds: float) -> None:
@@ -347,9 +355,8 @@ class Client:
             return None
         self._transfer = None
         if isinstance(message, Command):
-            round_trip = now - self._sent_at
-            self.statistics.round_trips.add(round_trip)
-            self._round_trips.add(round_trip, is_clear=self.sends == 1)
+            self.statistics.round_trips.add(now - self._sent_at)
+            self._round_trips.answered(now)
         elif isinstance(message, Welcome):
             self.statistics.counters["sessions"] += 1
             self._nonce = message.nonce
@@ -388,10 +395,16 @@ class Client:
             self._drop("stale", "", now)
             return None
         whole = self._assembler.take(fragment)
+        self._progress(now)
         if whole is None and asks(fragment) and (missing := self._assembler.missing()):
+            self._round_trips.sent(now)
             self._put([binary.encode(missing)], self._session_key)
-            self._resend_at = now + self._round_trips.wait(1)
         return whole
+
+    def _progress(self, now: float) -> None:
+        """The agent is there and works on the outstanding message."""
+        self._tries = 1
+        self._resend_at = now + self._round_trips.wait(1)
 
     def _resend_missing(self, missing: Missing, now: float) -> None:
         """Send again what the agent lacks of the outstanding message."""
@@ -399,8 +412,9 @@ class Client:
             self._drop("stale", "", now)
             return
         self.statistics.counters["resent"] += 1
+        self._round_trips.sent(now)
         self._put(self._transfer.resend(missing), self._transfer_key)
-        self._resend_at = now + self._round_trips.wait(1)
+        self._progress(now)
 
     def _unfit(self, welcome: Welcome) -> str:
         """Why a Welcome cannot be taken, or ""."""
@@ -444,7 +458,8 @@ class Client:
         self._transfer_key = self._key if isinstance(message, Hello) else self._session_key
         self.state = SIMULATOR[self.state, Way.SENT, type(message)]
         self.sequence = getattr(message, "sequence", 0)
-        self.sends = 1
+        self.sends = self._tries = 1
+        self._round_trips.sent(now, first=True)
         self._put(self._transfer.start(), self._transfer_key)
         closing = isinstance(message, Close)
         self._sent_at = now
