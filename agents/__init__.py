@@ -86,7 +86,7 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
     """
     for name in ("env_id", "options", "vehicle_hash", "observation", "action"):
         expected, got = getattr(kept.spec, name), getattr(log.spec, name)
-        if expected != got:
+        if expected != got and not _is_untold(got):
             raise ResumeError(f"resume: expected an env with {name} {expected}, got {got}")
     try:
         config = preset(kept.algorithm, "paper", **kept.config)
@@ -96,8 +96,11 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
         agent.set_state(kept.state)
     except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
         reason = " ".join(str(error).split())
-        raise CheckpointError(
-            f"checkpoint: its parts do not fit together: {reason:.300}"
-        ) from None
+        raise CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}") from None
     log.resume(kept.position)
     return agent
+
+
+def _is_untold(value: object) -> bool:
+    """Whether it is the hash of a peer that tells none."""
+    return value == "0" * 32

@@ -7,7 +7,7 @@ over any wire and in any simulator of the same model.
 
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
@@ -17,10 +17,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.spec import EnvSpec, component_names
 from ..models.errors import InputError
-from ..udp import LOST
 from .policies import ActionMap, flat, flat_size
 
-__all__ = ["Episode", "EpisodeLog", "Position", "ResumeError", "episode_seed"]
+__all__ = ["LOST", "Episode", "EpisodeLog", "Position", "ResumeError", "episode_seed"]
+
+LOST: Final = "simulator_lost"
+"""Name in the `info` of a step whose simulator was lost, as `rotorgram.udp` has it."""
 
 
 class ResumeError(InputError):
@@ -102,7 +104,8 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         *,
         keep_steps: bool = False,
     ) -> None:
-        self.env = env if isinstance(env, AdvancingVectorEnv) else _OneDrone(env)
+        told = ("metrics", "thrust") if keep_steps else ("metrics",)
+        self.env = env if isinstance(env, AdvancingVectorEnv) else _OneDrone(env, told)
         self.spec: EnvSpec = self.env.env_spec  # type: ignore[assignment]  # not Gymnasium's
         self.num_envs = count = self.env.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
@@ -151,7 +154,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @property
     def observations(self) -> np.ndarray:
-        """What the drones see now, flat: float32, shape (N, n). The next step may overwrite it."""
+        """What the drones see now, flat: float32, shape (N, n)."""
         return flat(self.env.observations, self.spec, self.num_envs)
 
     def start(self) -> None:
@@ -183,9 +186,9 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             idle = begins if frozen is None else begins | frozen
         self._flown.append(sent)
         self._keep_step(idle)
-        self.env_steps += self.num_envs - (0 if idle is None else int(idle.sum()))
+        self.env_steps += self.num_envs - (0 if idle is None else int(np.count_nonzero(idle)))
         ended = env.terminated | env.truncated
-        if ended.any():
+        if np.count_nonzero(ended):  # of few drones faster than `any`
             self._keep_episodes(ended)
 
     def begin(self, drones: np.ndarray) -> np.ndarray:
@@ -216,7 +219,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Begin an episode of every drone, with its own seed; arguments are not used."""
         self._number(self._all)
         self.env.reset(seed=self._seeds.tolist())
-        return self.observations.copy(), {}
+        return self.observations, {}
 
     def step(
         self, actions: np.ndarray
@@ -224,13 +227,12 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Fly one step. `info` has `final_obs` where an episode ended."""
         env = self.env
         self.fly(np.asarray(actions, np.float32).reshape(self.num_envs, -1))
-        last, rewards = self.observations.copy(), env.rewards.copy()
-        terminated, truncated = env.terminated.copy(), env.truncated.copy()
-        if not (terminated | truncated).any():
-            return last, rewards, terminated, truncated, {}
-        truncated |= self.begin(terminated | truncated)
-        info = {"final_obs": last, "_final_obs": terminated | truncated}
-        return self.observations.copy(), rewards, terminated, truncated, info
+        last, rewards, terminated = self.observations, env.rewards, env.terminated
+        truncated, info = env.truncated, {}
+        if (terminated | truncated).any():
+            truncated = truncated | self.begin(terminated | truncated)
+            info = {"final_obs": last, "_final_obs": terminated | truncated}
+        return self.observations, rewards, terminated, truncated, info
 
     # ---- resuming
 
@@ -242,7 +244,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             env_steps=self.env_steps,
             seconds=self.seconds,
             actions=np.array(recent or [self._still])[: len(recent)],
-            observations=self.observations.copy(),
+            observations=self.observations,
             numbers=self._numbers.copy(),
             lengths=self._lengths.copy(),
             first_steps=self._first_steps.copy(),
@@ -330,7 +332,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _keep_step(self, idle: np.ndarray | None) -> None:
         telemetry = self.env.telemetry
         values = telemetry["metrics"][:, 0] if "metrics" in telemetry else self._nothing
-        if idle is None or not idle.any():
+        if idle is None:
             self._lengths += 1
             self._rewards += self.env.rewards
             self._sizes += np.abs(values)
@@ -369,21 +371,25 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 
 class _OneDrone:
-    """An env of one drone as a batch of one: what the log needs of `AdvancingVectorEnv`."""
+    """An env of one drone as a batch of one: what the log needs of `AdvancingVectorEnv`.
+
+    Args:
+        env: The env.
+        told: Names of the arrays of the telemetry that are asked for.
+    """
 
     num_envs = 1
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, env: gym.Env[Any, Any], told: tuple[str, ...]) -> None:
         self._env = env
         self.env_spec: EnvSpec = env.get_wrapper_attr("env_spec")
         action = self.env_spec.action
         self._shape = getattr(action, "shape", None)
-        told = [a for a in self.env_spec.telemetry if a.name in ("metrics", "thrust")]
-        self.telemetry = {array.name: np.full((1, array.size), np.nan) for array in told}
-        self._told = [(component_names(array), self.telemetry[array.name][0]) for array in told]
+        arrays = [array for array in self.env_spec.telemetry if array.name in told]
+        self._told = [(array.name, component_names(array)) for array in arrays]
+        self.telemetry: dict[str, np.ndarray] = {}
         self.observations: Any = None
-        self.rewards = np.zeros(1)
-        self.terminated, self.truncated, self.lost = (np.zeros(1, bool) for _ in range(3))
+        self._set(0.0, False, False, False)
 
     def reset(self, *, seed: list[int]) -> None:
         """Begin an episode."""
@@ -418,10 +424,12 @@ class _OneDrone:
             self.observations = {k: np.asarray(v)[np.newaxis] for k, v in observation.items()}
         else:
             self.observations = np.asarray(observation)[np.newaxis]
-        for names, row in self._told:
-            row[:] = [info[name] for name in names]
+        self.telemetry = {
+            name: np.array([info[component] for component in components])[np.newaxis]
+            for name, components in self._told
+        }
         self._set(reward, terminated, truncated, LOST in info)
 
     def _set(self, reward: float, terminated: bool, truncated: bool, lost: bool) -> None:
-        self.rewards[0], self.lost[0] = reward, lost
-        self.terminated[0], self.truncated[0] = terminated, truncated
+        self.rewards, self.lost = np.array((reward,)), np.array((lost,))
+        self.terminated, self.truncated = np.array((terminated,)), np.array((truncated,))

@@ -71,7 +71,8 @@ class ActionMap:
                 f"action: expected a choice or numbers of type float, got {action.dtype}"
             )
         self._shape, self.outputs, self.size = action.shape, action.size, action.size
-        low, high = (bound.ravel() for bound in action.bounds())
+        # Two axes here and below: NumPy is slow where it has to add one to a batch of one.
+        low, high = (bound.reshape(1, -1) for bound in action.bounds())
         bounded = np.isfinite(low) & np.isfinite(high)
         with np.errstate(invalid="ignore"):
             self._middle = np.where(bounded, (low + high) / 2, 0.0).astype(np.float32)
@@ -114,8 +115,9 @@ class NetworkPolicy:
         self.spec = spec
         self.actions = ActionMap(spec.action)
         _check_shapes(weights, flat_size(spec), self.actions)
-        self._w1, self._b1 = np.ascontiguousarray(weights["hidden.weight"].T), weights["hidden.bias"]
-        self._w2, self._b2 = np.ascontiguousarray(weights["output.weight"].T), weights["output.bias"]
+        self._w1, self._b1 = weights["hidden.weight"].T, weights["hidden.bias"][np.newaxis]
+        self._w2, self._b2 = weights["output.weight"].T, weights["output.bias"][np.newaxis]
+        self._zero = np.zeros_like(self._b1)
         self._std = None if self.actions.discrete else np.exp(weights["log_std"])
 
     def reset(self) -> None:
@@ -123,10 +125,10 @@ class NetworkPolicy:
 
     def output(self, observations: np.ndarray) -> np.ndarray:
         """Means, or logits, shape (N, k), of flat observations, shape (N, n)."""
-        hidden: np.ndarray = observations @ self._w1
+        hidden: np.ndarray = observations.dot(self._w1)
         hidden += self._b1
-        np.maximum(hidden, 0.0, out=hidden)
-        output: np.ndarray = hidden @ self._w2
+        np.maximum(hidden, self._zero, out=hidden)
+        output: np.ndarray = hidden.dot(self._w2)
         output += self._b2
         return output
 

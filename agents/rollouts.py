@@ -38,8 +38,8 @@ class Rollout:
 
     @property
     def ends(self) -> np.ndarray:
-        """Whether an episode ended with the step: bool, shape (T, N)."""
-        ends: np.ndarray = self.terminated | self.truncated
+        """After which rows another episode begins, or may: bool, shape (T, N)."""
+        ends: np.ndarray = self.terminated | self.truncated | ~self.kept
         return ends
 
     def rows(self, array: np.ndarray) -> np.ndarray:
@@ -129,35 +129,34 @@ class Collector:
         log, env, count = self._log, self._log.env, self._log.num_envs
         log.start()
         stop = None if most_steps is None else log.env_steps + most_steps
-        done = np.zeros(count, bool)
+        done, waiting = np.zeros(count, bool), 0
         block = length or max(256 // count, 1)
         rows: list[tuple[np.ndarray, ...]] = []
-        observations = log.observations.copy()
+        observations = log.observations
         while len(rows) != length and (stop is None or log.env_steps < stop):
             if not len(rows) % block:
                 noise = policy.draw_noise(self._rng, block * count).reshape(block, count, -1)
             actions = policy.sample(observations, noise[len(rows) % block])
-            waiting = done if done.any() else None
+            idle = done if waiting else None
             if stop is None:
-                log.fly(actions, begins=waiting)
+                log.fly(actions, begins=idle)
             else:
-                log.fly(actions, frozen=waiting)
-            after = log.observations.copy()
+                log.fly(actions, frozen=idle)
+            after, terminated, truncated = log.observations, env.terminated, env.truncated
             rows.append(
-                (observations, actions, env.rewards.copy(), after, env.terminated.copy(),
-                 env.truncated.copy(), ~done, env.lost.copy())
-            )  # fmt: skip
-            observations, ended = after, env.terminated | env.truncated
+                (observations, actions, env.rewards, after, terminated, truncated, ~done, env.lost)
+            )
+            observations, ended = after, terminated | truncated
             done = ended if stop is None else done | ended
-            if done.all():
+            waiting = np.count_nonzero(done)  # of few drones faster than `any`
+            if waiting == count:
                 if stop is not None:
                     break
                 log.begin(done)
-                observations, done = log.observations.copy(), np.zeros(count, bool)
-        everyone = bool(done.all())
-        if done.any() and (stop is None or everyone):
+                observations, done, waiting = log.observations, np.zeros(count, bool), 0
+        if waiting and (stop is None or waiting == count):
             log.begin(done)
         *columns, kept, lost = (np.array(column) for column in zip(*rows, strict=True))
         names = tuple(vars(Rollout)["__dataclass_fields__"])
         rollout = Rollout(**dict(zip(names, (*columns, kept), strict=True)))
-        return rollout, lost, everyone
+        return rollout, lost, waiting == count

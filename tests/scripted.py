@@ -6,13 +6,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
-from rotorgram.agents.episodes import EpisodeLog
-from rotorgram.agents.vector_episodes import VectorEpisodeLog
+from rotorgram.agents.episodes import LOST, EpisodeLog
 from rotorgram.envs.autoreset import AdvancingVectorEnv
-from rotorgram.udp import LOST
+from rotorgram.envs.spaces import action_space, observation_space
+from rotorgram.envs.spec import ArraySpec, Discrete, EnvSpec, Metric
 
 Script = Sequence[Sequence[tuple[int, str]]]
 """Of each drone, length and end of its episodes, over and over."""
@@ -27,6 +25,21 @@ LOSSES: Script = [
     [(4, "lost"), (1, "limit"), (6, "end")],
     [(7, "end"), (2, "limit"), (6, "lost"), (3, "lost")],
 ]
+
+
+def spec_of(
+    action: ArraySpec | Discrete | None = None,
+    observation: Sequence[ArraySpec] = (ArraySpec(name="observation", shape=(3,)),),
+) -> EnvSpec:
+    """Of an env with the metric `distance`."""
+    return EnvSpec(
+        env_id="test/Scripted-v0",
+        control_period=0.02,
+        observation=tuple(observation),
+        action=action or ArraySpec(name="action", shape=(2,), low=-1.0, high=1.0),
+        telemetry=(ArraySpec(name="metrics", shape=(1,), components=("distance",)),),
+        metrics=(Metric(name="distance", unit="m"),),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,13 +64,10 @@ class Scripted(AdvancingVectorEnv):
     """Flies a script; a lost simulator as `RemoteVectorEnv` reports it."""
 
     def __init__(self, script: Script, *, discrete: bool = False, reward: float | None = None):
-        self.closed, self.num_envs, self._script, self._reward = False, len(script), script, reward
-        self.metadata = {"autoreset_mode": AutoresetMode.DISABLED}
-        box = spaces.Box(-1, 1, (2,), np.float32)
-        self.single_action_space = spaces.Discrete(3) if discrete else box
-        self.single_observation_space = spaces.Box(-9, 9, (3,), np.float32)
-        self.action_space = batch_space(self.single_action_space, len(script))
-        self.observation_space = batch_space(self.single_observation_space, len(script))
+        self.closed, self.num_envs, self._script, self._reward = False, 0, script, reward
+        self._take_spec(
+            spec_of(Discrete(n=3) if discrete else None), len(script), AutoresetMode.DISABLED
+        )
         self.flown: list[list[Row]] = [[] for _ in script]
         self._episodes, self._steps = [-1] * len(script), [0] * len(script)
         self._dice = np.random.default_rng(42)
@@ -68,16 +78,19 @@ class Scripted(AdvancingVectorEnv):
         self.advance(None, np.ones(self.num_envs, bool))
         return self.observations.copy(), {}
 
-    def advance(self, actions: Any, resets: Any, seeds: Any = None, holds: Any = None) -> None:
+    def advance(
+        self, actions: Any, resets: Any = None, seeds: Any = None, frozen: Any = None
+    ) -> None:
         self.observations = self.observations.copy()
         self._clear()
         for drone in range(self.num_envs):
-            if resets[drone]:
+            if resets is not None and resets[drone]:
                 self._episodes[drone] += 1
                 self._steps[drone] = 0
                 self.observations[drone] = self._dice.normal(size=3)
-            elif holds is None or not holds[drone]:
+            elif frozen is None or not frozen[drone]:
                 self._fly(drone, actions[drone])
+        self.telemetry = {"metrics": self.observations[:, :1].astype(float)}
 
     def _clear(self) -> None:
         self.rewards = np.zeros(self.num_envs)
@@ -101,7 +114,7 @@ class Scripted(AdvancingVectorEnv):
         row = Row(
             episode=self._episodes[drone],
             observation=before,
-            action=action.copy(),
+            action=np.array(action),
             reward=self.rewards[drone],
             after=self.observations[drone].copy(),
             terminated=bool(self.terminated[drone]),
@@ -110,28 +123,27 @@ class Scripted(AdvancingVectorEnv):
         )
         self.flown[drone].append(row)
 
-    def _info(self, mask: np.ndarray) -> dict[str, Any]:
-        return {}
-
 
 class OneDrone(gym.Env[np.ndarray, Any]):
     """The first drone of a scripted env, as `RemoteEnv` would fly it."""
 
     def __init__(self, env: Scripted) -> None:
-        self.env, self._nobody = env, np.zeros(1, bool)
-        self.observation_space = env.single_observation_space
-        self.action_space = env.single_action_space
+        self.env, self.env_spec = env, env.env_spec
+        self.observation_space = observation_space(env.env_spec)
+        self.action_space = action_space(env.env_spec)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
-        return self.env.reset()[0][0], {}
+        observation = self.env.reset()[0][0]
+        return observation, {"distance": float(observation[0])}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         env = self.env
-        env.advance(np.reshape(action, (1, -1)), self._nobody)
-        info = {LOST: "killed"} if env.lost[0] else {}
+        env.advance(np.reshape(action, (1, -1)))
+        info = {"distance": float(env.observations[0, 0])}
+        info |= {LOST: "killed"} if env.lost[0] else {}
         ends = bool(env.terminated[0]), bool(env.truncated[0])
         return env.observations[0].copy(), float(env.rewards[0]), *ends, info
 
 
-def log_of(env: Scripted) -> Any:
-    return VectorEpisodeLog(env, 7) if env.num_envs > 1 else EpisodeLog(OneDrone(env), 7)
+def log_of(env: Scripted) -> EpisodeLog:
+    return EpisodeLog(env if env.num_envs > 1 else OneDrone(env), 7)

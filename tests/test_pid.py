@@ -1,25 +1,55 @@
-"""The PID holds the target, in both action modes, and says what it cannot fly."""
+"""The PID holds the target, in both action modes and with any vehicle, or says what it needs."""
 
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
 import numpy as np
 import pytest
-from rotorgram.agents.pid import PID
-from rotorgram.envs import ElevationConfig
-from rotorgram.envs.elevation import ElevationEnv
-from rotorgram.experiments.evaluate import fly_episodes
+import rotorgram.envs  # noqa: F401
+from rotorgram.agents import PID
+from rotorgram.models.errors import InputError
+from scripted import spec_of
+
+ENV = "rotorgram/Elevation-v0"
 
 
 @pytest.mark.parametrize("mode", ["increment", "offset"])
 @pytest.mark.parametrize("drag", [0.0, 0.5])
 def test_pid_holds_the_target(mode: str, drag: float) -> None:
-    config = ElevationConfig(action_mode=mode, linear_drag=drag)
-    flights = fly_episodes(ElevationEnv(action_mode=mode, linear_drag=drag), PID(config), 5)
-    for flight in flights:
-        assert not flight.terminated
-        assert np.abs(flight.errors[-60:]).mean() < 0.02
+    env: Any = gym.make(ENV, action_mode=mode, linear_drag=drag)
+    policy = PID(env.get_wrapper_attr("env_spec"))
+    for seed in range(3):
+        policy.reset()
+        observation, _ = env.reset(seed=seed)
+        errors, truncated = [], False
+        while not truncated:
+            observation, _, terminated, truncated, info = env.step(policy.act(observation))
+            errors.append(abs(info["elevation_error"]))
+            assert not terminated
+        assert np.mean(errors[-60:]) < 0.02
+
+
+def test_pid_takes_the_vehicle_from_the_spec() -> None:
+    """Hover at 12 N of 30 N, scale 20 % of 30 N: 1 m too low wants 9 m/s² · 12 N / 9.8 m/s²."""
+    spec: Any = gym.make(ENV, action_mode="offset").get_wrapper_attr("env_spec")
+    arrays = {array.name: array for array in spec.telemetry}
+    thrust = replace(arrays["thrust"], low=0.0, high=30.0)
+    telemetry = tuple(thrust if a.name == "thrust" else a for a in spec.telemetry)
+    seen = replace(spec.observation[0], low=-9.0, high=(9.0, 9.0, 30 / 12 - 1))
+    policy = PID(replace(spec, telemetry=telemetry, observation=(seen,)))
+    action = policy.act(np.array([0.1, 0.0, 0.0], np.float32))
+    assert action == pytest.approx([0.9 * 12 / 9.8 / 6], rel=1e-6)
+    assert policy.act(np.array([9.0, 0.0, 0.0], np.float32)).tolist() == [1.0]
 
 
 def test_pid_says_what_it_needs() -> None:
-    with pytest.raises(ValueError, match="observation='full'"):
-        PID(ElevationConfig(observation="error"))
-    with pytest.raises(ValueError, match="action_type='continuous'"):
-        PID(ElevationConfig(action_type="discrete"))
+    for options, sentence in (
+        ({"observation": "error"}, "observation='full'"),
+        ({"action_type": "discrete"}, "action_type='continuous'"),
+    ):
+        env: Any = gym.make(ENV, **options)
+        with pytest.raises(InputError, match=sentence):
+            PID(env.get_wrapper_attr("env_spec"))
+    with pytest.raises(InputError, match="expected the env rotorgram/Elevation-v0"):
+        PID(spec_of())

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from rotorgram.agents.returns import advantages, rewards_to_go
-from rotorgram.agents.vpg import step_of_episode
+from rotorgram.agents.returns import advantages, discounted_sums, rewards_to_go, step_of_episode
 
 
 def flags(*values: int) -> np.ndarray:
@@ -30,13 +29,13 @@ def test_one_step_advantage_is_equation_3() -> None:
         terminated=flags(0, 0),
         truncated=flags(0, 0),
         gamma=0.5,
-        trace=0.0,
+        gae_lambda=0.0,
     )
     np.testing.assert_array_equal(got, [1 + 1.5 - 2, 1 + 2.5 - 3])
 
 
-@pytest.mark.parametrize("trace", [0.0, 0.5, 1.0])
-def test_value_is_carried_over_truncation_and_not_over_termination(trace: float) -> None:
+@pytest.mark.parametrize("gae_lambda", [0.0, 0.5, 1.0])
+def test_value_is_carried_over_truncation_and_not_over_termination(gae_lambda: float) -> None:
     def last(terminated: int, truncated: int) -> float:
         return advantages(
             np.array([0.0, 1.0]),
@@ -45,7 +44,7 @@ def test_value_is_carried_over_truncation_and_not_over_termination(trace: float)
             terminated=flags(0, terminated),
             truncated=flags(0, truncated),
             gamma=0.9,
-            trace=trace,
+            gae_lambda=gae_lambda,
         )[1]
 
     assert last(1, 0) == 1.0
@@ -53,7 +52,7 @@ def test_value_is_carried_over_truncation_and_not_over_termination(trace: float)
     assert last(1, 1) == 1.0, "both set: it is terminated"
 
 
-def test_trace_sums_discounted_errors_and_stops_at_ends() -> None:
+def test_lambda_sums_discounted_errors_and_stops_at_ends() -> None:
     got = advantages(
         np.array([1.0, 1.0, 1.0]),
         values=np.zeros(3),
@@ -61,7 +60,7 @@ def test_trace_sums_discounted_errors_and_stops_at_ends() -> None:
         terminated=flags(0, 0, 0),
         truncated=flags(0, 1, 0),
         gamma=1.0,
-        trace=0.5,
+        gae_lambda=0.5,
     )
     np.testing.assert_array_equal(got, [1 + 0.5 * 8, 8, 1])
 
@@ -76,7 +75,7 @@ def test_constant_reward_through_time_limits_has_its_closed_form() -> None:
         terminated=np.zeros(100, bool),
         truncated=np.arange(100) % 10 == 9,
         gamma=0.98,
-        trace=0.95,
+        gae_lambda=0.95,
     )
     np.testing.assert_allclose(got, 0, atol=1e-12)
 
@@ -85,3 +84,21 @@ def test_step_of_episode() -> None:
     assert step_of_episode(flags(0, 0, 1, 1, 0, 1, 0)).tolist() == [0, 1, 2, 0, 0, 1, 0]
     assert step_of_episode(flags(0, 0, 0)).tolist() == [0, 1, 2]
     assert step_of_episode(flags(1)).tolist() == [0]
+    both = np.stack([flags(0, 1, 0, 0), flags(0, 0, 0, 1)], axis=1)
+    assert step_of_episode(both).tolist() == [[0, 0], [1, 1], [0, 2], [1, 3]]
+
+
+def test_drones_beside_each_other_are_summed_each_for_itself() -> None:
+    rewards = np.array([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]])
+    ends = np.array([[False, True], [False, False], [False, False]])
+    got = rewards_to_go(rewards, ends, gamma=0.5)
+    np.testing.assert_array_equal(got, [[1 + 1 + 1, 10], [2 + 2, 20 + 20], [4, 40]])
+
+
+def test_sums_of_any_length_are_those_of_the_recursion() -> None:
+    dice = np.random.default_rng(0)
+    for length in (1, 2, 3, 7, 64, 100):
+        values, factors = dice.normal(size=length), dice.uniform(size=length)
+        expected = [values[t] + sum(np.prod(factors[t:u]) * values[u] for u in range(t + 1, length))
+                    for t in range(length)]  # fmt: skip
+        np.testing.assert_allclose(discounted_sums(values, factors), expected, rtol=1e-12)

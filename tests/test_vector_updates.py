@@ -14,11 +14,11 @@ import torch
 from rotorgram.agents import A2CConfig, VPGConfig, make_agent
 from rotorgram.agents.a2c import A2C
 from rotorgram.agents.policies import NetworkPolicy
-from rotorgram.agents.rollouts import AnyCollector, Collector, VectorCollector
+from rotorgram.agents.rollouts import Collector, Rollout
 from rotorgram.agents.vpg import VPG
 from scripted import CALM, LOSSES, Row, Script, Scripted, log_of
 
-GAMMA, RATE, VALUE_WEIGHT = 0.9, 0.01, 0.7
+GAMMA, RATE, VF_COEF = 0.9, 0.01, 0.7
 
 
 # ---- arithmetic
@@ -81,7 +81,9 @@ def policy_gradient(
     return gradient
 
 
-def a2c_rows(flown: list[list[Row]], value: Callable[[np.ndarray], float], trace: float) -> Any:
+def a2c_rows(
+    flown: list[list[Row]], value: Callable[[np.ndarray], float], gae_lambda: float
+) -> Any:
     """Rows to learn from and their advantages. A lost step is none; the one before bootstraps."""
     kept, advantages = [], []
     for rows in flown:
@@ -92,7 +94,7 @@ def a2c_rows(flown: list[list[Row]], value: Callable[[np.ndarray], float], trace
             goes_on = following is not None and not row.ends and not following.lost
             ahead = 0.0 if row.terminated else GAMMA * value(row.after)
             error = row.reward + ahead - value(row.observation)
-            sums.append(error + (GAMMA * trace * sums[-1] if goes_on else 0.0))
+            sums.append(error + (GAMMA * gae_lambda * sums[-1] if goes_on else 0.0))
         kept += [row for row in rows if not row.lost]
         advantages += sums[::-1]
     return kept, np.array(advantages)
@@ -109,19 +111,32 @@ def vpg_rows(flown: list[list[Row]]) -> tuple[list[Row], np.ndarray, np.ndarray]
          for number in sorted({row.episode for row in rows})]
         for rows in flown
     ]  # fmt: skip
-    kept, returns, steps = [], [], []
+    found: list[list[tuple[Row, float, int]]] = [[] for _ in flown]
     for round_ in zip_longest(*parts, fillvalue=[]):
         if len(flown) > 1 and not all(rows and rows[-1].ends for rows in round_):
             continue
-        for rows in round_:
+        for drone, rows in enumerate(round_):
             if not rows[-1].lost:
-                sums = [sum(GAMMA**k * row.reward for k, row in enumerate(rows[t:]))
-                        for t in range(len(rows))]  # fmt: skip
-                kept, returns, steps = kept + rows, returns + sums, [*steps, *range(len(rows))]
-    return kept, np.array(returns), np.array(steps)
+                found[drone] += [
+                    (rows[t], sum(GAMMA**k * row.reward for k, row in enumerate(rows[t:])), t)
+                    for t in range(len(rows))
+                ]
+    kept = [entry for entries in found for entry in entries]
+    return (
+        [r for r, _, _ in kept],
+        np.array([x for _, x, _ in kept]),
+        np.array([t for *_, t in kept]),
+    )
 
 
 # ---- updates
+
+
+def by_drone(rollout: Rollout) -> tuple[np.ndarray, np.ndarray]:
+    """What is kept of a rollout: observations and actions, one drone after the other."""
+    kept = rollout.kept.T
+    seen, done = (array.swapaxes(0, 1)[kept] for array in (rollout.observations, rollout.actions))
+    return seen, done
 
 
 class Followed:
@@ -155,7 +170,7 @@ class Followed:
         if isinstance(self.agent, VPG | A2C):
             loss = self.agent.loss
             self.agent.loss = lambda rollout: (  # type: ignore[method-assign]
-                self._seen.append((rollout.observations, rollout.actions)),
+                self._seen.append(by_drone(rollout)),
                 loss(rollout),
             )[1]
             return
@@ -187,7 +202,7 @@ class Followed:
     def _a2c(self, flown: list[list[Row]], rate: float) -> None:
         config = self.config
         value = lambda seen: float(self.critic(seen[np.newaxis].astype(float))[0, 0])  # noqa: E731
-        kept, advantages = a2c_rows(flown, value, config.trace)
+        kept, advantages = a2c_rows(flown, value, config.gae_lambda)
         self.left_out += sum(map(len, flown)) - len(kept)
         if not kept:
             assert not self._seen
@@ -196,10 +211,10 @@ class Followed:
         targets = advantages + self.critic(seen)[:, 0]
         if config.normalize and len(kept) > 1:
             advantages = (advantages - advantages.mean()) / (advantages.std(ddof=1) + 1e-8)
-        gradient = policy_gradient(self.actor, seen, actions, advantages, config.entropy_weight)
+        gradient = policy_gradient(self.actor, seen, actions, advantages, config.ent_coef)
         self.actor.adam(gradient, rate)
         errors = self.critic(seen) - targets[:, np.newaxis]
-        slope = 2 * VALUE_WEIGHT * errors / len(seen)
+        slope = 2 * VF_COEF * errors / len(seen)
         self.critic.adam(self.critic.gradient(seen, slope), rate)
 
     def _vpg(self, flown: list[list[Row]], rate: float) -> None:
@@ -232,8 +247,8 @@ class Followed:
 
 A2C_SETTINGS = [
     {"steps_per_update": 15},
-    {"steps_per_update": 14, "trace": 0.95, "normalize": True, "entropy_weight": 0.01},
-    {"steps_per_update": 1, "trace": 1.0, "entropy_weight": 0.1},
+    {"steps_per_update": 14, "gae_lambda": 0.95, "normalize": True, "ent_coef": 0.01},
+    {"steps_per_update": 1, "gae_lambda": 1.0, "ent_coef": 0.1},
 ]
 VPG_SETTINGS = [
     {"episodes_per_update": 1},
@@ -260,9 +275,7 @@ def test_updates_are_those_by_hand(
     losses, many = script[0] is LOSSES[0], len(script) > 1
     settings = {**changes, "gamma": GAMMA, "learning_rate": RATE, "anneal": True, "log_std": 0.0}
     config: Any = (
-        VPGConfig(**settings)
-        if algorithm == "vpg"
-        else A2CConfig(value_weight=VALUE_WEIGHT, **settings)
+        VPGConfig(**settings) if algorithm == "vpg" else A2CConfig(vf_coef=VF_COEF, **settings)
     )
     total = 130 if many else 60
     followed = Followed(algorithm, config, Scripted(script, discrete=discrete), total)
@@ -277,12 +290,12 @@ def test_updates_are_those_by_hand(
         assert abs(noise).max() > 2
 
 
-def collector_of(script: Script) -> tuple[Any, AnyCollector, NetworkPolicy]:
+def collector_of(script: Script) -> tuple[Any, Collector, NetworkPolicy]:
     """Reward 1 with every step, whatever is done."""
     log = log_of(Scripted(script, reward=1.0))
     agent: Any = make_agent("a2c", log, A2CConfig(), 0)
-    kind: Any = VectorCollector if len(script) > 1 else Collector
-    return log, kind(log, np.random.default_rng(0)), NetworkPolicy(agent.actor())
+    collector = Collector(log, np.random.default_rng(0))
+    return log, collector, NetworkPolicy(agent.actor(), log.spec)
 
 
 LOST_THIRD: Script = [[(20, "limit")], [(20, "limit")], [(3, "lost"), (20, "limit")]]
@@ -299,23 +312,25 @@ def test_a_lost_simulator_teaches_nothing(script: Script) -> None:
     np.testing.assert_allclose(VPG(log, config, 0).weights(rollout), 0, atol=1e-6)
 
     log, collector, policy = collector_of(script)
-    agent: Any = A2C(log, A2CConfig(gamma=0.98, trace=0.98), 0)
+    agent: Any = A2C(log, A2CConfig(gamma=0.98, gae_lambda=0.98), 0)
     with torch.no_grad():
         agent.networks["critic"].output.weight.zero_()
         agent.networks["critic"].output.bias.fill_(50.0)
     rollout = collector.steps(policy, 10 * len(script))
-    np.testing.assert_allclose(agent.advantages(rollout, np.full(len(rollout), 50.0)), 0, atol=1e-4)
+    values = np.full((10, len(script)), 50.0)
+    left = rollout.rows(agent.advantages(rollout, values))
+    np.testing.assert_allclose(left, 0, atol=1e-4)
     assert log.env_steps == 10 * len(script) - (len(script) > 1)  # of many, one begins instead
     assert len(rollout) == log.env_steps - 1
-    first = (len(script) - 1) * 10
-    assert rollout.truncated[first : first + 3].tolist() == [False, True, False]
+    assert rollout.truncated[:4, -1].tolist() == [False, True, True, False]
+    assert rollout.kept[:4, -1].tolist() == [True, True, False, len(script) == 1]
 
 
 def test_an_end_before_a_loss_stays_what_it_was() -> None:
     _, collector, policy = collector_of([[(2, "end"), (1, "lost"), (20, "limit")]])
     rollout = collector.steps(policy, 6)
-    assert rollout.terminated.tolist() == [False, True, False, False, False]
-    assert not rollout.truncated.any()
+    assert rollout.rows(rollout.terminated).tolist() == [False, True, False, False, False]
+    assert not rollout.rows(rollout.truncated).any()
 
 
 def test_lost_steps_count_as_flown() -> None:

@@ -1,0 +1,258 @@
+"""Trainings that stop and go on to the bit; files that are damaged or crafted are refused."""
+
+import json
+import os
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import rotorgram.envs  # noqa: F401
+import torch
+from rotorgram.agents import (
+    Checkpoint,
+    CheckpointError,
+    EpisodeLog,
+    ResumeError,
+    load,
+    make_agent,
+    preset,
+    resume_agent,
+    store,
+)
+from rotorgram.agents.checkpoints import software_versions, write_whole
+from rotorgram.agents.learner import Agent
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.models.errors import InputError
+
+ENV = "rotorgram/Elevation-v0"
+SMALL: dict[str, dict[str, Any]] = {
+    "vpg": {"episodes_per_update": 3},
+    "a2c": {"steps_per_update": 64},
+    "sb3-a2c": {"steps_per_update": 64},
+}
+OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
+TOTAL = 768
+
+
+def log_of(drones: int, seed: int = 5, **options: Any) -> EpisodeLog:
+    settings = {**OPTIONS, **options}
+    env: Any = LocalVectorEnv(ENV, drones, autoreset_mode="Disabled", **settings)
+    return EpisodeLog(gym.make(ENV, **settings) if drones == 1 else env, seed)
+
+
+def checkpoint_of(algorithm: str, log: EpisodeLog, agent: Agent) -> Checkpoint:
+    return Checkpoint(
+        algorithm=algorithm,
+        config=vars(preset(algorithm, "tuned", **SMALL[algorithm])),
+        spec=log.spec,
+        seed=log.run_seed,
+        env_steps=TOTAL,
+        actor=agent.actor(),
+        state=agent.state(),
+        position=log.position(),
+    )
+
+
+def trained(algorithm: str, log: EpisodeLog, updates: int = 10**9) -> Agent:
+    agent = make_agent(algorithm, log, preset(algorithm, "tuned", **SMALL[algorithm]), 5)
+    calls = iter(range(updates - 1))
+    agent.train(log, TOTAL, lambda: next(calls, None) is not None)
+    return agent
+
+
+@pytest.mark.parametrize("kind", ["continuous", "discrete"])
+@pytest.mark.parametrize("drones", [1, 4])
+@pytest.mark.parametrize("algorithm", SMALL)
+def test_a_training_that_was_stopped_ends_as_if_it_had_not(
+    algorithm: str, drones: int, kind: str, tmp_path: Path
+) -> None:
+    whole = log_of(drones, action_type=kind)
+    unbroken = trained(algorithm, whole)
+    half = log_of(drones, action_type=kind)
+    stopped = trained(algorithm, half, updates=3)
+    store(checkpoint_of(algorithm, half, stopped), tmp_path / "c")
+    kept = load(tmp_path / "c")
+    assert (kept.num_envs, kept.env_id, kept.options["episode_length"]) == (drones, ENV, 30)
+    assert kept.position.episodes == tuple(half.episodes)
+    torch.manual_seed(99)  # nothing may depend on what the process did before
+    log = log_of(drones, action_type=kind)
+    resumed = resume_agent(kept, log)
+    assert 0 < log.env_steps < TOTAL
+    resumed.train(log, TOTAL, lambda: True)
+    assert log.env_steps == whole.env_steps
+    expected = unbroken.state()
+    assert set(resumed.state()) == set(expected)
+    for name, array in resumed.state().items():
+        assert array.tobytes() == expected[name].tobytes(), name
+    episodes = [[replace(e, seconds=0.0) for e in one.episodes] for one in (log, whole)]
+    assert episodes[0] == episodes[1]
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Checkpoint:
+    path = tmp_path_factory.mktemp("kept") / "c"
+    log = log_of(2)
+    store(checkpoint_of("a2c", log, trained("a2c", log, updates=3)), path)
+    return load(path)
+
+
+def test_a_checkpoint_tells_where_it_comes_from(kept: Checkpoint) -> None:
+    assert (kept.algorithm, kept.config["gae_lambda"], kept.seed) == ("a2c", 0.98, 5)
+    assert kept.vehicle_hash == kept.spec.vehicle_hash != "0" * 32
+    assert kept.versions == software_versions()
+    assert kept.other_versions() == {}
+    other = replace(kept, versions={**kept.versions, "torch": "0.1"})
+    assert other.other_versions() == {"torch": ("0.1", kept.versions["torch"])}
+    assert kept.policy().act(np.zeros(3, np.float32)).shape == (1,)
+    with pytest.raises(InputError, match="policy: expected weights of shapes"):
+        kept.policy(log_of(1, observation="error").spec)
+
+
+def test_another_env_is_refused(kept: Checkpoint) -> None:
+    for options, sentence in (
+        ({"linear_drag": 0.1}, "an env with options"),
+        ({"target": 8.0}, "an env with options"),
+        ({"action_type": "discrete"}, "an env with options"),
+    ):
+        with pytest.raises(ResumeError, match=sentence):
+            resume_agent(kept, log_of(2, **options))
+    with pytest.raises(ResumeError, match="expected a training with 3 drones, got one with 2"):
+        resume_agent(kept, log_of(3))
+    position = replace(kept.position, actions=kept.position.actions * 0.5)
+    with pytest.raises(ResumeError, match="does not repeat the episodes"):
+        resume_agent(replace(kept, position=position), log_of(2))
+
+
+def test_the_smallest_damage_is_noticed(kept: Checkpoint, tmp_path: Path) -> None:
+    path = tmp_path / "c"
+    store(kept, path)
+    data = path.read_bytes()
+    places = np.random.default_rng(0).choice(len(data), 300, replace=False)
+    for place in [*range(8), *places.tolist()]:
+        damaged = bytearray(data)
+        damaged[place] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        with pytest.raises(CheckpointError, match="expected a rotorgram checkpoint"):
+            load(path)
+    for wrong in (b"", b"x", data[:-1], data + b"x", data[:100], b"garbage" * 100):
+        path.write_bytes(wrong)
+        with pytest.raises(CheckpointError, match="expected a rotorgram checkpoint"):
+            load(path)
+    with pytest.raises(CheckpointError, match="checkpoint: no file"):
+        load(tmp_path / "none")
+
+
+def test_what_is_not_finite_is_never_stored(kept: Checkpoint, tmp_path: Path) -> None:
+    path = tmp_path / "c"
+    store(kept, path)
+    before = path.read_bytes()
+    for part in ("actor", "state"):
+        arrays = {name: array.copy() for name, array in getattr(kept, part).items()}
+        next(array for array in arrays.values() if array.dtype.kind == "f").flat[0] = np.nan
+        with pytest.raises(CheckpointError, match=r"training diverged, .* is not finite"):
+            store(replace(kept, **{part: arrays}), path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["c"]
+
+
+def crafted(kept: Checkpoint, path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    """Write a checkpoint whose metadata is another, with the right checksum."""
+    from rotorgram.agents import checkpoints
+
+    store(kept, path)
+    data = path.read_bytes()
+    size = struct.unpack("<Q", data[:8])[0]
+    header = json.loads(data[8 : 8 + size])
+    meta = json.loads(header["__metadata__"]["rotorgram"])
+    change(meta)
+    header["__metadata__"] = {"rotorgram": json.dumps(meta), "sha256": "0" * 64}
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    plain = struct.pack("<Q", len(text)) + text + data[8 + size :]
+    digest = checkpoints.hashlib.sha256(plain).hexdigest()
+    path.write_bytes(plain.replace(b'"sha256":"' + b"0" * 64, f'"sha256":"{digest}'.encode()))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"spec": None},
+        {"spec": "{}"},
+        {"config": None},
+        {"env_steps": 10**400},
+        {"env_steps": 1.5},
+        {"seed": -1},
+        {"algorithm": ["vpg"]},
+        {"format": 1},
+        {"versions": []},
+        {"position": {"env_steps": 1, "seconds": -1.0}},
+        {"position": {}},
+    ],
+)
+def test_crafted_metadata_is_refused(
+    change: dict[str, Any], kept: Checkpoint, tmp_path: Path
+) -> None:
+    crafted(kept, tmp_path / "same", lambda meta: None)
+    assert load(tmp_path / "same").seed == 5
+    crafted(kept, tmp_path / "c", lambda meta: meta.update(change))
+    with pytest.raises(CheckpointError, match="expected a rotorgram checkpoint"):
+        load(tmp_path / "c")
+
+
+@pytest.mark.parametrize("algorithm", SMALL)
+def test_parts_that_do_not_fit_are_refused(algorithm: str) -> None:
+    log = log_of(2)
+    kept = checkpoint_of(algorithm, log, trained(algorithm, log, updates=3))
+    network = "policy.value_net.bias" if algorithm == "sb3-a2c" else "actor.output.bias"
+    rng = "rng.torch" if algorithm == "sb3-a2c" else "rng"
+    changes: list[dict[str, Any]] = [
+        {"optimizer.0.exp_avg": None},
+        {"optimizer.0.step": np.zeros(3, np.float32)},
+        {"optimizer.1.exp_avg_sq": np.zeros((7, 7), np.float32)},
+        {"optimizer.9999.exp_avg": np.zeros(1, np.float32)},
+        {network: None},
+        {network: np.zeros(9, np.float32)},
+        {rng: None},
+        {rng: np.zeros(3, np.uint8)},
+    ]
+    if algorithm == "sb3-a2c":
+        changes.append({"observation": np.zeros((2, 9), np.float32)})
+    for change in changes:
+        state = {k: v for k, v in {**kept.state, **change}.items() if v is not None}
+        with pytest.raises(CheckpointError, match="its parts do not fit together"):
+            resume_agent(replace(kept, state=state), log_of(2))
+    for config in ({"hidden": 10**9}, {"gamma": 7}, {"other": 1}):
+        wrong = replace(kept, config={**kept.config, **config})
+        with pytest.raises(CheckpointError, match="its parts do not fit together"):
+            resume_agent(wrong, log_of(2))
+
+
+def test_a_position_of_other_shapes_is_refused(kept: Checkpoint, tmp_path: Path) -> None:
+    for name, wrong in (
+        ("numbers", np.zeros((2, 1), int)),
+        ("lengths", np.zeros(2)),
+        ("first_steps", np.zeros(3, int)),
+        ("observations", np.zeros((2, 4), np.float32)),
+        ("actions", np.zeros((1000, 2, 1), np.float32)),
+    ):
+        store(replace(kept, position=replace(kept.position, **{name: wrong})), tmp_path / "c")
+        with pytest.raises(CheckpointError, match="expected a rotorgram checkpoint"):
+            load(tmp_path / "c")
+
+
+def test_a_file_is_written_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "new" / "file"
+    write_whole(path, b"one")
+    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(28, "full")))
+    with pytest.raises(OSError, match="full") as error:
+        write_whole(path, b"two")
+    assert error.value.filename == str(path), "a sentence about a full disk names the file"
+    assert path.read_bytes() == b"one"
+    assert os.listdir(path.parent) == ["file"]
