@@ -206,9 +206,7 @@ def bench(
 
 
 def parts_of(layers: Sequence[Layer]) -> list[tuple[str, float]]:
-    """Median time of each part of a lock-step step of one drone, s; the last two are what is left,
-    and the whole step.
-    """
+    """Median time of each part of a lock-step step of one drone, of the rest and of all, s."""
     of = {layer.name: layer for layer in layers}
     whole = statistics.median(1 / rate for rate in of["UDP, 1"].rates)
     whole += 1 / of["decide"].rate  # the layer flies without a policy

@@ -198,9 +198,7 @@ def _fly_batch(
         if isinstance(spec.action, Discrete)
         else np.zeros((count, *spec.action.shape), np.float32)
     )
-    starts = np.zeros(count, np.uint64)
-    starts[: len(seeds)] = list(seeds.values())
-    env.advance(actions, np.ones(count, bool), starts)
+    env.reset(seed=[*seeds.values(), *[0] * (count - len(seeds))])
     rows, rewards = [_copied(env.telemetry)], []
     lengths, terminated = np.zeros(count, int), np.zeros(count, bool)
     done, lost = np.arange(count) >= len(seeds), env.lost.copy()

@@ -9,17 +9,40 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from rotorgram.experiments.metrics import overshoot, settling_time, steady_state_error
-from rotorgram.experiments.records import (
+from rotorgram.envs.spec import ArraySpec, EnvSpec, Metric
+from rotorgram.experiments.metrics import Headline, overshoot, settling_time, steady_state
+from rotorgram.experiments.results import (
     EPISODE_COLUMNS,
     EVALUATION_COLUMNS,
     RUN_COLUMNS,
-    STEP_SCHEMA,
+    step_schema,
 )
 
 PERIOD = 0.05
+ERROR = Metric(name="elevation_error", unit="m", symbol="E", settled=0.05, held=0.1)
+GATES = Metric(name="gates_passed", unit="", goal="high", held=3.0)
 DELAYS = {"vpg": 0.15, "a2c": 0.3, "sb3-a2c": 0.25}
 FLOORS = {"vpg": 0.06, "a2c": 0.02, "sb3-a2c": 0.015, "pid": 0.004}
+
+
+def spec_of(metric: Metric = ERROR, low: float = -np.inf, length: int = 100) -> EnvSpec:
+    """A spec whose headline is the metric, of values from `low` on."""
+    metrics = ArraySpec(
+        name="metrics", shape=(1,), dtype="float64", low=low, components=(metric.name,)
+    )
+    return EnvSpec(
+        env_id="rotorgram/Elevation-v0",
+        options={"target": 10.0, "episode_length": length},
+        control_period=PERIOD,
+        vehicle="quad",
+        observation=(ArraySpec(name="observation", shape=(3,)),),
+        action=ArraySpec(name="action", shape=(1,), low=-1.0, high=1.0),
+        telemetry=(metrics,),
+        metrics=(metric,),
+    )
+
+
+HEADLINE = Headline.of(spec_of())
 
 
 def flight(skill: float, agent: str, length: int, rng: np.random.Generator) -> np.ndarray:
@@ -40,7 +63,7 @@ def synthetic_folder(
     length: int = 100,
     snapshots: int = 5,
 ) -> Path:
-    """Write records with the shapes of learning: `env_steps` per run, all by chance."""
+    """Write results with the shapes of learning: `env_steps` per run, all by chance."""
     rng = np.random.default_rng(1)
     episodes: list[dict[str, Any]] = []
     evaluations: list[dict[str, Any]] = []
@@ -77,7 +100,7 @@ def _train(agent, seed, rate, env_steps, length, rng, episodes, steps):  # type:
         errors = flight(skill, agent, max(2, flown), rng)[:flown]
         steps.append(
             {"agent": agent, "seed": seed, "phase": "train", "episode": number}
-            | {"step": np.arange(begin, begin + flown), "error": errors}
+            | {"step": np.arange(begin, begin + flown) + 1, "elevation_error": errors}
         )
         begin += flown
         if flown < length and begin >= env_steps:
@@ -85,8 +108,9 @@ def _train(agent, seed, rate, env_steps, length, rng, episodes, steps):  # type:
         episodes.append(
             dict.fromkeys(EPISODE_COLUMNS, 0)
             | {"agent": agent, "seed": seed, "episode": number, "first_step": begin - flown}
+            | {"last_step": begin}
             | {"length": flown, "return": float(np.sum(1 - np.minimum(np.abs(errors), 3)))}
-            | {"mean_abs_error": float(np.abs(errors).mean()), "truncated": flown == length}
+            | {"elevation_error": float(np.abs(errors).mean()), "truncated": flown == length}
             | {"terminated": flown < length, "seconds": begin / 2500}
         )
         number += 1
@@ -98,13 +122,14 @@ def _evaluate(agent, seed, mark, skill, length, rng, evaluations, steps, final):
         evaluations.append(
             {"agent": agent, "seed": seed, "env_steps": mark, "seconds": mark / 2500}
             | {"episode": episode, "length": length, "return": float(np.sum(1 - np.abs(errors)))}
-            | {"steady_error": steady_state_error(errors), "overshoot": overshoot(errors)}
-            | {"settling_time": settling_time(errors, PERIOD), "terminated": False}
+            | {"start": float(errors[0]), "elevation_error": steady_state(np.abs(errors))}
+            | {"overshoot": overshoot(errors), "terminated": False}
+            | {"settling_time": settling_time(errors, PERIOD, 0.05)}
         )
         if final:
             steps.append(
                 {"agent": agent, "seed": seed, "phase": "evaluation", "episode": episode}
-                | {"step": np.arange(length), "error": errors}
+                | {"step": np.arange(1, length + 1), "elevation_error": errors}
             )
 
 
@@ -117,22 +142,27 @@ def _write(folder, agents, seeds, env_steps, length, episodes, evaluations, step
         "preset": "tuned",
         "seeds": list(range(seeds)),
         "env_steps": env_steps,
-        "env": {"target": 10.0, "control_period": PERIOD, "episode_length": length},
+        "num_envs": 1,
+        "spec": json.loads(spec_of(length=length).to_json()),
+        "vehicle": None,
+        "bounds": {"time-optimal flight": 95.0},
         "agents": dict.fromkeys(agents, settings),
         "versions": {"rotorgram": "0.1.0", "mujoco": "4.0.0"},
-        "model_hash": "0123abcd",
         "machine": {"platform": "Linux", "processor": "some <processor>", "cores": 2},
     }
     (folder / "config.json").write_text(json.dumps(config))
-    pd.DataFrame(episodes, columns=list(EPISODE_COLUMNS)).to_csv(
-        folder / "episodes.csv", index=False
-    )
-    pd.DataFrame(evaluations, columns=list(EVALUATION_COLUMNS)).to_csv(
-        folder / "evaluations.csv", index=False
-    )
+    for name, rows, columns in (
+        ("episodes.csv", episodes, EPISODE_COLUMNS),
+        ("evaluations.csv", evaluations, EVALUATION_COLUMNS),
+    ):
+        own = [
+            "elevation_error" if column in ("mean_size", "steady") else column for column in columns
+        ]
+        pd.DataFrame(rows, columns=own).to_csv(folder / name, index=False)
     pd.DataFrame(runs, columns=list(RUN_COLUMNS)).to_csv(folder / "runs.csv", index=False)
     frame = pd.concat([pd.DataFrame(part) for part in steps])
+    schema = step_schema("elevation_error")
     table = pa.Table.from_pandas(
-        frame.assign(reward=0.0, thrust=49.0)[STEP_SCHEMA.names], STEP_SCHEMA, preserve_index=False
+        frame.assign(reward=0.0, thrust=49.0)[schema.names], schema, preserve_index=False
     )
     pq.write_table(table, folder / "steps.parquet")

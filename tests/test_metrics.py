@@ -5,31 +5,33 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import ERROR, GATES, HEADLINE, spec_of
 from rotorgram.experiments.metrics import (
     Curve,
+    Headline,
     average_return,
     bootstrap_difference,
     bootstrap_interval,
-    env_steps_to_reach,
     final_evaluations,
     final_per_run,
+    first_lasting_snapshot,
     iqm,
     overshoot,
     results_table,
-    seconds_to_reach,
     settling_time,
     spread_over_seeds,
-    steady_state_error,
+    steady_state,
+    trimmed_mean,
 )
-from rotorgram.experiments.records import EVALUATION_COLUMNS, RUN_COLUMNS
+from rotorgram.experiments.results import EVALUATION_COLUMNS, RUN_COLUMNS
 
 
 def evaluations(*rows: tuple[object, ...]) -> pd.DataFrame:
-    """Rows of (agent, seed, env_steps, steady_error, settling_time, terminated)."""
-    names = ["agent", "seed", "env_steps", "steady_error", "settling_time", "terminated"]
+    """Rows of (agent, seed, env_steps, steady, settling_time, terminated)."""
+    names = ["agent", "seed", "env_steps", "steady", "settling_time", "terminated"]
     frame = pd.DataFrame(rows, columns=names)
     frame["episode"] = frame.groupby(["agent", "seed", "env_steps"]).cumcount()
-    frame = frame.assign(seconds=frame["env_steps"] / 100, length=10, overshoot=0.2)
+    frame = frame.assign(seconds=frame["env_steps"] / 100, length=10, start=1.0, overshoot=0.2)
     return frame.assign(**{"return": 5.0})[list(EVALUATION_COLUMNS)]
 
 
@@ -37,10 +39,25 @@ def runs(*rows: tuple[object, ...]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(RUN_COLUMNS))
 
 
-def test_steady_state_error_is_the_mean_magnitude_of_the_last_quarter():
-    assert steady_state_error(np.array([5, 4, 3, 2, 1, 1, 0.1, -0.3])) == pytest.approx(0.2)
-    assert steady_state_error(np.array([3.0, -2.0])) == 2.0  # at least the last step
-    assert math.isnan(steady_state_error(np.array([])))
+def test_the_steady_state_is_the_mean_size_of_the_last_quarter():
+    sizes = HEADLINE.size(np.array([5, 4, 3, 2, 1, 1, 0.1, -0.3]))
+    assert steady_state(sizes) == pytest.approx(0.2)
+    assert steady_state(np.array([3.0, 2.0])) == 2.0  # at least the last step
+    assert math.isnan(steady_state(np.array([])))
+
+
+def test_a_headline_says_how_its_numbers_are_read():
+    distance = Headline.of(spec_of(ERROR, low=0.0))
+    gates = Headline.of(spec_of(GATES))
+    assert [one.signed for one in (HEADLINE, distance, gates)] == [True, False, False]
+    assert [one.size_symbol for one in (HEADLINE, distance, gates)] == ["|E|", "E", "gates_passed"]
+    assert [one.held_text for one in (HEADLINE, gates)] == ["|E| < 0.1 m", "gates_passed ≥ 3"]
+    assert HEADLINE.labelled("Steady |E|") == "Steady |E| (m)"
+    assert gates.labelled("Steady") == "Steady"
+    assert gates.size([-1.0, 2.0]).tolist() == [-1.0, 2.0]
+    assert HEADLINE.holds([0.05, 0.1, math.nan]).tolist() == [True, False, False]
+    assert gates.holds([2.9, 3.0, math.nan]).tolist() == [False, True, False]
+    assert (HEADLINE.worst([0.1, math.nan, 0.4]), gates.worst([5.0, 2.0])) == (0.4, 2.0)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +72,7 @@ def test_steady_state_error_is_the_mean_magnitude_of_the_last_quarter():
     ],
 )
 def test_settling_time(errors, expected):
-    value = settling_time(np.array(errors), control_period=0.1)
+    value = settling_time(np.array(errors), control_period=0.1, tolerance=0.05)
     assert value == pytest.approx(expected, nan_ok=True)
 
 
@@ -108,20 +125,32 @@ def test_bootstrap_difference():
 def test_reaching_the_target_counts_from_the_first_snapshot_that_lasts():
     errors = {0: 2.0, 100: 0.05, 200: 0.3, 300: 0.05, 400: 0.09}
     run = evaluations(*(("a2c", 0, steps, error, 1.0, False) for steps, error in errors.items()))
-    assert env_steps_to_reach(run) == 300.0
-    assert seconds_to_reach(run) == 3.0
-    assert env_steps_to_reach(run.iloc[::-1]) == 300.0  # whatever the rows' order
-    assert env_steps_to_reach(run, threshold=0.5) == 100.0
-    assert math.isnan(env_steps_to_reach(run, threshold=0.08))
+    assert first_lasting_snapshot(run, HEADLINE) == (300.0, 3.0)
+    assert first_lasting_snapshot(run.iloc[::-1], HEADLINE)[0] == 300.0  # whatever the rows' order
+    worse = run.assign(steady=run["steady"] + 0.02)  # the last is 0.11 m
+    assert np.isnan(first_lasting_snapshot(worse, HEADLINE)).all()
+    gates = Headline.of(spec_of(GATES))
+    passed = run.assign(steady=[5.0, 2.0, 3.0, 4.0, 3.0])
+    assert first_lasting_snapshot(passed, gates) == (200.0, 2.0)
 
 
 def test_a_snapshot_is_its_mean_and_a_crash_or_a_gap_is_a_miss():
     good = [("a2c", 0, 100, 0.05, 1.0, False), ("a2c", 0, 100, 0.13, 1.0, False)]
-    assert env_steps_to_reach(evaluations(*good)) == 100.0  # mean 0.09
+    assert first_lasting_snapshot(evaluations(*good), HEADLINE)[0] == 100.0  # mean 0.09
     crash = ("a2c", 0, 100, 0.0, math.nan, True)
-    assert math.isnan(env_steps_to_reach(evaluations(*good, crash)))
+    assert math.isnan(first_lasting_snapshot(evaluations(*good, crash), HEADLINE)[0])
     gap = ("a2c", 0, 100, math.nan, math.nan, False)
-    assert math.isnan(env_steps_to_reach(evaluations(*good, gap)))
+    assert math.isnan(first_lasting_snapshot(evaluations(*good, gap), HEADLINE)[0])
+
+
+def test_a_run_holds_without_a_crash_and_without_a_gap():
+    frame = evaluations(
+        ("a2c", 0, 100, 0.05, 1.0, False), ("a2c", 0, 100, 0.13, 1.0, False),
+        ("a2c", 1, 100, 0.01, 1.0, False), ("a2c", 1, 100, 0.01, 1.0, True),
+        ("a2c", 2, 100, 0.01, 1.0, False), ("a2c", 2, 100, math.nan, math.nan, False),
+        ("a2c", 3, 100, 0.2, 1.0, False),
+    )  # fmt: skip
+    assert final_per_run(frame, HEADLINE)["held"].tolist() == [True, False, False, False]
 
 
 def test_the_final_evaluation_is_each_runs_own_last_snapshot():
@@ -133,8 +162,8 @@ def test_the_final_evaluation_is_each_runs_own_last_snapshot():
         ("pid", 0, 0, 0.0, 1.0, False),
     )
     assert final_evaluations(frame)["env_steps"].tolist() == [200, 200, 150, 0]
-    first = final_per_run(frame).iloc[0]
-    assert first["steady_error"] == pytest.approx(0.2)
+    first = final_per_run(frame, HEADLINE).iloc[0]
+    assert first["steady"] == pytest.approx(0.2)
     assert first["settling_time"] == 2.0  # a crash has not settled, whatever its row says
     assert (first["episodes"], first["settled"], first["crashed"]) == (2, 1, 1)
 
@@ -146,27 +175,30 @@ def test_results_table():
         ("vpg", 2, 200, 0.4, math.nan, True),
         ("pid", 0, 0, 0.01, 3.0, False),
     )
-    table = results_table(frame, runs(*(("vpg", s, 200, 2.0, 100.0 + s) for s in range(3))))
-    assert table.index.tolist() == ["vpg", "pid"]
+    flown = runs(*(("vpg", s, 200, 2.0, 100.0 + s) for s in range(3)))
+    table = results_table(frame, flown, HEADLINE, {"time-optimal flight": 9.0})
+    assert table.index.tolist() == ["vpg", "pid", "time-optimal flight"]
+    bound = table.loc["time-optimal flight"]
+    assert (bound["return"], bound["seeds"], bound["crashed"]) == (9.0, 0, 0)
+    assert math.isnan(bound["steady"])
     vpg, pid = table.loc["vpg"], table.loc["pid"]
-    assert vpg["steady_error"] == pytest.approx(0.15)  # (0.02 + 0.03 + 0.4) / 3
-    assert (vpg["steady_error_low"], vpg["steady_error_high"]) == pytest.approx((0.02, 0.4))
+    assert vpg["steady"] == pytest.approx(0.15)  # (0.02 + 0.03 + 0.4) / 3
+    assert (vpg["steady_low"], vpg["steady_high"]) == pytest.approx((0.02, 0.4))
     assert (vpg["seeds"], vpg["episodes"], vpg["settled"], vpg["crashed"]) == (3, 3, 2, 1)
+    assert (vpg["held"], vpg["worst"]) == (2, 0.4)
     assert vpg["settling_time"] == 1.5
     assert (vpg["reached"], vpg["env_steps_to_reach"], vpg["seconds_to_reach"]) == (2, 200, 2)
     assert (vpg["steps_per_second"], vpg["return"]) == (101, 5)
     assert vpg["overshoot"] == pytest.approx(0.2)
-    assert (pid["steady_error"], pid["settling_time"]) == (0.01, 3.0)
-    assert math.isnan(pid["steady_error_low"])
+    assert (pid["steady"], pid["settling_time"]) == (0.01, 3.0)
+    assert math.isnan(pid["steady_low"])
     # An agent that is not trained has reached nothing by training.
     assert math.isnan(pid["reached"])
     assert math.isnan(pid["env_steps_to_reach"])
 
 
 def test_average_return_is_a_mean_over_a_share_of_training():
-    run = pd.DataFrame(
-        {"first_step": [0, 10, 20, 30], "length": [10] * 4, "return": [1.0, 2.0, 4.0, 8.0]}
-    )
+    run = pd.DataFrame({"last_step": [10, 20, 30, 40], "return": [1.0, 2.0, 4.0, 8.0]})
     curve = average_return(run, share=0.5)  # the last 20 steps: two episodes
     assert curve.x.tolist() == [10, 20, 30, 40]
     assert curve.y.tolist() == [1.0, 1.5, 3.0, 6.0]
@@ -184,3 +216,9 @@ def test_spread_over_seeds_keeps_to_what_all_seeds_reach():
     assert (three.low.tolist(), three.high.tolist()) == ([1.0, 1.0], [6.0, 6.0])
     five = spread_over_seeds([line(10, height) for height in (0.0, 1.0, 2.0, 3.0, 40.0)], grid)
     assert (five.low[0], five.middle[0], five.high[0]) == (1.0, 2.0, 3.0)
+
+
+def test_the_trimmed_mean_leaves_a_quarter_out_at_each_end():
+    assert trimmed_mean(np.array([1.0, 2.0, 6.0])) == 3.0
+    assert trimmed_mean(np.array([100.0, 2.0, 4.0, -100.0])) == 3.0
+    assert trimmed_mean(np.array([[0.0, 8.0], [2.0, 4.0]]), axis=0).tolist() == [1.0, 6.0]

@@ -14,18 +14,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from comparisons import synthetic_folder
-from rotorgram.experiments.charts import MAX_POINTS, Chart, chart_data
+from comparisons import HEADLINE, synthetic_folder
 from rotorgram.experiments.curves import (
     cumulative_returns,
-    error_fan,
-    flown_error,
+    flown_sizes,
     learning_curves,
-    pick_flights,
+    pick_trajectories,
     return_curves,
+    value_fan,
 )
-from rotorgram.experiments.figures import FIGURE_FILES, agent_color
+from rotorgram.experiments.figures import FIGURE_FILES
 from rotorgram.experiments.metrics import Spread
+from rotorgram.experiments.page import MAX_POINTS, Chart, chart_data
+from rotorgram.experiments.palette import agent_color
 from rotorgram.experiments.report import VIDEO_FILE, write_report
 
 CHARTS = ["learning", "flown", "reward", "training-error", "total-by-step", "total-by-episode"]
@@ -36,7 +37,7 @@ EVIL = "</script><img src=x onerror=alert(1)>"
 def training(returns: dict[int, list[float]], length: int = 10) -> pd.DataFrame:
     """Training episodes of A2C: the returns of each seed."""
     rows = [
-        {"agent": "a2c", "seed": seed, "first_step": number * length, "length": length, "return": y}
+        {"agent": "a2c", "seed": seed, "last_step": (number + 1) * length, "return": y}
         for seed, values in returns.items()
         for number, y in enumerate(values)
     ]
@@ -70,7 +71,7 @@ def test_learning_curves_are_means_over_episodes_then_over_seeds() -> None:
         ("pid", 0, 0, 0.01), ("pid", 0, 0, 0.03),
         ("vpg", 0, 0, np.nan),
     ]  # fmt: skip
-    evaluations = pd.DataFrame(rows, columns=["agent", "seed", "env_steps", "steady_error"])
+    evaluations = pd.DataFrame(rows, columns=["agent", "seed", "env_steps", "steady"])
     curves, levels = learning_curves(evaluations)
     assert list(curves) == ["a2c"]
     assert curves["a2c"].x.tolist() == [0, 100]
@@ -83,7 +84,7 @@ def test_learning_curves_are_means_over_episodes_then_over_seeds() -> None:
 def test_the_fan_has_the_quantiles_of_each_window() -> None:
     # Two windows of 50 steps: E from 0 to 4.9 m in the first, and -1 m in the second.
     errors = np.concatenate([np.arange(50) / 10, np.full(50, -1.0)])
-    fan = error_fan(pd.DataFrame({"step": np.arange(100), "error": errors}))
+    fan = value_fan(pd.DataFrame({"step": np.arange(100), "value": errors}))
     assert fan.x.tolist() == [25, 75]
     # Of n = 50 even values the quantile q is q (n - 1) / 10.
     first = [values[0] for values in fan[1:]]
@@ -94,31 +95,33 @@ def test_the_fan_has_the_quantiles_of_each_window() -> None:
 def flying(errors: list[list[float]]) -> pd.DataFrame:
     """Evaluation steps of one seed: E of each episode."""
     parts = [
-        pd.DataFrame({"seed": 0, "episode": n, "step": np.arange(len(values)), "error": values})
+        pd.DataFrame({"seed": 0, "episode": n, "step": np.arange(len(values)), "value": values})
         for n, values in enumerate(errors)
     ]
     return pd.concat(parts)
 
 
-def test_the_flown_error_is_of_those_that_still_fly() -> None:
-    spread = flown_error(flying([[-1.0, 1.0], [2.0, 2.0], [-3.0, 3.0], [4.0], [5.0]]), 0.5)
+def test_the_flown_sizes_are_of_those_that_still_fly() -> None:
+    spread = flown_sizes(
+        flying([[-1.0, 1.0], [2.0, 2.0], [-3.0, 3.0], [4.0], [5.0]]), 0.5, HEADLINE
+    )
     assert spread.x.tolist() == [0.0, 0.5]
     # Of five, the quartiles and the mean of what is between; of three, the extremes and the mean.
     assert (spread.low[0], spread.middle[0], spread.high[0]) == (2, 3, 4)
     assert (spread.low[1], spread.middle[1], spread.high[1]) == (1, 2, 3)
-    long = flown_error(flying([list(range(5000))]), 0.01)
+    long = flown_sizes(flying([list(range(5000))]), 0.01, HEADLINE)
     assert len(long.x) == 500
     assert (long.x[-1], long.middle[-1]) == (49.99, 4999)
 
 
-def test_flights_are_picked_once_and_for_all() -> None:
+def test_trajectories_are_picked_once_and_for_all() -> None:
     steps = flying([[float(n), 0.0] for n in range(60)])
-    shown, total = pick_flights(steps, 0.5)
+    shown, total = pick_trajectories(steps, 0.5)
     assert (len(shown), total) == (40, 60)
     assert all(time.tolist() == [0.0, 0.5] for time, _ in shown)
     starts = [error[0] for _, error in shown]
     assert len(set(starts)) == 40
-    assert starts == [error[0] for _, error in pick_flights(steps, 0.5).shown]
+    assert starts == [error[0] for _, error in pick_trajectories(steps, 0.5).shown]
 
 
 def chart(spread: Spread, **changes: Any) -> dict[str, Any]:
@@ -163,9 +166,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (EVIL, 0, 0, 2.0), (EVIL, 0, 800, 0.25),
         ("pid", 0, 0, 0.003),
     ]:  # fmt: skip
-        row = {"agent": agent, "seed": seed, "env_steps": env_steps, "steady_error": error}
+        row = {"agent": agent, "seed": seed, "env_steps": env_steps, "elevation_error": error}
         rows.append(row | {"seconds": env_steps / 100, "episode": 0, "length": 100, "return": 50.0})
-    frame = pd.DataFrame(rows).assign(settling_time=1.0, overshoot=0.1, terminated=False)
+    frame = pd.DataFrame(rows).assign(settling_time=1.0, overshoot=0.1, start=1.0, terminated=False)
     frame.to_csv(path / "evaluations.csv", index=False)
     write_report(path)
     return path
@@ -183,7 +186,7 @@ def data_of(page: str) -> dict[str, Any]:
     return data
 
 
-def test_the_page_holds_the_numbers_of_the_records(page: str) -> None:
+def test_the_page_holds_the_numbers_of_the_files(page: str) -> None:
     data = data_of(page)
     assert data["agents"] == ["VPG", "PID", EVIL]
     assert [one["key"] for one in data["charts"]] == CHARTS
@@ -256,9 +259,9 @@ def test_the_page_escapes_what_it_is_given(page: str) -> None:
 
 def test_the_page_tells_what_was_asked_for_and_where_it_ran(page: str, folder: Path) -> None:
     text = html.unescape(page)
-    for words in ("0123abcd", "rotorgram report FOLDER", "rotorgram compare --resume FOLDER"):
+    for words in ("0" * 32, "rotorgram report FOLDER", "rotorgram compare --resume FOLDER"):
         assert words in text
-    assert text.count('<span class="badge') == 4
+    assert text.count('<span class="badge') == 5
     for name in ("config.json", "results.csv", *(f"figures/{name}" for name in FIGURE_FILES)):
         assert (folder / name).is_file()
         assert f"<code>{name}</code>" in text
@@ -270,8 +273,8 @@ def test_the_outcome_is_one_sentence_of_the_tables_numbers(page: str) -> None:
     (lead,) = re.findall(r'<p class="lead">(.*?)</p>', page)
     text = html.unescape(lead)
     assert text.startswith(
-        "After 800 env steps of training, episodes end on average 0.030 m (VPG) and "
-        f"0.25 m ({EVIL}) from the target; without training, they end 0.0030 m (PID) from it; "
+        "After 800 env steps of training, episodes end with a mean |E| of 0.030 m (VPG) and "
+        f"0.25 m ({EVIL}); without training, with 0.0030 m (PID); "
         "of the paper's 4 claims, "
     )
     assert text.endswith("not tested.")
