@@ -196,7 +196,7 @@ def test_a_craft_of_any_size_fills_the_picture_as_ours_does(
             assert columns.mean() == pytest.approx(WIDTH / 2, abs=3)
             shares.append((np.ptp(columns), rows.mean()))
     (width, row), (other_width, other_row) = shares
-    assert other_width == pytest.approx(width, rel=0.45)
+    assert 0.8 * width < other_width < 1.7 * width  # of 1.5, 1.9 and 1.6 radii
     assert other_row == pytest.approx(row, abs=0.12 * HEIGHT)
     if camera == "top":
         assert other_width == pytest.approx(span * pixels_per_metre(stage, "top"), rel=0.2)

@@ -1,5 +1,6 @@
 """`rotorgram render`, what it does without OpenGL, and the film of a comparison."""
 
+import ctypes.util
 import json
 import logging
 import math
@@ -19,12 +20,17 @@ from pictures import HEIGHT, WIDTH, decoded, pixels
 from PIL import Image
 from rotorgram.agents.checkpoints import load
 from rotorgram.cli import main
-from rotorgram.cli.inputs import load_policy
-from rotorgram.envs import ElevationConfig
-from rotorgram.experiments.comparison_film import film_comparison
-from rotorgram.experiments.flights import flown_tracks, recorded_tracks
-from rotorgram.experiments.records import EVALUATION_COLUMNS
-from rotorgram.experiments.runs import write_config
+from rotorgram.envs.registry import env_spec
+from rotorgram.experiments.filming import Film, Shot, film, film_comparison
+from rotorgram.experiments.results import (
+    CONFIG_KEYS,
+    EPISODE_COLUMNS,
+    EVALUATION_COLUMNS,
+    RUN_COLUMNS,
+    write_config,
+)
+from rotorgram.experiments.trajectories import flown_trajectories, recorded_trajectories
+from rotorgram.models import InputError
 from rotorgram.rendering import NoOpenGL
 
 
@@ -51,7 +57,8 @@ def training(tmp_path_factory: pytest.TempPathFactory) -> Path:
         status = main(["train", "a2c", "--env-steps", "200", "--out", sys.argv[1],
                        "--set", "steps_per_update=50", "--env.episode-length", "25"])
         drawing = {name for name in sys.modules
-                   if name.startswith(("rotorgram.rendering", "OpenGL", "mujoco.egl"))}
+                   if name.startswith(("rotorgram.rendering.", "OpenGL", "mujoco.egl"))}
+        drawing -= {"rotorgram.rendering.gl"}  # looks at MUJOCO_GL and imports nothing
         assert not drawing, drawing
         sys.exit(status)
         """
@@ -66,23 +73,26 @@ def test_a_checkpoint_on_film_flies_as_it_does_over_the_wire(
 ) -> None:
     journal = tmp_path / "flight.mcap"
     assert run(capsys, "evaluate", training, "--episodes", 2, "--record", journal)[0] == 0
-    policy, config = load_policy(str(training), ElevationConfig())
-    assert config.episode_length == 25
-    assert repr(flown_tracks(policy, config, [1])) == repr(recorded_tracks(journal, [1]))
+    trained = load(training / "checkpoint.safetensors")
+    assert trained.options["episode_length"] == 25
+    (flown,) = flown_trajectories(
+        trained.policy(), trained.env_id, trained.options, [1], of="final"
+    )
+    (recorded,) = recorded_trajectories(journal, [1])
+    for name, values in flown.telemetry.items():
+        assert values.tobytes() == recorded.telemetry[name].tobytes()
+    assert flown.rewards.tobytes() == recorded.rewards.tobytes()
     out = tmp_path / "film.mp4"
     what = (training, journal, "--out", out, "--size", "642x240", *SMALL[2:])
     status, said, err = run(capsys, "render", *what, "--episode", 1, "--camera", "front")
     assert (status, err) == (0, "")
     assert f"film: {out} (13 pictures of 642x240)" in said  # 0.5 s, both ends
     last = decoded(out, 642, 240)[-1].astype(int)
-    plain = tmp_path / "plain.mp4"
-    status, _, _ = run(
-        capsys, "render", *what[:3], plain, *what[4:], "--episode", 1, "--no-overlay"
-    )
-    assert status == 0
-    bare = decoded(plain, 642, 240)[-1].astype(int)
-    # The same flight twice: below its name a pane is the other's picture, but for the compression.
-    assert abs(bare[40:, :320] - bare[40:, 322:]).mean() < 3
+    shots = [Shot(name="it", color="#7CC8F2", trajectories=[one]) for one in (flown, recorded)]
+    config = Film(width=642, height=240, camera="front", world="plain", fast=True, overlay=False)
+    film(tmp_path / "plain.png", shots, config)
+    bare = pixels(tmp_path / "plain.png").astype(int)
+    assert abs(bare[:, :320] - bare[:, 322:]).max() <= 3  # the same flight twice
     assert abs(last - bare).mean() > 10
 
 
@@ -183,6 +193,31 @@ def test_without_opengl_it_is_one_sentence_and_status_2(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("setting", ["nonsense", "osmesa"])
+def test_a_wrong_mujoco_gl_is_one_sentence_of_what_draws(setting: str, tmp_path: Path) -> None:
+    if ctypes.util.find_library("OSMesa") and setting == "osmesa":
+        pytest.skip("OSMesa is installed")
+
+    clean = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}  # MuJoCo sets it
+
+    def done(*words: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "rotorgram.cli", *map(str, words)],
+            env=clean | {"MUJOCO_GL": setting}, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+
+    draws = done("render", "pid", "--out", tmp_path / "film.mp4", *SMALL)
+    assert draws.returncode == 2
+    expected = {
+        "nonsense": "rotorgram: MUJOCO_GL: expected egl, osmesa, glfw or disable, got 'nonsense'\n",
+        "osmesa": "osmesa: its library is not installed",
+    }
+    assert expected[setting] in draws.stderr
+    assert draws.stderr.count("\n") == 1
+    flies = done("evaluate", "pid", "--episodes", 1, "--env.episode-length", 5)
+    assert (flies.returncode, flies.stderr.count("Traceback")) == (0, 0)
+
+
 @pytest.fixture
 def no_egl(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine without libEGL and without a display."""
@@ -244,20 +279,25 @@ def test_which_opengl_is_tried(
 def comparison(training: Path, tmp_path: Path) -> Path:
     """A comparison's folder: the checkpoint of the middle seed alone."""
     folder = tmp_path / "comparison"
-    env = load(training / "checkpoint.safetensors").env
-    config = ElevationConfig.from_options(env)
-    content = {"preset": "tuned", "seeds": [0, 1, 2], "env_steps": 200, "agents": {"a2c": {}}}
-    write_config(folder, "rotorgram compare", config, content)
+    folder.mkdir()
+    trained = load(training / "checkpoint.safetensors")
+    spec = env_spec(trained.env_id, trained.options)
+    content = dict.fromkeys(CONFIG_KEYS) | {"preset": "tuned", "seeds": [0, 1, 2], "agents": {}}
+    write_config(folder, "rotorgram compare", spec, None, content)
     rows = [
-        {"agent": agent, "seed": seed, "env_steps": 200, "seconds": 1.0, "episode": 0,
-         "length": 25, "return": 0.0, "steady_error": error, "settling_time": math.nan,
-         "overshoot": 0.0, "terminated": False}
+        dict.fromkeys(EVALUATION_COLUMNS, 0)
+        | {"agent": agent, "seed": seed, "env_steps": 200, "length": 25, "start": 0.5}
+        | {"steady": error, "settling_time": math.nan, "terminated": False}
         for agent, seed, error in (("a2c", 0, 0.3), ("a2c", 1, 0.1), ("a2c", 2, 0.2),
                                    ("pid", 0, 0.0))
     ]  # fmt: skip
-    pd.DataFrame(rows, columns=list(EVALUATION_COLUMNS)).to_csv(
-        folder / "evaluations.csv", index=False
-    )
+    for name, columns, found in (("evaluations", EVALUATION_COLUMNS, rows),
+                                 ("episodes", EPISODE_COLUMNS, []),
+                                 ("runs", RUN_COLUMNS, [])):  # fmt: skip
+        table = pd.DataFrame(found, columns=list(columns))
+        named = table.rename(columns={"steady": spec.metrics[0].name,
+                                      "mean_size": spec.metrics[0].name})  # fmt: skip
+        named.to_csv(folder / f"{name}.csv", index=False)
     (folder / "checkpoints").mkdir()
     data = (training / "checkpoint.safetensors").read_bytes()
     (folder / "checkpoints" / "a2c-seed2.safetensors").write_bytes(data)
@@ -267,13 +307,17 @@ def comparison(training: Path, tmp_path: Path) -> Path:
 def test_the_film_of_a_comparison_shows_its_agents(comparison: Path, opengl: None) -> None:
     out = comparison / "video.mp4"
     out.write_text("an old one")
-    assert film_comparison(comparison, out, world="plain")
+    picture = comparison / "video.jpg"
+    assert film_comparison(comparison, out, picture=picture, world="plain")
+    assert pixels(picture).shape == (400, 1280, 3)
+    assert pixels(picture).mean() > 60
     frames = decoded(out, 1280, 400)
     assert len(frames) == 13
     left, right = frames[0][:, :639].astype(int), frames[0][:, 641:].astype(int)
     assert abs(left[100:300] - right[100:300]).mean() < 8  # they start alike
     assert sorted(path.name for path in comparison.iterdir()) == [
-        "checkpoints", "config.json", "evaluations.csv", "video.mp4",
+        "checkpoints", "config.json", "episodes.csv", "evaluations.csv", "runs.csv",
+        "video.jpg", "video.mp4",
     ]  # fmt: skip
 
 
@@ -289,10 +333,10 @@ def test_a_comparison_without_opengl_has_no_film(
 
 
 def test_what_is_no_comparison_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"config\.json is missing"):
+    with pytest.raises(InputError, match=r"config\.json is missing"):
         film_comparison(tmp_path, tmp_path / "video.mp4")
     (tmp_path / "config.json").write_text(json.dumps({}))
-    with pytest.raises(ValueError, match=r"config\.json"):
+    with pytest.raises(InputError, match=r"config\.json"):
         film_comparison(tmp_path, tmp_path / "video.mp4")
 
 

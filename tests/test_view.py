@@ -8,33 +8,30 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 from peers import Running
+from pictures import HEXA, at
 from rotorgram.cli import main
-from rotorgram.cli import view as cli_view
-from rotorgram.cli.watch import Onlooker, Realtime
-from rotorgram.envs import TELEMETRY_NAMES, ElevationEnv
-from rotorgram.rendering import Moment, Stage
-from rotorgram.rendering.camera import Aim
-from rotorgram.rendering.live import Lines, LiveView, lines_over
+from rotorgram.cli._watch import Realtime, Watcher
+from rotorgram.envs import SingleEnv
+from rotorgram.envs.registry import env_spec
+from rotorgram.models import InputError
+from rotorgram.rendering import Moment, Stage, live
+from rotorgram.rendering.live import Aim, Lines, LiveView, lines_over
 from rotorgram.rendering.pace import Pace
 from rotorgram.udp import RemoteEnv, Simulator
-from rotorgram.udp.messages import Command, Hello, Message, State, Welcome
+from rotorgram.udp.protocol.messages import Command, Message, State, Welcome
+
+ELEVATION = "rotorgram/Elevation-v0"
 
 
 def moment(step: int = 0, *, height: float = 5.0, error: float = 0.5, episode: int = 0) -> Moment:
-    return Moment(
-        position=(0.0, height, 0.0),
-        attitude=(0.0, 0.0, 0.0),
-        thrusts=(49.0, 49.0, 49.0, 49.0),
-        error=error,
-        reward=0.25,
-        step=step,
-        episode=episode,
-    )
+    return at(height, error, reward=0.25, step=step, episode=episode)
 
 
 @dataclass
@@ -187,7 +184,7 @@ def test_without_a_period_every_step_is_due() -> None:
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, 1 / 17, 8.5, float("nan")])
 def test_wrong_speed(speed: float) -> None:
-    with pytest.raises(ValueError, match=r"^speed: expected 0.0625 to 8, got"):
+    with pytest.raises(InputError, match=r"^speed: expected 0.0625 to 8, got"):
         Pace(0.02, speed)
 
 
@@ -195,10 +192,10 @@ def test_wrong_speed(speed: float) -> None:
 
 
 def test_lines_over_one_drone() -> None:
-    assert lines_over((moment(7, height=4.5, error=0.5, episode=3),), "1 x", 1) == [
-        ("target", "5.00 m"),
+    assert lines_over((moment(7, height=4.5, error=0.5, episode=3),), 100.0, "1 x", 1) == [
+        ("E", "0.500 m"),
         ("elevation", "4.50 m"),
-        ("E", "+0.500 m"),
+        ("goal", "5.00 m"),
         ("F1 to F4", "49 49 49 49 N"),
         ("reward", "+0.250"),
         ("step", "7"),
@@ -209,27 +206,36 @@ def test_lines_over_one_drone() -> None:
 
 @pytest.mark.parametrize(("drones", "said"), [(2, "2"), (64, "2 of 64")])
 def test_lines_over_many_drones(drones: int, said: str) -> None:
-    lines = lines_over((moment(1), moment(2)), "1 x", drones)
+    lines = lines_over((moment(1), moment(2)), 100.0, "1 x", drones)
     assert lines[0] == ("drones", f"{said} shown, numbers of the first")
     assert ("step", "1") in lines
 
 
-def test_the_camera_stands_still_until_the_target_is_elsewhere(stage: Stage) -> None:
+def test_the_camera_goes_with_the_goal_and_leaves_the_mouse_its_turn(stage: Stage) -> None:
     aim, camera = Aim(stage), mujoco.MjvCamera()
     stage.show(moment(height=4.5, error=0.5))
-    assert aim.apply(camera)
+    aim.apply(camera)
     assert camera.lookat.tolist() == [0.0, 0.0, 5.0]
     assert (camera.azimuth, camera.elevation) == (0.0, -17.0)  # from behind, from above
-    camera.azimuth = 45.0  # whoever looks turns it
-    stage.show(moment(height=2.5, error=3.0))  # the target 0.5 m higher
-    assert not aim.apply(camera)
-    assert camera.lookat[2] == 5.0
-    stage.show(moment(height=8.0, error=0.0))
-    assert aim.apply(camera)
-    assert (camera.lookat[2], camera.azimuth) == (8.0, 45.0)
+    camera.azimuth, camera.lookat[0] = 45.0, 2.0  # by the mouse
+    for height, error in ((2.5, 2.5), (3.0, 2.0)):  # the craft alone moves
+        stage.show(moment(1, height=height, error=error))
+        aim.apply(camera)
+        assert camera.lookat.tolist() == [2.0, 0.0, 5.0]
+    stage.show(moment(2, height=8.0, error=0.0))
+    aim.apply(camera)
+    assert (camera.lookat.tolist(), camera.azimuth) == ([2.0, 0.0, 8.0], 45.0)
 
 
-# Whoever flies never waits.
+def test_without_a_goal_the_camera_goes_with_the_craft(stage: Stage) -> None:
+    aim, camera = Aim(stage), mujoco.MjvCamera()
+    for height in (5.0, 6.0):
+        stage.show(at(height, goal=None))
+        aim.apply(camera)
+        assert camera.lookat.tolist() == [0.0, 0.0, height]
+
+
+# The simulation never waits.
 
 
 def test_a_busy_view_drops_all_but_the_latest(stage: Stage) -> None:
@@ -276,7 +282,7 @@ def test_what_drawing_raises_because_it_was_closed_is_no_error(stage: Stage) -> 
 
 
 def test_a_view_of_two_wants_two_moments() -> None:
-    with fake_view(Stage("plain", 2)) as (live, _), pytest.raises(ValueError, match="expected 2"):
+    with fake_view(Stage("plain", 2)) as (live, _), pytest.raises(InputError, match="expected 2"):
         live.draw(moment())
 
 
@@ -285,7 +291,7 @@ ACTIONS = np.sin(np.arange(600)).astype(np.float32)[:, np.newaxis]
 
 def flown(env: object, steps: int) -> list[tuple[bytes, float, bool, bool]]:
     """The bits of so many steps of an env, with resets where they are due."""
-    assert isinstance(env, ElevationEnv | RemoteEnv)
+    assert isinstance(env, SingleEnv | RemoteEnv)
     observation, _ = env.reset(seed=3)
     seen = [(observation.tobytes(), 0.0, False, False)]
     for action in ACTIONS[:steps]:
@@ -299,12 +305,12 @@ def flown(env: object, steps: int) -> list[tuple[bytes, float, bool, bool]]:
 
 
 def test_a_watched_simulator_flies_the_same_bits_and_does_not_wait(stage: Stage) -> None:
-    expected = flown(ElevationEnv(), 600)
+    expected = flown(SingleEnv(ELEVATION), 600)
     assert sum(terminated or truncated for *_, terminated, truncated in expected) >= 2
     with RemoteEnv(("127.0.0.1", 0), connect=False, connect_timeout=20) as env:
         simulator = Simulator(server=env.address, bind=("127.0.0.1", 0))
         with simulator, fake_view(stage, busy=True) as (live, surface):
-            simulator.observer = Onlooker(live, simulator.fleet.hello)
+            simulator.observer = Watcher(live, simulator)
             running = Running(simulator)
             # The surface is busy with its first picture until all of this is flown.
             assert flown(env, 600) == expected
@@ -314,50 +320,45 @@ def test_a_watched_simulator_flies_the_same_bits_and_does_not_wait(stage: Stage)
             running.join()
 
 
-# What an onlooker makes of the wire.
+# What a view shows of the wire.
 
 
-def hello(drones: int) -> Hello:
-    one = np.ones(1, np.float32)
-    return Hello(
-        session=1,
-        env_id="any",
-        num_drones=drones,
-        observation_low=-one,
-        observation_high=one,
-        action_low=-one,
-        action_high=one,
-        discrete_actions=0,
-        control_period=0.02,
-        model_hash="0" * 32,
-        telemetry_names=TELEMETRY_NAMES,
-        options="",
-    )
-
-
-def state(*heights: float) -> State:
+def simulator_of(*heights: float, rotors: int = 4) -> Any:
+    """What a watcher reads of a simulator: drones at these heights, 0.5 m below their goals."""
     drones = len(heights)
-    telemetry = np.zeros((drones, len(TELEMETRY_NAMES)))
-    telemetry[:, TELEMETRY_NAMES.index("Y")] = heights
+    position, goal = np.zeros((drones, 3)), np.zeros((drones, 3))
+    position[:, 1], goal[:, 1] = heights, np.add(heights, 0.5)
+    telemetry = {
+        "position": position,
+        "attitude": np.zeros((drones, 3)),
+        "thrust": np.full((drones, rotors), 9.0),
+        "goal": goal,
+        "metrics": np.full((drones, 1), 0.5),
+    }
+    stepped = SimpleNamespace(num_envs=drones, telemetry=telemetry, rewards=np.full(drones, 0.25))
+    spec = env_spec(ELEVATION, {}, HEXA if rotors == 6 else None)
+    return SimpleNamespace(spec=spec, stepped=stepped)
+
+
+def state(drones: int = 1) -> State:
     return State(
         session=1,
         sequence=1,
-        observations=np.full((drones, 1), 0.5, np.float32),
+        time=0.0,
+        observations=(np.full((drones, 1), 0.5, np.float32),),
         rewards=np.full(drones, 0.25),
         terminated=np.zeros(drones, bool),
         truncated=np.zeros(drones, bool),
-        telemetry=telemetry,
     )
 
 
-def command(*what: str) -> Command:
-    """r resets, h holds, any other letter steps."""
+def command(*orders: str) -> Command:
+    """r resets, f freezes, s steps."""
     return Command(
         session=1,
         sequence=1,
-        actions=np.zeros((len(what), 1), np.float32),
-        resets=np.array([w == "r" for w in what]),
-        holds=np.array([w == "h" for w in what]) if "h" in what else None,
+        actions=np.zeros((len(orders), 1), np.float32),
+        orders=np.array(["srf".index(order) for order in orders], np.uint8),
     )
 
 
@@ -374,19 +375,19 @@ class RecordingView:
         self.drawn.append(moments)
 
 
-def test_an_onlooker_counts_steps_and_episodes_of_each_drone() -> None:
+def test_a_watcher_counts_steps_and_episodes_of_each_drone() -> None:
     view = RecordingView(Stage("plain", 2))
-    onlooker = Onlooker(view, hello(3))  # type: ignore[arg-type]
+    watcher = Watcher(view, simulator_of(4.0, 6.0, 8.0))  # type: ignore[arg-type]
     causes: list[Message] = [
-        Welcome(session=1, seed=None),
+        Welcome(session=1, nonce=1),
         command("r", "r", "r"),  # as an agent begins: nothing was flown yet
         command("s", "s", "s"),
-        command("s", "h", "s"),
+        command("s", "f", "s"),
         command("r", "s", "s"),
         command("s", "r", "s"),
     ]
     for cause in causes:
-        onlooker(cause, state(4.0, 6.0, 8.0))
+        watcher(cause, state(3))
     counted = [[(m.step, m.episode) for m in moments] for moments in view.drawn]
     assert counted == [
         [(0, 0), (0, 0)],
@@ -397,20 +398,27 @@ def test_an_onlooker_counts_steps_and_episodes_of_each_drone() -> None:
         [(1, 1), (0, 1)],
     ]
     first, second = view.drawn[-1]
-    assert (first.position, first.error, first.target) == ((0.0, 4.0, 0.0), 0.5, 4.5)
+    assert (first.position, first.goal) == ((0.0, 4.0, 0.0), (0.0, 4.5, 0.0))
+    assert first.metrics == (("elevation_error", 0.5, "m", "E"),)
     assert (first.reward, second.reward) == (0.25, 0.0)  # no step led to a start
+
+
+def test_a_watcher_shows_the_rotors_that_there_are() -> None:
+    view = RecordingView(Stage("plain", vehicle=HEXA))
+    Watcher(view, simulator_of(4.0, rotors=6))(None, state())  # type: ignore[arg-type]
+    assert view.drawn[0][0].thrusts == (9.0,) * 6
 
 
 def test_a_pause_freezes_the_picture_alone() -> None:
     view = RecordingView(Stage("plain"))
-    onlooker = Onlooker(view, hello(1))  # type: ignore[arg-type]
-    onlooker(None, state(5.0))
+    watcher = Watcher(view, simulator_of(5.0))  # type: ignore[arg-type]
+    watcher(None, state())
     view.pace.press("pause")
     for _ in range(3):
-        onlooker(command("s"), state(5.0))  # returns: lock-step goes on
+        watcher(command("s"), state())  # returns: lock-step goes on
     view.pace.press("step")
     for _ in range(3):
-        onlooker(command("s"), state(5.0))
+        watcher(command("s"), state())
     assert [moments[0].step for moments in view.drawn] == [0, 4]
 
 
@@ -425,9 +433,9 @@ def test_a_view_that_fails_or_closes_stops_no_simulator(
     failing, closed = FailingView(stage), RecordingView(stage)
     closed.is_running = False
     for view in (failing, closed):
-        onlooker = Onlooker(view, hello(1))  # type: ignore[arg-type]
+        watcher = Watcher(view, simulator_of(5.0))  # type: ignore[arg-type]
         for _ in range(2):
-            onlooker(command("s"), state(5.0))
+            watcher(command("s"), state())
         assert not view.drawn
     assert "the simulator goes on: the driver is gone" in caplog.text
     assert len(caplog.records) == 1 or "was closed" in caplog.text
@@ -436,7 +444,7 @@ def test_a_view_that_fails_or_closes_stops_no_simulator(
 def test_realtime_sleeps_from_step_to_step() -> None:
     hold, began = Realtime(0.05), time.monotonic()
     for _ in range(5):  # the first at once, the others 0.05 s apart
-        hold(None, state(5.0))
+        hold(None, state())
     assert time.monotonic() - began >= 0.2
 
 
@@ -491,16 +499,15 @@ def open_fakes(monkeypatch: pytest.MonkeyPatch) -> list[FakeSurface]:
         surfaces[-1].gate.set()
         return surfaces[-1]
 
-    monkeypatch.setattr(cli_view, "open_surface", open_fake)
+    monkeypatch.setattr(live, "open_surface", open_fake)
     return surfaces
 
 
 def test_view_shows_a_journal_to_its_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    journal, options = tmp_path / "flight.mcap", {"episode_length": 30}
-    anywhere = ("127.0.0.1", 0)
-    with RemoteEnv(anywhere, options=options, connect=False, record=journal) as env:
+    journal, anywhere = tmp_path / "flight.mcap", ("127.0.0.1", 0)
+    with RemoteEnv(anywhere, connect=False, record=journal) as env:
         simulator = Simulator(server=env.address, bind=anywhere, episode_length=30)
         running = Running(simulator)
         seen = flown(env, 70)  # 30 steps, a reset, 30 steps, a reset, 8 steps
@@ -510,7 +517,7 @@ def test_view_shows_a_journal_to_its_end(
     out = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in out[1:]] == [f"episode {k}" for k in range(3)]
     total = sum(reward for _, reward, *_ in seen[1:31])
-    assert out[1].startswith(f"episode 0: return {total:.1f}, last |E| ")
+    assert out[1].startswith(f"episode 0: return {total:.1f}, ")
     assert {shown[0].episode for shown in surfaces[0].shown} == {0, 1, 2}
     assert main(["view", str(journal), "--env.linear-drag", "1"]) == 1
     assert "expected no options with a journal" in capsys.readouterr().err
