@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
@@ -19,7 +20,7 @@ from rotorgram.cli._flags import AlgorithmName, PresetName, parse
 from rotorgram.cli._scalars import ScalarWriter
 from rotorgram.cli.serve import Serve
 from rotorgram.cli.sim import Sim
-from rotorgram.experiments.results import read_steps
+from rotorgram.experiments.results import read_results, read_steps
 from rotorgram.models import QUAD_XML
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -36,13 +37,29 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
 
 def start(*arguments: object) -> subprocess.Popen[str]:
     """A command in a process of its own, in a terminal's process group of its own."""
-    return subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-P", "-m", "rotorgram.cli", *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
     )
+    started.append(process)
+    return process
+
+
+started: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(autouse=True)
+def _nothing_runs_on() -> Iterator[None]:
+    """After a test that failed, too."""
+    yield
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+    started.clear()
 
 
 def free_port() -> int:
@@ -479,9 +496,9 @@ def test_compare_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture
     )  # fmt: skip
     assert status == 0
     assert f"report: {folder / 'report.html'}" in out.replace("\n", "")
-    records = read_records(folder)
-    assert sorted(set(records.runs.agent)) == ["a2c", "sb3-a2c", "vpg"]
-    assert sorted(set(records.evaluations.agent)) == ["a2c", "pid", "sb3-a2c", "vpg"]
+    results = read_results(folder)
+    assert sorted(set(results.runs.agent)) == ["a2c", "sb3-a2c", "vpg"]
+    assert sorted(set(results.evaluations.agent)) == ["a2c", "pid", "sb3-a2c", "vpg"]
     steps = read_steps(folder, "train", columns=("agent", "step", "error"))
     assert (steps.agent == "a2c").sum() == 1100
     assert steps[steps.agent == "vpg"].step.tolist() == list(range(1, 1101))
@@ -527,7 +544,7 @@ def test_an_interrupted_comparison_goes_on(
     assert status == 1
     assert "got others by --seeds" in err
     assert run(capsys, "compare", "--resume", folder, "--jobs", 1, "--no-film")[0] == 0
-    assert read_records(folder).runs.seed.tolist() == [0, 1, 2]
+    assert read_results(folder).runs.seed.tolist() == [0, 1, 2]
     assert first.splitlines()[1] in (folder / "evaluations.csv").read_text()
     assert not (folder / "parts").exists()
     status, _, err = run(capsys, "compare", "--resume", folder)
