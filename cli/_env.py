@@ -100,7 +100,7 @@ def remote_env(
     env_id: str,
     options: dict[str, Any],
     *,
-    required: bool,
+    required: bool = True,
     num_envs: int = 1,
     num_simulators: int = 1,
 ) -> Iterator[Any]:
@@ -113,8 +113,8 @@ def remote_env(
         command: Says where, and with which key.
         env_id: Task.
         options: Its options that are not the default.
-        required: Whether simulators that come must fly this task with these options; otherwise the
-            first that comes decides.
+        required: Whether simulators that come must fly this task, with these options if there are
+            any; otherwise the first that comes decides.
         num_envs: Drones.
         num_simulators: Simulators to wait for.
 
@@ -124,7 +124,7 @@ def remote_env(
     if num_simulators > 1 and command.listen is None:
         raise InputError(f"num-simulators: expected 1 without --listen, got {num_simulators}")
     if command.listen is not None:
-        required_env = (env_id, options) if required else (None, None)
+        required_env = (env_id, options or None) if required else (None, None)
         opened = _waiting(command, *required_env, num_envs, num_simulators)
     else:
         if command.key_file or command.insecure:
