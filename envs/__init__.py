@@ -18,7 +18,7 @@ from .spec import ArraySpec, Discrete, EnvSpec, Metric
 if TYPE_CHECKING:
     from .loop import Loop
     from .single import SingleEnv
-    from .tasks.task import Outcome, Task, TaskOptions
+    from .tasks.task import Outcome, Task, TaskOptions, check_choice, check_number
     from .vector import LocalVectorEnv
 
 __all__ = [
@@ -32,6 +32,8 @@ __all__ = [
     "SingleEnv",
     "Task",
     "TaskOptions",
+    "check_choice",
+    "check_number",
     "register",
     "register_all",
 ]
@@ -43,6 +45,8 @@ _HOMES: Final = {
     "SingleEnv": "single",
     "Task": "tasks.task",
     "TaskOptions": "tasks.task",
+    "check_choice": "tasks.task",
+    "check_number": "tasks.task",
 }
 
 

@@ -32,6 +32,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         terminated, truncated: bool, shape (N,).
         done: bool, shape (N,): the episode has ended and the next has not begun.
         lost: bool, shape (N,): the episode was truncated because its simulator was lost.
+        telemetry: By name, float64, shape (N, *shape).
     """
 
     env_spec: EnvSpec
@@ -42,11 +43,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
     truncated: np.ndarray
     done: np.ndarray
     lost: np.ndarray
-
-    @property
-    @abstractmethod
-    def telemetry(self) -> Mapping[str, np.ndarray]:
-        """By name, float64, shape (N, *shape)."""
+    telemetry: Mapping[str, np.ndarray]
 
     @abstractmethod
     def reset(
@@ -81,7 +78,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         resets = self.done if mode == AutoresetMode.NEXT_STEP and self.done.any() else None
         self.advance(array, resets)
         rewards, terminated, truncated = self.rewards, self.terminated, self.truncated
-        info = self._info(np.ones(self.num_envs, bool))
+        info = self._info(~self._nobody)
         if mode == AutoresetMode.SAME_STEP and self.done.any():
             truncated, info = self._begin_next(truncated, info)
         return self._observed(), rewards, terminated, truncated, info
@@ -102,6 +99,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
             self.observation_space = batch_space(self.single_observation_space, num_envs)
             self.action_space = batch_space(self.single_action_space, num_envs)
         self.env_spec, self.num_envs = spec, num_envs
+        self._nobody = np.zeros(num_envs, bool)
         self.control_period = spec.control_period
         fps = max(1, round(1 / spec.control_period))
         self.metadata = {"render_modes": [], "render_fps": fps, "autoreset_mode": mode}
@@ -128,15 +126,15 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         A simulator that is lost meanwhile truncates the episodes of its frozen drones: they begin
         their next as well.
         """
-        last, ended = self._observed(), np.zeros(self.num_envs, bool)
+        last, ended = self._observed(), self._nobody
         while self.done.any():
             truncated = truncated | self.lost
             ended = ended | self.done
             self.advance(self._no_actions(), self.done, None, ~self.done)
         masks = {name: mask & ended for name, mask in last_info.items() if name.startswith("_")}
-        info = self._info(np.ones(self.num_envs, bool))
+        info = self._info(~self._nobody)
         info |= {"final_obs": last, "_final_obs": ended}
-        info |= {"final_info": last_info | masks, "_final_info": ended.copy()}
+        info |= {"final_info": last_info | masks, "_final_info": ended | self._nobody}
         return truncated, info
 
     def _observed(self) -> Any:

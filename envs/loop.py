@@ -15,7 +15,7 @@ import numpy as np
 from ..models.errors import InputError
 from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..models.vehicle import Vehicle
-from ..sim import Array, Backend, PhysicsError, World, make_world
+from ..sim import Array, Backend, PhysicsError, World, make_world, on_host
 from . import registry
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
@@ -152,11 +152,11 @@ class Loop:
         self._has_goal = has_goal(draft)
         self._dtypes = [(a.name, a.shape, getattr(self._xp, a.dtype)) for a in draft.observation]
         none = self.world.state.touching != self.world.state.touching  # all False, on its device
-        self._nobody = none.reshape(num_envs)
+        self._none, self._nobody = none, none.reshape(num_envs)
         self.terminated = self.truncated = self.done = self._nobody
         self.rewards: Array = 0.0 * self._nobody
         self.observations: dict[str, Array] = {}
-        self._steps: Array = (0 * self.rewards).reshape(lead)[()]
+        self._steps: Array = (0 * self._nobody).reshape(lead)[()]
         self._waiting = ~self._nobody  # for a reset
         self._anyone_waits = True
         self._begun = False
@@ -187,6 +187,7 @@ class Loop:
             frozen: bool, shape (N,); None freezes none.
             chosen: By the names of `Task.choices`, what replaces a draw, shape (N,).
         """
+        resets, frozen = self.ours(resets), self.ours(frozen)
         idle = resets if frozen is None else frozen if resets is None else resets | frozen
         flown = None if idle is None or not idle.any() else ~idle
         if self._anyone_waits:
@@ -265,7 +266,9 @@ class Loop:
             over = bool(ended or late)
         else:
             self.rewards = total.reshape(n)
-            self.terminated, self.truncated = ended.reshape(n), late.reshape(n)
+            # New arrays, whatever the task gave: what a step gave away stays as it was.
+            self.terminated = (ended | self._none).reshape(n)
+            self.truncated = late.reshape(n)
             over = True
         if flown is not None:
             # A drone that did not fly gets no reward: nothing has ended, nothing was won.
@@ -346,17 +349,17 @@ class Loop:
     def _table(self) -> np.ndarray:
         state, n, at = self.world.state, self.num_envs, self._columns
         told = np.empty((n, at[self.spec.telemetry[-1].name].stop))
-        positions_in_paper_frame(_on_host(state.position).reshape(n, 3), told[:, :3])
-        attitudes_in_paper_frame(_on_host(state.quaternion).reshape(n, 4), told[:, 3:6])
-        told[:, at["thrust"]] = _on_host(state.thrust).reshape(n, -1)
+        positions_in_paper_frame(on_host(state.position).reshape(n, 3), told[:, :3])
+        attitudes_in_paper_frame(on_host(state.quaternion).reshape(n, 4), told[:, 3:6])
+        told[:, at["thrust"]] = on_host(state.thrust).reshape(n, -1)
         if self._has_goal:
             goal = self.task.goal(state)
             if goal is not self._goal[0]:  # many goals stay as they are
-                self._goal = goal, positions_in_paper_frame(_on_host(goal).reshape(n, 3))
+                self._goal = goal, positions_in_paper_frame(on_host(goal).reshape(n, 3))
             told[:, at["goal"]] = self._goal[1]
         if self._outcome is not None:
             for column, metric in enumerate(self.task.metrics, told.shape[1] - self._told):
-                told[:, column] = _on_host(self._outcome.metrics[metric.name]).reshape(n)
+                told[:, column] = on_host(self._outcome.metrics[metric.name]).reshape(n)
         return told
 
     def _row(self) -> list[float]:
@@ -380,10 +383,16 @@ class Loop:
         """Let go of threads and memory."""
         self.world.close()
 
+    def ours(self, mask: Array | None) -> Array | None:
+        """A mask that the caller gave, NumPy's or a tensor, as an array of the world's kind."""
+        if mask is None or self._xp is np:
+            return mask
+        return self._xp.asarray(mask, device=self._nobody.device)
+
     def _per_drone(self, values: Array) -> Array:
         if not self.world.shape:
             return np.array((values,))
-        return values.reshape(self.num_envs)
+        return _as_type(values.reshape(self.num_envs), values.dtype)
 
     def __reduce__(self) -> Any:
         """Raise: simulator memory cannot be copied, and a copy that seems to fly would be wrong."""
@@ -400,11 +409,5 @@ def _columns(spec: EnvSpec) -> dict[str, slice]:
 
 
 def _as_type(values: Array, dtype: Any) -> Array:
-    return values.astype(dtype) if isinstance(values, np.ndarray) else values.to(dtype)
-
-
-def _on_host(array: Array) -> np.ndarray:
-    if isinstance(array, np.ndarray | np.generic):
-        return np.asarray(array)
-    copied: np.ndarray = array.detach().cpu().numpy().astype(np.float64)
-    return copied
+    """A copy of that type."""
+    return values.astype(dtype) if isinstance(values, np.ndarray) else values.to(dtype, copy=True)

@@ -256,12 +256,12 @@ class EnvSpec:
         _check_text("vehicle", self.vehicle)
         if not (isinstance(self.vehicle_hash, str) and _HASH.fullmatch(self.vehicle_hash)):
             raise SpecError(f"vehicle_hash: expected 32 hex digits, got {self.vehicle_hash!r:.80}")
+        for name in self.agents:
+            _check_text("agents", name)
         if not 1 <= len(self.agents) <= MAX_AGENTS or len(set(self.agents)) < len(self.agents):
             raise SpecError(
                 f"agents: expected 1 to {MAX_AGENTS} different names, got {self.agents!r:.80}"
             )
-        for name in self.agents:
-            _check_text("agents", name)
         if not self.observation:
             raise SpecError("observation: expected at least one array, got none")
         for name, arrays in (("observation", self.observation), ("telemetry", self.telemetry)):

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from ..models.errors import InputError
-from ..sim import Backend
+from ..sim import Backend, on_host
 from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
 from .loop import Loop
 from .rendering import RENDER_MODES, checked_render_mode, moments, painter
@@ -31,8 +31,9 @@ class LocalVectorEnv(AdvancingVectorEnv):
     gives reward 0. With SAME_STEP the observation is that of the next episode, and `info` has
     `final_obs` and `final_info` where one ended. With DISABLED a reset with a mask begins the next.
 
-    With the backend `warp` what a step takes and gives are torch tensors on the world's device,
-    and `info` holds the metrics and the terms of the reward alone.
+    With the backend `warp` what a step gives are torch tensors on the world's device; it takes
+    them, or NumPy arrays. `info` then holds the metrics and the terms of the reward alone:
+    `telemetry` copies the rest to the host when it is asked for.
 
     Args:
         env_id: Of a registered task.
@@ -77,7 +78,8 @@ class LocalVectorEnv(AdvancingVectorEnv):
         )
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
-        self.lost = np.zeros(num_envs, bool)
+        self._on_device = not isinstance(loop.done, np.ndarray)
+        self._nobody = self.lost = self.done = loop.done
         self._episodes = np.zeros(num_envs, int)
         self._painter: Painter | None = None
         self.closed = False
@@ -97,8 +99,11 @@ class LocalVectorEnv(AdvancingVectorEnv):
                 that the seed gives.
         """
         options, names = dict(options or {}), self._loop.task.choices
-        mask = checked_mask(options.pop("reset_mask", None), self.num_envs)
-        chosen = {name: self._choice(name, value, names) for name, value in options.items()}
+        asked = options.pop("reset_mask", None)
+        mask = checked_mask(self._given(asked), self.num_envs)
+        chosen = {
+            name: self._choice(name, self._given(value), names) for name, value in options.items()
+        }
         seeds = checked_seeds(seed, self.num_envs)
         self._advance(self._no_actions(), mask, seeds, ~mask, chosen)
         return self._observed(), self._info(mask)
@@ -145,20 +150,40 @@ class LocalVectorEnv(AdvancingVectorEnv):
         self.rewards, self.terminated = loop.rewards, loop.terminated
         self.truncated, self.done = loop.truncated, loop.done
         if self.render_mode is not None:
-            self._episodes = self._episodes + (0 if resets is None else resets)
+            self._episodes = self._episodes + (0 if resets is None else on_host(resets))
             if self.render_mode == "human":
                 self.render()
 
     @property
-    def telemetry(self) -> Any:
+    def telemetry(self) -> Any:  # type: ignore[override]  # made when it is asked for
         """By name, float64, shape (N, *shape)."""
         return self._loop.telemetry
 
-    def _info(self, mask: np.ndarray) -> dict[str, Any]:
-        info = super()._info(mask)
-        for name, term in self._loop.reward_terms.items():
-            info[f"reward_{name}"], info[f"_reward_{name}"] = term, mask
+    def _shaped(self, actions: Any) -> Any:
+        if not self._on_device or isinstance(actions, list | tuple | np.ndarray):
+            return super()._shaped(actions)
+        if tuple(getattr(actions, "shape", ())) != self.action_space.shape:
+            raise InputError(
+                f"actions: expected a tensor of shape {self.action_space.shape}, got {actions!r:.80}"
+            )
+        return actions
+
+    def _info(self, mask: Any) -> dict[str, Any]:
+        loop = self._loop
+        if self._on_device:
+            which = loop.ours(mask)
+            info = {}
+            for name, values in loop.metrics.items():
+                info[name], info[f"_{name}"] = values, which
+        else:
+            which, info = mask, super()._info(mask)
+        for name, term in loop.reward_terms.items():
+            info[f"reward_{name}"], info[f"_reward_{name}"] = term, which
         return info
+
+    def _given(self, value: Any) -> Any:
+        """What the caller gave; NumPy's array in place of a tensor."""
+        return on_host(value) if self._on_device and hasattr(value, "detach") else value
 
     def _choice(self, name: str, value: Any, names: tuple[str, ...]) -> np.ndarray:
         if name not in names:

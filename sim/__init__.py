@@ -5,7 +5,7 @@ Knows nothing of tasks, rewards or Gymnasium.
 
 from .control import CollectiveThrust, Controller, RotorThrust
 from .random import Draw
-from .state import Array, Pose, WorldState, clip, component, constant, stack
+from .state import Array, Pose, WorldState, clip, component, constant, on_host, stack
 from .world import BACKENDS, Backend, PhysicsError, World, make_world
 
 __all__ = [
@@ -24,5 +24,6 @@ __all__ = [
     "component",
     "constant",
     "make_world",
+    "on_host",
     "stack",
 ]

@@ -7,13 +7,14 @@ Frames: world x, y, z with z up, right-handed; body x forward, y left, z up. SI 
 scalar first. Arrays are NumPy's, or torch's where the backend runs on another device.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-__all__ = ["Array", "Pose", "WorldState", "clip", "component", "constant", "stack"]
+__all__ = ["Array", "Pose", "WorldState", "clip", "component", "constant", "on_host", "stack"]
 
 Array = Any
 """A NumPy array or a torch tensor. Code for both uses operators and the namespace of the array
@@ -63,7 +64,7 @@ class Pose:
 def clip(array: Array, low: Any, high: Any) -> Array:
     """The nearest numbers within bounds: numbers, or arrays of the same kind."""
     if isinstance(array, float):  # a single drone's number, NumPy's among them
-        return low if array < low else high if array > high else array
+        return np.float64(low) if array < low else np.float64(high) if array > high else array
     if isinstance(array, np.ndarray):
         return np.minimum(np.maximum(array, low), high)  # a third of the time of NumPy's clip
     return array.clip(low, high)
@@ -74,16 +75,21 @@ def component(array: Array, index: int) -> Array:
     return array[..., index][()]
 
 
-def stack(parts: Any) -> Array:
-    """Arrays, or numbers of a single drone, along a new last axis."""
-    first = parts[0]
-    if isinstance(first, float) or first.ndim == 0:
+def stack(parts: Sequence[Any]) -> Array:
+    """Arrays along a new last axis; a number among them counts for all drones.
+
+    Of a single drone they are numbers.
+    """
+    for like in parts:
+        if getattr(like, "ndim", 0):
+            break
+    else:
         return np.array(parts)  # an eighth of the time of NumPy's stack
-    if isinstance(first, np.ndarray):
-        return np.stack(parts, axis=-1)
+    if isinstance(like, np.ndarray):
+        return np.stack([p if getattr(p, "ndim", 0) else np.full_like(like, p) for p in parts], -1)
     import torch
 
-    return torch.stack(parts, dim=-1)
+    return torch.stack([p if hasattr(p, "ndim") else torch.full_like(like, p) for p in parts], -1)
 
 
 def constant(values: Any, like: Array) -> Array:
@@ -100,3 +106,11 @@ def _tensor(raw: bytes, shape: tuple[int, ...], dtype: Any, device: Any) -> Arra
 
     array = np.frombuffer(raw).reshape(shape)
     return torch.tensor(array, dtype=dtype, device=device)
+
+
+def on_host(array: Array) -> np.ndarray:
+    """A number, array or tensor as a NumPy array; the memory may be shared. Tensors: float64."""
+    if isinstance(array, np.ndarray | np.generic | float | int):
+        return np.asarray(array)
+    copied: np.ndarray = array.detach().cpu().numpy()
+    return copied.astype(np.float64) if copied.dtype.kind == "f" else copied

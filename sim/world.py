@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, Final, Literal, Protocol, get_args
 
-from ..models.errors import InputError
+from ..models.errors import InputError, require
 from ..models.vehicle import Vehicle
 from .random import Draw
 from .state import Array, Pose, WorldState
@@ -15,6 +15,9 @@ Backend = Literal["mujoco", "warp"]
 """`mujoco`: threads of this machine, float64. `warp`: MuJoCo Warp, float32, a GPU if there is
 one."""
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
+
+_PACKAGES: Final = {"mujoco": (), "warp": ("torch", "warp", "mujoco_warp")}
+_SETTINGS: Final = {"mujoco": "num_threads", "warp": "device"}
 
 MAX_WORLDS: Final = 1 << 16
 """Most worlds of a batch."""
@@ -107,6 +110,14 @@ def make_world(
         raise InputError(f"backend: expected {' or '.join(BACKENDS)}, got {backend!r}")
     if type(num_worlds) is not int or not 1 <= num_worlds <= MAX_WORLDS:
         raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
+    for name, value in settings.items():
+        if name != _SETTINGS[backend]:
+            raise InputError(
+                f"{name}: expected {_SETTINGS[backend]}, the setting of the backend {backend}, "
+                f"got {name}={value!r}"
+            )
+    for package in _PACKAGES[backend]:
+        require(package, "gpu", f"the backend {backend}")
     module = import_module(f".backends.{backend}", __package__)
     world: World = module.make(vehicle, num_worlds, **settings)
     return world

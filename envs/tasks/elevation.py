@@ -169,9 +169,8 @@ class Elevation(Task):
             start = chosen
         self._check(target, start, mask)
         self.target = self.xp.where(mask, target, self.target)[()]
-        self._goal = stack((0.0 * self.target, 0.0 * self.target, self.target))
-        origin = 0.0 * start
-        return Pose(position=stack((origin, origin, start)))
+        self._goal = stack((0.0, 0.0, self.target))
+        return Pose(position=stack((0.0, 0.0, start)))
 
     def observe(self, state: WorldState) -> dict[str, Array]:
         """E, its rate and the thrust; or E alone."""

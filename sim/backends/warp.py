@@ -1,0 +1,270 @@
+"""MuJoCo Warp, float32, on a GPU or on the CPU; torch tensors share the simulator's memory."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import array_api_compat.torch as torch_api
+import mujoco
+import mujoco_warp
+import numpy as np
+import torch
+import warp
+from torch.utils.dlpack import from_dlpack
+
+from ...models.errors import InputError
+from ...models.vehicle import Vehicle
+from ..random import START, Draw
+from ..state import Array, Pose, WorldState, constant
+from ..world import PhysicsError, contact_check
+
+__all__ = ["FURTHEST", "WarpWorld", "make"]
+
+wp: Any = warp  # its types have gaps
+mjw: Any = mujoco_warp
+
+FURTHEST: Final = 100.0
+"""Largest coordinate of a start, m. float32 rounds 100 m to 8 µm; much further out a slow craft
+stands still, because what it flies in one physics step is rounded off."""
+
+CONTACTS_PER_GEOM: Final = 4
+"""Contacts of a geom with the ground that there is memory for."""
+
+
+def make(vehicle: Vehicle, num_worlds: int, *, device: str | None = None) -> "WarpWorld":
+    """Worlds of one drone each.
+
+    Args:
+        vehicle: What flies.
+        num_worlds: W.
+        device: `cpu`, `cuda`, `cuda:1`...; None takes a CUDA device if there is one.
+
+    Raises:
+        InputError: There is no such device.
+    """
+    return WarpWorld(vehicle, num_worlds, device)
+
+
+class WarpWorld:
+    """W worlds of one drone over ground of its own: `World`, in float32 on one device.
+
+    Physics steps are CUDA graphs, launched on torch's current stream. Contact is looked for as
+    often as in the backend `mujoco`; a craft touches where there are constraints for a contact.
+
+    Args:
+        vehicle: What flies.
+        num_worlds: W.
+        device: As of `make`.
+
+    Attributes:
+        device: The `torch.device` of all tensors.
+        qpos, qvel, ctrl: Live views of simulator memory, float32, shapes (W, 7), (W, 6), (W, R).
+    """
+
+    xp: Any = torch_api
+
+    def __init__(self, vehicle: Vehicle, num_worlds: int, device: str | None = None) -> None:
+        self.vehicle = vehicle
+        self.shape = (num_worlds, 1)
+        self.device, self._name = _device(device)
+        self._check = contact_check(vehicle.timestep)
+        self._generator = torch.Generator(self.device)
+        self._generator.seed()
+        model = copy.copy(vehicle.model)
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nothing reads them
+        solid = (model.geom_contype | model.geom_conaffinity) != 0
+        contacts = CONTACTS_PER_GEOM * int(solid.sum())
+        rows = max(1, 2 * (int(model.geom_condim.max(initial=1)) - 1))
+        with wp.ScopedDevice(self._name):
+            self._data = data = mjw.make_data(
+                model, num_worlds, nconmax=contacts, njmax=contacts * rows + model.neq * 6 + 6
+            )
+            self._model = mjw.put_model(model)
+            # DLPack shares the memory: these are made once, and nothing is copied.
+            self.qpos, self.qvel = from_dlpack(data.qpos), from_dlpack(data.qvel)
+            self.ctrl, self._rows = from_dlpack(data.ctrl), from_dlpack(data.nefc)
+            self._warmstart = from_dlpack(data.qacc_warmstart)
+            self.qpos[:, 2] = vehicle.rest_height + 1.0
+            mjw.step(self._model, data)  # compiles what is not yet in Warp's cache
+            wp.synchronize()
+            self._forward = self._captured(mjw.forward, 1)
+        self._rows_in_air = int(self._rows.max())
+        self._steps: dict[int, Any] = {}
+        newtons = np.array([rotor.newtons for rotor in vehicle.rotors])
+        self._newtons = constant(newtons, self.ctrl)
+        self._hover = constant(vehicle.hover_thrust, self.ctrl)
+        self._level = constant(np.array((1.0, 0.0, 0.0, 0.0)), self.ctrl)
+        self.state = WorldState(
+            position=self.qpos[:, None, :3],
+            quaternion=self.qpos[:, None, 3:],
+            velocity=self.qvel[:, None, :3],
+            body_rates=self.qvel[:, None, 3:],
+            thrust=torch.zeros((num_worlds, 1, vehicle.num_rotors), device=self.device),
+            touching=torch.zeros(self.shape, dtype=torch.bool, device=self.device),
+        )
+
+    def reset(self, mask: Array, pose: Pose) -> None:
+        """As `World.reset`. Raises `InputError` for a position beyond `FURTHEST`."""
+        state, rows = self.state, mask[..., None]
+        far = (pose.position.abs() > FURTHEST).any(dim=-1) & mask
+        if far.any():
+            got = [round(x, 3) for x in pose.position[far][0].tolist()]
+            raise InputError(
+                f"start: expected coordinates within {FURTHEST:g} m for the float32 of the "
+                f"backend warp, got {got}"
+            )
+        for array, values, default in (
+            (state.position, pose.position, 0.0),
+            (state.quaternion, pose.quaternion, self._level),
+            (state.velocity, pose.velocity, 0.0),
+            (state.body_rates, pose.body_rates, 0.0),
+            (state.thrust, pose.thrust, self._hover),
+        ):
+            array.copy_(torch.where(rows, default if values is None else values, array))
+        self._warmstart.masked_fill_(mask, 0.0)
+        self._apply_thrust()
+        self._launch(self._forward)
+        state.touching.copy_(torch.where(mask, self._contact(), state.touching))
+
+    def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
+        """As `World.step`."""
+        state, before = self.state, []
+        if mask is not None:
+            thrust = torch.where(mask[..., None], thrust, state.thrust)
+            before = [(array, array.clone()) for array in (self.qpos, self.qvel, self._warmstart)]
+        state.thrust.copy_(thrust)
+        self._apply_thrust()
+        touching = torch.zeros_like(state.touching)
+        while substeps > 0:
+            self._launch(self._graph(min(substeps, self._check)))
+            touching = touching | self._contact()
+            substeps -= self._check
+        for array, values in before:
+            array.copy_(torch.where(mask, array, values))  # type: ignore[arg-type]
+        if mask is not None:
+            touching = torch.where(mask, touching, state.touching)
+        state.touching.copy_(touching)
+        bad = ~(torch.cat((self.qpos, self.qvel), dim=1).abs() < mujoco.mjMAXVAL).all(dim=1)
+        if bad.any():
+            ids = bad.nonzero().flatten().tolist()
+            raise PhysicsError(f"MuJoCo Warp gave bad states in envs {ids[:5]}: reset the env")
+
+    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
+        """Seed the one generator of all worlds with the seeds of the mask together."""
+        ids = mask.flatten().nonzero().flatten().tolist()
+        given = [int(seed) for seed in (seeds[i] for i in ids) if seed is not None]
+        if given:
+            sequence = np.random.SeedSequence(given, spawn_key=(START,))
+            self._generator.manual_seed(int(sequence.generate_state(1, np.uint64)[0]))
+
+    def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
+        """As `World.draw`; a seed does not give the numbers that it gives the other backends."""
+        put = {
+            name: torch.as_tensor(values, dtype=torch.float32, device=self.device)
+            for name, values in (chosen or {}).items()
+        }
+        return TorchDraw(self._generator, mask, put)
+
+    def checked(self, actions: Array, width: int, choices: int, flown: Array | None) -> Array:
+        """As `World.checked`: a tensor on `device` or a NumPy array, as float32, shape (W, k)."""
+        if isinstance(actions, torch.Tensor) and actions.device != self.device:
+            raise InputError(f"actions: expected a tensor on {self.device}, got {actions.device}")
+        try:
+            values = torch.as_tensor(actions, device=self.device).detach()
+        except (TypeError, ValueError, RuntimeError):
+            raise InputError(f"actions: expected real numbers, got {actions!r:.80}") from None
+        shape = (self.shape[0], width)
+        if values.is_complex() or values.numel() != shape[0] * width:
+            raise InputError(
+                f"actions: expected real numbers of shape {shape}, "
+                f"got {values.dtype} of shape {tuple(values.shape)}"
+            )
+        values = values.reshape(shape).to(torch.float32)
+        right = values.isfinite()
+        if choices:
+            right = (values >= 0) & (values < choices) & (values % 1 == 0)
+        wrong = ~right.all(dim=1)
+        if flown is not None:
+            wrong = wrong & flown
+        if wrong.any():
+            first = int(wrong.nonzero()[0])
+            expected = f"a whole number 0 to {choices - 1}" if choices else "finite numbers"
+            got = values[first].tolist()
+            raise InputError(f"actions: expected {expected}, got {got} for env {first}")
+        return torch.where(right, values, 0.0)
+
+    def close(self) -> None:
+        """Let go of the graphs."""
+        self._steps.clear()
+
+    def _apply_thrust(self) -> None:
+        self.ctrl.copy_(self.state.thrust[:, 0] / self._newtons)
+
+    def _contact(self) -> torch.Tensor:
+        return (self._rows > self._rows_in_air)[:, None]
+
+    def _graph(self, steps: int) -> Any:
+        if steps not in self._steps:
+            self._steps[steps] = self._captured(mjw.step, steps)
+        return self._steps[steps]
+
+    def _captured(self, function: Any, times: int) -> Any:
+        """A CUDA graph that calls a function of model and data; on the CPU, the call itself."""
+        with wp.ScopedDevice(self._name), wp.ScopedCapture() as capture:
+            for _ in range(times):
+                function(self._model, self._data)
+        return capture.graph
+
+    def _launch(self, graph: Any) -> None:
+        stream = None
+        if self.qpos.is_cuda:  # in turn with what torch does before and after
+            stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
+        wp.capture_launch(graph, stream=stream)
+
+
+class TorchDraw:
+    """`Draw` from one generator for all worlds, so that the host need not know which draw."""
+
+    def __init__(
+        self, generator: torch.Generator, mask: torch.Tensor, chosen: Mapping[str, Array]
+    ) -> None:
+        self._generator = generator
+        self._mask = mask
+        self._chosen = chosen
+
+    def uniform(
+        self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
+    ) -> Array:
+        """As `Draw.uniform`, float32."""
+        return self._drawn(low + (high - low) * self._random(torch.rand, size), name)
+
+    def normal(self, scale: float, size: tuple[int, ...] = (), *, name: str = "") -> Array:
+        """As `Draw.normal`, float32."""
+        return self._drawn(scale * self._random(torch.randn, size), name)
+
+    def chosen(self, name: str) -> Array | None:
+        """As `Draw.chosen`."""
+        return self._chosen.get(name)
+
+    def _random(self, kind: Any, size: tuple[int, ...]) -> torch.Tensor:
+        shape, device = (*self._mask.shape, *size), self._mask.device
+        numbers: torch.Tensor = kind(shape, generator=self._generator, device=device)
+        return numbers
+
+    def _drawn(self, numbers: torch.Tensor, name: str) -> Array:
+        mask = self._mask.reshape(*self._mask.shape, *[1] * (numbers.ndim - 2))
+        return self._chosen.get(name, torch.where(mask, numbers, 0.0))
+
+
+def _device(name: str | None) -> tuple[torch.device, str]:
+    """The device for torch, and its name for Warp. Raises `InputError`."""
+    if name is None:
+        name = "cuda" if torch.cuda.is_available() and wp.is_cuda_available() else "cpu"
+    try:
+        ours = wp.get_device(str(name))
+        theirs = torch.device(wp.device_to_torch(ours))
+        torch.empty(0, device=theirs)
+    except (ValueError, RuntimeError, AssertionError):
+        expected = "'cpu', or a CUDA device that both Warp and torch find"
+        raise InputError(f"device: expected {expected}, got {name!r}") from None
+    return theirs, str(ours)

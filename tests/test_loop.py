@@ -1,0 +1,210 @@
+"""The loop: masks of `advance`, streams of random numbers, and what a task may give."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from rotorgram.envs import ArraySpec, Loop, Metric, Outcome, Task, TaskOptions, register, registry
+from rotorgram.models.errors import InputError
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.sim import CollectiveThrust, Pose, make_world, stack
+
+ID, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+HEXA = Path(__file__).parent / "data" / "hexa.xml"
+
+
+def started(env_id: str = ID, num_envs: int = 2, **options: Any) -> tuple[Loop, np.ndarray]:
+    """A loop with running episodes, and actions for it."""
+    loop = Loop(env_id, num_envs, options=options)
+    actions = np.full((num_envs, len(loop.task.controller.low)), 0.4, np.float32)
+    loop.advance(actions, np.ones(num_envs, bool), range(num_envs))
+    return loop, actions
+
+
+def shown(loop: Loop, drone: int) -> bytes:
+    """All that is told of a drone."""
+    arrays = [*loop.observations.values(), loop.telemetry_table]
+    return b"".join(array[drone].tobytes() for array in arrays)
+
+
+@pytest.mark.parametrize("env_id", [ID, HOVER])
+def test_a_frozen_drone_is_as_before(env_id: str) -> None:
+    (held, actions), (free, _) = (started(env_id, episode_length=5) for _ in range(2))
+    first, second = np.array([True, False]), np.array([False, True])
+    for loop in (held, free):
+        loop.advance(actions)
+    before = shown(held, 0)
+    for wrong in (np.nan, 9.0):
+        given = actions.copy()
+        given[0] = wrong  # ignored
+        held.advance(given, second, frozen=first)
+        assert shown(held, 0) == before
+        assert (held.rewards[0], held.terminated[0], held.truncated[0]) == (0.0, False, False)
+    for _ in range(4):  # and its episode is as long as if it had not been frozen
+        held.advance(actions, second)
+        free.advance(actions, second)
+        assert shown(held, 0) == shown(free, 0)
+    assert held.truncated[0]
+    held.advance(actions, second, frozen=first)  # also when its episode is over
+    with pytest.raises(gym.error.ResetNeeded, match="env 0 first"):
+        held.advance(actions)
+
+
+def test_flags_of_those_that_do_not_fly() -> None:
+    loop, actions = started(episode_length=1)
+    loop.advance(actions)
+    assert loop.truncated.tolist() == loop.done.tolist() == [True, True]
+    loop.advance(actions, np.array([True, False]), None, np.array([False, True]))
+    assert loop.truncated.tolist() == [False, False]
+    assert loop.rewards.tolist() == [0.0, 0.0]
+    assert loop.done.tolist() == [False, True]
+    assert loop.steps.tolist() == [0, 1]
+
+
+def test_the_first_reset_may_be_of_some() -> None:
+    loop, every = Loop(ID, 3), np.ones(3, bool)
+    still, some = np.zeros((3, 1), np.float32), np.array([False, True, False])
+    loop.advance(still, some, [7, 7, 7], frozen=~some)
+    alone = Loop(ID)
+    alone.advance(still[:1], every[:1], [7])
+    assert shown(loop, 1) == shown(alone, 0)
+    with pytest.raises(gym.error.ResetNeeded, match="env 0 first"):
+        loop.advance(still)
+    loop.advance(still, ~some, [5, 6, 7])
+    loop.advance(still)
+    assert loop.steps.tolist() == [1, 2, 1]
+
+
+def test_seeds_of_a_wire() -> None:
+    """Unsigned numbers of 64 bits, those of drones that are not reset among them."""
+    loop, actions = started(num_envs=3)
+    before = shown(loop, 1)
+    seeds = np.array([2**64 - 1, 5, 2**64 - 1], np.uint64)
+    loop.advance(actions, np.array([True, False, True]), seeds, np.array([False, True, False]))
+    assert shown(loop, 0) == shown(loop, 2) != shown(loop, 1) == before
+
+
+def test_another_use_of_randomness_does_not_move_the_starts() -> None:
+    """A world's seed gives a child to each use; the starts are those of the first child."""
+    world, every = make_world(Vehicle.load(), 2), np.ones((2, 1), bool)
+    world.seed(every, [11, 12])
+    drawn = world.draw(every).uniform(0.0, 1.0, (3,))[:, 0]
+    for seed, numbers in zip((11, 12), drawn, strict=True):
+        child = np.random.SeedSequence(seed).spawn(5)[0]  # however many there are
+        assert numbers.tolist() == np.random.default_rng(child).uniform(0.0, 1.0, 3).tolist()
+
+
+def test_a_draw_that_is_switched_off_moves_no_other() -> None:
+    """Equal ends draw all the same: a start tilt of 0 leaves heading and offset as they were."""
+    (tilted, _), (level, _) = (started(HOVER, start_tilt=tilt) for tilt in (30.0, 0.0))
+    np.testing.assert_array_equal(tilted.telemetry["position"], level.telemetry["position"])
+    assert abs(level.telemetry["attitude"][:, [0, 2]]).max() < 1e-12
+    headings = level.telemetry["metrics"][:, 1]
+    np.testing.assert_allclose(tilted.telemetry["metrics"][:, 1], headings, atol=8.0)
+
+
+# --- a task that gives whatever a task may give ---------------------------------------------------
+
+
+class Careless(Task):
+    """Gives live arrays of the simulator, an integer picture, and an end that never comes."""
+
+    metrics = (Metric(name="climb", unit="m/s", goal="high"),)
+
+    def setup(self) -> None:
+        self.controller = CollectiveThrust(self.vehicle, 10.0, increment=False)
+        self.observation = (
+            ArraySpec(name="position", shape=(3,), dtype="float64", low=-1e3, high=1e3),
+            ArraySpec(name="picture", shape=(2, 2), dtype="uint8"),
+        )
+
+    def begin(self, mask: Any, draw: Any) -> Pose:
+        return Pose(position=stack((0.0, 0.0, draw.uniform(3.0, 4.0))))
+
+    def observe(self, state: Any) -> dict[str, Any]:
+        ones = stack((1.0, 2.0, 3.0, state.position[..., 2]))
+        return {"position": state.position, "picture": ones.reshape((*ones.shape[:-1], 2, 2))}
+
+    def outcome(self, state: Any) -> Outcome:
+        climb = state.velocity[..., 2]
+        return Outcome(reward={"climb": climb}, terminated=False, metrics={"climb": climb})
+
+
+@pytest.fixture
+def careless() -> Iterator[str]:
+    register("careless-v0", Careless)
+    yield "careless-v0"
+    gym.registry.pop("careless-v0")
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_what_a_step_gave_stays_as_it_was(careless: str, num_envs: int) -> None:
+    loop = Loop(careless, num_envs, options={"episode_length": 3})
+    actions = np.ones((num_envs, 1), np.float32)
+    loop.advance(actions, np.ones(num_envs, bool), range(num_envs))
+    loop.advance(actions)
+    given = [*loop.observations.values(), *loop.metrics.values(), *loop.reward_terms.values()]
+    given += [loop.rewards, loop.terminated, loop.truncated, loop.telemetry_table]
+    kept = [array.copy() for array in given]
+    loop.advance(actions)
+    loop.advance(actions)
+    assert loop.truncated.all()
+    for array, before in zip(given, kept, strict=True):
+        assert array.tobytes() == before.tobytes()
+    assert loop.observations["picture"].dtype == np.uint8
+    assert loop.observations["picture"].tolist() == [[[1, 2], [3, 3]]] * num_envs
+    assert loop.observations["position"].shape == (num_envs, 3)
+    # 40 N on 20 kg: 2 m/s² for 3 steps of 0.02 s
+    assert loop.metrics["climb"] == pytest.approx(0.12, abs=1e-9)
+
+
+def test_several_arrays_are_a_dict(careless: str) -> None:
+    env = gym.make(careless, disable_env_checker=True)
+    check_env(env.unwrapped, skip_render_check=True)
+    observation, info = env.reset(seed=0)
+    assert set(observation) == {"position", "picture"}
+    assert "X_goal" not in info
+    many = gym.make_vec(careless, num_envs=2)
+    seen, _ = many.reset(seed=0)
+    assert seen["position"][0].tobytes() == observation["position"].tobytes()
+
+
+def test_ids() -> None:
+    assert {ID, HOVER} <= set(registry.known_ids())
+    assert registry.is_known(f"rotorgram.envs:{ID}")
+    with pytest.raises(InputError, match=r"^env: expected a registered id .*, got 'CartPole-v1'"):
+        Loop("CartPole-v1")
+    with pytest.raises(InputError, match="^env id: expected one that is free, got 'CartPole-v1'"):
+        register("CartPole-v1", Careless)
+    for wrong in ("landing", "my landing-v0", 3):
+        with pytest.raises(InputError, match="^env id: expected name-v0"):
+            register(wrong, Careless)  # type: ignore[arg-type]
+
+
+def test_what_a_user_typed_is_imported_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "typed_here.py").write_text(
+        "from rotorgram.envs import Task, register\nregister('Typed-v0', Task)\n"
+    )
+    assert not registry.is_known("typed_here:Typed-v0")
+    with pytest.raises(InputError, match="^env: expected a registered id"):
+        registry.task_type("typed_here:Typed-v0")
+    assert registry.load("typed_here:Typed-v0") == "Typed-v0"
+    assert registry.task_type("Typed-v0") is Task
+    assert registry.load(ID) == ID
+    with pytest.raises(InputError, match="^env: expected typed_here to register Other-v0"):
+        registry.load("typed_here:Other-v0")
+    with pytest.raises(InputError, match="^env: expected a module nowhere here, got none"):
+        registry.load("nowhere:Typed-v0")
+    gym.registry.pop("Typed-v0")
+
+
+def test_options_are_a_plain_dataclass() -> None:
+    assert registry.options_type(HOVER).from_options({"heading": 3}).heading == 3.0  # type: ignore[attr-defined]
+    assert issubclass(registry.options_type(ID), TaskOptions)

@@ -1,0 +1,279 @@
+"""The spec of an env: what may be said, JSON there and back, and JSON of somebody else."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rotorgram.envs.registry import env_spec
+from rotorgram.envs.spaces import action_space, info_columns, observation_space
+from rotorgram.envs.spec import (
+    ArraySpec,
+    Discrete,
+    EnvSpec,
+    Metric,
+    SpecError,
+    canonical_id,
+    component_names,
+)
+from rotorgram.models.errors import InputError
+
+ID, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+PICTURE = ArraySpec(name="picture", shape=(4, 5, 3), dtype="uint8", low=0, high=255)
+WORDS = st.text(st.characters(exclude_categories=["Cc", "Cs"]), min_size=1, max_size=20)
+NUMBERS = st.floats(-1e6, 1e6)
+
+
+def spec_of(**rest: Any) -> EnvSpec:
+    fields: dict[str, Any] = {
+        "env_id": "my/Env-v0",
+        "control_period": 0.02,
+        "observation": (PICTURE,),
+        "action": Discrete(n=3),
+    }
+    return EnvSpec(**{**fields, **rest})
+
+
+# --- what our envs say ----------------------------------------------------------------------------
+
+
+def test_the_elevation_env_by_hand() -> None:
+    spec = env_spec(ID, {"target": (4, 8)})
+    assert (spec.env_id, spec.control_period, spec.agents) == (ID, 0.02, ("drone_0",))
+    assert spec.options["target"] == [4.0, 8.0]  # as JSON gives it back
+    assert [array.name for array in spec.telemetry] == [
+        "position", "attitude", "thrust", "goal", "metrics",
+    ]  # fmt: skip
+    names = [name for array in spec.telemetry for name in component_names(array)]
+    assert names == [
+        "X", "Y", "Z", "phi", "theta", "psi", "F1", "F2", "F3", "F4",
+        "X_goal", "Y_goal", "Z_goal", "elevation_error",
+    ]  # fmt: skip
+    assert all(array.dtype == "float64" for array in spec.telemetry)
+    assert spec.headline == Metric(
+        name="elevation_error", unit="m", settled=0.05, held=0.1, symbol="E"
+    )
+    assert spec.telemetry[2].bounds()[1].tolist() == [100.0] * 4
+
+
+def test_the_hover_env_by_hand() -> None:
+    spec = env_spec(HOVER)
+    assert spec.observation[0].shape == (19,)
+    assert spec.action == ArraySpec(
+        name="action", shape=(4,), low=-1.0, high=1.0, components=("F1", "F2", "F3", "F4")
+    )
+    assert [metric.name for metric in spec.metrics] == ["position_error", "heading_error"]
+    assert spec.telemetry[-1].unit == ("m", "deg")
+
+
+@pytest.mark.parametrize("env_id", [ID, HOVER])
+def test_json_there_and_back(env_id: str) -> None:
+    spec = env_spec(env_id)
+    text = spec.to_json()
+    assert EnvSpec.from_json(text) == spec
+    assert EnvSpec.from_json(text).to_json() == text
+    assert len(text) < 4000
+
+
+# --- any spec -------------------------------------------------------------------------------------
+
+
+@st.composite
+def arrays(draw: st.DrawFn) -> ArraySpec:
+    shape = tuple(draw(st.lists(st.integers(1, 4), max_size=3)))
+    size = math.prod(shape)
+    low = draw(st.one_of(NUMBERS, st.lists(NUMBERS, min_size=size, max_size=size)))
+    wide = draw(st.booleans())
+    least = np.min(low)
+    high = math.inf if wide else np.maximum(low, least).max() + draw(st.floats(0, 10))
+    return ArraySpec(
+        name=draw(WORDS),
+        shape=shape,
+        dtype=draw(st.sampled_from(["float32", "float64", "uint8", "int32", "int64"])),
+        low=tuple(low) if isinstance(low, list) else low,
+        high=high,
+        unit=draw(st.one_of(WORDS, st.just(("m",) * size))),
+        frame=draw(WORDS),
+        components=draw(st.sampled_from([(), tuple(f"c{i}" for i in range(size))])),
+    )
+
+
+@st.composite
+def specs(draw: st.DrawFn) -> EnvSpec:
+    seen = draw(st.lists(arrays(), min_size=1, max_size=3, unique_by=lambda array: array.name))
+    metrics = draw(st.sampled_from([(), (Metric(name="gates", unit="1", goal="high"),)]))
+    told = tuple(
+        ArraySpec(name="metrics", shape=(1,), dtype="float64", components=(metric.name,))
+        for metric in metrics
+    )
+    return spec_of(
+        options=draw(st.dictionaries(WORDS, st.one_of(NUMBERS, WORDS, st.lists(NUMBERS)))),
+        control_period=draw(st.floats(1e-6, 1e3)),
+        vehicle=draw(WORDS),
+        vehicle_hash="0123456789abcdef" * 2,
+        agents=tuple(draw(st.lists(WORDS, min_size=1, max_size=3, unique=True))),
+        observation=tuple(seen),
+        action=draw(st.one_of(arrays(), st.builds(Discrete, n=st.integers(1, 1 << 24)))),
+        telemetry=told,
+        metrics=metrics,
+    )
+
+
+@settings(max_examples=60)
+@given(specs())
+def test_any_spec_survives_json(spec: EnvSpec) -> None:
+    assert EnvSpec.from_json(spec.to_json()) == spec
+
+
+def test_bounds_of_the_same_value_are_one_number() -> None:
+    one = ArraySpec(name="a", shape=(2, 3), low=(-1.0,) * 6, high=np.full((2, 3), 2.0))  # type: ignore[arg-type]
+    assert one == ArraySpec(name="a", shape=(2, 3), low=-1.0, high=2.0)
+    assert (one.low, one.high) == (-1.0, 2.0)
+    assert one.bounds()[1].tolist() == [[2.0] * 3] * 2
+    assert '"low":-1.0' in json.dumps(one.to_json(), separators=(",", ":"))
+
+
+def test_names_that_an_agent_does_not_know_are_left_out() -> None:
+    content = json.loads(spec_of().to_json())
+    content |= {"wind": 3, "observation": [{**content["observation"][0], "colour": "RGB"}]}
+    assert EnvSpec.from_json(json.dumps(content)) == spec_of()
+
+
+def test_spaces() -> None:
+    several = spec_of(observation=(PICTURE, ArraySpec(name="speed", shape=(), high=3.0)))
+    space = observation_space(several)
+    assert isinstance(space, spaces.Dict)
+    assert space["picture"] == spaces.Box(0, 255, (4, 5, 3), np.uint8)
+    assert space["speed"] == spaces.Box(-np.inf, 3.0, (), np.float32)
+    assert observation_space(spec_of()) == space["picture"]
+    assert action_space(several) == spaces.Discrete(3)
+    force = ArraySpec(name="f", shape=(2,), low=(0.0, -5.0), high=(100.0, 5.0))
+    assert action_space(spec_of(action=force)) == spaces.Box(
+        np.array([0.0, -5.0], np.float32), np.array([100.0, 5.0], np.float32)
+    )
+
+
+def test_columns_of_info() -> None:
+    told = (
+        ArraySpec(name="wind", shape=(2,), dtype="float64"),
+        ArraySpec(name="battery", shape=(1,), dtype="float64"),
+    )
+    values = {"wind": np.array([[1.0, 2.0], [3.0, 4.0]]), "battery": np.array([[5.0], [6.0]])}
+    columns = info_columns(spec_of(telemetry=told), values)
+    assert {name: column.tolist() for name, column in columns.items()} == {
+        "wind[0]": [1.0, 3.0],
+        "wind[1]": [2.0, 4.0],
+        "battery": [5.0, 6.0],
+    }
+
+
+def test_the_module_of_an_id_is_no_part_of_it() -> None:
+    assert canonical_id(f"rotorgram.envs:{ID}") == canonical_id(ID) == ID
+
+
+# --- refusals -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("build", "sentence"),
+    [
+        (lambda: ArraySpec(name="", shape=()), "name: expected a name"),
+        (lambda: ArraySpec(name="a\x1b[2J", shape=()), "name: .*without control"),
+        (lambda: ArraySpec(name="a", shape=(0,)), "a: expected a shape of whole numbers >= 1"),
+        (lambda: ArraySpec(name="a", shape=(2.0,)), "a: expected a shape"),  # type: ignore[arg-type]
+        (lambda: ArraySpec(name="a", shape=(1 << 30,)), "a: expected at most 4194304 elements"),
+        (lambda: ArraySpec(name="a", shape=(), dtype="float16"), "a: expected a dtype of float32"),
+        (lambda: ArraySpec(name="a", shape=(2,), low=(1.0,)), "a: expected one number for low"),
+        (lambda: ArraySpec(name="a", shape=(), low=math.nan), "a: expected one number for low"),
+        (lambda: ArraySpec(name="a", shape=(), low=2.0, high=1.0), "a: expected low <= high"),
+        (lambda: ArraySpec(name="a", shape=(), low=math.inf), "a: expected low <= high"),
+        (lambda: ArraySpec(name="a", shape=(2,), components=("x", "x")), "a: expected 2 different"),
+        (lambda: ArraySpec(name="a", shape=(2,), unit=("m",)), "a: expected 2 units, got 1"),
+        (lambda: Discrete(n=0), "action: expected 1 to 2.24 choices, got 0"),
+        (lambda: Discrete(n=2, components=("a",)), "action: expected 2 components"),
+        (lambda: Metric(name="", unit="m"), "metric: expected a name"),
+        (lambda: Metric(name="e", unit="m", goal="low"), "e: expected the goal"),  # type: ignore[arg-type]
+        (lambda: Metric(name="e", unit="m", settled=0.0), "e: expected settled > 0 or None"),
+        (lambda: spec_of(control_period=1e6), "control_period: expected 1e-6 to 1e3 s"),
+        (lambda: spec_of(vehicle_hash="xyz"), "vehicle_hash: expected 32 hex digits"),
+        (lambda: spec_of(agents=("a", "a")), "agents: expected 1 to 1024 different names"),
+        (lambda: spec_of(observation=()), "observation: expected at least one array"),
+        (lambda: spec_of(observation=(PICTURE, PICTURE)), "observation: .* different names"),
+        (lambda: spec_of(options={"a": object()}), "options: expected JSON values"),
+        (lambda: spec_of(options={"a": math.nan}), "options: expected JSON values"),
+        (
+            lambda: spec_of(metrics=(Metric(name="e", unit="m"),)),
+            "metrics: expected the components",
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_one_sentence(build: Any, sentence: str) -> None:
+    with pytest.raises(SpecError, match=f"^{sentence}") as caught:
+        build()
+    assert isinstance(caught.value, InputError)
+    assert "\n" not in str(caught.value)
+
+
+GOOD = json.loads(env_spec(HOVER).to_json())
+JSON = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=9)),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=4), st.dictionaries(st.text(max_size=9), inner, max_size=4)
+    ),
+    max_leaves=12,
+)
+
+
+def _paths(content: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    items = (
+        content.items()
+        if isinstance(content, dict)
+        else enumerate(content)
+        if isinstance(content, list)
+        else ()
+    )
+    return [path, *(p for key, value in items for p in _paths(value, (*path, key)))]
+
+
+PATHS = _paths(GOOD)
+
+
+@settings(max_examples=300)
+@given(st.sampled_from(PATHS[1:]), JSON)
+def test_a_spec_of_which_one_part_is_something_else(path: tuple[Any, ...], value: Any) -> None:
+    """Any part of Hover's spec put in place by anything: a spec, or one sentence."""
+    content = json.loads(json.dumps(GOOD))
+    *way, last = path
+    place = content
+    for key in way:
+        place = place[key]
+    place[last] = value
+    try:
+        spec = EnvSpec.from_json(json.dumps(content))
+    except SpecError as error:
+        assert "\n" not in str(error)  # noqa: PT017
+    else:
+        assert EnvSpec.from_json(spec.to_json()) == spec
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        "nan",
+        "[" * 100_000,
+        '{"a":' * 100_000,
+        '{"env_id": NaN}',
+        "\ud800",
+        "1" * 5000,
+    ],
+)
+def test_text_that_is_no_spec(text: str) -> None:
+    with pytest.raises(SpecError):
+        EnvSpec.from_json(text)
