@@ -118,7 +118,7 @@ class Train(AgentFlags):
                     f"{folder} holds one of {kept.algorithm}"
                 )
             refuse_settings(self, folder, free=("algorithm", *_FREE))
-            if "env" in self.given and self.env != kept.env_id:
+            if "env" in self.given and self.env_id != kept.env_id:
                 raise InputError(f"resume: expected --env {kept.env_id}, got {self.env}")
             if is_finished(kept):
                 print(

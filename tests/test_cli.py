@@ -184,6 +184,38 @@ def test_requirements_of_a_task_that_is_not_known_here() -> None:
     assert command.options == {"num_gates": 3, "wind": [0.5, 1], "track": "long"}
 
 
+TASK = """
+from rotorgram.envs import register
+from rotorgram.envs.tasks.elevation import Elevation
+
+
+class Low(Elevation):
+    pass
+
+
+register("Low-v0", Low)
+"""
+
+
+def test_a_task_of_the_working_directory(tmp_path: Path) -> None:
+    """It trains and flies; an agent that lacks its file serves it."""
+    (tmp_path / "low_task.py").write_text(TASK)
+    env = "--env low_task:Low-v0 --env.target 4"
+    done = shell(f"cd {tmp_path} && rotorgram train a2c {env} --env-steps 300 --out run")
+    assert done.returncode == 0, done.stderr
+    kept = load(tmp_path / "run" / "checkpoint.safetensors")
+    assert (kept.env_id, kept.options["target"]) == ("Low-v0", 4.0)
+    done = shell(f"rotorgram evaluate {tmp_path}/run --episodes 1")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "expected --env MODULE:Low-v0" in done.stderr
+    agent = start("serve", tmp_path / "run", "--listen", "127.0.0.1:0", "--episodes", 1)
+    assert agent.stdout is not None
+    server = agent.stdout.readline().split()[4]
+    done = shell(f"cd {tmp_path} && rotorgram sim {env} --bind 127.0.0.1:0 --server {server}")
+    assert done.returncode == 0, done.stderr
+    assert "episode 0: return" in agent.communicate(timeout=30)[0]
+
+
 @pytest.mark.parametrize("words", [["--help"], ["sim", "--help"], ["sim", "--speed", "2"]])
 def test_a_narrow_terminal(words: list[str]) -> None:
     """In five columns tyro takes gigabytes."""
