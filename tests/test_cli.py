@@ -89,7 +89,7 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["train", "a2c", "--set", "gamma=" + 9999 * "["], "gamma: expected a number from 0 to 1"),
         (["train", "vpg", "--listen", "8001"], "address: expected HOST:PORT"),
         (["train", "vpg", "--listen", "192.0.2.1:8001"], "is not a loopback address"),
-        (["train", "vpg", "--resume", "nowhere"], "checkpoint: no file"),
+        (["train", "vpg", "--resume", "nowhere"], "nowhere: cannot be written: No such file"),
         (["sim", "--server", "127.0.0.1:99999"], "address: expected HOST:PORT"),
         (["sim", "--bind", "127.0.0.1:0", "--env.target", "1"], "target: expected"),
         (["sim", "--env", "rotorgram/Nothing-v0"], "env: expected a registered id"),
@@ -101,7 +101,7 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["report", "nowhere"], "nowhere"),
         (["check-model", "nowhere.xml"], "vehicle: cannot read nowhere.xml"),
         (["sim", "--num-envs", "0", "--bind", "127.0.0.1:0"], "num_envs: expected 1 to 65536"),
-        (["sim", "--num-envs", "2", "--codec", "text"], "codec: expected 'binary' for 2 drones"),
+        (["sim", "--num-envs", "2", "--codec", "text"], "text codec: expected one drone, got 2"),
         (["sim", "--key-file", "nowhere"], "key file: cannot read nowhere"),
         (["train", "a2c", "--key-file", "nowhere"], "key-file, insecure: expected them with"),
         (["train", "a2c", "--store-every", "0"], "store-every: expected seconds > 0, got 0"),
@@ -182,6 +182,38 @@ def test_requirements_of_a_task_that_is_not_known_here() -> None:
     command = parse(Serve, "rotorgram serve", [*words, "--env.track", "long", "--episodes", "2"])
     assert (command.env, command.episodes) == ("other/Race-v3", 2)
     assert command.options == {"num_gates": 3, "wind": [0.5, 1], "track": "long"}
+
+
+TASK = """
+from rotorgram.envs import register
+from rotorgram.envs.tasks.elevation import Elevation
+
+
+class Low(Elevation):
+    pass
+
+
+register("Low-v0", Low)
+"""
+
+
+def test_a_task_of_the_working_directory(tmp_path: Path) -> None:
+    """It trains and flies; an agent that lacks its file serves it."""
+    (tmp_path / "low_task.py").write_text(TASK)
+    env = "--env low_task:Low-v0 --env.target 4"
+    done = shell(f"cd {tmp_path} && rotorgram train a2c {env} --env-steps 300 --out run")
+    assert done.returncode == 0, done.stderr
+    kept = load(tmp_path / "run" / "checkpoint.safetensors")
+    assert (kept.env_id, kept.options["target"]) == ("Low-v0", 4.0)
+    done = shell(f"rotorgram evaluate {tmp_path}/run --episodes 1")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "expected --env MODULE:Low-v0" in done.stderr
+    agent = start("serve", tmp_path / "run", "--listen", "127.0.0.1:0", "--episodes", 1)
+    assert agent.stdout is not None
+    server = agent.stdout.readline().split()[4]
+    done = shell(f"cd {tmp_path} && rotorgram sim {env} --bind 127.0.0.1:0 --server {server}")
+    assert done.returncode == 0, done.stderr
+    assert "episode 0: return" in agent.communicate(timeout=30)[0]
 
 
 @pytest.mark.parametrize("words", [["--help"], ["sim", "--help"], ["sim", "--speed", "2"]])
@@ -353,7 +385,7 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     assert len(pd.read_csv(folder / "episodes.csv")) >= 20
     status, out, _ = run(capsys, "evaluate", folder / "checkpoint.safetensors", "--episodes", 3)
     assert status == 0
-    assert "episodes          3" in out
+    assert "episodes   3, " in out
     assert run(capsys, "evaluate", folder, "--episodes", 1, "--env.linear-drag", 0.5)[0] == 0
     for changes, sentence in (
         (["vpg"], "resume: expected a training of vpg"),
