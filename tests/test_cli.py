@@ -210,7 +210,7 @@ def test_a_task_of_the_working_directory(tmp_path: Path) -> None:
     assert "expected --env MODULE:Low-v0" in done.stderr
     agent = start("serve", tmp_path / "run", "--listen", "127.0.0.1:0", "--episodes", 1)
     assert agent.stdout is not None
-    server = agent.stdout.readline().split()[4]
+    server = agent.stdout.readline().split()[5]
     done = shell(f"cd {tmp_path} && rotorgram sim {env} --bind 127.0.0.1:0 --server {server}")
     assert done.returncode == 0, done.stderr
     assert "episode 0: return" in agent.communicate(timeout=30)[0]
