@@ -1,4 +1,4 @@
-"""What local and remote vector envs have in common: Gymnasium's autoreset over a single method."""
+"""Base of local and remote vector envs: Gymnasium's autoreset over a single method."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -21,11 +21,11 @@ Seeds = Sequence[int | None] | np.ndarray
 class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
     """A vector env that is stepped by `advance`, the step of the wire.
 
-    A derived class sets the attributes below in `advance` to new arrays; what a step gave away
-    stays as it was.
+    A derived class sets the attributes below in `advance` to new arrays; arrays of earlier steps
+    do not change.
 
     Attributes:
-        env_spec: What there is to know of the env.
+        env_spec: The `EnvSpec` of the env.
         control_period: Time of a step, s.
         observations: float32, shape (N, n), where the spec has one array; else a dict of arrays.
         rewards: float64, shape (N,).
@@ -72,7 +72,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         """
 
     def step(self, actions: Any) -> Step:
-        """Fly every drone for one control period; what follows an episode, the autoreset says."""
+        """Fly every drone for one control period; after an episode the autoreset mode decides."""
         array = self._shaped(actions)
         mode = self.metadata["autoreset_mode"]
         resets = self.done if mode == AutoresetMode.NEXT_STEP and self.done.any() else None
@@ -84,9 +84,9 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         return self._observed(), rewards, terminated, truncated, info
 
     def _take_spec(self, spec: EnvSpec, num_envs: int, mode: AutoresetMode | str) -> None:
-        """Set what follows from a spec, spaces too. Raises `InputError`.
+        """Set spaces and other attributes from a spec. Raises `InputError`.
 
-        Spaces that are equal to those there are stay: their generators may have been seeded.
+        Spaces that have not changed are kept: their generators may have been seeded.
         """
         try:
             mode = AutoresetMode(mode)

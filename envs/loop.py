@@ -1,4 +1,4 @@
-"""The loop that joins a vehicle, a world and a task; every env and every simulator is this one.
+"""The loop that joins a vehicle, a world and a task; every env and simulator runs it.
 
 A single env is the loop with one world. An agent's command resets some drones, freezes some, and
 flies the others for one control period: `advance` is that step, the step of the wire.
@@ -42,7 +42,7 @@ def make_task(
 
 
 def spec_of(env_id: str, task: Task) -> EnvSpec:
-    """What an agent must know of a task's env."""
+    """The `EnvSpec` of a task's env."""
     vehicle, controller = task.vehicle, task.controller
     if controller.choices:
         action: ArraySpec | Discrete = Discrete(
@@ -96,7 +96,7 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
 
 
 def has_goal(task: Task) -> bool:
-    """Whether a task says where the drones should be."""
+    """Whether a task has goals."""
     return type(task).goal is not Task.goal
 
 
@@ -107,16 +107,16 @@ class Loop:
         env_id: Of a registered task.
         num_envs: N.
         vehicle: MJCF file; None is the paper's.
-        backend: What steps the physics.
+        backend: `mujoco` or `warp`.
         options: Of the task, by name.
         settings: Of the backend: `num_threads`, or `device`.
 
     Attributes:
-        spec: What there is to know of it.
-        task, world: What is joined here. Their arrays have the leading axes of the world; all
+        spec: Its `EnvSpec`.
+        task, world: Its parts. Their arrays have the leading axes of the world; all
             others here have one axis of N drones.
         observations: By name, shape (N, *shape), of the declared dtypes. This and the following
-            are made anew by each `advance`: those of the last one stay as they were.
+            are new arrays after each `advance`; arrays of earlier steps do not change.
         rewards: float64, shape (N,); 0 for a drone that did not fly.
         terminated, truncated: bool, shape (N,).
         done: bool, shape (N,): the episode has ended and the next has not begun.
@@ -124,8 +124,8 @@ class Loop:
 
     Raises:
         InputError: An argument, seed or action is not what it should be; nothing has changed.
-        PhysicsError: A state is bad; the drones that flew are to be reset.
-        gymnasium.error.ResetNeeded: A drone whose episode has not begun, or has ended, is to fly.
+        PhysicsError: A state is bad; reset the drones that flew.
+        gymnasium.error.ResetNeeded: An action came before an episode's beginning or after its end.
     """
 
     def __init__(
@@ -263,18 +263,18 @@ class Loop:
         if not self.world.shape:  # a single drone's numbers
             self.rewards = np.array((total,))
             self.terminated, self.truncated = np.array((ended,)), np.array((late,))
-            over = bool(ended or late)
+            may_end = bool(ended or late)
         else:
             self.rewards = total.reshape(n)
-            # New arrays, whatever the task gave: what a step gave away stays as it was.
+            # New arrays, whatever the task gave: arrays of earlier steps must not change.
             self.terminated = (ended | self._none).reshape(n)
             self.truncated = late.reshape(n)
-            over = True
+            may_end = True
         if flown is not None:
             # A drone that did not fly gets no reward: nothing has ended, nothing was won.
             self.rewards = self._xp.where(flown, self.rewards, 0.0)
             self.terminated, self.truncated = self.terminated & flown, self.truncated & flown
-        if over:
+        if may_end:
             ends = self.terminated | self.truncated
             if ends.any():
                 self._waiting, self._anyone_waits = self._waiting | ends, True
@@ -300,7 +300,7 @@ class Loop:
         return values.astype(np.float64)
 
     def _right(self, values: np.ndarray) -> np.ndarray | None:
-        """Whose actions are of the space, shape (N,); None if all are."""
+        """Which actions are in the action space, bool, shape (N,); None if all are."""
         if self._choices:
             right = ((values >= 0) & (values < self._choices) & (values % 1 == 0)).all(axis=1)
         else:
@@ -380,7 +380,7 @@ class Loop:
         return row
 
     def close(self) -> None:
-        """Let go of threads and memory."""
+        """Release threads and memory."""
         self.world.close()
 
     def ours(self, mask: Array | None) -> Array | None:
@@ -395,7 +395,7 @@ class Loop:
         return _as_type(values.reshape(self.num_envs), values.dtype)
 
     def __reduce__(self) -> Any:
-        """Raise: simulator memory cannot be copied, and a copy that seems to fly would be wrong."""
+        """Raise `TypeError`: simulator memory cannot be copied; a copy would fly wrong numbers."""
         raise TypeError("a running env cannot be copied or pickled: make another one")
 
 

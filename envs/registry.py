@@ -1,4 +1,4 @@
-"""Tasks by env id. What a file or a peer names is looked up here, never imported."""
+"""Tasks by env id. An id from a file or a peer is looked up here; its module is never imported."""
 
 import re
 import sys
@@ -27,7 +27,7 @@ def register(env_id: str, task: "str | type[Task]") -> None:
         task: A class derived from `Task`, or "module:Class", which is imported when needed.
 
     Raises:
-        InputError: The id is not of that form, or belongs to an env of somebody else.
+        InputError: The id is not of that form, or belongs to another package's env.
     """
     if not (isinstance(env_id, str) and _ID.fullmatch(env_id)):
         raise InputError(f"env id: expected name-v0 or namespace/name-v0, got {env_id!r}")
@@ -45,7 +45,7 @@ def register(env_id: str, task: "str | type[Task]") -> None:
 
 
 def load(env_id: str) -> str:
-    """The id without its module, once that is imported: for what a user typed, nothing else.
+    """Import the module of an id and return the id without it. For ids that a user typed only.
 
     The module of "module:Name-v0" is looked for in the working folder too.
 

@@ -1,4 +1,4 @@
-"""Render modes of the envs. What draws is imported when something is to be drawn, not before."""
+"""Render modes of the envs. Code that draws is imported on first use."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
@@ -24,14 +24,14 @@ def checked_render_mode(mode: str | None) -> str | None:
 
 
 def painter(mode: str, loop: "Loop") -> "Painter":
-    """Draws what a loop is to show."""
+    """A painter for the drones of a loop."""
     from ..rendering.painter import Painter
 
     return Painter(mode, loop.num_envs, loop.spec.control_period, loop.vehicle.path)
 
 
 def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
-    """What there is to see of every drone now; `episodes` are numbers of their episodes."""
+    """The current `Moment` of every drone; `episodes` are the numbers of their episodes."""
     steps, rewards = loop.steps, loop.rewards
     return [
         moment(
@@ -46,7 +46,7 @@ def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
 
 
 def moment(spec: EnvSpec, telemetry: Mapping[str, Any], **rest: Any) -> "Moment":
-    """What there is to see of one drone.
+    """The `Moment` of one drone.
 
     Args:
         spec: Of its env.

@@ -23,7 +23,7 @@ class SingleEnv(gym.Env[Any, Any]):
     `info` has every component of the telemetry by its name (positions and attitude in the paper's
     frame, thrusts, metrics) and the terms of the reward as `reward_<term>`.
 
-    Actions are rounded to float32; what lies beyond a bound counts as the bound.
+    Actions are rounded to float32; a number beyond a bound counts as the bound.
 
     Render modes: with `rgb_array`, `render()` gives a picture, uint8, shape (360, 480, 3); with
     `human` a window shows the flight in real time. The physics is the same with either.
@@ -35,7 +35,7 @@ class SingleEnv(gym.Env[Any, Any]):
         options: Of the task, by name.
 
     Attributes:
-        env_spec: What there is to know of the env.
+        env_spec: The `EnvSpec` of the env.
         control_period: Time of a step, s.
 
     Raises:

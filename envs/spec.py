@@ -1,6 +1,6 @@
-"""What crosses the wire, by name: shapes, dtypes, bounds, units and frames.
+"""Specs: names, shapes, dtypes, bounds, units and frames of all that crosses the wire.
 
-A simulator tells its `EnvSpec` in Hello, and an agent builds its spaces from it: it needs neither
+A simulator sends its `EnvSpec` in Hello, and an agent builds its spaces from it: it needs neither
 the env's code nor MuJoCo. This module imports the standard library and NumPy alone.
 """
 
@@ -35,7 +35,7 @@ Bound = float | tuple[float, ...]
 
 
 class SpecError(InputError):
-    """A spec does not describe anything that could cross the wire."""
+    """A spec is wrong: nothing of that kind can cross the wire."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,14 +188,14 @@ class Discrete:
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """A number that tells how well a task is done. The first of a task decides: its headline."""
+    """A measure of how well a task is done. The first metric of a task is its headline."""
 
     name: str
     unit: str
     goal: Literal["zero", "high"] = "zero"
-    """`zero`: an error, signed or not; the best is 0. `high`: the more the better."""
+    """`zero`: an error, signed or not; 0 is best. `high`: larger is better."""
     settled: float | None = None
-    """Size of the error below which an episode counts as settled; None where that means nothing."""
+    """Size of the error below which an episode counts as settled; None if undefined."""
     held: float | None = None
     """Mean size of the error at the end of an episode below which its goal counts as held."""
     symbol: str = ""
@@ -244,7 +244,7 @@ class EnvSpec:
     observation: tuple[ArraySpec, ...]
     action: ArraySpec | Discrete
     telemetry: tuple[ArraySpec, ...] = ()
-    """What a State tells besides, for logs and pictures; metrics last, in an array `metrics`."""
+    """Further arrays of a State, for logs and pictures; the last, `metrics`, has the metrics."""
     metrics: tuple[Metric, ...] = ()
 
     def __post_init__(self) -> None:

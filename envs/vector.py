@@ -31,9 +31,9 @@ class LocalVectorEnv(AdvancingVectorEnv):
     gives reward 0. With SAME_STEP the observation is that of the next episode, and `info` has
     `final_obs` and `final_info` where one ended. With DISABLED a reset with a mask begins the next.
 
-    With the backend `warp` what a step gives are torch tensors on the world's device; it takes
-    them, or NumPy arrays. `info` then holds the metrics and the terms of the reward alone:
-    `telemetry` copies the rest to the host when it is asked for.
+    With the backend `warp` a step gives torch tensors on the world's device; it accepts tensors
+    or NumPy arrays. `info` then holds the metrics and the terms of the reward alone:
+    `telemetry` copies the rest to the host on access.
 
     Args:
         env_id: Of a registered task.
@@ -183,7 +183,7 @@ class LocalVectorEnv(AdvancingVectorEnv):
         return info
 
     def _given(self, value: Any) -> Any:
-        """What the caller gave; NumPy's array in place of a tensor."""
+        """An argument of the caller; a tensor as a NumPy array."""
         return on_host(value) if self._on_device and hasattr(value, "detach") else value
 
     def _choice(self, name: str, value: Any, names: tuple[str, ...]) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""Vehicles: their MJCF, what follows from it, the scene around them, and their examination.
+"""Vehicles: MJCF files, the numbers derived from them, the scene around them, an examination.
 
 Importing this package does not import MuJoCo: `Vehicle`, `build_scene` and `attach_airport` do so
-when they are first asked for.
+on first use.
 """
 
 from importlib import import_module
@@ -33,7 +33,7 @@ SCENE_XML: Final = Path(__file__).parent / "scene.xml"
 """Ground, sky and light, which `build_scene` puts around a vehicle."""
 
 AIRPORT_XML: Final = Path(__file__).parent / "airport.xml"
-"""An airport to look at: what `attach_airport` puts around a scene."""
+"""The airport that `attach_airport` adds around a scene. It is visual only."""
 
 _HOMES: Final = {
     "Rotor": "vehicle",
@@ -44,7 +44,7 @@ _HOMES: Final = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import what needs MuJoCo on first use (PEP 562)."""
+    """Import on first use the names that need MuJoCo (PEP 562)."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f".{_HOMES[name]}", __name__), name)

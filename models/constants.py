@@ -1,4 +1,4 @@
-"""What the paper says of its vehicle, and nothing else (Drones 2023, 7, 225, section 2.2).
+"""Numbers that the paper gives for its vehicle, and no others (Drones 2023, 7, 225, section 2.2).
 
 Code takes a vehicle's numbers from `Vehicle`, which reads the compiled model. These serve the
 examination of the paper's vehicle and its documentation.

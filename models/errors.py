@@ -1,4 +1,4 @@
-"""Errors that are one sentence to the user. Imports the standard library alone."""
+"""Errors that the user reads as one sentence. Imports the standard library alone."""
 
 from importlib import import_module
 from types import ModuleType
@@ -7,7 +7,7 @@ __all__ = ["InputError", "MissingPackage", "require"]
 
 
 class InputError(ValueError):
-    """Something that the user gave is wrong. The message says what was expected and what came.
+    """Wrong input from the user, a peer or a file. The message gives expected and actual value.
 
     The command line prints it as one sentence. Any other `ValueError` is a bug of ours and keeps
     its traceback.

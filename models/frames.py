@@ -1,4 +1,4 @@
-"""The one place where MuJoCo's frame becomes the paper's, and the paper's MuJoCo's.
+"""Conversions between MuJoCo's frame and the paper's. No other module converts.
 
 MuJoCo: x forward, y left, z up, right-handed, quaternions scalar first.
 Paper and Unity: X right, Y up, Z forward, left-handed, degrees (paper, section 2.2, figure 4).
@@ -9,8 +9,8 @@ theta about Y, psi about Z. It gives no order: we take Unity's (`Transform.euler
 R = Ry(theta) · Rx(phi) · Rz(psi). Positive phi is nose down, positive theta is nose right, and
 positive psi is right side up.
 
-Every function takes any leading axes, none included, and gives a row the same bits alone as among
-others: it runs the same NumPy functions on contiguous arrays.
+Every function accepts any leading axes, or none. A row gives the same bits alone and in a batch,
+because the same NumPy functions run on contiguous arrays.
 """
 
 from typing import Final
@@ -80,7 +80,7 @@ def attitudes_in_paper_frame(quaternions: ArrayLike, out: Array | None = None) -
 
 
 def pose_in_mujoco_frame(positions: ArrayLike, attitudes: ArrayLike) -> Array:
-    """The way back, for what is drawn: `qpos` of a free joint, (..., 7).
+    """The reverse, for pictures: `qpos` of a free joint, (..., 7).
 
     Args:
         positions: (X, Y, Z), m, (..., 3).

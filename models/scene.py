@@ -1,6 +1,6 @@
-"""The scene around a vehicle: ground, sky and light, and an airport to look at.
+"""The scene around a vehicle: ground, sky and light, and a visual airport.
 
-Physics notices the ground alone. A vehicle file that brings a ground of its own keeps it.
+Only the ground affects the physics. A vehicle file with a ground of its own keeps that one.
 """
 
 from pathlib import Path
@@ -16,13 +16,13 @@ from .errors import InputError
 __all__ = ["AIRPORT_PREFIX", "World", "attach_airport", "build_scene"]
 
 World = Literal["plain", "airport"]
-"""What is around the vehicle."""
+"""Surroundings of the vehicle."""
 
 AIRPORT_PREFIX: Final = "airport/"
-"""What the name of everything begins with that `attach_airport` adds."""
+"""Prefix of all names that `attach_airport` adds."""
 
 SCENE_PREFIX: Final = "scene/"
-"""What the name of everything begins with that `build_scene` adds."""
+"""Prefix of all names that `build_scene` adds."""
 
 MOST_HEIGHTS: Final = 4096
 """Most rows and columns of a height field: 16.8 million points, 0.3 GB."""
@@ -47,8 +47,8 @@ def build_scene(
     Args:
         vehicle: Its MJCF file; None is the paper's.
         world: `plain` or `airport`.
-        visual: Keep what is only looked at. Without it the physics is the same, bit for bit, and
-            faster.
+        visual: Keep visual elements. Without them the physics is faster and the same, bit for
+            bit.
 
     Raises:
         InputError: The world is not one of these, or a height field is too large.
@@ -73,7 +73,7 @@ def build_scene(
 def _check_height_fields(path: Path, seen: set[Path]) -> None:
     """Raise `InputError` for a large height field in a file or what it includes.
 
-    MuJoCo takes the memory for it while it reads, and ends the process where there is none.
+    MuJoCo allocates its memory while it reads, and aborts the process if there is too little.
     """
     seen.add(path)
     try:

@@ -64,7 +64,7 @@ class Vehicle:
     hash: str
     """32 hexadecimal characters: the same file and drag, the same hash. See `Vehicle.load`."""
     model: mujoco.MjModel
-    """Vehicle and ground, compiled without what is only looked at. Not to be changed."""
+    """Vehicle and ground, compiled without visual elements. Do not change it."""
     linear_drag: float
     """Acceleration of -linear_drag · velocity, 1/s."""
     mass: float
@@ -77,7 +77,7 @@ class Vehicle:
     """About the center of mass, body axes, shape (3, 3), kg·m²."""
     rotors: tuple[Rotor, ...]
     allocation: np.ndarray
-    """What one newton of each rotor does, shape (4, R): thrust along body z (N), and torque about
+    """Effect of one newton of each rotor, shape (4, R): thrust along body z (N), and torque about
     body x, y and z at the center of mass (N·m)."""
     hover_thrust: np.ndarray
     """Thrusts at which the level craft neither moves nor turns, shape (R,), N."""

@@ -1,7 +1,7 @@
-"""What an action means: controllers turn actions into rotor thrusts.
+"""Controllers: they turn actions into rotor thrusts.
 
-A controller keeps nothing between steps: what it needs of the past it reads from the state. An
-action has k numbers within bounds, or is one of some choices.
+A controller has no memory: what it needs of the past is in the state. An action has k numbers
+within bounds, or is one of some choices.
 """
 
 from typing import Final, Protocol
@@ -28,7 +28,7 @@ class Controller(Protocol):
         """Thrust of each rotor until the next action, N, shape (W, A, R).
 
         Args:
-            action: float64, shape (W, A, k), finite. What lies beyond a bound counts as the bound.
+            action: float64, shape (W, A, k), finite. A number beyond a bound counts as the bound.
             state: As the last step left it.
         """
 
@@ -37,7 +37,7 @@ class CollectiveThrust:
     """One number for all rotors: they push alike, in proportion to their thrusts at hover.
 
     Args:
-        vehicle: What flies.
+        vehicle: The vehicle that it controls.
         newtons: Thrust per unit of action, mean over the rotors.
         increment: Add to the present thrust; otherwise to that of a hover.
         discrete: Three choices, decrease, hold and increase, in place of a number in [-1, 1].
@@ -79,7 +79,7 @@ class RotorThrust:
     """One number for each rotor: 0 is its thrust at hover, -1 its least and 1 its largest.
 
     Args:
-        vehicle: What flies.
+        vehicle: The vehicle that it controls.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:

@@ -28,14 +28,14 @@ class Draw(Protocol):
         Args:
             low, high: Range; equal ends give that number, and a number is drawn all the same.
             size: Of one drone.
-            name: A reset's options may choose the values by it in place of the draw.
+            name: Under this name a reset's options may give values in place of the draw.
         """
 
     def normal(self, scale: float, size: tuple[int, ...] = (), *, name: str = "") -> Array:
         """Normal numbers with mean 0 and that standard deviation, shape (W, A, *size)."""
 
     def chosen(self, name: str) -> Array | None:
-        """What a reset's options chose under that name, shape (W, A); None if nothing."""
+        """Values that a reset's options give under that name, shape (W, A); None if none."""
 
 
 class Streams:
@@ -72,7 +72,8 @@ class NumpyDraw:
         streams: Of all worlds.
         ids: Worlds that draw.
         shape: (W, A), or () for a single drone.
-        chosen: By name, what a reset's options put in place of a draw: shape (W, A, *size).
+        chosen: Values that a reset's options give in place of draws, by name: shape
+            (W, A, *size).
     """
 
     def __init__(

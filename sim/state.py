@@ -1,4 +1,4 @@
-"""What a world is in: arrays whose first two axes are W worlds and the A drones of each.
+"""State of worlds: arrays whose first two axes are W worlds and the A drones of each.
 
 A single drone has neither axis: code that counts axes from the last, as `position[..., 2]`, serves
 both.
@@ -47,7 +47,7 @@ class WorldState:
 
 @dataclass(kw_only=True, slots=True)
 class Pose:
-    """How worlds begin. What is None is level, at rest, or hovering."""
+    """Initial state of worlds. None means level, at rest, or at hover thrust."""
 
     position: Array
     """World frame, m, shape (W, A, 3)."""

@@ -1,4 +1,4 @@
-"""Worlds behind one interface, whatever steps their physics."""
+"""Worlds: one interface for all backends."""
 
 from collections.abc import Sequence
 from importlib import import_module
@@ -23,19 +23,19 @@ MAX_WORLDS: Final = 1 << 16
 """Most worlds of a batch."""
 
 CONTACT_CHECK: Final = 0.02
-"""Contact is looked for at least this often, s. A bounce of the paper's craft at full thrust lasts
-longer, unless its skids dip less than half a millimetre."""
+"""Longest time between two checks for contact, s. A bounce of the paper's craft at full thrust
+lasts longer, unless its skids dip less than half a millimetre."""
 
 
 class PhysicsError(RuntimeError):
-    """The physics reported a bad state; the numbers after it would mean nothing."""
+    """The physics reported a bad state; the numbers after it are meaningless."""
 
 
 class World(Protocol):
     """W worlds of A drones.
 
     Attributes:
-        vehicle: What flies in each.
+        vehicle: The vehicle of every drone.
         shape: (W, A), the leading axes of all arrays; () for a single drone.
         state: As the last step or reset left it.
         xp: Namespace of the array API standard for the state's arrays.
@@ -47,7 +47,7 @@ class World(Protocol):
     xp: Any
 
     def reset(self, mask: Array, pose: Pose) -> None:
-        """Begin anew in the worlds of the mask, bool, shape (W, A); their poses are those given."""
+        """Reset the worlds of the mask, bool, shape (W, A), to their rows of `pose`."""
 
     def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
         """Fly for so many physics steps with constant thrusts.
@@ -73,21 +73,21 @@ class World(Protocol):
         """Actions as this backend's arrays, where those are not NumPy's. Raises `InputError`.
 
         Args:
-            actions: What the caller gave: shape (N, k), or (N,) where they are choices.
+            actions: Of the caller: shape (N, k), or (N,) if they are choices.
             width: k.
             choices: 0, or how many.
-            flown: Whose actions count, bool, shape (N,); None: all.
+            flown: Drones that fly, bool, shape (N,); other actions are ignored. None: all.
         """
 
     def draw(self, mask: Array, chosen: Any = None) -> Draw:
-        """What draws numbers for the worlds of the mask; `chosen` as of `random.NumpyDraw`."""
+        """A `Draw` for the worlds of the mask; `chosen` as in `random.NumpyDraw`."""
 
     def close(self) -> None:
-        """Let go of threads and memory."""
+        """Release threads and memory."""
 
 
 def contact_check(timestep: float) -> int:
-    """Physics steps between two looks for contact."""
+    """Physics steps between two checks for contact."""
     return max(1, round(CONTACT_CHECK / timestep))
 
 
@@ -97,9 +97,9 @@ def make_world(
     """Worlds of one drone each.
 
     Args:
-        vehicle: What flies.
+        vehicle: The vehicle of every world.
         num_worlds: W.
-        backend: What steps the physics.
+        backend: `mujoco` or `warp`.
         settings: Of that backend: `num_threads`, or `device`.
 
     Raises:

@@ -38,9 +38,9 @@ class HoverOptions(TaskOptions):
     """Options of `rotorgram/Hover-v0`."""
 
     goal: tuple[float, float, float] = (0.0, 0.0, 5.0)
-    """Where to hover: x, y, z in MuJoCo's world frame (z up), m."""
+    """Position to hold: x, y, z in MuJoCo's world frame (z up), m."""
     heading: float = 0.0
-    """Where the nose shall point, degrees about z, anticlockwise from x."""
+    """Direction of the nose to hold, degrees about z, anticlockwise from x."""
     start_band: float = 1.0
     """Largest distance of the start from the goal along each axis, m."""
     start_tilt: float = 30.0

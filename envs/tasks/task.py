@@ -1,4 +1,4 @@
-"""What a task is. One class serves every backend, one drone or thousands, in process or over UDP.
+"""Base of tasks. One class serves every backend, one drone or thousands, in process or over UDP.
 
 A task is written for arrays with any leading axes: W worlds and the A drones of each, or none for a
 single drone. It counts axes from the last (`position[..., 2]`), uses operators, `stack` and the
@@ -56,7 +56,7 @@ class TaskOptions:
         self.check()
 
     def check(self) -> None:
-        """Check what a derived class adds; raise `InputError`."""
+        """Check the options of a derived class; raise `InputError`."""
 
     @classmethod
     def from_options(cls, options: Mapping[str, Any]) -> Self:
@@ -87,16 +87,16 @@ class Task:
 
     Class attributes:
         Options: Dataclass of the task's options.
-        metrics: What tells how well it is done. The first decides: the headline.
+        metrics: Measures of how well it is done. The first is the headline.
         choices: Names of draws that a reset's options may choose.
 
     Attributes:
         options: An instance of `Options`.
-        vehicle: What flies.
+        vehicle: The vehicle of every drone.
         shape: (W, A), or () for a single drone.
         xp: Namespace of the array API standard.
-        controller: What an action means; set by `setup`.
-        observation: What an agent sees, as specs of one drone; set by `setup`.
+        controller: Turns actions into thrusts; set by `setup`.
+        observation: Specs of one drone's observation; set by `setup`.
     """
 
     Options: ClassVar[type[TaskOptions]] = TaskOptions
@@ -124,17 +124,17 @@ class Task:
         raise NotImplementedError
 
     def begin(self, mask: Array, draw: Draw) -> Pose:
-        """Begin episodes: draw what they need, and say where the drones start.
+        """Begin episodes: draw their numbers, and return the starts of the drones.
 
         Args:
             mask: Worlds that begin one, bool, shape (W, A). The first call has all of them. Keep
-                what belongs to the others: `self.xp.where(mask, new, self.old)`.
+                the values of the others: `self.xp.where(mask, new, self.old)`.
             draw: Draws numbers of shape (W, A, ...).
         """
         raise NotImplementedError
 
     def observe(self, state: WorldState) -> dict[str, Array]:
-        """What the agent sees: an array (W, A, *shape) for each of `observation`, by its name.
+        """Observations: an array (W, A, *shape) for each of `observation`, by its name.
 
         Called after every step and reset. The loop copies the arrays and gives them their dtype;
         they have to lie within the bounds of their specs.
@@ -149,7 +149,7 @@ class Task:
         raise NotImplementedError
 
     def goal(self, state: WorldState) -> Array:
-        """Where the drones should be, for pictures: world frame, m, shape (W, A, 3). Optional."""
+        """Positions of the goals, for pictures: world frame, m, shape (W, A, 3). Optional."""
         raise NotImplementedError
 
 

@@ -1,4 +1,4 @@
-"""How the examination measures: answers to known forces and torques, and flights.
+"""Measurements of the examination: responses to known forces and torques, and flights.
 
 Frames: world x, y, z with z up; body x forward, y left, z up. SI units and radians throughout.
 """
@@ -32,10 +32,10 @@ __all__ = [
 Array = NDArray[np.float64]
 
 HEIGHT: Final = 1000.0
-"""Height at which flights begin, m: far enough from the floor for every one of them."""
+"""Initial height of flights, m: none of them reaches the floor."""
 
 EXACT: Final = 1e-9
-"""Tolerance where the integrator is exact: it leaves room for rounding over a flight, no more."""
+"""Tolerance where the integrator is exact: the rounding errors of a flight."""
 
 TRUNCATION: Final = 1e-6
 """Tolerance for tumbling flight, where RK4 truncates: 4e-7 rad/s in ten seconds at 10 ms for the
@@ -55,11 +55,11 @@ class Check:
     """One line of the examination."""
 
     name: str
-    """What was measured."""
+    """Name of the measured quantity."""
     expected: float
-    """The value worked out beforehand."""
+    """Expected value."""
     measured: float
-    """The value that the simulation gave."""
+    """Measured value."""
     unit: str
     """Unit of the three numbers; empty for pure numbers."""
     source: str
@@ -75,7 +75,7 @@ class Check:
 
 @dataclass(frozen=True)
 class RigidBody:
-    """What known forces and torques say of a body."""
+    """Properties of a body, identified from its response to known forces and torques."""
 
     mass_matrix: Array
     """Of the free joint, at rest and level: (6, 6), kg, kg·m, kg·m²."""

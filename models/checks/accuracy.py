@@ -1,4 +1,4 @@
-"""What an integrator and its step cost, and how true they are.
+"""Accuracy and cost of integrators and physics steps.
 
 `python -m rotorgram.models.checks.accuracy FILE.csv` writes the table that `docs/physics.md` shows.
 

@@ -1,4 +1,4 @@
-"""The physical examination: what a vehicle does, measured by flying it, against closed forms.
+"""The physical examination: simulated motions of a vehicle, compared with closed forms.
 
 Every figure is measured in simulation (accelerations under known forces and torques, positions
 after a flight). Any vehicle is held to mechanics and to what `Vehicle` derives from its compiled
@@ -42,7 +42,7 @@ _MECHANICS: Final = "rigid-body mechanics"
 
 
 def examine(vehicle: Vehicle, *, paper: bool | None = None) -> list[Check]:
-    """Fly a vehicle through the whole examination; its model is left as it was.
+    """Run the whole examination on a vehicle; its model does not change.
 
     Args:
         vehicle: Any.
@@ -83,7 +83,7 @@ def _body(vehicle: Vehicle, body: RigidBody) -> Iterator[Check]:
 
 
 def _rotors(vehicle: Vehicle, model: mujoco.MjModel, body: RigidBody) -> Iterator[Check]:
-    """What a newton of each rotor does, what limits it, and what all can do together."""
+    """Effect and limits of each rotor, and of all rotors together."""
     low, high = vehicle.thrust_low, vehicle.thrust_high
     idle = forces(vehicle, model, body, low)
     columns = []
@@ -116,7 +116,7 @@ def _free_fall(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
 
 
 def _hover(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
-    """At the hover's thrusts nothing accelerates or turns, and the craft stays where it was."""
+    """With hover thrusts the craft neither accelerates nor turns, and keeps its position."""
     data = ready(vehicle, model, vehicle.hover_thrust)
     mujoco.mj_forward(model, data)
     answer = np.array(data.qacc)
@@ -140,7 +140,7 @@ def _climb(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
 
 
 def _tumbling(vehicle: Vehicle, model: mujoco.MjModel, body: RigidBody) -> Iterator[Check]:
-    """Ten seconds of torque-free tumbling: what is conserved, and where the fall leads."""
+    """Ten seconds of torque-free tumbling: conserved quantities, and the path of the fall."""
     model = _unpowered(model)
     before, after = ready(vehicle, model), ready(vehicle, model)
     before.qvel[3:] = after.qvel[3:] = SPIN
@@ -183,7 +183,7 @@ def _linear_drag(vehicle: Vehicle, model: mujoco.MjModel, body: RigidBody) -> It
 
 
 def _unpowered(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy whose rotors do nothing, not even their least."""
+    """A copy with rotors that give no thrust, not even their least."""
     model = copy.copy(model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     return model

@@ -1,1 +1,1 @@
-"""What steps the physics of worlds."""
+"""Backends: physics engines that step worlds."""

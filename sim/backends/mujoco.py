@@ -1,7 +1,7 @@
 """MuJoCo on the threads of this machine, float64.
 
-`mujoco.batch.Batch` gives each world the bits that a loop over single ones gives it, with any
-number of threads.
+`mujoco.batch.Batch` gives each world the same bits as a loop over single worlds, with any number
+of threads.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,13 +31,13 @@ class MujocoWorld:
     """W worlds of one drone over ground of its own: `World`.
 
     MuJoCo answers a bad state with a reset and a line in MUJOCO_LOG.TXT. Here it raises
-    `PhysicsError`, because a silent reset would be learnt from, and that file is switched off for
+    `PhysicsError`, because an agent would learn from a silent reset, and switches that file off for
     the whole process; a log file of another name stays on.
 
     A single world has no leading axes: NumPy's scalars are ten times faster than its arrays of one.
 
     Args:
-        vehicle: What flies.
+        vehicle: The vehicle of every world.
         num_worlds: W.
         num_threads: Threads that step the worlds; 0 takes one for each processor.
     """
@@ -123,7 +123,7 @@ class MujocoWorld:
         return NumpyDraw(self._streams, self._ids(mask).tolist(), self.shape, chosen)
 
     def close(self) -> None:
-        """Nothing is held but memory."""
+        """Nothing to release but memory."""
 
     def _ids(self, mask: Array) -> np.ndarray:
         """Numbers of the worlds of a mask of the leading shape, or of shape (W,)."""
@@ -134,7 +134,7 @@ class MujocoWorld:
             np.divide(self._thrust, self._newtons, out=self._ctrl)
 
     def _describe_warnings(self) -> str:
-        # Take the warnings off, so that a reset gives usable worlds again.
+        # Clear the warnings, so that a reset gives usable worlds again.
         ids = np.flatnonzero(self._warnings.any(axis=1)).tolist()
         names = ", ".join(_warning_names(self._warnings.sum(axis=0).tolist()))
         self._warnings.fill(0)

@@ -28,14 +28,14 @@ FURTHEST: Final = 100.0
 stands still, because what it flies in one physics step is rounded off."""
 
 CONTACTS_PER_GEOM: Final = 4
-"""Contacts of a geom with the ground that there is memory for."""
+"""Most contacts of a geom with the ground: so many have memory."""
 
 
 def make(vehicle: Vehicle, num_worlds: int, *, device: str | None = None) -> "WarpWorld":
     """Worlds of one drone each.
 
     Args:
-        vehicle: What flies.
+        vehicle: The vehicle of every world.
         num_worlds: W.
         device: `cpu`, `cuda`, `cuda:1`...; None takes a CUDA device if there is one.
 
@@ -52,7 +52,7 @@ class WarpWorld:
     often as in the backend `mujoco`; a craft touches where there are constraints for a contact.
 
     Args:
-        vehicle: What flies.
+        vehicle: The vehicle of every world.
         num_worlds: W.
         device: As of `make`.
 
@@ -194,7 +194,7 @@ class WarpWorld:
         return torch.where(right, values, 0.0)
 
     def close(self) -> None:
-        """Let go of the graphs."""
+        """Release the graphs."""
         self._steps.clear()
 
     def _apply_thrust(self) -> None:
