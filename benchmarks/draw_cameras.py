@@ -7,21 +7,23 @@ import argparse
 from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
-from rotorgram.agents.pid import PID
-from rotorgram.envs import ElevationConfig
-from rotorgram.experiments.flights import flown_tracks
+from rotorgram.agents import PID
+from rotorgram.envs.registry import env_spec
+from rotorgram.experiments.filming import moments
+from rotorgram.experiments.trajectories import flown_trajectories
 from rotorgram.rendering import CAMERAS, Canvas, Stage
 
 WIDTH, HEIGHT = 480, 270  # of each picture
 COLUMNS, SPACE = 2, 4
 TIMES = 2  # drawn larger and reduced: smooth edges
-EPISODE, STEP = 1, 20  # on its way up to the target
+ENV = "rotorgram/Elevation-v0"
+EPISODE, STEP = 1, 20  # on its way to the goal
 
 
 def draw() -> Image.Image:
     """Two columns; the last picture is of the plain floor."""
-    config = ElevationConfig()
-    (track,) = flown_tracks(PID(config), config, [EPISODE])
+    (flown,) = flown_trajectories(PID(env_spec(ENV)), ENV, {}, [EPISODE])
+    flight = moments(flown)
     views = [("airport", camera) for camera in CAMERAS] + [("plain", "chase")]
     rows = -(-len(views) // COLUMNS)
     size = (COLUMNS * (WIDTH + SPACE) - SPACE, rows * (HEIGHT + SPACE) - SPACE)
@@ -29,7 +31,7 @@ def draw() -> Image.Image:
     for number, (world, camera) in enumerate(views):
         stage = Stage(world)
         with Canvas(stage, WIDTH * TIMES, HEIGHT * TIMES) as canvas:
-            for moment in track.moments[: STEP + 1]:
+            for moment in flight[: STEP + 1]:
                 stage.show(moment)
             picture = Image.fromarray(canvas.draw(camera)).reduce(TIMES)
         write = ImageDraw.Draw(picture)

@@ -3,16 +3,14 @@
 Run `python benchmarks/draw_drone.py`; it needs EGL (on Debian: libegl1, libgl1-mesa-dri).
 """
 
-import os
-
-os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported: it chooses once
-
 import argparse
+import os
 from pathlib import Path
 
+os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported: it chooses once
 import mujoco
 from PIL import Image
-from rotorgram.models import load_model
+from rotorgram.models import build_scene
 
 WIDTH, HEIGHT = 1200, 675
 OVERSAMPLING = 1.5  # drawn larger and reduced: smooth edges of thin arms and discs
@@ -21,9 +19,8 @@ ALTITUDE = 1.2  # m: low enough for craft and shadow to share the picture
 
 def draw() -> Image.Image:
     """The picture, WIDTH x HEIGHT, RGB: front and right side of the craft from above its level."""
-    model = load_model()
+    model = build_scene().compile()
     data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key("hover").id)
     data.qpos[2] = ALTITUDE
     mujoco.mj_forward(model, data)
     camera = mujoco.MjvCamera()

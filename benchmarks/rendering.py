@@ -2,8 +2,8 @@
 
     python benchmarks/rendering.py [--rounds 5] [--frames 20] [--out FILE.json]
 
-Every size and quality is drawn in turns; the fastest round of each counts, since whatever else the
-machine does only slows it down. The craft flies: every picture is another one.
+Every size and quality is drawn in turns; the fastest round of each counts, since other work on the
+machine only slows it down. The craft flies: every picture differs from the one before.
 """
 
 import argparse
@@ -17,16 +17,18 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-from rotorgram.agents.pid import PID
-from rotorgram.envs import ElevationConfig
-from rotorgram.experiments.filming import Film, Shot, film
-from rotorgram.experiments.flights import Track, flown_tracks
-from rotorgram.rendering import Canvas, Stage
+from rotorgram.agents import PID
+from rotorgram.envs.registry import env_spec
+from rotorgram.experiments.filming import Film, Shot, film, moments
+from rotorgram.experiments.trajectories import Trajectory, flown_trajectories
+from rotorgram.models import Vehicle
+from rotorgram.rendering import Canvas, Moment, Stage
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.rendering.overlay import Overlay
 
 SIZES = ((640, 360), (1280, 720))
-EPISODE = 1  # starts 0.75 m below its target
+ENV = "rotorgram/Elevation-v0"
+EPISODE = 1
 
 
 def rate(draw: Callable[[int], object], frames: int) -> float:
@@ -37,8 +39,8 @@ def rate(draw: Callable[[int], object], frames: int) -> float:
     return frames / (time.perf_counter() - start)
 
 
-def pictures(track: Track, rounds: int, frames: int) -> tuple[dict[str, float], str]:
-    """Pictures per second by size and quality, and who draws."""
+def pictures(flight: list[Moment], rounds: int, frames: int) -> tuple[dict[str, float], str]:
+    """Pictures per second by size and quality, and the name of the renderer."""
     rates: dict[str, float] = {}
     for _ in range(rounds):
         for width, height in SIZES:
@@ -48,7 +50,7 @@ def pictures(track: Track, rounds: int, frames: int) -> tuple[dict[str, float], 
                     renderer = driver()
 
                     def draw(number: int, stage: Stage = stage, canvas: Canvas = canvas) -> None:
-                        stage.show(track.moments[number])
+                        stage.show(flight[number])
                         canvas.draw("chase")
 
                     draw(0)
@@ -58,7 +60,7 @@ def pictures(track: Track, rounds: int, frames: int) -> tuple[dict[str, float], 
 
 
 def driver() -> str:
-    """What OpenGL calls itself."""
+    """Name of OpenGL's renderer."""
     context = offscreen_context(16, 16)
     from OpenGL.GL import GL_RENDERER, glGetString  # after the context has chosen its platform
 
@@ -68,26 +70,35 @@ def driver() -> str:
     return name
 
 
-def overlays(track: Track, rounds: int, frames: int) -> dict[str, float]:
-    """Milliseconds for what is written on a picture."""
+def overlays(flight: list[Moment], rounds: int, frames: int) -> dict[str, float]:
+    """Milliseconds for panel and graph of a picture."""
     import numpy as np
 
-    times = {}
+    times, values = {}, [moment.metrics[0].value for moment in flight]
     for width, height in SIZES:
-        overlay = Overlay(width, height, title="PID", period=0.02, seconds=5.0, band=1.0)
+        overlay = Overlay(
+            width,
+            height,
+            title="PID",
+            like=flight[0],
+            vehicle=Vehicle.load(),
+            period=0.02,
+            seconds=5.0,
+            scale=(-1.0, 1.0),
+        )
         picture = np.zeros((height, width, 3), np.uint8)
 
         def draw(number: int, overlay: Overlay = overlay, picture: Any = picture) -> None:
-            overlay.draw(picture, track.moments[number], track.errors[: number + 1])
+            overlay.draw(picture, flight[number], values[: number + 1])
 
         best = max(rate(draw, frames) for _ in range(rounds))
         times[f"{width}x{height}"] = round(1000 / best, 2)
     return times
 
 
-def whole_film(track: Track) -> dict[str, float]:
+def whole_film(flown: Trajectory) -> dict[str, float]:
     """Five seconds at 1280x720 as MP4, once."""
-    shot = Shot(name="PID", color="#B4BCC4", tracks=[track])
+    shot = Shot(name="PID", color="#B4BCC4", trajectories=[flown])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         start, spent = time.perf_counter(), time.process_time()
@@ -107,15 +118,15 @@ def main() -> None:
     default = Path("docs/results/performance/rendering.json")
     parser.add_argument("--out", type=Path, default=default)
     args = parser.parse_args()
-    config = ElevationConfig()
-    (track,) = flown_tracks(PID(config), config, [EPISODE])
-    rates, renderer = pictures(track, args.rounds, args.frames)
+    (flown,) = flown_trajectories(PID(env_spec(ENV)), ENV, {}, [EPISODE])
+    flight = moments(flown)
+    rates, renderer = pictures(flight, args.rounds, args.frames)
     result = {
         "rounds": args.rounds,
         "frames": args.frames,
         "pictures_per_second": rates,
-        "overlay_milliseconds": overlays(track, args.rounds, args.frames),
-        "film": whole_film(track),
+        "overlay_milliseconds": overlays(flight, args.rounds, args.frames),
+        "film": whole_film(flown),
         "renderer": renderer,
         "versions": {"mujoco": mujoco.__version__},
         "machine": {"processor": platform.machine(), "cores": os.cpu_count()},

@@ -61,12 +61,12 @@ def chosen_env(
     Raises:
         InputError: The options are of another task than the checkpoint's.
     """
-    if checkpoint is None or ("env" in command.given and command.env != checkpoint.env_id):
-        return command.env, command.options
-    if command.options and command.env != checkpoint.env_id:
+    if checkpoint is None or ("env" in command.given and command.env_id != checkpoint.env_id):
+        return command.env_id, command.options
+    if command.options and command.env_id != checkpoint.env_id:
         raise InputError(
             f"env: expected --env {checkpoint.env_id} with options of the task that the policy "
-            f"was trained on, got options of {command.env}"
+            f"was trained on, got options of {command.env_id}"
         )
     return checkpoint.env_id, {**checkpoint.options, **command.options}
 
@@ -100,7 +100,7 @@ def remote_env(
     env_id: str,
     options: dict[str, Any],
     *,
-    required: bool,
+    required: bool = True,
     num_envs: int = 1,
     num_simulators: int = 1,
 ) -> Iterator[Any]:
@@ -113,8 +113,8 @@ def remote_env(
         command: Says where, and with which key.
         env_id: Task.
         options: Its options that are not the default.
-        required: Whether simulators that come must fly this task with these options; otherwise the
-            first that comes decides.
+        required: Whether simulators that come must fly this task, with these options if there are
+            any; otherwise the first that comes decides.
         num_envs: Drones.
         num_simulators: Simulators to wait for.
 
@@ -124,16 +124,22 @@ def remote_env(
     if num_simulators > 1 and command.listen is None:
         raise InputError(f"num-simulators: expected 1 without --listen, got {num_simulators}")
     if command.listen is not None:
-        required_env = (env_id, options) if required else (None, None)
-        opened = _waiting(command, *required_env, num_envs, num_simulators)
+        required_env = (env_id if required else None, options or None if required else None)
+        opened = _waiting(command, required_env, num_envs, num_simulators)
     else:
         if command.key_file or command.insecure:
             raise InputError(
                 "key-file, insecure: expected them with --listen, got them for a simulator of "
                 "our own on this machine"
             )
+        from ..envs.registry import is_known
         from ..experiments.pairs import socket_pair
 
+        if not is_known(env_id):
+            raise InputError(
+                f"env: expected --env MODULE:{env_id}, for the task is not known here without the "
+                "module that registers it"
+            )
         opened = socket_pair(
             env_id, options, num_envs=num_envs, vehicle=command.vehicle, record=command.record
         )
@@ -147,8 +153,7 @@ def remote_env(
 @contextmanager
 def _waiting(
     command: AgentFlags,
-    env_id: str | None,
-    options: dict[str, Any] | None,
+    required: tuple[str | None, dict[str, Any] | None],
     num_envs: int,
     num_simulators: int,
 ) -> "Iterator[RemoteEnv | RemoteVectorEnv]":
@@ -162,8 +167,8 @@ def _waiting(
     assert command.listen is not None
     address = parse_address(command.listen)
     settings: dict[str, Any] = {
-        "env_id": env_id,
-        "options": options,
+        "env_id": required[0],
+        "options": required[1],
         "vehicle_hash": vehicle_hash,
         "connect": False,
         "connect_timeout": _CONNECT_TIMEOUT,

@@ -67,6 +67,11 @@ class EnvFlags(Command):
     options: Suppress[Fixed[dict]] = field(default_factory=dict)  # type: ignore[type-arg]
     """Options of the task. A checkpoint brings those that it was trained with."""
 
+    @property
+    def env_id(self) -> str:
+        """The task without its module."""
+        return self.env.rpartition(":")[2]
+
 
 @dataclass(frozen=True, kw_only=True)
 class AgentFlags(EnvFlags):
@@ -119,7 +124,7 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     options = {name: getattr(command.options, name) for name in names}
     checked = options_type.from_options(options)
     chosen = json.loads(json.dumps({name: getattr(checked, name) for name in names}))
-    return cast(C, replace(command, given=given, env=env_id, options=chosen))
+    return cast(C, replace(command, given=given, options=chosen))
 
 
 def _for_tyro(kind: type[Any], **namespace: Any) -> type[Any]:

@@ -78,9 +78,11 @@ def runs_folder(
                 yield folder, progress
         except BaseException:
             if any(folder.iterdir()):
-                where = f" --backend {command.backend}" if command.backend != "loky" else ""
-                where += f" --address {command.address}" if command.address else ""
-                print(f"go on with: rotorgram {name} --resume {shlex.quote(str(folder))}{where}")
+                words = ["rotorgram", *name.split(), "--resume", str(folder)]
+                for flag in ("env", "backend", "address"):
+                    if flag in command.given:
+                        words += [f"--{flag}", getattr(command, flag)]
+                print(f"go on with: {shlex.join(words)}")
             raise
 
 

@@ -62,7 +62,7 @@ class Compare(RunsFlags):
                 first_seed=self.first_seed,
                 env_steps=self.env_steps,
                 preset=self.preset,
-                env_id=self.env,
+                env_id=self.env_id,
                 options=self.options,
                 vehicle=self.vehicle,
                 snapshots=self.snapshots,

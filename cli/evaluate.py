@@ -31,8 +31,7 @@ class Evaluate(AgentFlags):
 
         check_count("episodes", self.episodes)
         checkpoint = load_checkpoint(self.policy)
-        required = checkpoint is not None or bool(self.options) or "env" in self.given
-        with remote_env(self, *chosen_env(self, checkpoint), required=required) as env:
+        with remote_env(self, *chosen_env(self, checkpoint)) as env:
             headline = Headline.of(env.env_spec)
             policy = policy_for(checkpoint, env.env_spec)
             trajectories = fly_episodes(env, policy, self.episodes, "final")

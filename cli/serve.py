@@ -31,9 +31,8 @@ class Serve(AgentFlags):
 
         check_count("episodes", self.episodes)
         checkpoint = load_checkpoint(self.policy)
-        required = checkpoint is not None or bool(self.options) or "env" in self.given
         episode = 0
-        with remote_env(self, *chosen_env(self, checkpoint), required=required) as env:
+        with remote_env(self, *chosen_env(self, checkpoint)) as env:
             policy = policy_for(checkpoint, env.env_spec)
             while self.episodes is None or episode < self.episodes:
                 with _next_simulator():

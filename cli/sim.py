@@ -53,7 +53,7 @@ class Sim(EnvFlags):
         from ..udp import LinkConfig, Simulator
 
         simulator = Simulator(
-            self.env,
+            self.env_id,
             server=parse_address(self.server),
             num_envs=self.num_envs,
             bind=parse_address(self.bind),

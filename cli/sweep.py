@@ -65,7 +65,7 @@ class Sweep(RunsFlags):
                 env_steps=self.env_steps,
                 num_envs=self.num_envs,
                 episodes=self.episodes,
-                env_id=self.env,
+                env_id=self.env_id,
                 options=self.options,
                 vehicle=self.vehicle,
                 **self.workers(),

@@ -26,7 +26,7 @@ EPISODES: Final = "episodes.csv"
 _FREE: Final = ("resume", "listen", "num_simulators", "key_file", "insecure", "record",
                 "store_every", "env", "vehicle")  # fmt: skip
 """Flags that a resumed training may be given."""
-_UPDATE_WITHIN: Final = 0.7  # s
+_UPDATE_WITHIN: Final = 2.0  # s
 _SHOW_EVERY: Final = 0.2  # s
 _LEAST_STEPS: Final = 16  # of each drone for an update of A2C
 _LEAST_UPDATES: Final = 30  # of VPG
@@ -118,7 +118,7 @@ class Train(AgentFlags):
                     f"{folder} holds one of {kept.algorithm}"
                 )
             refuse_settings(self, folder, free=("algorithm", *_FREE))
-            if "env" in self.given and self.env != kept.env_id:
+            if "env" in self.given and self.env_id != kept.env_id:
                 raise InputError(f"resume: expected --env {kept.env_id}, got {self.env}")
             if is_finished(kept):
                 print(

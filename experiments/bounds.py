@@ -1,6 +1,6 @@
 """Bounds of the elevation task: the largest return, and that of hovering in place.
 
-**Time-optimal flight.** From rest at the start to rest on the target in the least time that
+**Time-optimal.** From rest at the start to rest on the target in the least time that
 gravity and the action's limits allow. For a double integrator, and for one whose acceleration has a
 limited change per step, that is bang-bang control: everything towards the target up to one moment,
 everything against it up to a second, and, where the change of thrust is limited, everything back to
@@ -9,7 +9,7 @@ bisection within bisection. They may lie inside a control step; that step gets t
 The thrust is exact, the model is free of noise and the first step already knows the target: an
 agent comes near this return and does not exceed it by more than what one control step is worth.
 
-**Hover in place.** The thrust stays at hover: E stays what it was at the start.
+**Hover.** The thrust stays at hover: E stays what it was at the start.
 """
 
 from typing import Any, Final
@@ -52,8 +52,8 @@ def elevation_bounds(
     )
     fastest = elevation_reward(left).sum(axis=1)
     return {
-        "time-optimal flight": float(fastest.mean()),
-        "hover in place": float((steps * elevation_reward(starts)).mean()),
+        "time-optimal": float(fastest.mean()),
+        "hover": float((steps * elevation_reward(starts)).mean()),
     }
 
 

@@ -50,11 +50,14 @@ class _Exists(InputError):
 def _make(folder: Path) -> None:
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"out: cannot make {folder.parent}: {error.strerror}") from None
+    try:
         folder.mkdir()  # atomic: of two processes one succeeds
     except FileExistsError:
         raise _Exists(f"out: expected a new folder, {folder} exists already") from None
     except OSError as error:
-        raise InputError(f"out: cannot make the folder {folder}: {error.strerror}") from None
+        raise InputError(f"out: cannot make {folder}: {error.strerror}") from None
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, get_args
 import numpy as np
 
 from ..models.errors import require
-from .claims import OURS, Outcome, Verdict
+from .claims import MIN_SEEDS, OURS, Outcome, Verdict
 from .curves import AVERAGING_SHARE, Curves, Fan
 from .metrics import Headline, Spread
 from .palette import agent_color, agent_label, sort_agents
@@ -150,6 +150,9 @@ def _outcome(
              for name in get_args(Outcome) if counts[name]]  # fmt: skip
     if paper:
         parts.append(f"of the paper's {len(paper)} claims, {_listed(found)}")
+    most = int(table["seeds"].max())
+    if paper and most < MIN_SEEDS:
+        parts.append(f"{most} seed{'s' * (most != 1)} decide no claim, that takes {MIN_SEEDS}")
     text = "; ".join(parts) + "."
     return text[0].upper() + text[1:]
 

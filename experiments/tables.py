@@ -33,20 +33,26 @@ NOTHING: Final = "–"
 
 def headings(headline: Headline, short: bool = False) -> tuple[str, ...]:
     """Headings of the columns; short ones, in lines, for the terminal."""
-    size, unit, goal = headline.size_symbol, headline.labelled("Overshoot"), headline.held_text
+    size, goal = headline.size_symbol, headline.held_text
     settled = headline.metric.settled
     if short:
-        settling = "Settling\n(s)"
-        texts = (headline.labelled(f"Steady\n{size}"), "Hold\nit", settling, unit)
-        texts = (*texts, "Return", f"Env steps to\n{goal}", "Env\nsteps/s")
-        return ("Agent", *(text.replace("Overshoot (", "Overshoot\n(") for text in texts))
+        return (
+            "Agent",
+            headline.labelled(f"Steady\n{size}"),
+            "Hold\nit",
+            "Settling\n(s)",
+            headline.labelled("Overshoot\n").replace("\n ", "\n").rstrip(),
+            "Return",
+            f"Env steps to\n{goal}",
+            "Env\nsteps/s",
+        )
     band = f" to {headline.amount(f'{settled:.2g}')}" if settled is not None else ""
     return (
         "Agent",
         headline.labelled(f"Steady {size}"),
         f"Seeds that hold {goal}" if goal else "Seeds that hold",
         f"Settling{band} (s)",
-        unit,
+        headline.labelled("Overshoot"),
         "Return",
         f"Env steps to {goal}" if goal else "Env steps to hold",
         "Env steps per s",
@@ -71,7 +77,10 @@ def table_note(headline: Headline) -> str:
     if settled is not None and not headline.high:
         band = headline.amount(f"{settled:.2g}")
         parts.append(f"Settling: until {size} stays below {band}, over the episodes that settle.")
-    parts.append("A crashed episode counts with what was flown of it and has not settled.")
+    parts.append(
+        "A crashed episode counts with what was flown of it and has not settled. Bounds: the "
+        "time-optimal flight of the same episodes, and thrust that stays at hover."
+    )
     return " ".join(parts)
 
 
@@ -92,8 +101,10 @@ def terminal_table(table: "pd.DataFrame", headline: Headline) -> Table:
         caption="Below a value: its 95 % interval, and how many episodes (or seeds) got there.",
         caption_justify="left",
     )
-    for place, heading in enumerate(headings(headline, short=True)):
-        shown.add_column(heading, justify="left" if place == 0 else "right", overflow="fold")
+    first, *others = headings(headline, short=True)
+    shown.add_column(first, no_wrap=True)
+    for heading in others:
+        shown.add_column(heading, justify="right", overflow="fold")
     for row in result_rows(table):
         shown.add_row(*(_terminal_cell(cell) for cell in row), end_section=True)
     return shown
@@ -115,7 +126,7 @@ def _row(agent: str, row: Mapping[str, Any]) -> tuple[Cell, ...]:
     if not seeds:
         nothing = (Cell(NOTHING),)
         value = Cell(number_text(row["return"]))
-        return (Cell(agent, ("not flown",)), *nothing * 4, value, *nothing * 2)
+        return (Cell(agent, ("bound",)), *nothing * 4, value, *nothing * 2)
     crashed = (f"{int(row['crashed'])} of {episodes} crashed",) if row["crashed"] else ()
     settled = (f"{int(row['settled'])} of {episodes} settled",)
     reached: tuple[str, ...] = ()

@@ -109,10 +109,9 @@ class Moment:
         decimals = max(0, 2 - math.floor(math.log10(thrust_high * scale)))
         rotors = len(self.thrusts)
         name = f"F1 to F{rotors}" if rotors > 1 else "F1"
+        shown = self.thrusts
         if rotors > _MOST_THRUSTS:
-            name, shown = f"{name}, mean", (float(np.mean(self.thrusts)),)
-        else:
-            shown = self.thrusts
+            name, shown = f"{name}, mean", (float(np.mean(shown)),)
         thrusts = " ".join(f"{scale * thrust:.{decimals}f}" for thrust in shown)
         lines += [
             (name, f"{thrusts} {unit}"),

@@ -145,7 +145,7 @@ def _write(folder, agents, seeds, env_steps, length, episodes, evaluations, step
         "num_envs": 1,
         "spec": json.loads(spec_of(length=length).to_json()),
         "vehicle": None,
-        "bounds": {"time-optimal flight": 95.0},
+        "bounds": {"time-optimal": 95.0},
         "agents": dict.fromkeys(agents, settings),
         "versions": {"rotorgram": "0.1.0", "mujoco": "4.0.0"},
         "machine": {"platform": "Linux", "processor": "some <processor>", "cores": 2},

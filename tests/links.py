@@ -1,72 +1,78 @@
-"""What the tests of both state machines share: messages, links, and how to drive them."""
+"""What the tests of both state machines share: messages, layouts, both sides, and a network."""
 
-import zlib
-from collections.abc import Callable, Iterable
+import random
+from collections.abc import Callable
+from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
-from rotorgram.udp import LinkConfig, binary
-from rotorgram.udp.agent_link import AgentLink
-from rotorgram.udp.keys import OVERHEAD, Key, is_sealed
-from rotorgram.udp.link import Address
-from rotorgram.udp.messages import (
+from rotorgram.udp.protocol import binary
+from rotorgram.udp.protocol.auth import Key
+from rotorgram.udp.protocol.client import Address, Client, LinkConfig
+from rotorgram.udp.protocol.layout import ArrayLayout, Layout
+from rotorgram.udp.protocol.messages import (
+    FLY,
     Close,
     Command,
     Hello,
     Message,
+    Missing,
     Refuse,
     State,
     Unknown,
     Wait,
     Welcome,
 )
-from rotorgram.udp.simulator_link import SimulatorLink
+from rotorgram.udp.protocol.server import Event, Server
 
 SESSION, OTHER, NONCE = 77, 78, 99
 HERE, STRANGER = ("127.0.0.1", 8000), ("127.0.0.1", 9999)
-CONFIG = LinkConfig(timeout=10, first_resend=0.2, min_resend=0.01, max_resend=1.0)
+CONFIG = LinkConfig(timeout=10)
 SECRET = bytes(range(32))
 CAUSES = {"malformed", "forged", "foreign", "refused", "duplicate", "stale"}
 SHARED = {Hello, Welcome, Refuse, Wait, Unknown}
 """Sealed with the shared key; all else with that of the session."""
 
 
-def hello(**changes: object) -> Hello:
-    fields: dict[str, object] = {
-        "session": SESSION,
-        "env_id": "a/B-v0",
-        "num_drones": 1,
-        "observation_low": np.array([-9], np.float32),
-        "observation_high": np.array([9], np.float32),
-        "action_low": np.array([-1], np.float32),
-        "action_high": np.array([1], np.float32),
-        "discrete_actions": 0,
-        "control_period": 0.02,
-        "model_hash": "0" * 32,
-        "telemetry_names": (),
-        "options": "",
-    }
-    return Hello(**{**fields, **changes})  # type: ignore[arg-type]
-
-
-def state(sequence: int, session: int = SESSION, value: float = 0.0, size: int = 1) -> State:
-    return State(
-        session=session,
-        sequence=sequence,
-        observations=np.full((1, size), value, np.float32),
-        rewards=np.zeros(1),
-        terminated=np.zeros(1, bool),
-        truncated=np.zeros(1, bool),
-        telemetry=np.zeros((1, 0)),
+def layout(drones: int = 1, size: int = 1, telemetry: tuple[tuple[int, ...], ...] = ()) -> Layout:
+    return Layout(
+        drones=drones,
+        observation=(ArrayLayout(shape=(size,)),),
+        action=ArrayLayout(shape=(size,)),
+        telemetry=telemetry,
     )
 
 
-def command(sequence: int, session: int = SESSION, value: float = 0.0, size: int = 1) -> Command:
+ONE = layout()
+
+
+def hello(session: int = SESSION, **changes: Any) -> Hello:
+    return Hello(**{"session": session, "spec": '{"env_id":"a/B-v0"}', **changes})
+
+
+def state(
+    sequence: int, session: int = SESSION, value: float = 0.0, of: Layout = ONE, nonce: int = NONCE
+) -> State:
+    n = of.drones
+    return State(
+        session=session,
+        sequence=sequence,
+        time=0.0,
+        nonce=nonce if sequence == 1 else 0,
+        observations=tuple(np.full((n, *a.shape), value).astype(a.dtype) for a in of.observation),
+        rewards=np.zeros(n),
+        terminated=np.zeros(n, bool),
+        truncated=np.zeros(n, bool),
+        telemetry=tuple(np.zeros((n, *shape)) for shape in of.telemetry),
+    )
+
+
+def command(sequence: int, session: int = SESSION, value: float = 0.0, of: Layout = ONE) -> Command:
     return Command(
         session=session,
         sequence=sequence,
-        actions=np.full((1, size), value, np.float32),
-        resets=np.zeros(1, bool),
+        actions=np.full(of.actions.shape, value).astype(of.actions.dtype),
+        orders=np.full(of.drones, FLY, np.uint8),
     )
 
 
@@ -74,22 +80,38 @@ def close(sequence: int, session: int = SESSION, reason: str = "bye") -> Close:
     return Close(session=session, sequence=sequence, reason=reason)
 
 
-def unknown(sequence: int, session: int = SESSION) -> Unknown:
-    return Unknown(session=session, sequence=sequence)
-
-
 WELCOME = Welcome(session=SESSION, nonce=NONCE)
-REFUSE = Refuse(session=SESSION, reason="busy")
-WAIT = Wait(session=SESSION)
-ENDED = "the agent has closed"
 
 
-def simulator(*, key: Key | None = None, **changes: object) -> SimulatorLink:
-    return SimulatorLink(hello(**changes), CONFIG, key=key, draw_session=lambda: OTHER)
+def simulator(
+    *, of: Layout = ONE, sealed: bool = False, config: LinkConfig = CONFIG, **rest: Any
+) -> Client:
+    key = Key(SECRET, "simulator") if sealed else None
+    said = rest.pop("said", hello())
+    return Client(said, of, config, key=key, **{"draw_session": lambda: OTHER, **rest})
 
 
-def agent(refusal: str = "", *, places: int = 1, key: Key | None = None) -> AgentLink:
-    return AgentLink(lambda _: refusal, (1, 0), places=places, key=key, draw_nonce=lambda: NONCE)
+def agent(
+    refusal: str = "", *, of: Layout = ONE, sealed: bool = False, slots: int = 1, **rest: Any
+) -> Server:
+    keys = [Key(SECRET, "agent")] if sealed else []
+    rest = {"draw_nonce": lambda: NONCE, "text_layout": lambda: ONE, **rest}
+    return Server(lambda _: refusal or of, slots=slots, keys=keys, **rest)
+
+
+def send_state(link: Client, value: float, now: float) -> State:
+    """The next State of a client, every number of its observation the same."""
+    s = state(1, value=value, of=link.layout)
+    return link.send_state(
+        0.0, s.observations, s.rewards, s.terminated, s.truncated, s.telemetry, now
+    )
+
+
+def send_command(server: Server, slot: int, value: float, now: float) -> None:
+    session = server.slots[slot]
+    assert session is not None
+    c = command(1, value=value, of=session.layout)
+    server.send_command(slot, c.actions, c.orders, None, now)
 
 
 class Wire:
@@ -100,204 +122,80 @@ class Wire:
 
     def __call__(self, message: Message, asked: bytes = b"") -> bytes:
         """As an answer to a State, if it is an Unknown."""
-        datagram = binary.encode(message)
+        datagram = binary.encode(message, ONE)
         if self.key is None:
             return datagram
-        if type(message) in SHARED:
+        if type(message) in SHARED or (isinstance(message, Missing) and not message.sequence):
             return self.key.seal(datagram, asked if isinstance(message, Unknown) else b"")
         return self.key.for_session(message.session, NONCE).seal(datagram)
 
 
-def dropped(link: SimulatorLink | AgentLink) -> dict[str, int]:
+def dropped(link: Client | Server) -> dict[str, int]:
     return {cause: n for cause, n in link.statistics.counters.items() if cause in CAUSES and n}
 
 
-# ---- a simulator in each of its states
+Fate = Callable[[bytes], list[tuple[float, bytes]]]
+"""What becomes of a datagram: delays, s, and bytes."""
 
 
-def to_hello(link: SimulatorLink, wire: Wire) -> None:
-    link.connect(0.0)
+class Pair:
+    """A simulator and an agent joined by a network, with a clock of its own.
+
+    The simulator counts its steps in its observation, the agent its choices in its action.
+    """
+
+    def __init__(self, client: Client, server: Server, fate: Fate, peer: Address = HERE) -> None:
+        self.client, self.server, self.fate, self.peer = client, server, fate, peer
+        self.now = 0.0
+        self.steps: list[float] = []
+        """Actions in the order in which the simulator stepped them."""
+        self.seen: list[float] = []
+        """Observations in the order in which the agent took them."""
+        self.sent = 0
+        self._order = 0
+        self._flying: list[tuple[float, int, str, bytes]] = []
+
+    def run(self, steps: int) -> None:
+        self.client.connect(self.now)
+        while len(self.steps) < steps:
+            self._send()
+            timer = self.client.next_timer()
+            assert timer is not None or self._flying, "nothing will ever happen"
+            if self._flying and (timer is None or self._flying[0][0] <= timer):
+                self._arrive()
+            else:
+                assert timer is not None
+                self.now = max(self.now, timer)
+                assert self.client.handle_timer(self.now), "silent"
+
+    def _send(self) -> None:
+        for datagram in self.client.take_outgoing():
+            self._put("agent", datagram)
+        for datagram, _ in self.server.take_outgoing():
+            self._put("simulator", datagram)
+
+    def _put(self, to: str, datagram: bytes) -> None:
+        self.sent += 1
+        for delay, bytes_ in self.fate(datagram):
+            self._order += 1
+            heappush(self._flying, (self.now + delay, self._order, to, bytes_))
+
+    def _arrive(self) -> None:
+        self.now, _, to, datagram = heappop(self._flying)
+        if to == "agent":
+            event = self.server.receive(datagram, self.peer, self.now)
+            if isinstance(event, Event) and isinstance(event.message, State):
+                self.seen.append(float(event.message.observations[0].flat[0]))
+                send_command(self.server, event.slot, len(self.seen), self.now)
+            return
+        message = self.client.receive(datagram, self.now)
+        if isinstance(message, Command):
+            self.steps.append(float(message.actions.flat[0]))
+        if isinstance(message, Command | Welcome):
+            send_state(self.client, len(self.steps), self.now)
 
 
-def to_ready(link: SimulatorLink, wire: Wire) -> None:
-    to_hello(link, wire)
-    link.receive(wire(WELCOME), 0.0)
-
-
-def to_waiting(link: SimulatorLink, wire: Wire) -> None:
-    to_ready(link, wire)
-    link.send_state(state(1), 0.0)
-
-
-def to_ready_again(link: SimulatorLink, wire: Wire) -> None:
-    to_waiting(link, wire)
-    link.receive(wire(command(1)), 0.0)
-
-
-def to_closing(link: SimulatorLink, wire: Wire) -> None:
-    to_waiting(link, wire)
-    link.close("bye", 0.0)
-
-
-def to_closed(link: SimulatorLink, wire: Wire) -> None:
-    to_waiting(link, wire)
-    link.receive(wire(close(1)), 0.0)
-
-
-SIMULATOR_STATES: dict[str, Callable[[SimulatorLink, Wire], None]] = {
-    "hello": to_hello,
-    "ready": to_ready,
-    "waiting": to_waiting,
-    "ready 1": to_ready_again,
-    "closing": to_closing,
-    "closed": to_closed,
-}
-SIMULATOR_EVENTS: dict[str, Message] = {
-    "Welcome": WELCOME,
-    "Refuse": REFUSE,
-    "Wait": WAIT,
-    "Unknown 0": unknown(0),
-    "Unknown 1": unknown(1),
-    "Unknown 2": unknown(2),
-    "Command 0": command(0),
-    "Command 1": command(1),
-    "Command 2": command(2),
-    "Command 1, two numbers": command(1, size=2),
-    "Close 0": close(0),
-    "Close 1": close(1),
-    "Close 2": close(2),
-    "Hello": hello(),
-    "State 1": state(1),
-    "Welcome of another": Welcome(session=OTHER, nonce=NONCE),
-    "Command 1 of another": command(1, session=OTHER),
-    "Close 1 of another": close(1, session=OTHER),
-    "Unknown 1 of another": unknown(1, session=OTHER),
-}
-
-
-# ---- an agent in each of its states
-
-AGENT_STATES: dict[str, list[Any]] = {
-    "free": [],
-    "welcomed": [hello()],
-    "deciding": [hello(), state(1)],
-    "expecting": [hello(), state(1), command(1)],
-    "closing": [hello(), state(1), command(1), "close"],
-    "ended": [hello(), state(1), close(1)],
-    "silent": [hello(), state(1), command(1), "free"],
-    "full": ["other"],
-    "full, waits": ["other", hello()],
-    "closed": ["close"],
-    "welcomed, closed": [hello(), "close"],
-    "refusing": ["refuse"],
-    "welcomed, refusing": [hello(), "refuse"],
-}
-AGENT_EVENTS: dict[str, Message] = {
-    "Hello": hello(),
-    "new Hello": hello(session=OTHER),
-    "State 0": state(0),
-    "State 1": state(1),
-    "State 1, two numbers": state(1, size=2),
-    "State 2": state(2),
-    "State 3": state(3),
-    "new State 1": state(1, session=OTHER),
-    "Close 0": close(0),
-    "Close 1": close(1),
-    "Close 2": close(2),
-    "Close 3": close(3),
-    "Close 1 of another": close(1, session=OTHER),
-    "Command 1": command(1),
-    "Command 1 of another": command(1, session=OTHER),
-    "Welcome": WELCOME,
-    "Wait of another": Wait(session=OTHER),
-}
-LINE, COMMAND_LINE = b"1,0.0,0,0,0.0", b"1,0.0"
-
-
-def drive(link: AgentLink, steps: Iterable[Any], wire: Wire, address: Address = HERE) -> None:
-    """Bring an agent into a state by what a simulator at that address sends, and what it does."""
-    for step in steps:
-        if isinstance(step, Command):
-            link.send_command(0, step, 0.0)
-        elif step == "close":
-            link.close("bye", 0.0)
-        elif step == "free":
-            link.free(0)
-        elif step == "other":
-            drive(link, [hello(session=5), state(1, session=5)], wire, STRANGER)
-        elif step == "no text":
-            link.takes_text = False
-        elif step == "refuse":
-            link._accept = lambda _: "busy"
-        else:
-            link.receive(wire(step), address, 0.0)
-
-
-def state_of(link: AgentLink, address: Address = HERE) -> str:
-    return next((s.state for s in link.places if s and s.peer == address), "free")
-
-
-# ---- what attackers need
-
-ANYWHERE = ("10.6.6.6", 666)
-
-
-def fixed(datagram: bytes) -> bytes:
-    """With its checksum made right, behind whatever seal it has."""
-    at = OVERHEAD if is_sealed(datagram) else 0
-    head, body = datagram[: at + 4], datagram[at + 8 :]
-    if len(datagram) < at + 24:
-        return datagram
-    return head + zlib.crc32(body, zlib.crc32(head[at:])).to_bytes(4, "little") + body
-
-
-def of_agent(link: AgentLink) -> object:
-    """All that a datagram may change, but for what is remembered of those who come."""
-    return link.closed, [
-        s and (s.peer, s.number, s.state, s.sequence, s.reply, s.asked_at) for s in link.places
-    ]
-
-
-def of_simulator(link: SimulatorLink) -> object:
-    numbers = (link._sent_at, link._resend_at, link._deadline, link._smoothed, link._variation)
-    return link.state, link.sequence, link.hello.session, link.sends, link._outstanding, numbers
-
-
-def pair(sealed: bool, session: int = 77) -> tuple[SimulatorLink, AgentLink]:
-    keys: list[Any] = [Key(SECRET, side) if sealed else None for side in ("simulator", "agent")]
-    numbers = iter(range(1000, 2000))
-    link = SimulatorLink(
-        hello(session=session), LinkConfig(), key=keys[0], draw_session=lambda: next(numbers)
-    )
-    return link, new_agent(keys[1])
-
-
-def new_agent(key: Key | None) -> AgentLink:
-    return AgentLink(lambda _: "", (1, 0), key=key)
-
-
-def only(outgoing: list[Any]) -> bytes:
-    (first,) = outgoing
-    return first if isinstance(first, bytes) else first[0]
-
-
-def begin(link: SimulatorLink, agent: AgentLink) -> tuple[bytes, bytes]:
-    """To State 1, which is not delivered; the Hello and the State."""
-    if not link.sends:
-        link.connect(0.0)
-    greeting = only(link.take_outgoing())
-    agent.receive(greeting, HERE, 0.0)
-    link.receive(only(agent.take_outgoing()), 0.0)
-    link.send_state(state(1, link.hello.session), 0.0)
-    return greeting, only(link.take_outgoing())
-
-
-def step(link: SimulatorLink, agent: AgentLink, datagram: bytes) -> bytes:
-    """The Command for a State, and the next State."""
-    event = agent.receive(datagram, HERE, 0.0)
-    assert event is not None
-    answer = command(event.message.sequence, event.message.session)
-    agent.send_command(event.place, answer, 0.0)
-    assert isinstance(link.receive(only(agent.take_outgoing()), 0.0), Command)
-    link.send_state(state(link.sequence + 1, link.hello.session), 0.0)
-    return only(link.take_outgoing())
+def lossy(share: float, delay: float = 1e-3, seed: int = 1) -> Fate:
+    """Loses a share of all datagrams; the others take `delay`, s."""
+    dice = random.Random(seed)
+    return lambda datagram: [] if dice.random() < share else [(delay, datagram)]

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
@@ -19,7 +20,7 @@ from rotorgram.cli._flags import AlgorithmName, PresetName, parse
 from rotorgram.cli._scalars import ScalarWriter
 from rotorgram.cli.serve import Serve
 from rotorgram.cli.sim import Sim
-from rotorgram.experiments.results import read_steps
+from rotorgram.experiments.results import read_results, read_steps
 from rotorgram.models import QUAD_XML
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -36,13 +37,29 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
 
 def start(*arguments: object) -> subprocess.Popen[str]:
     """A command in a process of its own, in a terminal's process group of its own."""
-    return subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-P", "-m", "rotorgram.cli", *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
     )
+    started.append(process)
+    return process
+
+
+started: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(autouse=True)
+def _nothing_runs_on() -> Iterator[None]:
+    """After a test that failed, too."""
+    yield
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+    started.clear()
 
 
 def free_port() -> int:
@@ -72,7 +89,7 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["train", "a2c", "--set", "gamma=" + 9999 * "["], "gamma: expected a number from 0 to 1"),
         (["train", "vpg", "--listen", "8001"], "address: expected HOST:PORT"),
         (["train", "vpg", "--listen", "192.0.2.1:8001"], "is not a loopback address"),
-        (["train", "vpg", "--resume", "nowhere"], "checkpoint: no file"),
+        (["train", "vpg", "--resume", "nowhere"], "nowhere: cannot be written: No such file"),
         (["sim", "--server", "127.0.0.1:99999"], "address: expected HOST:PORT"),
         (["sim", "--bind", "127.0.0.1:0", "--env.target", "1"], "target: expected"),
         (["sim", "--env", "rotorgram/Nothing-v0"], "env: expected a registered id"),
@@ -84,7 +101,7 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["report", "nowhere"], "nowhere"),
         (["check-model", "nowhere.xml"], "vehicle: cannot read nowhere.xml"),
         (["sim", "--num-envs", "0", "--bind", "127.0.0.1:0"], "num_envs: expected 1 to 65536"),
-        (["sim", "--num-envs", "2", "--codec", "text"], "codec: expected 'binary' for 2 drones"),
+        (["sim", "--num-envs", "2", "--codec", "text"], "text codec: expected one drone, got 2"),
         (["sim", "--key-file", "nowhere"], "key file: cannot read nowhere"),
         (["train", "a2c", "--key-file", "nowhere"], "key-file, insecure: expected them with"),
         (["train", "a2c", "--store-every", "0"], "store-every: expected seconds > 0, got 0"),
@@ -165,6 +182,38 @@ def test_requirements_of_a_task_that_is_not_known_here() -> None:
     command = parse(Serve, "rotorgram serve", [*words, "--env.track", "long", "--episodes", "2"])
     assert (command.env, command.episodes) == ("other/Race-v3", 2)
     assert command.options == {"num_gates": 3, "wind": [0.5, 1], "track": "long"}
+
+
+TASK = """
+from rotorgram.envs import register
+from rotorgram.envs.tasks.elevation import Elevation
+
+
+class Low(Elevation):
+    pass
+
+
+register("Low-v0", Low)
+"""
+
+
+def test_a_task_of_the_working_directory(tmp_path: Path) -> None:
+    """It trains and flies; an agent that lacks its file serves it."""
+    (tmp_path / "low_task.py").write_text(TASK)
+    env = "--env low_task:Low-v0 --env.target 4"
+    done = shell(f"cd {tmp_path} && rotorgram train a2c {env} --env-steps 300 --out run")
+    assert done.returncode == 0, done.stderr
+    kept = load(tmp_path / "run" / "checkpoint.safetensors")
+    assert (kept.env_id, kept.options["target"]) == ("Low-v0", 4.0)
+    done = shell(f"rotorgram evaluate {tmp_path}/run --episodes 1")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "expected --env MODULE:Low-v0" in done.stderr
+    agent = start("serve", tmp_path / "run", "--listen", "127.0.0.1:0", "--episodes", 1)
+    assert agent.stdout is not None
+    server = agent.stdout.readline().split()[5]
+    done = shell(f"cd {tmp_path} && rotorgram sim {env} --bind 127.0.0.1:0 --server {server}")
+    assert done.returncode == 0, done.stderr
+    assert "episode 0: return" in agent.communicate(timeout=30)[0]
 
 
 @pytest.mark.parametrize("words", [["--help"], ["sim", "--help"], ["sim", "--speed", "2"]])
@@ -336,7 +385,7 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     assert len(pd.read_csv(folder / "episodes.csv")) >= 20
     status, out, _ = run(capsys, "evaluate", folder / "checkpoint.safetensors", "--episodes", 3)
     assert status == 0
-    assert "episodes          3" in out
+    assert "episodes   3, " in out
     assert run(capsys, "evaluate", folder, "--episodes", 1, "--env.linear-drag", 0.5)[0] == 0
     for changes, sentence in (
         (["vpg"], "resume: expected a training of vpg"),
@@ -479,9 +528,9 @@ def test_compare_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture
     )  # fmt: skip
     assert status == 0
     assert f"report: {folder / 'report.html'}" in out.replace("\n", "")
-    records = read_records(folder)
-    assert sorted(set(records.runs.agent)) == ["a2c", "sb3-a2c", "vpg"]
-    assert sorted(set(records.evaluations.agent)) == ["a2c", "pid", "sb3-a2c", "vpg"]
+    results = read_results(folder)
+    assert sorted(set(results.runs.agent)) == ["a2c", "sb3-a2c", "vpg"]
+    assert sorted(set(results.evaluations.agent)) == ["a2c", "pid", "sb3-a2c", "vpg"]
     steps = read_steps(folder, "train", columns=("agent", "step", "error"))
     assert (steps.agent == "a2c").sum() == 1100
     assert steps[steps.agent == "vpg"].step.tolist() == list(range(1, 1101))
@@ -527,7 +576,7 @@ def test_an_interrupted_comparison_goes_on(
     assert status == 1
     assert "got others by --seeds" in err
     assert run(capsys, "compare", "--resume", folder, "--jobs", 1, "--no-film")[0] == 0
-    assert read_records(folder).runs.seed.tolist() == [0, 1, 2]
+    assert read_results(folder).runs.seed.tolist() == [0, 1, 2]
     assert first.splitlines()[1] in (folder / "evaluations.csv").read_text()
     assert not (folder / "parts").exists()
     status, _, err = run(capsys, "compare", "--resume", folder)

@@ -9,6 +9,7 @@ from typing import Any
 import golden
 import numpy as np
 import pytest
+import state_tables
 from rotorgram.envs.spec import EnvSpec
 from rotorgram.udp.protocol import binary, text
 from rotorgram.udp.protocol.auth import Key
@@ -197,3 +198,9 @@ def test_text_lines() -> None:
         with pytest.raises(DecodeError):
             text.decode_command(line.encode(), layout, 0)
     assert np.signbit(first.observations[0][0, 1])
+
+
+def test_the_tables_of_states_are_those_of_the_code() -> None:
+    page = state_tables.PAGE.read_text("utf-8")
+    assert page == state_tables.page(), "run python tests/state_tables.py"
+    assert "| waiting | received | Command | ready |" in page

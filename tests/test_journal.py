@@ -89,7 +89,10 @@ def pair(
     if key_file:
         write_key(key_file)
     known = options if codec == "text" else None
-    common: dict[str, Any] = {"options": known, "connect": False, "key_file": key_file, **TIMES}
+    env_id = ENV_ID if codec == "text" else None
+    common: dict[str, Any] = {
+        "env_id": env_id, "options": known, "connect": False, "key_file": key_file, **TIMES
+    }  # fmt: skip
     remote: Any
     if drones == 1:
         remote = RemoteEnv(ANY, record=files["agent"], **common)
@@ -227,16 +230,13 @@ def test_nothing_that_a_journal_names_is_imported(
     assert verify(path).identical
 
 
-def changed_spec(
-    change: Callable[[dict[str, Any]], dict[str, Any]],
-) -> Callable[[Message], Message]:
-    """Changes the spec of every Hello."""
+def changed_spec(**values: Any) -> Callable[[Message], Message]:
+    """Changes fields of the spec of every Hello."""
 
     def changed(message: Message) -> Message:
         if not isinstance(message, Hello):
             return message
-        spec = json.loads(message.spec)
-        return replace(message, spec=json.dumps(spec | change(spec)))
+        return replace(message, spec=json.dumps(json.loads(message.spec) | values))
 
     return changed
 
@@ -389,7 +389,9 @@ def test_simulators_that_come_and_go(tmp_path: Path) -> None:
 
 def test_text_simulators_one_after_another_are_sessions_of_their_own(tmp_path: Path) -> None:
     path = tmp_path / "agent.mcap"
-    with RemoteEnv(ANY, connect=False, record=path, timeout=1, connect_timeout=2) as remote:
+    with RemoteEnv(
+        ANY, env_id=ENV_ID, connect=False, record=path, timeout=1, connect_timeout=2
+    ) as remote:
         for seed in (1, 2):
             simulator = Simulator(server=remote.address, bind=ANY, codec="text", config=QUICK)
             running = Running(simulator)
@@ -430,12 +432,14 @@ def test_several_simulators_at_once(tmp_path: Path) -> None:
 
 def test_an_agent_that_was_started_anew(tmp_path: Path) -> None:
     path = tmp_path / "simulator.mcap"
-    first = RemoteEnv(ANY, connect=False, **TIMES)
-    address = first.address
+    killed = launch(RECORD, 0, tmp_path / "killed.mcap", 20, "wait")
+    assert killed.stdout is not None
+    address = "127.0.0.1", int(killed.stdout.readline())
     running = Running(Simulator(server=address, bind=ANY, config=QUICK, record=path))
-    fly(first, 20)
-    first._server.close.detach()  # as if it were killed
-    first._server._port.close()
+    while not killed.stdout.readline().startswith("flown"):
+        pass
+    killed.kill()
+    killed.communicate()
     with RemoteEnv(address, connect=False, **TIMES) as second:
         fly(second, 20)
     running.join()
@@ -455,8 +459,7 @@ def test_loss_and_repetition_do_not_enter(tmp_path: Path) -> None:
     with Relay(ANY, remote.address, faults) as relay:
         thread = threading.Thread(target=relay.run)
         thread.start()
-        config = LinkConfig(timeout=5, first_resend=0.01)
-        running = Running(Simulator(server=relay.address, bind=ANY, config=config, record=theirs))
+        running = Running(Simulator(server=relay.address, bind=ANY, config=QUICK, record=theirs))
         fly(remote, 200)
         remote.close()
         running.join()
@@ -755,6 +758,9 @@ RECORD = """
             remote.reset()
         if step % 50 == 0:
             print("step", time.time_ns(), flush=True)
+    print("flown", flush=True)
+    if sys.argv[4:]:
+        time.sleep(60)
 """
 
 

@@ -1,277 +1,517 @@
-"""Both state machines without sockets: every pair of state and datagram.
-
-`test_link_cases.py` has what no table shows, `test_link_times.py` the timers, `test_link_world.py`
-joins the two by a bad network, and `test_link_hostile.py` and `test_link_anything.py` have the
-attackers.
-"""
+"""Both state machines, with a clock of their own: who says what, when, and what changes nothing."""
 
 from typing import Any
 
 import pytest
 from links import (
-    AGENT_EVENTS,
-    AGENT_STATES,
-    COMMAND_LINE,
-    ENDED,
+    CONFIG,
     HERE,
-    LINE,
     NONCE,
+    ONE,
     OTHER,
-    REFUSE,
+    SECRET,
     SESSION,
-    SHARED,
-    SIMULATOR_EVENTS,
-    SIMULATOR_STATES,
-    WAIT,
+    STRANGER,
     WELCOME,
+    Pair,
     Wire,
     agent,
     close,
     command,
-    drive,
     dropped,
     hello,
+    layout,
+    lossy,
+    send_command,
+    send_state,
     simulator,
     state,
-    state_of,
-    unknown,
 )
-from rotorgram.udp import binary
-from rotorgram.udp.agent_link import Event
-from rotorgram.udp.messages import (
+from rotorgram.models.errors import InputError
+from rotorgram.udp import LinkConfig
+from rotorgram.udp.protocol import binary, text
+from rotorgram.udp.protocol.auth import Key
+from rotorgram.udp.protocol.client import Client, RoundTrips
+from rotorgram.udp.protocol.messages import (
+    Alive,
+    Close,
+    Command,
+    Extension,
     Hello,
     Message,
+    Missing,
     Refuse,
+    State,
     Unknown,
     Wait,
     Welcome,
 )
+from rotorgram.udp.protocol.server import Server
+from rotorgram.udp.protocol.transitions import AGENT, SIMULATOR, AgentState, SimulatorState, Way
 
-# ---- the simulator's table
-
-SIMULATOR_TABLE: dict[tuple[str, str], tuple[str, list[Message], str]] = {
-    # (state, event): (state after, sent, counter); "": it counts. All others: dropped as stale.
-    ("hello", "Welcome"): ("ready", [], ""),
-    ("hello", "Refuse"): ("closed", [], ""),
-    ("hello", "Wait"): ("hello", [], ""),
-    ("ready", "Close 0"): ("closed", [close(0, reason="")], ""),
-    ("waiting", "Command 1"): ("ready", [], ""),
-    ("waiting", "Command 1, two numbers"): ("waiting", [], "malformed"),
-    ("waiting", "Unknown 1"): ("hello", [hello(session=OTHER)], ""),
-    ("waiting", "Close 0"): ("closed", [close(1, reason="")], ""),
-    ("waiting", "Close 1"): ("closed", [close(1, reason="")], ""),
-    ("ready 1", "Close 0"): ("closed", [close(1, reason="")], ""),
-    ("ready 1", "Close 1"): ("closed", [close(1, reason="")], ""),
-    ("closing", "Close 0"): ("closed", [], ""),
-    ("closing", "Close 1"): ("closed", [], ""),
-}
+LONG = "{" + " " * 200 + "}"
+"""A Hello so long that its refusal is not cut."""
+BOTH = pytest.mark.parametrize("sealed", [False, True], ids=["open", "sealed"])
 
 
-@pytest.mark.parametrize("sealed", [False, True], ids=["open", "sealed"])
-@pytest.mark.parametrize("event", SIMULATOR_EVENTS)
-@pytest.mark.parametrize("before", SIMULATOR_STATES)
-def test_simulator_table(before: str, event: str, sealed: bool) -> None:
-    ours, theirs = Wire("simulator", sealed), Wire("agent", sealed)
-    link, message = simulator(key=ours.key), SIMULATOR_EVENTS[event]
-    SIMULATOR_STATES[before](link, theirs)
-    assert link.state == before.split()[0]
-    assert not dropped(link)
+def plain(datagram: bytes) -> Message:
+    data = datagram[24:] if datagram[:2] == b"\xa7S" else datagram
+    return binary.decode(data, ONE)
+
+
+def to(link: Client, where: SimulatorState, wire: Wire) -> Client:
+    """A simulator in a state."""
+    if where is SimulatorState.IDLE:
+        return link
+    link.connect(0.0)
+    if where is not SimulatorState.HELLO:
+        link.receive(wire(WELCOME), 0.0)
+        if where is not SimulatorState.READY:
+            send_state(link, 0.0, 0.0)
+            if where is SimulatorState.CLOSING:
+                link.close("bye", 0.0)
+            if where is SimulatorState.CLOSED:
+                link.receive(wire(close(1)), 0.0)
     link.take_outgoing()
-    after, sent, counter = SIMULATOR_TABLE.get((before, event), (link.state, [], "stale"))
-    if "another" in event:
-        counter = "foreign"
-    if sealed and type(message) not in SHARED and ("another" in event or before == "hello"):
-        counter = "forged"  # no such session here, so no key to tell what it is
-    taken = link.receive(theirs(message, b"".join(link._outstanding)), 1.0)
-    assert link.state == after
-    assert dropped(link) == ({counter: 1} if counter else {})
-    assert link.take_outgoing() == [ours(m) for m in sent]
-    quiet = counter or isinstance(message, Wait | Unknown)
-    assert type(taken) is (type(None) if quiet else type(message))
+    return link
 
 
-# ---- the agent's table
-
-WELCOMED = [WELCOME]
-NEW = [Welcome(session=OTHER, nonce=NONCE)]
-UNREFUSED = {"Hello": ("", WELCOMED, ""), "new Hello": ("", NEW, "")}
-NO_SESSION: dict[str, tuple[str, list[Message], str]] = {
-    "State 0": ("", [unknown(0)], "foreign"),
-    "State 1": ("", [unknown(1)], "foreign"),
-    "State 1, two numbers": ("", [unknown(1)], "foreign"),
-    "State 2": ("", [unknown(2)], "foreign"),
-    "State 3": ("", [unknown(3)], "foreign"),
-    "new State 1": ("", [unknown(1, session=OTHER)], "foreign"),
-}
-NOTHING = {event: ("", [], "foreign") for event in AGENT_EVENTS}
-AGENT_TABLE: dict[str, dict[str, tuple[str, list[Message], str]]] = {
-    # state: event: (state after, "" if it is the same; sent; counter, "" if it counts)
-    "free": {**NOTHING, **NO_SESSION, **UNREFUSED},
-    "welcomed": {
-        **NOTHING,
-        **NO_SESSION,
-        "Hello": ("", WELCOMED, "duplicate"),
-        "new Hello": ("", NEW, ""),
-        "State 1": ("deciding", [], ""),
-        "State 1, two numbers": ("", [], "malformed"),
-    },
-    "deciding": {
-        "new Hello": ("", NEW, ""),
-        "State 1": ("", [], "duplicate"),
-        "State 1, two numbers": ("", [], "duplicate"),
-        "State 3": ("", [unknown(3)], "foreign"),
-        "new State 1": ("", [unknown(1, session=OTHER)], "foreign"),
-        "Close 1": ("free", [close(1, reason="")], ""),
-    },
-    "expecting": {
-        "new Hello": ("", NEW, ""),
-        "State 1": ("", [command(1)], "duplicate"),
-        "State 1, two numbers": ("", [command(1)], "duplicate"),
-        "State 2": ("deciding", [], ""),
-        "State 3": ("", [unknown(3)], "foreign"),  # it has gone on with another agent
-        "new State 1": ("", [unknown(1, session=OTHER)], "foreign"),
-        "Close 1": ("free", [close(1, reason="")], ""),
-        "Close 2": ("free", [close(1, reason="")], ""),
-    },
-    "closing": {
-        "State 3": ("", [], "foreign"),
-        "new State 1": ("", [], "foreign"),
-        "new Hello": ("", [Refuse(session=OTHER, reason=ENDED)], "refused"),
-        "State 1": ("", [close(1)], "duplicate"),
-        "State 1, two numbers": ("", [close(1)], "duplicate"),
-        "Close 1": ("free", [], ""),
-        "Close 2": ("free", [], ""),
-    },
-    "ended": {**NOTHING, **NO_SESSION, "Hello": ("", [], "stale"), "new Hello": ("", NEW, "")},
-    "silent": {**NOTHING, **NO_SESSION, "Hello": ("", [], "stale"), "new Hello": ("", NEW, "")},
-    "full": {
-        **NOTHING,
-        **NO_SESSION,
-        "Hello": ("", [WAIT], ""),
-        "new Hello": ("", [Wait(session=OTHER)], ""),
-    },
-    "full, waits": {
-        **NOTHING,
-        **NO_SESSION,
-        "Hello": ("", [WAIT], ""),
-        "new Hello": ("", [Wait(session=OTHER)], ""),
-    },
-    "closed": {
-        **NOTHING,
-        "Hello": ("", [Refuse(session=SESSION, reason=ENDED)], "refused"),
-        "new Hello": ("", [Refuse(session=OTHER, reason=ENDED)], "refused"),
-    },
-    "welcomed, closed": {
-        **NOTHING,
-        "Hello": ("", [Refuse(session=SESSION, reason=ENDED)], "refused"),
-        "new Hello": ("", [Refuse(session=OTHER, reason=ENDED)], "refused"),
-        "State 1": ("", [close(1, reason=ENDED)], "refused"),
-        "State 1, two numbers": ("", [], "malformed"),
-    },
-    "refusing": {
-        **NOTHING,
-        **NO_SESSION,
-        "Hello": ("", [REFUSE], "refused"),
-        "new Hello": ("", [Refuse(session=OTHER, reason="busy")], "refused"),
-    },
-    "welcomed, refusing": {
-        **NOTHING,
-        **NO_SESSION,
-        "Hello": ("", WELCOMED, "duplicate"),
-        "new Hello": ("", [Refuse(session=OTHER, reason="busy")], "refused"),
-        "State 1": ("", [close(1, reason="busy")], "refused"),
-        "State 1, two numbers": ("", [], "malformed"),
-    },
-}
+def agent_at(where: AgentState, wire: Wire, sealed: bool = False) -> Server:
+    """An agent with a simulator in that state."""
+    server = agent(sealed=sealed)
+    server.receive(wire(hello()), HERE, 0.0)
+    if where is not AgentState.WELCOMED:
+        assert server.receive(wire(state(1)), HERE, 0.0)
+        if where in (AgentState.EXPECTING, AgentState.CLOSED):
+            send_command(server, 0, 0.0, 0.0)
+        if where is AgentState.CLOSING:
+            server.close("bye", 0.0)
+        if where is AgentState.CLOSED:
+            server.receive(wire(close(1)), HERE, 0.0)
+    server.take_outgoing()
+    return server
 
 
-@pytest.mark.parametrize("sealed", [False, True], ids=["open", "sealed"])
-@pytest.mark.parametrize("event", AGENT_EVENTS)
-@pytest.mark.parametrize("before", AGENT_STATES)
-def test_agent_table(before: str, event: str, sealed: bool) -> None:
-    ours, theirs = Wire("agent", sealed), Wire("simulator", sealed)
-    link, message = agent(key=ours.key), AGENT_EVENTS[event]
-    drive(link, AGENT_STATES[before], theirs)
-    begun = state_of(link)
-    assert begun == before or begun == "free"
-    assert not dropped(link)
-    link.take_outgoing()
-    default = ("", [], "foreign" if "another" in event else "stale")
-    after, sent, counter = AGENT_TABLE[before].get(event, default)
-    taken = link.receive(theirs(message), HERE, 1.0)
-    assert state_of(link) == (after or begun)
-    assert link.take_outgoing() == [(ours(m, theirs(message)), HERE) for m in sent]
-    assert dropped(link) == ({counter: 1} if counter else {})
-    if counter or isinstance(message, Hello):
-        assert taken is None
-    else:
-        assert isinstance(taken, Event)
-        assert (taken.place, type(taken.message)) == (0, type(message))
-        assert taken.joined == (before == "welcomed")
+# ---- the tables
 
 
-# ---- the agent's table by text
-
-TEXT_STATES: dict[str, list[Any]] = {
-    "free": [],
-    "deciding": [LINE],
-    "expecting": [LINE, command(1, session=0)],
-    "closing": [LINE, "close"],
-    "ended": [LINE, b"1,close"],
-    "full": ["other"],
-    "closed": ["close"],
-    "binary": [hello(), state(1)],
-    "no text": ["no text"],
-}
-TEXT_EVENTS = [LINE, b"0,0.0,0,0,0.0", b"2,0.0,0,0,0.0", b"3,0,0,0,0", b"0,close", b"1,close",
-               b"2,close", b"1,0.0", b"x"]  # fmt: skip
-JOINS = {line: ("deciding", [], "") for line in TEXT_EVENTS[:4]}
-NO_ROOM = {line: ("", [line[:2] + b"close"], "refused") for line in TEXT_EVENTS[:4]}
-STRANGE = {b"1,0.0": ("", [], "malformed"), b"x": ("", [], "malformed")}
-FOREIGN = {line: ("", [], "foreign") for line in TEXT_EVENTS[4:7]}
-TEXT_TABLE: dict[str, dict[bytes, tuple[str, list[bytes], str]]] = {
-    "free": {**JOINS, **FOREIGN},
-    "deciding": {LINE: ("", [], "duplicate"), b"1,close": ("free", [b"1,close"], "")},
-    "expecting": {
-        LINE: ("", [COMMAND_LINE], "duplicate"),
-        b"2,0.0,0,0,0.0": ("deciding", [], ""),
-        b"1,close": ("free", [b"1,close"], ""),
-        b"2,close": ("free", [b"1,close"], ""),
-    },
-    "closing": {
-        LINE: ("", [b"1,close"], "duplicate"),
-        b"1,close": ("free", [], ""),
-        b"2,close": ("free", [], ""),
-    },
-    "ended": {**JOINS, **FOREIGN},
-    "full": {**NO_ROOM, **FOREIGN},
-    "closed": {**NO_ROOM, **FOREIGN},
-    "binary": {**NO_ROOM, **FOREIGN},
-    "no text": {**NO_ROOM, **FOREIGN},
-}
+@BOTH
+@pytest.mark.parametrize("where", [s for s in SimulatorState if s is not SimulatorState.IDLE])
+def test_a_simulator_takes_what_its_table_says(where: SimulatorState, sealed: bool) -> None:
+    wire = Wire("agent", sealed)
+    number = 1 if where in (SimulatorState.WAITING, SimulatorState.CLOSING) else 0
+    messages: list[Message] = [
+        WELCOME,
+        Wait(session=SESSION),
+        Refuse(session=SESSION, reason="busy"),
+        command(number),
+        close(number),
+        hello(),
+        state(number + 1),
+        Alive(session=SESSION, sequence=number),
+        Unknown(session=SESSION, sequence=number),
+    ]
+    for message in messages:
+        link = to(simulator(sealed=sealed), where, wire)
+        asked = link._asking if isinstance(message, Unknown) else b""
+        taken = link.receive(wire(message, asked), 0.0)
+        then = SIMULATOR.get((where, Way.RECEIVED, type(message)))
+        if then is SimulatorState.IDLE:  # it says Hello at once
+            assert link.state is SimulatorState.HELLO
+            assert link.hello.session == OTHER
+        else:
+            assert link.state is (then or where)
+        moves = isinstance(message, Welcome | Refuse | Command | Close)
+        assert (taken is not None) == (then is not None and moves), message
+        assert bool(dropped(link)) == (then is None)
 
 
-@pytest.mark.parametrize("event", TEXT_EVENTS)
-@pytest.mark.parametrize("before", TEXT_STATES)
-def test_agent_table_by_text(before: str, event: bytes) -> None:
-    link = agent()
-    drive(link, TEXT_STATES[before], lambda m: m if isinstance(m, bytes) else binary.encode(m))
-    begun = state_of(link)
-    link.take_outgoing()
-    row = {**STRANGE, **TEXT_TABLE[before]}
-    after, sent, counter = row.get(event, ("", [], "stale"))
-    taken = link.receive(event, HERE, 1.0)
-    assert state_of(link) == (after or begun)
-    assert link.take_outgoing() == [(line, HERE) for line in sent]
-    assert dropped(link) == ({counter: 1} if counter else {})
-    assert (taken is None) == bool(counter)
+@BOTH
+@pytest.mark.parametrize(
+    "where", [s for s in AgentState if s not in (AgentState.NEW, AgentState.QUEUED)]
+)
+def test_an_agent_takes_what_its_table_says(where: AgentState, sealed: bool) -> None:
+    wire = Wire("simulator", sealed)
+    seated = where not in (AgentState.WELCOMED, AgentState.CLOSED)
+    due = 2 if seated else 1
+    for message in (
+        state(due),
+        close(1),
+        command(1),
+        WELCOME,
+        Alive(session=SESSION, sequence=1),
+        Missing(session=SESSION, sequence=1, kind=5, count=2, first=0, bitmap=b"\1"),
+    ):
+        server = agent_at(where, wire, sealed)
+        event = server.receive(wire(message), HERE, 0.0)
+        then = AGENT.get((where, Way.RECEIVED, type(message)))
+        session = server.slots[0]
+        if where is AgentState.CLOSED or (where is AgentState.WELCOMED and then is None):
+            assert session is None
+            assert event is None
+        elif then is AgentState.CLOSED:
+            assert session is None
+            assert event is not None
+        else:
+            assert session is not None
+            assert session.state is (then or where)
+            assert (event is not None) == (then is not None and isinstance(message, State))
 
 
-@pytest.mark.parametrize("line", TEXT_EVENTS)
-def test_an_agent_with_a_key_closes_text_states_and_answers_nothing_else(line: bytes) -> None:
-    link = agent(key=Wire("agent", True).key)
-    assert link.receive(line, HERE, 0.0) is None
-    # An answer to a Close would be answered by another agent with a key, and so on for ever.
-    answers = [(line[:2] + b"close", HERE)] if line in TEXT_EVENTS[:4] else []
-    assert link.take_outgoing() == answers
+def test_only_what_the_table_says_can_be_sent() -> None:
+    wire = Wire("agent", False)
+    for where in SimulatorState:
+        link = to(simulator(), where, wire)
+        if (where, Way.SENT, State) in SIMULATOR:
+            send_state(link, 0.0, 0.0)
+        else:
+            with pytest.raises(ValueError, match="expected state ready"):
+                send_state(link, 0.0, 0.0)
+    for there in (AgentState.WELCOMED, AgentState.EXPECTING, AgentState.CLOSING):
+        server = agent_at(there, Wire("simulator", False))
+        order = command(1)
+        with pytest.raises(ValueError, match="deciding"):
+            server.send_command(0, order.actions, order.orders, None, 0.0)
+
+
+# ---- lock-step
+
+
+@BOTH
+def test_a_repeat_is_the_same_bytes_and_gets_the_same_answer(sealed: bool) -> None:
+    client, server = simulator(sealed=sealed), agent(sealed=sealed)
+    Pair(client, server, lossy(0)).run(3)
+    first = client.take_outgoing()
+    assert client.handle_timer(client.next_timer() or 0.0)
+    assert client.take_outgoing() == first
+    event = server.receive(first[0], HERE, 1.0)
+    assert event is not None
+    send_command(server, 0, 9.0, 1.0)
+    answer = server.take_outgoing()
+    for _ in range(3):
+        assert server.receive(first[0], HERE, 1.0) is None
+        assert server.take_outgoing() == answer
+    assert server.statistics.counters["duplicate"] == 3
+
+
+@pytest.mark.parametrize("seed", range(4))
+@BOTH
+def test_each_command_is_stepped_once_on_a_bad_wire(seed: int, sealed: bool) -> None:
+    import random
+
+    dice = random.Random(seed)
+
+    def fate(datagram: bytes) -> list[tuple[float, bytes]]:
+        raw = bytearray(datagram)
+        if dice.random() < 0.1:
+            raw[dice.randrange(len(raw))] ^= 1 << dice.randrange(8)
+        copies = dice.choices([0, 1, 2], [0.3, 0.5, 0.2])[0]
+        return [(dice.choice([0.001, 0.004, 0.3]), bytes(raw)) for _ in range(copies)]
+
+    patient = LinkConfig(timeout=1000)
+    pair = Pair(simulator(sealed=sealed, config=patient), agent(sealed=sealed), fate)
+    pair.run(150)
+    assert pair.steps == [float(i + 1) for i in range(150)]
+    assert pair.seen == [float(i) for i in range(len(pair.seen))]
+
+
+def test_no_resend_on_a_clean_wire_and_few_on_one_that_slows_down() -> None:  # fault 16
+    delay = [1e-4]
+    pair = Pair(simulator(), agent(), lambda datagram: [(delay[0], datagram)])
+    pair.run(100)
+    assert pair.client.statistics.counters["resent"] == 0
+    delay[0] = 0.05
+    pair.run(200)
+    slow = pair.client.statistics.counters["resent"]
+    assert slow < 60
+    pair.run(300)
+    assert pair.client.statistics.counters["resent"] < slow + 10
+
+
+def test_waits_follow_the_round_trips() -> None:
+    trips = RoundTrips()
+    assert trips.wait(1) == 0.2
+    for at in range(50):
+        trips.sent(float(at), first=True)
+        trips.answered(at + 0.02)
+    assert trips.wait(1) == pytest.approx(0.03, abs=1e-3)
+    assert trips.wait(8) == pytest.approx(0.03, abs=1e-3)
+    assert trips.wait(9) == pytest.approx(0.06, abs=2e-3)
+    assert trips.wait(40) == 1.0
+
+
+def test_silence_ends_a_simulator_and_a_pause_of_its_own_does_not() -> None:  # fault 25
+    link = to(simulator(), SimulatorState.WAITING, Wire("agent", False))
+    link.pardon(100.0)
+    assert link.handle_timer(50.0)
+    assert not link.handle_timer(111.0)
+    assert link.state is SimulatorState.CLOSING
+
+
+def test_wrong_numbers_of_the_config() -> None:
+    for wrong in ({"timeout": 0}, {"timeout": float("nan")}, {"max_datagram": 100}):
+        with pytest.raises(InputError, match="expected"):
+            LinkConfig(**wrong)
+
+
+# ---- slots
+
+
+def test_a_second_simulator_waits_until_the_first_has_left() -> None:
+    server = agent()
+    first, second = Wire("simulator", False), hello(session=OTHER)
+    server.receive(first(hello()), HERE, 0.0)
+    server.receive(first(state(1)), HERE, 0.0)
+    server.take_outgoing()
+    datagram = binary.encode(second)
+    server.receive(datagram, STRANGER, 0.0)
+    ((reply, to_),) = server.take_outgoing()
+    assert (plain(reply), to_) == (Wait(session=OTHER), STRANGER)
+    server.receive(binary.encode(close(1)), HERE, 0.0)
+    server.take_outgoing()
+    server.receive(datagram, STRANGER, 0.0)
+    ((reply, _),) = server.take_outgoing()
+    assert isinstance(plain(reply), Welcome)
+    event = server.receive(binary.encode(state(1, OTHER), ONE), STRANGER, 0.0)
+    assert event is not None
+    assert event.joined
+
+
+def test_the_queue_is_refused_when_the_agent_closes() -> None:
+    server = agent_at(AgentState.DECIDING, Wire("simulator", False))
+    server.receive(binary.encode(hello(session=OTHER)), STRANGER, 0.0)
+    server.take_outgoing()
+    server.close("over", 0.0)
+    told = {address: plain(d) for d, address in server.take_outgoing()}
+    assert isinstance(told[HERE], Close)
+    refuse = told[STRANGER]
+    assert isinstance(refuse, Refuse)
+    assert "over".startswith(refuse.reason[:4])
+
+
+def test_a_source_that_never_reads_takes_no_slot() -> None:  # fault 11
+    server = agent()
+    sent = got = 0
+    for message in (hello(), *(state(1, nonce=guess) for guess in range(20))):
+        datagram = binary.encode(message, ONE)
+        sent += len(datagram)
+        server.receive(datagram, STRANGER, 0.0)
+        got += sum(len(d) for d, _ in server.take_outgoing())
+    assert server.slots == [None]
+    assert got <= sent
+
+
+@BOTH
+def test_a_replayed_hello_does_not_keep_the_real_simulator_from_recovering(sealed: bool) -> None:
+    """Fault 10: after an agent's restart its State is answered by Unknown, whoever said Hello."""
+    wire = Wire("simulator", sealed)
+    client = to(simulator(sealed=sealed), SimulatorState.WAITING, Wire("agent", sealed))
+    server = agent(sealed=sealed)  # started anew
+    server.receive(wire(hello()), STRANGER, 0.0)
+    server.take_outgoing()
+    client.handle_timer(5.0)
+    for datagram in client.take_outgoing():
+        server.receive(datagram, HERE, 0.0)
+    ((reply, address),) = server.take_outgoing()
+    assert address == HERE
+    assert client.receive(reply, 5.0) is None
+    assert client.state is SimulatorState.HELLO
+    assert client.hello.session == OTHER
+
+
+def test_a_session_of_another_address_is_not_ended_by_a_stranger() -> None:
+    server = agent_at(AgentState.EXPECTING, Wire("simulator", False))
+    for message in (state(2), close(1), state(7), hello()):
+        server.receive(binary.encode(message, ONE), STRANGER, 0.0)
+    assert server.take_outgoing() == []
+    assert server.slots[0] is not None
+
+
+def test_an_old_hello_that_came_late_is_forgotten() -> None:
+    """Its State 5 says that the simulator flew with another agent: it is to begin again."""
+    server = agent_at(AgentState.WELCOMED, Wire("simulator", False))
+    server.receive(binary.encode(state(5), ONE), HERE, 0.0)
+    ((reply, _),) = server.take_outgoing()
+    assert plain(reply) == Unknown(session=SESSION, sequence=5)
+    server.receive(binary.encode(state(1), ONE), HERE, 0.0)  # its opening is forgotten
+    assert server.slots == [None]
+
+
+def test_a_session_that_has_ended_is_not_taken_up() -> None:
+    server = agent_at(AgentState.CLOSED, Wire("simulator", False))
+    server.receive(binary.encode(hello()), HERE, 0.0)
+    assert server.take_outgoing() == []
+
+
+def test_what_is_remembered_of_strangers_is_bounded() -> None:
+    server = agent(max_datagram=1200)
+    long = hello(spec='{"x":"' + "y" * 5000 + '"}')
+    for number in range(3000):
+        server.receive(binary.encode(hello(session=number)), ("127.0.0.1", number), 0.0)
+        data = binary.frame(129, number, 0, b"\0\0\5\0\0\0\0\0" + binary.encode(long)[:1000])
+        server.receive(data, ("127.0.0.2", number), 0.0)
+    assert len(server._openings) <= 1024
+    assert len(server._assembling) <= 16
+
+
+def test_refusals_and_their_size() -> None:
+    server = agent("x" * 500)
+    datagram = binary.encode(hello())
+    server.receive(datagram, HERE, 0.0)
+    ((reply, _),) = server.take_outgoing()
+    assert len(reply) <= len(datagram)
+    assert isinstance(plain(reply), Refuse)
+
+
+def test_versions_and_critical_extensions() -> None:  # fault 18
+    critical = (Extension(number=9, value=b"", critical=True),)
+    for message, words in (
+        (hello(spec=LONG, versions=(1, 1)), "version 2"),
+        (hello(spec=LONG, extensions=critical), "critical extension of type 9"),
+    ):
+        server = agent()
+        server.receive(binary.encode(message), HERE, 0.0)
+        ((reply, _),) = server.take_outgoing()
+        refuse = plain(reply)
+        assert isinstance(refuse, Refuse)
+        assert words in refuse.reason
+    optional = (Extension(number=9, value=b"?"),)
+    server.receive(binary.encode(hello(session=3, extensions=optional)), STRANGER, 0.0)
+    ((reply, _),) = server.take_outgoing()
+    assert isinstance(plain(reply), Welcome)
+    link = to(simulator(), SimulatorState.HELLO, Wire("agent", False))
+    for wrong in (
+        Welcome(session=SESSION, nonce=1, version=3),
+        Welcome(session=SESSION, nonce=1, extensions=critical),
+    ):
+        assert link.receive(binary.encode(wrong), 0.0) is None
+    assert link.state is SimulatorState.HELLO
+    assert link.receive(binary.encode(WELCOME), 0.0) == WELCOME
+
+
+def test_an_agent_takes_any_of_its_keys() -> None:  # fault 18: keys change while all fly
+    new = bytes(32)
+    keys = [Key(SECRET, "agent"), Key(new, "agent")]
+    server = Server(lambda _: ONE, slots=2, keys=keys, draw_nonce=lambda: NONCE)
+    for number, secret in enumerate((SECRET, new)):
+        key = Key(secret, "simulator")
+        client = Client(hello(session=number + 1), ONE, CONFIG, key=key)
+        Pair(client, server, lossy(0), ("127.0.0.1", 8000 + number)).run(5)
+    assert all(server.slots)
+    stranger = Client(hello(session=9), ONE, CONFIG, key=Key(bytes([7]) * 32, "simulator"))
+    stranger.connect(0.0)
+    server.receive(stranger.take_outgoing()[0], STRANGER, 0.0)
+    assert server.take_outgoing() == []
+    assert server.statistics.counters["forged"] == 1
+
+
+# ---- liveness
+
+
+@BOTH
+def test_a_simulator_that_computes_says_that_it_lives(sealed: bool) -> None:  # fault 33
+    client, server = simulator(sealed=sealed), agent(sealed=sealed)
+    Pair(client, server, lossy(0)).run(3)
+    client.take_outgoing()
+    ((datagram, _),) = server.take_outgoing() or [(b"", HERE)]
+    client.receive(datagram, 1.0)
+    session = server.slots[0]
+    assert session is not None
+    for datagram in client.alive():
+        assert server.receive(datagram, HERE, 50.0) is None
+    if client.state is SimulatorState.READY:
+        assert session.heard_at == 50.0
+
+
+# ---- text
+
+
+def by_text() -> Client:
+    return simulator(by_text=True)
+
+
+def test_text_flies() -> None:
+    pair = Pair(by_text(), agent(), lossy(0.3))
+    pair.client.connect(0.0)
+    send_state(pair.client, 0.0, 0.0)
+    pair.run(50)
+    assert pair.steps == [float(i + 1) for i in range(50)]
+
+
+def test_a_late_copy_of_a_text_state_takes_no_slot_again() -> None:  # fault 9
+    server = agent()
+    assert server.receive(b"1,0,0,0,1", HERE, 0.0)
+    send_command(server, 0, 0.0, 0.0)
+    assert server.receive(b"2,0,0,0,1", HERE, 0.0)
+    assert server.receive(b"2,close", HERE, 0.0)
+    assert server.receive(b"2,0,0,0,1", HERE, 0.1) is None
+    assert server.slots == [None]
+    assert server.statistics.counters["sessions"] == 1
+    assert server.receive(b"1,0,0,0,1", HERE, 0.2)  # another simulator at that address
+    server = agent()
+    assert server.receive(b"1,0,0,0,1", HERE, 0.0)
+    send_command(server, 0, 0.0, 0.0)
+    assert server.receive(b"2,close", HERE, 0.0)  # its State 2 was overtaken
+    assert server.receive(b"2,0,0,0,1", HERE, 0.1) is None
+    assert server.receive(b"2,0,0,0,1", HERE, 3.0)  # not for ever
+
+
+def test_text_is_told_why_it_may_not_fly() -> None:
+    line = b"7,0,0,0,1"
+    full = agent_at(AgentState.DECIDING, Wire("simulator", False))
+    keyed = agent(sealed=True)
+    other = agent(text_layout=lambda: None)
+    for server, answers in ((full, True), (keyed, True), (other, False)):
+        assert server.receive(line, STRANGER, 0.0) is None
+        replies = server.take_outgoing()
+        assert [reply for reply, _ in replies] == ([b"7,close"] if answers else [])
+
+
+def test_a_key_and_text_do_not_go_together() -> None:
+    with pytest.raises(InputError, match="only binary"):
+        simulator(by_text=True, sealed=True)
+    with pytest.raises(InputError, match="one drone"):
+        simulator(by_text=True, of=layout(2))
+
+
+# ---- keys that only one side has
+
+
+def test_what_a_side_without_the_key_is_told() -> None:
+    server = agent(sealed=True)
+    server.receive(binary.encode(hello(spec="{" + " " * 99 + "}")), HERE, 0.0)
+    ((reply, _),) = server.take_outgoing()
+    refuse = plain(reply)
+    assert isinstance(refuse, Refuse)
+    assert "this agent has one" in refuse.reason
+    link = to(simulator(sealed=True), SimulatorState.HELLO, Wire("agent", True))
+    assert link.receive(binary.encode(Refuse(session=SESSION, reason="no key")), 0.0) is None
+    assert "no key" in link.statistics.last_error
+    link = to(simulator(), SimulatorState.HELLO, Wire("agent", False))
+    link.receive(Wire("agent", True)(WELCOME), 0.0)
+    assert "the agent has one" in link.statistics.last_error
     assert dropped(link) == {"forged": 1}
+
+
+def test_recorded_messages_of_another_session_are_forged() -> None:
+    old = Key(SECRET, "agent").for_session(SESSION, 1)
+    link = to(simulator(sealed=True), SimulatorState.WAITING, Wire("agent", True))
+    assert link.receive(old.seal(binary.encode(command(1), ONE)), 0.0) is None
+    assert dropped(link) == {"forged": 1}
+
+
+def test_every_message_is_shown_once() -> None:
+    seen: dict[str, list[Any]] = {"simulator": [], "agent": []}
+    client = simulator(tap=lambda slot, m, data: seen["simulator"].append((slot, data)))
+    server = agent(tap=lambda slot, m, data: seen["agent"].append((slot, data)))
+    pair = Pair(client, server, lossy(0.3))
+    pair.run(30)
+    client.close("done", pair.now)
+    pair._send()
+    hellos = [data for _, data in seen["simulator"] if data[3] == binary.HELLO]
+    assert len(hellos) == 1
+    numbers = [binary.peek(data)[::2] for _, data in seen["agent"]]
+    assert len(set(numbers)) == len(numbers)
+    assert [d for _, d in seen["simulator"][:60]] == [d for _, d in seen["agent"][:60]]
+    assert text.is_text(b"1,close")
+    assert isinstance(hello(), Hello)

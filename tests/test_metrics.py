@@ -176,9 +176,9 @@ def test_results_table():
         ("pid", 0, 0, 0.01, 3.0, False),
     )
     flown = runs(*(("vpg", s, 200, 2.0, 100.0 + s) for s in range(3)))
-    table = results_table(frame, flown, HEADLINE, {"time-optimal flight": 9.0})
-    assert table.index.tolist() == ["vpg", "pid", "time-optimal flight"]
-    bound = table.loc["time-optimal flight"]
+    table = results_table(frame, flown, HEADLINE, {"time-optimal": 9.0})
+    assert table.index.tolist() == ["vpg", "pid", "time-optimal"]
+    bound = table.loc["time-optimal"]
     assert (bound["return"], bound["seeds"], bound["crashed"]) == (9.0, 0, 0)
     assert math.isnan(bound["steady"])
     vpg, pid = table.loc["vpg"], table.loc["pid"]

@@ -122,13 +122,21 @@ def waiting(process: subprocess.Popen[str]) -> tuple[str, int]:
     return "127.0.0.1", int(line.rsplit(":", 1)[1])
 
 
+TEXT_SIMULATOR = """
+import sys
+from rotorgram.udp import Simulator
+with Simulator(server=("127.0.0.1", int(sys.argv[1])), bind=("127.0.0.1", 0), codec="text",
+               episode_length=int(sys.argv[2])) as simulator:
+    simulator.run()
+"""
+
+
 def flown(agent: list[str], config: FaultConfig | None, steps: int = 250) -> list[str]:
-    """Three episodes of `rotorgram sim`, the agent's lines."""
-    sim = ours("sim", "--codec", "text", "--bind", "127.0.0.1:0", "--env.episode-length", steps)
+    """Three episodes of a simulator by text, the agent's lines."""
     with (
         running(agent, 0, 3, 7) as process,
         relayed(waiting(process), config) as address,
-        running(sim, "--server", place(address)) as simulator,
+        running([sys.executable, "-c", TEXT_SIMULATOR], address[1], steps) as simulator,
     ):
         status, out, err = ended(process)
         assert (status, err) == (0, "")

@@ -14,13 +14,14 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from rotorgram.agents.checkpoints import load, software_versions
-from rotorgram.envs import ElevationConfig
 from rotorgram.experiments import workers as module
-from rotorgram.experiments.compare import CompareConfig, compare
+from rotorgram.experiments.compare import compare
 from rotorgram.experiments.errors import RunsFailed
-from rotorgram.experiments.records import read_records, read_steps
-from rotorgram.experiments.sweep import SweepConfig, read_sweep_runs, sweep
-from rotorgram.experiments.workers import WorkersConfig, open_workers
+from rotorgram.experiments.folders import new_folder
+from rotorgram.experiments.results import read_results, read_steps
+from rotorgram.experiments.settings import CompareConfig, SweepConfig, WorkersConfig
+from rotorgram.experiments.sweep import read_sweep_runs, sweep
+from rotorgram.experiments.workers import open_workers
 
 # Ray listens beyond this machine. It reads these when it is imported.
 os.environ |= {
@@ -32,7 +33,7 @@ ray = pytest.importorskip("ray", reason="needs Ray: pip install 'rotorgram[ray]'
 
 CONFIG = CompareConfig(
     agents=("a2c",), seeds=1, env_steps=600, snapshots=1, curve_episodes=1, episodes=1,
-    env=ElevationConfig(episode_length=50),
+    options={"episode_length": 50},
 )  # fmt: skip
 TIMES = ["seconds", "steps_per_second"]
 
@@ -66,21 +67,23 @@ def address() -> Iterator[str]:
 
 def test_the_numbers_are_those_of_this_machine(tmp_path: Path, address: str) -> None:
     shown = []
-    on_ray, here = tmp_path / "ray", tmp_path / "here"
+    on_ray, here = (new_folder(tmp_path / name, "compare") for name in ("ray", "here"))
     config = replace(CONFIG, backend="ray", address=address)
     compare(config, on_ray, "", lambda name, done, total, words: shown.append((name, words)))
     compare(CONFIG, here, "", nothing)
     assert {("a2c seed 0", "done"), ("pid", "done")} <= {*shown}
-    a, b = read_records(on_ray), read_records(here)
+    a, b = read_results(on_ray), read_results(here)
     assert len(a.episodes) > 5
     for table in ("episodes", "evaluations", "runs"):
         left, right = (
-            getattr(records, table).drop(columns=TIMES, errors="ignore") for records in (a, b)
+            getattr(results, table).drop(columns=TIMES, errors="ignore") for results in (a, b)
         )
         pd.testing.assert_frame_equal(left, right, check_exact=True)
     for phase in ("train", "evaluation"):
         pd.testing.assert_frame_equal(
-            read_steps(on_ray, phase), read_steps(here, phase), check_exact=True
+            read_steps(on_ray, "elevation_error", phase),
+            read_steps(here, "elevation_error", phase),
+            check_exact=True,
         )
     name = "checkpoints/a2c-seed0.safetensors"
     actor, other = load(on_ray / name).actor, load(here / name).actor
@@ -90,11 +93,11 @@ def test_the_numbers_are_those_of_this_machine(tmp_path: Path, address: str) -> 
 def test_a_sweep_gives_the_rows_of_this_machine(tmp_path: Path, address: str) -> None:
     config = SweepConfig(
         algorithm="a2c", grid={"gamma": (0.9, 0.99)}, seeds=1, env_steps=300, episodes=1,
-        env=ElevationConfig(episode_length=50),
+        options={"episode_length": 50},
     )  # fmt: skip
     tables = []
     for where in (config, replace(config, backend="ray", address=address)):
-        folder = tmp_path / where.backend
+        folder = new_folder(tmp_path / where.backend, "sweep")
         sweep(where, folder, "", nothing)
         rows = read_sweep_runs(folder, config).sort_values("point").reset_index(drop=True)
         tables.append(rows.drop(columns=TIMES))
@@ -124,7 +127,7 @@ def test_a_worker_with_other_software_is_refused(
     config = replace(CONFIG, backend="ray", address=address)
     sentence = f"numpy: expected version 0.1 .*, got {here['numpy']} on {socket.gethostname()}"
     with pytest.raises(RunsFailed, match=f"2 of 2 runs failed: .*{sentence}"):
-        compare(config, tmp_path / "out", "", nothing)
+        compare(config, tmp_path, "", nothing)
 
 
 def test_ctrl_c_ends_workers_and_simulators(tmp_path: Path, address: str) -> None:
@@ -174,14 +177,14 @@ def test_no_such_cluster(tmp_path: Path) -> None:
         address = f"127.0.0.1:{sock.getsockname()[1]}"
         sentence = f"address: expected a Ray cluster at {address}, got: Connection refused"
         with pytest.raises(ValueError, match=sentence):
-            compare(replace(CONFIG, backend="ray", address=address), tmp_path / "out", "", nothing)
-    assert not (tmp_path / "out").exists()
+            compare(replace(CONFIG, backend="ray", address=address), tmp_path, "", nothing)
+    assert not list(tmp_path.iterdir())
 
 
 def test_no_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ValueError, match=r"pip install 'rotorgram\[ray\]'"):
-        compare(replace(CONFIG, backend="ray"), tmp_path / "out", "", nothing)
+    with pytest.raises(ImportError, match=r"pip install 'rotorgram\[ray\]'"):
+        compare(replace(CONFIG, backend="ray"), tmp_path, "", nothing)
 
 
 def test_an_address_is_of_a_cluster() -> None:

@@ -128,13 +128,13 @@ def test_every_agent_keeps_its_colour(dark):
 
 def test_the_table_and_the_verdicts_are_written_too(comparison):
     table = table_of(read_results(comparison))
-    assert table.index.tolist() == ["vpg", "a2c", "sb3-a2c", "pid", "time-optimal flight"]
+    assert table.index.tolist() == ["vpg", "a2c", "sb3-a2c", "pid", "time-optimal"]
     written = pd.read_csv(comparison / "results.csv", index_col="agent")
     pd.testing.assert_frame_equal(written, table, check_dtype=False, check_index_type=False)
     lines = (comparison / "results.md").read_text(encoding="utf-8").splitlines()
     # Bars inside cells are escaped: every line of the table has the same number of columns.
     assert [len(re.findall(r"(?<!\\)\|", line)) for line in lines[:7]] == [9] * 7
-    assert lines[6].startswith("| time-optimal flight (not flown) | – |")
+    assert lines[6].startswith("| time-optimal (bound) | – |")
     claims = json.loads((comparison / "claims.json").read_text(encoding="utf-8"))
     assert len(claims) == 5
     assert set(claims[0]) == {"claim", "source", "preset", "verdict", "definition", "evidence"}

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 import pytest
-from rotorgram.udp.sockets import Port, open_socket
+from rotorgram.udp.transport.sockets import Port, open_socket
 
 ANY = ("127.0.0.1", 0)
 
@@ -85,3 +85,25 @@ def test_the_port_is_nobody_elses(port: Port, others: list[socket.socket]) -> No
             thief.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             with pytest.raises(OSError, match="in use"):
                 thief.bind(port.address)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="one socket for all elsewhere")
+def test_the_port_cannot_be_taken_while_a_simulator_joins(
+    port: Port, others: list[socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:  # fault 30
+    """A thief tries in the very moment; another user has no other way than SO_REUSEADDR."""
+    tried = []
+    bind = socket.socket.bind
+
+    class Socket(socket.socket):
+        def bind(self, address: object) -> None:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as thief:
+                thief.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                with pytest.raises(OSError, match="in use"):
+                    bind(thief, address)
+                tried.append(address)
+            super().bind(address)
+
+    monkeypatch.setattr("rotorgram.udp.transport.sockets.socket.socket", Socket)
+    port.keep([others[0].getsockname()])
+    assert tried == [port.address]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from rotorgram.udp.statistics import NOTICE_INTERVAL, Durations, Statistics
+from rotorgram.udp.protocol.statistics import NOTICE_INTERVAL, Durations, Statistics
 
 SAMPLES: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
     "uniform": lambda dice: dice.uniform(50e-6, 10e-3, 9999),

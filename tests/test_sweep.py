@@ -10,21 +10,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import GATES, HEADLINE, spec_of
 from rotorgram.agents import preset
 from rotorgram.agents.policies import NetworkPolicy
 from rotorgram.cli import main
 from rotorgram.cli.sweep import parse_grid
-from rotorgram.envs import ElevationConfig, ElevationEnv
 from rotorgram.experiments.compare import read_compare_config
-from rotorgram.experiments.errors import RunsFailed
-from rotorgram.experiments.evaluate import evaluation_seed
-from rotorgram.experiments.records import RecordsError
+from rotorgram.experiments.errors import ResultsError, RunsFailed
+from rotorgram.experiments.folders import locked
+from rotorgram.experiments.metrics import Headline
+from rotorgram.experiments.results import CONFIG_KEYS
+from rotorgram.experiments.settings import CompareConfig, SweepConfig
 from rotorgram.experiments.sweep import (
     RUN_COLUMNS,
-    SweepConfig,
     missing_runs,
     read_sweep_config,
     read_sweep_runs,
@@ -33,13 +35,14 @@ from rotorgram.experiments.sweep import (
     write_sweep_table,
 )
 from rotorgram.experiments.training import Run, Training
+from rotorgram.experiments.trajectories import evaluation_seed
 from rotorgram.experiments.workers import WorkersConfig, open_workers
 
 OPTIONS: dict[str, Any] = {"episode_length": 40, "flight_band": 1.2}
 CONFIG = SweepConfig(
     algorithm="a2c",
     grid={"learning_rate": (0.003, 0.05), "steps_per_update": (64,)},
-    seeds=2, env_steps=400, episodes=3, env=ElevationConfig(**OPTIONS),
+    seeds=2, env_steps=400, episodes=3, options=OPTIONS,
 )  # fmt: skip
 TIMES = ["seconds", "steps_per_second"]
 FLAGS = ("--env-steps", "300", "--episodes", "1", "--env.episode-length", "40")
@@ -64,7 +67,7 @@ def sorted_rows(folder: Path, config: SweepConfig = CONFIG) -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("sweep") / "out"
+    path = tmp_path_factory.mktemp("sweep")
     sweep(CONFIG, path, "rotorgram sweep a2c", nothing)
     return path
 
@@ -72,36 +75,36 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_row_is_what_the_run_gives_in_process(folder: Path) -> None:
     rows = sorted_rows(folder)
     runs = list(zip(rows["seed"], rows["point"], strict=True))
-    assert runs == [(0, 0), (0, 1), (1, 0), (1, 1)]
-    env = ElevationEnv(**OPTIONS)
+    assert runs == [(1000, 0), (1000, 1), (1001, 0), (1001, 1)]
+    env = gym.make(CONFIG.env_id, **OPTIONS).unwrapped
     run = Run(
         algorithm="a2c",
         config=preset("a2c", "tuned", learning_rate=0.05, steps_per_update=64),
-        env=CONFIG.env, seed=1, env_steps=400,
+        options=OPTIONS, seed=1001, env_steps=400,
     )  # fmt: skip
     training = Training(run, env)
     training.train()
-    policy = NetworkPolicy(training.agent.actor())
+    policy = NetworkPolicy(training.agent.actor(), training.log.spec)
     errors, returns, crashed = [], [], 0
     for episode in range(3):
-        observation, _ = env.reset(seed=evaluation_seed(episode))
-        flown, rewards, over = [], [], False
-        while not over:
-            observation, reward, terminated, truncated, _ = env.step(policy.act(observation))
-            flown.append(abs(float(observation[0])))
+        observation, _ = env.reset(seed=evaluation_seed(episode, "tuning"))
+        flown, rewards, done = [], [], False
+        while not done:
+            observation, reward, terminated, truncated, info = env.step(policy.act(observation))
+            flown.append(abs(info["elevation_error"]))
             rewards.append(float(reward))
-            over = terminated or truncated
+            done = terminated or truncated
         errors.append(np.mean(flown[-max(1, len(flown) // 4) :]))
         returns.append(sum(rewards))
         crashed += terminated
     row = rows.iloc[-1]  # the second point, with the second seed
-    assert row["steady_error"] == pytest.approx(np.mean(errors), rel=1e-12)
+    assert row["steady"] == pytest.approx(np.mean(errors), rel=1e-12)
     assert row["return"] == pytest.approx(np.mean(returns), rel=1e-12)
     assert (row["env_steps"], row["episodes"], row["crashed"]) == (400, 3, crashed)
 
 
 def test_files_tell_settings_and_software(folder: Path) -> None:
-    assert sorted(p.name for p in folder.iterdir()) == ["config.json", "runs.csv"]
+    assert sorted(p.name for p in folder.iterdir()) == [".lock", "config.json", "runs.csv"]
     table = pd.read_csv(folder / "runs.csv")
     assert list(table.columns[:4]) == ["point", "learning_rate", "steps_per_update", "seed"]
     settings = table[["point", "learning_rate", "steps_per_update"]].drop_duplicates()
@@ -111,10 +114,11 @@ def test_files_tell_settings_and_software(folder: Path) -> None:
     content = json.loads((folder / "config.json").read_text())
     assert content["command"] == "rotorgram sweep a2c"
     assert content["agents"]["a2c"]["gamma"] == 0.98
-    assert len(content["model_hash"]) == 32
+    assert content["seeds"] == [1000, 1001]
+    assert len(content["spec"]["vehicle_hash"]) == 32
     assert content["versions"]["mujoco"].startswith("4.")
     assert read_sweep_config(folder) == CONFIG
-    with pytest.raises(RecordsError, match="expected a comparison's"):
+    with pytest.raises(ResultsError, match="expected a comparison's"):
         read_compare_config(folder)
 
 
@@ -139,18 +143,18 @@ def test_what_is_missing_is_flown_to_the_same_numbers(folder: Path, tmp_path: Pa
 def test_a_run_that_fails_is_named_and_the_others_are_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # Adam's step is as large as the learning rate: this one is no float32 any more.
+    # Adam's step is as large as the learning rate: the second update overflows.
     folder = tmp_path / "out"
-    flags = ("--grid", "learning_rate=0.01,1e39", "--seeds", 1, *FLAGS, "--out", folder)
+    flags = ("--grid", "learning_rate=0.01,1e29", "--seeds", 1, *FLAGS, "--out", folder)
     status, out, err = run(capsys, "sweep", "a2c", *flags)
     assert status == 1
-    assert err.startswith("rotorgram: 1 of 2 runs failed: learning_rate=1e+39 seed 0: ")
+    assert err.startswith("rotorgram: 1 of 2 runs failed: learning_rate=1e+29 seed 1000: ")
     assert err.count("\n") == 1
     assert f"go on with: rotorgram sweep a2c --resume {folder}" in out
     assert "1 of 2 runs done" in out
     assert pd.read_csv(folder / "sweep.csv")["learning_rate"].tolist() == [0.01]
     config = read_sweep_config(folder)
-    with pytest.raises(RunsFailed, match=r"1 of 1 runs failed: learning_rate=1e\+39 seed 0"):
+    with pytest.raises(RunsFailed, match=r"1 of 1 runs failed: learning_rate=1e\+29 seed 1000"):
         sweep(config, folder, "", nothing)
     assert read_sweep_runs(folder, config)["point"].tolist() == [0]
 
@@ -158,6 +162,59 @@ def test_a_run_that_fails_is_named_and_the_others_are_kept(
 def _dies(job: int, _: object) -> int:
     os.kill(os.getpid(), signal.SIGKILL)
     return job
+
+
+SWEEP = """
+import sys
+from pathlib import Path
+from rotorgram.experiments.settings import SweepConfig
+from rotorgram.experiments.sweep import sweep
+config = SweepConfig(algorithm="a2c", grid={"gamma": (0.9, 0.99)}, env_steps=10_000_000, jobs=2)
+sweep(config, Path(sys.argv[1]), "", lambda *_: None)
+"""
+
+
+def test_workers_and_simulators_end_with_a_process_that_is_killed(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", SWEEP, str(tmp_path)]) as process:
+        deadline = time.monotonic() + 60
+        while sum("until-stdin" in words for words in _descendants(process.pid).values()) < 2:
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
+        family = _descendants(process.pid)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    deadline = time.monotonic() + 15
+    while alive := [pid for pid in family if Path(f"/proc/{pid}/exe").exists()]:
+        assert time.monotonic() < deadline, alive
+        time.sleep(0.2)
+
+
+def _descendants(root: int) -> dict[int, str]:
+    """Processes that descend from one, with their command lines."""
+    words = ["ps", "-ewwo", "pid,ppid,args"]
+    listing = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    rows = [line.split(None, 2) for line in listing.splitlines()[1:]]
+    found: dict[int, str] = {}
+    for _ in range(4):  # generations
+        found |= {int(p): args for p, parent, args in rows if int(parent) in {root, *found}}
+    return found
+
+
+def test_seeds_of_a_sweep_are_not_those_of_a_comparison() -> None:
+    assert list(CompareConfig(seeds=3).all_seeds) == [0, 1, 2]
+    assert list(CompareConfig(seeds=2, first_seed=40).all_seeds) == [40, 41]
+    sweep_seeds = SweepConfig(algorithm="a2c", grid={"gamma": (0.9,)}).all_seeds
+    assert list(sweep_seeds) == [1000, 1001, 1002]
+    with pytest.raises(ValueError, match="first_seed: expected 0 or more, got -1"):
+        CompareConfig(first_seed=-1)
+
+
+def test_a_folder_is_swept_by_one_process(tmp_path: Path) -> None:
+    busy = pytest.raises(ValueError, match="expected a folder that no other process writes to")
+    with locked(tmp_path), busy:
+        sweep(CONFIG, tmp_path, "", nothing)
+    assert [path.name for path in tmp_path.iterdir()] == [".lock"]
 
 
 def test_a_worker_that_is_killed_is_one_sentence() -> None:
@@ -173,15 +230,15 @@ def test_points_are_all_combinations_and_every_one_flies_before_the_next_seed() 
     assert config.points() == [dict(zip(names, point, strict=True)) for point in points]
     runs = config.runs()
     assert [(job.run.seed, job.point) for job in runs] == [
-        (seed, point) for seed in (0, 1) for point in range(4)
+        (seed, point) for seed in (1000, 1001) for point in range(4)
     ]
-    assert runs[5].name == "learning_rate=0.003 steps_per_update=100 seed 1"
+    assert runs[5].name == "learning_rate=0.003 steps_per_update=100 seed 1001"
     assert runs[5].run.config == preset("a2c", "tuned", learning_rate=0.003, steps_per_update=100)
 
 
 def rows_of(*runs: tuple[int, int, float, float, int]) -> pd.DataFrame:
-    """Runs of ten episodes: point, seed, steady |E|, return, crashed."""
-    names = ("point", "seed", "steady_error", "return", "crashed")
+    """Runs of ten episodes: point, seed, steady state, return, crashed."""
+    names = ("point", "seed", "steady", "return", "crashed")
     rest = {"env_steps": 400, "episodes": 10, "settled": 9, "seconds": 2.0}
     rows = [{**rest, **dict(zip(names, run, strict=True))} for run in runs]
     return pd.DataFrame(rows).assign(steps_per_second=200.0)[list(RUN_COLUMNS)]
@@ -195,20 +252,27 @@ def test_points_are_ranked_by_their_worst_seed_and_its_crashes() -> None:
         (2, 0, 0.02, 21.0, 2), (2, 1, 0.01, 22.0, 0), (2, 2, 0.04, 19.0, 0),  # crashes twice
         (3, 0, 0.01, 22.0, 0),  # and two seeds to come
     )  # fmt: skip
-    table = sweep_table(config, rows)
-    # The band is 1.2 m: 0.02 m and two crashes of ten are 0.02 + 0.24 = 0.26 m.
-    assert table["point"].tolist() == [2, 1, 0, 3]
-    assert table["score"].tolist() == pytest.approx([0.26, 0.3, 0.5, 0.01])
-    assert table["worst_error"].tolist() == [0.04, 0.3, 0.5, 0.01]
-    assert table["median_error"].tolist() == [0.02, 0.2, 0.01, 0.01]
-    assert table["return"].tolist() == [21.0, 11.0, 20.0, 22.0]
-    assert table["learning_rate"].tolist() == [0.3, 0.2, 0.1, 0.4]
+    table = sweep_table(config, rows, HEADLINE)
+    # Whole points first; of these the fewest crashes of a seed, then the worst seed's error.
+    assert table["point"].tolist() == [1, 0, 2, 3]
+    assert table["most_crashed"].tolist() == [0, 0, 2, 0]
+    assert table["worst"].tolist() == [0.3, 0.5, 0.04, 0.01]
+    assert table["median"].tolist() == [0.2, 0.01, 0.02, 0.01]
+    assert table["return"].tolist() == [11.0, 20.0, 21.0, 22.0]
+    assert table["learning_rate"].tolist() == [0.2, 0.1, 0.3, 0.4]
     assert table["seeds"].tolist() == [3, 3, 3, 1]
-    assert table["crashed"].tolist() == [2, 0, 0, 0]
+    assert table["crashed"].tolist() == [0, 0, 2, 0]
     assert table["settled"].tolist() == [27, 27, 27, 9]
+    # Of a metric that is to be high, the lowest seed is the worst.
+    high = sweep_table(config, rows, Headline.of(spec_of(GATES)))
+    assert high["point"].tolist() == [1, 0, 2, 3]
+    assert high["worst"].tolist() == [0.1, 0.01, 0.01, 0.01]
 
 
 def test_a_sweep_of_which_nothing_is_done_has_an_empty_table(tmp_path: Path) -> None:
+    content = {"spec": json.loads(spec_of().to_json())} | dict.fromkeys(CONFIG_KEYS[:5], 1)
+    content |= {key: {} for key in CONFIG_KEYS[6:]}
+    (tmp_path / "config.json").write_text(json.dumps(content))
     table = write_sweep_table(CONFIG, tmp_path)
     assert table.empty
     assert (tmp_path / "sweep.csv").read_text().startswith("point,learning_rate,steps_per_update")
@@ -222,10 +286,10 @@ def test_runs_of_another_sweep_are_refused(folder: Path, tmp_path: Path, change:
         "foreign": [*lines[:-1], "4" + lines[-1][1:]],
         "text": [*lines[:-1], "x" + lines[-1][1:]],
         "empty": [],
-        "column": [line.replace("steady_error", "error") for line in lines],
+        "column": [line.replace("steady", "error") for line in lines],
     }[change]
     (tmp_path / "runs.csv").write_text("".join(content))
-    with pytest.raises(RecordsError, match=r"runs\.csv: expected"):
+    with pytest.raises(ResultsError, match=r"runs\.csv: expected"):
         read_sweep_runs(tmp_path, CONFIG)
 
 
@@ -247,14 +311,18 @@ def test_the_grid_is_read_by_name() -> None:
         (["--grid", "gamma=0.9,1.1"], "gamma: expected a number from 0 to 1, got 1.1"),
         (["--grid", "gamma=0.9,0.90"], "grid: expected each gamma once, got 0.9 twice"),
         (["--grid", "gamma=0.9", "gamma=0.8"], "grid: expected each name once, got gamma twice"),
-        (["--grid", "gamma=0.9", "--grid", "trace=2"], "trace: expected a number from 0 to 1"),
+        (
+            ["--grid", "gamma=0.9", "--grid", "gae_lambda=2"],
+            "gae_lambda: expected a number from 0 to 1",
+        ),
         (["--grid", "gamma=0.9", "--seeds", "0"], "seeds: expected at least 1, got 0"),
+        (["--grid", "gamma=0.9", "--first-seed", "-1"], "first_seed: expected 0 or more, got -1"),
         (["--grid", "gamma=0.9", "--env-steps", "9"], "env_steps: expected at least 256, got 9"),
         (["--grid", "gamma=0.9", "--num-envs", "0"], "num_envs: expected 1 or more, got 0"),
         (["--grid", "gamma=0.9", "--jobs", "0"], "jobs: expected at least 1, got 0"),
         (["--grid", "gamma=0.9", "--address", "a:1"], "address: expected it with backend ray"),
         (["--grid", "gamma=0.9", "--env.target", "1"], "target: expected"),
-        (["--grid", "gamma=0.9", "--out", "."], "is there already"),
+        (["--grid", "gamma=0.9", "--out", "."], "exists already"),
         (["--resume", "nowhere"], "config.json is missing"),
     ],
 )

@@ -1,6 +1,7 @@
 """docs/troubleshooting.md quotes what is really printed: each sentence is provoked."""
 
 import socket
+import sys
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
@@ -59,7 +60,7 @@ def test_an_agent_that_drops_everything(port: int, capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     ("keyed", "part"),
     [(True, "key: this agent has one (--key-file), and the simulator has none"),
-     (False, "refused: expected target 6.0, got 5.0")],
+     (False, "refused: options: expected target 6.0, got 5.0")],
 )  # fmt: skip
 def test_refused(keyed: bool, part: str, key: Path, capsys: pytest.CaptureFixture[str]) -> None:
     env = RemoteEnv(
@@ -102,8 +103,22 @@ def test_a_bad_key_file(key: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_folder_that_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    part = "is there already; choose another folder"
-    check(["train", "a2c", "--out", str(tmp_path)], ["out: ", part], capsys)
+    check(
+        ["train", "a2c", "--out", str(tmp_path)],
+        ["out: expected a new folder", "exists already"],
+        capsys,
+    )
+
+
+def test_a_missing_layer(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    check(["train", "a2c"], ["pip install 'rotorgram[train]'"], capsys)
+
+
+def test_a_task_that_is_not_known(capsys: pytest.CaptureFixture[str]) -> None:
+    check(["sim", "--env", "rotorgram/Race-v0"], ["env: expected a registered id ("], capsys)
 
 
 def test_nothing_to_draw_with(

@@ -1,63 +1,57 @@
-"""Training with many drones: seeds of episodes, rollouts drone by drone, resuming, SB3's side."""
+"""Episodes and rollouts of any number of drones: seeds, logs, resuming, SB3's side."""
 
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from itertools import pairwise
-from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
-from peers import ANY, Running
-from rotorgram.agents import preset
-from rotorgram.agents.checkpoints import load
-from rotorgram.agents.episodes import ResumeError, episode_seed
-from rotorgram.agents.policies import NetworkPolicy
-from rotorgram.agents.returns import advantages
-from rotorgram.agents.rollouts import VectorCollector
-from rotorgram.agents.sb3_vec import SB3VecEnv
-from rotorgram.agents.vector_episodes import VectorEpisodeLog
-from rotorgram.cli import main
-from rotorgram.envs import ENV_ID, ElevationConfig, ElevationVectorEnv
-from rotorgram.experiments.training import Run, Training, is_finished
-from rotorgram.udp import RemoteVectorEnv, Simulator
-from stable_baselines3 import PPO
+import rotorgram.envs
+import rotorgram.udp
+from rotorgram.agents import (
+    EpisodeLog,
+    NetworkPolicy,
+    ResumeError,
+    episode_seed,
+    make_agent,
+    preset,
+)
+from rotorgram.agents.episodes import LOST
+from rotorgram.agents.rollouts import Collector
+from rotorgram.agents.sb3 import SB3VecEnv
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.models.errors import InputError
+from rotorgram.udp import RemoteEnv, RemoteVectorEnv, Simulator
 
+ENV = "rotorgram/Elevation-v0"
 N = 5
 OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
 
 
-@contextmanager
-def remote(simulators: int, drones: int, mode: str = "Disabled") -> Iterator[RemoteVectorEnv]:
-    with closing(
-        RemoteVectorEnv(
-            ANY,
-            num_simulators=simulators,
-            num_envs=simulators * drones,
-            connect=False,
-            autoreset_mode=mode,
-        )
-    ) as env:
-        running = [
-            Running(Simulator(server=env.address, bind=ANY, num_envs=drones, **OPTIONS))
-            for _ in range(simulators)
-        ]
-        env.connect()
-        yield env
-    for one in running:
-        one.join()
+def vector(drones: int = N, mode: str = "Disabled", **options: Any) -> LocalVectorEnv:
+    return LocalVectorEnv(ENV, drones, autoreset_mode=mode, **{**OPTIONS, **options})
 
 
-def policy(seed: int = 0) -> NetworkPolicy:
-    dice = np.random.default_rng(seed)
-    shapes = {"hidden.weight": (16, 3), "hidden.bias": (16,), "output.weight": (1, 16)}
+def single(**options: Any) -> Any:
+    return gym.make(ENV, disable_env_checker=True, **options)
+
+
+def policy(log: EpisodeLog) -> NetworkPolicy:
+    dice = np.random.default_rng(0)
+    size = log.single_observation_space.shape[0]  # type: ignore[index]
+    shapes = {"hidden.weight": (16, size), "hidden.bias": (16,),
+              "output.weight": (log.actions.outputs, 16)}  # fmt: skip
     weights = {k: 0.3 * dice.normal(size=s).astype(np.float32) for k, s in shapes.items()}
-    return NetworkPolicy(
-        {**weights, "output.bias": np.zeros(1, np.float32), "log_std": np.zeros(1, np.float32)}
-    )
+    zeros = np.zeros(log.actions.outputs, np.float32)
+    return NetworkPolicy({**weights, "output.bias": zeros, "log_std": zeros}, log.spec)
+
+
+def collector_of(drones: int, **options: Any) -> tuple[EpisodeLog, Collector, NetworkPolicy]:
+    log = EpisodeLog(vector(drones, **options), 0)
+    return log, Collector(log, np.random.default_rng(0)), policy(log)
 
 
 def random_actions(dice: np.random.Generator, drones: int = N) -> np.ndarray:
@@ -67,8 +61,13 @@ def random_actions(dice: np.random.Generator, drones: int = N) -> np.ndarray:
 # ---- episodes
 
 
+def test_episode_seeds_differ_between_runs_and_episodes() -> None:
+    seeds = {episode_seed(run, k) for run in range(20) for k in range(50)}
+    assert len(seeds) == 1000
+
+
 def test_every_episode_has_the_seed_of_its_number() -> None:
-    log = VectorEpisodeLog(ElevationVectorEnv(N, **OPTIONS), seed=3)
+    log = EpisodeLog(vector(), seed=3)
     log.reset()
     dice, flown = np.random.default_rng(0), []
     for _ in range(100):
@@ -78,27 +77,51 @@ def test_every_episode_has_the_seed_of_its_number() -> None:
     assert len(log.episodes) >= 3 * N
     numbers = [episode.episode for episode in log.episodes]
     assert sorted(numbers)[: 2 * N] == list(range(2 * N))
-    with closing(gym.make(ENV_ID, **OPTIONS)) as single:
-        for episode in log.episodes:
-            # Which drone flew it? The one whose actions repeat it, from the step where it began.
-            first = episode.first_step // N
-            returns = []
-            for drone in range(N):
-                single.reset(seed=episode_seed(3, episode.episode))
-                rewards: list[float] = []
-                for actions in flown[first : first + episode.length]:
-                    _, reward, terminated, truncated, _ = single.step(actions[drone])
-                    rewards.append(float(reward))
-                    if terminated or truncated:
-                        break
-                if len(rewards) == episode.length and terminated == episode.terminated:
-                    returns.append(sum(rewards))
-            assert episode.total_reward in returns
-            assert episode.truncated != episode.terminated
+    env = single(**OPTIONS)
+    for episode in log.episodes:
+        # Which drone flew it? The one whose actions repeat it, from the step where it began.
+        first, matches = episode.first_step // N, []
+        for drone in range(N):
+            env.reset(seed=episode_seed(3, episode.episode))
+            rewards, sizes = [], []
+            for actions in flown[first : first + episode.length]:
+                _, reward, terminated, truncated, info = env.step(actions[drone])
+                rewards.append(reward)
+                sizes.append(abs(info["elevation_error"]))
+                if terminated or truncated:
+                    break
+            if len(rewards) == episode.length and terminated == episode.terminated:
+                matches.append((sum(rewards), np.mean(sizes)))
+        got = episode.total_reward, episode.mean_size
+        assert any(got == pytest.approx(match, rel=1e-9) for match in matches)
+        assert episode.truncated != episode.terminated
+
+
+def test_the_log_of_one_drone_and_of_many_keep_the_same() -> None:
+    logs = [EpisodeLog(env, seed=5, keep_steps=True) for env in (single(**OPTIONS), vector(1))]
+    dice = np.random.default_rng(1)
+    actions = [random_actions(dice, 1) for _ in range(70)]
+    for log in logs:
+        log.start()
+        for action in actions:
+            log.fly(action)
+            if log.env.terminated[0] or log.env.truncated[0]:
+                log.begin(np.ones(1, bool))
+    one, other = (log.steps() for log in logs)
+    for name, column in one.items():
+        assert column.tobytes() == other[name].tobytes()
+    assert one["value"].shape == (70,)
+    first = logs[0].episodes[0]
+    assert (first.episode, first.first_step) == (0, 0)
+    assert one["episode"].tolist().count(0) == first.length
+    own = one["episode"] == 0
+    assert first.total_reward == pytest.approx(one["reward"][own].sum(), rel=1e-5)
+    assert first.mean_size == pytest.approx(np.abs(one["value"][own]).mean(), rel=1e-5)
+    assert one["thrust"][0] == pytest.approx(49 + 5 * actions[0][0, 0], rel=1e-6)
 
 
 def test_a_step_is_gymnasiums_same_step() -> None:
-    log = VectorEpisodeLog(ElevationVectorEnv(N, **OPTIONS), seed=0)
+    log = EpisodeLog(vector(), seed=0)
     log.reset()
     dice, ended = np.random.default_rng(0), 0
     for _ in range(60):
@@ -116,319 +139,136 @@ def test_a_step_is_gymnasiums_same_step() -> None:
     assert ended > N
 
 
-@pytest.mark.parametrize("where", ["here", "over UDP"])
-def test_resuming_brings_every_drone_to_where_it_was(where: str) -> None:
-    @contextmanager
-    def env() -> Iterator[Any]:
-        if where == "here":
-            yield ElevationVectorEnv(4, **OPTIONS)
-        else:
-            with remote(2, 2) as other:
-                yield other
+@pytest.mark.parametrize("drones", [1, 4])
+def test_resuming_brings_every_drone_to_where_it_was(drones: int) -> None:
+    def env() -> Any:
+        return single(**OPTIONS) if drones == 1 else vector(drones)
 
     for steps in (0, 1, 37):
-        with env() as one, env() as other:
-            first, second = VectorEpisodeLog(one, 1), VectorEpisodeLog(other, 1)
-            dice = np.random.default_rng(7)
-            first.reset()
-            for _ in range(steps):
-                first.step(random_actions(dice, 4))
-            second.resume(first.position(), first.episodes)
-            for _ in range(45):
-                actions = random_actions(dice, 4)
-                results = first.step(actions), second.step(actions)
-                for ours, theirs in zip(results[0][:4], results[1][:4], strict=True):
-                    assert ours.tobytes() == theirs.tobytes()
-            kept = [[replace(e, seconds=0.0) for e in log.episodes] for log in (first, second)]
-            assert kept[0] == kept[1]
+        first, second = EpisodeLog(env(), 1), EpisodeLog(env(), 1)
+        dice = np.random.default_rng(7)
+        first.reset()
+        for _ in range(steps):
+            first.step(random_actions(dice, drones))
+        second.resume(first.position())
+        for _ in range(45):
+            actions = random_actions(dice, drones)
+            for ours, theirs in zip(first.step(actions)[:4], second.step(actions)[:4], strict=True):
+                assert ours.tobytes() == theirs.tobytes()
+        kept = [[replace(e, seconds=0.0) for e in log.episodes] for log in (first, second)]
+        assert kept[0] == kept[1]
 
 
 def test_resuming_elsewhere_is_refused() -> None:
-    first = VectorEpisodeLog(ElevationVectorEnv(2, **OPTIONS), 1)
+    first = EpisodeLog(vector(2), 1)
     first.reset()
     for _ in range(10):
         first.step(np.full((2, 1), 0.1))
     for changes in ({"linear_drag": 0.1}, {"episode_length": 5}):
-        env = ElevationVectorEnv(2, **{**OPTIONS, **changes})
         with pytest.raises(ResumeError, match="does not repeat the episodes"):
-            VectorEpisodeLog(env, 1).resume(first.position(), [])
-    with pytest.raises(ResumeError, match="expected a training with 3 drones"):
-        VectorEpisodeLog(ElevationVectorEnv(3), 1).resume(first.position(), [])
+            EpisodeLog(vector(2, **changes), 1).resume(first.position())
+
+
+class Losing(LocalVectorEnv):
+    """Loses the simulator of its second half while the first half is reset, once."""
+
+    armed = False
+
+    def advance(
+        self, actions: Any, resets: Any = None, seeds: Any = None, frozen: Any = None
+    ) -> None:
+        super().advance(actions, resets, seeds, frozen)
+        self.lost = np.zeros(self.num_envs, bool)
+        if self.armed and frozen is not None and resets.any() and frozen[-1]:
+            self.armed = False
+            self.struck = frozen[-2:].copy()
+            self.lost[-2:] = self.struck
+            self.truncated = self.lost.copy()
+
+
+def test_a_simulator_lost_while_others_begin() -> None:
+    env = Losing(ENV, 4, autoreset_mode="Disabled", **OPTIONS)
+    log = EpisodeLog(env, 0)
+    log.reset()
+    dice, seen = np.random.default_rng(0), False
+    for step in range(80):
+        env.armed = step > 5 and not seen
+        observations, _, terminated, truncated, info = log.step(random_actions(dice, 4))
+        if step > 5 and not seen and not env.armed:
+            seen = True
+            # The frozen drones are truncated too, and begin anew.
+            assert truncated[-2:][env.struck].all()
+            assert (info["_final_obs"] == terminated | truncated).all()
+            assert not observations[terminated | truncated, 1:].any()
+    assert seen
+    assert any(episode.simulator_lost for episode in log.episodes)
 
 
 # ---- rollouts
 
 
-def test_a_rollout_is_drone_by_drone() -> None:
-    log = VectorEpisodeLog(ElevationVectorEnv(N, **OPTIONS), 0)
-    collector = VectorCollector(log, np.random.default_rng(0))
-    known = flown = 0
-    for _ in range(3):
-        rollout = collector.steps(policy(), 20 * N - 3)  # rounded up
-        ended = log.episodes[known:]
-        known = len(log.episodes)
-        # One step of 20 for each episode that began within them.
-        assert 20 * N - len(ended) <= len(rollout) <= 20 * N
-        assert log.env_steps - flown == len(rollout)
-        flown = log.env_steps
-        following, after = rollout.observations[1:], rollout.next_observations[:-1]
-        going_on = ~rollout.ends[:-1]
-        assert (following[going_on] == after[going_on]).all()
-        # What comes after an end is the start of an episode, or the next drone's.
-        assert (following[~going_on] != after[~going_on]).any(axis=1).all()
-        assert not (rollout.terminated & rollout.truncated).any()
+@pytest.mark.parametrize("drones", [1, N])
+def test_a_rollout_keeps_final_observations_and_goes_on(drones: int) -> None:
+    log, collector, flown_by = collector_of(drones)
+    rollouts = [collector.steps(flown_by, 20 * drones - drones // 2) for _ in range(3)]
+    assert sum(map(len, rollouts)) == log.env_steps
+    observations, after, ends, kept = (
+        np.concatenate([getattr(rollout, name) for rollout in rollouts])
+        for name in ("observations", "next_observations", "ends", "kept")
+    )
+    assert kept.shape == (60, drones)
+    # A step is spent for an episode that began within the rollouts, if others were flying.
+    assert (~kept).sum() <= len(log.episodes)
+    assert (drones > 1) == (not kept.all())
+    same = (observations[1:] == after[:-1]).all(axis=2)
+    going_on = ~ends[:-1]
+    assert same[going_on].all()
+    starts = kept[1:] & ends[:-1]
+    assert not observations[1:][starts][:, 1:].any(), "at rest, hovering"
 
 
-def test_advantages_of_a_rollout_are_those_of_each_drone() -> None:
-    log = VectorEpisodeLog(ElevationVectorEnv(N, **OPTIONS), 0)
-    rollout = VectorCollector(log, np.random.default_rng(0)).steps(policy(), 25 * N)
-    dice = np.random.default_rng(1)
-    values, following = dice.normal(size=(2, len(rollout)))
-    arguments = (rollout.rewards, values, following, rollout.terminated, rollout.truncated)
-    together = advantages(*arguments, gamma=0.98, trace=0.9)
-    starts = np.flatnonzero(np.append(True, rollout.ends))
-    assert starts[-1] == len(rollout)  # nothing is carried from one stretch to the next
-    for first, last in pairwise(starts):
-        alone = advantages(*(a[first:last] for a in arguments), gamma=0.98, trace=0.9)
-        assert together[first:last].tobytes() == alone.tobytes()
-
-
-def test_whole_episodes_of_every_drone() -> None:
-    log = VectorEpisodeLog(ElevationVectorEnv(N, **OPTIONS), 0)
-    collector = VectorCollector(log, np.random.default_rng(0))
+@pytest.mark.parametrize("drones", [1, N])
+def test_whole_episodes_of_every_drone(drones: int) -> None:
+    log, collector, flown_by = collector_of(drones)
     for number in range(1, 4):
-        rollout = collector.episodes(policy(), N + 1, 10**6)
-        assert int(rollout.ends.sum()) == 2 * N
-        assert rollout.ends[-1]
-        assert len(log.episodes) == 2 * N * number
-        lengths = [e.length for e in log.episodes[-2 * N :]]
-        starts = np.flatnonzero(np.append(True, rollout.ends[:-1]))
-        assert sorted(np.diff(np.append(starts, len(rollout)))) == sorted(lengths)
-        assert not rollout.observations[starts, 1:].any()  # at rest, hovering
+        rollout = collector.episodes(flown_by, drones + 1, 10**6)
+        assert ((rollout.terminated | rollout.truncated) & rollout.kept).sum() == 2 * drones
+        assert len(log.episodes) == 2 * drones * number
+        assert len(rollout) == sum(e.length for e in log.episodes[-2 * drones :])
     assert log.env_steps == sum(e.length for e in log.episodes)
 
 
 def test_episodes_are_broken_off_where_the_training_ends() -> None:
     """A part of an episode is not learnt from, but it was flown; a single drone keeps its last."""
-    log = VectorEpisodeLog(ElevationVectorEnv(N), 0)
-    rollout = VectorCollector(log, np.random.default_rng(0)).episodes(policy(), 1, 23)
-    assert (len(rollout), log.env_steps) == (0, 25)
-    assert rollout.observations.shape == (0, 3)
-    log = VectorEpisodeLog(ElevationVectorEnv(1), 0)
-    rollout = VectorCollector(log, np.random.default_rng(0)).episodes(policy(), 1, 23)
-    assert len(rollout) == log.env_steps == 23
+    for drones, learnt, flown in ((N, 0, 25), (1, 23, 23)):
+        log, collector, flown_by = collector_of(drones, flight_band=3.0)
+        rollout = collector.episodes(flown_by, 1, 23)
+        assert (len(rollout), log.env_steps) == (learnt, flown)
 
 
-def test_policies_of_many_are_those_of_each() -> None:
-    dice = np.random.default_rng(0)
-    one = policy()
-    observations = dice.normal(size=(50, 3)).astype(np.float32)
-    noise = one.draw_noise(dice, 50)
-    each = np.array([one.sample(o, n) for o, n in zip(observations, noise, strict=True)])
-    np.testing.assert_allclose(one.samples(observations, noise), each, rtol=1e-5, atol=1e-6)
-    weights = {"hidden.weight": np.ones((4, 1)), "hidden.bias": np.zeros(4),
-               "output.weight": np.eye(3, 4), "output.bias": np.zeros(3)}  # fmt: skip
-    discrete = NetworkPolicy({k: v.astype(np.float32) for k, v in weights.items()})
-    observations, noise = observations[:, :1], discrete.draw_noise(dice, 50)
-    each = np.array([discrete.sample(o, n) for o, n in zip(observations, noise, strict=True)])
-    assert discrete.samples(observations, noise).tobytes() == each.tobytes()
+# ---- other tasks
 
 
-# ---- training
-
-
-SMALL = {
-    "vpg": {"episodes_per_update": 3},
-    "a2c": {"steps_per_update": 64},
-    "sb3-a2c": {"steps_per_update": 64},
-}
-
-
-def run_of(algorithm: str, **options: Any) -> Run:
-    return Run(
-        algorithm=algorithm,
-        config=preset(algorithm, "tuned", **SMALL[algorithm]),
-        env=ElevationConfig(**OPTIONS, **options),
-        seed=5,
-        env_steps=1024,
-        num_envs=4,
-    )
-
-
-@pytest.mark.parametrize("kind", ["continuous", "discrete"])
-@pytest.mark.parametrize("algorithm", SMALL)
-def test_a_training_that_was_stopped_ends_as_if_it_had_not(
-    algorithm: str, kind: str, tmp_path: Path
-) -> None:
-    run = run_of(algorithm, action_type=kind)
-    options = {**OPTIONS, "action_type": kind}
-    unbroken = Training(run, ElevationVectorEnv(4, **options))
-    assert unbroken.train()
-    stopped = Training(run, ElevationVectorEnv(4, **options))
-    updates = iter(range(3))
-    assert not stopped.train(lambda: next(updates, None) != 2)
-    stopped.store(tmp_path / "c")
-    kept = load(tmp_path / "c")
-    assert kept.num_envs == 4
-    assert not is_finished(kept)
-    torch.manual_seed(99)
-    resumed = Training.resume(kept, ElevationVectorEnv(4, **options), stopped.log.episodes)
-    assert resumed.train()
-    assert is_finished(resumed.checkpoint())
-    assert resumed.log.env_steps == unbroken.log.env_steps
-    for ours, theirs in ((resumed.agent.state(), unbroken.agent.state()),
-                         (resumed.agent.actor(), unbroken.agent.actor())):  # fmt: skip
-        assert set(ours) == set(theirs)
-        for name in ours:
-            assert ours[name].tobytes() == theirs[name].tobytes(), name
-    kept_episodes = [[replace(e, seconds=0.0) for e in t.log.episodes] for t in (resumed, unbroken)]
-    assert kept_episodes[0] == kept_episodes[1]
-
-
-def test_progress_tells_of_every_drone() -> None:
-    """Of 120 drones that begin together the last 20 to end are those that flew longest."""
-    run = replace(run_of("vpg"), num_envs=120, env_steps=7200)
-    training = Training(run, ElevationVectorEnv(120, **OPTIONS))
-    training.train()
-    assert len(training.log.episodes) >= 240
-    last = training.log.episodes[-120:]
-    lengths = [episode.length for episode in last]
-    assert np.mean(lengths[-20:]) > np.mean(lengths)
-    mean = np.mean([episode.total_reward for episode in last])
-    assert training.progress().mean_return == pytest.approx(mean)
-    assert training.scalars()["rollout/ep_rew_mean"] == pytest.approx(mean)
-    assert training.scalars()["rollout/ep_len_mean"] == pytest.approx(np.mean(lengths))
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "settings", "note"),
-    [
-        ("a2c", ("--num-envs", 16), ""),
-        (
-            "sb3-a2c",
-            ("--num-envs", 18),
-            "note: an update has 15 steps of each of 18 drones, and sb3-a2c learns little from "
-            "fewer than 16: try --set steps_per_update=576, a higher learning_rate, and "
-            "--env-steps 57600 or more\n",
-        ),
-        # Rounds of 4 episodes of 5 steps: 30 updates, and one less.
-        ("vpg", ("--num-envs", 4, "--env-steps", 600), ""),
-        (
-            "vpg",
-            ("--num-envs", 4, "--env-steps", 599),
-            "note: 599 env steps of 4 drones may be as few as 29 updates, and vpg learns little "
-            "from fewer than 30: try --env-steps 600 or more, or fewer drones\n",
-        ),
-    ],
-)
-def test_train_says_where_the_drones_are_too_many(
-    algorithm: str,
-    settings: tuple[object, ...],
-    note: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    arguments = ["train", algorithm, "--env-steps", 600, "--env.episode-length", 5]
-    folder = tmp_path / "run"
-    assert main([str(a) for a in (*arguments, *settings, "--out", folder)]) == 0
-    out = capsys.readouterr().out
-    assert out.startswith(note)
-    assert out.count("note: ") == bool(note)
-
-
-@pytest.mark.parametrize("algorithm", ["vpg", "a2c"])
-def test_over_udp_the_training_is_the_same(algorithm: str) -> None:
-    run = run_of(algorithm)
-    here = Training(run, ElevationVectorEnv(4, **OPTIONS))
-    here.train()
-    with remote(2, 2) as env:
-        there = Training(run, env)
-        there.train()
-    for name, weight in here.agent.actor().items():
-        assert weight.tobytes() == there.agent.actor()[name].tobytes()
-
-
-def test_a_lost_simulator_is_marked() -> None:
-    arguments: dict[str, Any] = {"bind": ANY, "num_envs": 2, **OPTIONS}
-    with closing(
-        RemoteVectorEnv(ANY, num_envs=2, connect=False, timeout=0.5, autoreset_mode="Disabled")
-    ) as env:
-        first = Running(Simulator(server=env.address, **arguments))
-        env.connect()
-        log = VectorEpisodeLog(env, 0)
-        log.reset()
-        for _ in range(3):
-            log.step(np.zeros((2, 1)))
-        first.cut()
-        other = Running(Simulator(server=env.address, **arguments))
-        assert log.step(np.zeros((2, 1)))[3].all()
-        assert [(e.length, e.truncated, e.simulator_lost) for e in log.episodes] == [
-            (4, True, True)
-        ] * 2
-        for _ in range(30):
-            log.step(np.zeros((2, 1)))
-        assert [e.episode for e in log.episodes] == [0, 1, 2, 3]
-        assert not log.episodes[-1].simulator_lost
-        # The seeds of the next episodes were theirs, though the simulator was another.
-        single = VectorEpisodeLog(ElevationVectorEnv(2, **OPTIONS), 0)
-        single.resume(log.position(), log.episodes)
-    other.join()
-
-
-class Losing(ElevationVectorEnv):
-    """Loses the simulator of its second half while the first half is reset, once."""
-
-    armed = False
-
-    def advance(self, actions: Any, resets: Any, seeds: Any = None, holds: Any = None) -> None:
-        super().advance(actions, resets, seeds, holds)
-        self.lost = np.zeros(self.num_envs, bool)
-        if self.armed and holds is not None and resets.any() and holds[-1]:
-            self.armed = False
-            self.lost[-2:] = self.struck = holds[-2:]
-            self.truncated, self.over = self.lost.copy(), self.over | self.lost
-
-
-@pytest.mark.parametrize("wrapped", [True, False])
-def test_a_simulator_lost_while_others_begin(wrapped: bool) -> None:
-    env: Any = Losing(4, autoreset_mode="SameStep", **OPTIONS)
-    flown: Any = VectorEpisodeLog(env, 0) if wrapped else env
-    flown.reset(seed=0)
-    dice, seen = np.random.default_rng(0), False
-    for step in range(80):
-        env.armed = step > 5 and not seen
-        observations, rewards, terminated, truncated, info = flown.step(random_actions(dice, 4))
-        assert len(rewards) == 4
-        if step > 5 and not seen and not env.armed:
-            seen = True
-            # Whoever held is truncated too, with its last observation, and at a new start.
-            assert truncated[-2:][env.struck].all()
-            ended = terminated | truncated
-            assert (info["_final_obs"] == ended).all()
-            assert not observations[ended, 1:].any()
-            assert not env.over.any()
-    assert seen
-    if wrapped:
-        assert any(episode.simulator_lost for episode in flown.episodes)
-
-
-def test_the_env_has_as_many_drones_as_the_run() -> None:
-    with pytest.raises(ValueError, match="env: expected one of 4 drones, got 3"):
-        Training(run_of("a2c"), ElevationVectorEnv(3))
-    with pytest.raises(ValueError, match="num_envs: expected 1 or more, got 0"):
-        replace(run_of("a2c"), num_envs=0)
-    with pytest.raises(ValueError, match="env_steps: expected at least 120, got 119"):
-        replace(run_of("vpg"), env_steps=119)  # an episode of each
+def test_many_numbers_to_see_and_to_act() -> None:
+    """Hover-v0 has four actions; the log knows its metric by name."""
+    log = EpisodeLog(gym.make("rotorgram/Hover-v0", episode_length=20), 0, keep_steps=True)
+    rollout = Collector(log, np.random.default_rng(0)).steps(policy(log), 50)
+    assert rollout.actions.shape == (50, 1, 4)
+    assert log.episodes
+    steps = log.steps()
+    own = steps["value"][steps["episode"] == 0]
+    assert log.episodes[0].mean_size == pytest.approx(own.mean(), rel=1e-5)
+    assert (own >= 0).all()
 
 
 # ---- Stable-Baselines3
 
 
 def test_sb3_sees_final_observations_and_truncations() -> None:
-    env = SB3VecEnv(ElevationVectorEnv(N, autoreset_mode="SameStep", **OPTIONS))
+    env = SB3VecEnv(vector(mode="SameStep"))
     env.seed(3)
     first = env.reset()
-    other = ElevationVectorEnv(N, autoreset_mode="SameStep", **OPTIONS)
+    other = vector(mode="SameStep")
     assert first.tobytes() == other.reset(seed=3)[0].tobytes()
     dice, kinds = np.random.default_rng(0), set()
     for _ in range(80):
@@ -449,12 +289,60 @@ def test_sb3_sees_final_observations_and_truncations() -> None:
 
 
 def test_sb3_wants_same_step() -> None:
-    with pytest.raises(ValueError, match="expected a vector env with autoreset SAME_STEP"):
-        SB3VecEnv(ElevationVectorEnv(2))
+    with pytest.raises(InputError, match="expected a vector env with autoreset SAME_STEP"):
+        SB3VecEnv(vector(2))
 
 
-def test_sb3_flies_over_the_batched_wire() -> None:
-    with remote(1, 4, mode="SameStep") as env:
-        model = PPO("MlpPolicy", SB3VecEnv(env), n_steps=16, batch_size=32, device="cpu")
-        model.learn(128)
-        assert model.num_timesteps == 128
+# ---- over UDP
+
+
+@contextmanager
+def remote(simulators: int, drones: int) -> Iterator[Any]:
+    """A vector env whose drones are flown by simulators in threads; one drone is a `RemoteEnv`."""
+    options: dict[str, Any] = {"connect": False, "connect_timeout": 20, "timeout": 20}
+    with ExitStack() as stack:
+        env: Any
+        if simulators * drones == 1:
+            env = RemoteEnv(("127.0.0.1", 0), **options)
+        else:
+            env = RemoteVectorEnv(
+                ("127.0.0.1", 0),
+                num_simulators=simulators,
+                num_envs=simulators * drones,
+                autoreset_mode="Disabled",
+                **options,
+            )
+        stack.callback(env.close)
+        for _ in range(simulators):
+            simulator = Simulator(
+                ENV, server=env.address, bind=("127.0.0.1", 0), num_envs=drones, **OPTIONS
+            )
+            thread = Thread(target=simulator.run)
+            thread.start()
+            stack.callback(simulator.close)
+            stack.callback(thread.join)
+            stack.callback(simulator.stop)
+        env.connect()
+        yield env
+
+
+@pytest.mark.parametrize(("simulators", "drones"), [(1, 1), (2, 2)])
+def test_over_udp_the_training_is_the_same_and_goes_on(simulators: int, drones: int) -> None:
+    config: Any = preset("a2c", "tuned", steps_per_update=64)
+    count = simulators * drones
+    here = EpisodeLog(single(**OPTIONS) if count == 1 else vector(count), 1)
+    agent = make_agent("a2c", here, config, 1)
+    agent.train(here, 512, lambda: True)
+    with remote(simulators, drones) as env:
+        there = EpisodeLog(env, 1)
+        other = make_agent("a2c", there, config, 1)
+        other.train(there, 512, lambda: True)
+        for name, weight in agent.actor().items():
+            assert weight.tobytes() == other.actor()[name].tobytes()
+        again = EpisodeLog(env, 1)
+        again.resume(here.position())
+        assert again.position().observations.tobytes() == here.observations.tobytes()
+
+
+def test_the_name_of_a_loss_is_that_of_the_wire() -> None:
+    assert LOST == rotorgram.udp.LOST

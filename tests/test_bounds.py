@@ -1,0 +1,58 @@
+"""Bounds of the elevation task against flights computed by hand."""
+
+import numpy as np
+import pytest
+from rotorgram.envs.tasks.elevation import ElevationOptions
+from rotorgram.experiments.bounds import bang_bang, elevation_bounds, elevation_reward
+from rotorgram.models.vehicle import Vehicle
+
+
+def flown(distance: float, towards: float, against: float, **rest: float) -> np.ndarray:
+    one = np.array([distance]), 250, 0.02, np.array([towards]), np.array([against])
+    return bang_bang(*one, **rest)[0]
+
+
+def test_equal_accelerations_meet_in_the_middle() -> None:
+    # 4 m at 1 m/s²: two seconds of thrust, two of braking.
+    left = flown(4.0, 1.0, 1.0)
+    assert left[[49, 99, 149, 199, 249]] == pytest.approx([3.5, 2.0, 0.5, 0.0, 0.0], abs=1e-4)
+
+
+def test_unequal_accelerations_switch_earlier_or_later() -> None:
+    # t_1 = sqrt(2 d b / (a (a + b))) and t_2 = a t_1 / b: 1 s and 3 s for d = 6 m, a = 3, b = 1.
+    left = flown(6.0, 3.0, 1.0)
+    assert left[[49, 199]] == pytest.approx([4.5, 0.0], abs=1e-4)
+
+
+def test_limited_changes_take_four_equal_parts() -> None:
+    # Steps of 0.1 m/s² each 0.02 s are 5 m/s³. Four parts of n steps, from 0 to 0.1 n m/s² and
+    # back, twice: the sum of sums gives 2 n³ · 0.1 · 0.02² m.
+    steps = 20
+    left = flown(2 * steps**3 * 0.1 * 0.02**2, 50.0, 50.0, change=0.1)
+    assert abs(left[4 * steps :]).max() < 1e-4
+    assert left[4 * steps - 4] > 1e-4
+    assert left[2 * steps - 1] == pytest.approx(left[0] / 2, rel=0.05)
+
+
+def test_drag_makes_way_and_braking_shorter() -> None:
+    assert flown(6.0, 3.0, 1.0, drag=1.0)[49] > flown(6.0, 3.0, 1.0)[49]
+    assert abs(flown(1.0, 3.0, 1.0, drag=1.0)[-1]) < 1e-4
+
+
+def test_returns_of_the_papers_task() -> None:
+    starts = (np.arange(40) - 19.5) / 20
+    bounds = elevation_bounds(ElevationOptions(), Vehicle.load(), starts)
+    # (s - |E|) / (s + |E|) with s = 0.5 m, over |E| uniform in 0 to 1 m: log 3 - 1 per step.
+    assert bounds["hover"] == pytest.approx(250 * (np.log(3) - 1), rel=0.005)
+    assert bounds["time-optimal"] == pytest.approx(232, abs=1)
+    # Nothing is better than to be there at once, and thrust without inertia is better than with.
+    free = elevation_bounds(ElevationOptions(thrust_scale=100.0), Vehicle.load(), starts)
+    assert bounds["time-optimal"] < free["time-optimal"] < 250
+    assert elevation_reward(np.array([0.0, 0.5, -1.5])).tolist() == [1.0, 0.0, -0.5]
+
+
+def test_offsets_limit_the_acceleration_and_not_its_change() -> None:
+    options = ElevationOptions(action_mode="offset", linear_drag=2.0)
+    bounds = elevation_bounds(options, Vehicle.load(linear_drag=2.0), np.array([1.0]))
+    left = flown(1.0, 4.0, 4.0, drag=2.0)  # four rotors, 20 N each, 20 kg
+    assert bounds["time-optimal"] == pytest.approx(elevation_reward(left).sum())
