@@ -19,31 +19,42 @@ from pathlib import Path
 from typing import Any
 
 from rotorgram.agents import preset
-from rotorgram.agents.checkpoints import software_versions
-from rotorgram.envs import ElevationConfig
 from rotorgram.experiments.pairs import socket_pair
 from rotorgram.experiments.training import Run, Training
+from rotorgram.udp.journal import software
 
 FLOOD = """
 import json, random, socket, sys, time
-import gymnasium as gym, numpy as np, rotorgram.envs
+import numpy as np
 from dataclasses import replace
-from rotorgram.udp import binary
-from rotorgram.udp.fleet import Fleet
-from rotorgram.udp.messages import Hello
+from rotorgram.envs.registry import env_spec
+from rotorgram.udp.layouts import layout_of
+from rotorgram.udp.protocol import binary
+from rotorgram.udp.protocol.messages import Hello, State
 port, seconds = int(sys.argv[1]), float(sys.argv[2])
 dice = random.Random(0)
-fleet = Fleet("rotorgram/Elevation-v0", 1, {})
-fleet.reset(0)
+spec = env_spec("rotorgram/Elevation-v0", {})
+layout, other = layout_of(spec), replace(spec, env_id="other/Env-v0")
+
+def state():
+    zero = np.zeros(1)
+    return State(session=dice.getrandbits(64), sequence=1, time=0.0, rewards=zero,
+                 terminated=zero > 0, truncated=zero > 0,
+                 observations=tuple(np.zeros(s.shape, s.dtype) for s in layout.observation_slots),
+                 telemetry=tuple(np.zeros(s.shape) for s in layout.telemetry_slots))
+
+def hello(spec):
+    return Hello(session=dice.getrandbits(64), spec=spec.to_json())
+
 kinds = []
 for _ in range(200):
     kinds += [
         dice.randbytes(dice.randrange(1400)),
         b"\\xa7R\\x02\\x05" + dice.randbytes(60),
-        binary.encode(fleet.state(dice.getrandbits(64), 1)),
-        binary.encode(replace(fleet.hello, session=dice.getrandbits(64), env_id="other/Env-v0")),
-        binary.encode(replace(fleet.hello, session=dice.getrandbits(64))),
-        b"1,0.5,0,0,1,2,3" + b",0" * 10,
+        binary.encode(state(), layout),
+        binary.encode(hello(other)),
+        binary.encode(hello(spec)),
+        b"1,0.5,0,0,1,2,3" + b",0" * 14,
     ]
 sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 sock.connect(("127.0.0.1", port))
@@ -61,7 +72,7 @@ print(json.dumps({"sent": sent, "datagrams_per_second": round(sent / seconds)}))
 
 
 def train(run: Run, flood_seconds: float) -> dict[str, Any]:
-    with socket_pair(run.env) as env:
+    with socket_pair(run.env_id, run.options) as env:
         training = Training(run, env)
         flood, marks = None, []
 
@@ -108,7 +119,8 @@ def main() -> None:
     run = Run(
         algorithm="a2c",
         config=preset("a2c", "tuned"),
-        env=ElevationConfig(),
+        env_id="rotorgram/Elevation-v0",
+        options={},
         seed=0,
         env_steps=args.env_steps,
     )
@@ -127,7 +139,7 @@ def main() -> None:
         "flooded_seconds": flooded.get("flooded_seconds"),
         "flood": flooded["flood"],
         "agent": flooded["agent"],
-        "versions": software_versions(),
+        "versions": software(),
         "machine": {"cores": os.cpu_count()},
     }
     args.out.parent.mkdir(parents=True, exist_ok=True)

@@ -27,10 +27,9 @@ from typing import NamedTuple
 
 import numpy as np
 from rotorgram.udp import RemoteEnv
-from rotorgram.udp.journal import Journal, software
-from rotorgram.udp.messages import Command, Hello, State
-from rotorgram.udp.recording import read_journal, summarize
-from rotorgram.udp.statistics import Statistics
+from rotorgram.udp.journal import Journal, read_journal, software, summarize
+from rotorgram.udp.protocol.messages import Command, Hello, State
+from rotorgram.udp.protocol.statistics import Statistics
 
 SIDES: dict[str, tuple[str, ...]] = {
     "none": (),
@@ -133,7 +132,7 @@ def journal_alone(source: Path, target: Path, repeats: int = 9) -> float:
     flown = flown[:40_000]
     times = []
     for number in range(repeats):
-        journal = Journal(target / f"{number}.mcap", about={}, attachments={})
+        journal = Journal(target / f"{number}.mcap", side="agent")
         journal.start(Statistics())
         journal.tap(0, hello.message, hello.datagram)
         start = time.perf_counter()

@@ -23,12 +23,12 @@ import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401
 from joblib import Parallel, delayed
-from rotorgram.agents.checkpoints import software_versions
-from rotorgram.udp import RemoteVectorEnv, sockets
-from rotorgram.udp.keys import write_key
+from rotorgram.udp import RemoteVectorEnv
+from rotorgram.udp.journal import software
+from rotorgram.udp.protocol.auth import write_key
 
 FAULTS = {"drop": 0.3, "duplicate": 0.1, "reorder": 0.2, "corrupt": 0.05, "truncate": 0.02}
-PERIOD = 0.005  # s: one physics step for each control step, so that the wire is what is soaked
+PERIOD = 0.01  # s: one physics step for each control step, so that the wire is what is soaked
 
 RELAY = """
 import json, signal, sys
@@ -45,11 +45,9 @@ with Relay(("127.0.0.1", 0), tuple(settings["server"]), FaultConfig(**settings["
 
 SIMULATE = """
 import json, sys
-from rotorgram.udp import LinkConfig, Simulator, sockets
-sockets._ATTENTION = 1e-5
+from rotorgram.udp import Simulator
 settings = json.loads(sys.argv[1])
-quick = LinkConfig(first_resend=0.002, min_resend=0.0005, max_resend=0.002)
-with Simulator(server=("127.0.0.1", settings["port"]), bind=("127.0.0.1", 0), config=quick,
+with Simulator(server=("127.0.0.1", settings["port"]), bind=("127.0.0.1", 0),
                num_envs=settings["drones"], key_file=settings["key"],
                control_period=settings["period"]) as simulator:
     simulator.run()
@@ -67,56 +65,18 @@ def said(process: subprocess.Popen[str]) -> Any:
     return json.loads(process.stdout.readline())
 
 
-class Local:
-    """Drones in process, with the autoreset of the remote ones."""
-
-    def __init__(self, drones: int) -> None:
-        self.envs = [
-            gym.make("rotorgram/Elevation-v0", control_period=PERIOD, disable_env_checker=True)
-            for _ in range(drones)
-        ]
-        self.over = [False] * drones
-
-    def reset(self, seed: int) -> list[tuple[Any, ...]]:
-        return [
-            (*self.result(env.reset(seed=seed + i)), "0.0", False, False)
-            for i, env in enumerate(self.envs)
-        ]
-
-    def step(self, actions: np.ndarray) -> list[tuple[Any, ...]]:
-        rows = []
-        for i, env in enumerate(self.envs):
-            if self.over[i]:
-                rows.append((*self.result(env.reset()), "0.0", False, False))
-                self.over[i] = False
-                continue
-            observation, reward, terminated, truncated, info = env.step(actions[i])
-            row = *self.result((observation, info)), repr(reward), terminated, truncated
-            rows.append(row)
-            self.over[i] = terminated or truncated
-        return rows
-
-    def result(self, answer: tuple[Any, Any]) -> tuple[bytes, bytes]:
-        observation, info = answer
-        names = self.envs[0].unwrapped.telemetry_names
-        return observation.tobytes(), np.array([info[name] for name in names]).tobytes()
-
-
-def remote_rows(names: list[str], answer: tuple[Any, ...]) -> list[tuple[Any, ...]]:
-    observations, rewards, terminated, truncated, info = answer
-    # repr tells 0.0 from -0.0.
-    telemetry = np.stack([info[name] for name in names], axis=1)
-    return [
-        (o.tobytes(), t.tobytes(), *flags)
-        for o, t, *flags in zip(
-            observations, telemetry, map(repr, rewards.tolist()), terminated.tolist(),
-            truncated.tolist(), strict=True,
-        )
-    ]  # fmt: skip
+def numbers(answer: tuple[Any, ...]) -> dict[str, bytes]:
+    """Every bit of an answer of a vector env, by name."""
+    *arrays, info = answer
+    names = ["observations", "rewards", "terminated", "truncated"][: len(arrays)]
+    told = {name: array for name, array in info.items() if not name.startswith(("_", "reward"))}
+    return {
+        name: np.ascontiguousarray(array).tobytes()
+        for name, array in [*zip(names, arrays, strict=True), *told.items()]
+    }
 
 
 def soak(job: int, steps: int, drones: int, keyed: bool) -> dict[str, Any]:
-    sockets._ATTENTION = 1e-5  # s: dozens of processes share the cores, so those that wait sleep
     folder = Path(tempfile.mkdtemp())
     key = str(folder / "key") if keyed else None
     if key:
@@ -128,19 +88,17 @@ def soak(job: int, steps: int, drones: int, keyed: bool) -> dict[str, Any]:
     relay = launch(RELAY, {"server": remote.address, "faults": {**FAULTS, "seed": job}})
     settings = {"port": said(relay), "drones": drones, "key": key, "period": PERIOD}
     simulator = launch(SIMULATE, settings)
-    local, dice = Local(drones), np.random.default_rng(job)
-    observations, info = remote.reset(seed=job)
-    names = [name for name in info if not name.startswith("_")]
-    nothing = np.zeros(drones), np.zeros(drones, bool), np.zeros(drones, bool)
-    assert remote_rows(names, (observations, *nothing, info)) == local.reset(job)
+    local = gym.make_vec("rotorgram/Elevation-v0", num_envs=drones, **options)
+    dice = np.random.default_rng(job)
+    assert numbers(remote.reset(seed=job)) == numbers(local.reset(seed=job))
     began, different, ended = time.perf_counter(), None, 0
     for step in range(1, steps + 1):
         actions = dice.uniform(-1.2, 1.2, (drones, 1)).astype(np.float32)
-        rows = remote_rows(names, remote.step(actions))
-        if rows != local.step(actions):
+        answer = remote.step(actions)
+        if numbers(answer) != numbers(local.step(actions)):
             different = step
             break
-        ended += sum(local.over)
+        ended += int((answer[2] | answer[3]).sum())
     seconds = time.perf_counter() - began
     agent = remote.statistics.numbers()
     remote.close()
@@ -178,7 +136,7 @@ def main() -> None:
         "bits_that_differ": sum(job["first_step_that_differs"] is not None for job in jobs),
         "network": dict(network),
         "jobs": jobs,
-        "versions": software_versions(),
+        "versions": software(),
         "machine": {"cores": os.cpu_count()},
     }
     args.out.parent.mkdir(parents=True, exist_ok=True)

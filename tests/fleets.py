@@ -6,18 +6,20 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import rotorgram.envs
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from peers import ANY, ENV_ID, Running
+from rotorgram.envs.registry import env_spec
+from rotorgram.envs.spec import component_names
 from rotorgram.udp import (
     LinkConfig,
     RemoteVectorEnv,
     Simulator,
 )
 
-QUICK = LinkConfig(timeout=10, first_resend=0.02, max_resend=0.2)
-NAMES = rotorgram.envs.TELEMETRY_NAMES
+QUICK = LinkConfig(timeout=10)
+SPEC = env_spec(ENV_ID)
+NAMES = [name for array in SPEC.telemetry for name in component_names(array)]
 
 
 @contextmanager
@@ -29,7 +31,6 @@ def flying(
         ANY,
         num_simulators=simulators,
         num_envs=simulators * drones,
-        env_id=env,
         autoreset_mode=autoreset,
         connect=False,
     )
@@ -48,9 +49,7 @@ def simulate(remote: RemoteVectorEnv, config: LinkConfig = QUICK, **arguments: A
 
 @contextmanager
 def sync(num_envs: int, **options: Any) -> Iterator[VectorEnv]:
-    with closing(
-        gym.make_vec(ENV_ID, num_envs=num_envs, vectorization_mode="sync", **options)
-    ) as env:
+    with closing(gym.make_vec(ENV_ID, num_envs=num_envs, **options)) as env:
         yield env
 
 

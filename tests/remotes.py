@@ -10,6 +10,7 @@ import numpy as np
 import rotorgram.envs  # noqa: F401
 from gymnasium import spaces
 from peers import ANY, ENV_ID, Running
+from rotorgram.envs.spec import component_names
 from rotorgram.udp import (
     LinkConfig,
     RemoteEnv,
@@ -22,8 +23,8 @@ QUICK = LinkConfig(timeout=5)
 @contextmanager
 def flying(env: Any = ENV_ID, codec: Any = "binary", **options: Any) -> Iterator[SimpleNamespace]:
     """A RemoteEnv, and a simulator for it in a thread."""
-    remote_options = options if codec == "text" else None
-    remote = RemoteEnv(ANY, connect=False, options=remote_options, timeout=5, connect_timeout=5)
+    known = {"env_id": ENV_ID, "options": options} if codec == "text" else {}
+    remote = RemoteEnv(ANY, connect=False, timeout=5, connect_timeout=5, **known)
     simulator = Simulator(
         env, server=remote.address, bind=ANY, codec=codec, config=QUICK, **options
     )
@@ -38,7 +39,8 @@ def flying(env: Any = ENV_ID, codec: Any = "binary", **options: Any) -> Iterator
 def assert_parity(remote: gym.Env, local: gym.Env, steps: int, seeds: list[int]) -> None:
     """The same seeds and actions give the same bits."""
     dice = np.random.default_rng(5)
-    names = local.unwrapped.telemetry_names
+    spec = local.unwrapped.env_spec
+    names = [name for array in spec.telemetry for name in component_names(array)]
 
     def same(here: tuple, there: tuple) -> None:
         assert here[0].tobytes() == there[0].tobytes()

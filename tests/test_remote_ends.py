@@ -20,16 +20,15 @@ from peers import ANY, ENV_ID, Running, launch, plain_socket
 from remotes import QUICK, Broken, assert_parity, flying
 from rotorgram.udp import (
     LinkConfig,
-    LinkError,
     PeerClosed,
     PeerSilent,
     Refused,
     RemoteEnv,
     Simulator,
-    binary,
     sockets,
 )
-from rotorgram.udp.messages import Close, Hello, Welcome
+from rotorgram.udp.protocol import binary
+from rotorgram.udp.protocol.messages import Close, Hello, Welcome
 
 # ---- silence and ends
 
@@ -61,9 +60,7 @@ def test_nothing_listens() -> None:
 
 def test_an_agent_that_hears_but_never_answers() -> None:
     with plain_socket() as sock:
-        simulator = Simulator(
-            server=sock.getsockname(), bind=ANY, config=LinkConfig(timeout=0.3, first_resend=0.1)
-        )
+        simulator = Simulator(server=sock.getsockname(), bind=ANY, config=LinkConfig(timeout=0.3))
         running = Running(simulator)
         error = running.join()
         assert isinstance(error, PeerSilent)
@@ -78,12 +75,10 @@ def test_an_agent_that_hears_but_never_answers() -> None:
 
 def test_an_agent_that_falls_silent_is_told() -> None:
     with plain_socket() as sock:
-        simulator = Simulator(
-            server=sock.getsockname(), bind=ANY, config=LinkConfig(timeout=0.3, first_resend=0.1)
-        )
+        simulator = Simulator(server=sock.getsockname(), bind=ANY, config=LinkConfig(timeout=0.3))
         running = Running(simulator)
         hello, address = sock.recvfrom(65507)
-        welcome = Welcome(session=binary.decode(hello).session)
+        welcome = Welcome(session=binary.decode(hello).session, nonce=1)
         sock.sendto(binary.encode(welcome), address)
         error = running.join()
         assert isinstance(error, PeerSilent)
@@ -188,7 +183,7 @@ def test_no_way_to_the_agent_is_like_silence(monkeypatch: pytest.MonkeyPatch) ->
             raise errors.pop()
         return sockets.receive(sock, timeout)
 
-    monkeypatch.setattr("rotorgram.udp.simulator.receive", receive)
+    monkeypatch.setattr("rotorgram.udp.transport.simulator.receive", receive)
     with plain_socket() as sock:
         address = sock.getsockname()
         with Simulator(server=address, bind=ANY, config=LinkConfig(timeout=0.3)) as simulator:
@@ -285,7 +280,7 @@ def test_a_second_simulator_waits_until_the_first_has_left(
         first = Running(Simulator(Broken(None), server=remote.address, bind=ANY, config=QUICK))
         remote.reset()
         # Its timeout is shorter than the wait: it does not run while the agent says Wait.
-        config = LinkConfig(timeout=0.6, first_resend=0.05, max_resend=0.2)
+        config = LinkConfig(timeout=0.6)
         second = Running(Simulator(Broken(0.0), server=remote.address, bind=ANY, config=config))
         until = time.monotonic() + 1.2
         while time.monotonic() < until:
@@ -300,7 +295,7 @@ def test_a_second_simulator_waits_until_the_first_has_left(
         assert remote.statistics.counters["refused"] == 0
         first.join()
     assert second.join() == "the agent closed"
-    assert "every place at the agent is taken; waiting for a free one" in caplog.text
+    assert "every slot of the agent is taken; waiting for a free one" in caplog.text
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
@@ -363,48 +358,20 @@ def test_a_simulator_that_waits_is_told_when_the_agent_closes() -> None:
         assert str(error).endswith(" refused: the agent closed")
 
 
-@pytest.mark.parametrize("codec", ["binary", "text"])
 @pytest.mark.parametrize(
     ("value", "sentence"),
     [
         (None, "RuntimeError: bad state x+"),
-        (np.nan, "ValueError: observations: expected finite"),
+        (np.nan, "InputError: .*: expected finite numbers"),
     ],
 )
-def test_an_env_that_fails(codec: Any, value: float | None, sentence: str) -> None:
-    remote = RemoteEnv(
-        ANY, connect=False, options={"observation": "error"} if codec == "text" else None
-    )
-    env = Broken(value)
-    if codec == "text":
-        env.telemetry_names = remote._names  # type: ignore[attr-defined]
-        info = dict.fromkeys(remote._names, 0.0)
-        reset, step = env.reset, env.step
-        env.reset = lambda **k: (reset(**k)[0], info)  # type: ignore[method-assign]
-        env.step = lambda action: (*step(action)[:4], info)  # type: ignore[method-assign]
-    running = Running(Simulator(env, server=remote.address, bind=ANY, codec=codec, config=QUICK))
+def test_an_env_that_fails(value: float | None, sentence: str) -> None:
+    remote = RemoteEnv(ANY, connect=False)
+    running = Running(Simulator(Broken(value), server=remote.address, bind=ANY, config=QUICK))
     remote.reset()
     remote.step(np.zeros(1))
     remote.step(np.zeros(1))
-    if codec == "text":
-        sentence = "the simulator closed"
     with pytest.raises(PeerClosed, match=f"the simulator at .* closed: {sentence}"):
         remote.step(np.zeros(1))
     assert isinstance(running.join(), RuntimeError if value is None else ValueError)
     remote.close()
-
-
-def test_an_agent_that_flies_on_after_the_end() -> None:
-    with plain_socket() as sock:
-        simulator = Simulator(
-            server=sock.getsockname(), bind=ANY, codec="text", config=QUICK, episode_length=1
-        )
-        running = Running(simulator)
-        for sequence in (1, 2):
-            line, address = sock.recvfrom(1024)
-            sock.sendto(f"{sequence},0.0".encode(), address)
-        assert b"2," in line
-        assert sock.recv(1024) == b"2,close"
-    error = running.join()
-    assert isinstance(error, LinkError)
-    assert "an action came for drone 0 after the end of its episode: expected a reset" in str(error)

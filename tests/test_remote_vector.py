@@ -12,7 +12,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from peers import ANY, ENV_ID, Running, plain_socket
-from rotorgram.envs import ElevationVectorEnv
+from rotorgram.envs import LocalVectorEnv
 from rotorgram.udp import (
     PeerSilent,
     Refused,
@@ -146,6 +146,7 @@ def test_the_first_simulator_says_how_many_drones_there_are() -> None:
 def test_seeded_spaces_stay_seeded() -> None:
     with flying(1, 2) as (remote, _):
         samples = []
+        remote.connect()
         for _ in range(2):
             remote.action_space.seed(3)
             remote.reset()
@@ -205,7 +206,7 @@ def test_wrong_discrete_actions() -> None:
     with flying(1, 2, action_type="discrete") as (remote, _):
         remote.reset()
         for actions in ([0, 3], [-1, 0], [0.5, 1], [np.nan, 1]):
-            with pytest.raises(ValueError, match="actions: expected whole numbers 0 to 2, got"):
+            with pytest.raises(ValueError, match="action: expected"):
                 remote.step(np.array(actions))
         remote.step(np.array([0, 2]))
 
@@ -230,15 +231,16 @@ def test_wrong_seeds(seed: Any) -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ({"num_simulators": 0}, "num_simulators: expected 1 or more, got 0"),
-        ({"num_envs": 0}, "num_envs: expected a multiple of num_simulators = 1, got 0"),
+        ({"num_simulators": 0}, "num_simulators: expected 1 to 65536, got 0"),
+        (
+            {"num_envs": 0},
+            "num_envs: expected a multiple of num_simulators = 1, at most 65536, got 0",
+        ),
         (
             {"num_simulators": 2, "num_envs": 5},
-            "num_envs: expected a multiple of num_simulators = 2, got 5",
+            "num_envs: expected a multiple of num_simulators = 2, at most 131072, got 5",
         ),
-        ({"connect": False}, "num_envs: expected a number with connect=False, got None"),
         ({"timeout": 0}, "timeout: expected seconds > 0, got 0"),
-        ({"options": {"wind": 1}}, "options: expected some of target, .*, got 'wind'"),
         ({"address": ("0.0.0.0", 0)}, "0.0.0.0 is not a loopback address"),
         ({"key_file": "/nowhere/key"}, "key file: cannot read /nowhere/key"),
     ],
@@ -255,7 +257,7 @@ def test_wrong_arguments(arguments: dict[str, Any], sentence: str) -> None:
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_autoreset_is_that_of_the_local_env(mode: str, drones: int) -> None:
     options: dict[str, Any] = {"episode_length": 12, "flight_band": 1.3}
-    local = ElevationVectorEnv(2 * drones, autoreset_mode=mode, **options)
+    local = LocalVectorEnv(ENV_ID, 2 * drones, autoreset_mode=mode, **options)
     with flying(2, drones, autoreset=mode, **options) as (remote, _):
         assert remote.metadata["autoreset_mode"] == local.metadata["autoreset_mode"]
         assert_same(remote.reset(seed=4), local.reset(seed=4))
@@ -278,7 +280,7 @@ def test_autoreset_is_that_of_the_local_env(mode: str, drones: int) -> None:
 
 
 def test_a_mask_resets_some_and_the_others_hold() -> None:
-    local = ElevationVectorEnv(4, autoreset_mode="Disabled")
+    local = LocalVectorEnv(ENV_ID, 4, autoreset_mode="Disabled")
     with flying(2, 2, autoreset="Disabled") as (remote, _):
         assert_same(remote.reset(seed=1), local.reset(seed=1))
         dice = np.random.default_rng(0)
@@ -297,7 +299,7 @@ def test_a_mask_resets_some_and_the_others_hold() -> None:
 
 
 def test_a_mask_before_the_first_reset_leaves_the_others_to_be_reset() -> None:
-    local = ElevationVectorEnv(4)
+    local = LocalVectorEnv(ENV_ID, 4)
     actions = np.full((4, 1), 0.5, np.float32)
     some = {"reset_mask": np.array([False, True, False, False])}
     rest = {"reset_mask": ~some["reset_mask"]}
@@ -347,7 +349,7 @@ def test_who_waits_for_a_reset_loses_no_episode_with_its_simulator() -> None:
 
 def test_who_has_ended_and_holds_is_not_forgotten() -> None:
     options: dict[str, Any] = {"start_band": 0.3, "flight_band": 0.4}
-    local = ElevationVectorEnv(2, **options)
+    local = LocalVectorEnv(ENV_ID, 2, **options)
     with flying(1, 2, **options) as (remote, _):
         assert_same(remote.reset(seed=1), local.reset(seed=1))
         actions = np.array([[1.0], [0.0]], np.float32)
@@ -373,8 +375,8 @@ def test_a_step_after_the_end_without_autoreset_changes_nothing() -> None:
 
 
 def test_states_larger_than_the_systems_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rotorgram.udp.sockets._BUFFER", 212_992)  # Linux's own limit
-    local = ElevationVectorEnv(5000)
+    monkeypatch.setattr("rotorgram.udp.transport.sockets._BUFFER", 212_992)  # Linux's own limit
+    local = LocalVectorEnv(ENV_ID, 5000)
     with flying(1, 5000) as (remote, _):
         assert_same(remote.reset(seed=1), local.reset(seed=1))
         actions = np.full((5000, 1), 0.1, np.float32)

@@ -42,14 +42,20 @@ def main() -> int:
     ends_with_stdin = words[1:] == ["--until-stdin-closes"]
     try:
         with Simulator(**parse_arguments(words[:1] if ends_with_stdin else words)) as simulator:
-            signal.signal(signal.SIGTERM, lambda *_: simulator.stop())
+            ended: list[int] = []
+
+            def end(number: int, _: object) -> None:
+                ended.append(number)
+                simulator.stop()
+
+            signal.signal(signal.SIGTERM, end)
             if ends_with_stdin:
                 Thread(target=_stop_with_stdin, args=(simulator,), daemon=True).start()
             simulator.run()
+            return 128 + ended[0] if ended else 0
     except (LinkError, OSError, InputError) as error:
         print(f"rotorgram simulator: {error}", file=sys.stderr)
         return 1
-    return 0
 
 
 def _stop_with_stdin(simulator: Simulator) -> None:

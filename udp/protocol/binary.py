@@ -235,7 +235,7 @@ def _encode_state(m: State, layout: Layout | None) -> bytes:
     numbers = layout.state_numbers
     if numbers is None or not _adds_up(numbers.unpack_from(body)):
         floats = (*layout.observation_slots, layout.rewards, *layout.telemetry_slots)
-        _expect_finite(_HEADERLESS + body, m.time, floats)
+        _expect_finite("observation, reward, telemetry", _HEADERLESS + body, m.time, floats)
     return body
 
 
@@ -246,7 +246,7 @@ def _decode_state(data: bytes, session: int, sequence: int, layout: Layout | Non
     numbers = layout.state_numbers
     if numbers is None or not _adds_up(numbers.unpack_from(data, HEADER_SIZE)):
         floats = (*layout.observation_slots, layout.rewards, *layout.telemetry_slots)
-        _expect_finite(data, time, floats)
+        _expect_finite("observation, reward, telemetry", data, time, floats)
     terminated, truncated = layout.flags
     _expect_flags(data[terminated.at : truncated.end], _FLAGS)
     return State(
@@ -307,7 +307,7 @@ def _check_command(data: bytes, layout: Layout) -> None:
         return
     quick = layout.command_numbers
     if quick is None or not _adds_up(quick.unpack_from(data, COMMAND_ARRAYS_AT)):
-        _expect_finite(data, 0.0, (actions,))
+        _expect_finite("action", data, 0.0, (actions,))
 
 
 def _bytes_of(what: str, slot: Slot, array: np.ndarray) -> bytes:
@@ -325,7 +325,7 @@ def _adds_up(numbers: tuple[Any, ...]) -> bool:
     return isfinite(sum(numbers))
 
 
-def _expect_finite(data: bytes, time: float, slots: tuple[Slot, ...]) -> None:
+def _expect_finite(what: str, data: bytes, time: float, slots: tuple[Slot, ...]) -> None:
     if not isfinite(time):
         raise InputError(f"time: expected a finite number, got {time}")
     for slot in slots:
@@ -334,7 +334,9 @@ def _expect_finite(data: bytes, time: float, slots: tuple[Slot, ...]) -> None:
             finite = np.isfinite(array)
             if not finite.all():
                 first = np.argwhere(~finite)[0].tolist()
-                raise InputError(f"expected finite numbers, got {array[*first]} at {first}")
+                raise InputError(
+                    f"{what}: expected finite numbers, got {array[*first]} at {first}"
+                )
 
 
 def _expect(layout: Layout | None) -> Layout:

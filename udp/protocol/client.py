@@ -111,27 +111,27 @@ class RoundTrips:
     def __init__(self) -> None:
         self._smoothed: float | None = None
         self._variation = 0.0
-        self._sent: tuple[float, float] = (0.0, 0.0)  # the last two sendings
+        self._sent_at = 0.0
+        self._is_repeat = self._was_repeated = False
 
     def sent(self, now: float, *, first: bool = False) -> None:
         """Something was sent that wants an answer, for the first time or again."""
-        self._sent = (now, now if first else self._sent[0])
+        if first:
+            self._was_repeated = self._is_repeat
+        self._sent_at, self._is_repeat = now, not first
 
     def answered(self, now: float) -> None:
-        """The answer came. It is taken for one to the last sending, unless it came too soon."""
-        last, before = self._sent
-        seconds = now - last
-        if self._smoothed is not None and seconds < self._smoothed / 2:
-            seconds = now - before
+        """The answer came: to the last sending, but to which one is unclear if it came too soon."""
+        seconds = now - self._sent_at
         if self._smoothed is None:
             self._smoothed, self._variation = seconds, seconds / 2
-        else:
+        elif not (self._is_repeat and seconds < self._smoothed / 2):
             self._variation += (abs(self._smoothed - seconds) - self._variation) / 4
             self._smoothed += (seconds - self._smoothed) / 8
 
     def answered_again(self) -> None:
-        """An answer came a second time: it was asked for too early."""
-        if self._smoothed is not None:
+        """An answer came a second time. If it was asked for twice, that was too early."""
+        if self._smoothed is not None and self._was_repeated:
             self._smoothed = min(_TOO_EARLY * self._smoothed, _LONGEST_RESEND)
 
     def wait(self, tries: int) -> float:

@@ -183,8 +183,8 @@ class RemoteEnv(ServedEnv, gym.Env[Any, Any]):
         """As the space has it, a copy."""
         arrays = state.observations
         if len(arrays) == 1:
-            return arrays[0][0].copy()
-        return {name: a[0].copy() for name, a in zip(self._arrays, arrays, strict=True)}
+            return np.array(arrays[0][0])
+        return {name: np.array(a[0]) for name, a in zip(self._arrays, arrays, strict=True)}
 
     def _info(self, state: State) -> dict[str, Any]:
         numbers: list[float] = []

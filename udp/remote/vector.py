@@ -147,6 +147,12 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
         self._take_states(np.ones(self.num_envs, bool))
         return self._observed(), self._info(mask)
 
+    def step(self, actions: Any) -> Any:
+        """Fly every drone for one control period; what follows an episode, the autoreset says."""
+        if not self._flying:
+            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        return super().step(actions)
+
     def advance(
         self,
         actions: np.ndarray,

@@ -202,17 +202,18 @@ class Agent:
                 self._give_up(pending, now)
                 now = time.monotonic()
                 continue
+            datagram: bytes | None
             try:
                 datagram, address = self._port.receive(left, strangers=None in slots)
             except (OSError, ValueError):
                 if not self.close.alive:  # another thread has closed the env
                     raise gym.error.ClosedEnvironmentError("the env was closed") from None
-                datagram = b""  # nothing came; or (Windows) an earlier datagram found nobody
+                datagram = None  # nothing came; or (Windows) an earlier datagram found nobody
             before, now = now, time.monotonic()
             if (pause := now - before - min(left, LONGEST_WAIT)) > _PAUSE:
                 # This process was stopped: what the simulators sent meanwhile was not read.
                 self._deadlines = [deadline + pause for deadline in self._deadlines]
-            if datagram:
+            if datagram is not None:
                 event = server.receive(datagram, address, now)
                 if event:
                     self._handle(event, address)

@@ -29,7 +29,7 @@ __all__ = ["DEFAULT_AGENT", "DEFAULT_SIMULATOR", "Observer", "Simulator"]
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
 
-_ALIVE_EVERY: Final = 1.0
+_ALIVE_EVERY: Final = 0.5
 """While a step takes longer, the agent is told as often that it is being computed, s."""
 _PAUSE: Final = 1.0
 """A wait that took so much longer than it should, s: this process was stopped meanwhile."""
@@ -200,7 +200,7 @@ class Simulator:
             self._send_state(None)
         while not self._stopped:
             message = self._wait()
-            if message is None:
+            if message is None or self._stopped:
                 break
             if isinstance(message, Close):
                 if self._text and not link.statistics.round_trips.count:
@@ -326,7 +326,7 @@ class Simulator:
         """In a thread: tell the agent of a long step that it is being computed."""
         while not finished.wait(_ALIVE_EVERY):
             began_at = self._began_at
-            if began_at is not None and time.monotonic() - began_at > _ALIVE_EVERY:
+            if began_at is not None and time.monotonic() - began_at > _ALIVE_EVERY / 2:
                 for datagram in self.link.alive():
                     self._send(datagram)
 

@@ -27,10 +27,10 @@ from rotorgram.udp import (
     PeerSilent,
     Refused,
     RemoteVectorEnv,
-    binary,
 )
 from rotorgram.udp.fleet import describe, make_env
-from rotorgram.udp.messages import Wait
+from rotorgram.udp.protocol import binary
+from rotorgram.udp.protocol.messages import Wait
 
 SIMULATE = """
     import json, sys
@@ -38,7 +38,7 @@ SIMULATE = """
     arguments = json.loads(sys.argv[1])
     for name in ("server", "bind"):
         arguments[name] = tuple(arguments[name])
-    config = LinkConfig(timeout=20, first_resend=0.02, max_resend=0.2)
+    config = LinkConfig(timeout=20)
     with Simulator(config=config, **arguments) as simulator:
         print(simulator.address[1], flush=True)
         print(simulator.run())
@@ -65,7 +65,7 @@ def test_a_place_that_stays_free() -> None:
 def test_a_late_simulator_waits_until_another_leaves(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     # Its timeout is shorter than its wait: it does not run while the agent says Wait.
-    config = LinkConfig(timeout=0.5, first_resend=0.05, max_resend=0.1)
+    config = LinkConfig(timeout=0.5)
     with flying(2, 2) as (remote, running):
         remote.reset(seed=3)
         late = simulate(remote, config, num_envs=2)
@@ -73,11 +73,11 @@ def test_a_late_simulator_waits_until_another_leaves(caplog: pytest.LogCaptureFi
         while time.monotonic() - start < 1:
             remote.step(np.zeros((4, 1)))
             time.sleep(0.02)
-        assert late.simulator.link.state == "hello"
+        assert late.simulator.link.state.value == "hello"
         assert late.simulator.link.statistics.counters["refused"] == 0
-        assert "every place at the agent is taken; waiting for a free one" in caplog.text
+        assert "every slot at the agent is taken; waiting for a free one" in caplog.text
         running[0].cut()
-        remote._server.config = replace(remote._server.config, timeout=0.3)
+        remote._agent.config = replace(remote._agent.config, timeout=0.3)
         *_, truncated, info = remote.step(np.zeros((4, 1)))
         assert truncated.sum() == 2
         assert late.simulator.link.state == "waiting"
@@ -246,7 +246,7 @@ def test_a_killed_simulator_takes_only_its_own_drones_along(how: str) -> None:
         assert_same(remote.reset(seed=6), local.reset(seed=6))
         assert assert_parity(remote, local, 65) == 6
         place = 1
-        session = remote._server.link.places[place]
+        session = remote._agent.server.slots[place]
         assert session is not None
         port = session.peer[1]
         if how == "another waits":
