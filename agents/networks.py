@@ -19,7 +19,7 @@ else:
     torch = require("torch", "train", "training")
     nn = torch.nn
 
-__all__ = ["Actor", "Critic", "arrays_of", "load_arrays"]
+__all__ = ["Actor", "Critic", "arrays_of", "load_arrays", "nn", "torch"]
 
 LOG_STD_MIN, LOG_STD_MAX = -4.0, 1.0
 

@@ -29,9 +29,8 @@ class VPGConfig:
     """Discount. The paper names none."""
     episodes_per_update: int = 1
     """Episodes flown with one policy ("a set of drone data"; the paper gives no number)."""
-    baseline: Literal["none", "time", "linear"] = "none"
-    """Taken off the returns: nothing (paper), their mean at the same step of the episode, or their
-    least-squares fit over observation and time."""
+    baseline: Literal["none", "time"] = "none"
+    """Taken off the returns: nothing (paper), or their mean at the same step of the episode."""
     normalize: bool = False
     """Divide the returns of an update by their standard deviation."""
     log_std: float = -0.5
@@ -40,8 +39,8 @@ class VPGConfig:
     def __post_init__(self) -> None:
         _check(self, counts=("hidden", "episodes_per_update"), shares=("gamma",),
                flags=("anneal", "normalize"))  # fmt: skip
-        if self.baseline not in ("none", "time", "linear"):
-            raise InputError(f"baseline: expected none, time or linear, got {self.baseline!r}")
+        if self.baseline not in ("none", "time"):
+            raise InputError(f"baseline: expected 'none' or 'time', got {self.baseline!r}")
         if self.baseline == "time" and self.episodes_per_update < 2:
             raise InputError(
                 "episodes_per_update: expected 2 or more with baseline 'time', where a single "
@@ -120,7 +119,7 @@ PRESETS: Final[dict[str, dict[str, VPGConfig | A2CConfig]]] = {
             anneal=True,
             gamma=0.98,
             episodes_per_update=4,
-            baseline="linear",
+            baseline="time",
             normalize=True,
         ),
     },

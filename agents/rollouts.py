@@ -148,7 +148,7 @@ class Collector:
             )
             observations, ended = after, terminated | truncated
             done = ended if stop is None else done | ended
-            waiting = np.count_nonzero(done)  # of few drones faster than `any`
+            waiting = int(np.count_nonzero(done))  # of few drones faster than `any`
             if waiting == count:
                 if stop is not None:
                     break

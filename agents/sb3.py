@@ -204,7 +204,8 @@ class SB3A2C:
         model.num_timesteps = int(state["steps"])
         if "observation" in state:
             shapes = state["observation"].shape, state["starts"].shape
-            expected = (model.n_envs, *model.observation_space.shape), (model.n_envs,)
+            sizes = model.observation_space.shape or ()
+            expected = (model.n_envs, *sizes), (model.n_envs,)
             if shapes != expected:
                 raise ValueError(f"observation, starts: expected shapes {expected}, got {shapes}")
             model._last_obs = state["observation"]

@@ -1,6 +1,6 @@
 """PPO in one file on the vector env: collect, advantages, update, and nothing hidden.
 
-    python examples/ppo_loop.py [--updates 40]
+    python examples/ppo_loop.py [--updates 50]
 
 The env resets a drone in the step after its episode's end (Gymnasium's NEXT_STEP). That step is no
 transition: its action is ignored and its reward is 0, so it is masked out of everything.
@@ -16,22 +16,25 @@ from torch import nn
 
 assert rotorgram.envs  # importing it registers the env
 parser = argparse.ArgumentParser()
-parser.add_argument("--updates", type=int, default=40)
+parser.add_argument("--updates", type=int, default=50)
+parser.add_argument("--seed", type=int, default=0)
 args = parser.parse_args()
 
-DRONES, STEPS, GAMMA, LAMBDA, CLIP = 64, 64, 0.98, 0.95, 0.2
-torch.manual_seed(0)
+DRONES, STEPS, GAMMA, LAMBDA, CLIP = 16, 128, 0.98, 0.95, 0.2
+torch.manual_seed(args.seed)
 torch.set_num_threads(1)
 envs = gym.make_vec("rotorgram/Elevation-v0", num_envs=DRONES)
 
 
 def network(outputs: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(3, 32), nn.Tanh(), nn.Linear(32, outputs))
+    return nn.Sequential(nn.Linear(3, 64), nn.Tanh(), nn.Linear(64, outputs))
 
 
 actor, critic, log_std = network(1), network(1), nn.Parameter(torch.tensor(-0.5))
+with torch.no_grad():
+    actor[2].weight *= 0.01  # the first policy holds the thrust
 optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters(), log_std], lr=3e-3)
-observation, _ = envs.reset(seed=0)
+observation, _ = envs.reset(seed=args.seed)
 fresh = np.zeros(DRONES, bool)  # whose next step is a reset, no transition
 total, returns = np.zeros(DRONES), []
 
@@ -66,7 +69,7 @@ for update in range(args.updates):
     seen, action, advantage = seen[flown], action[flown], advantage[flown]
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
 
-    for _ in range(8):
+    for _ in range(10):
         for batch in torch.randperm(len(seen)).split(512):
             policy = torch.distributions.Normal(actor(seen[batch]), log_std.exp())
             ratio = (policy.log_prob(action[batch]).sum(1) - old[batch]).exp()
@@ -76,6 +79,6 @@ for update in range(args.updates):
             optimizer.zero_grad()
             (0.5 * miss - gain).backward()
             optimizer.step()
-    recent = f"{np.mean(returns[-DRONES:]):.1f}" if returns else "none yet"
+    recent = f"{np.mean(returns[-2 * DRONES :]):.1f}" if returns else "none yet"
     print(f"update {update + 1}: {(update + 1) * DRONES * STEPS:,} steps, return {recent}")
 envs.close()

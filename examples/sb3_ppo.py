@@ -7,7 +7,7 @@ import argparse
 import subprocess
 import sys
 
-from rotorgram.agents.sb3_vec import SB3VecEnv
+from rotorgram.agents.sb3 import SB3VecEnv
 from rotorgram.udp import RemoteVectorEnv
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy

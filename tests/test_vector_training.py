@@ -1,17 +1,30 @@
 """Episodes and rollouts of any number of drones: seeds, logs, resuming, SB3's side."""
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from threading import Thread
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import rotorgram.envs  # noqa: F401
-from rotorgram.agents import EpisodeLog, NetworkPolicy, ResumeError, episode_seed
+import rotorgram.envs
+import rotorgram.udp
+from rotorgram.agents import (
+    EpisodeLog,
+    NetworkPolicy,
+    ResumeError,
+    episode_seed,
+    make_agent,
+    preset,
+)
+from rotorgram.agents.episodes import LOST
 from rotorgram.agents.rollouts import Collector
 from rotorgram.agents.sb3 import SB3VecEnv
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.models.errors import InputError
+from rotorgram.udp import RemoteEnv, RemoteVectorEnv, Simulator
 
 ENV = "rotorgram/Elevation-v0"
 N = 5
@@ -278,3 +291,58 @@ def test_sb3_sees_final_observations_and_truncations() -> None:
 def test_sb3_wants_same_step() -> None:
     with pytest.raises(InputError, match="expected a vector env with autoreset SAME_STEP"):
         SB3VecEnv(vector(2))
+
+
+# ---- over UDP
+
+
+@contextmanager
+def remote(simulators: int, drones: int) -> Iterator[Any]:
+    """A vector env whose drones are flown by simulators in threads; one drone is a `RemoteEnv`."""
+    options: dict[str, Any] = {"connect": False, "connect_timeout": 20, "timeout": 20}
+    with ExitStack() as stack:
+        env: Any
+        if simulators * drones == 1:
+            env = RemoteEnv(("127.0.0.1", 0), **options)
+        else:
+            env = RemoteVectorEnv(
+                ("127.0.0.1", 0),
+                num_simulators=simulators,
+                num_envs=simulators * drones,
+                autoreset_mode="Disabled",
+                **options,
+            )
+        stack.callback(env.close)
+        for _ in range(simulators):
+            simulator = Simulator(
+                ENV, server=env.address, bind=("127.0.0.1", 0), num_envs=drones, **OPTIONS
+            )
+            thread = Thread(target=simulator.run)
+            thread.start()
+            stack.callback(simulator.close)
+            stack.callback(thread.join)
+            stack.callback(simulator.stop)
+        env.connect()
+        yield env
+
+
+@pytest.mark.parametrize(("simulators", "drones"), [(1, 1), (2, 2)])
+def test_over_udp_the_training_is_the_same_and_goes_on(simulators: int, drones: int) -> None:
+    config: Any = preset("a2c", "tuned", steps_per_update=64)
+    count = simulators * drones
+    here = EpisodeLog(single(**OPTIONS) if count == 1 else vector(count), 1)
+    agent = make_agent("a2c", here, config, 1)
+    agent.train(here, 512, lambda: True)
+    with remote(simulators, drones) as env:
+        there = EpisodeLog(env, 1)
+        other = make_agent("a2c", there, config, 1)
+        other.train(there, 512, lambda: True)
+        for name, weight in agent.actor().items():
+            assert weight.tobytes() == other.actor()[name].tobytes()
+        again = EpisodeLog(env, 1)
+        again.resume(here.position())
+        assert again.position().observations.tobytes() == here.observations.tobytes()
+
+
+def test_the_name_of_a_loss_is_that_of_the_wire() -> None:
+    assert LOST == rotorgram.udp.LOST
