@@ -2,7 +2,7 @@
 
     python benchmarks/scaling.py [--out FILE.json]
 
-* **threads**: `ElevationVectorEnv` of 1,024 drones on one thread and on two, in turns.
+* **threads**: the vector env of 1,024 drones on one thread and on two, in turns.
 * **simulators**: 1, 2 and 4 of 1,024 drones each at one agent, in turns, on this machine. Besides
   the rate: the processor time that the agent takes for a control step, which is what a learner pays
   for simulators that have machines of their own. From it, and from the time that one simulator
@@ -28,12 +28,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import gymnasium as gym
 import numpy as np
+import rotorgram.envs  # noqa: F401  # makes the envs known
 from rotorgram.agents.checkpoints import software_versions
-from rotorgram.envs import ElevationConfig, ElevationVectorEnv
-from rotorgram.experiments.compare import CompareConfig, compare
+from rotorgram.experiments.compare import compare
+from rotorgram.experiments.folders import new_folder
+from rotorgram.experiments.settings import CompareConfig
 from rotorgram.udp import RemoteVectorEnv
 
+ENV_ID = "rotorgram/Elevation-v0"
 DRONES = 1024
 MACHINES = 1, 2, 4, 8, 16
 NETWORK = 0.0005
@@ -54,7 +58,7 @@ def fly(env, seconds):
     count, actions = 0, np.zeros((env.num_envs, 1), np.float32)
     wall, cpu = time.perf_counter(), time.process_time()
     while time.perf_counter() - wall < seconds:
-        env.advance(actions, env.terminated | env.truncated)
+        env.advance(actions, env.done if env.done.any() else None)
         count += 1
     return count / (time.perf_counter() - wall), (time.process_time() - cpu) / count
 
@@ -69,7 +73,7 @@ def simulators(count):
             autoreset_mode="Disabled", connect_timeout=60.0,
         )
     ) as env:  # fmt: skip
-        settings = {"server": env.address, "bind": here, "num_envs": DRONES}
+        settings = {"server": env.address, "bind": here, "num_envs": DRONES, "env": ENV_ID}
         words = [sys.executable, "-m", "rotorgram.udp", json.dumps(settings)]
         with ExitStack() as stack:
             for _ in range(count):
@@ -102,7 +106,8 @@ def measure_threads(rounds, seconds):
     with ExitStack() as stack:
         envs = {}
         for threads in (1, 2):
-            env = stack.enter_context(closing(ElevationVectorEnv(DRONES, num_threads=threads)))
+            made = gym.make_vec(ENV_ID, num_envs=DRONES, num_threads=threads).unwrapped
+            env = stack.enter_context(closing(made))
             env.reset(seed=0)
             envs[threads] = env
         return {name: value["rate"] for name, value in in_turns(envs, rounds, seconds).items()}
@@ -129,7 +134,6 @@ def extrapolate(alone, measured):
 def measure_runs(env_steps, rounds):
     config = CompareConfig(
         agents=("a2c",), seeds=4, env_steps=env_steps, snapshots=1, curve_episodes=1, episodes=1,
-        env=ElevationConfig(),
     )  # fmt: skip
     ways = {"one worker": replace(config, jobs=1), "two, loky": replace(config, jobs=2)}
     with ExitStack() as stack:
@@ -147,7 +151,7 @@ def measure_runs(env_steps, rounds):
         for number in range(rounds):
             for name, way in ways.items():
                 start = time.perf_counter()
-                compare(way, folder / f"{number} {name}", "", lambda *_: None)
+                compare(way, new_folder(folder / f"{number} {name}", ""), "", lambda *_: None)
                 seconds[name].append(round(time.perf_counter() - start, 2))
                 print(f"{name}: {seconds[name][-1]} s", flush=True)
     return {

@@ -3,7 +3,7 @@
     python benchmarks/time_to_hover.py [--seeds 5] [--out FILE.json]
 
 For each setting and seed a process is started that imports everything, starts a simulator, trains
-over UDP and evaluates the policy without exploration: the mean of |E| over the last half of 20
+over UDP and evaluates the policy without exploration: the mean of |E| over the last quarter of 20
 episodes, m. The clock runs from the start of the process to its end. A setting counts as reached
 where every seed holds |E| < 0.05 m; the settings are those that reached it soonest among those that
 were tried.
@@ -24,24 +24,27 @@ from rotorgram.agents.checkpoints import software_versions
 FLY = """
 import json, sys
 import numpy as np
+import rotorgram.envs
 from rotorgram.agents import preset
 from rotorgram.agents.policies import NetworkPolicy
-from rotorgram.envs import ElevationConfig
-from rotorgram.experiments.evaluate import evaluation_row, fly_episodes
+from rotorgram.experiments.metrics import Headline
 from rotorgram.experiments.pairs import socket_pair
-from rotorgram.experiments.training import Run, Training
+from rotorgram.experiments.results import evaluation_row
+from rotorgram.experiments.settings import Run
+from rotorgram.experiments.training import Training
+from rotorgram.experiments.trajectories import fly_episodes
 s = json.loads(sys.argv[1])
-env = ElevationConfig()
-run = Run(algorithm=s["agent"], config=preset(s["agent"], "tuned", **s["changes"]), env=env,
+run = Run(algorithm=s["agent"], config=preset(s["agent"], "tuned", **s["changes"]),
           seed=s["seed"], env_steps=s["env_steps"], num_envs=s["drones"])
-with socket_pair(env, num_envs=run.num_envs) as remote:
+with socket_pair(**run.env, num_envs=run.num_envs) as remote:
     training = Training(run, remote)
     training.train()
-with socket_pair(env) as remote:
-    flights = fly_episodes(remote, NetworkPolicy(training.agent.actor()), 20)
-rows = [evaluation_row(f, k, env.control_period) for k, f in enumerate(flights)]
+spec = training.log.spec
+with socket_pair(**run.env, num_envs=20) as remote:
+    flown = fly_episodes(remote, NetworkPolicy(training.agent.actor(), spec), 20, "final")
+rows = [evaluation_row(one, Headline.of(spec)) for one in flown]
 print(json.dumps({"training": training.log.seconds,
-                  "error": float(np.mean([r["steady_error"] for r in rows]))}))
+                  "error": float(np.mean([r["steady"] for r in rows]))}))
 """
 
 MANY: dict[str, Any] = {"steps_per_update": 2048, "learning_rate": 0.03}

@@ -17,9 +17,9 @@ from pathlib import Path
 
 from rotorgram.agents import preset
 from rotorgram.agents.checkpoints import software_versions
-from rotorgram.envs import ElevationConfig
 from rotorgram.experiments.pairs import socket_pair
-from rotorgram.experiments.training import Run, Training
+from rotorgram.experiments.settings import Run
+from rotorgram.experiments.training import Training
 
 AGENTS = ("a2c", "vpg", "sb3-a2c")
 
@@ -28,11 +28,10 @@ def steps_per_second(algorithm: str, env_steps: int, seed: int) -> float:
     run = Run(
         algorithm=algorithm,
         config=preset(algorithm, "tuned"),
-        env=ElevationConfig(),
         seed=seed,
         env_steps=env_steps,
     )
-    with socket_pair(run.env) as env:
+    with socket_pair(**run.env) as env:
         training = Training(run, env)
         training.train()
         return training.log.env_steps / training.log.seconds

@@ -349,7 +349,9 @@ def _messages() -> tuple[Any, State, Command]:
 @contextmanager
 def _codec(name: str) -> Iterator[Slice]:
     layout, state, command = _messages()
-    what, message = name.split()[0], state if name.endswith("State") else command
+    what, kind = name.split()
+    messages: dict[str, State | Command] = {"State": state, "Command": command}
+    message: State | Command = messages[kind]
     datagram = binary.encode(message, layout)
 
     def fly() -> int:

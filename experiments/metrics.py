@@ -290,7 +290,7 @@ def training_runs(episodes: pd.DataFrame, agent: str) -> list[pd.DataFrame]:
 
 def episode_ends(episodes: pd.DataFrame) -> npt.NDArray[np.float64]:
     """Env step of the run at which each training episode ended, shape (episodes,)."""
-    return episodes["last_step"].to_numpy(np.float64)
+    return np.asarray(episodes["last_step"], dtype=np.float64)
 
 
 def average_return(run: pd.DataFrame, share: float) -> Curve:

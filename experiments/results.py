@@ -330,7 +330,7 @@ def step_table(
 ) -> "pa.Table":
     """Rows of `steps.parquet` from `episode`, `step`, `value`, `reward` and `thrust`, (T,) each."""
     count = len(columns["step"])
-    named = {_in_file(name, metric): values for name, values in columns.items()}
+    named: dict[str, Any] = {_in_file(name, metric): x for name, x in columns.items()}
     named |= {"agent": [agent] * count, "seed": np.full(count, seed), "phase": [phase] * count}
     schema = step_schema(metric)
     arrays = [

@@ -10,7 +10,7 @@ from itertools import product
 from typing import Any, Final, Literal
 
 from ..agents.presets import A2CConfig, VPGConfig, preset
-from ..envs.registry import is_known, options_type, task_type
+from ..envs.registry import env_spec, is_known, options_type, task_type
 from ..models.errors import InputError
 
 __all__ = ["AGENTS", "Backend", "CompareConfig", "EnvConfig", "Run", "SweepConfig", "SweepRun",
@@ -124,6 +124,8 @@ class _ManyRuns(WorkersConfig, EnvConfig):
         self._check_counts("seeds", "env_steps", "episodes")
         if self.first_seed < 0:
             raise InputError(f"first_seed: expected 0 or more, got {self.first_seed}")
+        if env_spec(**self.env).headline is None:
+            raise InputError(f"env: expected one that names a metric, got {self.env_id}")
 
     def _check_counts(self, *names: str) -> None:
         for name in names:

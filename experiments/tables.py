@@ -33,20 +33,26 @@ NOTHING: Final = "–"
 
 def headings(headline: Headline, short: bool = False) -> tuple[str, ...]:
     """Headings of the columns; short ones, in lines, for the terminal."""
-    size, unit, goal = headline.size_symbol, headline.labelled("Overshoot"), headline.held_text
+    size, goal = headline.size_symbol, headline.held_text
     settled = headline.metric.settled
     if short:
-        settling = "Settling\n(s)"
-        texts = (headline.labelled(f"Steady\n{size}"), "Hold\nit", settling, unit)
-        texts = (*texts, "Return", f"Env steps to\n{goal}", "Env\nsteps/s")
-        return ("Agent", *(text.replace("Overshoot (", "Overshoot\n(") for text in texts))
+        return (
+            "Agent",
+            headline.labelled(f"Steady\n{size}"),
+            "Hold\nit",
+            "Settling\n(s)",
+            headline.labelled("Overshoot\n").replace("\n ", "\n").rstrip(),
+            "Return",
+            f"Env steps to\n{goal}",
+            "Env\nsteps/s",
+        )
     band = f" to {headline.amount(f'{settled:.2g}')}" if settled is not None else ""
     return (
         "Agent",
         headline.labelled(f"Steady {size}"),
         f"Seeds that hold {goal}" if goal else "Seeds that hold",
         f"Settling{band} (s)",
-        unit,
+        headline.labelled("Overshoot"),
         "Return",
         f"Env steps to {goal}" if goal else "Env steps to hold",
         "Env steps per s",

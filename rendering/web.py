@@ -167,7 +167,7 @@ class _LoopbackViewer(web_viewer.WebViewer):  # type: ignore[misc]
         if not ip_address(host).is_loopback:  # another version of MuJoCo
             self._http_sock.close()
             self._tcp_sock.close()
-            raise OSError(f"the web viewer would serve {host} port {port} to everybody")
+            raise OSError(f"the web viewer would serve {host} port {port} to every machine")
         super()._start_server()
 
 

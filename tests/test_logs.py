@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
@@ -25,9 +26,8 @@ from rotorgram.agents.vpg import VPG
 from rotorgram.cli import main
 from rotorgram.cli.progress import Bars, Lines
 from rotorgram.cli.scalars import ScalarWriter
-from rotorgram.envs import ElevationConfig
-from rotorgram.envs.elevation import ElevationEnv
-from rotorgram.experiments.training import Run, Training
+from rotorgram.experiments.settings import Run
+from rotorgram.experiments.training import Training
 from stable_baselines3 import A2C as PlainA2C
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
@@ -40,6 +40,10 @@ AGENTS = ["vpg", "a2c", "sb3-a2c"]
 ENTROPY_OF_ONE = 0.5 * math.log(2 * math.pi * math.e)  # nats, of a Gaussian with deviation 1
 
 Curves = dict[str, list[tuple[int, float]]]
+
+
+def elevation(**options: Any) -> Any:
+    return gym.make("rotorgram/Elevation-v0", **options).unwrapped
 
 
 def curves(folder: Path) -> Curves:
@@ -102,10 +106,10 @@ class Capture(KVWriter):
 def test_sb3_logs_the_same_under_the_same_names() -> None:
     """A plain SB3 with its own Monitor and log, beside what we say of the same episodes."""
     run = Run(
-        algorithm="sb3-a2c", config=preset("a2c", "tuned"), env=ElevationConfig(), seed=0,
+        algorithm="sb3-a2c", config=preset("a2c", "tuned"), seed=0,
         env_steps=2400,
     )  # fmt: skip
-    training = Training(run, ElevationEnv(episode_length=12))
+    training = Training(run, elevation(episode_length=12))
     model = PlainA2C("MlpPolicy", Monitor(training.log), n_steps=40, device="cpu")  # type: ignore[arg-type]
     capture = Capture(training)
     model.set_logger(Logger(folder=None, output_formats=[capture]))
@@ -125,11 +129,11 @@ def test_sb3_logs_the_same_under_the_same_names() -> None:
 
 @pytest.mark.parametrize("algorithm", AGENTS)
 def test_discrete_actions_have_no_deviation(algorithm: str) -> None:
-    env = ElevationEnv(action_type="discrete", episode_length=10)
+    env = elevation(action_type="discrete", episode_length=10)
     size = {"episodes_per_update": 2} if algorithm == "vpg" else {"steps_per_update": 20}
     run = Run(
         algorithm=algorithm, config=preset(algorithm, "tuned", **size),
-        env=ElevationConfig(action_type="discrete"), seed=0, env_steps=40,
+        options={"action_type": "discrete"}, seed=0, env_steps=40,
     )  # fmt: skip
     training = Training(run, env)
     assert not any(name.startswith("train/") for name in training.scalars()), "before an update"
@@ -143,10 +147,8 @@ def test_discrete_actions_have_no_deviation(algorithm: str) -> None:
 
 def test_what_is_not_defined_is_not_written() -> None:
     """One step has no variance to explain."""
-    run = Run(
-        algorithm="a2c", config=preset("a2c", "paper"), env=ElevationConfig(), seed=0, env_steps=1
-    )
-    training = Training(run, ElevationEnv())
+    run = Run(algorithm="a2c", config=preset("a2c", "paper"), seed=0, env_steps=1)
+    training = Training(run, elevation())
     training.train()
     logged = training.scalars()
     assert "train/explained_variance" not in logged
@@ -245,7 +247,7 @@ def test_the_terms_of_vpg_by_hand() -> None:
 def test_ours_logs_what_sb3_logs_of_the_same_updates() -> None:
     """SB3 flies; ours, from the same weights, is given the same experience."""
     config = A2CConfig(steps_per_update=64, trace=0.95, learning_rate=0.01, normalize=True)
-    recorder = Recorder(ElevationEnv(episode_length=40))
+    recorder = Recorder(elevation(episode_length=40))
     log = EpisodeLog(recorder, seed=0)
     theirs: Any = make_agent("sb3-a2c", log, config, 0)
     ours = A2C(log, config, seed=1)
