@@ -28,8 +28,8 @@ class RemoteEnv(ServedEnv, gym.Env[Any, Any]):
     The simulator may start before or after. Its Hello brings the spec of its env, and the spaces
     follow from that: this side needs neither the env's code nor MuJoCo. A text simulator says no
     Hello, and is read by the spec of `env_id` with `options`, which must be registered here.
-    Observations, rewards, ends of episodes and telemetry are those of the env in the simulator, bit for bit;
-    `info` carries the telemetry by its components.
+    Observations, rewards, ends of episodes and telemetry are those of the env in the simulator, bit
+    for bit; `info` carries the telemetry by its components.
 
     A simulator that is killed and started again, or another one that comes in its place, goes on:
     the running episode ends as truncated, with the observation before it, reward 0 and the reason
