@@ -75,7 +75,7 @@ def test_a_late_simulator_waits_until_another_leaves(caplog: pytest.LogCaptureFi
             time.sleep(0.02)
         assert late.simulator.link.state.value == "hello"
         assert late.simulator.link.statistics.counters["refused"] == 0
-        assert "every slot at the agent is taken; waiting for a free one" in caplog.text
+        assert "every slot of the agent is taken; waiting for a free one" in caplog.text
         running[0].cut()
         remote._agent.config = replace(remote._agent.config, timeout=0.3)
         *_, truncated, info = remote.step(np.zeros((4, 1)))
