@@ -32,30 +32,36 @@ PORT = 8001
 
 AGENT = """
 import json, sys, time
+from contextlib import closing
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from rotorgram.envs.loop import Loop
 from rotorgram.udp import RemoteVectorEnv
 drones, seconds, key, host, port = json.loads(sys.argv[1])
 env_id = "rotorgram/Elevation-v0"
 loop = Loop(env_id, drones, options={})
-everybody = np.ones(drones, bool)
-with RemoteVectorEnv((host, port), env_id=env_id, num_envs=drones, key_file=key,
-                     autoreset_mode="Disabled", timeout=60) as env:
-    dice, seeds = np.random.default_rng(0), np.arange(drones, dtype=np.uint64)
-    actions = np.zeros((drones, 1), np.float32)
-    steps, began = -1, 0.0
-    while steps < 0 or time.perf_counter() - began < seconds:
-        resets = everybody if steps < 0 else loop.done.copy()
-        env.advance(actions, resets, seeds if steps < 0 else None)
-        loop.advance(actions, resets, seeds if steps < 0 else None)
-        (ours,) = loop.observations.values()
-        assert env.observations.tobytes() == ours.tobytes(), f"step {steps}: observations differ"
-        assert env.rewards.tobytes() == loop.rewards.tobytes(), f"step {steps}: rewards differ"
-        assert (env.terminated == loop.terminated).all(), f"step {steps}: ends differ"
-        if steps < 0:
-            began = time.perf_counter()
-        steps += 1
+
+def compare(step):
+    (ours,) = loop.observations.values()
+    assert env.observations.tobytes() == ours.tobytes(), f"step {step}: observations differ"
+    assert env.rewards.tobytes() == loop.rewards.tobytes(), f"step {step}: rewards differ"
+    assert (env.terminated == loop.terminated).all(), f"step {step}: ends differ"
+    assert (env.truncated == loop.truncated).all(), f"step {step}: ends differ"
+
+with closing(RemoteVectorEnv((host, port), env_id=env_id, num_envs=drones, key_file=key,
+                             autoreset_mode=AutoresetMode.DISABLED, connect=False)) as env:
+    env.reset(seed=0)
+    loop.advance(np.zeros((drones, 1), np.float32), np.ones(drones, bool),
+                 np.arange(drones, dtype=np.uint64), None)
+    compare(0)
+    dice, steps, began = np.random.default_rng(0), 0, time.perf_counter()
+    while time.perf_counter() - began < seconds:
         actions = dice.uniform(-1, 1, (drones, 1)).astype(np.float32)
+        resets = loop.done.copy()
+        env.advance(actions, resets)
+        loop.advance(actions, resets, None, None)
+        steps += 1
+        compare(steps)
     seconds = time.perf_counter() - began
     print(json.dumps({"steps": steps, "seconds": seconds, "statistics": env.statistics.numbers()}))
 """
@@ -147,7 +153,7 @@ def launch(namespace: str, code: str, settings: list[Any]) -> subprocess.Popen[s
 
 def fly(drones: int, mtu: int, delay: float, loss: float, seconds: float) -> dict[str, Any]:
     """The rate and counts of one flight. Raises `CalledProcessError` if it fails."""
-    from rotorgram.udp.protocol.keys import write_key
+    from rotorgram.udp.protocol.auth import write_key
 
     with tempfile.TemporaryDirectory() as folder, two_machines(mtu) as (here, there):
         key = str(Path(folder) / "key")
@@ -158,7 +164,8 @@ def fly(drones: int, mtu: int, delay: float, loss: float, seconds: float) -> dic
         simulator = launch(there[0], SIMULATE, [drones, key, server, bind])
         try:
             out, _ = agent.communicate(timeout=seconds + 300)
-            simulator.wait(timeout=30)
+            if agent.returncode == 0:
+                simulator.wait(timeout=30)
         finally:
             for process in (agent, simulator):
                 process.kill()

@@ -353,9 +353,9 @@ def test_who_has_ended_and_holds_is_not_forgotten() -> None:
     with flying(1, 2, **options) as (remote, _):
         assert_same(remote.reset(seed=1), local.reset(seed=1))
         actions = np.array([[1.0], [0.0]], np.float32)
-        while not local.over.any():
+        while not local.done.any():
             assert_same(remote.step(actions), local.step(actions))
-        assert local.over.tolist() == [True, False]
+        assert local.done.tolist() == [True, False]
         others = {"reset_mask": np.array([False, True])}
         assert_same(remote.reset(seed=7, options=others), local.reset(seed=7, options=others))
         for _ in range(3):  # the first resets drone 0

@@ -334,9 +334,7 @@ def _expect_finite(what: str, data: bytes, time: float, slots: tuple[Slot, ...])
             finite = np.isfinite(array)
             if not finite.all():
                 first = np.argwhere(~finite)[0].tolist()
-                raise InputError(
-                    f"{what}: expected finite numbers, got {array[*first]} at {first}"
-                )
+                raise InputError(f"{what}: expected finite numbers, got {array[*first]} at {first}")
 
 
 def _expect(layout: Layout | None) -> Layout:

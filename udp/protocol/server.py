@@ -174,8 +174,12 @@ class Server:
         session = self.slots[slot] if slot >= 0 else None
         arrival = _Arrival(datagram, address, now)
         try:
-            if text.is_text(datagram) and not self._keys and (layout := self._text_layout()):
-                return self._receive_text(slot, session, layout, arrival)
+            if text.is_text(datagram):
+                layout = None if self._keys else self._text_layout()
+                if layout is not None:
+                    return self._receive_text(slot, session, layout, arrival)
+                self._turn_text_away(arrival)
+                return None
             plain, key = (
                 (datagram, None)
                 if not (self._keys or is_sealed(datagram))
@@ -287,16 +291,16 @@ class Server:
         self, slot: int, session: Session, message: Message, plain: bytes, arrival: _Arrival
     ) -> Event | None:
         is_state = isinstance(message, State)
-        if is_state and message.sequence == session.sequence:
+        number = getattr(message, "sequence", 0)
+        if is_state and number == session.sequence:
             if session.state is not AgentState.DECIDING:  # else the answer is not there yet
                 self._repeat(session)
             self._drop("duplicate", "", arrival)
             return None
-        if is_state and message.sequence > session.sequence + 1 and not session.is_text:
+        if is_state and number > session.sequence + 1 and not session.is_text:
             # It went on with another agent: what opened it here came late, from before a restart.
             self._disown(plain, arrival)
             return None
-        number = getattr(message, "sequence", 0)
         is_due = number == session.sequence + is_state or isinstance(message, Close)
         state = AGENT.get((session.state, Way.RECEIVED, type(message))) if is_due else None
         if state is None:
@@ -508,6 +512,19 @@ class Server:
         self._drop("refused", reason, arrival)
         return None
 
+    def _turn_text_away(self, arrival: _Arrival) -> None:
+        """Answer a line where no text is flown. Raises `DecodeError`."""
+        sequence, fields = text.split(arrival.datagram)
+        line = text.encode(Close(session=0, sequence=sequence, reason=""))
+        if fields != ["close"] and len(line) <= len(arrival.datagram):
+            # Else two agents would answer each other's Closes for ever.
+            self._put([line], arrival.address, None)
+            self.statistics.counters["sent"] += 1
+        if self._keys:
+            self._drop("forged", "key: this agent has one (--key-file), text has none", arrival)
+        else:
+            self._drop("refused", "text is not flown here", arrival)
+
     # ---- from a datagram to a message
 
     def _open(self, arrival: _Arrival, session: Session | None) -> tuple[bytes, Key | None]:
@@ -607,12 +624,6 @@ class Server:
             trusted = under_seal and not isinstance(error, KeyMismatch)
             key = self._keys.get(key_id(datagram)) if trusted else None
             self._refuse(number, str(error), address, size, key)
-        elif text.is_text(datagram) and (layout := self._text_layout()) and self._keys:
-            with suppress(DecodeError):
-                line = text.decode_state(datagram, layout)
-                if isinstance(line, State):  # two agents would answer each other's Closes for ever
-                    close = Close(session=0, sequence=line.sequence, reason="")
-                    self._put([text.encode(close)], address, None)
         cause = "forged" if isinstance(error, Forged) else "malformed"
         self._drop(cause, str(error), arrival)
 

@@ -21,7 +21,15 @@ from .errors import DecodeError
 from .layout import Layout
 from .messages import FLY, MAX_UINT64, RESET, Close, Command, State
 
-__all__ = ["MAX_LINE", "check_layout", "decode_command", "decode_state", "encode", "is_text"]
+__all__ = [
+    "MAX_LINE",
+    "check_layout",
+    "decode_command",
+    "decode_state",
+    "encode",
+    "is_text",
+    "split",
+]
 
 MAX_LINE: Final = 1024
 _DIGITS: Final = frozenset(b"0123456789")
@@ -91,7 +99,7 @@ def _expect_finite(numbers: list[float]) -> None:
 
 def decode_state(datagram: bytes, layout: Layout) -> State | Close:
     """A simulator's line, as of session 0. Raises `DecodeError` for anything else."""
-    sequence, fields = _split(datagram)
+    sequence, fields = split(datagram)
     if fields == ["close"]:
         return Close(session=0, sequence=sequence, reason="the simulator closed")
     observation, telemetry = layout.observation_slots[0], layout.telemetry_slots
@@ -124,7 +132,7 @@ def decode_state(datagram: bytes, layout: Layout) -> State | Close:
 
 def decode_command(datagram: bytes, layout: Layout, session: int) -> Command | Close:
     """An agent's line, taken as one of `session`. Raises `DecodeError` for anything else."""
-    sequence, fields = _split(datagram)
+    sequence, fields = split(datagram)
     if fields == ["close"]:
         return Close(session=session, sequence=sequence, reason="the agent closed")
     actions = layout.actions
@@ -155,7 +163,8 @@ def _action(fields: list[str], layout: Layout) -> np.ndarray:
     return np.array([choice])
 
 
-def _split(datagram: bytes) -> tuple[int, list[str]]:
+def split(datagram: bytes) -> tuple[int, list[str]]:
+    """Sequence number and the other fields of a line. Raises `DecodeError`."""
     if len(datagram) > MAX_LINE:
         raise DecodeError(f"text line: expected at most {MAX_LINE} bytes, got {len(datagram)}")
     try:

@@ -104,7 +104,7 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
             insecure=insecure,
             record=record,
         )
-        checked_mode(autoreset_mode)
+        self.metadata = {"render_modes": [], "autoreset_mode": _checked_mode(autoreset_mode)}
         self._agent = Agent(address, config)
         self.closed = False
         if connect:
@@ -304,10 +304,10 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
         return info
 
 
-def checked_mode(mode: AutoresetMode | str) -> None:
-    """Raise `InputError` if it is no autoreset mode."""
+def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    """Raises `InputError` if it is no autoreset mode."""
     try:
-        AutoresetMode(mode)
+        return AutoresetMode(mode)
     except ValueError:
         expected = " or ".join(repr(m.value) for m in AutoresetMode)
         raise InputError(f"autoreset_mode: expected {expected}, got {mode!r}") from None
