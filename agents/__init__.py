@@ -1,4 +1,4 @@
-"""Algorithms that learn to fly, and one that need not.
+"""Learning algorithms, their policies and files, and a PID controller.
 
 Policies, the PID and the reading of checkpoints need neither torch nor SB3: `make_agent` and
 `resume_agent` import them.
@@ -41,11 +41,11 @@ __all__ = [
 def make_agent(
     algorithm: str, log: EpisodeLog, config: VPGConfig | A2CConfig, seed: int
 ) -> "Agent":
-    """A fresh agent for what a log flies.
+    """A new agent for the env of a log.
 
     Args:
         algorithm: `vpg`, `a2c` or `sb3-a2c`.
-        log: What it is to train on.
+        log: Log of the env to train on.
         config: Hyperparameters of that algorithm.
         seed: Seed of the run.
 
@@ -73,15 +73,15 @@ def make_agent(
 
 
 def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
-    """The agent of a checkpoint, and its log brought to where the run stood.
+    """The agent of a checkpoint; the log resumes at the position of the run.
 
     Args:
         kept: The checkpoint.
-        log: Fresh, of the same seed and number of drones.
+        log: New, with the same seed and number of drones.
 
     Raises:
         CheckpointError: The parts of the checkpoint do not fit together.
-        ResumeError: The env is another one, or does not repeat what was flown.
+        ResumeError: The env is another one, or does not repeat the interrupted episodes.
         MissingPackage: torch or SB3 is not installed.
     """
     for name in ("env_id", "options", "vehicle_hash", "observation", "action"):

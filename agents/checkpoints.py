@@ -1,7 +1,7 @@
 """Checkpoints: one safetensors file with weights, state, config, spec, seed and versions.
 
 Loading one runs no code from it, and imports nothing that it names. Writing one replaces the old
-file whole or not at all. A checksum over all bytes of the file tells of the smallest damage.
+file whole or not at all. A checksum over all bytes of the file detects any damage.
 """
 
 import hashlib
@@ -32,7 +32,7 @@ _GROUPS: Final = ("policy", "state", "position", "episodes")
 _MOST: Final = 2**62
 _CHECKSUM: Final = re.compile(rb'"sha256":"([0-9a-f]{64})"')
 _MALFORMED: Final = (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError)
-"""What reading a crafted file can raise."""
+"""Errors that reading a crafted file can raise."""
 
 
 class CheckpointError(InputError):
@@ -56,7 +56,7 @@ class Checkpoint:
     state: Mapping[str, np.ndarray]
     """State of the agent."""
     position: Position
-    """Where the run stands, and the episodes that have ended."""
+    """Position of the run, and its ended episodes."""
     versions: dict[str, str] = field(default_factory=lambda: software_versions())
 
     @property
@@ -71,7 +71,7 @@ class Checkpoint:
 
     @property
     def vehicle_hash(self) -> str:
-        """Model that flew; zeros where the env told none."""
+        """Hash of the vehicle; zeros if the env has none."""
         return self.spec.vehicle_hash
 
     @property
@@ -101,7 +101,7 @@ class Checkpoint:
 
 
 def software_versions() -> dict[str, str]:
-    """Versions of what the numbers depend on, as far as it is installed."""
+    """Versions of the installed packages that the numbers depend on."""
     versions = {"python": platform.python_version()}
     for name in ("rotorgram", "mujoco", "gymnasium", "numpy", "torch", "stable-baselines3"):
         with suppress(PackageNotFoundError):
@@ -214,7 +214,7 @@ def _with_checksum(data: bytes, checksum: bytes) -> bytes:
 
 
 def _is_finite(name: str, array: np.ndarray) -> bool:
-    # An env without metrics tells no error: that is NaN, and no divergence.
+    # Without metrics the error of an episode is NaN, which is no divergence.
     allowed = name == "episodes/mean_size"
     return allowed or array.dtype.kind != "f" or bool(np.isfinite(array).all())
 

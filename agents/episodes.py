@@ -53,21 +53,21 @@ class Episode:
     seconds: float
     """Wall time since training began, s."""
     simulator_lost: bool = False
-    """Whether it was truncated since its simulator was lost, not since its time was over."""
+    """Whether it was truncated because its simulator was lost, not by its time limit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Position:
-    """Where a run of N drones stands."""
+    """Position of a run of N drones."""
 
     env_steps: int
     seconds: float
     """Wall time since training began."""
     actions: np.ndarray
-    """What the env got: float32, shape (t, N, k), or int64, shape (t, N), where t steps are those
-    of the longest running episode."""
+    """Actions of the env: float32, shape (t, N, k), or int64, shape (t, N), for the t steps of the
+    longest running episode."""
     observations: np.ndarray
-    """What the last of them led to, flat: float32, shape (N, n)."""
+    """Observations after the last of them, flat: float32, shape (N, n)."""
     numbers: np.ndarray
     """Number of the running episode of each: int64, shape (N,)."""
     lengths: np.ndarray
@@ -75,11 +75,11 @@ class Position:
     first_steps: np.ndarray
     """Env steps of the run before the running episode of each: int64, shape (N,)."""
     episodes: tuple[Episode, ...] = ()
-    """Those that have ended, in that order."""
+    """Ended episodes, in the order of their ends."""
 
 
 class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """Gives every episode of every drone its seed, and keeps what was flown.
+    """Gives every episode of every drone its seed, and keeps its actions.
 
     Episodes are numbered as they begin, of several that begin with the same step in the order of
     the drones. `fly` and `begin` leave the results in the attributes of `env`. `reset` and `step`
@@ -89,12 +89,12 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Args:
         env: Local or remote; of one drone, or a vector env.
         seed: Seed of the run.
-        keep_steps: Whether `steps` is asked for.
+        keep_steps: Keep every step, for `steps`.
 
     Attributes:
         spec: `EnvSpec` of the env.
         env_steps: Control steps of all drones together.
-        episodes: Those that have ended, in that order.
+        episodes: Ended episodes, in the order of their ends.
     """
 
     def __init__(
@@ -237,7 +237,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     # ---- resuming
 
     def position(self) -> Position:
-        """Where the run stands now."""
+        """The current position of the run."""
         longest = int(self._lengths.max())
         recent = self._flown[len(self._flown) - longest :]
         return Position(
@@ -252,7 +252,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         )
 
     def resume(self, position: Position) -> None:
-        """Bring the env to where another run stood, and go on from there.
+        """Bring the env to the position of another run, and continue there.
 
         Every drone flies the actions of its running episode again. A drone whose episode is
         shorter than the longest is frozen until its turn. `steps` begins with these steps.

@@ -1,4 +1,4 @@
-"""What the algorithms have in common: fly, update, repeat; and stop and go on at any update."""
+"""Base of the algorithms: fly, update, repeat; stop and resume at any update."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -32,17 +32,17 @@ OnUpdate = Callable[[], bool]
 
 
 class Diverged(InputError):
-    """An update has left weights that are not finite. What was stored before it is whole."""
+    """Weights are not finite after an update. Checkpoints from before it are whole."""
 
 
 class Agent(Protocol):
     """An algorithm in training. Its state is plain arrays, whole at every update."""
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
-        """Train until the log counts `env_steps`; the state resumes where it stood.
+        """Train until the log counts `env_steps`, from the current state on.
 
         Raises:
-            Diverged: An update has left weights that are not finite.
+            Diverged: Weights are not finite after an update.
         """
 
     def last_step(self, env_steps: int) -> int:
@@ -66,7 +66,7 @@ class Agent(Protocol):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Terms:
-    """What the loss of an update was made of, kept as tensors: few updates are asked for numbers.
+    """Terms of the loss of an update, as tensors: few updates are logged.
 
     Those of the critic are None where there is none.
     """
@@ -80,7 +80,7 @@ class Terms:
     values: torch.Tensor | None = None
     """V(s_t) before the update, shape (T,)."""
     targets: torch.Tensor | None = None
-    """What they were drawn to, shape (T,)."""
+    """Their targets, shape (T,)."""
 
     def numbers(self) -> dict[str, float]:
         """By SB3's names and with its signs."""
@@ -135,7 +135,7 @@ class Learner:
         raise NotImplementedError
 
     def loss(self, rollout: Rollout) -> torch.Tensor:
-        """What one step of Adam lowers."""
+        """The loss that one step of Adam lowers."""
         raise NotImplementedError
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
@@ -248,7 +248,7 @@ def set_optimizer_arrays(
 
 
 def updates_of(optimizer: torch.optim.Optimizer) -> int:
-    """How many steps an Adam has taken."""
+    """Number of steps that an Adam optimizer has taken."""
     states = list(optimizer.state.values())
     return int(states[0]["step"]) if states else 0
 

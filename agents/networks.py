@@ -35,7 +35,7 @@ class Actor(nn.Module):
     """Policy: Gaussian for continuous actions, categorical for discrete ones.
 
     The Gaussian's standard deviation does not depend on the state. An action is neither clipped
-    nor squashed here: what the env gets is clipped, what is scored is what was drawn.
+    nor squashed here: the env gets the clipped action, the loss scores the drawn one.
 
     Args:
         inputs: Length of a flat observation, n.

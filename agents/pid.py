@@ -1,4 +1,4 @@
-"""A hand-tuned PID controller on the same socket: the classical yardstick of Elevation."""
+"""A hand-tuned PID controller: the classical baseline of `Elevation-v0`."""
 
 from typing import Any, Final
 
@@ -18,7 +18,7 @@ DERIVATIVE: Final = 5.4
 INTEGRAL: Final = 1.0
 """1/s³: there is no steady load to remove here; an unknown mass would be one."""
 INTEGRAL_BAND: Final = 0.02
-"""m: the integral grows only this near the target, so that the way there does not wind it up."""
+"""m: the integral grows only this near the target, against windup."""
 SHARES: Final = {"increment": 0.05, "offset": 0.2}
 """Thrust per unit of action over the rotors' largest, where the option `thrust_scale` is None."""
 
@@ -26,7 +26,7 @@ SHARES: Final = {"increment": 0.05, "offset": 0.2}
 class PID:
     """Wanted acceleration from E, its rate and its integral; then the thrust that gives it.
 
-    Needs the full observation and continuous actions. What it knows of the vehicle follows from the
+    Needs the full observation and continuous actions. It derives the vehicle's numbers from the
     spec: the bounds of the rotors' thrust in the telemetry, N, over those in the observation,
     relative to hover, give the thrust at hover, and that over g the mass that a rotor carries.
 

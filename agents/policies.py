@@ -1,4 +1,4 @@
-"""Policies as they fly: plain NumPy, because 16 units need no tensor library."""
+"""Policies for flying, in plain NumPy: 16 units need no tensor library."""
 
 from collections.abc import Mapping
 from typing import Any, Protocol
@@ -12,7 +12,7 @@ __all__ = ["ActionMap", "NetworkPolicy", "Policy", "flat", "flat_size"]
 
 
 class Policy(Protocol):
-    """What flies a drone: called once for each control step."""
+    """Chooses actions: called once for each control step."""
 
     def reset(self) -> None:
         """Forget the last episode."""
@@ -42,7 +42,7 @@ def flat_size(spec: EnvSpec) -> int:
 
 
 class ActionMap:
-    """From what a network gives to what an env takes.
+    """Maps outputs of a network to actions of an env.
 
     Of a continuous action the network's 0 is the middle between the bounds, -1 the lower and 1 the
     upper one; where there is no bound, it is the number itself. Of a discrete action the network
@@ -81,7 +81,7 @@ class ActionMap:
         self._plain = bool((self._middle == 0).all() and (self._half == 1).all())
 
     def to_envs(self, actions: np.ndarray) -> np.ndarray:
-        """What N drones get for drawn actions, shape (N, k).
+        """Actions of an env for drawn actions, shape (N, k).
 
         float32, shape (N, k), inside the bounds; or int64, shape (N,).
         """
@@ -93,7 +93,7 @@ class ActionMap:
         return clipped
 
     def to_env(self, action: np.ndarray) -> Any:
-        """What a single env gets for a drawn action, shape (k,): of its shape, or an int."""
+        """Action of a single env for a drawn one, shape (k,): of the env's shape, or an int."""
         if self.discrete:
             return int(action[0])
         return self.to_envs(action[np.newaxis])[0].reshape(self._shape)

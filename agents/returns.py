@@ -1,4 +1,4 @@
-"""Returns and advantages, as pure functions of what was flown.
+"""Returns and advantages, as pure functions of trajectories.
 
 Time is the first axis, drones may be the second: every array has the shape (T,) or (T, N).
 `terminated` and `truncated` mark the last transition of an episode. A value is carried over a

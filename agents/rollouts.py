@@ -13,7 +13,7 @@ __all__ = ["Collector", "Rollout"]
 
 @dataclass(frozen=True, kw_only=True)
 class Rollout:
-    """T steps of N drones. Rows that are not kept are no transitions: nothing is learnt from them.
+    """T steps of N drones. Rows that are not kept are no transitions: no loss has them.
 
     Recursions over time may run through them, for an episode ends before each.
     """
@@ -25,7 +25,7 @@ class Rollout:
     rewards: np.ndarray
     """float64, shape (T, N)."""
     next_observations: np.ndarray
-    """What each step led to, before any reset: float32, shape (T, N, n)."""
+    """Observations after each step, before any reset: float32, shape (T, N, n)."""
     terminated: np.ndarray
     """bool, shape (T, N)."""
     truncated: np.ndarray
@@ -43,7 +43,7 @@ class Rollout:
         return ends
 
     def rows(self, array: np.ndarray) -> np.ndarray:
-        """What is kept of an array of shape (T, N, ...): one row for each transition."""
+        """The kept rows of an array of shape (T, N, ...): one for each transition."""
         if self.kept.all():
             return array.reshape(-1, *array.shape[2:])
         chosen: np.ndarray = array[self.kept]
@@ -78,7 +78,7 @@ class Collector:
     """Flies a policy, episode after episode, across calls.
 
     Args:
-        log: What it flies.
+        log: Log of the env to fly.
         rng: Draws the actions.
     """
 
@@ -99,10 +99,10 @@ class Collector:
     def episodes(self, policy: NetworkPolicy, count: int, most_steps: int) -> Rollout:
         """Whole episodes, as many as there are drones or a multiple: at least so many.
 
-        A drone whose episode ends is frozen until all have ended. A round that is broken off,
-        since `most_steps` are flown, is left out: all of its episodes but the shortest would be
-        fragments. A single drone's last fragment is kept. Episodes whose simulator was lost are
-        left out, and a round of nothing else does not count.
+        A drone whose episode ends is frozen until all have ended. A round that `most_steps`
+        cuts off is left out: all of its episodes but the shortest would be fragments. A single
+        drone's last fragment is kept. Episodes with a lost simulator are left out, and a round of
+        nothing else does not count.
         """
         log = self._log
         rounds, last = -(-count // log.num_envs), log.env_steps + most_steps
@@ -123,7 +123,7 @@ class Collector:
         """So many steps of all drones; or an episode of each, if it takes at most so many steps.
 
         Returns:
-            What was flown; in which steps a simulator was lost, bool, shape (T, N); and whether
+            The rollout; the steps in which a simulator was lost, bool, shape (T, N); and whether
             all drones stand at the end of an episode.
         """
         log, env, count = self._log, self._log.env, self._log.num_envs

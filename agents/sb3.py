@@ -114,7 +114,7 @@ class SB3A2C:
     `A2CConfig`: given the same experience, it makes the same updates as ours.
 
     Args:
-        log: What it trains on: SB3 wants it at construction.
+        log: Log of the env to train on: SB3 wants it at construction.
         config: Hyperparameters.
         seed: Seed of the run: weights and actions.
     """
@@ -176,7 +176,7 @@ class SB3A2C:
         return {ours: weights[theirs] for ours, theirs in _NAMES.items() if theirs in weights}
 
     def state(self) -> dict[str, np.ndarray]:
-        """Weights, optimizer, both generators and what SB3 remembers between rollouts."""
+        """Weights, optimizer, both generators and the state of SB3 between rollouts."""
         model = self._model
         state = {
             f"policy.{name}": value.numpy().copy()

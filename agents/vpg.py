@@ -17,7 +17,7 @@ class VPG(Learner):
     """Raise the log-probability of every action by the return that followed it.
 
     The gradient of Equation 2, R_t · grad log P(a_t | s_t), averaged over the steps of an update.
-    Algorithm 1 prints the update without R; Equation 2 has it, and so have we.
+    Algorithm 1 prints the update without R; Equation 2 has it, as we do.
     """
 
     def __init__(self, log: EpisodeLog, config: VPGConfig, seed: int) -> None:

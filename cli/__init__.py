@@ -1,8 +1,8 @@
 """The command `rotorgram`: one module for each command, imported when it is chosen.
 
-Exit statuses: 0 done; 1 something that the user, the other side or the system did, in one sentence,
-or a check that failed; 2 a wrong flag, or no OpenGL for a command that draws; 130 Ctrl-C;
-141 nobody reads standard output any more; 143 SIGTERM. A bug of ours keeps its traceback.
+Exit statuses: 0 done; 1 an error of the user, the other side or the system, in one sentence, or a
+check that failed; 2 a wrong flag, or no OpenGL for a command that draws; 130 Ctrl-C;
+141 standard output is closed; 143 SIGTERM. A bug of ours keeps its traceback.
 """
 
 import ast
@@ -60,8 +60,8 @@ _ABOUT: Final = "A MuJoCo drone simulator that reinforcement-learning agents fly
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; its exit status.
 
-    What the user or the other side did wrong is one sentence on standard error, without traceback;
-    with ROTORGRAM_TRACEBACK set, with it.
+    An error of the user or the other side is one sentence on standard error. If ROTORGRAM_TRACEBACK
+    is set, its traceback is printed instead.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
@@ -185,7 +185,7 @@ def _show_log() -> None:
 
 
 def _sentence(error: Exception) -> str | None:
-    """What the user is told; None for a bug of ours. Our own classes of errors are sentences."""
+    """Sentence for the user; None for a bug of ours. Our own classes of errors are sentences."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if isinstance(error, OSError) or type(error).__module__.startswith("rotorgram."):

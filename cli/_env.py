@@ -86,7 +86,7 @@ def policy_for(checkpoint: "Checkpoint | None", spec: "EnvSpec") -> "Policy":
 
 
 def words_of(trajectory: "Trajectory") -> str:
-    """Return of an episode, and the metric that decides at its end."""
+    """Return of an episode, and the headline metric at its end."""
     words = f"return {trajectory.rewards.sum():.1f}"
     if (metric := trajectory.spec.headline) is None:
         return words

@@ -1,4 +1,4 @@
-"""What every command declares and how its flags are parsed: tyro, plus the options of any task."""
+"""Base of all commands, and the parser of their flags: tyro, plus the options of any task."""
 
 import json
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ PresetName = Literal["paper", "tuned"]
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """What every command is: its fields are the flags, their docstrings the help."""
+    """Base of all commands: the fields are the flags, their docstrings the help."""
 
     given: Suppress[Fixed[frozenset]] = frozenset()  # type: ignore[type-arg]
     """Names of the fields that the user set, if only to their default; those of options of the
@@ -156,7 +156,7 @@ def _listens(kind: type[Command], given: frozenset[str]) -> bool:
 
 
 def parse_value(text: str) -> Any:
-    """A value as JSON; what is no JSON is a text. Python's True and False are taken too."""
+    """A value as JSON; other words are texts. Python's True and False are taken too."""
     try:
         return json.loads({"True": "true", "False": "false", "None": "null"}.get(text, text))
     except (ValueError, RecursionError):

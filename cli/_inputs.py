@@ -1,4 +1,4 @@
-"""What commands make of their flags: addresses, counts, folders, and what a resumed run keeps."""
+"""Checks of flags: addresses, counts, folders, and the settings that a resumed run keeps."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress

@@ -87,7 +87,7 @@ class Lines:
 
 
 class _Pace:
-    """How fast a run has been lately: what was done, and when, over the last seconds.
+    """Recent speed of a run: amounts done and their times, over the last seconds.
 
     There is always a point: a bar may be drawn, by a thread of rich's, at any time.
     """
@@ -128,7 +128,7 @@ class _Runs:
 
 
 class _Figures(TextColumn):
-    """A column of what a function says of a task."""
+    """A column with the text that a function gives for a task."""
 
     def __init__(self, figures: Callable[[Task], str]) -> None:
         super().__init__("", table_column=Column(no_wrap=True, justify="right"))

@@ -1,4 +1,4 @@
-"""What commands of many runs share: flags of their workers, progress, how to resume, reports."""
+"""Commands of many runs: flags of their workers, progress, how to resume, reports."""
 
 import logging
 import shlex

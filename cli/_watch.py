@@ -1,4 +1,4 @@
-"""`rotorgram sim --view`: shows what is flown while an agent flies."""
+"""`rotorgram sim --view`: shows the drones while an agent flies them."""
 
 import logging
 import time
@@ -22,14 +22,14 @@ _log = logging.getLogger(__name__)
 
 
 class Watcher:
-    """Shows a live view what a simulator steps, as often as the view draws: an observer.
+    """Passes States of a simulator to a live view, as often as it draws: an observer.
 
     Lock-step never waits for it. A pause freezes the picture alone: an agent that got no answer
     would take the simulator for lost. If the view is closed or fails, the simulator goes on.
 
     Args:
         live: Shows the first so many drones.
-        simulator: What it flies.
+        simulator: The simulator to show.
     """
 
     def __init__(self, live: LiveView, simulator: Simulator) -> None:

@@ -1,4 +1,4 @@
-"""`rotorgram bench`: what bounds a training on this machine, layer by layer."""
+"""`rotorgram bench`: the speed of each layer of a training on this machine."""
 
 import logging
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ __all__ = ["Bench"]
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Command):
-    """Measure what bounds a training on this machine, from raw physics to an update."""
+    """Measure the layers of a training on this machine, from raw physics to an update."""
 
     rounds: int = 7
     """Turns of every layer, besides one to warm up; medians count."""

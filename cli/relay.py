@@ -14,7 +14,7 @@ __all__ = ["Relay"]
 
 
 class FaultFlags(FaultConfig):
-    """What happens to datagrams."""
+    """Faults of the relayed datagrams."""
 
     def __post_init__(self) -> None:
         """Accept any number: `FaultConfig` raises `InputError` for a wrong one."""

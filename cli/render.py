@@ -47,13 +47,13 @@ class Render(EnvFlags):
     at: float | None = None
     """With a .png: the time of the picture in the first episode, s. Default: its end."""
     world: Literal["airport", "plain"] = "airport"
-    """What is around the drones in the picture; it changes no flight."""
+    """Surroundings of the drones in the picture; they change no flight."""
     overlay: bool = True
     """Whether numbers and curves are on the picture. Of several flights the names always are."""
     fast: bool = False
     """Without shadows and smooth edges: several times as fast where software draws."""
     names: tuple[str, ...] = ()
-    """Titles, one for each flight. Default: what flies."""
+    """Titles, one for each flight. Default: the policies."""
     session: int | None = None
     """With a journal: which session, from 1, as rotorgram replay counts. Default: the first that
     flew."""
@@ -124,7 +124,7 @@ class Render(EnvFlags):
         ]
 
     def _find(self, what: str) -> "tuple[str, str, list[Trajectory]]":
-        """Agent, name and trajectories of what the user named."""
+        """Agent, name and trajectories of a policy or journal."""
         from ..experiments.palette import agent_label
         from ..experiments.trajectories import flown_trajectories, recorded_trajectories
         from ._env import chosen_env, load_checkpoint, local_spec, policy_for

@@ -1,4 +1,4 @@
-"""`rotorgram replay`: what a journal holds, and whether it simulates to the same bits."""
+"""`rotorgram replay`: contents of a journal, and whether it simulates to the same bits."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ __all__ = ["Replay"]
 
 @dataclass(frozen=True, kw_only=True)
 class Replay(Command):
-    """Tell what a journal holds, and simulate it again."""
+    """Summarize a journal, and simulate it again."""
 
     file: Positional[Path]
     """MCAP file that --record wrote; after a crash it is read up to where it was cut."""
@@ -20,7 +20,7 @@ class Replay(Command):
     """Simulate every session again and compare every bit; exit status 1 if one differs."""
     env: str | None = None
     """module:Name-v0 to import a module of the working directory that registers the journal's
-    task. What a journal names is never imported."""
+    task. An id in a journal is never imported."""
     vehicle: str | None = None
     """MJCF file that was flown. Default: the paper's quadcopter."""
 

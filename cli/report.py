@@ -1,4 +1,4 @@
-"""`rotorgram report`: draw what a folder of results holds."""
+"""`rotorgram report`: draw the results in a folder."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ class Report(Command):
     """Whether a comparison's agents are filmed, if there is no film yet, where there is OpenGL."""
 
     def run(self) -> int:
-        """Write what is drawn from the files, and print the table."""
+        """Write figures and report from the files, and print the table."""
         from ..experiments.sweep import is_sweep
         from ._runs import report_comparison, report_sweep
 

@@ -39,12 +39,12 @@ class Sim(EnvFlags):
     record: Path | None = None
     """MCAP file to write every message to."""
     view: Literal["window", "web"] | None = None
-    """Show what is flown, up to 16 drones: in a window, or on a page for browsers. Lock-step does
+    """Show up to 16 drones: in a window, or on a page for browsers. Lock-step does
     not wait for it. Keys: docs/viewing.md."""
     view_port: int = 8080
     """TCP port of the page, on this machine's loopback; 0 takes the first free one."""
     world: Literal["airport", "plain"] = "airport"
-    """What is around the drones in the view."""
+    """Surroundings of the drones in the view."""
     realtime: bool = False
     """Fly no faster than real time, for viewers."""
 

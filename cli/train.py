@@ -59,7 +59,7 @@ class Train(AgentFlags):
     resume: Path | None = None
     """Folder of a training to go on with; it keeps its settings."""
     store_every: float = 10.0
-    """Seconds between two checkpoints; what is flown after the last one is flown again."""
+    """Seconds between two checkpoints; a resumed training flies again from the last one."""
 
     def run(self) -> int:
         """Train by these settings, or by those of the folder to resume."""
@@ -185,7 +185,7 @@ def _change(word: str) -> tuple[str, Any]:
 
 
 def _advice(run: "Run") -> str:
-    """What to set if an update has too little data of so many drones; empty if not."""
+    """Advice if an update has too little data of so many drones; empty if not."""
     from ..agents import A2CConfig
 
     drones, config = run.num_envs, run.config
@@ -244,7 +244,7 @@ class _Keeper:
             self._due = time.monotonic() + self._every
 
     def close(self) -> None:
-        """Write what does not need an update to be whole."""
+        """Write logs; they may end between two updates."""
         self._write_episodes()
         self._scalars.close()
 

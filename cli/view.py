@@ -33,7 +33,7 @@ class View(EnvFlags):
     port: int = 8080
     """TCP port of the page, on this machine's loopback; 0 takes the first free one."""
     world: Literal["airport", "plain"] = "airport"
-    """What is around the drone."""
+    """Surroundings of the drone."""
     speed: float = 1.0
     """1 is real time, from 1/16 to 8."""
     episodes: int | None = None

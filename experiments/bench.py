@@ -1,11 +1,11 @@
-"""What bounds a training on this machine: the layers from raw physics to an update, side by side.
+"""The speed of each layer of a training on this machine, from raw physics to an update.
 
 Every layer is open at the same time and they take turns to run for a moment, in an order that
 changes from round to round. Ratios are made within a round, and their medians count, so that a
 machine that slows down for a while slows all alike.
 
-The parts of a lock-step exchange are layers too, each measured by itself, and what is left of the
-time of a step is the links' own.
+The parts of a lock-step exchange are layers too, each measured by itself; the links take the rest
+of the time of a step.
 """
 
 import copy
@@ -61,7 +61,7 @@ class Ratio:
     name: str
     of: Callable[[Rates], float]
     target: float | None = None
-    """What it should reach; None: it is told only."""
+    """Target; None: the figure has none."""
     at_most: bool = False
     """Whether less is better."""
 
@@ -108,7 +108,7 @@ RATIOS: Final = (
     _over("a2c, 1", "sb3-a2c, 1"),
     _over("vector env, 4096", "vector env, 64"),
 )
-"""Figures of rates, with what they should reach."""
+"""Figures of rates, with their targets."""
 
 PARTS: Final = (
     "simulate",
@@ -155,7 +155,7 @@ class BenchConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
-    """One of the things measured."""
+    """One measured layer."""
 
     name: str
     about: str
@@ -175,7 +175,7 @@ def bench(
     """Measure every layer, and write `bench.json` into `folder`.
 
     Args:
-        config: How long.
+        config: Duration of the measurement.
         folder: Made if it is not there.
         on_layer: Told before each turn: name of the layer, turns done, turns in all.
     """
@@ -215,7 +215,7 @@ def parts_of(layers: Sequence[Layer]) -> list[tuple[str, float]]:
 
 
 def layers_of(folder: Path) -> list[Layer]:
-    """What `bench` wrote. Raises `InputError` if it is not there."""
+    """Read the results of `bench`. Raises `InputError` if there are none."""
     path = folder / "bench.json"
     try:
         content = json.loads(path.read_text())
@@ -308,7 +308,7 @@ def _udp_batch(drones: int) -> Iterator[Slice]:
 
 @contextmanager
 def _simulate() -> Iterator[Slice]:
-    """What a simulator does between a Command and a State."""
+    """The simulator's part between a Command and a State."""
     loop = Loop(ENV_ID)
     dice = np.random.default_rng(0)
     actions = dice.uniform(-0.1, 0.1, (_STEPS_AT_ONCE, 1, 1)).astype(np.float32)

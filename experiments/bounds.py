@@ -1,4 +1,4 @@
-"""What the elevation task allows at most, and what doing nothing earns: rows beside the agents'.
+"""Bounds of the elevation task: the largest return, and that of hovering in place.
 
 **Time-optimal.** From rest at the start to rest on the target in the least time that
 gravity and the action's limits allow. For a double integrator, and for one whose acceleration has a
@@ -35,7 +35,7 @@ def elevation_bounds(
 
     Args:
         options: Of `rotorgram/Elevation-v0`.
-        vehicle: What flies.
+        vehicle: The vehicle.
         starts: E at the start of each episode, m, shape (n,).
     """
     steps, period = options.episode_length, options.control_period

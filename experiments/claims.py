@@ -89,7 +89,7 @@ Outcome = Literal["borne out", "not borne out", "undecided", "not tested"]
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What the data say about one claim of the paper."""
+    """The verdict on one claim of the paper."""
 
     claim: str
     """The claim, with the paper's words."""
@@ -116,7 +116,7 @@ class _Comparison:
     unit: str
     larger: bool
     without: str = ""
-    """What is said of a run that is long enough and yet has no number."""
+    """Words for a run that is long enough and yet has no number."""
 
 
 def _late(run: pd.DataFrame) -> npt.NDArray[np.bool_]:

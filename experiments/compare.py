@@ -43,7 +43,7 @@ from .workers import open_workers
 __all__ = ["PARTS", "CompareConfig", "compare", "evaluation_pair", "read_compare_config"]
 
 PARTS: Final = "parts"
-"""Folder of what the runs of an unfinished comparison left behind."""
+"""Folder with the parts of an unfinished comparison, one for each run."""
 MAX_BATCH: Final = 64
 """Most evaluation episodes that are flown at a time."""
 
@@ -57,9 +57,9 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
     `report.write_report`.
 
     Args:
-        config: What is compared.
+        config: Settings of the comparison.
         folder: One that exists, and no other process writes to: see `folders.new_folder`.
-        command: What the user typed, for `config.json`.
+        command: The user's command, for `config.json`.
         on_progress: Told how far it is.
 
     Raises:
@@ -82,12 +82,12 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
 
 
 def _name(run: Run | None) -> str:
-    """What a run is called; None: the PID, which needs no training and has no seeds."""
+    """Name of a run; None: the PID, which needs no training and has no seeds."""
     return f"{run.algorithm} seed {run.seed}" if run else "pid"
 
 
 def _part(run: Run | None) -> str:
-    """What its part is called."""
+    """Name of its part."""
     return f"{run.algorithm}-seed{run.seed}" if run else "pid-seed0"
 
 
@@ -205,7 +205,7 @@ def _bounds(config: CompareConfig) -> dict[str, float]:
 
 
 def read_compare_config(folder: Path) -> CompareConfig:
-    """What a comparison was to compare, from its `config.json`. Raises `ResultsError`."""
+    """Settings of a comparison, from its `config.json`. Raises `ResultsError`."""
     content = read_config(folder)
     try:
         return CompareConfig(

@@ -1,4 +1,4 @@
-"""The curves of a comparison, from its files: what the figures and the report's page both draw.
+"""The curves of a comparison, from its files, for the figures and the report's page.
 
 Lines are interquartile means over seeds; bands are the quartiles over seeds (from four seeds on) or
 the range from the lowest to the highest seed. Curves of one agent's seeds end where the shortest of
@@ -107,7 +107,7 @@ def make_curves(folder: Path | str, results: Results) -> Curves:
 
     Args:
         folder: Where `rotorgram compare` wrote; the step rows are read from it.
-        results: What `results.read_results(folder)` gave.
+        results: As of `results.read_results(folder)`.
 
     Raises:
         ResultsError: The step rows are missing or are not what they should be.

@@ -1,4 +1,4 @@
-"""What can go wrong with runs and with the files that they leave. Imports no other package."""
+"""Errors of runs and of their files. Imports no other package."""
 
 from ..models.errors import InputError
 

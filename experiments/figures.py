@@ -75,8 +75,8 @@ def draw_figures(
 
     Args:
         folder: Where `rotorgram compare` wrote.
-        results: What `read_results(folder)` gave, where it is at hand.
-        curves: What `make_curves(folder, results)` gave, where they are at hand.
+        results: As of `read_results(folder)`; None: read them.
+        curves: As of `make_curves(folder, results)`; None: make them.
 
     Returns:
         The PNG files, in the order of `FIGURE_FILES`.

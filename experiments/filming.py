@@ -39,7 +39,7 @@ _COMPARISON_QUALITY: Final = 27
 
 
 def moments(trajectory: Trajectory) -> list[Moment]:
-    """What a trajectory looks like after each control step, and at its start.
+    """The moments of a trajectory: its start, and after each control step.
 
     Raises:
         InputError: Its telemetry does not tell where the craft is.
@@ -66,7 +66,7 @@ def moments(trajectory: Trajectory) -> list[Moment]:
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """One pane: a name, and what was flown under it."""
+    """One pane: a name and its trajectories."""
 
     name: str
     color: str
@@ -82,7 +82,7 @@ class Shot:
 
 @dataclass(frozen=True, kw_only=True)
 class Film:
-    """How it is filmed."""
+    """Settings of a film."""
 
     width: int = 1280
     """Pixels."""
@@ -93,7 +93,7 @@ class Film:
     """Seconds of flight per second of film."""
     world: World = "airport"
     vehicle: str | None = None
-    """MJCF file of what flies; None: the paper's."""
+    """MJCF file of the vehicle; None: the paper's."""
     overlay: bool = True
     """Whether numbers and graphs are drawn. Of several panes the names always are."""
     at: float | None = None
@@ -117,14 +117,14 @@ def film(path: Path, shots: Sequence[Shot], config: Film, on_frame: OnFrame | No
         path: As of `write_film`. A `.png` is the picture at `config.at`, or the last.
         shots: One or more, each with as many trajectories. An episode lasts until the longest
             trajectory of it has ended; one that ended before stays on its last picture.
-        config: How.
+        config: Settings.
         on_frame: Told how far it is.
 
     Returns:
         Frames written.
 
     Raises:
-        NoOpenGL: There is nothing to draw with.
+        NoOpenGL: No OpenGL works here.
         InputError: The name, the size or the rate is not what it should be, or the film would be
             longer than any film.
         OSError: It cannot be written.
@@ -303,7 +303,7 @@ def film_comparison(
     picture: Path | None = None,
     world: World = "airport",
 ) -> bool:
-    """Film what a comparison trained: each agent and the PID, the same episode side by side.
+    """Film the agents of a comparison: each agent and the PID, the same episode side by side.
 
     Of an agent's seeds the middle one flies, by the steady state in the final evaluation (of an
     even number the better of the two in the middle). Of the episodes of that evaluation they fly

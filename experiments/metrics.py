@@ -1,4 +1,4 @@
-"""What is measured of a trajectory and of a set of runs: pure functions of arrays and frames.
+"""Measures of a trajectory and of a set of runs: pure functions of arrays and frames.
 
 Over an episode: `steady_state`, `settling_time`, `overshoot` of the headline metric. Over seeds:
 the interquartile mean (`iqm`) with a percentile-bootstrap interval, as Agarwal et al. ("Deep
@@ -6,7 +6,7 @@ Reinforcement Learning at the Edge of the Statistical Precipice", 2021) recommen
 the share of seeds that hold their goal, and the worst seed. `results_table` puts them together.
 
 How episodes that end early (a crash) enter: the steady state, the overshoot and the return are
-those of what was flown; the settling time is missing, and the table says how many episodes
+those of the flown part; the settling time is missing, and the table says how many episodes
 settled and how many crashed; a run with a crash in its evaluation does not hold its goal.
 """
 
@@ -127,14 +127,14 @@ class Headline:
 
     @property
     def held_text(self) -> str:
-        """What holding its goal means: "|E| < 0.1 m"; empty where it means nothing."""
+        """The condition of a held goal: "|E| < 0.1 m"; empty if undefined."""
         if self.metric.held is None:
             return ""
         sign = "≥" if self.high else "<"
         return f"{self.size_symbol} {sign} {self.amount(f'{self.metric.held:g}')}"
 
     def size(self, values: Values) -> npt.NDArray[np.float64]:
-        """Magnitude of an error, value of what is to be high; same shape, float64."""
+        """Magnitude of an error, value of a metric with goal `high`; same shape, float64."""
         array = np.asarray(values, dtype=np.float64)
         return array if self.high else np.abs(array)
 
@@ -342,7 +342,7 @@ def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tup
 
     Args:
         evaluations: The evaluation episodes of one run (one agent, one seed).
-        headline: Says what holding means.
+        headline: The metric that defines a held goal.
 
     Returns:
         Env steps and seconds of training of the first snapshot from which on every snapshot holds

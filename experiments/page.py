@@ -1,4 +1,4 @@
-"""The page of a comparison's report: one HTML file that needs no other, nor a network."""
+"""The page of a comparison's report: one HTML file, without other files or a network."""
 
 import base64
 import json
@@ -53,7 +53,7 @@ _ASSETS: Final = {
 
 
 class FolderFile(NamedTuple):
-    """A file of the comparison's folder: its name there, and what it holds."""
+    """A file of the comparison's folder: its name and its contents."""
 
     name: str
     text: str
@@ -71,13 +71,13 @@ def render_page(
     """Make the page.
 
     Args:
-        results: What `results.read_results` gave.
-        table: What `metrics.results_table` gave.
-        verdicts: What `report.verdicts_of` gave.
-        curves: What `curves.make_curves` gave.
+        results: As of `results.read_results`.
+        table: As of `metrics.results_table`.
+        verdicts: As of `report.verdicts_of`.
+        curves: As of `curves.make_curves`.
         video: An MP4 of the agents side by side, shown where there is one.
         poster: A JPEG of it, shown before it is played.
-        files: What lies beside the page.
+        files: Files beside the page.
     """
     config, headline = results.config, results.headline
     agents = sort_agents(table.index[table["seeds"] > 0])
@@ -115,7 +115,7 @@ def _template() -> "jinja2.Template":
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    # What is not a number has no place in JSON: better an error here than a page without charts.
+    # NaN has no place in JSON: better an error here than a page without charts.
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     return environment.from_string(_read("report.html"))
 
@@ -132,7 +132,7 @@ def _asset(path: str) -> "Markup":
 def _outcome(
     table: "pd.DataFrame", verdicts: Sequence[Verdict], env_steps: int, headline: Headline
 ) -> str:
-    """What came out, in one sentence."""
+    """The result in one sentence."""
     seen = table[table["steady"].notna()]
     trained = _ends(seen[seen["steps_per_second"].notna()], headline)
     others = _ends(seen[seen["steps_per_second"].isna()], headline)
@@ -182,7 +182,7 @@ def _extent(results: Results) -> str:
 
 
 def _schedule(agents: Mapping[str, Mapping[str, Any]]) -> str:
-    """What an annealed learning rate means for the claims; "" if the judged agents have none."""
+    """Effect of an annealed learning rate on the claims; "" if the judged agents have none."""
     annealed = [agent_label(name) for name in ("vpg", "a2c") if agents.get(name, {}).get("anneal")]
     if not annealed:
         return ""
@@ -207,7 +207,7 @@ def _hyperparameters(
 
 
 def _settings(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """What was asked for, less the hyperparameters: titled lists of names and values."""
+    """Settings without the hyperparameters: titled lists of names and values."""
     general = {name: config[name] for name in ("preset", "seeds", "env_steps", "num_envs")
                if name in config}  # fmt: skip
     spec = config["spec"]
@@ -219,7 +219,7 @@ def _settings(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]
 
 
 def _surroundings(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Where it ran: titled lists of names and values."""
+    """Machine and software: titled lists of names and values."""
     spec = config["spec"]
     vehicle = {"name": spec.get("vehicle", ""), "hash": spec.get("vehicle_hash", "")}
     return [
@@ -242,7 +242,7 @@ def _written(value: Any) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Chart:
-    """One chart: what it shows, in words, and its series."""
+    """One chart: its description and its series."""
 
     key: str
     """Names it in the page."""
@@ -337,7 +337,7 @@ def chart_data(charts: Sequence[Chart], agents: Sequence[str]) -> list[dict[str,
     """Give the charts as what JSON can hold: rounded, thinned, missing values as None.
 
     Args:
-        charts: What `make_charts` gave.
+        charts: As of `make_charts`.
         agents: Every agent that may be in them; a series names its agent by the place in here.
     """
     return [

@@ -45,7 +45,7 @@ def socket_pair(
         record: MCAP file for the agent's journal.
 
     Raises:
-        PeerClosed: The simulator did not start, or ended; the sentence holds what it said.
+        PeerClosed: The simulator did not start, or ended; the sentence quotes its last words.
         PeerSilent: The simulator runs and does not answer.
     """
     config = EnvConfig(

@@ -1,4 +1,4 @@
-"""How agents are shown everywhere: their order, their names and their colours."""
+"""Order, names and colours of agents in all tables and figures."""
 
 from collections.abc import Iterable
 from typing import Final

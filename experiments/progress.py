@@ -1,8 +1,8 @@
-"""Progress of runs in other processes: one small datagram now and then, to what shows it.
+"""Progress of runs in other processes: one small datagram now and then.
 
-A lost one matters nothing: the next tells the same. No process, pipe or lock has to be shared, and
-a run goes on where nobody listens any more. Datagrams stay on this machine: runs on another tell
-nothing before they are done.
+A lost datagram does no harm: the next one has the same numbers. Processes share no pipe or lock,
+and a run goes on without a listener. Datagrams stay on this machine: a run on another machine
+reports nothing before it is done.
 """
 
 import contextlib
@@ -18,14 +18,14 @@ from typing import Final
 __all__ = ["OnProgress", "Progress", "ProgressListener", "ProgressSender"]
 
 OnProgress = Callable[[str, int, int, str], None]
-"""Called with a run's name, what is done, what there is to do, and a word on how it goes."""
+"""Called with a run's name, the amounts done and in total, and a status text."""
 
 _EVERY: Final = 0.2  # s
 
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """Where a training stands."""
+    """Progress of a training."""
 
     env_steps: int
     total: int
@@ -39,7 +39,7 @@ class Progress:
     unit: str = ""
 
     def words(self) -> str:
-        """How it goes, for a progress bar."""
+        """Status text for a progress bar."""
         if math.isnan(self.mean_return):
             return ""
         text = f"return {self.mean_return:.0f}"
@@ -88,7 +88,7 @@ class ProgressSender:
 
 
 class ProgressListener:
-    """Hands on what runs tell, from a thread of its own, until its block ends."""
+    """Passes on the progress of runs, from a thread of its own, until its block ends."""
 
     def __init__(self, on_progress: OnProgress) -> None:
         self._on_progress = on_progress
@@ -106,14 +106,14 @@ class ProgressListener:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Hand on what has come, and end."""
+        """Pass on what is left, and end."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.sendto(b"", ("127.0.0.1", self._port))
         self._thread.join()
         self._socket.close()
 
     def tell(self, name: str, done: int, total: int, words: str) -> None:
-        """Hand on what this process knows by itself."""
+        """Pass on progress of this process."""
         with self._lock:
             self._on_progress(name, done, total, words)
 

@@ -48,7 +48,7 @@ CLAIMS_FILE: Final = "claims.json"
 VIDEO_FILE: Final = "video.mp4"
 """The agents side by side; the page has it in itself where it lies in the folder."""
 POSTER_FILE: Final = "video.jpg"
-"""What the page shows of the film before it is played."""
+"""Picture that the page shows before the film is played."""
 PAPERS_TASK: Final = "rotorgram/Elevation-v0"
 """The paper's claims are about this task."""
 
@@ -91,7 +91,7 @@ def write_report(folder: Path | str, results: Results | None = None) -> Path:
 
     Args:
         folder: Where `rotorgram compare` wrote.
-        results: What `results.read_results(folder)` gave, where it is at hand.
+        results: As of `results.read_results(folder)`; None: read them.
 
     Returns:
         The path of the page.

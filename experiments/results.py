@@ -13,7 +13,7 @@ reports.
 | `runs.csv` | training run (agent and seed) |
 
 The column of the headline metric has the metric's own name, such as `elevation_error`; its unit
-stands in `config.json`. In the frames that are read it has the name that says what it is: `steady`
+stands in `config.json`. In data frames its name says what it is: `steady`
 (mean size in the last quarter of an evaluation episode), `mean_size` (over a training episode) or
 `value` (after a step).
 """
@@ -167,11 +167,11 @@ def write_config(
     vehicle: str | None,
     content: Mapping[str, Any],
 ) -> None:
-    """Write `config.json`: the content, and what the numbers depend on besides.
+    """Write `config.json`: the content, and versions and machine, on which the numbers depend too.
 
     Args:
         folder: Where to; a file that exists stays: a resumed run keeps its settings.
-        command: What the user typed.
+        command: The user's command.
         spec: Of the env.
         vehicle: Path of the vehicle's file; None: the paper's.
         content: Settings of the comparison or the sweep; with them all of `CONFIG_KEYS` are there.
@@ -192,7 +192,7 @@ def write_config(
 
 
 def machine() -> dict[str, Any]:
-    """What runs on which a time depends."""
+    """Machine and software on which times depend."""
     joblib = require("joblib", "train", "counting cores")
     return {
         "platform": platform.platform(),
@@ -227,7 +227,7 @@ def read_spec(folder: Path | str, config: Mapping[str, Any]) -> EnvSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class RunResults:
-    """What one run leaves behind."""
+    """Results of one run."""
 
     agent: str
     seed: int
@@ -346,7 +346,7 @@ def step_table(
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """What a comparison's folder holds, less the step rows (see `read_steps`)."""
+    """Contents of a comparison's folder, without the step rows (see `read_steps`)."""
 
     config: dict[str, Any]
     """`config.json`."""

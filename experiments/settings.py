@@ -1,4 +1,4 @@
-"""What a run, a comparison and a sweep are to do: checked as they are made, before anything flies.
+"""Settings of a run, a comparison and a sweep: checked on construction, before anything flies.
 
 Imports neither torch nor pandas.
 """
@@ -19,7 +19,7 @@ __all__ = ["AGENTS", "Backend", "CompareConfig", "EnvConfig", "Run", "SweepConfi
 AGENTS: Final = ("vpg", "a2c", "sb3-a2c")
 
 Backend = Literal["loky", "ray"]
-"""What flies the jobs: the cores of this machine, or a Ray cluster."""
+"""Workers of the jobs: the cores of this machine, or a Ray cluster."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class EnvConfig:
 
     @property
     def module(self) -> str | None:
-        """What another process has to import to know the task; None for ours."""
+        """Module that another process must import to know the task; None for ours."""
         if not is_known(self.env_id):
             return None
         name = task_type(self.env_id).__module__
@@ -50,7 +50,7 @@ class EnvConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Run(EnvConfig):
-    """What is trained: everything that the numbers follow from, but for the software."""
+    """Settings of one training: all that its numbers depend on but the software."""
 
     algorithm: str
     config: VPGConfig | A2CConfig
@@ -82,7 +82,7 @@ class Run(EnvConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class WorkersConfig:
-    """Which workers fly, and how many at a time."""
+    """Kind and number of workers."""
 
     jobs: int | None = None
     """Jobs at a time; None: one for each core of the machine or of the cluster."""
@@ -103,7 +103,7 @@ class WorkersConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class _ManyRuns(WorkersConfig, EnvConfig):
-    """What comparisons and sweeps have in common."""
+    """Base of comparisons and sweeps."""
 
     preset: str = "tuned"
     """`paper` or `tuned`."""
@@ -155,7 +155,7 @@ class _ManyRuns(WorkersConfig, EnvConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class CompareConfig(_ManyRuns):
-    """What is compared, and which workers fly it."""
+    """Settings of a comparison and its workers."""
 
     agents: tuple[str, ...] = AGENTS
     """Agents to train. The PID is always evaluated beside them, where it can fly the env."""
@@ -189,19 +189,19 @@ class SweepRun:
     point: int
     """Of the grid."""
     settings: dict[str, Any]
-    """What the point changes of the preset."""
+    """Changes of the point to the preset."""
     run: Run
 
     @property
     def name(self) -> str:
-        """What the run is called."""
+        """Name of the run."""
         words = " ".join(f"{name}={value}" for name, value in self.settings.items())
         return f"{words} seed {self.run.seed}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepConfig(_ManyRuns):
-    """What is tried, and which workers fly it. Its seeds are not those of a comparison."""
+    """Settings of a sweep and its workers. Its seeds are not those of a comparison."""
 
     algorithm: str
     """`vpg`, `a2c` or `sb3-a2c`."""

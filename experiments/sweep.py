@@ -77,9 +77,9 @@ def sweep(config: SweepConfig, folder: Path, command: str, on_progress: OnProgre
     the same folder (and the config of `read_sweep_config`).
 
     Args:
-        config: What is tried.
+        config: Settings of the sweep.
         folder: One that exists, and no other process writes to: see `folders.new_folder`.
-        command: What the user typed, for `config.json`.
+        command: The user's command, for `config.json`.
         on_progress: Told how far it is.
 
     Raises:
@@ -199,7 +199,7 @@ def is_sweep(folder: Path) -> bool:
 
 
 def read_sweep_config(folder: Path) -> SweepConfig:
-    """What a sweep was to try, from its `config.json`. Raises `ResultsError`."""
+    """Settings of a sweep, from its `config.json`. Raises `ResultsError`."""
     content = read_config(folder)
     try:
         settings = content["sweep"]

@@ -60,7 +60,7 @@ def headings(headline: Headline, short: bool = False) -> tuple[str, ...]:
 
 
 def table_note(headline: Headline) -> str:
-    """What the columns are."""
+    """Explanation of the columns."""
     size, goal, settled = headline.size_symbol, headline.held_text, headline.metric.settled
     parts = [
         "Interquartile means over seeds with 95 % bootstrap intervals, from the deterministic "
@@ -85,7 +85,7 @@ def table_note(headline: Headline) -> str:
 
 
 class Cell(NamedTuple):
-    """A cell of the table: its value, and what stands in small print below it."""
+    """A cell of the table: its value, and the small print below it."""
 
     value: str
     details: tuple[str, ...] = ()

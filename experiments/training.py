@@ -41,7 +41,7 @@ class Snapshot:
 
 
 def is_finished(kept: Checkpoint) -> bool:
-    """Whether a training has flown all that it was to. SB3 flies whole rollouts only."""
+    """Whether a training has flown all its env steps. SB3 flies whole rollouts only."""
     least = 1
     if kept.algorithm == "sb3-a2c":
         least = A2CConfig(**kept.config).rollout_size(kept.num_envs)
@@ -53,11 +53,11 @@ class Training:
     """A run on an env, to be started, stopped, stored and resumed at update boundaries.
 
     Args:
-        run: What to train.
+        run: Settings of the training.
         env: Local or remote, a vector env where the run has many drones; not closed here.
         snapshots: How many times, evenly spread, the policy is kept for later evaluation, besides
             the untrained one.
-        keep_steps: Whether `log.steps()` is asked for.
+        keep_steps: Keep every step, for `log.steps()`.
     """
 
     run: Run
@@ -125,7 +125,7 @@ class Training:
         return self.log.env_steps >= self.agent.last_step(self.run.env_steps)
 
     def progress(self) -> Progress:
-        """Where the training stands."""
+        """Progress of the training."""
         recent = self.log.episodes[-max(_RECENT, self.run.num_envs) :]
         headline = self.log.spec.headline
         return Progress(
@@ -139,10 +139,10 @@ class Training:
         )
 
     def scalars(self) -> dict[str, float]:
-        """Where the training stands, in numbers for TensorBoard, by the names that SB3 gives them.
+        """Progress of the training, in numbers for TensorBoard, under SB3's names.
 
-        To be asked for at an update. `docs/algorithms/README.md` has the table. What is not defined
-        yet, or not finite, is left out.
+        Call it at an update. `docs/algorithms/README.md` has the table. Numbers that are not
+        defined yet, or not finite, are left out.
         """
         log = self.log
         numbers = {
@@ -196,7 +196,7 @@ def train_run(
     """Train to the end, as comparisons and sweeps do.
 
     Args:
-        run: What to train.
+        run: Settings of the training.
         env: Of as many drones as the run has.
         progress: Told how far it is.
         snapshots, keep_steps: As of `Training`.

@@ -30,7 +30,7 @@ _EVALUATION: Final = 20230324  # the day the paper appeared
 
 EpisodeSet = Literal["final", "curve", "tuning"]
 """Evaluation episodes that share no start: `final` for the figures that are reported, `curve` for
-snapshots during training and whatever else looks at a policy, `tuning` for choosing settings."""
+snapshots during training and all other looks at a policy, `tuning` for choosing settings."""
 
 _SETS: Final[tuple[EpisodeSet, ...]] = ("final", "curve", "tuning")
 
@@ -54,8 +54,8 @@ class Trajectory:
 
     spec: EnvSpec
     telemetry: Mapping[str, np.ndarray]
-    """Every telemetry array by name, float64, shape (T + 1, *shape): row k is what k control steps
-    led to, row 0 the start. Units and frames are those of the spec."""
+    """Every telemetry array by name, float64, shape (T + 1, *shape): row k is after k control
+    steps, row 0 the start. Units and frames are those of the spec."""
     rewards: np.ndarray
     """float64, shape (T,)."""
     ending: Ending
@@ -89,7 +89,7 @@ class Trajectory:
 
     @property
     def headline(self) -> np.ndarray:
-        """The metric that decides, shape (T + 1,); nan where the env names none."""
+        """The headline metric, shape (T + 1,); nan where the env names none."""
         if self.spec.headline is None:
             return np.full(len(self) + 1, np.nan)
         return self.values(self.spec.headline.name)

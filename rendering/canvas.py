@@ -19,12 +19,12 @@ class Canvas:
     """Pictures of a stage, all of one size.
 
     Args:
-        stage: What is drawn.
+        stage: The stage to draw.
         width, height: Pixels.
         fast: Without shadows and smooth edges, which take most of the time where software draws.
 
     Raises:
-        NoOpenGL: There is nothing to draw with.
+        NoOpenGL: No OpenGL works here.
         InputError: Width or height is not 16 to 8192.
     """
 
@@ -55,7 +55,7 @@ class Canvas:
         """Draw the stage as it is now.
 
         Args:
-            camera: From where.
+            camera: Point of view.
             stage: A twin of the canvas's stage, to be drawn in its place.
 
         Returns:

@@ -18,13 +18,13 @@ from ._pillow import Image
 __all__ = ["QUALITY", "SUFFIXES", "check_film", "poster", "write_film"]
 
 SUFFIXES: Final = (".mp4", ".gif", ".png", "")
-"""What a film may be; no suffix is a folder of PNGs."""
+"""Kinds of film, by suffix; no suffix is a folder of PNGs."""
 QUALITY: Final = 20
 """x264's constant rate factor: less is better and larger."""
 
 
 def check_film(path: Path, width: int, height: int, fps: float) -> None:
-    """Check, before anything is drawn, what `write_film` is to write. Raises `InputError`."""
+    """Check the arguments of `write_film` before anything is drawn. Raises `InputError`."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(
             f"film: expected a name that ends in .mp4, .gif or .png, or a folder's name without a "
@@ -118,7 +118,7 @@ class _Counted:
 
 
 def _write_gif(path: Path, frames: _Counted, fps: float) -> None:
-    # Without dithering: what stands still stays the same, and costs nothing.
+    # Without dithering: parts that stand still do not change, and cost nothing.
     pictures = (Image.fromarray(f).quantize(256, dither=Image.Dither.NONE) for f in frames)
     first = next(pictures)
     milliseconds = round(100 / fps) * 10

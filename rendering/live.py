@@ -47,7 +47,7 @@ class Aim:
             view = self._stage.camera("free")
             for name in ("azimuth", "elevation", "distance", "lookat"):
                 setattr(camera, name, getattr(view, name))
-        else:  # what the mouse has turned and moved stays so
+        else:  # keep what the mouse has changed
             camera.lookat[:] += focus - self._focus
         self._focus = focus
 
@@ -65,7 +65,7 @@ class Surface(Protocol):
         """Whether it is still open."""
 
     def is_watched(self) -> bool:
-        """Whether somebody looks."""
+        """Whether there is a viewer."""
 
     def close(self) -> None:
         """Close it."""
@@ -75,8 +75,8 @@ class LiveView:
     """Draws the latest moments in a thread of its own.
 
     Args:
-        stage: What is drawn. The view alone shows moments on it.
-        surface: What it is drawn on.
+        stage: The stage to draw. The view alone shows moments on it.
+        surface: The window or page to draw on.
         pace: Its speed is a line of the overlay.
         of: Number of drones, if more than are shown.
     """
@@ -101,7 +101,7 @@ class LiveView:
 
     @property
     def is_watched(self) -> bool:
-        """Whether somebody looks: of a page, whether a browser has opened it."""
+        """Whether there is a viewer: of a page, whether a browser has opened it."""
         return self.surface.is_watched()
 
     @property

@@ -72,10 +72,10 @@ class Overlay:
         color: Of title and curve, "#RRGGBB"; light, the ground is dark.
         like: A moment of the flight: its metrics, its goal and its rotors say which lines there
             are.
-        vehicle: What flies: it gives the limits of the thrusts.
+        vehicle: The vehicle: it gives the limits of the thrusts.
         period: Time between two values of the graph, s.
         seconds: Length of the graph's time axis, s.
-        scale: Lower and upper end of the graph, in the metric's unit. What is beyond is not drawn:
+        scale: Lower and upper end of the graph, in the metric's unit. Values beyond are not drawn:
             a triangle marks where the curve leaves.
         numbers: Whether there is more than the title.
 
@@ -128,7 +128,7 @@ class Overlay:
             picture: uint8, shape (height, width, 3).
             moment: For the panel.
             values: The headline metric from the episode's start to this moment, one each period.
-            note: What happened, such as "terminated".
+            note: An event, such as "terminated".
         """
         image = Image.fromarray(picture)
         if image.size != self._size:
@@ -275,7 +275,7 @@ class Overlay:
 
 
 def _enlarged(image: Image.Image, box: Box, write: Callable[[ImageDraw.ImageDraw], None]) -> None:
-    """Write on a part of the picture. What is not written on stays as it is, bit for bit."""
+    """Write on a part of the picture. All other pixels stay the same, bit for bit."""
     part = image.crop(box)
     part = part.resize((part.width * _TIMES, part.height * _TIMES), Image.Resampling.NEAREST)
     write(ImageDraw.Draw(part))

@@ -8,7 +8,7 @@ from ..models.errors import InputError
 __all__ = ["FASTEST", "SLOWEST", "SPEEDS", "Pace", "Press"]
 
 Press = Literal["pause", "step", "slower", "faster"]
-"""What a key or a button does."""
+"""Effect of a key or a button."""
 
 SPEEDS: Final = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
 """Steps of `slower` and `faster`; 1 is real time."""

@@ -19,7 +19,7 @@ _OF_MANY: Final = (240, 180)
 
 
 class Painter:
-    """What the `render` of an env returns or shows. Nothing is opened before the first call.
+    """Draws for the `render` of an env. Opens nothing before the first call.
 
     Args:
         mode: `rgb_array`, or `human`.
@@ -41,7 +41,7 @@ class Painter:
         """A picture of each craft, uint8 of shape (height, width, 3); None with `human`.
 
         Raises:
-            NoOpenGL: There is nothing to draw with, or no display to show it on.
+            NoOpenGL: No OpenGL works here, or there is no display.
         """
         if self._mode == "human":
             self._show(moments[:MOST_DRONES])
@@ -53,7 +53,7 @@ class Painter:
         return tuple(self._draw(self._canvas, moment) for moment in moments)
 
     def close(self) -> None:
-        """Close what is open."""
+        """Close the canvas or the window."""
         for opened in (self._canvas, self._view):
             if opened is not None:
                 opened.close()

@@ -67,12 +67,12 @@ class Stage:
         trail: Whether paths are drawn.
 
     Attributes:
-        vehicle: What flies.
+        vehicle: The vehicle of every craft.
         radius: Of a sphere about the body's origin that holds the craft, m. Cameras, goals and
             paths scale with it.
-        model: With everything that is only looked at.
-        data: Poses of what was shown last.
-        moments: What was shown last.
+        model: With all visual elements.
+        data: Poses of the last moments.
+        moments: The last moments.
 
     Raises:
         InputError: One of these is not what it should be.
@@ -140,11 +140,11 @@ class Stage:
                 path.append(pose[:3].copy())
             self._reach[i] = self._reached(i, pose[:3])
         mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_comPos(self.model, self.data)  # what cameras and lights follow
+        mujoco.mj_comPos(self.model, self.data)  # the body that cameras and lights follow
         mujoco.mj_camlight(self.model, self.data)
 
     def camera(self, name: Camera | Literal["free"]) -> mujoco.MjvCamera:
-        """A camera for what is shown now. All but `onboard` see every craft.
+        """A camera for the last moments. All but `onboard` see every craft.
 
         `chase` and `top` go with the craft; `front`, `side` and `free`, where a viewer's camera
         begins, look at the goal if there is one, and move back from a craft that is far from it.

@@ -39,7 +39,7 @@ _COLUMN: Final = 90.0
 
 
 def refusal(host: str | None, origin: str | None) -> str | None:
-    """Why a request is refused, by its headers; None if it is not.
+    """The reason to refuse a request, by its headers; None if it is accepted.
 
     A page of another site may open a WebSocket to this machine, and its name server may name this
     machine's address. `Host` and `Origin` then tell the other site's name.
@@ -81,8 +81,8 @@ class WebPage:
     """A stage in browsers, served on this machine's loopback alone. `Surface`.
 
     Args:
-        stage: What is shown.
-        pace: What buttons and keys change.
+        stage: The stage to show.
+        pace: Changed by buttons and keys.
         port: TCP port; 0 takes the first free one from 8080 on.
 
     Attributes:
@@ -173,7 +173,7 @@ class _LoopbackViewer(web_viewer.WebViewer):  # type: ignore[misc]
 
 @dataclass(frozen=True, kw_only=True)
 class _Look(messages.Snapshot):  # type: ignore[misc]
-    """What is drawn besides poses."""
+    """The scene besides its poses."""
 
     lines: Lines
     geoms: list[mujoco.MjvGeom]

@@ -45,8 +45,8 @@ class Window:
     """A stage in a window. `Surface`.
 
     Args:
-        stage: What is shown.
-        pace: What the keys change.
+        stage: The stage to show.
+        pace: Changed by the keys.
 
     Raises:
         NoDisplay: There is no display, or none that OpenGL can draw on.
@@ -97,7 +97,7 @@ class Window:
         return bool(self._handle.is_running())
 
     def is_watched(self) -> bool:
-        """Whether somebody looks: a window is looked at from its start."""
+        """Whether there is a viewer: a window has one from its start."""
         return True
 
     def close(self) -> None:

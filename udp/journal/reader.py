@@ -1,4 +1,4 @@
-"""Reads a journal, whole or cut off, and tells what is in it."""
+"""Reads and summarizes a journal, whole or cut off."""
 
 import json
 import os
@@ -56,7 +56,7 @@ class Session:
     """Counts the sessions of the file, from 1."""
     slot: int
     hello: Hello
-    """The text codec has no Hello. Then it is what the recording side knows, of session 0."""
+    """The text codec has no Hello. Then the recording side makes one, of session 0."""
     codec: str
     """`binary` or `text`."""
     welcome: Welcome | None = None

@@ -39,7 +39,7 @@ class Difference:
 
 @dataclass(kw_only=True)
 class SessionVerdict:
-    """How the repetition of one session compares."""
+    """Result of repeating one session."""
 
     session: Session
     same: int = 0
@@ -51,7 +51,7 @@ class SessionVerdict:
     difference: Difference | None = None
     """The first of all."""
     problem: str = ""
-    """Why it cannot be repeated, or not to its end."""
+    """Reason if it cannot be repeated, or not to its end."""
     notes: list[str] = field(default_factory=list)
     """Other things that have changed."""
 
@@ -73,7 +73,7 @@ class SessionVerdict:
 
 @dataclass(kw_only=True)
 class Verification:
-    """How the repetition of a journal compares."""
+    """Result of repeating a journal."""
 
     path: Path
     complete: bool

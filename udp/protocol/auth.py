@@ -1,4 +1,4 @@
-"""A shared key: datagrams that only those who hold it can make.
+"""A shared key: only its holders can make a valid datagram.
 
 A sealed datagram is an envelope of 24 bytes before the message:
 
@@ -6,9 +6,9 @@ A sealed datagram is an envelope of 24 bytes before the message:
     2   6 bytes   id of the key: so that an agent may hold several while they are changed
     8   16 bytes  tag: keyed BLAKE2b (RFC 7693) of the message, `person` of the sender's side
 
-What opens a session is tagged with the shared key; all that follows with a key that both sides'
-random numbers enter, so that nothing of another session is ever taken. Nothing is hidden: sealing
-authenticates, it does not encrypt.
+Messages that open a session are tagged with the shared key; later ones with a key derived from it
+and both sides' random numbers, so that no message of another session is accepted. Sealing
+authenticates; it does not encrypt.
 """
 
 import os
@@ -67,7 +67,7 @@ class Key:
         self._envelope = _MAGIC + self.id
         self._side = side
         there = "agent" if side == "simulator" else "simulator"
-        # A keyed state is copied for each datagram: half the price of making one anew.
+        # A keyed state is copied for each datagram: half the time of making a new one.
         self._ours = blake2b(key=secret, digest_size=_TAG_SIZE, person=side.encode())
         self._theirs = blake2b(key=secret, digest_size=_TAG_SIZE, person=there.encode())
 
@@ -78,7 +78,7 @@ class Key:
         return Key(secret.digest(), self._side, id_=self.id)
 
     def seal(self, message: bytes, asked: bytes = b"") -> bytes:
-        """The datagram that carries a message. Only who has sent `asked` takes it for an answer."""
+        """The datagram that carries a message. Only the sender of `asked` accepts the answer."""
         tag = self._ours.copy()
         tag.update(message + asked)
         return self._envelope + tag.digest() + message

@@ -41,9 +41,9 @@ Every message, and every fragment of one, begins with 24 bytes:
                                       30       bitmap to the end, at least 1 byte, lowest bit first
 
 An extension is a u16 (bits 0-14 its type, bit 15 set if it is critical), a u16 length of at most
-512, and so many bytes. A side skips what it does not know; it does not go on if that is critical.
-Reserved bytes are sent as 0 and ignored. The header, the layout of a fragment, the first two fields
-of Hello and the whole of Refuse are those of every version.
+512, and so many bytes. A side skips an extension that it does not know, and stops if that one is
+critical. Reserved bytes are sent as 0 and ignored. The header, the layout of a fragment, the first
+two fields of Hello and the whole of Refuse are those of every version.
 """
 
 import struct

@@ -2,8 +2,8 @@
 
 A caller hands in datagrams with the time of their arrival (seconds of any monotonic clock), sends
 what `take_outgoing` gives, and calls `handle_timer` when `next_timer` says. Exactly one State is
-outstanding at any time, so a sequence number is all it takes to step the physics once for each
-Command: the simulator repeats the same bytes until the Command of the same number comes.
+outstanding at any time, so a sequence number suffices to step the physics once for each Command:
+ the simulator repeats the same bytes until the Command of the same number comes.
 """
 
 import secrets
@@ -88,7 +88,7 @@ def largest_datagram(peer: Address, most: int | None = None) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class LinkConfig:
-    """How a simulator exchanges."""
+    """Times and sizes of a simulator's exchange."""
 
     timeout: float = 120.0
     """It gives up when nothing has answered for this long, s: longer than an agent waits for one
@@ -106,7 +106,7 @@ class LinkConfig:
 
 
 class RoundTrips:
-    """How long an answer takes, and so when to ask again (RFC 6298)."""
+    """Measures round trips, and derives the time of a resend (RFC 6298)."""
 
     def __init__(self) -> None:
         self._smoothed: float | None = None
@@ -147,7 +147,7 @@ class Client:
     """Says Hello, then exchanges States for Commands.
 
     Args:
-        hello: What is simulated.
+        hello: Hello to send: the spec and the number of worlds.
         layout: That of the Hello.
         config: Times of the exchange.
         largest: Bytes of the largest datagram, a seal not counted.
@@ -376,7 +376,7 @@ class Client:
             words = f" that says: {message.reason}" if isinstance(message, Refuse) else ""
             raise Forged(f"not sealed, a {type(message).__name__}{words}")
         kind, _, sequence = binary.peek(message_of(datagram))
-        if kind == binary.UNKNOWN:  # answers this very State, not one that somebody made up
+        if kind == binary.UNKNOWN:  # answers this very State, not a forged one
             return key.open(datagram, self._asking)
         if kind in binary.OF_SESSION or (kind == binary.MISSING and sequence):
             if self._session_key is None:
@@ -417,7 +417,7 @@ class Client:
         self._progress(now)
 
     def _unfit(self, welcome: Welcome) -> str:
-        """Why a Welcome cannot be taken, or ""."""
+        """The reason to refuse a Welcome, or ""."""
         low, high = self.hello.versions
         if not low <= welcome.version <= high:
             return f"Welcome: expected version {low} to {high}, got {welcome.version}"

@@ -1,4 +1,4 @@
-"""What can go wrong on the wire: we misused it (`ValueError`), or the peer did (these)."""
+"""Errors of the peer and the wire. Misuse of our own code raises `ValueError`."""
 
 __all__ = ["DecodeError", "LinkError", "PeerClosed", "PeerSilent", "Refused", "VersionMismatch"]
 

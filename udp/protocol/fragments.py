@@ -8,9 +8,9 @@ A fragment is a datagram with the header of its message, 128 added to its type, 
     29  3 bytes reserved
     32       a slice of the message, its header included, at least one byte
 
-A message is sent in bursts. The last fragment of a burst asks for an answer: a `Missing` with what
-has not come, or, if all has, what answers the message. So only what is missing is sent again, and
-the bursts follow each other at the pace of the round trip.
+A message is sent in bursts. The last fragment of a burst asks for an answer: a `Missing` with the
+fragments that have not come, or, if all have, the answer to the message. So only missing fragments
+are sent again, and the bursts follow each other at the pace of the round trip.
 """
 
 import struct
@@ -56,7 +56,7 @@ _LARGEST_BITMAP: Final = 128
 
 
 class Window:
-    """How much is sent in one burst. It grows while bursts arrive, and halves if much is lost."""
+    """Size of a burst. It grows while bursts arrive, and halves if much is lost."""
 
     def __init__(self) -> None:
         self.size = _FIRST_BURST

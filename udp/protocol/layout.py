@@ -1,6 +1,6 @@
 """Where each array of a State and of a Command lies, known from Hello on.
 
-Every array begins at a multiple of 8 bytes, counted from the begin of the message; the bytes
+Every array begins at a multiple of 8 bytes, counted from the beginning of the message; the bytes
 between two arrays are 0 and are ignored. Numbers are little-endian, in C order, and the drone is
 the first axis. With N drones a State is, after its fixed 40 bytes:
 
@@ -82,7 +82,7 @@ class Slot:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """What the messages of one simulator look like.
+    """Layout of the messages of one simulator.
 
     Raises:
         InputError: The drones are too many, or a message would be larger than `MAX_MESSAGE`.

@@ -1,4 +1,4 @@
-"""What the two sides say to each other. Imports the standard library and NumPy alone.
+"""Messages of the two sides. Imports the standard library and NumPy alone.
 
 Every array has the drone as its first axis; a single drone is N = 1. Quantities are the env's own:
 this module knows nothing of drones but their number. Short messages check themselves. A `State` or
@@ -46,7 +46,7 @@ MAX_SPEC: Final = 1 << 22
 FLY: Final = 0
 RESET: Final = 1
 FREEZE: Final = 2
-"""What a drone is ordered to do: fly its action, reset instead of it, or do nothing."""
+"""Order to a drone: fly its action, reset instead of it, or do nothing."""
 
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
@@ -91,7 +91,7 @@ class Extension:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Hello:
-    """Simulator to agent, first: what it simulates."""
+    """Simulator to agent, first: its env and its worlds."""
 
     session: int
     """Random 64-bit number, new at every start of a simulator and of its agent."""
@@ -195,7 +195,7 @@ class Missing:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class State:
-    """Simulator to agent: what every drone sees after the step that `sequence` counts."""
+    """Simulator to agent: observations of every drone after the step that `sequence` counts."""
 
     session: int
     sequence: int
@@ -217,7 +217,7 @@ class State:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Command:
-    """Agent to simulator: what every drone does next. Answers the State of the same `sequence`."""
+    """Agent to simulator: next order of every drone. Answers the State of the same `sequence`."""
 
     session: int
     sequence: int

@@ -1,9 +1,9 @@
 """The agent's side of the exchange (UDP server), free of sockets and clocks.
 
 It has slots, one for each simulator that it flies. A Hello that fits is welcomed, and takes a slot
-only when its State 1 has come with the nonce of the Welcome: a Hello that was recorded and sent
-again, or whose sender does not read, takes none. A repeated State is answered with the bytes of
-the first answer. What is kept of a simulator without a slot is bounded.
+only when its State 1 has come with the nonce of the Welcome: a recorded Hello that is sent
+again takes none, and neither does a sender that does not read. A repeated State is answered with
+the bytes of the first answer. Memory for simulators without a slot is bounded.
 """
 
 import secrets
@@ -61,7 +61,7 @@ class NoSuchSession(DecodeError):
 
 
 class Event(NamedTuple):
-    """What a datagram brought."""
+    """The effect of a datagram."""
 
     slot: int
     message: State | Close
@@ -168,7 +168,7 @@ class Server:
     # ---- what the caller does
 
     def receive(self, datagram: bytes, address: Address, now: float) -> Event | None:
-        """Take a datagram; what it brought, if it moves an exchange on."""
+        """Take a datagram; its effect, if it moves an exchange on."""
         self.statistics.counters["received"] += 1
         slot = self._slot_of.get(address, -1)
         session = self.slots[slot] if slot >= 0 else None
@@ -355,7 +355,7 @@ class Server:
             self._let_wait(Session(address, hello.session, layout, hello, key=key), size)
 
     def _fit(self, hello: Hello) -> Layout | str:
-        """The layout of a simulator that may come, or why it may not."""
+        """The layout of a simulator that is accepted, or the reason to refuse it."""
         if self.closed:
             return "the agent has closed"
         low, high = hello.versions
@@ -433,7 +433,7 @@ class Server:
         """A message of a session that is none here."""
         if kind in (binary.STATE, binary.MISSING):
             self._disown(plain, arrival)
-        else:  # the answer to a Close of ours, mostly: not worth a word
+        else:  # the answer to a Close of ours, mostly: not counted
             self.statistics.counters["foreign"] += 1
 
     def _disown(self, plain: bytes, arrival: _Arrival) -> None:
@@ -446,7 +446,7 @@ class Server:
         if is_fragment(plain) and not asks(plain):
             return  # one answer will do
         if self.closed or self._seated(number, elsewhere=address):
-            # Somebody else has it, elsewhere: no word of ours shall end it.
+            # Another address has it: no answer of ours may end it.
             self._drop("foreign", f"session {number:016x}", arrival)
             return
         self.statistics.counters["foreign"] += 1  # after a restart of ours, mostly: no word of it

@@ -1,7 +1,7 @@
-"""Whose turn it is: every state of both sides, and what is sent and received in it.
+"""States of both sides, and the messages that each state sends and receives.
 
-One table for each side says what a message does, sent or received; what is not in it cannot be
-sent, and is dropped when it comes. A text simulator begins at READY, for it says no Hello.
+One table for each side says what a message does, sent or received; other messages cannot be
+sent, and are dropped when they come. A text simulator begins at READY, for it says no Hello.
 """
 
 from enum import Enum

@@ -1,1 +1,1 @@
-"""Drones in simulators elsewhere, as Gymnasium envs of the agent's."""
+"""Drones in remote simulators as Gymnasium envs of the agent."""

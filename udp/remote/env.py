@@ -1,4 +1,4 @@
-"""One drone elsewhere, as a Gymnasium env of the agent's."""
+"""One drone in a remote simulator as a Gymnasium env of the agent."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,13 +23,13 @@ _RESET: Final = np.array([RESET], np.uint8)
 
 
 class RemoteEnv(ServedEnv, gym.Env[Any, Any]):
-    """A drone in a simulator elsewhere, flown in lock-step over UDP.
+    """A drone in a remote simulator, flown in lock-step over UDP.
 
-    The simulator may start before or after. Its Hello brings the spec of its env, and that the
-    spaces: this side needs neither the env's code nor a simulator. A text simulator says no Hello,
-    and is read by the spec of `env_id` with `options`, which must be registered here. Observations,
-    rewards, ends of episodes and telemetry are those of the env in the simulator, bit for bit;
-    `info` carries the telemetry by its components.
+    The simulator may start before or after. Its Hello brings the spec of its env, and the spaces
+    follow from that: this side needs neither the env's code nor MuJoCo. A text simulator says no
+    Hello, and is read by the spec of `env_id` with `options`, which must be registered here.
+    Observations, rewards, ends of episodes and telemetry are those of the env in the simulator, bit
+    for bit; `info` carries the telemetry by its components.
 
     A simulator that is killed and started again, or another one that comes in its place, goes on:
     the running episode ends as truncated, with the observation before it, reward 0 and the reason
@@ -49,12 +49,12 @@ class RemoteEnv(ServedEnv, gym.Env[Any, Any]):
         max_datagram: Largest datagram, bytes, a seal not counted. None: 65,483 on loopback, 1,200
             elsewhere.
         key_file: File with the key that the simulators have too (`rotorgram key`). With it any
-            address is allowed, for only those who hold the key can take part.
+            address is allowed, because only holders of the key can take part.
         insecure: Allow an address that is not loopback without a key.
         record: MCAP file to write every message to; it must not exist.
 
     Attributes:
-        env_spec: What there is to know of the env, once a simulator has come.
+        env_spec: The `EnvSpec` of the env, once a simulator has come.
         control_period: Time of a step, s, likewise.
 
     Raises:
@@ -160,8 +160,8 @@ class RemoteEnv(ServedEnv, gym.Env[Any, Any]):
         return state
 
     def _take_spec(self) -> None:
-        """Set what follows from the spec. Spaces that are equal to those there are stay: their
-        generators may have been seeded.
+        """Set spaces and other attributes from the spec. Spaces that have not changed are kept:
+        their generators may have been seeded.
         """
         spec = self._spec_that_came()
         if getattr(self, "env_spec", None) == spec:

@@ -1,4 +1,4 @@
-"""What the envs over UDP have in common, with one drone or many: the `Agent` behind them."""
+"""Base of the envs over UDP, with one drone or many: the `Agent` behind them."""
 
 from typing import Any, Final
 
@@ -17,7 +17,7 @@ LOST: Final = "simulator_lost"
 
 
 class ServedEnv:
-    """An env whose drones are in simulators elsewhere. For a class that is a Gymnasium env too."""
+    """An env with drones in remote simulators. For a class that is a Gymnasium env too."""
 
     _agent: Agent
 
@@ -38,12 +38,12 @@ class ServedEnv:
 
 
 def checked_actions(action: Any, spec: EnvSpec, shape: tuple[int, ...]) -> np.ndarray:
-    """Actions as they cross the wire, of the spec's dtype. Bounds are the env's affair.
+    """Actions as they cross the wire, of the spec's dtype. The env checks bounds.
 
     Args:
-        action: What an env was given.
+        action: Argument of `step`.
         spec: Its spec.
-        shape: What shape the action must have.
+        shape: Shape that the action must have.
 
     Raises:
         InputError: It is not of that shape, not real, or cannot be of that dtype.

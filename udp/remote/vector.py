@@ -1,4 +1,4 @@
-"""The drones of one or many simulators elsewhere, as one vector env of the agent's."""
+"""The drones of one or many remote simulators as one vector env of the agent."""
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -44,8 +44,8 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
             is that of the first simulator that comes.
         autoreset_mode: `AutoresetMode`, or its value.
         connect: Wait for the simulators now. Otherwise `connect` or the first `reset` waits.
-        env_id, options, vehicle_hash, connect_timeout, timeout, max_datagram, key_file, insecure,
-            record: As `RemoteEnv`.
+        env_id, options, vehicle_hash, connect_timeout, timeout, max_datagram: As `RemoteEnv`.
+        key_file, insecure, record: As `RemoteEnv`.
 
     Raises:
         InputError: An address, number, option, key file, action or seed is not what it should be;
@@ -201,7 +201,7 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
         self._flying = False
 
     def _take(self, spec: EnvSpec) -> None:
-        """Set what follows from the spec."""
+        """Set spaces and other attributes from the spec."""
         worlds = self._agent.worlds
         num_envs = self.num_simulators * worlds * len(spec.agents)
         self._take_spec(spec, num_envs, self._mode)
@@ -244,7 +244,7 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
         seeds: np.ndarray | None,
         frozen: np.ndarray,
     ) -> dict[int, Order]:
-        """What each simulator is told. The arrays are those of all drones."""
+        """Order of each simulator. The arrays are those of all drones."""
         orders = (RESET * resets + FREEZE * frozen).astype(np.uint8).reshape(self._shape)
         rows = actions.reshape(*self._shape, *self._row)
         numbers = None if seeds is None else seeds.reshape(self._shape)
@@ -254,7 +254,7 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
         }
 
     def _take_states(self, still: np.ndarray) -> None:
-        """Take over what came; rewards and flags are 0 for the drones that did not fly."""
+        """Take over the States; rewards and flags are 0 for the drones that did not fly."""
         states = [state for state in self._agent.states if state]
         spec = self.env_spec
         self._arrays = {

@@ -93,7 +93,7 @@ class AgentConfig:
 
 
 class Agent:
-    """Exchanges Commands for States with every simulator, all at the same time.
+    """Exchanges Commands for States with all simulators at the same time.
 
     Attributes:
         server: The state machine.
@@ -259,7 +259,7 @@ class Agent:
             _log.warning("%s", self.lost[slot])
 
     def _give_up(self, pending: list[int], now: float) -> None:
-        """Free the slots of the silent. Raises `PeerSilent` if nobody took one that was free."""
+        """Free the slots of silent simulators. Raises `PeerSilent` if no other took a free slot."""
         for slot in pending:
             if now < self._deadlines[slot]:
                 continue
@@ -289,7 +289,7 @@ class Agent:
 
     def _say_waiting(self, slot: int) -> None:
         here, wait = address_text(self.address), self.config.connect_timeout
-        long = f"{wait:g} s " if wait < 86_400 else ""  # the commands wait for a month
+        long = f"{wait:g} s " if wait < 86_400 else ""  # commands wait without limit
         _log.warning("%s; waiting %sfor another at %s", self.lost[slot], long, here)
 
     def _nobody_came(self, lost: str) -> str:
@@ -309,8 +309,8 @@ class Agent:
 
 
 class _Required:
-    """What a simulator must be. The server holds it: an `Agent` held by its server would never
-    be garbage.
+    """Requirements of a simulator. The server holds them: an `Agent` held by its server would
+    never be garbage.
     """
 
     def __init__(self, config: AgentConfig) -> None:
@@ -396,7 +396,7 @@ def _told(options: Mapping[str, Any], name: str) -> str:
 
 
 def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
-    """In what a simulator is unlike those that have flown before, in a sentence."""
+    """Difference between a simulator and earlier ones, in a sentence; "" if there is none."""
     if reason := _options_difference(ours.options, theirs.options, both_ways=True):
         return reason
     for name in ("env_id", "vehicle_hash", "control_period", "agents", "observation", "action",

@@ -30,13 +30,13 @@ DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
 
 _ALIVE_EVERY: Final = 0.5
-"""While a step takes longer, the agent is told as often that it is being computed, s."""
+"""Period of the message Alive while a long step is computed, s."""
 _PAUSE: Final = 1.0
 """A wait that took so much longer than it should, s: this process was stopped meanwhile."""
 
 Observer = Callable[[Message | None, State], None]
-"""Is told what moved the drones, a Command or the Welcome that resets them all, and the State that
-it led to: valid during the call only. None, by text: the reset before the first State."""
+"""Called with the message that moved the drones, a Command or the Welcome that resets them all, and
+the State after it: valid during the call only. None, by text: the reset before the first State."""
 
 
 class Simulator:
@@ -50,16 +50,16 @@ class Simulator:
         bind: Address of this side; port 0 takes a free port.
         codec: `binary`, or the paper's `text`.
         vehicle: MJCF file; None is the paper's.
-        backend: What steps the physics: `mujoco` or `warp`.
+        backend: `mujoco` or `warp`.
         config: Times of the exchange.
         key_file: File with the key that the agent has too (`rotorgram key`). With it any address
-            is allowed, for only those who hold the key can take part.
+            is allowed, because only holders of the key can take part.
         insecure: Allow an address that is not loopback without a key.
         record: MCAP file to write every message to; it must not exist.
         options: Options of the env, by name.
 
     Attributes:
-        spec: What is simulated.
+        spec: Spec of the env.
         stepped: The loop or the envs.
         observer: Called for every State once it is sent, while the agent thinks; None at first.
 
@@ -131,7 +131,7 @@ class Simulator:
     def run(self) -> str:
         """Fly until the agent closes; the reason that it gave. A simulator runs once.
 
-        Whatever ends the run, an error of the env too, the agent is told at once. In the main
+        The agent is told at once when the run ends, also by an error of the env. In the main
         thread Ctrl-C ends it after the step that is being computed; a second one at once.
 
         Raises:

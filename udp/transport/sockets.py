@@ -1,4 +1,4 @@
-"""Sockets: opening them, with a clear sentence for what can be wrong, and waiting on them.
+"""Sockets: open them, with a clear sentence for each error, and wait on them.
 
 A wait is a blocking read. A loop of non-blocking reads that yields in between saves some
 microseconds on an idle machine, and takes three times as long as soon as another process wants the
@@ -109,7 +109,7 @@ def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -
 
 
 def _enlarge_buffer(sock: socket.socket) -> None:
-    """Ask for room for the parts of a large message; the system gives what it allows."""
+    """Ask for room for the fragments of a large message; the system may give less."""
     with suppress(OSError):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
 
@@ -141,10 +141,10 @@ def receive(sock: socket.socket, timeout: float) -> tuple[bytes, Address]:
 
 
 class Port:
-    """The agent's port: a socket for everybody and, where the system can, one for each simulator.
+    """The agent's port: a socket for all senders and, if the system can, one for each simulator.
 
     Those are connected, so that the system sorts the datagrams, each socket has a buffer of its
-    own, and nobody else can fill the one of a simulator, however fast he sends.
+    own, and no other sender can fill the one of a simulator.
 
     Raises:
         InputError, OSError: As `open_socket`.
@@ -157,7 +157,7 @@ class Port:
         self._simulators = selectors.DefaultSelector()
         self._all = selectors.DefaultSelector()
         self._all.register(self._everybody, selectors.EVENT_READ)
-        self._missing = False  # whether a simulator's datagrams come to the socket for everybody
+        self._missing = False  # whether a simulator's datagrams come to the socket for all senders
         self._next_look = 0.0
 
     @property
@@ -167,7 +167,7 @@ class Port:
         return host, port
 
     def keep(self, peers: Collection[Address]) -> None:
-        """Have a socket for each of these, and for nobody else."""
+        """Have a socket for each of these, and no others."""
         for peer in self._own.keys() - set(peers):
             sock = self._own.pop(peer)
             for selector in (self._simulators, self._all):
@@ -183,8 +183,8 @@ class Port:
 
         Args:
             timeout: Longest wait, s.
-            strangers: Whether one from anybody is as welcome as one of a simulator. Otherwise they
-                are looked at only now and then.
+            strangers: Wait for datagrams of strangers too. Otherwise they are looked at only now
+                and then.
 
         Raises:
             TimeoutError, OSError: As the function `receive`; a wait may end early.
@@ -223,7 +223,7 @@ class Port:
                 one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
             sock.bind(self._everybody.getsockname())
             sock.connect(peer)
-        except OSError:  # then its datagrams come to the socket for everybody
+        except OSError:  # then its datagrams come to the socket for all senders
             sock.close()
             return
         finally:
@@ -245,7 +245,7 @@ def _receive_any(selector: selectors.BaseSelector, timeout: float) -> tuple[byte
 
 
 def log_notices(statistics: Statistics, now: float) -> None:
-    """Write to the log `rotorgram.udp` what there is to say: warnings, and a report each minute."""
+    """Write warnings, and a report each minute, to the log `rotorgram.udp`."""
     for notice in statistics.take_notices():
         _log.warning("%s", notice)
     if statistics.report_due(now):

@@ -1,4 +1,4 @@
-"""What a simulator steps: the loop of a registered task, or Gymnasium envs one after the other."""
+"""Envs of a simulator: the loop of a registered task, or Gymnasium envs one after the other."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -46,7 +46,7 @@ class Stepped(Protocol):
         """Reset some drones, freeze some, and fly the others for one control period."""
 
     def close(self) -> None:
-        """Free what is held."""
+        """Release threads, windows and memory."""
 
 
 def make_stepped(
@@ -63,7 +63,7 @@ def make_stepped(
         env: Id of a registered task, of an env of Gymnasium, or one env itself.
         num_envs: N.
         vehicle: MJCF file, for a registered task.
-        backend: What steps the physics of a registered task.
+        backend: `mujoco` or `warp`, for a registered task.
         options: Of the env, by name.
 
     Raises:
