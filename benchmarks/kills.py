@@ -30,7 +30,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pandas as pd
-from rotorgram.agents.checkpoints import load, software_versions
+from rotorgram.agents.checkpoints import load
+from rotorgram.udp.journal import software
 
 COLUMNS = ["episode", "first_step", "length", "total_reward"]
 HANG = 60.0  # s
@@ -95,7 +96,7 @@ class Pair:
         path = self.folder / "checkpoint.safetensors"
         if not path.exists():
             return
-        count = load(path).position.episode
+        count = len(load(path).position.episodes)
         table = pd.read_csv(self.folder / "episodes.csv")[COLUMNS][:count]
         assert table.episode.tolist() == list(range(count)), "episodes are missing"
         known = self.before[: len(table)].reset_index(drop=True)
@@ -216,7 +217,7 @@ def main() -> None:
             for side, times in interrupts.items()
             if times
         },
-        "versions": software_versions(),
+        "versions": software(),
         "machine": {"cores": os.cpu_count()},
     }
     args.out.parent.mkdir(parents=True, exist_ok=True)

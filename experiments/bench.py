@@ -368,7 +368,8 @@ def _codec(name: str) -> Iterator[Slice]:
 @contextmanager
 def _echo() -> Iterator[Slice]:
     """A blocking Python client and server; datagrams of the sizes of a State and a Command."""
-    layout, *messages = _messages()
+    layout, *both = _messages()
+    messages: tuple[State | Command, ...] = tuple(both)  # type: ignore[arg-type]
     state, command = (len(binary.encode(message, layout)) for message in messages)
     words = [sys.executable, "-c", _ECHO, str(command)]
     with subprocess.Popen(words, stdout=subprocess.PIPE) as process:

@@ -8,10 +8,16 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import inf, nan, sqrt
+from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
 import pytest
-from peers import ANY, running
+import rotorgram.envs  # noqa: F401
+from peers import ANY, ENV_ID, Running, running
 from rotorgram.models.errors import InputError
+from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
+from rotorgram.udp.protocol.auth import write_key
 from rotorgram.udp.transport import relay as relay_module
 from rotorgram.udp.transport.relay import FaultConfig, Faults, Relay
 
@@ -447,3 +453,27 @@ def test_insecure_allows_other_addresses() -> None:
     ):
         client.sendto(b"a", ("127.0.0.1", relay.address[1]))
         assert server.recv(9) == b"a"
+
+
+@pytest.mark.parametrize("mtu", [1500, 576])
+def test_many_drones_fly_through_a_path_that_drops_fragments(mtu: int, tmp_path: Path) -> None:
+    """64 drones have States of 12 kB: several packets, and every datagram has to fit into one."""
+    key = tmp_path / "key"
+    write_key(key)
+    faults = FaultConfig(drop=0.02, mtu=mtu, black_hole=True, seed=5)
+    largest = {"max_datagram": mtu - 28 - 24}  # less the headers of IP and UDP, and the seal
+    remote = RemoteVectorEnv(ANY, num_envs=64, key_file=key, connect=False, **largest)
+    with running(Relay(ANY, remote.address, faults)) as relay:
+        config = LinkConfig(timeout=20, **largest)
+        simulator = Running(
+            Simulator(server=relay.address, bind=ANY, num_envs=64, key_file=key, config=config)
+        )
+        local = gym.make_vec(ENV_ID, num_envs=64)
+        assert remote.reset(seed=1)[0].tobytes() == local.reset(seed=1)[0].tobytes()
+        actions = np.random.default_rng(0).uniform(-1, 1, (20, 64, 1)).astype(np.float32)
+        for action in actions:
+            for ours, theirs in zip(remote.step(action)[:4], local.step(action)[:4], strict=True):
+                assert ours.tobytes() == theirs.tobytes()
+        remote.close()
+        simulator.join()
+    assert relay.counters["dropped"] > 0

@@ -25,7 +25,7 @@ def test_of_two_that_want_one_folder_one_gets_it(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"out: expected a new folder, .*out exists already"):
         new_folder(tmp_path / "a" / "out", "compare")
     (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match="out: cannot make .*file: File exists"):
+    with pytest.raises(ValueError, match=r"out: cannot make .*file: File exists"):
         new_folder(tmp_path / "file" / "out", "compare")
 
 

@@ -233,12 +233,14 @@ class Command:
     @property
     def resets(self) -> np.ndarray:
         """bool, shape (N,): reset instead of flown."""
-        return self.orders == RESET
+        mask: np.ndarray = self.orders == RESET
+        return mask
 
     @property
     def frozen(self) -> np.ndarray:
         """bool, shape (N,): neither reset nor flown."""
-        return self.orders == FREEZE
+        mask: np.ndarray = self.orders == FREEZE
+        return mask
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -291,16 +291,16 @@ class Server:
         self, slot: int, session: Session, message: Message, plain: bytes, arrival: _Arrival
     ) -> Event | None:
         is_state = isinstance(message, State)
-        if is_state and message.sequence == session.sequence:
+        number = getattr(message, "sequence", 0)
+        if is_state and number == session.sequence:
             if session.state is not AgentState.DECIDING:  # else the answer is not there yet
                 self._repeat(session)
             self._drop("duplicate", "", arrival)
             return None
-        if is_state and message.sequence > session.sequence + 1 and not session.is_text:
+        if is_state and number > session.sequence + 1 and not session.is_text:
             # It went on with another agent: what opened it here came late, from before a restart.
             self._disown(plain, arrival)
             return None
-        number = getattr(message, "sequence", 0)
         is_due = number == session.sequence + is_state or isinstance(message, Close)
         state = AGENT.get((session.state, Way.RECEIVED, type(message))) if is_due else None
         if state is None:

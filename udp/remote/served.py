@@ -49,8 +49,7 @@ def checked_actions(action: Any, spec: EnvSpec, shape: tuple[int, ...]) -> np.nd
         InputError: It is not of that shape, not real, or cannot be of that dtype.
     """
     array = np.asarray(action)
-    is_discrete = isinstance(spec.action, Discrete)
-    dtype = np.dtype(np.int64 if is_discrete else spec.action.dtype)
+    dtype = np.dtype(np.int64 if isinstance(spec.action, Discrete) else spec.action.dtype)
     if array.shape != shape:
         raise InputError(f"action: expected an array of shape {shape}, got shape {array.shape}")
     if array.dtype == dtype:
