@@ -94,13 +94,13 @@ class Verdict:
     claim: str
     """The claim, with the paper's words."""
     source: str
-    """Where the paper makes it."""
+    """Place of the claim in the paper."""
     preset: str
     """Hyperparameters with which the agents were trained."""
     verdict: Outcome
     """The outcome."""
     definition: str
-    """How the claim was measured and decided."""
+    """Definition of its measure and of the decision."""
     evidence: str
     """The numbers."""
 

@@ -47,7 +47,7 @@ class Result:
     failure: str = ""
     """A sentence; empty if the job is done."""
     value: Any = None
-    """What its function returned, if it is done."""
+    """Result of its function, if it is done."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,9 +85,9 @@ class Workers:
         """Give results as they come. To be closed: what still flies then is ended.
 
         Args:
-            function: Called in a worker, with a job and what tells its progress.
+            function: Called in a worker, with a job and its progress sender.
             jobs: By name.
-            env: What is flown: a worker imports the module of a task of the user's own.
+            env: Env of the jobs: a worker imports the module of the user's task.
         """
         home, versions = self._listener.home, software_versions()
         task = f"{env.module}:{env.env_id}" if env and env.module else None

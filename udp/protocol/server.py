@@ -47,7 +47,7 @@ _LEAST_ASSEMBLING: Final = 16
 """Simulators without a slot of which fragments are kept; more, if there are more slots: so many
 may come at the same moment."""
 _TEXT_REMEMBERED: Final = 2.0
-"""How long a late copy of the last line of a closed text simulator is told from a new one, s."""
+"""Time in which a copy of the last line of a closed text simulator is recognized, s."""
 _REASON_AT: Final = binary.HEADER_SIZE + 2
 """Bytes of a Refuse or a Close before its reason."""
 
@@ -470,7 +470,7 @@ class Server:
     def _forget_until(self, opening: Session) -> None:
         """Forget the opening of a State 1, and what the same address began before it.
 
-        What it began later has not ended: if this State came late, that Hello may still be said.
+        Keep later openings: if this State came late, their Hello may still be repeated.
         """
         for key, other in list(self._openings.items()):
             if key[0] == opening.peer:

@@ -1,4 +1,4 @@
-"""What a side sees of the wire: counts, round trips, and notices at a bounded rate."""
+"""Statistics of one side of the wire: counts, round trips, and notices at a bounded rate."""
 
 from collections import Counter
 from math import frexp
@@ -16,7 +16,7 @@ REPORT_INTERVAL: Final = 60.0
 _STEPS: Final = 32
 """Buckets for each doubling: a quantile is right to 3 %."""
 _QUIET: Final = frozenset({"duplicate", "stale"})
-"""What every network that loses datagrams makes: counted, not worth a notice."""
+"""Events of every network that loses datagrams: counted, without a notice."""
 
 
 class Durations:
@@ -78,7 +78,7 @@ class Statistics:
 
     @property
     def last_error(self) -> str:
-        """Why the last datagram was dropped that should not have come; "" if none was."""
+        """Why the last unexpected datagram was dropped; "" if none was."""
         return one_line(self._last)
 
     def notice(self, sentence: str) -> None:

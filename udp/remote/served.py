@@ -58,8 +58,8 @@ def checked_actions(action: Any, spec: EnvSpec, shape: tuple[int, ...]) -> np.nd
         expected = "real" if dtype.kind == "f" else "whole"
         raise InputError(f"action: expected {expected} numbers, got {array.dtype}")
     if dtype.kind == "f":
-        with np.errstate(over="ignore", under="ignore"):  # whatever the program has set
-            return array.astype(dtype)  # what overflows is infinite, and refused as such
+        with np.errstate(over="ignore", under="ignore"):  # independent of the program's settings
+            return array.astype(dtype)  # an overflow is infinite, and refused as such
     whole = array.astype(dtype)
     if (whole != array).any():
         raise InputError(f"action: expected numbers of {dtype}, got {array}")

@@ -176,13 +176,13 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
         self._flying = False  # until the answers are there
         self._agent.exchange(self._orders(slots, sent, resets, numbers, frozen))
         lost = self._agent.lost
-        if any(lost) and seeds is not None:  # what came instead of a lost one has not seen them
+        if any(lost) and seeds is not None:  # a simulator in place of a lost one knows none
             lost = self._reset_until_done(resets, numbers, lost)
         before, telemetry = self._arrays, self.telemetry
         self._take_states(resets | frozen)
         reasons = np.repeat(np.array(lost, object), self._shape[1])
         broken = (reasons != "") & ~resets & ~grounded
-        if broken.any():  # what came is the start of the next episodes
+        if broken.any():  # these States are the start of the next episodes
             for now, then in ((self._arrays, before), (self.telemetry, telemetry)):
                 for name, array in now.items():
                     array[broken] = then[name][broken]

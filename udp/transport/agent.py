@@ -45,7 +45,7 @@ Order = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig:
-    """How an agent listens, which simulators it flies, and how long it waits."""
+    """Settings of an agent: keys and sizes, accepted simulators, and times."""
 
     env_id: str | None = None
     """A simulator of another env is refused; None flies any."""
@@ -409,7 +409,7 @@ def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
 
 def _leave(pid: int, server: Server, port: Port, journal: "Journal | None") -> None:
     """Tell every simulator, until it has answered or will not."""
-    if os.getpid() != pid:  # a fork of the process whose flight this is
+    if os.getpid() != pid:  # a fork of the process that owns the agent
         return
     server.close("the agent closed", time.monotonic())
     while True:
