@@ -200,6 +200,8 @@ class Metric:
     """Mean size of the error at the end of an episode below which its goal counts as held."""
     symbol: str = ""
     """Short symbol for figures and overlays, as E; empty: the name."""
+    signed: bool = False
+    """Whether it changes sign where it passes its best: then there is an overshoot."""
 
     def __post_init__(self) -> None:
         for name in ("name", "unit", "symbol"):
@@ -208,6 +210,10 @@ class Metric:
             raise SpecError("metric: expected a name, got ''")
         if self.goal not in ("zero", "high"):
             raise SpecError(f"{self.name}: expected the goal 'zero' or 'high', got {self.goal!r}")
+        if type(self.signed) is not bool:
+            raise SpecError(
+                f"{self.name}: expected signed to be true or false, got {self.signed!r}"
+            )
         for name in ("settled", "held"):
             value = getattr(self, name)
             if value is not None and not (_is_number(value) and math.isfinite(value) and value > 0):
@@ -216,13 +222,14 @@ class Metric:
     def to_json(self) -> dict[str, Any]:
         """A JSON object."""
         content = {"name": self.name, "unit": self.unit, "goal": self.goal}
-        rest = {"settled": self.settled, "held": self.held, "symbol": self.symbol}
+        rest: dict[str, Any] = {"settled": self.settled, "held": self.held, "symbol": self.symbol}
+        rest["signed"] = self.signed
         return content | {name: value for name, value in rest.items() if value}
 
     @classmethod
     def from_json(cls, content: Any) -> Self:
         """The reverse of `to_json`. Raises `SpecError`."""
-        known = ("name", "unit", "goal", "settled", "held", "symbol")
+        known = ("name", "unit", "goal", "settled", "held", "symbol", "signed")
         return cls(**_fields(content, "a metric", known, required=("name", "unit")))
 
 

@@ -80,17 +80,18 @@ class Headline:
     """
 
     metric: Metric
-    signed: bool
-    """Whether it can be negative; only then an overshoot is defined."""
 
     @classmethod
     def of(cls, spec: EnvSpec) -> "Headline":
         """The headline metric of an env. Raises `InputError` where the env names none."""
         if spec.headline is None:
             raise InputError(f"env: expected one that names a metric, got {spec.env_id}")
-        (array,) = (one for one in spec.telemetry if one.name == "metrics")
-        signed = spec.headline.goal == "zero" and float(array.bounds()[0].flat[0]) < 0
-        return cls(metric=spec.headline, signed=signed)
+        return cls(metric=spec.headline)
+
+    @property
+    def signed(self) -> bool:
+        """Whether it changes sign; only then an overshoot is defined."""
+        return self.metric.signed
 
     @property
     def name(self) -> str:

@@ -19,7 +19,7 @@ from rotorgram.experiments.results import (
 )
 
 PERIOD = 0.05
-ERROR = Metric(name="elevation_error", unit="m", symbol="E", settled=0.05, held=0.1)
+ERROR = Metric(name="elevation_error", unit="m", symbol="E", settled=0.05, held=0.1, signed=True)
 GATES = Metric(name="gates_passed", unit="", goal="high", held=3.0)
 DELAYS = {"vpg": 0.15, "a2c": 0.3, "sb3-a2c": 0.25}
 FLOORS = {"vpg": 0.06, "a2c": 0.02, "sb3-a2c": 0.015, "pid": 0.004}

@@ -28,7 +28,6 @@ from rotorgram.udp import (
     Refused,
     RemoteVectorEnv,
 )
-
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.messages import Hello, Wait
 

@@ -55,7 +55,7 @@ def test_the_elevation_env_by_hand() -> None:
     ]  # fmt: skip
     assert all(array.dtype == "float64" for array in spec.telemetry)
     assert spec.headline == Metric(
-        name="elevation_error", unit="m", settled=0.05, held=0.1, symbol="E"
+        name="elevation_error", unit="m", settled=0.05, held=0.1, symbol="E", signed=True
     )
     assert spec.telemetry[2].bounds()[1].tolist() == [100.0] * 4
 

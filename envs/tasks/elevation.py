@@ -132,7 +132,9 @@ class Elevation(Task):
     """
 
     Options = ElevationOptions
-    metrics = (Metric(name="elevation_error", unit="m", settled=0.05, held=0.1, symbol="E"),)
+    metrics = (
+        Metric(name="elevation_error", unit="m", settled=0.05, held=0.1, symbol="E", signed=True),
+    )
     choices = ("target", "start")
 
     def setup(self) -> None:

@@ -106,7 +106,7 @@ class Hover(Task):
     Options = HoverOptions
     metrics = (
         Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e"),
-        Metric(name="heading_error", unit="deg", settled=5.0),
+        Metric(name="heading_error", unit="deg", settled=5.0, signed=True),
     )
 
     def setup(self) -> None:

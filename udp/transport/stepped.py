@@ -73,13 +73,13 @@ def make_stepped(
         raise InputError(f"num_envs: expected 1 to {MAX_DRONES}, got {num_envs!r}")
     if isinstance(env, str):
         if registry.is_known(env):
-            from ...envs.loop import Loop
+            from ...envs.loop import Loop, OnHost
 
             name: Any = backend
             loop: Any = Loop(
                 canonical_id(env), num_envs, vehicle=vehicle, backend=name, options=options
             )
-            return loop  # type: ignore[no-any-return]
+            return loop if backend == "mujoco" else OnHost(loop)
         envs = [_make(env, options) for _ in range(num_envs)]
     else:
         if options:
