@@ -400,7 +400,7 @@ class Loop:
 
 
 class OnHost:
-    """A loop whose results are NumPy arrays, wherever its world runs: what a simulator sends.
+    """A loop whose results are NumPy arrays, wherever its world runs, for simulators.
 
     Its attributes are those of the loop.
     """

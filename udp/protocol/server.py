@@ -564,7 +564,7 @@ class Server:
     def _assemble(
         self, fragment: bytes, holder: Session | None, arrival: _Arrival, key: Key | None
     ) -> bytes | None:
-        """The message, once all its fragments are there, of who may send it now."""
+        """The message of an accepted sender, once all its fragments are there."""
         kind, number, sequence = binary.check(fragment)
         kind &= ~binary.FRAGMENT
         if kind == binary.HELLO and holder is None:

@@ -82,7 +82,7 @@ class Statistics:
         return one_line(self._last)
 
     def notice(self, sentence: str) -> None:
-        """Something that whoever watches wants to know."""
+        """Keep a notice for the log."""
         self._notices.append(one_line(sentence))
 
     def take_notices(self) -> list[str]:
