@@ -56,7 +56,7 @@ import numpy as np
 
 from ...models.errors import InputError
 from .errors import DecodeError, VersionMismatch
-from .layout import COMMAND_ARRAYS_AT, MAX_MESSAGE, STATE_ARRAYS_AT, Layout, Slot
+from .layout import COMMAND_ARRAYS_AT, MAX_MESSAGE, Layout, Slot
 from .messages import (
     MAX_SPEC,
     MAX_TEXT,

@@ -188,7 +188,7 @@ class Server:
 
     def _receive_any(self, slot: int, session: Session | None, arrival: _Arrival) -> Event | None:
         """Whatever comes: `receive` knows only the State that a slot waits for."""
-        datagram, address, now = arrival
+        datagram, address, _ = arrival
         try:
             if text.is_text(datagram):
                 layout = None if self._keys else self._text_layout()
