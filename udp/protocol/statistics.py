@@ -30,11 +30,13 @@ class Durations:
 
     def add(self, seconds: float) -> None:
         """Count one. Below a nanosecond is a nanosecond: clocks may stand still."""
-        seconds = max(seconds, 1e-9)
+        if seconds < 1e-9:
+            seconds = 1e-9
         mantissa, exponent = frexp(seconds)  # mantissa in [0.5, 1)
         self._buckets[exponent * _STEPS + int((mantissa - 0.5) * (2 * _STEPS))] += 1
         self.count += 1
-        self.longest = max(self.longest, seconds)
+        if seconds > self.longest:
+            self.longest = seconds
 
     def quantile(self, share: float) -> float:
         """Duration that the given share of all does not exceed, s; 0 if there is none."""
@@ -89,6 +91,10 @@ class Statistics:
         """Sentences for the log, each once."""
         notices, self._notices = self._notices, []
         return notices
+
+    def has_news(self, now: float) -> bool:
+        """Whether there are notices to take, or a report may be due."""
+        return bool(self._notices) or self._next_report is None or now >= self._next_report
 
     def report_due(self, now: float) -> bool:
         """Whether a minute has passed since the last report, or since the first call."""
