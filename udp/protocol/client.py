@@ -63,7 +63,7 @@ CLOSE_LINGER: Final = 0.25
 
 _FIRST_RESEND: Final = 0.2
 """Wait before a resend while no round trip has been measured, s."""
-_GRANULARITY: Final = 0.01
+_GRANULARITY: Final = 0.005
 """A system may let a process wait for so long, s: the least that is added to a round trip."""
 _LONGEST_RESEND: Final = 1.0
 """Longest wait before a resend, s."""
@@ -72,7 +72,7 @@ _PATIENCE: Final = 8
 
 
 _TOO_EARLY: Final = 1.5
-"""By so much round trips are taken for longer when an answer comes twice."""
+"""By so much round trips are taken for longer when answers come twice."""
 _AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING, Way.RECEIVED, Command]
 
 
@@ -107,18 +107,27 @@ class LinkConfig:
 
 
 class RoundTrips:
-    """Measures round trips, and derives the time of a resend (RFC 6298)."""
+    """Measures round trips, and derives the time of a resend (RFC 6298).
+
+    A round trip counts at most as twice the wait of then: a side that paused once, to learn for
+    example, does not make every resend of the next second late.
+    """
 
     def __init__(self) -> None:
         self._smoothed: float | None = None
         self._variation = 0.0
         self._sent_at = 0.0
-        self._is_repeat = self._was_repeated = False
+        self._is_repeat = self._was_repeated = self._came_twice = False
+        self._in_a_row = 0
+        """Messages in a row that were repeated, and then answered twice."""
 
     def sent(self, now: float, *, first: bool = False) -> None:
         """Something was sent that wants an answer, for the first time or again."""
         if first:
             self._was_repeated = self._is_repeat
+            if not self._came_twice:
+                self._in_a_row = 0
+            self._came_twice = False
         self._sent_at, self._is_repeat = now, not first
 
     def answered(self, now: float) -> None:
@@ -127,12 +136,21 @@ class RoundTrips:
         if self._smoothed is None:
             self._smoothed, self._variation = seconds, seconds / 2
         elif not (self._is_repeat and seconds < self._smoothed / 2):
+            seconds = min(seconds, 2 * self.wait(0))
             self._variation += (abs(self._smoothed - seconds) - self._variation) / 4
             self._smoothed += (seconds - self._smoothed) / 8
 
     def answered_again(self) -> None:
-        """An answer came a second time. If it was asked for twice, that was too early."""
-        if self._smoothed is not None and self._was_repeated:
+        """The answer to the last message came a second time.
+
+        If that was asked for twice, it may have been too early; a network that doubles datagrams
+        does the same, but seldom to two messages in a row.
+        """
+        if self._smoothed is None or not self._was_repeated or self._came_twice:
+            return
+        self._came_twice = True
+        self._in_a_row += 1
+        if self._in_a_row > 1:
             self._smoothed = min(_TOO_EARLY * self._smoothed, _LONGEST_RESEND)
 
     def wait(self, tries: int) -> float:
