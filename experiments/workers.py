@@ -24,7 +24,7 @@ from ..agents.checkpoints import software_versions
 from ..envs.registry import load
 from ..models.errors import InputError, require
 from .errors import RunsFailed
-from .pairs import close_shared_pairs, kill_simulators
+from .pairs import close_shared_pairs
 from .progress import OnProgress, ProgressListener, ProgressSender
 from .settings import EnvConfig, WorkersConfig
 
@@ -270,7 +270,6 @@ def _watch(parent: int) -> None:
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(_WATCH_EVERY)
-        kill_simulators()
         os._exit(1)
 
     Thread(target=watch, daemon=True).start()

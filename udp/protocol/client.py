@@ -279,7 +279,7 @@ class Client:
             session, number = self.hello.session, self.sequence
             self._send(Close(session=session, sequence=number, reason=one_line(reason)), now)
         elif self.state is not SimulatorState.CLOSING:
-            self.state = SimulatorState.CLOSED
+            self._end()  # a Hello that was not answered is not repeated
 
     def receive(self, datagram: bytes, now: float) -> Welcome | Refuse | Command | Close | None:
         """Take a datagram from the agent; the message, if it moves the exchange on."""
