@@ -17,7 +17,7 @@ from ..protocol.layout import MAX_DRONES
 from ..protocol.messages import FREEZE, MAX_UINT64, RESET
 from ..transport.agent import Agent, AgentConfig, Order
 from ..transport.simulator import DEFAULT_AGENT
-from .served import LOST, ServedEnv, checked_actions
+from .served import LOST, ServedEnv, action_dtype, checked_actions
 
 __all__ = ["RemoteVectorEnv"]
 
@@ -206,7 +206,7 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
         num_envs = self.num_simulators * worlds * len(spec.agents)
         self._take_spec(spec, num_envs, self._mode)
         self._shape = self.num_simulators, num_envs // self.num_simulators
-        self._dtype = np.dtype(np.int64 if isinstance(spec.action, Discrete) else spec.action.dtype)
+        self._dtype = action_dtype(spec)
         self._row = () if isinstance(spec.action, Discrete) else spec.action.shape
         self._nothing: np.ndarray = np.zeros((num_envs, *self._row), self._dtype)
         if not self._flying:
@@ -283,7 +283,7 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
                 array = np.where(idle, 0, array)
             if array.dtype.kind == "f" and (array % 1 == 0).all():
                 array = array.astype(np.int64)
-        sent = checked_actions(array, self.env_spec, shape)
+        sent = checked_actions(array, self._dtype, shape)
         if idle.any() and sent.shape == shape:
             sent = sent.copy()
             sent[idle] = 0

@@ -196,11 +196,12 @@ class Agent:
         self._flush()
         if self._journal:
             self._journal.write()
-        while pending := self._pending():
+        pending = self._pending()
+        while pending:
             left = min([self._deadlines[slot] for slot in pending]) - now
             if left <= 0:
                 self._give_up(pending, now)
-                now = time.monotonic()
+                now, pending = time.monotonic(), self._pending()
                 continue
             datagram: bytes | None
             try:
@@ -217,6 +218,7 @@ class Agent:
                 event = server.receive(datagram, address, now)
                 if event:
                     self._handle(event, address)
+                    pending = self._pending()
                 self._flush()
 
     def _pending(self) -> list[int]:
