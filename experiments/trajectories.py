@@ -15,16 +15,8 @@ from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.spec import Discrete, EnvSpec, component_names
 from ..models.errors import InputError
 
-__all__ = [
-    "Ending",
-    "EpisodeSet",
-    "Trajectory",
-    "evaluation_seed",
-    "flown_trajectories",
-    "fly",
-    "fly_episodes",
-    "recorded_trajectories",
-]
+__all__ = ["Ending", "EpisodeSet", "Trajectory", "evaluation_seed", "flown_trajectories", "fly",
+           "fly_episodes", "recorded_trajectories"]  # fmt: skip
 
 _EVALUATION: Final = 20230324  # the day the paper appeared
 
