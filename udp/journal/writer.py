@@ -178,7 +178,6 @@ class Journal:
             return
         now = time.time_ns()
         try:
-            self._file.encode()
             # Clocks are set back at times.
             if self._size > _CHUNK or not 0 <= now - self._flushed < _SECOND:
                 self._flush(now)
