@@ -9,18 +9,16 @@ import sys
 from rotorgram.agents import PID
 from rotorgram.udp import RemoteEnv
 
-TARGET = 6.0  # m
-
-# The agent is the UDP server: it listens first, on a free port.
-env = RemoteEnv(("127.0.0.1", 0), options={"target": TARGET}, connect=False)
+# The agent is the UDP server: it listens first, on a free port. It refuses another target.
+env = RemoteEnv(("127.0.0.1", 0), options={"target": 6.0}, connect=False)
 host, port = env.address
 
 # The simulator is the UDP client. It may as well run in another terminal, or on another machine.
 simulator = subprocess.Popen(
     [sys.executable, "-m", "rotorgram.cli", "sim", "--server", f"{host}:{port}",
-     "--bind", "127.0.0.1:0", "--env.target", str(TARGET)]
+     "--bind", "127.0.0.1:0", "--env.target", "6.0"]
 )  # fmt: skip
-env.connect()
+env.connect()  # the simulator's Hello brings the spec
 
 pid = PID(env.env_spec)
 observation, info = env.reset(seed=1)
@@ -29,7 +27,7 @@ total, terminated, truncated = 0.0, False, False
 while not (terminated or truncated):
     observation, reward, terminated, truncated, info = env.step(pid.act(observation))
     total += reward
-print(f"return {total:.1f}, elevation {info['Y']:.3f} m of {TARGET} m")
+print(f"return {total:.1f}, elevation {info['Y']:.3f} m of {info['Y_goal']} m")
 print(env.statistics)
 env.close()  # tells the simulator, which ends
 simulator.wait()

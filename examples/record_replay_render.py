@@ -20,13 +20,13 @@ journal = folder / "flight.mcap"
 if journal.exists():
     sys.exit(f"{journal} is there already: name another folder")
 
-with socket_pair(record=journal) as env:
-    flown = fly(env, PID(env.env_spec), seed=7)
-print(f"return {flown.rewards.sum():.1f}: {journal}")
+with socket_pair("rotorgram/Elevation-v0", record=journal) as env:
+    trajectory = fly(env, PID(env.env_spec), seed=7)
+print(f"return {trajectory.rewards.sum():.1f}: {journal}")
 
 print(verify(journal))
 
-# Looking needs OpenGL; flying and comparing do not.
+# A film needs OpenGL; flying and comparing do not.
 shot = Shot(name="PID", color="#E69F00", trajectories=recorded_trajectories(journal, [0]))
 film(folder / "flight.mp4", [shot], Film(width=640, height=360, camera="side", fast=True))
 print(f"film: {folder / 'flight.mp4'}")

@@ -12,7 +12,8 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from rotorgram.agents import preset
+from rotorgram.agents import NetworkPolicy, preset
+from rotorgram.experiments.metrics import steady_state
 from rotorgram.experiments.pairs import socket_pair
 from rotorgram.experiments.settings import Run
 from rotorgram.experiments.training import Training
@@ -27,18 +28,20 @@ args = parser.parse_args()
 run = Run(
     algorithm="a2c",
     config=preset("a2c", "tuned", steps_per_update=1024, learning_rate=0.02),
+    env_id="rotorgram/Elevation-v0",
     options={"target": (4.0, 8.0)},  # a target of its own for every episode
     seed=0,
     env_steps=args.env_steps,
     num_envs=args.num_envs,
 )
-with socket_pair(**run.env, num_envs=run.num_envs) as drones:  # an agent here, a simulator beside
+with socket_pair(**run.env, num_envs=run.num_envs) as drones:  # agent here, simulator beside it
     training = Training(run, drones)
     training.train()
 training.store(args.out)
 print(f"{training.log.env_steps:,} env steps in {training.log.seconds:.1f} s: {args.out}")
 
 with socket_pair(**run.env) as drone:
-    flown = fly_episodes(drone, training.checkpoint().policy(), episodes=5)
-late = [np.abs(one.headline[-len(one) // 4 :]).mean() for one in flown]
-print(f"steady-state |E|: {np.mean(late):.3f} m")
+    policy = NetworkPolicy(training.agent.actor(), drone.env_spec)
+    trajectories = fly_episodes(drone, policy, episodes=5)
+errors = [abs(one.values("elevation_error")[1:]) for one in trajectories]
+print(f"steady-state |E|: {np.mean([steady_state(error) for error in errors]):.3f} m")

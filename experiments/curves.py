@@ -65,7 +65,7 @@ class Flown(NamedTuple):
     shown: list[Curve]
     """The metric over the time in the episode (s)."""
     total: int
-    """How many there are."""
+    """Number of all trajectories."""
 
 
 @dataclass(frozen=True, kw_only=True)

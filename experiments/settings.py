@@ -108,7 +108,7 @@ class _ManyRuns(WorkersConfig, EnvConfig):
     preset: str = "tuned"
     """`paper` or `tuned`."""
     seeds: int = 5
-    """How many seeds, the same for every agent or point."""
+    """Number of seeds, the same for every agent or point."""
     first_seed: int = 0
     """The first of them."""
     env_steps: int = 200_000
