@@ -29,6 +29,8 @@ class Compare(RunsFlags):
     """The first of them."""
     env_steps: int = 200_000
     """Env steps of each training; a learning rate that falls, falls over all of them."""
+    num_envs: int = 1
+    """Drones of each training that fly at the same time, in lock-step. Env steps count all."""
     snapshots: int = 10
     """Policies kept during each training, for the learning curves."""
     episodes: int = 20
@@ -61,6 +63,7 @@ class Compare(RunsFlags):
                 seeds=self.seeds,
                 first_seed=self.first_seed,
                 env_steps=self.env_steps,
+                num_envs=self.num_envs,
                 preset=self.preset,
                 env_id=self.env_id,
                 options=self.options,
