@@ -140,7 +140,7 @@ class Render(EnvFlags):
             policy = policy_for(checkpoint, local_spec(self, checkpoint))
         agent = checkpoint.algorithm if checkpoint else what
         env = chosen_env(self, checkpoint)
-        flown = flown_trajectories(policy, *env, episodes, vehicle=self.vehicle)
+        flown = flown_trajectories(policy, *env, episodes, vehicle=self.vehicle, of="final")
         return agent, what if what == "random" else agent_label(agent), flown
 
 
@@ -153,10 +153,14 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def _told_apart(names: Sequence[str], what: Sequence[str]) -> list[str]:
-    """The names; of those that are the same, what the user typed besides."""
-    return [
-        name if names.count(name) == 1 else f"{name}, {Path(words).stem}"
+    """The names; of those that are the same, what the user typed besides, then a number."""
+    longer = [
+        name if names.count(name) == 1 or words == "pid" else f"{name}, {Path(words).stem}"
         for name, words in zip(names, what, strict=True)
+    ]
+    return [
+        name if longer.count(name) == 1 else f"{name} {longer[: place + 1].count(name)}"
+        for place, name in enumerate(longer)
     ]
 
 

@@ -81,4 +81,4 @@ class View(EnvFlags):
             policy = policy_for(checkpoint, local_spec(self, checkpoint))
         env = chosen_env(self, checkpoint)
         for episode in count():
-            yield from flown_trajectories(policy, *env, [episode], vehicle=self.vehicle)
+            yield from flown_trajectories(policy, *env, [episode], vehicle=self.vehicle, of="final")

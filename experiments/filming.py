@@ -13,6 +13,7 @@ import numpy as np
 from ..agents.checkpoints import load
 from ..agents.pid import PID
 from ..agents.policies import Policy
+from ..envs.rendering import moment
 from ..models.errors import InputError
 from ..rendering import Camera, Canvas, Moment, NoOpenGL, Stage, World
 from ..rendering.film import QUALITY, check_film, poster, write_film
@@ -51,11 +52,10 @@ def moments(trajectory: Trajectory) -> list[Moment]:
             f"pictures: expected telemetry of {', '.join(missing)}, "
             f"{trajectory.spec.env_id} tells none"
         )
-    metrics = [(one.name, one.unit, one.symbol) for one in trajectory.spec.metrics]
     return [
-        Moment.of(
+        moment(
+            trajectory.spec,
             {name: array[step] for name, array in trajectory.telemetry.items()},
-            metrics,
             reward=float(trajectory.rewards[step - 1]) if step else 0.0,
             step=step,
             episode=trajectory.episode,

@@ -68,7 +68,7 @@ def socket_pair(
     arguments = {"server": env.address, "bind": here, "num_envs": num_envs, "env": env_id}
     arguments |= {"vehicle": config.vehicle, "options": config.options}
     arguments |= {"module": config.module} if config.module else {}
-    command = [sys.executable, "-m", "rotorgram.udp", json.dumps(arguments)]
+    command = [sys.executable, "-P", "-m", "rotorgram.udp", json.dumps(arguments)]
     with TemporaryFile("w+") as said:
         process = subprocess.Popen(
             [*command, "--until-stdin-closes"], stdin=subprocess.PIPE, stderr=said
