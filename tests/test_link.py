@@ -234,9 +234,9 @@ def test_waits_follow_the_round_trips() -> None:
     for at in range(50):
         trips.sent(float(at), first=True)
         trips.answered(at + 0.02)
-    assert trips.wait(1) == pytest.approx(0.03, abs=1e-3)
-    assert trips.wait(8) == pytest.approx(0.03, abs=1e-3)
-    assert trips.wait(9) == pytest.approx(0.06, abs=2e-3)
+    assert trips.wait(1) == pytest.approx(0.025, abs=1e-3)
+    assert trips.wait(8) == pytest.approx(0.025, abs=1e-3)
+    assert trips.wait(9) == pytest.approx(0.05, abs=2e-3)
     assert trips.wait(40) == 1.0
 
 
