@@ -127,19 +127,15 @@ class Render(EnvFlags):
         """Agent, name and trajectories of a policy or journal."""
         from ..experiments.palette import agent_label
         from ..experiments.trajectories import flown_trajectories, recorded_trajectories
-        from ._env import chosen_env, load_checkpoint, local_spec, policy_for
+        from ._env import pilot_of
 
         episodes = range(self.episode, self.episode + self.episodes)
         path = Path(what)
         if path.suffix == ".mcap":
             recorded = recorded_trajectories(path, episodes, session=self.session, drone=self.drone)
             return path.stem, path.stem, recorded
-        policy = checkpoint = None
-        if what != "random":
-            checkpoint = load_checkpoint(what)
-            policy = policy_for(self, checkpoint, local_spec(self, checkpoint))
+        checkpoint, policy, env = pilot_of(self, what)
         agent = checkpoint.algorithm if checkpoint else what
-        env = chosen_env(self, checkpoint)
         flown = flown_trajectories(policy, *env, episodes, vehicle=self.vehicle, of="final")
         return agent, what if what == "random" else agent_label(agent), flown
 

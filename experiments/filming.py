@@ -54,11 +54,7 @@ def moments(trajectory: Trajectory) -> list[Moment]:
     return [
         moment(
             trajectory.spec,
-<<<<<<< HEAD
-            {name: array[step] for name, array in trajectory.telemetry.items()},
-=======
             {name: array[step] for name, array in told.items()},
->>>>>>> integ
             reward=float(trajectory.rewards[step - 1]) if step else 0.0,
             step=step,
             episode=trajectory.episode,

@@ -66,10 +66,7 @@ def socket_pair(
     arguments = {"server": env.address, "bind": here, "num_envs": num_envs, "env": env_id}
     arguments |= {"vehicle": config.vehicle, "options": config.options}
     arguments |= {"module": config.module} if config.module else {}
-<<<<<<< HEAD
-=======
     # -P: no folder of the working directory stands for the package.
->>>>>>> integ
     command = [sys.executable, "-P", "-m", "rotorgram.udp", json.dumps(arguments)]
     with TemporaryFile("w+") as said:
         process = subprocess.Popen(
