@@ -4,10 +4,12 @@ A controller has no memory: what it needs of the past is in the state. An action
 within bounds, or is one of some choices.
 """
 
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
-from ..models.vehicle import Vehicle
 from .state import Array, WorldState, clip, component, constant
+
+if TYPE_CHECKING:
+    from ..models.vehicle import Vehicle
 
 __all__ = ["CollectiveThrust", "Controller", "RotorThrust"]
 
@@ -44,7 +46,7 @@ class CollectiveThrust:
     """
 
     def __init__(
-        self, vehicle: Vehicle, newtons: float, *, increment: bool, discrete: bool = False
+        self, vehicle: "Vehicle", newtons: float, *, increment: bool, discrete: bool = False
     ) -> None:
         self.low: tuple[float, ...] = (-1.0,)
         self.high: tuple[float, ...] = (1.0,)
@@ -83,7 +85,7 @@ class RotorThrust:
         vehicle: The vehicle that it controls.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: "Vehicle") -> None:
         self.low, self.high = (-1.0,) * vehicle.num_rotors, (1.0,) * vehicle.num_rotors
         self.components = tuple(f"F{i + 1}" for i in range(vehicle.num_rotors))
         self.choices = 0
