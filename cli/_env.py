@@ -78,11 +78,27 @@ def local_spec(command: EnvFlags, checkpoint: "Checkpoint | None") -> "EnvSpec":
     return registry.env_spec(*chosen_env(command, checkpoint), vehicle=command.vehicle)
 
 
-def policy_for(checkpoint: "Checkpoint | None", spec: "EnvSpec") -> "Policy":
-    """The policy of a checkpoint, or the PID. Raises `InputError` if it does not fit the env."""
-    from ..agents import PID
+def policy_for(command: EnvFlags, checkpoint: "Checkpoint | None", spec: "EnvSpec") -> "Policy":
+    """The policy of a checkpoint, or the PID.
 
-    return checkpoint.policy(spec) if checkpoint else PID(spec)
+    Raises:
+        InputError: It does not fit the env, or was trained on another vehicle and the user has not
+            named one.
+    """
+    if checkpoint is None:
+        from ..agents import PID
+
+        return PID(spec)
+    trained = checkpoint.spec
+    same_drag = trained.options.get("linear_drag") == spec.options.get("linear_drag")
+    other = trained.vehicle_hash != spec.vehicle_hash and same_drag
+    if other and "vehicle" not in command.given:
+        raise InputError(
+            f"vehicle: expected {trained.vehicle} (model {trained.vehicle_hash[:8]}), on which the "
+            f"policy was trained, got {spec.vehicle} (model {spec.vehicle_hash[:8]}); name one "
+            "with --vehicle"
+        )
+    return checkpoint.policy(spec)
 
 
 def words_of(trajectory: "Trajectory") -> str:

@@ -137,7 +137,7 @@ class Render(EnvFlags):
         policy = checkpoint = None
         if what != "random":
             checkpoint = load_checkpoint(what)
-            policy = policy_for(checkpoint, local_spec(self, checkpoint))
+            policy = policy_for(self, checkpoint, local_spec(self, checkpoint))
         agent = checkpoint.algorithm if checkpoint else what
         env = chosen_env(self, checkpoint)
         flown = flown_trajectories(policy, *env, episodes, vehicle=self.vehicle)

@@ -78,7 +78,7 @@ class View(EnvFlags):
         policy = checkpoint = None
         if self.what != "random":
             checkpoint = load_checkpoint(self.what)
-            policy = policy_for(checkpoint, local_spec(self, checkpoint))
+            policy = policy_for(self, checkpoint, local_spec(self, checkpoint))
         env = chosen_env(self, checkpoint)
         for episode in count():
             yield from flown_trajectories(policy, *env, [episode], vehicle=self.vehicle)

@@ -289,7 +289,7 @@ class Loop:
             raise InputError(f"actions: expected shape {expected}, got {actions.shape}")
         values = actions.reshape(self.num_envs, self._width)
         if values.dtype != np.float32 and not self._choices:
-            with np.errstate(over="ignore"):  # what overflows is infinite, and refused as such
+            with np.errstate(over="ignore"):  # an overflow is infinite, and refused as such
                 values = values.astype(np.float32)
         right = self._right(values)
         if right is not None:
@@ -400,7 +400,7 @@ class Loop:
 
 
 class OnHost:
-    """A loop whose results are NumPy arrays, wherever its world runs: what a simulator sends.
+    """A loop whose results are NumPy arrays, wherever its world runs, for simulators.
 
     Its attributes are those of the loop.
     """

@@ -139,7 +139,7 @@ _STEPS_AT_ONCE: Final = 64
 
 @dataclass(frozen=True, kw_only=True)
 class BenchConfig:
-    """How long to measure."""
+    """Duration of a measurement."""
 
     rounds: int = 7
     """Turns of every layer."""

@@ -13,6 +13,7 @@ import numpy as np
 from ..agents.checkpoints import load
 from ..agents.pid import PID
 from ..agents.policies import Policy
+from ..envs.rendering import moment
 from ..models.errors import InputError
 from ..rendering import Camera, Canvas, Moment, NoOpenGL, Stage, World
 from ..rendering.film import QUALITY, check_film, poster, write_film
@@ -44,18 +45,16 @@ def moments(trajectory: Trajectory) -> list[Moment]:
     Raises:
         InputError: Its telemetry does not tell where the craft is.
     """
-    missing = [name for name in ("position", "attitude", "thrust")
-               if name not in trajectory.telemetry]  # fmt: skip
-    if missing:
+    told = trajectory.telemetry
+    if missing := {"position", "attitude", "thrust"} - set(told):
         raise InputError(
-            f"pictures: expected telemetry of {', '.join(missing)}, "
+            f"pictures: expected telemetry of {', '.join(sorted(missing))}, "
             f"{trajectory.spec.env_id} tells none"
         )
-    metrics = [(one.name, one.unit, one.symbol) for one in trajectory.spec.metrics]
     return [
-        Moment.of(
-            {name: array[step] for name, array in trajectory.telemetry.items()},
-            metrics,
+        moment(
+            trajectory.spec,
+            {name: array[step] for name, array in told.items()},
             reward=float(trajectory.rewards[step - 1]) if step else 0.0,
             step=step,
             episode=trajectory.episode,
@@ -262,8 +261,8 @@ class _Pane:
         step = trajectory.step_at(seconds)
         if (episode, step) != self._shown:
             begin = self._shown[1] + 1 if episode == self._shown[0] else 0
-            for moment in self._shot.moments[episode][begin : step + 1]:  # its path has no gaps
-                self._stage.show(moment)
+            for one in self._shot.moments[episode][begin : step + 1]:  # its path has no gaps
+                self._stage.show(one)
             self._shown = episode, step
             self._picture = self._draw(episode, step)
         return self._picture

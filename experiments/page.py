@@ -257,7 +257,7 @@ class Chart:
     log: bool = False
     """Whether y is drawn on a logarithmic scale."""
     mark: float | None = None
-    """Where a dotted line is drawn across, in y."""
+    """Value of y with a dotted line."""
 
 
 def make_charts(curves: Curves, headline: Headline) -> list[Chart]:

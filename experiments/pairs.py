@@ -14,14 +14,12 @@ from typing import Any, Final
 from ..udp import PeerClosed, PeerSilent, RemoteEnv, RemoteVectorEnv
 from .settings import EnvConfig
 
-__all__ = ["close_shared_pairs", "kill_simulators", "shared_pair", "socket_pair"]
+__all__ = ["close_shared_pairs", "shared_pair", "socket_pair"]
 
 _START_TIMEOUT: Final = 60.0
 _ANSWER_TIMEOUT: Final = 10.0
 _STOP_TIMEOUT: Final = 5.0
 _POLL: Final = 0.5
-
-_simulators: set[subprocess.Popen[bytes]] = set()
 
 
 @contextmanager
@@ -68,12 +66,12 @@ def socket_pair(
     arguments = {"server": env.address, "bind": here, "num_envs": num_envs, "env": env_id}
     arguments |= {"vehicle": config.vehicle, "options": config.options}
     arguments |= {"module": config.module} if config.module else {}
-    command = [sys.executable, "-m", "rotorgram.udp", json.dumps(arguments)]
+    # -P: no folder of the working directory stands for the package.
+    command = [sys.executable, "-P", "-m", "rotorgram.udp", json.dumps(arguments)]
     with TemporaryFile("w+") as said:
         process = subprocess.Popen(
             [*command, "--until-stdin-closes"], stdin=subprocess.PIPE, stderr=said
         )
-        _simulators.add(process)
         try:
             _connect(env, process)
             yield env
@@ -109,13 +107,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-    _simulators.discard(process)
-
-
-def kill_simulators() -> None:
-    """End every simulator of this process at once: for a process that ends without a goodbye."""
-    for process in tuple(_simulators):
-        process.kill()
 
 
 _shared: dict[str, tuple[Any, ExitStack]] = {}

@@ -29,17 +29,8 @@ from .tables import markdown_table, terminal_table
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = [
-    "CLAIMS_FILE",
-    "POSTER_FILE",
-    "REPORT_FILE",
-    "RESULTS_CSV",
-    "RESULTS_MARKDOWN",
-    "VIDEO_FILE",
-    "table_of",
-    "terminal_table",
-    "write_report",
-]
+__all__ = ["CLAIMS_FILE", "POSTER_FILE", "REPORT_FILE", "RESULTS_CSV", "RESULTS_MARKDOWN",
+           "VIDEO_FILE", "table_of", "terminal_table", "write_report"]  # fmt: skip
 
 REPORT_FILE: Final = "report.html"
 RESULTS_CSV: Final = "results.csv"

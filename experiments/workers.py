@@ -24,7 +24,7 @@ from ..agents.checkpoints import software_versions
 from ..envs.registry import load
 from ..models.errors import InputError, require
 from .errors import RunsFailed
-from .pairs import close_shared_pairs, kill_simulators
+from .pairs import close_shared_pairs
 from .progress import OnProgress, ProgressListener, ProgressSender
 from .settings import EnvConfig, WorkersConfig
 
@@ -47,7 +47,7 @@ class Result:
     failure: str = ""
     """A sentence; empty if the job is done."""
     value: Any = None
-    """What its function returned, if it is done."""
+    """Result of its function, if it is done."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,9 +85,9 @@ class Workers:
         """Give results as they come. To be closed: what still flies then is ended.
 
         Args:
-            function: Called in a worker, with a job and what tells its progress.
+            function: Called in a worker, with a job and its progress sender.
             jobs: By name.
-            env: What is flown: a worker imports the module of a task of the user's own.
+            env: Env of the jobs: a worker imports the module of the user's task.
         """
         home, versions = self._listener.home, software_versions()
         task = f"{env.module}:{env.env_id}" if env and env.module else None
@@ -270,7 +270,6 @@ def _watch(parent: int) -> None:
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(_WATCH_EVERY)
-        kill_simulators()
         os._exit(1)
 
     Thread(target=watch, daemon=True).start()

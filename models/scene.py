@@ -58,6 +58,7 @@ def build_scene(
         raise InputError(f"world: expected 'plain' or 'airport', got {world!r}")
     path = Path(vehicle if vehicle is not None else QUAD_XML)
     _check_height_fields(path, set())
+    switch_off_log_file()
     spec = mujoco.MjSpec.from_file(str(path))
     if not any(geom.type in _GROUNDS for geom in spec.worldbody.geoms):
         scene = mujoco.MjSpec.from_file(str(SCENE_XML))
@@ -93,6 +94,14 @@ def _check_height_fields(path: Path, seen: set[Path]) -> None:
             and (inner := path.parent / element.get("file", "")) not in seen
         ):
             _check_height_fields(inner, seen)
+
+
+def switch_off_log_file() -> None:
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT; a log file of another name stays on."""
+    config = mujoco.MjLogConfig.get()
+    if config.logto_file and config.logfile == "MUJOCO_LOG.TXT":
+        config.logto_file = False
+        config.set()
 
 
 def _copy_settings(source: Any, target: Any) -> None:

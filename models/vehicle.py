@@ -41,7 +41,7 @@ class Rotor:
 
     name: str
     position: tuple[float, float, float]
-    """Where its thrust acts, body frame, m."""
+    """Point at which its thrust acts, body frame, m."""
     axis: tuple[float, float, float]
     """Unit vector of its thrust, body frame."""
     reaction: tuple[float, float, float]

@@ -27,14 +27,15 @@ from rotorgram.udp import (
     RemoteEnv,
     RemoteVectorEnv,
     Simulator,
-    binary,
 )
-from rotorgram.udp.faults import FaultConfig
-from rotorgram.udp.keys import OVERHEAD, write_key
-from rotorgram.udp.messages import Close, Command, Hello, State
+from rotorgram.udp.protocol import binary
+from rotorgram.udp.protocol.auth import OVERHEAD, write_key
+from rotorgram.udp.protocol.layout import Layout
+from rotorgram.udp.protocol.messages import Close, Command, Hello, State
+from rotorgram.udp.transport.relay import FaultConfig
 
 LOSSY = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.2, seed=2)
-QUICK = LinkConfig(timeout=10, first_resend=0.02, max_resend=0.2)
+QUICK = LinkConfig(timeout=10)
 posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
 SIMULATE = """
@@ -43,7 +44,7 @@ SIMULATE = """
     arguments = json.loads(sys.argv[1])
     for name in ("server", "bind"):
         arguments[name] = tuple(arguments[name])
-    config = LinkConfig(timeout=30, first_resend=0.05, max_resend=0.01)
+    config = LinkConfig(timeout=30)
     with Simulator(config=config, **arguments) as simulator:
         print(simulator.address[1], flush=True)
         print(simulator.run())
@@ -358,7 +359,7 @@ def keyed(
     agent_key: str | None, simulator_key: str | None, codec: Any = "binary"
 ) -> Iterator[tuple[RemoteEnv, Running]]:
     remote = RemoteEnv(ANY, connect=False, connect_timeout=0.6, key_file=agent_key)
-    config = LinkConfig(timeout=0.5, first_resend=0.1)
+    config = LinkConfig(timeout=0.5)
     simulator = Simulator(
         server=remote.address, bind=ANY, codec=codec, config=config, key_file=simulator_key
     )
@@ -421,7 +422,7 @@ def test_text_and_a_key(key_file: str) -> None:
             remote.connect()
         error = running.join()
         assert isinstance(error, Refused)
-        assert "closed before its first command: it has no free place, has a key" in str(error)
+        assert "closed before its first command: it has no free slot, has a key" in str(error)
 
 
 def test_a_key_allows_every_address(key_file: str) -> None:

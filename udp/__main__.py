@@ -81,6 +81,7 @@ def parse_arguments(words: list[str]) -> dict[str, Any]:
         if not isinstance(value, kind):
             raise InputError(f"{name}: expected {expected}, got {value!r}")
     if module := arguments.pop("module", None):
+        sys.path.append(os.getcwd())  # last, and with -P not there: it shadows no other module
         import_module(module)
     pairs = {name: tuple(arguments[name]) for name in ("server", "bind") if name in arguments}
     return {**arguments.pop("options", {}), **arguments, **pairs}

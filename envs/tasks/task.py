@@ -70,7 +70,7 @@ class TaskOptions:
 
 @dataclass(kw_only=True, slots=True)
 class Outcome:
-    """What a control step led to."""
+    """Result of a control step."""
 
     reward: dict[str, Array]
     """Terms by name, each of shape (W, A); their sum is the reward."""
@@ -118,8 +118,8 @@ class Task:
     def setup(self) -> None:
         """Set `controller` and `observation`, from `options` and `vehicle`.
 
-        What an episode has to remember begins here too, as a number: `self.target = 0.0`. An option
-        that does not go with the vehicle raises `InputError`.
+        Also set initial values of an episode's memory, as numbers: `self.target = 0.0`. Raise
+        `InputError` for an option that does not fit the vehicle.
         """
         raise NotImplementedError
 

@@ -45,7 +45,6 @@ class MujocoWorld:
     xp: Any = np
 
     def __init__(self, vehicle: Vehicle, num_worlds: int, num_threads: int = 0) -> None:
-        _switch_off_log_file()
         self.vehicle = vehicle
         self.shape: tuple[int, ...] = (num_worlds, 1) if num_worlds > 1 else ()
         self._streams = Streams(num_worlds)
@@ -144,11 +143,3 @@ class MujocoWorld:
 def _warning_names(counts: Iterable[int]) -> list[str]:
     """MuJoCo's names of the warnings whose counts are not 0."""
     return [mujoco.mjtWarning(i).name for i, count in enumerate(counts) if count]
-
-
-def _switch_off_log_file() -> None:
-    """Keep MuJoCo from writing MUJOCO_LOG.TXT; a log file of another name stays on."""
-    config = mujoco.MjLogConfig.get()
-    if config.logto_file and config.logfile == "MUJOCO_LOG.TXT":
-        config.logto_file = False
-        config.set()

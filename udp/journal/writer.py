@@ -111,8 +111,8 @@ class Journal:
 
         Args:
             statistics: Those of the link. They are written every 10 s, and at the end.
-            slots: Who holds each slot of an agent; another holder is another session. Only the
-                text codec needs it, where all sessions have the same number.
+            slots: Sessions in the slots of an agent; another one in a slot is another session.
+                Only the text codec needs them: there all sessions have the same number.
 
         Raises:
             FileExistsError: The file exists.

@@ -56,7 +56,7 @@ import numpy as np
 
 from ...models.errors import InputError
 from .errors import DecodeError, VersionMismatch
-from .layout import COMMAND_ARRAYS_AT, MAX_MESSAGE, STATE_ARRAYS_AT, Layout, Slot
+from .layout import COMMAND_ARRAYS_AT, MAX_MESSAGE, Layout, Slot
 from .messages import (
     MAX_SPEC,
     MAX_TEXT,
@@ -90,8 +90,10 @@ __all__ = [
     "VERSION",
     "check",
     "decode",
+    "decode_due",
     "encode",
     "frame",
+    "numbers_of",
     "peek",
 ]
 
@@ -204,6 +206,37 @@ def decode(datagram: bytes, layout: Layout | None = None) -> Message:
         raise DecodeError(f"{decoder.__name__[8:]}: {error}") from None
 
 
+def decode_due(
+    kind: int, datagram: bytes, numbers: bytes, session: int, sequence: int, layout: Layout
+) -> Message | None:
+    """The message that is waited for, if this datagram is that one and whole.
+
+    The short way of a lock-step: only one header can come, so it is compared, not read. None
+    sends any other datagram, and one that is wrong, the way of `decode`, which tells why.
+
+    Args:
+        kind: Its type.
+        datagram: What came.
+        numbers: Bytes 8 to 23 of the message.
+        session, sequence: The same as numbers.
+        layout: That of the Hello.
+    """
+    start, crc = _STARTS[kind]
+    if datagram[:4] != start or datagram[8:24] != numbers:
+        return None
+    if zlib.crc32(datagram[8:], crc) != int.from_bytes(datagram[4:8], "little"):
+        return None
+    try:
+        return _DECODERS[kind](datagram, session, sequence, layout)
+    except (ValueError, struct.error):
+        return None
+
+
+def numbers_of(session: int, sequence: int) -> bytes:
+    """Bytes 8 to 23 of a message."""
+    return _NUMBERS.pack(session, sequence)
+
+
 def peek(datagram: bytes) -> tuple[int, int, int]:
     """Type, session and sequence that a datagram claims, nothing verified; zeros if it has none.
 
@@ -220,17 +253,13 @@ def peek(datagram: bytes) -> tuple[int, int, int]:
 
 def _encode_state(m: State, layout: Layout | None) -> bytes:
     layout = _expect(layout)
-    slots = (*layout.observation_slots, layout.rewards, *layout.flags, *layout.telemetry_slots)
+    slots = layout.state_slots
     arrays = (*m.observations, m.rewards, m.terminated, m.truncated, *m.telemetry)
     if len(arrays) != len(slots):
         raise InputError(f"State: expected {len(slots)} arrays, got {len(arrays)}")
     pieces = [_STATE_BODY.pack(m.time, m.nonce)]
-    at = STATE_ARRAYS_AT
-    for slot, array in zip(slots, arrays, strict=True):
-        if at != slot.at:
-            pieces.append(_PADS[slot.at - at])
-        pieces.append(_bytes_of("State", slot, array))
-        at = slot.end
+    for (slot, pad), array in zip(slots, arrays, strict=True):
+        pieces += (pad, _bytes_of("State", slot, array))
     body = b"".join(pieces)
     numbers = layout.state_numbers
     if numbers is None or not _adds_up(numbers.unpack_from(body)):
@@ -249,16 +278,18 @@ def _decode_state(data: bytes, session: int, sequence: int, layout: Layout | Non
         _expect_finite("observation, reward, telemetry", data, time, floats)
     terminated, truncated = layout.flags
     _expect_flags(data[terminated.at : truncated.end], _FLAGS)
+    arrays = [np.ndarray(slot.shape, slot.dtype, data, slot.at) for slot, _ in layout.state_slots]
+    first = len(layout.observation)
     return State(
         session=session,
         sequence=sequence,
         time=time,
         nonce=nonce,
-        observations=tuple([slot.view(data) for slot in layout.observation_slots]),
-        rewards=layout.rewards.view(data),
-        terminated=terminated.view(data),
-        truncated=truncated.view(data),
-        telemetry=tuple([slot.view(data) for slot in layout.telemetry_slots]),
+        observations=tuple(arrays[:first]),
+        rewards=arrays[first],
+        terminated=arrays[first + 1],
+        truncated=arrays[first + 2],
+        telemetry=tuple(arrays[first + 3 :]),
     )
 
 
@@ -312,7 +343,7 @@ def _check_command(data: bytes, layout: Layout) -> None:
 
 def _bytes_of(what: str, slot: Slot, array: np.ndarray) -> bytes:
     """Bytes of an array that has to be that of a slot. Numbers are never converted."""
-    if array.shape != slot.shape or array.dtype != slot.dtype:
+    if array.shape != slot.shape or (array.dtype is not slot.dtype and array.dtype != slot.dtype):
         raise InputError(
             f"{what}: expected {slot.dtype.name} of shape {slot.shape}, "
             f"got {array.dtype.name} of shape {array.shape}"
@@ -480,9 +511,12 @@ def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
     return tuple(extensions)
 
 
+def _start(kind: int) -> bytes:
+    return MAGIC + bytes((VERSION, kind))
+
+
 def _entry(kind: int, encoder: Callable[[Any, Layout | None], bytes]) -> tuple[Any, ...]:
-    start = MAGIC + bytes((VERSION, kind))
-    return start, zlib.crc32(start), encoder
+    return _start(kind), zlib.crc32(_start(kind)), encoder
 
 
 _ENCODERS: Final[dict[type, tuple[Any, ...]]] = {
@@ -511,3 +545,6 @@ _DECODERS: Final[dict[int, Callable[[bytes, int, int, Layout | None], Message]]]
     ALIVE: _decode_alive,
     MISSING: _decode_missing,
 }
+
+_STARTS: Final = {kind: (_start(kind), zlib.crc32(_start(kind))) for kind in _DECODERS}
+"""First four bytes of a message, and their CRC-32."""

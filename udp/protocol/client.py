@@ -73,6 +73,7 @@ _PATIENCE: Final = 8
 
 _TOO_EARLY: Final = 1.5
 """By so much round trips are taken for longer when answers come twice."""
+_AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING, Way.RECEIVED, Command]
 
 
 def new_session() -> int:
@@ -158,7 +159,9 @@ class RoundTrips:
             wait = _FIRST_RESEND
         else:
             wait = self._smoothed + max(_GRANULARITY, 4 * self._variation)
-        return min(wait * 2.0 ** min(max(tries - _PATIENCE, 0), 16), _LONGEST_RESEND)
+        if tries > _PATIENCE:
+            wait *= 2.0 ** min(tries - _PATIENCE, 16)
+        return min(wait, _LONGEST_RESEND)
 
 
 class Client:
@@ -205,6 +208,7 @@ class Client:
         self._config = config
         self._largest = largest
         self._text = by_text
+        self._is_plain = not by_text and key is None
         self._key = key
         self._session_key: Key | None = None
         self._nonce = 0
@@ -215,6 +219,7 @@ class Client:
         self._window = Window()
         self._transfer: Transfer | None = None  # of the outstanding message
         self._transfer_key: Key | None = None
+        self._due = b""  # bytes 8 to 23 of the Command that is waited for: those of the State
         self._asking = b""  # the datagram that was sent last and wants an answer
         self._outgoing: list[bytes] = []
         self._round_trips = RoundTrips()
@@ -274,11 +279,24 @@ class Client:
             session, number = self.hello.session, self.sequence
             self._send(Close(session=session, sequence=number, reason=one_line(reason)), now)
         elif self.state is not SimulatorState.CLOSING:
-            self.state = SimulatorState.CLOSED
+            self._end()  # a Hello that was not answered is not repeated
 
     def receive(self, datagram: bytes, now: float) -> Welcome | Refuse | Command | Close | None:
         """Take a datagram from the agent; the message, if it moves the exchange on."""
         self.statistics.counters["received"] += 1
+        if self.state is SimulatorState.WAITING and self._is_plain:
+            session, sequence = self.hello.session, self.sequence
+            message = binary.decode_due(
+                binary.COMMAND, datagram, self._due, session, sequence, self.layout
+            )
+            if message is not None:
+                return self._take(message, _AFTER_COMMAND, datagram, now)
+        return self._receive_any(datagram, now)
+
+    def _receive_any(
+        self, datagram: bytes, now: float
+    ) -> Welcome | Refuse | Command | Close | None:
+        """Whatever comes: `receive` knows only the Command that is waited for."""
         try:
             plain = datagram if self._key is None else self._open(datagram)
             if self._text:
@@ -355,6 +373,12 @@ class Client:
         self, message: Message, state: SimulatorState, plain: bytes, now: float
     ) -> Welcome | Refuse | Command | Close | None:
         """A message that may come now."""
+        if isinstance(message, Command):
+            self.state, self._transfer = state, None
+            self._record(message, plain)
+            self.statistics.round_trips.add(now - self._sent_at)
+            self._round_trips.answered(now)
+            return message
         was_closing = self.state is SimulatorState.CLOSING
         if isinstance(message, Missing):
             self._deadline = now + self._config.timeout
@@ -372,17 +396,14 @@ class Client:
             self._begin_again(now)
             return None
         self._transfer = None
-        if isinstance(message, Command):
-            self.statistics.round_trips.add(now - self._sent_at)
-            self._round_trips.answered(now)
-        elif isinstance(message, Welcome):
+        if isinstance(message, Welcome):
             self.statistics.counters["sessions"] += 1
             self._nonce = message.nonce
             if self._key:
                 self._session_key = self._key.for_session(message.session, message.nonce)
         elif isinstance(message, Close) and not was_closing:
             self._answer_close()
-        assert isinstance(message, Welcome | Refuse | Command | Close)
+        assert isinstance(message, Welcome | Refuse | Close)
         return message
 
     def _open(self, datagram: bytes) -> bytes:
@@ -472,14 +493,16 @@ class Client:
         """Send a message and repeat it until it is answered."""
         data = self._encode(message)
         self._record(message, data)
-        self._transfer = Transfer(data, self._largest, self._window)
-        self._transfer_key = self._key if isinstance(message, Hello) else self._session_key
-        self.state = SIMULATOR[self.state, Way.SENT, type(message)]
-        self.sequence = getattr(message, "sequence", 0)
+        self._transfer = transfer = Transfer(data, self._largest, self._window)
+        self._due = data[8:24]
+        kind = type(message)
+        self._transfer_key = self._key if kind is Hello else self._session_key
+        self.state = SIMULATOR[self.state, Way.SENT, kind]
+        self.sequence = 0 if isinstance(message, Hello) else message.sequence
         self.sends = self._tries = 1
         self._round_trips.sent(now, first=True)
-        self._put(self._transfer.start(), self._transfer_key)
-        closing = isinstance(message, Close)
+        self._put(transfer.start(), self._transfer_key)
+        closing = kind is Close
         self._sent_at = now
         self._resend_at = now + (CLOSE_INTERVAL if closing else self._round_trips.wait(1))
         self._deadline = now + (CLOSE_LINGER if closing else self._config.timeout)

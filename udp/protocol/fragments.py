@@ -159,7 +159,7 @@ class Assembler:
         self._begin((0, 0, -1), 0)
 
     def take(self, fragment: bytes) -> bytes | None:
-        """Take a fragment whose header was checked; the message, if it is whole now.
+        """Take a fragment with a checked header; the message, if it is whole now.
 
         Raises:
             DecodeError: The fragment's numbers make no sense, or it is too much.

@@ -138,6 +138,13 @@ class Layout:
         return self._slots(self.flags[1].end, [(shape, "float64") for shape in self.telemetry])
 
     @cached_property
+    def state_slots(self) -> tuple[tuple[Slot, bytes], ...]:
+        """Every array of a State in its order, with the bytes before it that are 0."""
+        slots = (*self.observation_slots, self.rewards, *self.flags, *self.telemetry_slots)
+        ends = (STATE_ARRAYS_AT, *(slot.end for slot in slots))
+        return tuple((slot, bytes(slot.at - end)) for slot, end in zip(slots, ends, strict=False))
+
+    @cached_property
     def state_size(self) -> int:
         """Bytes of a State."""
         return (self.telemetry_slots or self.flags)[-1].end
@@ -187,7 +194,7 @@ class Layout:
         slots = []
         for shape, name in arrays:
             at = _aligned(at)
-            dtype = np.dtype(name).newbyteorder("<")
+            dtype = np.dtype("<" + np.dtype(name).str[1:])  # NumPy's own object: quick to compare
             end = at + self.drones * math.prod(shape) * dtype.itemsize
             slots.append(Slot(at=at, end=end, shape=(self.drones, *shape), dtype=dtype))
             at = end

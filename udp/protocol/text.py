@@ -203,7 +203,7 @@ def _floats(name: str, fields: list[str]) -> list[float]:
 
 def _float32(name: str, fields: list[str]) -> np.ndarray:
     """Numbers of one drone, float32, shape (1, len(fields))."""
-    with np.errstate(over="ignore", under="ignore"):  # whatever the program has set
+    with np.errstate(over="ignore", under="ignore"):  # independent of the program's settings
         array: np.ndarray = np.array([_floats(name, fields)]).astype(np.float32)
     _expect_finite(array[0].tolist())
     return array

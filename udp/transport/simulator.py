@@ -99,7 +99,7 @@ class Simulator:
         self._trouble = ""
         self._stopped = False
         self._began_at: float | None = None  # when the step began that is being computed
-        with ExitStack() as failing:  # what is open, should a later step fail
+        with ExitStack() as failing:  # closes what is open if a later step fails
             self.stepped: Stepped = make_stepped(
                 env, num_envs, vehicle=vehicle, backend=backend, options=options
             )
