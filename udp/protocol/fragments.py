@@ -1,12 +1,7 @@
 """Messages that are larger than a datagram: cut into fragments, and put together again.
 
-A fragment is a datagram with the header of its message, 128 added to its type, and
-
-    24  u16  number of the fragment, from 0
-    26  u16  number of fragments, 1 to 16,384
-    28  u8   1 if its sender waits for an answer after it, else 0
-    29  3 bytes reserved
-    32       a slice of the message, its header included, at least one byte
+A fragment is a datagram with the header of its message, 128 added to its type, and a header of its
+own: its number, the number of all, and whether its sender waits for an answer (docs/protocol.md).
 
 A message is sent in bursts. The last fragment of a burst asks for an answer: a `Missing` with the
 fragments that have not come, or, if all have, the answer to the message. So only missing fragments
