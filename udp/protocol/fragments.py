@@ -11,6 +11,7 @@ are sent again, and the bursts follow each other at the pace of the round trip.
 import struct
 from math import ceil
 from typing import Final
+from zlib import crc32
 
 import numpy as np
 
@@ -81,6 +82,9 @@ class Transfer:
             self.count = ceil(len(message) / (largest - _OVERHEAD))
             self._slice = ceil(len(message) / self.count)
             self.count = ceil(len(message) / self._slice)  # fewer, where rounding made empty ones
+            self._start = message[:3] + bytes((message[3] | binary.FRAGMENT,))
+            self._numbers = message[8:HEADER_SIZE]
+            self._crc = crc32(self._numbers, crc32(self._start))
         self._window = window
         self._burst: list[int] = []
         self._next = 0  # no fragment from this one on was sent
@@ -118,10 +122,11 @@ class Transfer:
         return [self._fragment(number, asks=number == burst[-1]) for number in burst]
 
     def _fragment(self, number: int, *, asks: bool) -> bytes:
-        kind, session, sequence = binary.peek(self.message)
         at = number * self._slice
-        body = _FRAGMENT.pack(number, self.count, asks) + self.message[at : at + self._slice]
-        return binary.frame(kind | binary.FRAGMENT, session, sequence, body)
+        head = _FRAGMENT.pack(number, self.count, asks)
+        slice_ = self.message[at : at + self._slice]
+        crc = crc32(slice_, crc32(head, self._crc)).to_bytes(4, "little")
+        return b"".join((self._start, crc, self._numbers, head, slice_))
 
 
 def is_fragment(datagram: bytes) -> bool:
