@@ -41,9 +41,9 @@ Every message, and every fragment of one, begins with 24 bytes:
                                       30       bitmap to the end, at least 1 byte, lowest bit first
 
 An extension is a u16 (bits 0-14 its type, bit 15 set if it is critical), a u16 length of at most
-512, and so many bytes. A side skips an extension that it does not know, and stops if that one is
-critical. Reserved bytes are sent as 0 and ignored. The header, the layout of a fragment, the first
-two fields of Hello and the whole of Refuse are those of every version.
+512, and so many bytes; there are at most 64. A side skips an extension that it does not know, and
+stops if that one is critical. Reserved bytes are sent as 0 and ignored. The header, the layout of
+a fragment, the first two fields of Hello and the whole of Refuse are those of every version.
 """
 
 import struct
@@ -132,6 +132,7 @@ _MISSING_BODY: Final = struct.Struct("<BxHH")
 _EXTENSION: Final = struct.Struct("<HH")
 _LENGTH: Final = struct.Struct("<H")
 _CRITICAL: Final = 1 << 15
+_MOST_EXTENSIONS: Final = 64
 _FLAGS: Final = b"\0\1"
 _ORDERS: Final = b"\0\1\2"
 _BOOL: Final = np.dtype(bool)
@@ -500,6 +501,8 @@ def _extensions(extensions: tuple[Extension, ...]) -> bytes:
 def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
     extensions = []
     while at < len(data):
+        if len(extensions) == _MOST_EXTENSIONS:
+            raise InputError(f"extensions: expected at most {_MOST_EXTENSIONS}, got more")
         number, size = _EXTENSION.unpack_from(data, at)
         at += _EXTENSION.size
         if size > len(data) - at:
