@@ -90,6 +90,7 @@ _MISSING_BODY: Final = struct.Struct("<BxHH")
 _EXTENSION: Final = struct.Struct("<HH")
 _LENGTH: Final = struct.Struct("<H")
 _CRITICAL: Final = 1 << 15
+_MOST_EXTENSIONS: Final = 64
 _FLAGS: Final = b"\0\1"
 _ORDERS: Final = b"\0\1\2"
 _BOOL: Final = np.dtype(bool)
@@ -464,6 +465,8 @@ def _extensions(extensions: tuple[Extension, ...]) -> bytes:
 def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
     extensions = []
     while at < len(data):
+        if len(extensions) == _MOST_EXTENSIONS:
+            raise InputError(f"extensions: expected at most {_MOST_EXTENSIONS}, got more")
         number, size = _EXTENSION.unpack_from(data, at)
         at += _EXTENSION.size
         if size > len(data) - at:
