@@ -152,7 +152,7 @@ def encode(message: Message, layout: Layout | None = None) -> bytes:
     start, crc, encoder = _ENCODERS[kind]
     try:
         numbers = _NUMBERS.pack(message.session, getattr(message, "sequence", 0))
-        rest = numbers + encoder(message, layout)
+        rest: bytes = numbers + encoder(message, layout)
     except struct.error as error:
         raise InputError(f"{kind.__name__}: {error}") from None
     if len(rest) + 8 > MAX_MESSAGE:
