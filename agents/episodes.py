@@ -154,7 +154,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @property
     def observations(self) -> np.ndarray:
-        """What the drones see now, flat: float32, shape (N, n)."""
+        """Current observations, flat: float32, shape (N, n)."""
         return flat(self.env.observations, self.spec, self.num_envs)
 
     def start(self) -> None:

@@ -89,9 +89,9 @@ class Collector:
     def steps(self, policy: NetworkPolicy, count: int) -> Rollout:
         """Whole steps of all drones, as many as so many transitions need.
 
-        Running episodes go on in the next call. A drone whose episode has ended begins the next in
-        place of a step, so that there are fewer transitions by one; where all have ended, no step
-        is spent. Steps whose simulator was lost are left out.
+        Running episodes go on in the next call. After an episode ends, that drone's next step
+        begins the next episode and is no transition; if all have ended, no step is spent.
+        Steps with a lost simulator are left out.
         """
         rollout, lost, _ = self._fly(policy, -(-count // self._log.num_envs), None)
         return rollout.without_steps(lost)

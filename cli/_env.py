@@ -21,6 +21,7 @@ __all__ = [
     "chosen_env",
     "load_checkpoint",
     "local_spec",
+    "pilot_of",
     "policy_for",
     "remote_env",
     "words_of",
@@ -78,11 +79,40 @@ def local_spec(command: EnvFlags, checkpoint: "Checkpoint | None") -> "EnvSpec":
     return registry.env_spec(*chosen_env(command, checkpoint), vehicle=command.vehicle)
 
 
-def policy_for(checkpoint: "Checkpoint | None", spec: "EnvSpec") -> "Policy":
-    """The policy of a checkpoint, or the PID. Raises `InputError` if it does not fit the env."""
-    from ..agents import PID
+def policy_for(command: EnvFlags, checkpoint: "Checkpoint | None", spec: "EnvSpec") -> "Policy":
+    """The policy of a checkpoint, or the PID.
 
-    return checkpoint.policy(spec) if checkpoint else PID(spec)
+    Raises:
+        InputError: It does not fit the env, or was trained on another vehicle and the user has not
+            named one.
+    """
+    if checkpoint is None:
+        from ..agents import PID
+
+        return PID(spec)
+    trained = checkpoint.spec
+    same_drag = trained.options.get("linear_drag") == spec.options.get("linear_drag")
+    other = trained.vehicle_hash != spec.vehicle_hash and same_drag
+    if other and "vehicle" not in command.given:
+        raise InputError(
+            f"vehicle: expected {trained.vehicle} (model {trained.vehicle_hash[:8]}), on which the "
+            f"policy was trained, got {spec.vehicle} (model {spec.vehicle_hash[:8]}); name one "
+            "with --vehicle"
+        )
+    return checkpoint.policy(spec)
+
+
+def pilot_of(
+    command: EnvFlags, what: str
+) -> "tuple[Checkpoint | None, Policy | None, tuple[str, dict[str, Any]]]":
+    """Checkpoint, policy and chosen env of what flies here; `random` has no policy, `pid` no
+    checkpoint. Raises `InputError`.
+    """
+    checkpoint = policy = None
+    if what != "random":
+        checkpoint = load_checkpoint(what)
+        policy = policy_for(command, checkpoint, local_spec(command, checkpoint))
+    return checkpoint, policy, chosen_env(command, checkpoint)
 
 
 def words_of(trajectory: "Trajectory") -> str:

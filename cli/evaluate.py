@@ -33,7 +33,7 @@ class Evaluate(AgentFlags):
         checkpoint = load_checkpoint(self.policy)
         with remote_env(self, *chosen_env(self, checkpoint)) as env:
             headline = Headline.of(env.env_spec)
-            policy = policy_for(checkpoint, env.env_spec)
+            policy = policy_for(self, checkpoint, env.env_spec)
             trajectories = fly_episodes(env, policy, self.episodes, "final")
         rows = [evaluation_row(trajectory, headline) for trajectory in trajectories]
 

@@ -33,7 +33,7 @@ class Serve(AgentFlags):
         checkpoint = load_checkpoint(self.policy)
         episode = 0
         with remote_env(self, *chosen_env(self, checkpoint)) as env:
-            policy = policy_for(checkpoint, env.env_spec)
+            policy = policy_for(self, checkpoint, env.env_spec)
             while self.episodes is None or episode < self.episodes:
                 with _next_simulator():
                     flown = fly(env, policy, evaluation_seed(episode), episode)

@@ -262,8 +262,11 @@ class Loop:
         self.terms = outcome.reward
         if not self.world.shape:  # a single drone's numbers
             self.rewards = np.array((total,))
-            self.terminated, self.truncated = np.array((ended,)), np.array((late,))
             may_end = bool(ended or late)
+            # New arrays, as below; an array of truth values is fastest as a copy of another.
+            self.terminated, self.truncated = self._nobody.copy(), self._nobody.copy()
+            if may_end:
+                self.terminated[0], self.truncated[0] = ended, late
         else:
             self.rewards = total.reshape(n)
             # New arrays, whatever the task gave: arrays of earlier steps must not change.
@@ -289,7 +292,7 @@ class Loop:
             raise InputError(f"actions: expected shape {expected}, got {actions.shape}")
         values = actions.reshape(self.num_envs, self._width)
         if values.dtype != np.float32 and not self._choices:
-            with np.errstate(over="ignore"):  # what overflows is infinite, and refused as such
+            with np.errstate(over="ignore"):  # an overflow is infinite, and refused as such
                 values = values.astype(np.float32)
         right = self._right(values)
         if right is not None:
@@ -400,7 +403,7 @@ class Loop:
 
 
 class OnHost:
-    """A loop whose results are NumPy arrays, wherever its world runs: what a simulator sends.
+    """A loop whose results are NumPy arrays, wherever its world runs, for simulators.
 
     Its attributes are those of the loop.
     """

@@ -6,13 +6,10 @@ python examples/fly_pid.py
 import subprocess
 import sys
 
-from rotorgram.agents.pid import PID
-from rotorgram.envs import ElevationConfig
+from rotorgram.agents import PID
 from rotorgram.udp import RemoteEnv
 
-task = ElevationConfig(target=6.0)
-
-# The agent is the UDP server: it listens first, on a free port.
+# The agent is the UDP server: it listens first, on a free port. It refuses another target.
 env = RemoteEnv(("127.0.0.1", 0), options={"target": 6.0}, connect=False)
 host, port = env.address
 
@@ -21,16 +18,16 @@ simulator = subprocess.Popen(
     [sys.executable, "-m", "rotorgram.cli", "sim", "--server", f"{host}:{port}",
      "--bind", "127.0.0.1:0", "--env.target", "6.0"]
 )  # fmt: skip
-env.connect()
+env.connect()  # the simulator's Hello brings the spec
 
-pid = PID(task)
+pid = PID(env.env_spec)
 observation, info = env.reset(seed=1)
 pid.reset()
 total, terminated, truncated = 0.0, False, False
 while not (terminated or truncated):
     observation, reward, terminated, truncated, info = env.step(pid.act(observation))
     total += reward
-print(f"return {total:.1f}, elevation {info['Y']:.3f} m of {task.target} m")
+print(f"return {total:.1f}, elevation {info['Y']:.3f} m of {info['Y_goal']} m")
 print(env.statistics)
 env.close()  # tells the simulator, which ends
 simulator.wait()

@@ -12,12 +12,12 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from rotorgram.agents import preset
-from rotorgram.agents.policies import NetworkPolicy
-from rotorgram.envs import ElevationConfig
-from rotorgram.experiments.evaluate import evaluation_row, fly_episodes
+from rotorgram.agents import NetworkPolicy, preset
+from rotorgram.experiments.metrics import steady_state
 from rotorgram.experiments.pairs import socket_pair
-from rotorgram.experiments.training import Run, Training
+from rotorgram.experiments.settings import Run
+from rotorgram.experiments.training import Training
+from rotorgram.experiments.trajectories import fly_episodes
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--env-steps", type=int, default=100_000)
@@ -25,22 +25,23 @@ parser.add_argument("--num-envs", type=int, default=16)
 parser.add_argument("--out", type=Path, default=Path("policy.safetensors"))
 args = parser.parse_args()
 
-task = ElevationConfig(target=(4.0, 8.0))  # a target of its own for every episode
 run = Run(
     algorithm="a2c",
     config=preset("a2c", "tuned", steps_per_update=1024, learning_rate=0.02),
-    env=task,
+    env_id="rotorgram/Elevation-v0",
+    options={"target": (4.0, 8.0)},  # a target of its own for every episode
     seed=0,
     env_steps=args.env_steps,
     num_envs=args.num_envs,
 )
-with socket_pair(task, num_envs=run.num_envs) as drones:  # an agent here, a simulator beside it
+with socket_pair(**run.env, num_envs=run.num_envs) as drones:  # agent here, simulator beside it
     training = Training(run, drones)
     training.train()
 training.store(args.out)
 print(f"{training.log.env_steps:,} env steps in {training.log.seconds:.1f} s: {args.out}")
 
-with socket_pair(task) as drone:
-    flights = fly_episodes(drone, NetworkPolicy(training.agent.actor()), episodes=5)
-rows = [evaluation_row(flight, i, task.control_period) for i, flight in enumerate(flights)]
-print(f"steady-state |E|: {np.mean([row['steady_error'] for row in rows]):.3f} m")
+with socket_pair(**run.env) as drone:
+    policy = NetworkPolicy(training.agent.actor(), drone.env_spec)
+    trajectories = fly_episodes(drone, policy, episodes=5)
+errors = [abs(one.values("elevation_error")[1:]) for one in trajectories]
+print(f"steady-state |E|: {np.mean([steady_state(error) for error in errors]):.3f} m")

@@ -8,9 +8,9 @@ every verdict states its own, and with which preset the agents were trained.
 The claims are judged one by one, each with its own 95 % interval; nothing corrects for their
 number, so the chance that at least one is decided wrongly is larger than 5 %.
 
-Two agents whose intervals overlap are not thereby alike. That our A2C is no worse than SB3's is a
-claim of ours, and is shown by a margin of non-inferiority: the whole interval of the difference has
-to lie on the good side of it.
+Overlapping intervals do not show that two agents are alike. Our own claim, that our A2C is no worse
+than SB3's, is shown by a margin of non-inferiority: the whole interval of the difference has to lie
+on the good side of it.
 """
 
 from collections.abc import Callable, Collection
@@ -36,16 +36,8 @@ if TYPE_CHECKING:
 else:
     pd = require("pandas", "train", "comparing agents")
 
-__all__ = [
-    "MIN_SEEDS",
-    "OURS",
-    "Verdict",
-    "convergence_step",
-    "fluctuation",
-    "judge_claims",
-    "judge_no_worse",
-    "long_run_return",
-]
+__all__ = ["MIN_SEEDS", "OURS", "Verdict", "convergence_step", "fluctuation", "judge_claims",
+           "judge_no_worse", "long_run_return"]  # fmt: skip
 
 MIN_SEEDS: Final = 30
 """Seeds with a value that each agent needs before a claim is decided.
@@ -94,13 +86,13 @@ class Verdict:
     claim: str
     """The claim, with the paper's words."""
     source: str
-    """Where the paper makes it."""
+    """Place of the claim in the paper."""
     preset: str
     """Hyperparameters with which the agents were trained."""
     verdict: Outcome
     """The outcome."""
     definition: str
-    """How the claim was measured and decided."""
+    """Definition of its measure and of the decision."""
     evidence: str
     """The numbers."""
 

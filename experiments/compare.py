@@ -1,18 +1,18 @@
 """The comparison: every agent, over the same seeds and env steps, each through a socket pair."""
 
 import shutil
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from ..agents import preset
 from ..agents.checkpoints import Checkpoint, store
 from ..agents.pid import PID
-from ..agents.policies import NetworkPolicy, Policy
+from ..agents.policies import NetworkPolicy
 from ..envs.loop import Loop
 from ..envs.registry import env_spec, options_type
 from ..envs.spec import EnvSpec, canonical_id
@@ -36,11 +36,11 @@ from .results import (
     write_config,
 )
 from .settings import CompareConfig, EnvConfig, Run
-from .training import Training, train_run
+from .training import Snapshot, train_run
 from .trajectories import Trajectory, evaluation_seed, fly_episodes
 from .workers import open_workers
 
-__all__ = ["PARTS", "CompareConfig", "compare", "evaluation_pair", "read_compare_config"]
+__all__ = ["PARTS", "compare", "evaluation_pair", "read_compare_config"]
 
 PARTS: Final = "parts"
 """Folder with the parts of an unfinished comparison, one for each run."""
@@ -75,7 +75,7 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
         _write_config(config, spec, folder, command)
         for unfinished in parts.glob(".*"):
             shutil.rmtree(unfinished)
-        runs: list[Run | None] = [*config.runs(), *([None] if _pid(spec) else [])]
+        runs: list[Run | None] = [*config.runs(), *([None] if _can_fly(spec) else [])]
         jobs = {_name(run): run for run in runs if not (parts / _part(run)).exists()}
         workers.fly_all(partial(_fly, config), jobs, partial(_keep, folder), config)
         join_parts(parts, folder, headline.name)
@@ -104,88 +104,67 @@ def _fly(
 ) -> tuple[RunResults, Checkpoint | None]:
     """Train and evaluate (in a worker process)."""
     if run is None:
-        return _evaluate_pid(config), None
-    return _train(run, config, progress)
-
-
-def _train(
-    run: Run, config: CompareConfig, progress: ProgressSender
-) -> tuple[RunResults, Checkpoint]:
+        return _evaluate("pid", 0, config), None
     with shared_pair(**run.env, num_envs=run.num_envs) as env:
         training, row = train_run(run, env, progress, config.snapshots, keep_steps=True)
-        checkpoint = training.checkpoint()
-    log = training.log
-    headline = Headline.of(log.spec)
-    rows, trajectories = _evaluate(training, config, headline)
+        checkpoint, log = training.checkpoint(), training.log
+    results = _evaluate(run.algorithm, run.seed, config, training.taken)
     steps = log.steps()
     steps["step"] = np.arange(1, len(steps["episode"]) + 1)
-    training_steps = step_table(
-        headline.name, agent=run.algorithm, seed=run.seed, phase="train", **steps
-    )
-    results = RunResults(
-        agent=run.algorithm,
-        seed=run.seed,
-        metric=headline.name,
+    label = {"agent": run.algorithm, "seed": run.seed, "phase": "train"}
+    trained = replace(
+        results,
         episodes=[episode_row(one, run.num_envs, log.env_steps) for one in log.episodes],
-        evaluations=rows,
         runs=[row],
-        steps=[
-            training_steps,
-            *evaluation_steps(run.algorithm, run.seed, headline, trajectories),
-        ],
+        steps=[step_table(results.metric, **label, **steps), *results.steps],
     )
-    return results, checkpoint
+    return trained, checkpoint
 
 
 def evaluation_pair(config: EnvConfig, episodes: int) -> AbstractContextManager[Any]:
     """A remote env that flies that many episodes at a time, or `MAX_BATCH`."""
-    return shared_pair(
-        config.env_id, config.options, vehicle=config.vehicle, num_envs=min(episodes, MAX_BATCH)
-    )
+    return shared_pair(**config.env, num_envs=min(episodes, MAX_BATCH))
 
 
 def _evaluate(
-    training: Training, config: CompareConfig, headline: Headline
-) -> tuple[list[dict[str, Any]], list[Trajectory]]:
+    agent: str, seed: int, config: CompareConfig, taken: Sequence[Snapshot] = ()
+) -> RunResults:
+    """Evaluate the snapshots of a training, or the PID."""
     rows: list[dict[str, Any]] = []
-    trajectories: list[Trajectory] = []
-    *earlier, last = training.taken
-    with evaluation_pair(config, max(config.curve_episodes, config.episodes)) as env:
-        for snapshot in [*earlier, last]:
-            policy = NetworkPolicy(snapshot.actor, training.log.spec)
-            if snapshot is last:
-                trajectories = flown = fly_episodes(env, policy, config.episodes, "final")
+    flown: list[Trajectory] = []
+    most = max(config.curve_episodes, config.episodes) if taken else config.episodes
+    with evaluation_pair(config, most) as env:
+        spec = env.env_spec
+        headline = Headline.of(spec)
+        for snapshot in taken or [None]:
+            policy = NetworkPolicy(snapshot.actor, spec) if snapshot else PID(spec)
+            if snapshot is None or snapshot is taken[-1]:
+                flown = fly_episodes(env, policy, config.episodes, "final")
             else:
                 flown = fly_episodes(env, policy, config.curve_episodes, "curve")
-            behind = {"env_steps": snapshot.env_steps, "seconds": snapshot.seconds}
+            behind = {
+                "env_steps": snapshot.env_steps if snapshot else 0,
+                "seconds": snapshot.seconds if snapshot else 0.0,
+            }
             rows += [{**behind, **evaluation_row(one, headline)} for one in flown]
-    return rows, trajectories
-
-
-def _evaluate_pid(config: CompareConfig) -> RunResults:
-    with evaluation_pair(config, config.episodes) as env:
-        policy = _pid(env.env_spec)
-        assert policy is not None
-        trajectories = fly_episodes(env, policy, config.episodes, "final")
-        headline = Headline.of(env.env_spec)
-    behind = {"env_steps": 0, "seconds": 0.0}
     return RunResults(
-        agent="pid",
-        seed=0,
+        agent=agent,
+        seed=seed,
         metric=headline.name,
         episodes=[],
-        evaluations=[{**behind, **evaluation_row(one, headline)} for one in trajectories],
+        evaluations=rows,
         runs=[],
-        steps=evaluation_steps("pid", 0, headline, trajectories),
+        steps=evaluation_steps(agent, seed, headline, flown),
     )
 
 
-def _pid(spec: EnvSpec) -> Policy | None:
-    """The PID, where it can fly the env."""
+def _can_fly(spec: EnvSpec) -> bool:
+    """Whether the PID can fly the env."""
     try:
-        return PID(spec)
+        PID(spec)
     except InputError:
-        return None
+        return False
+    return True
 
 
 def _bounds(config: CompareConfig) -> dict[str, float]:
@@ -208,18 +187,8 @@ def read_compare_config(folder: Path) -> CompareConfig:
     """Settings of a comparison, from its `config.json`. Raises `ResultsError`."""
     content = read_config(folder)
     try:
-        return CompareConfig(
-            agents=tuple(content["agents"]),
-            seeds=len(content["seeds"]),
-            first_seed=content["seeds"][0],
-            env_steps=content["env_steps"],
-            num_envs=content["num_envs"],
-            preset=content["preset"],
-            env_id=content["spec"]["env_id"],
-            options=content["spec"]["options"],
-            vehicle=content["vehicle"],
-            **content["evaluation"],
-        )
+        common = CompareConfig.read_content(content)
+        return CompareConfig(agents=tuple(content["agents"]), **common, **content["evaluation"])
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ResultsError(f"{folder / CONFIG_FILE}: expected a comparison's: {error!r}") from None
 
@@ -227,17 +196,7 @@ def read_compare_config(folder: Path) -> CompareConfig:
 def _write_config(config: CompareConfig, spec: EnvSpec, folder: Path, command: str) -> None:
     if (folder / CONFIG_FILE).exists():
         return
-    content = {
-        "preset": config.preset,
-        "seeds": list(config.all_seeds),
-        "env_steps": config.env_steps,
-        "num_envs": config.num_envs,
-        "agents": {agent: asdict(preset(agent, config.preset)) for agent in config.agents},
-        "evaluation": {
-            "snapshots": config.snapshots,
-            "curve_episodes": config.curve_episodes,
-            "episodes": config.episodes,
-        },
-        "bounds": _bounds(config),
-    }
-    write_config(folder, command, spec, config.vehicle, content)
+    names = ("snapshots", "curve_episodes", "episodes")
+    content = config.content(*config.agents)
+    content["evaluation"] = {name: getattr(config, name) for name in names}
+    write_config(folder, command, spec, config.vehicle, {**content, "bounds": _bounds(config)})

@@ -19,6 +19,7 @@ from .metrics import (
     Spread,
     average_return,
     episode_ends,
+    extent,
     iqm,
     spread_over_seeds,
     training_runs,
@@ -32,18 +33,9 @@ else:
     pd = require("pandas", "train", "comparing agents")
 
 __all__ = [
-    "AVERAGING_SHARE",
-    "Curves",
-    "Fan",
-    "Flown",
-    "cumulative_returns",
-    "flown_sizes",
-    "learning_curves",
-    "make_curves",
-    "pick_trajectories",
-    "return_curves",
-    "value_fan",
-]
+    "AVERAGING_SHARE", "Curves", "Fan", "Flown", "cumulative_returns", "flown_sizes",
+    "learning_curves", "make_curves", "pick_trajectories", "return_curves", "value_fan",
+]  # fmt: skip
 
 AVERAGING_SHARE: Final = 0.05
 """Share of training over which the average reward is a running mean."""
@@ -56,19 +48,15 @@ FloatArray = npt.NDArray[np.float64]
 
 
 class Fan(NamedTuple):
-    """Quantiles of the metric over windows of training, shape (windows,); x in env steps."""
+    """Quantiles of the metric over windows of training: 5, 25, 50, 75 and 95 %, each of shape
+    (windows,); x in env steps."""
 
     x: FloatArray
     low: FloatArray
-    """5 %."""
     lower: FloatArray
-    """25 %."""
     middle: FloatArray
-    """50 %."""
     upper: FloatArray
-    """75 %."""
     high: FloatArray
-    """95 %."""
 
 
 class Flown(NamedTuple):
@@ -77,7 +65,7 @@ class Flown(NamedTuple):
     shown: list[Curve]
     """The metric over the time in the episode (s)."""
     total: int
-    """How many there are."""
+    """Number of all trajectories."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,10 +92,6 @@ class Curves:
 
 def make_curves(folder: Path | str, results: Results) -> Curves:
     """Make all curves of a comparison.
-
-    Args:
-        folder: Where `rotorgram compare` wrote; the step rows are read from it.
-        results: As of `results.read_results(folder)`.
 
     Raises:
         ResultsError: The step rows are missing or are not what they should be.
@@ -198,21 +182,14 @@ def flown_sizes(steps: pd.DataFrame, control_period: float, headline: Headline) 
     Args:
         steps: Evaluation steps of one agent, columns `step` and `value`; at least one row.
         control_period: Time between two control steps, s.
-        headline: Says what the size is.
     """
     last = int(steps["step"].max())
     moments = np.unique(np.linspace(0, last, min(last + 1, _MAX_MOMENTS)).round().astype(np.int64))
     shown = steps[steps["step"].isin(moments)]
     groups = [headline.size(rows.to_numpy()) for _, rows in shown.groupby("step")["value"]]
-    ends = np.array([_ends(values) for values in groups])
+    ends = np.array([np.quantile(values, extent(len(values))) for values in groups])
     x = np.unique(shown["step"]) * control_period
     return Spread(x, np.array([iqm(values) for values in groups]), ends[:, 0], ends[:, 1])
-
-
-def _ends(values: FloatArray) -> FloatArray:
-    """The quartiles, or the extremes below four values, as `spread_over_seeds` has them."""
-    quartiles = (0.25, 0.75) if len(values) >= 4 else (0.0, 1.0)
-    return np.asarray(np.quantile(values, quartiles))
 
 
 def learning_curves(evaluations: pd.DataFrame) -> tuple[dict[str, Spread], dict[str, float]]:

@@ -6,13 +6,14 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from ..agents.checkpoints import load
 from ..agents.pid import PID
 from ..agents.policies import Policy
+from ..envs.rendering import moment
 from ..models.errors import InputError
 from ..rendering import Camera, Canvas, Moment, NoOpenGL, Stage, World
 from ..rendering.film import QUALITY, check_film, poster, write_film
@@ -33,8 +34,9 @@ MOST_FRAMES: Final = 1_000_000
 _SPACE: Final = 2  # pixels between panes
 _DARK: Final = (13, 18, 26)
 _ASPECT: Final = 1.2  # of a pane that shows a craft and its graph well
-_COMPARISON_SIZE: Final = (1280, 400)
-_COMPARISON_QUALITY: Final = 27
+_COMPARISON: Final[dict[str, Any]] = {
+    "width": 1280, "height": 400, "camera": "front", "fast": True, "quality": 27,
+}  # fmt: skip
 """Small enough for a page that holds the film in itself."""
 
 
@@ -44,18 +46,16 @@ def moments(trajectory: Trajectory) -> list[Moment]:
     Raises:
         InputError: Its telemetry does not tell where the craft is.
     """
-    missing = [name for name in ("position", "attitude", "thrust")
-               if name not in trajectory.telemetry]  # fmt: skip
-    if missing:
+    told = trajectory.telemetry
+    if missing := {"position", "attitude", "thrust"} - set(told):
         raise InputError(
-            f"pictures: expected telemetry of {', '.join(missing)}, "
+            f"pictures: expected telemetry of {', '.join(sorted(missing))}, "
             f"{trajectory.spec.env_id} tells none"
         )
-    metrics = [(one.name, one.unit, one.symbol) for one in trajectory.spec.metrics]
     return [
-        Moment.of(
-            {name: array[step] for name, array in trajectory.telemetry.items()},
-            metrics,
+        moment(
+            trajectory.spec,
+            {name: array[step] for name, array in told.items()},
             reward=float(trajectory.rewards[step - 1]) if step else 0.0,
             step=step,
             episode=trajectory.episode,
@@ -230,15 +230,9 @@ class _Pane:
     """The picture of one flight, drawn again only where it changes."""
 
     def __init__(
-        self,
-        shot: Shot,
-        config: Film,
-        canvas: Canvas,
-        stage: Stage,
-        seconds: float,
-        scale: tuple[float, float],
-        named: bool,
-    ) -> None:
+        self, shot: Shot, config: Film, canvas: Canvas, stage: Stage, seconds: float,
+        scale: tuple[float, float], named: bool,
+    ) -> None:  # fmt: skip
         self._shot, self._config = shot, config
         self._canvas, self._stage = canvas, stage
         self._shown = (-1, -1)  # episode and step
@@ -262,8 +256,8 @@ class _Pane:
         step = trajectory.step_at(seconds)
         if (episode, step) != self._shown:
             begin = self._shown[1] + 1 if episode == self._shown[0] else 0
-            for moment in self._shot.moments[episode][begin : step + 1]:  # its path has no gaps
-                self._stage.show(moment)
+            for one in self._shot.moments[episode][begin : step + 1]:  # its path has no gaps
+                self._stage.show(one)
             self._shown = episode, step
             self._picture = self._draw(episode, step)
         return self._picture
@@ -315,7 +309,7 @@ def film_comparison(
         out: The film; one that exists is replaced.
         on_frame: Told how far it is.
         picture: JPEG of a moment of the film, written beside it; what a page shows before it plays.
-        world: Where.
+        world: Surroundings.
 
     Returns:
         Whether there is a film. Without OpenGL there is none, and a line in the log says why.
@@ -327,16 +321,7 @@ def film_comparison(
     from .results import read_results
 
     results = read_results(folder)
-    width, height = _COMPARISON_SIZE
-    config = Film(
-        width=width,
-        height=height,
-        camera="front",
-        world=world,
-        vehicle=results.config["vehicle"],
-        fast=True,
-        quality=_COMPARISON_QUALITY,
-    )
+    config = Film(**_COMPARISON, world=world, vehicle=results.config["vehicle"])
     fresh = out.with_name(f".fresh-{out.name}")
     fresh.unlink(missing_ok=True)
     try:

@@ -28,47 +28,33 @@ else:
     pd = require("pandas", "train", "comparing agents")
 
 __all__ = [
-    "Curve",
-    "Headline",
-    "Spread",
-    "average_return",
-    "bootstrap_difference",
-    "bootstrap_interval",
-    "episode_ends",
-    "final_evaluations",
-    "final_per_run",
-    "first_lasting_snapshot",
-    "iqm",
-    "overshoot",
-    "results_table",
-    "settling_time",
-    "spread_over_seeds",
-    "steady_state",
-    "training_runs",
-    "trimmed_mean",
-]
+    "Curve", "Headline", "Spread", "average_return", "bootstrap_difference", "bootstrap_interval",
+    "episode_ends", "extent", "final_evaluations", "final_per_run", "first_lasting_snapshot", "iqm",
+    "overshoot", "results_table", "settling_time", "spread_over_seeds", "steady_state",
+    "training_runs", "trimmed_mean",
+]  # fmt: skip
 
 _RESAMPLES: Final = 2000
 _COUNTS: Final = ("seeds", "episodes", "settled", "crashed")
 
-FloatArray = npt.NDArray[np.floating[Any]]
+Floats = npt.NDArray[np.float64]
 Values = Sequence[float] | npt.NDArray[np.floating[Any]]
 
 
 class Curve(NamedTuple):
     """One seed's curve: x ascending, both of shape (n,)."""
 
-    x: npt.NDArray[np.float64]
-    y: npt.NDArray[np.float64]
+    x: Floats
+    y: Floats
 
 
 class Spread(NamedTuple):
     """Several seeds' curves on one grid, each of shape (m,)."""
 
-    x: npt.NDArray[np.float64]
-    middle: npt.NDArray[np.float64]
-    low: npt.NDArray[np.float64]
-    high: npt.NDArray[np.float64]
+    x: Floats
+    middle: Floats
+    low: Floats
+    high: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,28 +120,25 @@ class Headline:
         sign = "≥" if self.high else "<"
         return f"{self.size_symbol} {sign} {self.amount(f'{self.metric.held:g}')}"
 
-    def size(self, values: Values) -> npt.NDArray[np.float64]:
+    def size(self, values: Values) -> Floats:
         """Magnitude of an error, value of a metric with goal `high`; same shape, float64."""
-        array = np.asarray(values, dtype=np.float64)
-        return array if self.high else np.abs(array)
+        return np.asarray(values, float) if self.high else np.abs(np.asarray(values, float))
 
     def holds(self, sizes: Values) -> npt.NDArray[np.bool_]:
         """Whether each mean size counts as holding the goal; false for nan, or without a bound."""
-        held = self.metric.held
-        array = np.asarray(sizes, dtype=np.float64)
-        if held is None:
-            return np.zeros(array.shape, bool)
-        return np.asarray(array >= held if self.high else array < held)
+        array, held = np.asarray(sizes, float), self.metric.held
+        # None as nan: no number is above or below it.
+        bound = np.nan if held is None else held
+        return np.asarray(array >= bound if self.high else array < bound)
 
     def worst(self, sizes: Values) -> float:
         """The worst of the values that are not missing; nan if there is none."""
         finite = _finite(sizes)
-        if not finite.size:
-            return math.nan
-        return float(finite.min() if self.high else finite.max())
+        worst = np.min if self.high else np.max
+        return float(worst(finite)) if finite.size else math.nan
 
 
-def steady_state(sizes: FloatArray) -> float:
+def steady_state(sizes: Values) -> float:
     """Mean size in the last quarter of an episode (at least its last step), in the metric's unit.
 
     Args:
@@ -164,13 +147,11 @@ def steady_state(sizes: FloatArray) -> float:
     Returns:
         nan for an episode without steps.
     """
-    values = np.asarray(sizes, dtype=np.float64)
-    if values.size == 0:
-        return math.nan
-    return float(values[-max(1, values.size // 4) :].mean())
+    values = np.asarray(sizes, float)
+    return float(values[-max(1, values.size // 4) :].mean()) if values.size else math.nan
 
 
-def settling_time(errors: FloatArray, control_period: float, tolerance: float) -> float:
+def settling_time(errors: Values, control_period: float, tolerance: float) -> float:
     """Time from which the error stays inside the tolerance until the episode ends, s.
 
     Args:
@@ -182,13 +163,13 @@ def settling_time(errors: FloatArray, control_period: float, tolerance: float) -
         nan if the last error lies outside the band, or if there is none. An episode that crashes
         has not settled whatever its errors say; the caller knows, this function does not.
     """
-    outside = ~(np.abs(np.asarray(errors, dtype=np.float64)) < tolerance)
+    outside = ~(np.abs(np.asarray(errors, float)) < tolerance)
     if outside.size == 0 or outside[-1]:
         return math.nan
     return float(outside.nonzero()[0][-1] + 1) * control_period if outside.any() else 0.0
 
 
-def overshoot(errors: FloatArray) -> float:
+def overshoot(errors: Values) -> float:
     """How far the craft passed its target: the largest -sign(E_0)·E, at least 0.
 
     An episode that begins exactly on its target has no side to pass to: its largest |E| counts.
@@ -199,26 +180,24 @@ def overshoot(errors: FloatArray) -> float:
     Returns:
         In the metric's unit; nan for an episode without steps.
     """
-    values = np.asarray(errors, dtype=np.float64)
-    if values.size == 0:
+    values = np.asarray(errors, float)
+    if not values.size:
         return math.nan
     if values[0] == 0.0:
         return float(np.abs(values).max())
     return max(0.0, float((-np.sign(values[0]) * values).max()))
 
 
-def _finite(values: Values) -> npt.NDArray[np.float64]:
-    array = np.asarray(values, dtype=np.float64)
+def _finite(values: Values) -> Floats:
+    array = np.asarray(values, float)
     return array[np.isfinite(array)]
 
 
-def trimmed_mean(values: FloatArray, axis: int = -1) -> npt.NDArray[np.float64]:
+def trimmed_mean(values: Values, axis: int = -1) -> Floats:
     """Mean along an axis without the lowest and the highest quarter; below four nothing is cut."""
-    ordered = np.sort(np.asarray(values, dtype=np.float64), axis=axis)
-    count = ordered.shape[axis]
-    cut = count // 4
-    middle = np.take(ordered, np.arange(cut, count - cut), axis=axis)
-    return np.asarray(middle.mean(axis=axis))
+    ordered = np.moveaxis(np.sort(values, axis=axis), axis, 0)
+    cut = len(ordered) // 4
+    return np.asarray(ordered[cut : len(ordered) - cut].mean(axis=0))
 
 
 def iqm(values: Values) -> float:
@@ -230,19 +209,17 @@ def iqm(values: Values) -> float:
     return float(trimmed_mean(finite)) if finite.size else math.nan
 
 
-def _resampled_iqms(values: FloatArray, rng: np.random.Generator) -> npt.NDArray[np.float64]:
+def _resampled_iqms(values: Values, rng: np.random.Generator) -> Floats:
     return trimmed_mean(rng.choice(values, size=(_RESAMPLES, values.size), replace=True), axis=1)
 
 
-def bootstrap_interval(
-    values: Values, confidence: float = 0.95, seed: int = 0
-) -> tuple[float, float]:
-    """Percentile-bootstrap interval of the interquartile mean over seeds.
+def bootstrap_interval(values: Values) -> tuple[float, float]:
+    """95 % percentile-bootstrap interval of the interquartile mean over seeds.
+
+    It is the same each time that a report is written.
 
     Args:
         values: One value per seed; missing ones are left out.
-        confidence: Share of the bootstrap distribution between the two ends.
-        seed: Of the resampling, so that a report is the same each time it is written.
 
     Returns:
         (low, high). (nan, nan) for fewer than two values: one seed shows no spread, which is not
@@ -251,13 +228,11 @@ def bootstrap_interval(
     finite = _finite(values)
     if finite.size < 2:
         return math.nan, math.nan
-    return _ends(_resampled_iqms(finite, np.random.default_rng(seed)), confidence)
+    return _ends(_resampled_iqms(finite, np.random.default_rng(0)))
 
 
-def bootstrap_difference(
-    first: Values, second: Values, confidence: float = 0.95, seed: int = 0
-) -> tuple[float, float, float]:
-    """Difference between two interquartile means over seeds, with its bootstrap interval.
+def bootstrap_difference(first: Values, second: Values) -> tuple[float, float, float]:
+    """Difference between two interquartile means over seeds, with its 95 % bootstrap interval.
 
     The runs of the two agents are resampled independently, although runs of one seed share their
     starting states, and VPG's and A2C's also the actor's first weights and the stream of noise. As
@@ -271,12 +246,12 @@ def bootstrap_difference(
     difference = iqm(one) - iqm(other)
     if min(one.size, other.size) < 2:
         return difference, math.nan, math.nan
-    rng = np.random.default_rng(seed)
-    return difference, *_ends(_resampled_iqms(one, rng) - _resampled_iqms(other, rng), confidence)
+    rng = np.random.default_rng(0)
+    return difference, *_ends(_resampled_iqms(one, rng) - _resampled_iqms(other, rng))
 
 
-def _ends(means: npt.NDArray[np.float64], confidence: float) -> tuple[float, float]:
-    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+def _ends(means: Floats) -> tuple[float, float]:
+    low, high = np.quantile(means, [0.025, 0.975])
     return float(low), float(high)
 
 
@@ -289,9 +264,9 @@ def training_runs(episodes: pd.DataFrame, agent: str) -> list[pd.DataFrame]:
     return [run for _, run in own.groupby("seed")]
 
 
-def episode_ends(episodes: pd.DataFrame) -> npt.NDArray[np.float64]:
+def episode_ends(episodes: pd.DataFrame) -> Floats:
     """Env step of the run at which each training episode ended, shape (episodes,)."""
-    return np.asarray(episodes["last_step"], dtype=np.float64)
+    return np.asarray(episodes["last_step"], float)
 
 
 def average_return(run: pd.DataFrame, share: float) -> Curve:
@@ -311,9 +286,7 @@ def average_return(run: pd.DataFrame, share: float) -> Curve:
     return Curve(ends, (total[last] - total[first]) / (last - first))
 
 
-def spread_over_seeds(
-    curves: Sequence[Curve], grid: npt.NDArray[np.float64] | None = None
-) -> Spread:
+def spread_over_seeds(curves: Sequence[Curve], grid: Floats | None = None) -> Spread:
     """Put several seeds' curves on one grid: interquartile mean and spread.
 
     Args:
@@ -328,11 +301,15 @@ def spread_over_seeds(
     end = min(curve.x[-1] for curve in curves)
     if grid is None:
         grid = np.linspace(start, max(start, end), 300)
-    x = np.asarray(grid[(grid >= start) & (grid <= end)], dtype=np.float64)
+    x = np.asarray(grid[(grid >= start) & (grid <= end)], float)
     values = np.stack([np.interp(x, curve.x, curve.y) for curve in curves])
-    quartiles = (0.25, 0.75) if len(curves) >= 4 else (0.0, 1.0)
-    low, high = np.quantile(values, quartiles, axis=0)
+    low, high = np.quantile(values, extent(len(curves)), axis=0)
     return Spread(x, trimmed_mean(values, axis=0), low, high)
+
+
+def extent(count: int) -> tuple[float, float]:
+    """Quantiles of a band over so many values: the quartiles, or the extremes below four."""
+    return (0.25, 0.75) if count >= 4 else (0.0, 1.0)
 
 
 def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tuple[float, float]:
@@ -343,7 +320,6 @@ def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tup
 
     Args:
         evaluations: The evaluation episodes of one run (one agent, one seed).
-        headline: The metric that defines a held goal.
 
     Returns:
         Env steps and seconds of training of the first snapshot from which on every snapshot holds
@@ -406,9 +382,7 @@ def results_table(
     """Tabulate the final evaluations and the training of all agents.
 
     Args:
-        evaluations: As of `results.read_evaluations`.
-        runs: As of `results.read_runs`.
-        headline: The metric that decides.
+        evaluations, runs, headline: As of `results.Results`.
         bounds: Mean returns that no agent reached but physics or idleness gives, by name.
 
     Returns:
@@ -451,14 +425,13 @@ def _final_row(final: pd.DataFrame, headline: Headline) -> dict[str, float]:
 def _training_row(
     evaluations: pd.DataFrame, runs: pd.DataFrame, headline: Headline
 ) -> dict[str, float]:
-    if runs.empty or headline.metric.held is None:
-        names = ("reached", "env_steps_to_reach", "seconds_to_reach")
-        nothing = dict.fromkeys(names, math.nan)
-        return {**nothing, "steps_per_second": iqm(runs["steps_per_second"].to_numpy())}
-    reached = [first_lasting_snapshot(run, headline) for _, run in evaluations.groupby("seed")]
-    steps, seconds = np.array(reached).T
+    reached, steps, seconds = math.nan, np.empty(0), np.empty(0)
+    if len(runs) and headline.metric.held is not None:
+        first = [first_lasting_snapshot(run, headline) for _, run in evaluations.groupby("seed")]
+        steps, seconds = np.array(first).T
+        reached = int(np.isfinite(steps).sum())
     return {
-        "reached": int(np.isfinite(steps).sum()),
+        "reached": reached,
         "env_steps_to_reach": iqm(steps),
         "seconds_to_reach": iqm(seconds),
         "steps_per_second": iqm(runs["steps_per_second"].to_numpy()),

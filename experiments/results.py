@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from ..agents.checkpoints import software_versions, write_whole
+from ..agents.episodes import Episode
 from ..envs.spec import EnvSpec, SpecError
 from ..models.errors import require
 from .errors import ResultsError
@@ -48,29 +49,11 @@ else:
     pq = require("pyarrow.parquet", "train", "comparing agents")
 
 __all__ = [
-    "CONFIG_FILE",
-    "CONFIG_KEYS",
-    "EPISODES_FILE",
-    "EPISODE_COLUMNS",
-    "EVALUATIONS_FILE",
-    "EVALUATION_COLUMNS",
-    "RUNS_FILE",
-    "RUN_COLUMNS",
-    "STEPS_FILE",
-    "Results",
-    "RunResults",
-    "episode_row",
-    "evaluation_row",
-    "evaluation_steps",
-    "join_parts",
-    "machine",
-    "read_config",
-    "read_results",
-    "read_spec",
-    "read_steps",
-    "step_table",
-    "write_config",
-]
+    "CONFIG_FILE", "CONFIG_KEYS", "EPISODES_FILE", "EPISODE_COLUMNS", "EVALUATIONS_FILE",
+    "EVALUATION_COLUMNS", "RUNS_FILE", "RUN_COLUMNS", "STEPS_FILE", "Results", "RunResults",
+    "episode_row", "evaluation_row", "evaluation_steps", "join_parts", "machine", "read_config",
+    "read_results", "read_spec", "read_steps", "step_table", "write_config",
+]  # fmt: skip
 
 CONFIG_FILE: Final = "config.json"
 EPISODES_FILE: Final = "episodes.csv"
@@ -78,18 +61,8 @@ STEPS_FILE: Final = "steps.parquet"
 EVALUATIONS_FILE: Final = "evaluations.csv"
 RUNS_FILE: Final = "runs.csv"
 
-CONFIG_KEYS: Final = (
-    "created",
-    "command",
-    "preset",
-    "seeds",
-    "env_steps",
-    "spec",
-    "vehicle",
-    "agents",
-    "versions",
-    "machine",
-)
+CONFIG_KEYS: Final = ("created", "command", "preset", "seeds", "env_steps", "spec", "vehicle",
+                      "agents", "versions", "machine")  # fmt: skip
 
 EPISODE_COLUMNS: Final[Mapping[str, str]] = {
     "agent": "str",
@@ -161,19 +134,13 @@ def step_schema(metric: str) -> "pa.Schema":
 
 
 def write_config(
-    folder: Path,
-    command: str,
-    spec: EnvSpec,
-    vehicle: str | None,
-    content: Mapping[str, Any],
+    folder: Path, command: str, spec: EnvSpec, vehicle: str | None, content: Mapping[str, Any]
 ) -> None:
     """Write `config.json`: the content, and versions and machine, on which the numbers depend too.
 
     Args:
         folder: Where to; a file that exists stays: a resumed run keeps its settings.
-        command: The user's command.
-        spec: Of the env.
-        vehicle: Path of the vehicle's file; None: the paper's.
+        command, spec, vehicle: The user's command; of the env; path of its file or None.
         content: Settings of the comparison or the sweep; with them all of `CONFIG_KEYS` are there.
     """
     path = folder / CONFIG_FILE
@@ -193,12 +160,8 @@ def write_config(
 
 def machine() -> dict[str, Any]:
     """Machine and software on which times depend."""
-    joblib = require("joblib", "train", "counting cores")
-    return {
-        "platform": platform.platform(),
-        "processor": platform.machine(),
-        "cores": joblib.cpu_count(),
-    }
+    cores = require("joblib", "train", "counting cores").cpu_count()
+    return {"platform": platform.platform(), "processor": platform.machine(), "cores": cores}
 
 
 def read_config(folder: Path | str) -> dict[str, Any]:
@@ -272,17 +235,16 @@ def join_parts(parts: Path, folder: Path, metric: str) -> None:
     shutil.rmtree(parts.rename(parts.with_name(f".{parts.name}")))
 
 
-def episode_row(episode: Any, num_envs: int, env_steps: int) -> dict[str, Any]:
+def episode_row(episode: Episode, num_envs: int, env_steps: int) -> dict[str, Any]:
     """A training episode as a row of `episodes.csv`, without agent and seed.
 
     Args:
-        episode: An `agents.episodes.Episode`.
+        episode: The episode.
         num_envs: Drones of the run. While one flies a step, each of the others does.
         env_steps: Of the run.
     """
     last = min(episode.first_step + episode.length * num_envs, env_steps)
-    row = {**asdict(episode), "return": episode.total_reward, "last_step": last}
-    return row | {"mean_size": episode.mean_size}
+    return {**asdict(episode), "return": episode.total_reward, "last_step": last}
 
 
 def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]:
@@ -309,12 +271,11 @@ def evaluation_steps(
     agent: str, seed: int, headline: Headline, trajectories: Sequence[Trajectory]
 ) -> "list[pa.Table]":
     """Every env step of evaluation trajectories."""
+    label = {"agent": agent, "seed": seed, "phase": "evaluation"}
     return [
         step_table(
             headline.name,
-            agent=agent,
-            seed=seed,
-            phase="evaluation",
+            **label,
             episode=np.full(len(one), one.episode),
             step=np.arange(1, len(one) + 1),
             value=one.values(headline.name)[1:],
@@ -397,18 +358,11 @@ def read_steps(
         raise ResultsError(f"{path} is not a Parquet file: {error}") from error
     whole = step_schema(metric)
     _check_names(path, "column", whole.names, dataset.schema.names)
-    keep = 1.0
-    if max_rows is not None:
-        keep = min(1.0, max_rows / max(1, pq.read_metadata(path).num_rows))
     names = [_in_file(column, metric) for column in columns]
-    schema = pa.schema([whole.field(name) for name in names])
-    rng = np.random.default_rng(0)
-    kept = []
-    for batch in dataset.to_batches(columns=names, filter=pads.field("phase") == phase):
-        if keep < 1.0:
-            batch = batch.filter(pa.array(rng.random(batch.num_rows) < keep))
-        kept.append(pa.Table.from_batches([batch]).cast(schema))
-    table = pa.concat_tables(kept) if kept else schema.empty_table()
+    table = dataset.to_table(columns=names, filter=pads.field("phase") == phase)
+    if max_rows is not None and max_rows < (count := pq.read_metadata(path).num_rows):
+        table = table.filter(np.random.default_rng(0).random(len(table)) < max_rows / count)
+    table = table.cast(pa.schema([whole.field(name) for name in names]))
     frame: pd.DataFrame = table.unify_dictionaries().to_pandas()
     return frame.rename(columns={metric: "value"})
 
@@ -421,8 +375,7 @@ def _existing(folder: Path | str, name: str) -> Path:
 
 
 def _check_names(path: Path, kind: str, wanted: Iterable[str], present: Iterable[str]) -> None:
-    missing = [name for name in wanted if name not in set(present)]
-    if missing:
+    if missing := [name for name in wanted if name not in set(present)]:
         raise ResultsError(
             f"{path} lacks the {kind}{'s' if len(missing) > 1 else ''} {', '.join(missing)}; "
             f"it has {', '.join(present) or 'none'}"
@@ -434,8 +387,7 @@ def _read_csv(folder: Path | str, name: str, metric: str) -> "pd.DataFrame":
     columns = _TABLES[name]
     types = {_in_file(column, metric): kind for column, kind in columns.items()}
     try:
-        present = list(pd.read_csv(path, nrows=0).columns)
-        _check_names(path, "column", types, present)
+        _check_names(path, "column", types, list(pd.read_csv(path, nrows=0).columns))
         frame = pd.read_csv(path, usecols=list(types), dtype=dict(types))[list(types)]
     except ResultsError:
         raise

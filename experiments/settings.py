@@ -40,6 +40,11 @@ class EnvConfig:
         object.__setattr__(self, "options", json.loads(json.dumps(options)))
 
     @property
+    def env(self) -> dict[str, Any]:
+        """Keyword arguments of `EnvConfig` and `pairs.socket_pair`."""
+        return {"env_id": self.env_id, "options": self.options, "vehicle": self.vehicle}
+
+    @property
     def module(self) -> str | None:
         """Module that another process must import to know the task; None for ours."""
         if not is_known(self.env_id):
@@ -74,11 +79,6 @@ class Run(EnvConfig):
         if self.env_steps < least:
             raise InputError(f"env_steps: expected at least {least}, got {self.env_steps}")
 
-    @property
-    def env(self) -> dict[str, Any]:
-        """Keyword arguments of `EnvConfig` and `pairs.socket_pair`."""
-        return {"env_id": self.env_id, "options": self.options, "vehicle": self.vehicle}
-
 
 @dataclass(frozen=True, kw_only=True)
 class WorkersConfig:
@@ -108,7 +108,7 @@ class _ManyRuns(WorkersConfig, EnvConfig):
     preset: str = "tuned"
     """`paper` or `tuned`."""
     seeds: int = 5
-    """How many seeds, the same for every agent or point."""
+    """Number of seeds, the same for every agent or point."""
     first_seed: int = 0
     """The first of them."""
     env_steps: int = 200_000
@@ -133,14 +133,27 @@ class _ManyRuns(WorkersConfig, EnvConfig):
                 raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
 
     @property
-    def env(self) -> dict[str, Any]:
-        """Keyword arguments of `EnvConfig` and `pairs.socket_pair`."""
-        return {"env_id": self.env_id, "options": self.options, "vehicle": self.vehicle}
-
-    @property
     def all_seeds(self) -> range:
         """The seeds."""
         return range(self.first_seed, self.first_seed + self.seeds)
+
+    def content(self, *algorithms: str) -> dict[str, Any]:
+        """What `config.json` has of it, but for the env; `read_content` reads it."""
+        return {
+            "preset": self.preset,
+            "seeds": list(self.all_seeds),
+            "env_steps": self.env_steps,
+            "num_envs": self.num_envs,
+            "agents": {name: asdict(preset(name, self.preset)) for name in algorithms},
+        }
+
+    @staticmethod
+    def read_content(content: Mapping[str, Any]) -> dict[str, Any]:
+        """The settings that all have, from the content of a `config.json`."""
+        kept = {name: content[name] for name in ("preset", "env_steps", "num_envs", "vehicle")}
+        seeds, spec = content["seeds"], content["spec"]
+        kept |= {"env_id": spec["env_id"], "options": spec["options"]}
+        return kept | {"seeds": len(seeds), "first_seed": seeds[0]}
 
     def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:
         return Run(
@@ -237,9 +250,7 @@ class SweepConfig(_ManyRuns):
         """
         return [
             SweepRun(
-                point=point,
-                settings=settings,
-                run=self._run(self.algorithm, seed, **settings),
+                point=point, settings=settings, run=self._run(self.algorithm, seed, **settings)
             )
             for seed in self.all_seeds
             for point, settings in enumerate(self.points())

@@ -10,14 +10,12 @@ A folder holds three files, all of them whole at any moment:
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ..agents import preset
 from ..agents.checkpoints import write_whole
 from ..agents.policies import NetworkPolicy
 from ..envs.registry import env_spec
@@ -39,19 +37,8 @@ if TYPE_CHECKING:
 else:
     pd = require("pandas", "train", "a sweep")
 
-__all__ = [
-    "RUN_COLUMNS",
-    "SWEEP_FILE",
-    "SweepConfig",
-    "SweepRun",
-    "is_sweep",
-    "missing_runs",
-    "read_sweep_config",
-    "read_sweep_runs",
-    "sweep",
-    "sweep_table",
-    "write_sweep_table",
-]
+__all__ = ["SWEEP_FILE", "is_sweep", "missing_runs", "read_sweep_config", "read_sweep_runs",
+           "sweep", "sweep_table", "write_sweep_table"]  # fmt: skip
 
 SWEEP_FILE: Final = "sweep.csv"
 
@@ -76,21 +63,13 @@ def sweep(config: SweepConfig, folder: Path, command: str, on_progress: OnProgre
     A sweep that was interrupted, or of which a run failed, goes on where it was: call it again with
     the same folder (and the config of `read_sweep_config`).
 
-    Args:
-        config: Settings of the sweep.
-        folder: One that exists, and no other process writes to: see `folders.new_folder`.
-        command: The user's command, for `config.json`.
-        on_progress: Told how far it is.
-
-    Raises:
-        RunsFailed: Some runs failed; the rows of the others are written.
-        InputError: The env names no metric, another process writes to the folder, or there is no
-            such Ray cluster; nothing is written.
+    Arguments and errors are those of `compare.compare`.
     """
     spec = env_spec(**config.env)
     Headline.of(spec)
     with open_workers(config, on_progress) as workers, locked(folder):
-        content = _content(config)
+        content = config.content(config.algorithm)
+        content["sweep"] = {"grid": dict(config.grid), "episodes": config.episodes}
         write_config(folder, command, spec, config.vehicle, content)
         done = read_sweep_runs(folder, config)
         rows = done.to_dict("records")
@@ -105,12 +84,7 @@ def sweep(config: SweepConfig, folder: Path, command: str, on_progress: OnProgre
 
 
 def missing_runs(config: SweepConfig, rows: pd.DataFrame) -> list[SweepRun]:
-    """The runs that are not done.
-
-    Args:
-        config: Of the sweep.
-        rows: As of `read_sweep_runs`.
-    """
+    """The runs that are not among the rows of `read_sweep_runs`."""
     done = set(zip(rows["point"], rows["seed"], strict=True))
     return [job for job in config.runs() if (job.point, job.run.seed) not in done]
 
@@ -137,11 +111,6 @@ def sweep_table(config: SweepConfig, rows: pd.DataFrame, headline: Headline) -> 
     A point is as good as its worst seed: first by the crashed episodes of the seed that crashed
     most, then by the worst steady state. Points that lack a seed stand last, for the worst of fewer
     seeds flatters.
-
-    Args:
-        config: Of the sweep.
-        rows: As of `read_sweep_runs`.
-        headline: The metric that decides.
 
     Returns:
         `point` and its settings; `seeds` that are done; `worst` and `median` steady state over
@@ -202,34 +171,15 @@ def read_sweep_config(folder: Path) -> SweepConfig:
     """Settings of a sweep, from its `config.json`. Raises `ResultsError`."""
     content = read_config(folder)
     try:
-        settings = content["sweep"]
         (algorithm,) = content["agents"]
         return SweepConfig(
             algorithm=algorithm,
-            grid={name: tuple(values) for name, values in settings["grid"].items()},
-            preset=content["preset"],
-            seeds=len(content["seeds"]),
-            first_seed=content["seeds"][0],
-            env_steps=content["env_steps"],
-            num_envs=content["num_envs"],
-            episodes=settings["episodes"],
-            env_id=content["spec"]["env_id"],
-            options=content["spec"]["options"],
-            vehicle=content["vehicle"],
+            grid={name: tuple(values) for name, values in content["sweep"]["grid"].items()},
+            episodes=content["sweep"]["episodes"],
+            **SweepConfig.read_content(content),
         )
     except (AttributeError, KeyError, IndexError, TypeError, ValueError) as error:
         raise ResultsError(f"{folder / CONFIG_FILE}: expected a sweep's: {error!r}") from None
-
-
-def _content(config: SweepConfig) -> dict[str, Any]:
-    return {
-        "preset": config.preset,
-        "seeds": list(config.all_seeds),
-        "env_steps": config.env_steps,
-        "num_envs": config.num_envs,
-        "agents": {config.algorithm: asdict(preset(config.algorithm, config.preset))},
-        "sweep": {"grid": dict(config.grid), "episodes": config.episodes},
-    }
 
 
 def _with_settings(table: pd.DataFrame, config: SweepConfig) -> pd.DataFrame:

@@ -15,17 +15,8 @@ from .palette import agent_label
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = [
-    "NOTHING",
-    "Cell",
-    "count_text",
-    "headings",
-    "markdown_table",
-    "number_text",
-    "result_rows",
-    "table_note",
-    "terminal_table",
-]
+__all__ = ["NOTHING", "Cell", "count_text", "headings", "markdown_table", "number_text",
+           "result_rows", "table_note", "terminal_table"]  # fmt: skip
 
 NOTHING: Final = "–"
 """Shown where there is no value."""
@@ -187,16 +178,11 @@ def markdown_table(table: "pd.DataFrame", headline: Headline) -> str:
     """Make a Markdown table from `metrics.results_table`, with its note below."""
     titles = headings(headline)
     lines = [titles, ("---", *["---:"] * (len(titles) - 1))]
-    for row in result_rows(table):
-        lines.append(tuple(_markdown_cell(cell) for cell in row))
-    text = "".join(f"| {' | '.join(cells)} |\n" for cells in _escape_bars(lines))
-    return f"{text}\n{table_note(headline)}\n"
+    lines += [tuple(map(_markdown_cell, row)) for row in result_rows(table)]
+    # |E| in a cell would end the cell.
+    text = ["".join(f"| {cell.replace('|', chr(92) + '|')} " for cell in line) for line in lines]
+    return "".join(f"{line}|\n" for line in text) + f"\n{table_note(headline)}\n"
 
 
 def _markdown_cell(cell: Cell) -> str:
     return f"{cell.value} ({'; '.join(cell.details)})" if cell.details else cell.value
-
-
-def _escape_bars(lines: list[tuple[str, ...]]) -> list[list[str]]:
-    # |E| in a cell would end the cell.
-    return [[cell.replace("|", r"\|") for cell in line] for line in lines]

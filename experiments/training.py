@@ -1,6 +1,6 @@
 """One training run: an agent, an env, a seed; with snapshots, checkpoints and a way to stop."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,9 +8,16 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from ..agents import A2CConfig, make_agent, preset
-from ..agents.checkpoints import Checkpoint, CheckpointError, store
-from ..agents.episodes import EpisodeLog, ResumeError
+from ..agents import (
+    A2CConfig,
+    Checkpoint,
+    CheckpointError,
+    EpisodeLog,
+    make_agent,
+    preset,
+    resume_agent,
+    store,
+)
 from ..envs.autoreset import AdvancingVectorEnv
 from ..models.errors import InputError, require
 from .progress import Progress, ProgressSender
@@ -18,6 +25,8 @@ from .settings import Run
 
 if TYPE_CHECKING:
     import torch
+
+    from ..agents.learner import Agent
 else:
     torch = require("torch", "train", "training")
 
@@ -66,6 +75,9 @@ class Training:
     keep_steps: bool = False
     taken: list[Snapshot] = field(default_factory=list)
 
+    kept: Checkpoint | None = None
+    """What to go on from; its run is `run`."""
+
     def __post_init__(self) -> None:
         # Networks of 16 units: a second thread costs more than it brings.
         torch.set_num_threads(1)
@@ -73,17 +85,15 @@ class Training:
         if drones != self.run.num_envs:
             raise InputError(f"env: expected one of {self.run.num_envs} drones, got {drones}")
         self.log = EpisodeLog(self.env, self.run.seed, keep_steps=self.keep_steps)
-        self.agent = make_agent(self.run.algorithm, self.log, self.run.config, self.run.seed)
+        self.agent: Agent = (
+            resume_agent(self.kept, self.log)
+            if self.kept
+            else make_agent(self.run.algorithm, self.log, self.run.config, self.run.seed)
+        )
 
     @classmethod
     def resume(cls, kept: Checkpoint, env: AnyEnv) -> "Training":
-        """Go on from a checkpoint.
-
-        Raises:
-            CheckpointError: The checkpoint's parts do not fit together.
-            ResumeError: The env does not repeat the episode that was interrupted, or flies another
-                vehicle.
-        """
+        """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
         try:
             run = Run(
                 algorithm=kept.algorithm,
@@ -94,19 +104,9 @@ class Training:
                 env_steps=kept.env_steps,
                 num_envs=kept.num_envs,
             )
-            training = cls(run, env)
-            training.agent.set_state(kept.state)
-        except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
-            reason = " ".join(f"{error!r:.300}".split())
-            raise CheckpointError(f"checkpoint: its parts do not fit together: {reason}") from None
-        flown = training.log.spec.vehicle_hash
-        if flown != kept.vehicle_hash:
-            raise ResumeError(
-                f"resume: expected a simulator of the vehicle {kept.vehicle_hash}, "
-                f"got one of {flown}"
-            )
-        training.log.resume(kept.position)
-        return training
+        except (InputError, TypeError, ValueError) as error:
+            raise CheckpointError(f"checkpoint: its parts do not fit together: {error}") from None
+        return cls(run, env, kept=kept)
 
     def train(self, on_update: Callable[[], bool] = lambda: True) -> bool:
         """Train to the end, or until `on_update` returns False. Whether the end was reached."""
@@ -132,8 +132,8 @@ class Training:
             env_steps=self.log.env_steps,
             total=self.run.env_steps,
             seconds=self.log.seconds,
-            mean_return=float(np.mean([e.total_reward for e in recent])) if recent else np.nan,
-            mean_size=float(np.mean([e.mean_size for e in recent])) if recent else np.nan,
+            mean_return=_mean(e.total_reward for e in recent),
+            mean_size=_mean(e.mean_size for e in recent),
             symbol=(headline.symbol or headline.name) if headline else "",
             unit=headline.unit if headline else "",
         )
@@ -150,10 +150,10 @@ class Training:
             "time/fps": log.env_steps / log.seconds if log.seconds else np.nan,
             **self.agent.scalars(),
         }
-        if recent := log.episodes[-max(_WINDOW, self.run.num_envs) :]:
-            numbers["rollout/ep_rew_mean"] = float(np.mean([e.total_reward for e in recent]))
-            numbers["rollout/ep_len_mean"] = float(np.mean([e.length for e in recent]))
-            numbers["rollout/ep_error_mean"] = float(np.mean([e.mean_size for e in recent]))
+        recent = log.episodes[-max(_WINDOW, self.run.num_envs) :]
+        numbers["rollout/ep_rew_mean"] = _mean(e.total_reward for e in recent)
+        numbers["rollout/ep_len_mean"] = _mean(e.length for e in recent)
+        numbers["rollout/ep_error_mean"] = _mean(e.mean_size for e in recent)
         if (statistics := getattr(self.env, "statistics", None)) is not None:
             numbers |= {f"wire/{name}": value for name, value in statistics.numbers().items()}
         return {name: value for name, value in numbers.items() if np.isfinite(value)}
@@ -179,27 +179,21 @@ class Training:
         return self.log.env_steps * self.snapshots >= len(self.taken) * self.run.env_steps
 
     def _take(self) -> None:
-        self.taken.append(
-            Snapshot(
-                env_steps=self.log.env_steps, seconds=self.log.seconds, actor=self.agent.actor()
-            )
-        )
+        log = self.log
+        taken = Snapshot(env_steps=log.env_steps, seconds=log.seconds, actor=self.agent.actor())
+        self.taken.append(taken)
+
+
+def _mean(numbers: Iterable[float]) -> float:
+    """NaN of none."""
+    kept = list(numbers)
+    return float(np.mean(kept)) if kept else np.nan
 
 
 def train_run(
-    run: Run,
-    env: AnyEnv,
-    progress: ProgressSender,
-    snapshots: int = 0,
-    keep_steps: bool = False,
+    run: Run, env: AnyEnv, progress: ProgressSender, snapshots: int = 0, keep_steps: bool = False
 ) -> tuple[Training, dict[str, Any]]:
-    """Train to the end, as comparisons and sweeps do.
-
-    Args:
-        run: Settings of the training.
-        env: Of as many drones as the run has.
-        progress: Told how far it is.
-        snapshots, keep_steps: As of `Training`.
+    """Train to the end, and tell the progress, as comparisons and sweeps do.
 
     Returns:
         The training, and how long it took: `env_steps`, `seconds` and `steps_per_second`.
@@ -211,10 +205,7 @@ def train_run(
         return True
 
     training.train(on_update)
-    env_steps, seconds = training.log.env_steps, training.log.seconds
+    steps, seconds = training.log.env_steps, training.log.seconds
     progress(run.env_steps, run.env_steps, "evaluating")
-    return training, {
-        "env_steps": env_steps,
-        "seconds": seconds,
-        "steps_per_second": env_steps / seconds,
-    }
+    times = {"env_steps": steps, "seconds": seconds, "steps_per_second": steps / seconds}
+    return training, times

@@ -15,16 +15,8 @@ from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.spec import Discrete, EnvSpec, component_names
 from ..models.errors import InputError
 
-__all__ = [
-    "Ending",
-    "EpisodeSet",
-    "Trajectory",
-    "evaluation_seed",
-    "flown_trajectories",
-    "fly",
-    "fly_episodes",
-    "recorded_trajectories",
-]
+__all__ = ["Ending", "EpisodeSet", "Trajectory", "evaluation_seed", "flown_trajectories", "fly",
+           "fly_episodes", "recorded_trajectories"]  # fmt: skip
 
 _EVALUATION: Final = 20230324  # the day the paper appeared
 
@@ -171,7 +163,7 @@ def fly_episodes(
 
     Args:
         env: Of one drone, or a vector env without autoreset.
-        policy: What flies. Every drone of a vector env gets a copy.
+        policy: Chooses the actions. Every drone of a vector env gets a copy.
         episodes: How many.
         of: Which.
     """
@@ -250,7 +242,7 @@ def flown_trajectories(
     """Evaluation episodes by number, flown in process without exploration.
 
     Args:
-        policy: What flies; None draws actions at random, the same for the same episode.
+        policy: Chooses the actions; None draws actions at random, the same for the same episode.
         env_id: A registered env.
         options: Of the env.
         episodes: Their numbers.
@@ -275,7 +267,7 @@ def recorded_trajectories(
     """Episodes of one drone of one session of a journal.
 
     Args:
-        path: What `--record` wrote; cut off by a crash it is read up to the cut.
+        path: Journal of `--record`; one that a crash cut off is read up to the cut.
         episodes: Their numbers; None for all. They count, from 0, the episodes of which a step is
             recorded, those that were given up and one that the journal's end cut off among them.
         session: As `rotorgram replay` counts them, from 1. None: the first with a step in it.

@@ -56,7 +56,7 @@ class Surface(Protocol):
     """A window or a page on which a stage is drawn."""
 
     where: str
-    """Where to look, for a sentence."""
+    """Place to look at, for a sentence."""
 
     def show(self, lines: Lines) -> None:
         """Draw the stage as it is now, with these lines over it."""

@@ -47,7 +47,7 @@ class Moment:
     thrusts: tuple[float, ...]
     """F1 to FR, N."""
     goal: Vector | None = None
-    """Where the craft should be, X, Y, Z, m; None if the task has no such place."""
+    """Position to reach or hold, X, Y, Z, m; None if the task has no goal."""
     metrics: tuple[MetricValue, ...] = ()
     """The headline first."""
     reward: float = 0.0

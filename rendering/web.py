@@ -35,7 +35,7 @@ _KEYS: Final[tuple[tuple[Any, Press], ...]] = (
     (imgui.Key.KeypadAdd, "faster"),
 )
 _COLUMN: Final = 90.0
-"""Where values begin, in pixels of the panel."""
+"""Left edge of values, in pixels of the panel."""
 
 
 def refusal(host: str | None, origin: str | None) -> str | None:

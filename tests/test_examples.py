@@ -10,7 +10,7 @@ import pytest
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SHORT = {
-    "fly_pid.py": ([], r"return 1\d\d\.\d, elevation 6\.000 m of 6\.0 m"),
+    "fly_pid.py": ([], r"return 2\d\d\.\d, elevation 6\.000 m of 6\.0 m"),
     "ppo_loop.py": (["--updates", "2"], r"update 2: 4,096 steps, return -?\d+\.\d"),
     "record_replay_render.py": ([], r"identical: \d+ States[^|]*film: flight\.mp4"),
     "sb3_ppo.py": (["--env-steps", "2048"], r"return -?\d+\.\d ± \d+\.\d of at most 250"),

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -307,3 +307,12 @@ def test_wrong_films_are_one_sentence(tmp_path: Path) -> None:
     for shots in ([], [shot()], [shot(trajectory(5.0)), shot(trajectory(5.0), trajectory(5.0))]):
         with pytest.raises(InputError, match="shots: expected one or more"):
             film(tmp_path / "film.gif", shots, FAST)
+
+
+def test_a_film_without_end_is_refused(tmp_path: Path) -> None:
+    """A peer may name a control period of days; the film would hold millions of frames."""
+    flown = trajectory(5.0, 5.0)
+    slow = replace(flown, spec=replace(flown.spec, control_period=1e6))
+    with pytest.raises(InputError, match="film: expected at most 1,000,000 frames, got 25,000,000"):
+        film(tmp_path / "film.gif", [shot(slow)], FAST)
+    assert not list(tmp_path.iterdir())

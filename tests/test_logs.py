@@ -7,7 +7,6 @@ import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -15,25 +14,24 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from gymnasium import spaces
 from rich.console import Console
 from rotorgram.agents import A2CConfig, VPGConfig, make_agent, preset
 from rotorgram.agents.a2c import A2C
 from rotorgram.agents.checkpoints import load
 from rotorgram.agents.episodes import EpisodeLog
-from rotorgram.agents.rollouts import Rollout
+from rotorgram.agents.sb3 import SB3VecEnv
 from rotorgram.agents.vpg import VPG
 from rotorgram.cli import main
-from rotorgram.cli.progress import Bars, Lines
-from rotorgram.cli.scalars import ScalarWriter
+from rotorgram.cli._progress import Bars, Lines
+from rotorgram.cli._scalars import ScalarWriter
 from rotorgram.experiments.settings import Run
 from rotorgram.experiments.training import Training
 from stable_baselines3 import A2C as PlainA2C
 from stable_baselines3.common.logger import KVWriter, Logger
-from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecMonitor
 from tensorboard.backend.event_processing import plugin_event_accumulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_learning import Recorder, copy_weights
+from test_learning import Recorder, copy_weights, log_of, rollout
 
 DOCS = Path(__file__).parent.parent / "docs" / "algorithms"
 AGENTS = ["vpg", "a2c", "sb3-a2c"]
@@ -110,7 +108,7 @@ def test_sb3_logs_the_same_under_the_same_names() -> None:
         env_steps=2400,
     )  # fmt: skip
     training = Training(run, elevation(episode_length=12))
-    model = PlainA2C("MlpPolicy", Monitor(training.log), n_steps=40, device="cpu")  # type: ignore[arg-type]
+    model = PlainA2C("MlpPolicy", VecMonitor(SB3VecEnv(training.log)), n_steps=40, device="cpu")
     capture = Capture(training)
     model.set_logger(Logger(folder=None, output_formats=[capture]))
     training.log.start_clock()
@@ -170,7 +168,7 @@ def test_the_values_by_hand(
     assert not (tmp_path / "sb3").exists(), "SB3 is to write nothing"
     table = pd.read_csv(folder / "episodes.csv")
     assert len(table) > 150, "more than a window"
-    columns = {"rew": "total_reward", "len": "length", "error": "mean_abs_error"}
+    columns = {"rew": "total_reward", "len": "length", "error": "mean_size"}
     for short, column in columns.items():
         for step, value in logged[f"rollout/ep_{short}_mean"]:
             ended = table[table.first_step + table.length <= step]
@@ -197,17 +195,14 @@ def test_the_entropy_is_that_of_the_deviation_before_the_update(
         assert loss == pytest.approx(-(ENTROPY_OF_ONE + math.log(deviation)), rel=1e-5)
 
 
-SPACES: Any = SimpleNamespace(
-    observation_space=spaces.Box(-9, 9, (1,), np.float32),
-    action_space=spaces.Box(-1, 1, (1,), np.float32),
-)
-TWO_STEPS = Rollout(
+TWO_STEPS = rollout(
     observations=np.array([[1.0], [1.5]], np.float32),
     actions=np.array([[0.3], [2.0]], np.float32),
     rewards=np.array([1.0, 2.0]),
     next_observations=np.array([[5.0], [5.0]], np.float32),
     terminated=np.array([True, True]),
     truncated=np.array([False, False]),
+    kept=np.array([True, True]),
 )
 LOG_P = [-0.045 - 0.9189385, -2.0 - 0.9189385]  # of the actions, of mean 0 and deviation 1
 
@@ -220,7 +215,7 @@ def fill(network: torch.nn.Module, value: float) -> None:
 
 def test_the_terms_of_a2c_by_hand() -> None:
     """V is the observation, so A = (1 - 1, 2 - 1.5)."""
-    agent = A2C(SPACES, A2CConfig(hidden=1, log_std=0.0, entropy_weight=0.1), 0)
+    agent = A2C(log_of(), A2CConfig(hidden=1, log_std=0.0, ent_coef=0.1), 0)
     fill(agent.networks["actor"], 0.0)
     fill(agent.networks["critic"], 1.0)
     loss = float(agent.loss(TWO_STEPS).detach())
@@ -235,7 +230,7 @@ def test_the_terms_of_a2c_by_hand() -> None:
 
 
 def test_the_terms_of_vpg_by_hand() -> None:
-    agent = VPG(SPACES, VPGConfig(hidden=1, log_std=0.0), 0)
+    agent = VPG(log_of(), VPGConfig(hidden=1, log_std=0.0), 0)
     fill(agent.networks["actor"], 0.0)
     loss = float(agent.loss(TWO_STEPS).detach())
     logged = agent.scalars()
@@ -246,7 +241,7 @@ def test_the_terms_of_vpg_by_hand() -> None:
 
 def test_ours_logs_what_sb3_logs_of_the_same_updates() -> None:
     """SB3 flies; ours, from the same weights, is given the same experience."""
-    config = A2CConfig(steps_per_update=64, trace=0.95, learning_rate=0.01, normalize=True)
+    config = A2CConfig(steps_per_update=64, gae_lambda=0.95, learning_rate=0.01, normalize=True)
     recorder = Recorder(elevation(episode_length=40))
     log = EpisodeLog(recorder, seed=0)
     theirs: Any = make_agent("sb3-a2c", log, config, 0)
@@ -264,10 +259,10 @@ def test_ours_logs_what_sb3_logs_of_the_same_updates() -> None:
     def follow() -> bool:
         after, rewards, terminated, truncated, _ = zip(*recorder.results, strict=True)
         recorder.results.clear()
-        data = Rollout(
+        data = rollout(
             observations=seen[0], actions=seen[1], rewards=np.array(rewards),
             next_observations=np.array(after), terminated=np.array(terminated),
-            truncated=np.array(truncated),
+            truncated=np.array(truncated), kept=np.ones(len(rewards), bool),
         )  # fmt: skip
         ours._optimizer.zero_grad()
         ours.loss(data).backward()

@@ -1,6 +1,7 @@
 """Vehicles from other MJCF files fly every task; tests/test_model.py has what is derived."""
 
 import math
+import re
 import struct
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from rotorgram.cli import main
 from rotorgram.envs import Loop
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
@@ -187,3 +189,20 @@ def test_a_period_that_does_not_fit_the_files_step(files: dict[str, Path]) -> No
     gym.make(ELEVATION, vehicle=files["unequal"], control_period=0.005)
     with pytest.raises(InputError, match=r"^control_period: .* physics step of 0.01 s, got 0.005"):
         gym.make(ELEVATION, vehicle=files["included"], control_period=0.005)
+
+
+def test_a_policy_flies_another_vehicle_only_if_the_user_names_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small, run = ("--vehicle", str(DATA / "small.xml")), str(tmp_path / "run")
+    task = ("--env", HOVER, "--num-envs", "4", "--env-steps", "256")
+    assert main(["train", "a2c", *task, *small, "--out", run]) == 0
+    assert main(["evaluate", run, "--episodes", "1", *small]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", run, "--episodes", "1"]) == 1
+    assert re.search(
+        r"vehicle: expected small .* on which the policy was trained, got rotorgram quadcopter",
+        capsys.readouterr().err,
+    )
+    paper = str(Vehicle.load().path)
+    assert main(["evaluate", run, "--episodes", "1", "--vehicle", paper]) == 0

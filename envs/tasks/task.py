@@ -10,14 +10,17 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from numbers import Real
-from typing import Any, ClassVar, Final, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 import numpy as np
 
+from ...models import MOST_DRAG
 from ...models.errors import InputError
-from ...models.vehicle import MOST_DRAG, Vehicle
 from ...sim import Array, Controller, Draw, Pose, WorldState
 from ..spec import ArraySpec, Metric
+
+if TYPE_CHECKING:
+    from ...models.vehicle import Vehicle
 
 __all__ = ["Outcome", "Task", "TaskOptions", "check_choice", "check_number", "finite"]
 
@@ -70,7 +73,7 @@ class TaskOptions:
 
 @dataclass(kw_only=True, slots=True)
 class Outcome:
-    """What a control step led to."""
+    """Result of a control step."""
 
     reward: dict[str, Array]
     """Terms by name, each of shape (W, A); their sum is the reward."""
@@ -107,7 +110,7 @@ class Task:
     observation: tuple[ArraySpec, ...]
 
     def __init__(
-        self, options: Any, vehicle: Vehicle, shape: tuple[int, ...] = (), xp: Any = np
+        self, options: Any, vehicle: "Vehicle", shape: tuple[int, ...] = (), xp: Any = np
     ) -> None:
         self.options = options
         self.vehicle = vehicle
@@ -118,8 +121,8 @@ class Task:
     def setup(self) -> None:
         """Set `controller` and `observation`, from `options` and `vehicle`.
 
-        What an episode has to remember begins here too, as a number: `self.target = 0.0`. An option
-        that does not go with the vehicle raises `InputError`.
+        Also set initial values of an episode's memory, as numbers: `self.target = 0.0`. Raise
+        `InputError` for an option that does not fit the vehicle.
         """
         raise NotImplementedError
 

@@ -63,7 +63,7 @@ class Check:
     unit: str
     """Unit of the three numbers; empty for pure numbers."""
     source: str
-    """Where the expected value comes from."""
+    """Source of the expected value."""
     tolerance: float = EXACT
     """Largest difference that passes."""
 
@@ -106,7 +106,7 @@ class RigidBody:
         return float(data.qvel[3:] @ self.inertia @ data.qvel[3:]) / 2
 
     def place(self, data: Any) -> Array:
-        """Where the centre of mass is, world frame, (3,), m."""
+        """Position of the centre of mass, world frame, (3,), m."""
         return np.array(data.qpos[:3]) + _turned(data, self.center_of_mass)
 
     def velocity(self, data: Any) -> Array:

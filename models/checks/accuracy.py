@@ -55,7 +55,7 @@ class Accuracy:
     attitude_deg: float
     """Angle between the attitude reached and the converged one, degrees."""
     sinks_mm: float
-    """How deep a drop from 1 m sinks into the floor, mm."""
+    """Depth to which a drop from 1 m sinks into the floor, mm."""
     cost_us: float
     """Wall time of a simulated second of tumbling flight, µs: the machine's, not the model's."""
 
@@ -138,7 +138,7 @@ def _tumble(
 
 
 def _sinks(vehicle: Vehicle, integrator: str, step: float) -> float:
-    """How far below its height of rest a drop from 1 m takes the craft, m."""
+    """Largest depth of the craft below its height of rest after a drop from 1 m, m."""
     model, data = _start(vehicle, integrator, step, vehicle.rest_height + 1.0)
     lowest = vehicle.rest_height
     for _ in range(round(1.5 / step)):

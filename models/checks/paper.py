@@ -1,8 +1,7 @@
-"""What the paper's vehicle must show beside mechanics: the paper's numbers, and ours where it
-gives none.
+"""Checks of the paper's vehicle beside mechanics: the paper's numbers, or ours if it gives none.
 
-The paper says what `constants` holds. Its drone has a mass "concentrated in the centre", which no
-body has that can be turned: the parts below are ours, as are numbering and reaction of the rotors.
+`constants` has the numbers of the paper. Its drone has a mass "concentrated in the centre", so it
+would have no inertia: the parts below are ours, as are numbering and reaction of the rotors.
 """
 
 import math

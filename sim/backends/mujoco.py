@@ -4,6 +4,7 @@
 of threads.
 """
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -45,13 +46,13 @@ class MujocoWorld:
     xp: Any = np
 
     def __init__(self, vehicle: Vehicle, num_worlds: int, num_threads: int = 0) -> None:
-        _switch_off_log_file()
         self.vehicle = vehicle
         self.shape: tuple[int, ...] = (num_worlds, 1) if num_worlds > 1 else ()
         self._streams = Streams(num_worlds)
         self._check = contact_check(vehicle.timestep)
         threads = 1 if num_worlds == 1 else num_threads
         self._batch = batch = Batch(vehicle.model, num_worlds, threads)
+        self._owner = None if threads == 1 else os.getpid()
         # Live views of simulator memory, made once.
         qpos: np.ndarray = batch.bind("qpos")
         qvel: np.ndarray = batch.bind("qvel")
@@ -77,6 +78,7 @@ class MujocoWorld:
 
     def reset(self, mask: Array, pose: Pose) -> None:
         """As `World.reset`."""
+        self._check_process()
         ids = self._ids(mask)
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         state, here = self.state, () if self.shape == () else ids
@@ -95,6 +97,7 @@ class MujocoWorld:
 
     def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
         """As `World.step`."""
+        self._check_process()
         ids = None if mask is None else self._ids(mask)
         here = ... if ids is None or self.shape == () else ids
         self.state.thrust[here] = thrust[here]
@@ -125,6 +128,10 @@ class MujocoWorld:
     def close(self) -> None:
         """Nothing to release but memory."""
 
+    def _check_process(self) -> None:
+        if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
+            raise RuntimeError("the threads of an env do not follow into a fork: make another env")
+
     def _ids(self, mask: Array) -> np.ndarray:
         """Numbers of the worlds of a mask of the leading shape, or of shape (W,)."""
         return np.flatnonzero(mask)
@@ -144,11 +151,3 @@ class MujocoWorld:
 def _warning_names(counts: Iterable[int]) -> list[str]:
     """MuJoCo's names of the warnings whose counts are not 0."""
     return [mujoco.mjtWarning(i).name for i, count in enumerate(counts) if count]
-
-
-def _switch_off_log_file() -> None:
-    """Keep MuJoCo from writing MUJOCO_LOG.TXT; a log file of another name stays on."""
-    config = mujoco.MjLogConfig.get()
-    if config.logto_file and config.logfile == "MUJOCO_LOG.TXT":
-        config.logto_file = False
-        config.set()

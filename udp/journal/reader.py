@@ -223,7 +223,7 @@ class SessionSummary:
     returns: float = 0.0
     """Sum of their returns."""
     ending: str = "not closed"
-    """How it was closed or refused, in words."""
+    """Reason of its Close or Refuse."""
 
     @property
     def seconds(self) -> float:

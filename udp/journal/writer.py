@@ -111,8 +111,8 @@ class Journal:
 
         Args:
             statistics: Those of the link. They are written every 10 s, and at the end.
-            slots: Who holds each slot of an agent; another holder is another session. Only the
-                text codec needs it, where all sessions have the same number.
+            slots: Sessions in the slots of an agent; another one in a slot is another session.
+                Only the text codec needs them: there all sessions have the same number.
 
         Raises:
             FileExistsError: The file exists.
@@ -178,7 +178,6 @@ class Journal:
             return
         now = time.time_ns()
         try:
-            self._file.encode()
             # Clocks are set back at times.
             if self._size > _CHUNK or not 0 <= now - self._flushed < _SECOND:
                 self._flush(now)

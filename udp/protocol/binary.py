@@ -1,49 +1,7 @@
 """The binary codec: messages to bytes and back, as pure functions. Little-endian throughout.
 
-Every message, and every fragment of one, begins with 24 bytes:
-
-    0   2 bytes  magic a7 52
-    2   u8       version: 2. A Hello is written in the lowest version that its simulator speaks
-    3   u8       type; plus 128 in a fragment: see `fragments`
-    4   u32      CRC-32 (zlib, PNG) of bytes 0-3 followed by bytes 8-end
-    8   u64      session
-    16  u64      sequence number; 0 in Hello, Welcome, Refuse and Wait
-
-    Hello 1, simulator to agent       24  u8   lowest version that it speaks
-                                      25  u8   highest
-                                      26  2 bytes reserved
-                                      28  u32  number of worlds W
-                                      32  u32  bytes of the spec L
-                                      36  4 bytes reserved
-                                      40  L bytes: the EnvSpec, JSON in UTF-8
-                                      40 + L   extensions, to the end
-    Welcome 2, agent to simulator     24  u64  nonce
-                                      32  u64  seed of the simulator's first reset
-                                      40  u8   1 if there is a seed, else 0
-                                      41  u8   version of all that follows
-                                      42  6 bytes reserved
-                                      48       extensions, to the end
-    Refuse 3, agent to simulator      24  u16 and so many bytes of UTF-8: reason
-    State 4, simulator to agent       24  f64  simulated time, s
-                                      32  u64  nonce of the Welcome in State 1; else 0
-                                      40       arrays: see `layout`
-    Command 5, agent to simulator     24  u32  number of seeds, 0 or N
-                                      28  4 bytes reserved
-                                      32       arrays: see `layout`
-    Close 6, either                   24  u16 and so many bytes of UTF-8: reason
-    Wait 7, agent to simulator        the header alone
-    Unknown 8, agent to simulator     the header alone; sequence number of the State it answers
-    Alive 9, simulator to agent       the header alone; sequence number of the Command
-    Missing 10, either                24  u8   type of the message: 1, 4 or 5
-                                      25  1 byte reserved
-                                      26  u16  number of its fragments
-                                      28  u16  fragment that bit 0 stands for
-                                      30       bitmap to the end, at least 1 byte, lowest bit first
-
-An extension is a u16 (bits 0-14 its type, bit 15 set if it is critical), a u16 length of at most
-512, and so many bytes. A side skips an extension that it does not know, and stops if that one is
-critical. Reserved bytes are sent as 0 and ignored. The header, the layout of a fragment, the first
-two fields of Hello and the whole of Refuse are those of every version.
+`docs/protocol.md` has every field of every message at its offset, and what a reader ignores: the
+constants and structs below follow it, and `tests/golden.py` writes the bytes that both must give.
 """
 
 import struct
@@ -56,7 +14,7 @@ import numpy as np
 
 from ...models.errors import InputError
 from .errors import DecodeError, VersionMismatch
-from .layout import COMMAND_ARRAYS_AT, MAX_MESSAGE, STATE_ARRAYS_AT, Layout, Slot
+from .layout import COMMAND_ARRAYS_AT, MAX_MESSAGE, Layout, Slot
 from .messages import (
     MAX_SPEC,
     MAX_TEXT,
@@ -90,8 +48,10 @@ __all__ = [
     "VERSION",
     "check",
     "decode",
+    "decode_due",
     "encode",
     "frame",
+    "numbers_of",
     "peek",
 ]
 
@@ -152,13 +112,14 @@ def encode(message: Message, layout: Layout | None = None) -> bytes:
     start, crc, encoder = _ENCODERS[kind]
     try:
         numbers = _NUMBERS.pack(message.session, getattr(message, "sequence", 0))
-        rest: bytes = numbers + encoder(message, layout)
+        rest = numbers + encoder(message, layout)
     except struct.error as error:
         raise InputError(f"{kind.__name__}: {error}") from None
     if len(rest) + 8 > MAX_MESSAGE:
         got = len(rest) + 8
         raise InputError(f"{kind.__name__}: expected at most {MAX_MESSAGE} bytes, got {got}")
-    return start + zlib.crc32(rest, crc).to_bytes(4, "little") + rest
+    data: bytes = start + zlib.crc32(rest, crc).to_bytes(4, "little") + rest
+    return data
 
 
 def frame(kind: int, session: int, sequence: int, body: bytes) -> bytes:
@@ -204,6 +165,37 @@ def decode(datagram: bytes, layout: Layout | None = None) -> Message:
         raise DecodeError(f"{decoder.__name__[8:]}: {error}") from None
 
 
+def decode_due(
+    kind: int, datagram: bytes, numbers: bytes, session: int, sequence: int, layout: Layout
+) -> Message | None:
+    """The message that is waited for, if this datagram is that one and whole.
+
+    The short way of a lock-step: only one header can come, so it is compared, not read. None
+    sends any other datagram, and one that is wrong, the way of `decode`, which tells why.
+
+    Args:
+        kind: Its type.
+        datagram: What came.
+        numbers: Bytes 8 to 23 of the message.
+        session, sequence: The same as numbers.
+        layout: That of the Hello.
+    """
+    start, crc = _STARTS[kind]
+    if datagram[:4] != start or datagram[8:24] != numbers:
+        return None
+    if zlib.crc32(datagram[8:], crc) != int.from_bytes(datagram[4:8], "little"):
+        return None
+    try:
+        return _DECODERS[kind](datagram, session, sequence, layout)
+    except (ValueError, struct.error):
+        return None
+
+
+def numbers_of(session: int, sequence: int) -> bytes:
+    """Bytes 8 to 23 of a message."""
+    return _NUMBERS.pack(session, sequence)
+
+
 def peek(datagram: bytes) -> tuple[int, int, int]:
     """Type, session and sequence that a datagram claims, nothing verified; zeros if it has none.
 
@@ -220,17 +212,15 @@ def peek(datagram: bytes) -> tuple[int, int, int]:
 
 def _encode_state(m: State, layout: Layout | None) -> bytes:
     layout = _expect(layout)
-    slots = (*layout.observation_slots, layout.rewards, *layout.flags, *layout.telemetry_slots)
+    slots = layout.state_slots
     arrays = (*m.observations, m.rewards, m.terminated, m.truncated, *m.telemetry)
     if len(arrays) != len(slots):
         raise InputError(f"State: expected {len(slots)} arrays, got {len(arrays)}")
     pieces = [_STATE_BODY.pack(m.time, m.nonce)]
-    at = STATE_ARRAYS_AT
-    for slot, array in zip(slots, arrays, strict=True):
-        if at != slot.at:
-            pieces.append(_PADS[slot.at - at])
-        pieces.append(_bytes_of("State", slot, array))
-        at = slot.end
+    for (shape, dtype, _, pad), array in zip(slots, arrays, strict=True):
+        if array.shape != shape or (array.dtype is not dtype and array.dtype != dtype):
+            raise _misfit("State", shape, dtype, array)
+        pieces += (pad, array.tobytes())
     body = b"".join(pieces)
     numbers = layout.state_numbers
     if numbers is None or not _adds_up(numbers.unpack_from(body)):
@@ -249,16 +239,18 @@ def _decode_state(data: bytes, session: int, sequence: int, layout: Layout | Non
         _expect_finite("observation, reward, telemetry", data, time, floats)
     terminated, truncated = layout.flags
     _expect_flags(data[terminated.at : truncated.end], _FLAGS)
+    arrays = [np.ndarray(shape, dtype, data, at) for shape, dtype, at, _ in layout.state_slots]
+    first = len(layout.observation)
     return State(
         session=session,
         sequence=sequence,
         time=time,
         nonce=nonce,
-        observations=tuple([slot.view(data) for slot in layout.observation_slots]),
-        rewards=layout.rewards.view(data),
-        terminated=terminated.view(data),
-        truncated=truncated.view(data),
-        telemetry=tuple([slot.view(data) for slot in layout.telemetry_slots]),
+        observations=tuple(arrays[:first]),
+        rewards=arrays[first],
+        terminated=arrays[first + 1],
+        truncated=arrays[first + 2],
+        telemetry=tuple(arrays[first + 3 :]),
     )
 
 
@@ -313,11 +305,15 @@ def _check_command(data: bytes, layout: Layout) -> None:
 def _bytes_of(what: str, slot: Slot, array: np.ndarray) -> bytes:
     """Bytes of an array that has to be that of a slot. Numbers are never converted."""
     if array.shape != slot.shape or array.dtype != slot.dtype:
-        raise InputError(
-            f"{what}: expected {slot.dtype.name} of shape {slot.shape}, "
-            f"got {array.dtype.name} of shape {array.shape}"
-        )
+        raise _misfit(what, slot.shape, slot.dtype, array)
     return array.tobytes()
+
+
+def _misfit(what: str, shape: tuple[int, ...], dtype: np.dtype, array: np.ndarray) -> InputError:
+    return InputError(
+        f"{what}: expected {dtype.name} of shape {shape}, "
+        f"got {array.dtype.name} of shape {array.shape}"
+    )
 
 
 def _adds_up(numbers: tuple[Any, ...]) -> bool:
@@ -480,9 +476,12 @@ def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
     return tuple(extensions)
 
 
+def _start(kind: int) -> bytes:
+    return MAGIC + bytes((VERSION, kind))
+
+
 def _entry(kind: int, encoder: Callable[[Any, Layout | None], bytes]) -> tuple[Any, ...]:
-    start = MAGIC + bytes((VERSION, kind))
-    return start, zlib.crc32(start), encoder
+    return _start(kind), zlib.crc32(_start(kind)), encoder
 
 
 _ENCODERS: Final[dict[type, tuple[Any, ...]]] = {
@@ -511,3 +510,6 @@ _DECODERS: Final[dict[int, Callable[[bytes, int, int, Layout | None], Message]]]
     ALIVE: _decode_alive,
     MISSING: _decode_missing,
 }
+
+_STARTS: Final = {kind: (_start(kind), zlib.crc32(_start(kind))) for kind in _DECODERS}
+"""First four bytes of a message, and their CRC-32."""

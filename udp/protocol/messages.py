@@ -193,9 +193,12 @@ class Missing:
         return numbers
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+@dataclass(kw_only=True, slots=True, eq=False)
 class State:
-    """Simulator to agent: observations of every drone after the step that `sequence` counts."""
+    """Simulator to agent: observations of every drone after the step that `sequence` counts.
+
+    Not to be changed, as all messages; to freeze it would triple the time to make one.
+    """
 
     session: int
     sequence: int
@@ -215,9 +218,12 @@ class State:
     """Each array of the layout, float64, shape (N, *shape)."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+@dataclass(kw_only=True, slots=True, eq=False)
 class Command:
-    """Agent to simulator: next order of every drone. Answers the State of the same `sequence`."""
+    """Agent to simulator: next order of every drone. Answers the State of the same `sequence`.
+
+    Not to be changed, as `State`.
+    """
 
     session: int
     sequence: int

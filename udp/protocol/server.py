@@ -47,7 +47,8 @@ _LEAST_ASSEMBLING: Final = 16
 """Simulators without a slot of which fragments are kept; more, if there are more slots: so many
 may come at the same moment."""
 _TEXT_REMEMBERED: Final = 2.0
-"""How long a late copy of the last line of a closed text simulator is told from a new one, s."""
+"""Time in which a copy of the last line of a closed text simulator is recognized, s."""
+_AFTER_STATE: Final = AGENT[AgentState.EXPECTING, Way.RECEIVED, State]
 _REASON_AT: Final = binary.HEADER_SIZE + 2
 """Bytes of a Refuse or a Close before its reason."""
 
@@ -89,6 +90,10 @@ class Session:
     assembler: Assembler | None = None
     """Of the State that is coming in fragments."""
     window: Window = field(default_factory=Window)
+    largest: int = 0
+    """Bytes of the largest datagram to it, a seal not counted; 0 before the first message."""
+    due: bytes = b""
+    """Bytes 8 to 23 of the State that is expected; empty where it is sealed, or a line of text."""
     asked_at: float | None = None
     """When the Command was sent whose State is expected."""
     heard_at: float = 0.0
@@ -172,7 +177,18 @@ class Server:
         self.statistics.counters["received"] += 1
         slot = self._slot_of.get(address, -1)
         session = self.slots[slot] if slot >= 0 else None
-        arrival = _Arrival(datagram, address, now)
+        if session and session.state is AgentState.EXPECTING and session.due:
+            number, sequence = session.number, session.sequence + 1
+            state = binary.decode_due(
+                binary.STATE, datagram, session.due, number, sequence, session.layout
+            )
+            if isinstance(state, State):
+                return self._take_state(slot, session, state, datagram, now)
+        return self._receive_any(slot, session, _Arrival(datagram, address, now))
+
+    def _receive_any(self, slot: int, session: Session | None, arrival: _Arrival) -> Event | None:
+        """Whatever comes: `receive` knows only the State that a slot waits for."""
+        datagram, address, _ = arrival
         try:
             if text.is_text(datagram):
                 layout = None if self._keys else self._text_layout()
@@ -238,6 +254,8 @@ class Server:
             seeds=seeds,
         )
         self._answer(slot, session, command)
+        if session.key is None and not session.is_text:
+            session.due = binary.numbers_of(session.number, session.sequence + 1)
         session.asked_at = session.heard_at = now
 
     def free(self, slot: int) -> None:
@@ -308,11 +326,7 @@ class Server:
             return None
         match message:
             case State():
-                session.sequence, session.state = message.sequence, state
-                if session.asked_at is not None:
-                    self.statistics.round_trips.add(arrival.now - session.asked_at)
-                self._record(slot, message, plain, session)
-                return Event(slot, message)
+                return self._take_state(slot, session, message, plain, arrival.now)
             case Alive():
                 session.heard_at = arrival.now
             case Missing():
@@ -382,6 +396,17 @@ class Server:
         session.move(Way.SENT, Wait)
         session.room = size - len(wait)
         _keep(self._queue, session.peer, session)
+
+    def _take_state(
+        self, slot: int, session: Session, state: State, plain: bytes, now: float
+    ) -> Event:
+        """The next State of a slot."""
+        session.sequence, session.state = state.sequence, _AFTER_STATE
+        if session.asked_at is not None:
+            self.statistics.round_trips.add(now - session.asked_at)
+        if self._tap:
+            self._record(slot, state, plain, session)
+        return Event(slot, state)
 
     def _join(
         self, opening: Session, state: State, plain: bytes, arrival: _Arrival
@@ -470,7 +495,7 @@ class Server:
     def _forget_until(self, opening: Session) -> None:
         """Forget the opening of a State 1, and what the same address began before it.
 
-        What it began later has not ended: if this State came late, that Hello may still be said.
+        Keep later openings: if this State came late, their Hello may still be repeated.
         """
         for key, other in list(self._openings.items()):
             if key[0] == opening.peer:
@@ -564,7 +589,7 @@ class Server:
     def _assemble(
         self, fragment: bytes, holder: Session | None, arrival: _Arrival, key: Key | None
     ) -> bytes | None:
-        """The message, once all its fragments are there, of who may send it now."""
+        """The message of an accepted sender, once all its fragments are there."""
         kind, number, sequence = binary.check(fragment)
         kind &= ~binary.FRAGMENT
         if kind == binary.HELLO and holder is None:
@@ -636,9 +661,10 @@ class Server:
         """
         data = text.encode(message) if session.is_text else binary.encode(message, session.layout)
         session.move(Way.SENT, type(message))
-        self._record(slot, message, data, session)
-        session.reply = self._transfer(data, session)
-        self._put(session.reply.start(), session.peer, session.key)
+        if self._tap:
+            self._record(slot, message, data, session)
+        session.reply = reply = self._transfer(data, session)
+        self._put(reply.start(), session.peer, session.key)
         self.statistics.counters["sent"] += 1
 
     def _repeat(self, session: Session) -> None:
@@ -658,11 +684,13 @@ class Server:
             self.statistics.counters["sent"] += 1
 
     def _transfer(self, data: bytes, session: Session) -> Transfer:
-        largest = largest_datagram(session.peer, self._max_datagram)
-        return Transfer(data, largest, session.window)
+        if not session.largest:
+            session.largest = largest_datagram(session.peer, self._max_datagram)
+        return Transfer(data, session.largest, session.window)
 
     def _put(self, datagrams: list[bytes], address: Address, key: Key | None) -> None:
-        self._outgoing += [(key.seal(d) if key else d, address) for d in datagrams]
+        for datagram in datagrams:
+            self._outgoing.append((key.seal(datagram) if key else datagram, address))
 
     def _record(self, slot: int, message: Message, data: bytes, session: Session) -> None:
         if self._tap:

@@ -1,4 +1,4 @@
-"""What a side sees of the wire: counts, round trips, and notices at a bounded rate."""
+"""Statistics of one side of the wire: counts, round trips, and notices at a bounded rate."""
 
 from collections import Counter
 from math import frexp
@@ -16,7 +16,7 @@ REPORT_INTERVAL: Final = 60.0
 _STEPS: Final = 32
 """Buckets for each doubling: a quantile is right to 3 %."""
 _QUIET: Final = frozenset({"duplicate", "stale"})
-"""What every network that loses datagrams makes: counted, not worth a notice."""
+"""Events of every network that loses datagrams: counted, without a notice."""
 
 
 class Durations:
@@ -30,11 +30,13 @@ class Durations:
 
     def add(self, seconds: float) -> None:
         """Count one. Below a nanosecond is a nanosecond: clocks may stand still."""
-        seconds = max(seconds, 1e-9)
+        if seconds < 1e-9:
+            seconds = 1e-9
         mantissa, exponent = frexp(seconds)  # mantissa in [0.5, 1)
         self._buckets[exponent * _STEPS + int((mantissa - 0.5) * (2 * _STEPS))] += 1
         self.count += 1
-        self.longest = max(self.longest, seconds)
+        if seconds > self.longest:
+            self.longest = seconds
 
     def quantile(self, share: float) -> float:
         """Duration that the given share of all does not exceed, s; 0 if there is none."""
@@ -78,17 +80,21 @@ class Statistics:
 
     @property
     def last_error(self) -> str:
-        """Why the last datagram was dropped that should not have come; "" if none was."""
+        """Why the last unexpected datagram was dropped; "" if none was."""
         return one_line(self._last)
 
     def notice(self, sentence: str) -> None:
-        """Something that whoever watches wants to know."""
+        """Keep a notice for the log."""
         self._notices.append(one_line(sentence))
 
     def take_notices(self) -> list[str]:
         """Sentences for the log, each once."""
         notices, self._notices = self._notices, []
         return notices
+
+    def has_news(self, now: float) -> bool:
+        """Whether there are notices to take, or a report may be due."""
+        return bool(self._notices) or self._next_report is None or now >= self._next_report
 
     def report_due(self, now: float) -> bool:
         """Whether a minute has passed since the last report, or since the first call."""

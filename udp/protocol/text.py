@@ -1,10 +1,7 @@
 """The text codec: one drone, numbers separated by commas, at most 1024 bytes of ASCII.
 
-The paper's peers turn arrays of numbers into bytes and back (section 2.1). There is no Hello:
-
-    simulator:  sequence,reward,terminated,truncated,observation...,telemetry...
-    agent:      sequence,action...    or    sequence,reset[,seed]
-    either:     sequence,close
+The paper's peers turn arrays of numbers into bytes and back (section 2.1). There is no Hello. The
+grammar is in docs/protocol.md.
 
 Numbers are written as float64 with the fewest digits that read back as the same bits; a float32
 is written as the float64 of the same value.
@@ -203,7 +200,7 @@ def _floats(name: str, fields: list[str]) -> list[float]:
 
 def _float32(name: str, fields: list[str]) -> np.ndarray:
     """Numbers of one drone, float32, shape (1, len(fields))."""
-    with np.errstate(over="ignore", under="ignore"):  # whatever the program has set
+    with np.errstate(over="ignore", under="ignore"):  # independent of the program's settings
         array: np.ndarray = np.array([_floats(name, fields)]).astype(np.float32)
     _expect_finite(array[0].tolist())
     return array

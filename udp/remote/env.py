@@ -14,7 +14,7 @@ from ..protocol.client import Address
 from ..protocol.messages import FLY, MAX_UINT64, RESET, State
 from ..transport.agent import Agent, AgentConfig
 from ..transport.simulator import DEFAULT_AGENT
-from .served import LOST, ServedEnv, checked_actions
+from .served import LOST, ServedEnv, action_dtype, checked_actions
 
 __all__ = ["RemoteEnv"]
 
@@ -133,7 +133,7 @@ class RemoteEnv(ServedEnv, gym.Env[Any, Any]):
         """Fly for one control period. The action is sent in the dtype of its space."""
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
-        actions = checked_actions(action, self.env_spec, self._action_shape)[np.newaxis]
+        actions = checked_actions(action, self._action_dtype, self._action_shape)[np.newaxis]
         self._flying = False  # until the answer is there
         try:
             self._agent.exchange({0: (actions, _FLY, None)})
@@ -174,10 +174,9 @@ class RemoteEnv(ServedEnv, gym.Env[Any, Any]):
         self.metadata = {"render_modes": [], "render_fps": fps}
         self._arrays = tuple(array.name for array in spec.observation)
         self._names = tuple(n for array in spec.telemetry for n in component_names(array))
-        discrete = isinstance(spec.action, Discrete)
         self._action_shape = () if isinstance(spec.action, Discrete) else spec.action.shape
-        dtype = np.dtype(np.int64 if discrete else getattr(spec.action, "dtype", None))
-        self._no_action: np.ndarray = np.zeros((1, *self._action_shape), dtype)
+        self._action_dtype = action_dtype(spec)
+        self._no_action: np.ndarray = np.zeros((1, *self._action_shape), self._action_dtype)
 
     def _observation(self, state: State) -> Any:
         """As the space has it, a copy."""
@@ -189,5 +188,5 @@ class RemoteEnv(ServedEnv, gym.Env[Any, Any]):
     def _info(self, state: State) -> dict[str, Any]:
         numbers: list[float] = []
         for array in state.telemetry:
-            numbers += array.ravel().tolist()
+            numbers += array.tolist()[0] if array.ndim == 2 else array.ravel().tolist()
         return dict(zip(self._names, numbers, strict=True))

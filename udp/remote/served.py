@@ -10,7 +10,7 @@ from ..protocol.client import Address
 from ..protocol.statistics import Statistics
 from ..transport.agent import Agent
 
-__all__ = ["LOST", "ServedEnv", "checked_actions"]
+__all__ = ["LOST", "ServedEnv", "action_dtype", "checked_actions"]
 
 LOST: Final = "simulator_lost"
 """Key of `info`: why the simulator was lost whose episode ends here as truncated."""
@@ -37,19 +37,23 @@ class ServedEnv:
         return spec
 
 
-def checked_actions(action: Any, spec: EnvSpec, shape: tuple[int, ...]) -> np.ndarray:
-    """Actions as they cross the wire, of the spec's dtype. The env checks bounds.
+def action_dtype(spec: EnvSpec) -> np.dtype:
+    """The dtype of actions as they cross the wire."""
+    return np.dtype(np.int64 if isinstance(spec.action, Discrete) else spec.action.dtype)
+
+
+def checked_actions(action: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
+    """Actions as they cross the wire. The env checks bounds.
 
     Args:
         action: Argument of `step`.
-        spec: Its spec.
+        dtype: As `action_dtype` gives it.
         shape: Shape that the action must have.
 
     Raises:
         InputError: It is not of that shape, not real, or cannot be of that dtype.
     """
     array = np.asarray(action)
-    dtype = np.dtype(np.int64 if isinstance(spec.action, Discrete) else spec.action.dtype)
     if array.shape != shape:
         raise InputError(f"action: expected an array of shape {shape}, got shape {array.shape}")
     if array.dtype == dtype:
@@ -58,8 +62,8 @@ def checked_actions(action: Any, spec: EnvSpec, shape: tuple[int, ...]) -> np.nd
         expected = "real" if dtype.kind == "f" else "whole"
         raise InputError(f"action: expected {expected} numbers, got {array.dtype}")
     if dtype.kind == "f":
-        with np.errstate(over="ignore", under="ignore"):  # whatever the program has set
-            return array.astype(dtype)  # what overflows is infinite, and refused as such
+        with np.errstate(over="ignore", under="ignore"):  # independent of the program's settings
+            return array.astype(dtype)  # an overflow is infinite, and refused as such
     whole = array.astype(dtype)
     if (whole != array).any():
         raise InputError(f"action: expected numbers of {dtype}, got {array}")

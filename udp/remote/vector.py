@@ -17,7 +17,7 @@ from ..protocol.layout import MAX_DRONES
 from ..protocol.messages import FREEZE, MAX_UINT64, RESET
 from ..transport.agent import Agent, AgentConfig, Order
 from ..transport.simulator import DEFAULT_AGENT
-from .served import LOST, ServedEnv, checked_actions
+from .served import LOST, ServedEnv, action_dtype, checked_actions
 
 __all__ = ["RemoteVectorEnv"]
 
@@ -176,13 +176,13 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
         self._flying = False  # until the answers are there
         self._agent.exchange(self._orders(slots, sent, resets, numbers, frozen))
         lost = self._agent.lost
-        if any(lost) and seeds is not None:  # what came instead of a lost one has not seen them
+        if any(lost) and seeds is not None:  # a simulator in place of a lost one knows none
             lost = self._reset_until_done(resets, numbers, lost)
         before, telemetry = self._arrays, self.telemetry
         self._take_states(resets | frozen)
         reasons = np.repeat(np.array(lost, object), self._shape[1])
         broken = (reasons != "") & ~resets & ~grounded
-        if broken.any():  # what came is the start of the next episodes
+        if broken.any():  # these States are the start of the next episodes
             for now, then in ((self._arrays, before), (self.telemetry, telemetry)):
                 for name, array in now.items():
                     array[broken] = then[name][broken]
@@ -206,7 +206,7 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
         num_envs = self.num_simulators * worlds * len(spec.agents)
         self._take_spec(spec, num_envs, self._mode)
         self._shape = self.num_simulators, num_envs // self.num_simulators
-        self._dtype = np.dtype(np.int64 if isinstance(spec.action, Discrete) else spec.action.dtype)
+        self._dtype = action_dtype(spec)
         self._row = () if isinstance(spec.action, Discrete) else spec.action.shape
         self._nothing: np.ndarray = np.zeros((num_envs, *self._row), self._dtype)
         if not self._flying:
@@ -283,7 +283,7 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
                 array = np.where(idle, 0, array)
             if array.dtype.kind == "f" and (array % 1 == 0).all():
                 array = array.astype(np.int64)
-        sent = checked_actions(array, self.env_spec, shape)
+        sent = checked_actions(array, self._dtype, shape)
         if idle.any() and sent.shape == shape:
             sent = sent.copy()
             sent[idle] = 0

@@ -45,7 +45,7 @@ Order = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig:
-    """How an agent listens, which simulators it flies, and how long it waits."""
+    """Settings of an agent: keys and sizes, accepted simulators, and times."""
 
     env_id: str | None = None
     """A simulator of another env is refused; None flies any."""
@@ -196,11 +196,12 @@ class Agent:
         self._flush()
         if self._journal:
             self._journal.write()
-        while pending := self._pending():
+        pending = self._pending()
+        while pending:
             left = min([self._deadlines[slot] for slot in pending]) - now
             if left <= 0:
                 self._give_up(pending, now)
-                now = time.monotonic()
+                now, pending = time.monotonic(), self._pending()
                 continue
             datagram: bytes | None
             try:
@@ -217,6 +218,7 @@ class Agent:
                 event = server.receive(datagram, address, now)
                 if event:
                     self._handle(event, address)
+                    pending = self._pending()
                 self._flush()
 
     def _pending(self) -> list[int]:
@@ -409,7 +411,7 @@ def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
 
 def _leave(pid: int, server: Server, port: Port, journal: "Journal | None") -> None:
     """Tell every simulator, until it has answered or will not."""
-    if os.getpid() != pid:  # a fork of the process whose flight this is
+    if os.getpid() != pid:  # a fork of the process that owns the agent
         return
     server.close("the agent closed", time.monotonic())
     while True:

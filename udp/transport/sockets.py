@@ -128,15 +128,13 @@ def receive(sock: socket.socket, timeout: float) -> tuple[bytes, Address]:
     """The next datagram and where it came from.
 
     Raises:
-        TimeoutError: Nothing came within `timeout`, s, or `LONGEST_WAIT`: look at the clock.
+        TimeoutError: Nothing came within `timeout`, s, or a tenth more, or `LONGEST_WAIT`: look at
+            the clock.
         OSError: An earlier datagram came back, or the socket is closed.
     """
-    if timeout < LONGEST_WAIT:  # else the socket's own will do: to set it is a system call
-        sock.settimeout(max(timeout, 1e-6))
-        try:
-            return sock.recvfrom(_MAX_DATAGRAM)
-        finally:
-            sock.settimeout(LONGEST_WAIT)
+    timeout = min(max(timeout, 1e-6), LONGEST_WAIT)
+    if not timeout <= (sock.gettimeout() or 0.0) <= 1.1 * timeout:  # to set it is a system call
+        sock.settimeout(min(1.05 * timeout, LONGEST_WAIT))
     return sock.recvfrom(_MAX_DATAGRAM)
 
 
@@ -203,6 +201,10 @@ class Port:
 
     def send(self, datagram: bytes, address: Address) -> None:
         """Send a datagram. Raises `OSError`."""
+        if sock := self._own.get(address):
+            with suppress(ConnectionError):  # an earlier datagram found nobody: this was not sent
+                sock.send(datagram)
+                return
         self._everybody.sendto(datagram, address)
 
     def close(self) -> None:
@@ -246,6 +248,8 @@ def _receive_any(selector: selectors.BaseSelector, timeout: float) -> tuple[byte
 
 def log_notices(statistics: Statistics, now: float) -> None:
     """Write warnings, and a report each minute, to the log `rotorgram.udp`."""
+    if not statistics.has_news(now):
+        return
     for notice in statistics.take_notices():
         _log.warning("%s", notice)
     if statistics.report_due(now):
