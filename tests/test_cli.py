@@ -13,7 +13,9 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import pandas as pd
 import pytest
 from rotorgram.agents import load
@@ -26,6 +28,7 @@ from rotorgram.cli.serve import Serve
 from rotorgram.cli.sim import Sim
 from rotorgram.experiments.results import read_results, read_steps
 from rotorgram.models import QUAD_XML, InputError
+from rotorgram.udp import Simulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 
@@ -514,6 +517,35 @@ def test_sim_and_serve_meet(tmp_path: Path) -> None:
     out, err = simulator.communicate(timeout=10)
     assert (simulator.returncode, err) == (0, "")
     assert "the agent closed" in out
+
+
+class Terse(gym.Env[Any, Any]):
+    """Elevation without position and attitude in its telemetry."""
+
+    def __init__(self) -> None:
+        self.env: Any = gym.make("rotorgram/Elevation-v0", episode_length=50).unwrapped
+        some = [a for a in self.env.env_spec.telemetry if a.name in ("thrust", "metrics")]
+        self.env_spec = replace(self.env.env_spec, telemetry=tuple(some))
+        self.observation_space, self.action_space = (
+            self.env.observation_space,
+            self.env.action_space,
+        )
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return self.env.reset(seed=seed)
+
+    def step(self, action: Any) -> Any:
+        return self.env.step(action)
+
+
+def test_a_simulator_of_other_telemetry_is_served() -> None:  # fault 12
+    port = free_port()
+    agent = start("serve", "pid", "--listen", f"127.0.0.1:{port}", "--episodes", 1)
+    with Simulator(Terse(), server=("127.0.0.1", port), bind=("127.0.0.1", 0)) as simulator:
+        assert simulator.run() == "the agent closed"
+    out, err = agent.communicate(timeout=30)
+    assert (agent.returncode, err) == (0, "")
+    assert "episode 0: return" in out
 
 
 def test_a_key_a_relay_and_a_journal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -253,7 +253,7 @@ class McapFile:
 
 
 def _bytes(record: McapRecord) -> bytes:
-    builder = RecordBuilder()
+    builder: Any = RecordBuilder()
     record.write(builder)
     data: bytes = builder.end()
     return data

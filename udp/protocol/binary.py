@@ -119,7 +119,8 @@ def encode(message: Message, layout: Layout | None = None) -> bytes:
     if len(rest) + 8 > MAX_MESSAGE:
         got = len(rest) + 8
         raise InputError(f"{kind.__name__}: expected at most {MAX_MESSAGE} bytes, got {got}")
-    return start + zlib.crc32(rest, crc).to_bytes(4, "little") + rest
+    data: bytes = start + zlib.crc32(rest, crc).to_bytes(4, "little") + rest
+    return data
 
 
 def frame(kind: int, session: int, sequence: int, body: bytes) -> bytes:

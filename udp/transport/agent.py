@@ -399,11 +399,11 @@ def _told(options: Mapping[str, Any], name: str) -> str:
 
 def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
     """Difference between a simulator and earlier ones, in a sentence; "" if there is none."""
-    if reason := _options_difference(ours.options, theirs.options, both_ways=True):
-        return reason
-    for name in ("env_id", "vehicle_hash", "control_period", "agents", "observation", "action",
-                 "telemetry", "metrics"):  # fmt: skip
+    for name in ("env_id", "options", "vehicle_hash", "control_period", "agents", "observation",
+                 "action", "telemetry", "metrics"):  # fmt: skip
         expected, got = getattr(ours, name), getattr(theirs, name)
+        if expected != got and name == "options":
+            return _options_difference(expected, got, both_ways=True)
         if expected != got:
             return f"{name}: expected {expected!r:.200} as before, got {got!r:.200}"
     return ""
