@@ -190,9 +190,9 @@ class Agent:
         """Send what is due and answer what comes, until it is the agent's turn everywhere."""
         server, config, slots = self.server, self.config, self.server.slots
         now = time.monotonic()
-        for slot, session in enumerate(slots):
-            wait = config.timeout if session else config.connect_timeout
-            self._deadlines[slot] = now + wait
+        self._deadlines = [
+            now + (config.timeout if session else config.connect_timeout) for session in slots
+        ]
         self._flush()
         if self._journal:
             self._journal.write()
