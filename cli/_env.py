@@ -21,6 +21,7 @@ __all__ = [
     "chosen_env",
     "load_checkpoint",
     "local_spec",
+    "pilot_of",
     "policy_for",
     "remote_env",
     "words_of",
@@ -99,6 +100,19 @@ def policy_for(command: EnvFlags, checkpoint: "Checkpoint | None", spec: "EnvSpe
             "with --vehicle"
         )
     return checkpoint.policy(spec)
+
+
+def pilot_of(
+    command: EnvFlags, what: str
+) -> "tuple[Checkpoint | None, Policy | None, tuple[str, dict[str, Any]]]":
+    """Checkpoint, policy and chosen env of what flies here; `random` has no policy, `pid` no
+    checkpoint. Raises `InputError`.
+    """
+    checkpoint = policy = None
+    if what != "random":
+        checkpoint = load_checkpoint(what)
+        policy = policy_for(command, checkpoint, local_spec(command, checkpoint))
+    return checkpoint, policy, chosen_env(command, checkpoint)
 
 
 def words_of(trajectory: "Trajectory") -> str:

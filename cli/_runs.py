@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from tyro.conf import arg
 
-from ._flags import EnvFlags
+from ._flags import EnvFlags, PresetName
 from ._inputs import folder_to_write
 
 if TYPE_CHECKING:
@@ -31,6 +31,8 @@ __all__ = [
 ]
 
 _WORKERS: Final = ("jobs", "backend", "address")
+_SETTINGS: Final = ("preset", "seeds", "first_seed", "env_steps", "num_envs", "episodes", "env_id",
+                    "options", "vehicle")  # fmt: skip
 RESUMED: Final = (*_WORKERS, "resume", "env")
 """Flags that a resumed command may be given: they change no number. `--env` imports the module of a
 task."""
@@ -40,6 +42,19 @@ task."""
 class RunsFlags(EnvFlags):
     """A command of many runs, on the cores of this machine or on many machines."""
 
+    preset: PresetName = "tuned"
+    """Hyperparameters: the paper's, or ours."""
+    env_steps: int = 200_000
+    """Env steps of each training, of all its drones together; a learning rate that falls, falls
+    over all of them."""
+    num_envs: int = 1
+    """Drones that fly at the same time, in lock-step, in each training."""
+    episodes: int = 20
+    """Evaluation episodes of each final policy."""
+    out: Path | None = None
+    """Folder to write; it must not exist. Default: runs/COMMAND-TIME."""
+    resume: Path | None = None
+    """Folder of an interrupted command to go on with; it keeps its settings."""
     jobs: int | None = None
     """Runs at a time. Default: one for each core of this machine, or of the cluster."""
     backend: Literal["loky", "ray"] = "loky"
@@ -51,6 +66,10 @@ class RunsFlags(EnvFlags):
         """Fields of `WorkersConfig`."""
         return {name: getattr(self, name) for name in _WORKERS}
 
+    def settings(self) -> dict[str, Any]:
+        """Fields that `CompareConfig` and `SweepConfig` share."""
+        return {name: getattr(self, name) for name in (*_WORKERS, *_SETTINGS)}
+
 
 def command_line() -> str:
     """The command as the user typed it."""
@@ -58,21 +77,20 @@ def command_line() -> str:
 
 
 @contextmanager
-def runs_folder(
-    name: str, command: RunsFlags, resume: Path | None, out: Path | None
-) -> "Iterator[tuple[Path, OnProgress]]":
+def runs_folder(name: str, command: RunsFlags) -> "Iterator[tuple[Path, OnProgress]]":
     """The folder to write to, and what shows the progress. If the runs fail, it says how to resume.
 
     Args:
         name: The command and its positional arguments.
-        command: Says which workers run.
-        resume: Folder to go on with.
-        out: Otherwise, folder to make.
+        command: Says where, and which workers run.
     """
     from ._progress import bars
 
-    making = nullcontext(resume) if resume else folder_to_write(out, name.replace(" ", "-"))
-    with making as folder:
+    with (
+        nullcontext(command.resume)
+        if command.resume
+        else folder_to_write(command.out, name.replace(" ", "-"))
+    ) as folder:
         try:
             with bars() as progress:
                 yield folder, progress

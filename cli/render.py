@@ -127,20 +127,16 @@ class Render(EnvFlags):
         """Agent, name and trajectories of a policy or journal."""
         from ..experiments.palette import agent_label
         from ..experiments.trajectories import flown_trajectories, recorded_trajectories
-        from ._env import chosen_env, load_checkpoint, local_spec, policy_for
+        from ._env import pilot_of
 
         episodes = range(self.episode, self.episode + self.episodes)
         path = Path(what)
         if path.suffix == ".mcap":
             recorded = recorded_trajectories(path, episodes, session=self.session, drone=self.drone)
             return path.stem, path.stem, recorded
-        policy = checkpoint = None
-        if what != "random":
-            checkpoint = load_checkpoint(what)
-            policy = policy_for(self, checkpoint, local_spec(self, checkpoint))
+        checkpoint, policy, env = pilot_of(self, what)
         agent = checkpoint.algorithm if checkpoint else what
-        env = chosen_env(self, checkpoint)
-        flown = flown_trajectories(policy, *env, episodes, vehicle=self.vehicle)
+        flown = flown_trajectories(policy, *env, episodes, vehicle=self.vehicle, of="final")
         return agent, what if what == "random" else agent_label(agent), flown
 
 
@@ -153,10 +149,14 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def _told_apart(names: Sequence[str], what: Sequence[str]) -> list[str]:
-    """The names; of those that are the same, what the user typed besides."""
-    return [
-        name if names.count(name) == 1 else f"{name}, {Path(words).stem}"
+    """The names; of those that are the same, what the user typed besides, then a number."""
+    longer = [
+        name if names.count(name) == 1 or words == "pid" else f"{name}, {Path(words).stem}"
         for name, words in zip(names, what, strict=True)
+    ]
+    return [
+        name if longer.count(name) == 1 else f"{name} {longer[: place + 1].count(name)}"
+        for place, name in enumerate(longer)
     ]
 
 

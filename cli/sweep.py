@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ..models.errors import InputError
-from ._flags import AlgorithmName, PresetName, parse_value
+from ._flags import AlgorithmName, parse_value
 from ._inputs import refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_sweep, runs_folder
 
@@ -30,22 +30,10 @@ class Sweep(RunsFlags):
     ] = ()
     """Values to try, such as learning_rate=0.003,0.01 steps_per_update=64,256: every combination
     is a point."""
-    preset: PresetName = "tuned"
-    """Hyperparameters that the grid does not name: the paper's, or ours."""
     seeds: int = 3
-    """Number of seeds, the same for every point."""
+    """Number of seeds, the same for every point; 30 or more before one is called the best."""
     first_seed: int = 1000
     """The first of them: by default none that a comparison uses."""
-    env_steps: int = 200_000
-    """Env steps of each training, of all its drones together."""
-    num_envs: int = 1
-    """Drones that fly at the same time, in lock-step, in each training."""
-    episodes: int = 20
-    """Evaluation episodes of each final policy."""
-    out: Path | None = None
-    """Folder to write; it must not exist. Default: runs/sweep-ALGORITHM-TIME."""
-    resume: Path | None = None
-    """Folder of an interrupted sweep to go on with; it keeps its settings."""
 
     def run(self) -> int:
         """Sweep, and print the table."""
@@ -59,20 +47,11 @@ class Sweep(RunsFlags):
             config = SweepConfig(
                 algorithm=self.algorithm,
                 grid=parse_grid(word for words in self.grid for word in words),
-                preset=self.preset,
-                seeds=self.seeds,
-                first_seed=self.first_seed,
-                env_steps=self.env_steps,
-                num_envs=self.num_envs,
-                episodes=self.episodes,
-                env_id=self.env_id,
-                options=self.options,
-                vehicle=self.vehicle,
-                **self.workers(),
+                **self.settings(),
             )
         name = f"sweep {config.algorithm}"
         try:
-            with runs_folder(name, self, self.resume, self.out) as (folder, progress):
+            with runs_folder(name, self) as (folder, progress):
                 sweep(config, folder, command_line(), progress)
         except RunsFailed:  # the other points are reported all the same
             report_sweep(folder)

@@ -68,17 +68,13 @@ class View(EnvFlags):
     def _trajectories(self) -> "Iterator[Trajectory]":
         """Episode after episode, as long as there are any."""
         from ..experiments.trajectories import flown_trajectories, recorded_trajectories
-        from ._env import chosen_env, load_checkpoint, local_spec, policy_for
+        from ._env import pilot_of
 
         if (path := Path(self.what)).suffix == ".mcap":
             if self.options:
                 raise InputError("env: expected no options with a journal, which has its own")
             yield from recorded_trajectories(path)
             return
-        policy = checkpoint = None
-        if self.what != "random":
-            checkpoint = load_checkpoint(self.what)
-            policy = policy_for(self, checkpoint, local_spec(self, checkpoint))
-        env = chosen_env(self, checkpoint)
+        _, policy, env = pilot_of(self, self.what)
         for episode in count():
-            yield from flown_trajectories(policy, *env, [episode], vehicle=self.vehicle)
+            yield from flown_trajectories(policy, *env, [episode], vehicle=self.vehicle, of="final")

@@ -18,7 +18,11 @@ from ..models.errors import InputError
 __all__ = ["ArraySpec", "Discrete", "EnvSpec", "Metric", "SpecError", "canonical_id"]
 
 MAX_ELEMENTS: Final = 1 << 22
-"""Most numbers of one array of one drone."""
+"""Most numbers of all observations of one drone."""
+MAX_TOLD: Final = 1 << 14
+"""Most numbers of all telemetry of one drone: each has a name in `info`."""
+MAX_DIMENSIONS: Final = 16
+"""Most axes of an array."""
 MAX_ARRAYS: Final = 64
 """Most arrays of an observation or of the telemetry."""
 MAX_AGENTS: Final = 1024
@@ -28,6 +32,7 @@ MAX_NAME: Final = 200
 
 _DTYPES: Final = ("float32", "float64", "uint8", "int32", "int64")
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
+_LARGEST: Final = float(np.finfo(np.float64).max)
 _HASH: Final = re.compile(r"[0-9a-f]{32}")
 
 Bound = float | tuple[float, ...]
@@ -61,9 +66,17 @@ class ArraySpec:
             raise SpecError("name: expected a name for an array, got ''")
         shape = self.shape
         if not isinstance(shape, tuple) or not all(type(n) is int and n >= 1 for n in shape):
-            raise SpecError(f"{self.name}: expected a shape of whole numbers >= 1, got {shape!r}")
+            raise SpecError(
+                f"{self.name}: expected a shape of whole numbers >= 1, got {shape!r:.80}"
+            )
+        if len(shape) > MAX_DIMENSIONS:
+            raise SpecError(
+                f"{self.name}: expected at most {MAX_DIMENSIONS} axes, got {len(shape)}"
+            )
         if self.size > MAX_ELEMENTS:
-            raise SpecError(f"{self.name}: expected at most {MAX_ELEMENTS} elements, got {shape}")
+            raise SpecError(
+                f"{self.name}: expected at most {MAX_ELEMENTS} elements, got {shape!r:.80}"
+            )
         if self.dtype not in _DTYPES:
             raise SpecError(
                 f"{self.name}: expected a dtype of {', '.join(_DTYPES)}, got {self.dtype!r}"
@@ -120,7 +133,9 @@ class ArraySpec:
             raise SpecError(f"{self.name}: expected {self.size} units, got {len(self.unit)}")
         names = self.components
         if names and (len(names) != self.size or len(set(names)) < len(names) or "" in names):
-            raise SpecError(f"{self.name}: expected {self.size} different components, got {names}")
+            raise SpecError(
+                f"{self.name}: expected {self.size} different components, got {names!r:.80}"
+            )
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object; fields that have their default are left out, infinity is null."""
@@ -216,8 +231,8 @@ class Metric:
             )
         for name in ("settled", "held"):
             value = getattr(self, name)
-            if value is not None and not (_is_number(value) and math.isfinite(value) and value > 0):
-                raise SpecError(f"{self.name}: expected {name} > 0 or None, got {value!r}")
+            if value is not None and not (_is_number(value) and 0 < value <= _LARGEST):
+                raise SpecError(f"{self.name}: expected {name} > 0 or None, got {value!r:.80}")
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object."""
@@ -259,7 +274,7 @@ class EnvSpec:
         object.__setattr__(self, "options", _plain(dict(self.options)))
         period = self.control_period
         if not (_is_number(period) and 1e-6 <= period <= 1e3):
-            raise SpecError(f"control_period: expected 1e-6 to 1e3 s, got {period!r}")
+            raise SpecError(f"control_period: expected 1e-6 to 1e3 s, got {period!r:.80}")
         _check_text("vehicle", self.vehicle)
         if not (isinstance(self.vehicle_hash, str) and _HASH.fullmatch(self.vehicle_hash)):
             raise SpecError(f"vehicle_hash: expected 32 hex digits, got {self.vehicle_hash!r:.80}")
@@ -275,6 +290,9 @@ class EnvSpec:
             names = [array.name for array in arrays]
             if len(arrays) > MAX_ARRAYS or len(set(names)) < len(names):
                 raise SpecError(f"{name}: expected at most {MAX_ARRAYS} different names")
+            most = MAX_ELEMENTS if name == "observation" else MAX_TOLD
+            if (size := sum(array.size for array in arrays)) > most:
+                raise SpecError(f"{name}: expected at most {most} elements in all, got {size}")
         self._check_metrics()
 
     def _check_metrics(self) -> None:
@@ -282,12 +300,12 @@ class EnvSpec:
         told = {a.name: a for a in self.telemetry}.get("metrics")
         if (told.components if told else ()) != names:
             raise SpecError(
-                f"metrics: expected the components of the telemetry 'metrics' to be {names}, "
-                f"got {told.components if told else ()}"
+                f"metrics: expected the components of the telemetry 'metrics' to be {names!r:.80}, "
+                f"got {told.components if told else ()!r:.80}"
             )
         listed = [name for array in self.telemetry for name in component_names(array)]
         if len(set(listed)) < len(listed):
-            raise SpecError(f"telemetry: expected each component once, got {listed}")
+            raise SpecError(f"telemetry: expected each component once, got {listed!r:.80}")
 
     @property
     def headline(self) -> Metric | None:
@@ -386,7 +404,9 @@ def _from_null(bound: Any, none: float) -> Any:
 def _plain(options: dict[str, Any]) -> dict[str, Any]:
     """Options as JSON gives them back: tuples become lists. Raises `SpecError`."""
     try:
-        plain: dict[str, Any] = json.loads(json.dumps(options, allow_nan=False))
+        text = json.dumps(options, allow_nan=False, ensure_ascii=False)
+        text.encode()  # half a surrogate pair cannot be sent
+        plain: dict[str, Any] = json.loads(text)
     except (TypeError, ValueError, RecursionError) as error:
         raise SpecError(f"options: expected JSON values, got {options!r:.80}: {error}") from None
     for name in plain:

@@ -1,6 +1,7 @@
 """The scene around a vehicle: ground, sky and light, and a visual airport.
 
-Only the ground affects the physics. A vehicle file with a ground of its own keeps that one.
+Only the ground affects the physics. A vehicle file keeps its own ground, sky and lights, and gets
+those that it lacks.
 """
 
 from pathlib import Path
@@ -28,6 +29,7 @@ MOST_HEIGHTS: Final = 4096
 """Most rows and columns of a height field: 16.8 million points, 0.3 GB."""
 
 _GROUNDS: Final = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+_SKY: Final = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 _HIDDEN_GROUP: Final = 3  # viewers and renderers draw groups 0 to 2 unless told otherwise
 _NEAR, _FAR = 0.25, 1200.0  # m: where drawing begins and ends; the hills lie within
 
@@ -60,15 +62,28 @@ def build_scene(
     _check_height_fields(path, set())
     switch_off_log_file()
     spec = mujoco.MjSpec.from_file(str(path))
-    if not any(geom.type in _GROUNDS for geom in spec.worldbody.geoms):
-        scene = mujoco.MjSpec.from_file(str(SCENE_XML))
-        _copy_settings(scene.visual, spec.visual)
-        _copy_settings(scene.stat, spec.stat)
-        spec.attach(scene, prefix=SCENE_PREFIX, frame=spec.worldbody.add_frame())
+    has_ground = any(geom.type in _GROUNDS for geom in spec.worldbody.geoms)
+    if visual or not has_ground:
+        _attach_scene(spec, ground=not has_ground)
     if world == "airport":
         attach_airport(spec)
     spec.compiler.discardvisual = not visual
     return spec
+
+
+def _attach_scene(spec: mujoco.MjSpec, *, ground: bool) -> None:
+    """Add the sky and the sun of `SCENE_XML` unless `spec` has its own, and its ground if asked."""
+    scene = mujoco.MjSpec.from_file(str(SCENE_XML))
+    source, target = (scene, spec) if ground else (spec, scene)  # both alike: MuJoCo warns if not
+    _copy_settings(source.visual, target.visual)
+    _copy_settings(source.stat, target.stat)
+    if not ground:
+        scene.delete(scene.geom("floor"))
+    if any(texture.type == _SKY for texture in spec.textures):
+        scene.delete(scene.texture("sky"))
+    if spec.worldbody.lights:
+        scene.delete(scene.light("sun"))
+    spec.attach(scene, prefix=SCENE_PREFIX, frame=spec.worldbody.add_frame())
 
 
 def _check_height_fields(path: Path, seen: set[Path]) -> None:
@@ -142,7 +157,7 @@ def attach_airport(spec: mujoco.MjSpec) -> None:
         if _is_ground(model, compiled.id):
             geom.group = _HIDDEN_GROUP
     for texture in list(spec.textures):
-        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
+        if texture.type == _SKY:
             spec.delete(texture)
     _set_visuals(spec, model)
     airport = mujoco.MjSpec.from_file(str(AIRPORT_XML))

@@ -18,7 +18,7 @@ from typing import Any, Final, Self
 import mujoco
 import numpy as np
 
-from . import QUAD_XML
+from . import MOST_DRAG, QUAD_XML
 from .errors import InputError
 from .scene import build_scene
 
@@ -28,8 +28,6 @@ LEAST_TIMESTEP: Final = 1e-5
 """Smallest physics step, s: a control step of 0.02 s then takes a hundredth of a second."""
 MOST_HEIGHT: Final = 1e4
 """Height above which no craft may touch anything, m."""
-MOST_DRAG: Final = 100.0
-"""Largest linear drag, 1/s. RK4 at 10 ms is within 0.1 % there, and unstable above 278 /s."""
 
 _HASH_BYTES: Final = 16
 _RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves

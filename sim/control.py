@@ -4,10 +4,12 @@ A controller has no memory: what it needs of the past is in the state. An action
 within bounds, or is one of some choices.
 """
 
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
-from ..models.vehicle import Vehicle
 from .state import Array, WorldState, clip, component, constant
+
+if TYPE_CHECKING:
+    from ..models.vehicle import Vehicle
 
 __all__ = ["CollectiveThrust", "Controller", "RotorThrust"]
 
@@ -44,7 +46,7 @@ class CollectiveThrust:
     """
 
     def __init__(
-        self, vehicle: Vehicle, newtons: float, *, increment: bool, discrete: bool = False
+        self, vehicle: "Vehicle", newtons: float, *, increment: bool, discrete: bool = False
     ) -> None:
         self.low: tuple[float, ...] = (-1.0,)
         self.high: tuple[float, ...] = (1.0,)
@@ -58,7 +60,8 @@ class CollectiveThrust:
         self._rotors: Final = 0 if alike else slice(None)
         self._hover: Final = hover[self._rotors]
         self._per_action: Final = newtons * (hover / hover.mean())[self._rotors]
-        self._limits: Final = (low[self._rotors], high[self._rotors])
+        self._low: Final = low[self._rotors]
+        self._high: Final = high[self._rotors]
         self._increment = increment
 
     def thrust(self, action: Array, state: WorldState) -> Array:
@@ -71,7 +74,7 @@ class CollectiveThrust:
 
     def _clipped(self, thrust: Array, share: Array) -> Array:
         base = thrust if self._increment else constant(self._hover, thrust)
-        low, high = (constant(limit, thrust) for limit in self._limits)
+        low, high = constant(self._low, thrust), constant(self._high, thrust)
         return clip(base + constant(self._per_action, thrust) * share, low, high)
 
 
@@ -82,7 +85,7 @@ class RotorThrust:
         vehicle: The vehicle that it controls.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: "Vehicle") -> None:
         self.low, self.high = (-1.0,) * vehicle.num_rotors, (1.0,) * vehicle.num_rotors
         self.components = tuple(f"F{i + 1}" for i in range(vehicle.num_rotors))
         self.choices = 0

@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Any, Final, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, get_args
 
 from ..models.errors import InputError, require
-from ..models.vehicle import Vehicle
 from .random import Draw
 from .state import Array, Pose, WorldState
+
+if TYPE_CHECKING:
+    from ..models.vehicle import Vehicle
 
 __all__ = ["BACKENDS", "Backend", "PhysicsError", "World", "contact_check", "make_world"]
 
@@ -41,7 +43,7 @@ class World(Protocol):
         xp: Namespace of the array API standard for the state's arrays.
     """
 
-    vehicle: Vehicle
+    vehicle: "Vehicle"
     shape: tuple[int, ...]
     state: WorldState
     xp: Any
@@ -92,7 +94,7 @@ def contact_check(timestep: float) -> int:
 
 
 def make_world(
-    vehicle: Vehicle, num_worlds: int, backend: Backend = "mujoco", **settings: Any
+    vehicle: "Vehicle", num_worlds: int, backend: Backend = "mujoco", **settings: Any
 ) -> World:
     """Worlds of one drone each.
 

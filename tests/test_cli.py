@@ -1,6 +1,7 @@
 """The command line as a user meets it: good input, wrong input, Ctrl-C, a missing peer."""
 
 import json
+import logging
 import os
 import re
 import shutil
@@ -10,18 +11,21 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
 from rotorgram.agents import load
+from rotorgram.agents.checkpoints import store
 from rotorgram.cli import COMMANDS, main
+from rotorgram.cli._env import chosen_env
 from rotorgram.cli._flags import AlgorithmName, PresetName, parse
 from rotorgram.cli._scalars import ScalarWriter
 from rotorgram.cli.serve import Serve
 from rotorgram.cli.sim import Sim
 from rotorgram.experiments.results import read_results, read_steps
-from rotorgram.models import QUAD_XML
+from rotorgram.models import QUAD_XML, InputError
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 
@@ -90,11 +94,16 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["train", "vpg", "--listen", "8001"], "address: expected HOST:PORT"),
         (["train", "vpg", "--listen", "192.0.2.1:8001"], "is not a loopback address"),
         (["train", "vpg", "--resume", "nowhere"], "nowhere: cannot be written: No such file"),
+        (["train", "a2c", "--resume", "/proc/self"], "/proc/self: cannot be written: "),
+        (["train", "a2c", "--out", "/proc/run"], "out: cannot make /proc/run: "),
+        (["train", "a2c", "--out", "/dev/null/run"], "out: cannot make /dev/null"),
         (["sim", "--server", "127.0.0.1:99999"], "address: expected HOST:PORT"),
         (["sim", "--bind", "127.0.0.1:0", "--env.target", "1"], "target: expected"),
         (["sim", "--env", "rotorgram/Nothing-v0"], "env: expected a registered id"),
         (["sim", "--env", "nowhere:Nothing-v0"], "env: expected a module nowhere here, got none"),
         (["sim", "--vehicle", "nowhere.xml"], "vehicle: cannot read nowhere.xml"),
+        (["compare", "--num-envs", "0"], "num_envs: expected 1 or more, got 0"),
+        (["compare", "--first-seed", "-1"], "first_seed: expected 0 or more, got -1"),
         (["compare", "--seeds", "0"], "seeds: expected at least 1, got 0"),
         (["compare", "--agents", "vpg", "vpg"], "agents: expected each once"),
         (["compare", "--out", "."], "expected a new folder"),
@@ -265,7 +274,9 @@ def test_standard_output_that_takes_nothing(command: str, status: int, error: st
 
 
 def test_standard_output_in_ascii() -> None:
-    for command in ("rotorgram --help", "rotorgram render --help", "rotorgram check-model"):
+    commands = ("rotorgram --help", "rotorgram render --help", "rotorgram check-model",
+                "rotorgram evaluate pid --episodes 1")  # fmt: skip
+    for command in commands:
         done = shell(command, PYTHONIOENCODING="ascii")
         assert (done.returncode, done.stderr) == (0, ""), command
 
@@ -389,6 +400,7 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     assert run(capsys, "evaluate", folder, "--episodes", 1, "--env.linear-drag", 0.5)[0] == 0
     for changes, sentence in (
         (["vpg"], "resume: expected a training of vpg"),
+        (["a2c", "--seed", 0], "got others by --seed"),  # its own: set all the same
         (["a2c", "--seed", 3, "--set", "gamma=0.5"], "got others by --seed, --set"),
     ):
         status, _, err = run(capsys, "train", *changes, "--resume", folder)
@@ -397,8 +409,73 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     status, _, err = run(capsys, "evaluate", folder, "--env.observation", "error")
     assert status == 1
     assert "policy: expected weights of shapes" in err
+    reference = chosen_env(parse(Serve, "serve", ["x"]), kept)
+    assert reference == ("rotorgram/Elevation-v0", kept.options)
+    words = ["x", "--env.episode-length", "1000", "--env.linear-drag=0"]  # the defaults
+    assert chosen_env(parse(Serve, "serve", words), kept)[1] == {
+        **kept.options, "episode_length": 1000, "linear_drag": 0.0
+    }  # fmt: skip
     (folder / "episodes.csv").unlink()  # a result: the checkpoint has the episodes
     assert run(capsys, "train", "a2c", "--resume", folder)[0] == 0
+
+
+def test_of_two_trainings_with_one_folder_one_is_refused(tmp_path: Path) -> None:
+    """And of two that resume it."""
+    settings = ("--env-steps", 3000, "--set", "steps_per_update=100", "--store-every", 0.1)
+    for words in (("--out", tmp_path / "run", *settings), ("--resume", tmp_path / "run")):
+        both = [start("train", "a2c", *words) for _ in range(2)]
+        ended = []
+        for process in both:
+            out, err = process.communicate(timeout=60)
+            ended.append((process.returncode, out, err))
+        (_, out, err), (status, _, refused) = sorted(ended, key=lambda one: one[0])
+        assert "3,000 env steps" in out, err
+        if words[0] == "--out" or status:  # of a finished one both may say that it is finished
+            assert (status, refused.count("\n")) == (1, 1)
+            assert "expected a " in refused
+        kept = load(tmp_path / "run" / "checkpoint.safetensors")
+        assert kept.position.env_steps == 3000
+        assert len(kept.position.episodes) == len(pd.read_csv(tmp_path / "run" / "episodes.csv"))
+
+
+def test_a_resumed_training_names_other_versions(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ("--env-steps", 300, "--set", "steps_per_update=100")
+    assert run(capsys, "train", "a2c", "--out", tmp_path / "run", *settings)[0] == 0
+    file = tmp_path / "run" / "checkpoint.safetensors"
+    kept = load(file)
+    versions = {**kept.versions, "mujoco": "3.0.0"}
+    store(replace(kept, versions=versions, env_steps=600), file)
+    status, out, _ = run(capsys, "train", "a2c", "--resume", tmp_path / "run")
+    assert status == 0
+    now = kept.versions["mujoco"]
+    assert f"note: mujoco was 3.0.0 and is {now}: the numbers may differ" in out
+    assert out.count("note: ") == 1
+
+
+def test_a_full_disk_is_named_with_its_file(tmp_path: Path) -> None:
+    """A limit of the size of files is as a disk that is full."""
+    words = "train a2c --env-steps 300 --set steps_per_update=100 --out"
+    done = shell(f"ulimit -f 1; rotorgram {words} {tmp_path}/run")
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert re.fullmatch(rf"rotorgram: {tmp_path}/run/\S+: File too large", line)
+
+
+def test_text_of_others_holds_no_terminal_escapes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(self: Sim) -> int:
+        logging.getLogger("rotorgram.udp").warning("said \x1b[2J")
+        raise InputError("refused: \x1b]0;title\x07")
+
+    monkeypatch.setattr(Sim, "run", fail)
+    status, _, err = run(capsys, "sim")
+    assert (status, err) == (
+        1,
+        "rotorgram: said \ufffd[2J\nrotorgram: refused: \ufffd]0;title\ufffd\n",
+    )
 
 
 def test_ctrl_c_stops_a_training_that_resumes_to_the_numbers_of_an_unbroken_one(

@@ -240,6 +240,31 @@ def test_waits_follow_the_round_trips() -> None:
     assert trips.wait(40) == 1.0
 
 
+def test_one_pause_does_not_make_later_resends_late() -> None:
+    trips = RoundTrips()
+    for at in range(50):
+        trips.sent(float(at), first=True)
+        trips.answered(at + (1.0 if at == 40 else 0.002))
+    assert trips.wait(1) < 0.01
+
+
+def test_only_answers_that_come_twice_in_a_row_lengthen_the_wait() -> None:
+    trips = RoundTrips()
+    trips.sent(0.0, first=True)
+    trips.sent(0.0)
+    trips.answered(0.1)
+    longer = []
+    for twice in (True, False, True, True, True, False, True):  # the one before came so
+        trips.sent(1.0, first=True)
+        before = trips.wait(1)
+        if twice:
+            trips.answered_again()
+            trips.answered_again()
+        longer.append(trips.wait(1) > before)
+        trips.sent(2.0)
+    assert longer == [False, False, False, True, True, False, False]
+
+
 def test_silence_ends_a_simulator_and_a_pause_of_its_own_does_not() -> None:  # fault 25
     link = to(simulator(), SimulatorState.WAITING, Wire("agent", False))
     link.pardon(100.0)

@@ -132,6 +132,33 @@ def test_offscreen_buffer_is_large_enough(model: mujoco.MjModel) -> None:
     assert model.vis.global_.offheight >= 720
 
 
+OWN = {
+    "ground": '<geom name="own" type="plane" size="0 0 1"/>',
+    "sun": '<light name="own" pos="0 0 5"/>',
+    "sky": '<texture name="own" type="skybox" builtin="flat" width="8" height="8"/>',
+}
+
+
+@pytest.mark.parametrize("own", [[], ["ground"], ["ground", "sun"], ["ground", "sky"], [*OWN]])
+def test_a_file_keeps_its_ground_sun_and_sky_and_gets_those_it_lacks(
+    own: list[str], tmp_path: Path
+) -> None:
+    text = QUAD_XML.read_text(encoding="utf-8")
+    inside = "".join(OWN[name] for name in own if name != "sky")
+    text = text.replace("<worldbody>", f"<worldbody>{inside}", 1)
+    sky = f"<asset>{OWN['sky']}</asset>" if "sky" in own else ""
+    (tmp_path / "vehicle.xml").write_text(text.replace("<worldbody>", f"{sky}<worldbody>", 1))
+    model = build_scene(tmp_path / "vehicle.xml").compile()
+    suns = [model.light(i).name for i in range(model.nlight)]
+    skies = [model.tex(i).name for i in range(model.ntex)
+             if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX]  # fmt: skip
+    grounds = [model.geom(i).name for i in range(model.ngeom)
+               if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_PLANE]  # fmt: skip
+    assert suns == ["own" if "sun" in own else "scene/sun"]
+    assert skies == ["own" if "sky" in own else "scene/sky"]
+    assert grounds == ["own" if "ground" in own else "scene/floor"]
+
+
 def test_without_what_is_only_looked_at_the_physics_is_the_same() -> None:
     models = [build_scene(visual=visual).compile() for visual in (True, False)]
     assert models[0].ngeom > models[1].ngeom

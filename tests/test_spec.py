@@ -186,6 +186,7 @@ def test_the_module_of_an_id_is_no_part_of_it() -> None:
         (lambda: ArraySpec(name="a", shape=(0,)), "a: expected a shape of whole numbers >= 1"),
         (lambda: ArraySpec(name="a", shape=(2.0,)), "a: expected a shape"),  # type: ignore[arg-type]
         (lambda: ArraySpec(name="a", shape=(1 << 30,)), "a: expected at most 4194304 elements"),
+        (lambda: ArraySpec(name="a", shape=(1,) * 65), "a: expected at most 16 axes, got 65"),
         (lambda: ArraySpec(name="a", shape=(), dtype="float16"), "a: expected a dtype of float32"),
         (lambda: ArraySpec(name="a", shape=(2,), low=(1.0,)), "a: expected one number for low"),
         (lambda: ArraySpec(name="a", shape=(), low=math.nan), "a: expected one number for low"),
@@ -198,12 +199,14 @@ def test_the_module_of_an_id_is_no_part_of_it() -> None:
         (lambda: Metric(name="", unit="m"), "metric: expected a name"),
         (lambda: Metric(name="e", unit="m", goal="low"), "e: expected the goal"),  # type: ignore[arg-type]
         (lambda: Metric(name="e", unit="m", settled=0.0), "e: expected settled > 0 or None"),
+        (lambda: Metric(name="e", unit="m", held=10**400), "e: expected held > 0 or None"),
         (lambda: spec_of(control_period=1e6), "control_period: expected 1e-6 to 1e3 s"),
         (lambda: spec_of(vehicle_hash="xyz"), "vehicle_hash: expected 32 hex digits"),
         (lambda: spec_of(agents=("a", "a")), "agents: expected 1 to 1024 different names"),
         (lambda: spec_of(observation=()), "observation: expected at least one array"),
         (lambda: spec_of(observation=(PICTURE, PICTURE)), "observation: .* different names"),
         (lambda: spec_of(options={"a": object()}), "options: expected JSON values"),
+        (lambda: spec_of(options={"a": ["\ud800"]}), "options: expected JSON values"),
         (lambda: spec_of(options={"a": math.nan}), "options: expected JSON values"),
         (
             lambda: spec_of(metrics=(Metric(name="e", unit="m"),)),
@@ -216,6 +219,15 @@ def test_what_makes_no_sense_is_one_sentence(build: Any, sentence: str) -> None:
         build()
     assert isinstance(caught.value, InputError)
     assert "\n" not in str(caught.value)
+
+
+def test_a_short_spec_cannot_ask_for_much_memory() -> None:
+    """Arrays of 2^22 numbers, 64 of them, and a name for each number: gigabytes from 3 kB."""
+    arrays = tuple(ArraySpec(name=f"a{i}", shape=(1 << 22,)) for i in range(2))
+    with pytest.raises(SpecError, match="observation: expected at most 4194304 elements in all"):
+        spec_of(observation=arrays)
+    with pytest.raises(SpecError, match="telemetry: expected at most 16384 elements in all"):
+        spec_of(telemetry=arrays[:1])
 
 
 GOOD = json.loads(env_spec(HOVER).to_json())

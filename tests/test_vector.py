@@ -1,5 +1,7 @@
 """The vector env: N single envs bit for bit, Gymnasium's autoreset, and clear refusals."""
 
+import os
+import signal
 import time
 from pathlib import Path
 from typing import Any
@@ -253,3 +255,23 @@ def test_the_registered_entry_point() -> None:
     for env_id in (ID, HOVER):
         assert gym.spec(env_id).vector_entry_point == "rotorgram.envs.vector:LocalVectorEnv"
         assert isinstance(gym.make_vec(env_id, num_envs=2), LocalVectorEnv)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_threads_do_not_follow_into_a_fork() -> None:
+    """A child has no thread that would step its drones: it is told, and does not wait for them."""
+    vector = gym.make_vec(ID, num_envs=2, num_threads=2)
+    vector.reset(seed=1)
+    action = np.zeros((2, 1), np.float32)
+    vector.step(action)
+    child = os.fork()
+    if child == 0:
+        signal.alarm(10)
+        try:
+            vector.step(action)
+        except RuntimeError as error:
+            os._exit(0 if "make another env" in str(error) else 1)
+        os._exit(2)
+    assert os.waitpid(child, 0)[1] == 0
+    vector.step(action)
+    vector.close()

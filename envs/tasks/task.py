@@ -10,14 +10,17 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from numbers import Real
-from typing import Any, ClassVar, Final, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 import numpy as np
 
+from ...models import MOST_DRAG
 from ...models.errors import InputError
-from ...models.vehicle import MOST_DRAG, Vehicle
 from ...sim import Array, Controller, Draw, Pose, WorldState
 from ..spec import ArraySpec, Metric
+
+if TYPE_CHECKING:
+    from ...models.vehicle import Vehicle
 
 __all__ = ["Outcome", "Task", "TaskOptions", "check_choice", "check_number", "finite"]
 
@@ -107,7 +110,7 @@ class Task:
     observation: tuple[ArraySpec, ...]
 
     def __init__(
-        self, options: Any, vehicle: Vehicle, shape: tuple[int, ...] = (), xp: Any = np
+        self, options: Any, vehicle: "Vehicle", shape: tuple[int, ...] = (), xp: Any = np
     ) -> None:
         self.options = options
         self.vehicle = vehicle

@@ -4,6 +4,7 @@
 of threads.
 """
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -51,6 +52,7 @@ class MujocoWorld:
         self._check = contact_check(vehicle.timestep)
         threads = 1 if num_worlds == 1 else num_threads
         self._batch = batch = Batch(vehicle.model, num_worlds, threads)
+        self._owner = None if threads == 1 else os.getpid()
         # Live views of simulator memory, made once.
         qpos: np.ndarray = batch.bind("qpos")
         qvel: np.ndarray = batch.bind("qvel")
@@ -76,6 +78,7 @@ class MujocoWorld:
 
     def reset(self, mask: Array, pose: Pose) -> None:
         """As `World.reset`."""
+        self._check_process()
         ids = self._ids(mask)
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         state, here = self.state, () if self.shape == () else ids
@@ -94,6 +97,7 @@ class MujocoWorld:
 
     def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
         """As `World.step`."""
+        self._check_process()
         ids = None if mask is None else self._ids(mask)
         here = ... if ids is None or self.shape == () else ids
         self.state.thrust[here] = thrust[here]
@@ -123,6 +127,10 @@ class MujocoWorld:
 
     def close(self) -> None:
         """Nothing to release but memory."""
+
+    def _check_process(self) -> None:
+        if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
+            raise RuntimeError("the threads of an env do not follow into a fork: make another env")
 
     def _ids(self, mask: Array) -> np.ndarray:
         """Numbers of the worlds of a mask of the leading shape, or of shape (W,)."""

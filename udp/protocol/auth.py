@@ -1,10 +1,8 @@
 """A shared key: only its holders can make a valid datagram.
 
-A sealed datagram is an envelope of 24 bytes before the message:
-
-    0   2 bytes   magic a7 53
-    2   6 bytes   id of the key: so that an agent may hold several while they are changed
-    8   16 bytes  tag: keyed BLAKE2b (RFC 7693) of the message, `person` of the sender's side
+A sealed datagram is an envelope of 24 bytes before the message: a magic number, the id of the key,
+so that an agent may hold several while they are changed, and the tag, a keyed BLAKE2b with the
+sender's side as `person` (docs/protocol.md has the offsets).
 
 Messages that open a session are tagged with the shared key; later ones with a key derived from it
 and both sides' random numbers, so that no message of another session is accepted. Sealing

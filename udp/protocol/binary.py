@@ -1,49 +1,7 @@
 """The binary codec: messages to bytes and back, as pure functions. Little-endian throughout.
 
-Every message, and every fragment of one, begins with 24 bytes:
-
-    0   2 bytes  magic a7 52
-    2   u8       version: 2. A Hello is written in the lowest version that its simulator speaks
-    3   u8       type; plus 128 in a fragment: see `fragments`
-    4   u32      CRC-32 (zlib, PNG) of bytes 0-3 followed by bytes 8-end
-    8   u64      session
-    16  u64      sequence number; 0 in Hello, Welcome, Refuse and Wait
-
-    Hello 1, simulator to agent       24  u8   lowest version that it speaks
-                                      25  u8   highest
-                                      26  2 bytes reserved
-                                      28  u32  number of worlds W
-                                      32  u32  bytes of the spec L
-                                      36  4 bytes reserved
-                                      40  L bytes: the EnvSpec, JSON in UTF-8
-                                      40 + L   extensions, to the end
-    Welcome 2, agent to simulator     24  u64  nonce
-                                      32  u64  seed of the simulator's first reset
-                                      40  u8   1 if there is a seed, else 0
-                                      41  u8   version of all that follows
-                                      42  6 bytes reserved
-                                      48       extensions, to the end
-    Refuse 3, agent to simulator      24  u16 and so many bytes of UTF-8: reason
-    State 4, simulator to agent       24  f64  simulated time, s
-                                      32  u64  nonce of the Welcome in State 1; else 0
-                                      40       arrays: see `layout`
-    Command 5, agent to simulator     24  u32  number of seeds, 0 or N
-                                      28  4 bytes reserved
-                                      32       arrays: see `layout`
-    Close 6, either                   24  u16 and so many bytes of UTF-8: reason
-    Wait 7, agent to simulator        the header alone
-    Unknown 8, agent to simulator     the header alone; sequence number of the State it answers
-    Alive 9, simulator to agent       the header alone; sequence number of the Command
-    Missing 10, either                24  u8   type of the message: 1, 4 or 5
-                                      25  1 byte reserved
-                                      26  u16  number of its fragments
-                                      28  u16  fragment that bit 0 stands for
-                                      30       bitmap to the end, at least 1 byte, lowest bit first
-
-An extension is a u16 (bits 0-14 its type, bit 15 set if it is critical), a u16 length of at most
-512, and so many bytes. A side skips an extension that it does not know, and stops if that one is
-critical. Reserved bytes are sent as 0 and ignored. The header, the layout of a fragment, the first
-two fields of Hello and the whole of Refuse are those of every version.
+`docs/protocol.md` has every field of every message at its offset, and what a reader ignores: the
+constants and structs below follow it, and `tests/golden.py` writes the bytes that both must give.
 """
 
 import struct
@@ -258,8 +216,10 @@ def _encode_state(m: State, layout: Layout | None) -> bytes:
     if len(arrays) != len(slots):
         raise InputError(f"State: expected {len(slots)} arrays, got {len(arrays)}")
     pieces = [_STATE_BODY.pack(m.time, m.nonce)]
-    for (slot, pad), array in zip(slots, arrays, strict=True):
-        pieces += (pad, _bytes_of("State", slot, array))
+    for (shape, dtype, _, pad), array in zip(slots, arrays, strict=True):
+        if array.shape != shape or (array.dtype is not dtype and array.dtype != dtype):
+            raise _misfit("State", shape, dtype, array)
+        pieces += (pad, array.tobytes())
     body = b"".join(pieces)
     numbers = layout.state_numbers
     if numbers is None or not _adds_up(numbers.unpack_from(body)):
@@ -278,7 +238,7 @@ def _decode_state(data: bytes, session: int, sequence: int, layout: Layout | Non
         _expect_finite("observation, reward, telemetry", data, time, floats)
     terminated, truncated = layout.flags
     _expect_flags(data[terminated.at : truncated.end], _FLAGS)
-    arrays = [np.ndarray(slot.shape, slot.dtype, data, slot.at) for slot, _ in layout.state_slots]
+    arrays = [np.ndarray(shape, dtype, data, at) for shape, dtype, at, _ in layout.state_slots]
     first = len(layout.observation)
     return State(
         session=session,
@@ -343,12 +303,16 @@ def _check_command(data: bytes, layout: Layout) -> None:
 
 def _bytes_of(what: str, slot: Slot, array: np.ndarray) -> bytes:
     """Bytes of an array that has to be that of a slot. Numbers are never converted."""
-    if array.shape != slot.shape or (array.dtype is not slot.dtype and array.dtype != slot.dtype):
-        raise InputError(
-            f"{what}: expected {slot.dtype.name} of shape {slot.shape}, "
-            f"got {array.dtype.name} of shape {array.shape}"
-        )
+    if array.shape != slot.shape or array.dtype != slot.dtype:
+        raise _misfit(what, slot.shape, slot.dtype, array)
     return array.tobytes()
+
+
+def _misfit(what: str, shape: tuple[int, ...], dtype: np.dtype, array: np.ndarray) -> InputError:
+    return InputError(
+        f"{what}: expected {dtype.name} of shape {shape}, "
+        f"got {array.dtype.name} of shape {array.shape}"
+    )
 
 
 def _adds_up(numbers: tuple[Any, ...]) -> bool:

@@ -1,12 +1,7 @@
 """Messages that are larger than a datagram: cut into fragments, and put together again.
 
-A fragment is a datagram with the header of its message, 128 added to its type, and
-
-    24  u16  number of the fragment, from 0
-    26  u16  number of fragments, 1 to 16,384
-    28  u8   1 if its sender waits for an answer after it, else 0
-    29  3 bytes reserved
-    32       a slice of the message, its header included, at least one byte
+A fragment is a datagram with the header of its message, 128 added to its type, and a header of its
+own: its number, the number of all, and whether its sender waits for an answer (docs/protocol.md).
 
 A message is sent in bursts. The last fragment of a burst asks for an answer: a `Missing` with the
 fragments that have not come, or, if all have, the answer to the message. So only missing fragments
@@ -16,6 +11,7 @@ are sent again, and the bursts follow each other at the pace of the round trip.
 import struct
 from math import ceil
 from typing import Final
+from zlib import crc32
 
 import numpy as np
 
@@ -79,6 +75,18 @@ class Transfer:
         window: Size of the bursts, of this side and peer.
     """
 
+    __slots__ = (
+        "_burst",
+        "_crc",
+        "_next",
+        "_numbers",
+        "_slice",
+        "_start",
+        "_window",
+        "count",
+        "message",
+    )
+
     def __init__(self, message: bytes, largest: int, window: Window) -> None:
         self.message = message
         self.count = 1
@@ -86,6 +94,9 @@ class Transfer:
             self.count = ceil(len(message) / (largest - _OVERHEAD))
             self._slice = ceil(len(message) / self.count)
             self.count = ceil(len(message) / self._slice)  # fewer, where rounding made empty ones
+            self._start = message[:3] + bytes((message[3] | binary.FRAGMENT,))
+            self._numbers = message[8:HEADER_SIZE]
+            self._crc = crc32(self._numbers, crc32(self._start))
         self._window = window
         self._burst: list[int] = []
         self._next = 0  # no fragment from this one on was sent
@@ -123,10 +134,11 @@ class Transfer:
         return [self._fragment(number, asks=number == burst[-1]) for number in burst]
 
     def _fragment(self, number: int, *, asks: bool) -> bytes:
-        kind, session, sequence = binary.peek(self.message)
         at = number * self._slice
-        body = _FRAGMENT.pack(number, self.count, asks) + self.message[at : at + self._slice]
-        return binary.frame(kind | binary.FRAGMENT, session, sequence, body)
+        head = _FRAGMENT.pack(number, self.count, asks)
+        slice_ = self.message[at : at + self._slice]
+        crc = crc32(slice_, crc32(head, self._crc)).to_bytes(4, "little")
+        return b"".join((self._start, crc, self._numbers, head, slice_))
 
 
 def is_fragment(datagram: bytes) -> bool:

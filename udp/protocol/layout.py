@@ -1,21 +1,7 @@
 """Where each array of a State and of a Command lies, known from Hello on.
 
-Every array begins at a multiple of 8 bytes, counted from the beginning of the message; the bytes
-between two arrays are 0 and are ignored. Numbers are little-endian, in C order, and the drone is
-the first axis. With N drones a State is, after its fixed 40 bytes:
-
-    each observation array   its dtype, N x shape
-    rewards                  f64 x N
-    terminated, truncated    u8 x N each, 0 or 1, without a gap between the two
-    each telemetry array     f64, N x shape
-
-and a Command, after its fixed 32 bytes:
-
-    actions                  their dtype, N x shape; a discrete one is an i64
-    orders                   u8 x N: 0 fly, 1 reset, 2 stay frozen
-    seeds                    u64 x N, or nothing
-
-The size of a message is exactly where its last array ends.
+The tables of State and Command in `docs/protocol.md` say it in words: every array begins at a
+multiple of 8 bytes, and the size of a message is exactly where its last array ends.
 """
 
 import math
@@ -138,11 +124,17 @@ class Layout:
         return self._slots(self.flags[1].end, [(shape, "float64") for shape in self.telemetry])
 
     @cached_property
-    def state_slots(self) -> tuple[tuple[Slot, bytes], ...]:
-        """Every array of a State in its order, with the bytes before it that are 0."""
+    def state_slots(self) -> tuple[tuple[tuple[int, ...], np.dtype, int, bytes], ...]:
+        """Of every array of a State in its order: shape, dtype, first byte, and the zeros before.
+
+        Plain tuples, for they are looked at in each message.
+        """
         slots = (*self.observation_slots, self.rewards, *self.flags, *self.telemetry_slots)
         ends = (STATE_ARRAYS_AT, *(slot.end for slot in slots))
-        return tuple((slot, bytes(slot.at - end)) for slot, end in zip(slots, ends, strict=False))
+        return tuple(
+            (slot.shape, slot.dtype, slot.at, bytes(slot.at - end))
+            for slot, end in zip(slots, ends, strict=False)
+        )
 
     @cached_property
     def state_size(self) -> int:

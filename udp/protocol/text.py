@@ -1,10 +1,7 @@
 """The text codec: one drone, numbers separated by commas, at most 1024 bytes of ASCII.
 
-The paper's peers turn arrays of numbers into bytes and back (section 2.1). There is no Hello:
-
-    simulator:  sequence,reward,terminated,truncated,observation...,telemetry...
-    agent:      sequence,action...    or    sequence,reset[,seed]
-    either:     sequence,close
+The paper's peers turn arrays of numbers into bytes and back (section 2.1). There is no Hello. The
+grammar is in docs/protocol.md.
 
 Numbers are written as float64 with the fewest digits that read back as the same bits; a float32
 is written as the float64 of the same value.
