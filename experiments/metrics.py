@@ -189,8 +189,9 @@ def overshoot(errors: Values) -> float:
 
 
 def _finite(values: Values) -> Floats:
-    array = np.asarray(values, float)
-    return array[np.isfinite(array)]
+    array: Floats = np.asarray(values, float)
+    finite: Floats = array[np.isfinite(array)]
+    return finite
 
 
 def trimmed_mean(values: Values, axis: int = -1) -> Floats:
@@ -209,7 +210,7 @@ def iqm(values: Values) -> float:
     return float(trimmed_mean(finite)) if finite.size else math.nan
 
 
-def _resampled_iqms(values: Values, rng: np.random.Generator) -> Floats:
+def _resampled_iqms(values: Floats, rng: np.random.Generator) -> Floats:
     return trimmed_mean(rng.choice(values, size=(_RESAMPLES, values.size), replace=True), axis=1)
 
 
