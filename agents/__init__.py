@@ -17,25 +17,10 @@ if TYPE_CHECKING:
     from .learner import Agent
 
 __all__ = [
-    "PID",
-    "PRESETS",
-    "A2CConfig",
-    "AlgorithmName",
-    "Checkpoint",
-    "CheckpointError",
-    "Episode",
-    "EpisodeLog",
-    "NetworkPolicy",
-    "Policy",
-    "ResumeError",
-    "VPGConfig",
-    "episode_seed",
-    "load",
-    "make_agent",
-    "preset",
-    "resume_agent",
-    "store",
-]
+    "PID", "PRESETS", "A2CConfig", "AlgorithmName", "Checkpoint", "CheckpointError", "Episode",
+    "EpisodeLog", "NetworkPolicy", "Policy", "ResumeError", "VPGConfig", "episode_seed", "load",
+    "make_agent", "preset", "resume_agent", "store",
+]  # fmt: skip
 
 
 def make_agent(

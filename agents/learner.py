@@ -14,18 +14,8 @@ from .policies import ActionMap, NetworkPolicy, flat_size
 from .presets import A2CConfig, VPGConfig
 from .rollouts import Collector, Rollout
 
-__all__ = [
-    "Agent",
-    "Diverged",
-    "Learner",
-    "OnUpdate",
-    "Terms",
-    "check_finite",
-    "optimizer_arrays",
-    "seeds_of",
-    "set_optimizer_arrays",
-    "updates_of",
-]
+__all__ = ["Agent", "Diverged", "Learner", "OnUpdate", "Terms", "check_finite", "optimizer_arrays",
+           "seeds_of", "set_optimizer_arrays", "updates_of"]  # fmt: skip
 
 OnUpdate = Callable[[], bool]
 """Called after every rollout and its update; training stops where it returns False."""

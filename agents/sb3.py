@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
@@ -86,19 +85,15 @@ class SB3VecEnv(sb3_vec.VecEnv):
         """An attribute of the vector env, which all envs share."""
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, *_: Any, **__: Any) -> None:
         """Not possible: the envs are one."""
         raise NotImplementedError("set_attr: the envs of a vector env have no attributes to set")
 
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
-    ) -> list[Any]:
+    def env_method(self, *_: Any, **__: Any) -> list[Any]:
         """Not possible: the envs are one."""
         raise NotImplementedError("env_method: the envs of a vector env have no methods to call")
 
-    def env_is_wrapped(
-        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Any = None
-    ) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """False: wrappers of single envs are not here."""
         return [False] * len(list(self._get_indices(indices)))
 

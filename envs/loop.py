@@ -262,8 +262,11 @@ class Loop:
         self.terms = outcome.reward
         if not self.world.shape:  # a single drone's numbers
             self.rewards = np.array((total,))
-            self.terminated, self.truncated = np.array((ended,)), np.array((late,))
             may_end = bool(ended or late)
+            # New arrays, as below; an array of truth values is fastest as a copy of another.
+            self.terminated, self.truncated = self._nobody.copy(), self._nobody.copy()
+            if may_end:
+                self.terminated[0], self.truncated[0] = ended, late
         else:
             self.rewards = total.reshape(n)
             # New arrays, whatever the task gave: arrays of earlier steps must not change.

@@ -9,7 +9,7 @@ import numpy as np
 from ..models.errors import InputError
 from .loop import Loop
 from .rendering import RENDER_MODES, checked_render_mode, moments, painter
-from .spaces import action_space, joined, observation_space, telemetry_names
+from .spaces import action_space, observation_space, telemetry_names
 
 if TYPE_CHECKING:
     from ..rendering.painter import Painter
@@ -64,6 +64,8 @@ class SingleEnv(gym.Env[Any, Any]):
         self.observation_space = observation_space(loop.spec)
         self.action_space = action_space(loop.spec)
         self._names = telemetry_names(loop.spec)
+        arrays = loop.spec.observation
+        self._only = arrays[0].name if len(arrays) == 1 else ""
         self._all = np.ones(1, bool)
         self._no_action = np.zeros((1, len(loop.task.controller.low)), np.float32)
         self._episodes = 0
@@ -139,14 +141,16 @@ class SingleEnv(gym.Env[Any, Any]):
         return array
 
     def _observation(self) -> Any:
-        first = {name: values[0] for name, values in self._loop.observations.items()}
-        return joined(self.env_spec, first)
+        observations = self._loop.observations
+        if self._only:  # the loop makes new arrays with each step
+            return observations[self._only][0]
+        return {name: values[0] for name, values in observations.items()}
 
     def _info(self) -> dict[str, Any]:
         loop = self._loop
         info = dict(zip(self._names, loop.telemetry_table[0].tolist(), strict=True))
         for name, term in loop.terms.items():
-            info[f"reward_{name}"] = float(term)
+            info["reward_" + name] = float(term)
         return info
 
     def __deepcopy__(self, memo: Any) -> Any:

@@ -61,7 +61,6 @@ class Ratio:
     name: str
     of: Callable[[Rates], float]
     target: float | None = None
-    """Target; None: the figure has none."""
     at_most: bool = False
     """Whether less is better."""
 
@@ -110,15 +109,8 @@ RATIOS: Final = (
 )
 """Figures of rates, with their targets."""
 
-PARTS: Final = (
-    "simulate",
-    "encode State",
-    "decode State",
-    "decide",
-    "encode Command",
-    "decode Command",
-    "UDP echo",
-)
+PARTS: Final = ("simulate", "encode State", "decode State", "decide", "encode Command",
+                "decode Command", "UDP echo")  # fmt: skip
 """Layers of which a lock-step step of one drone consists: once each."""
 
 _ECHO: Final = """
@@ -179,17 +171,16 @@ def bench(
         folder: Made if it is not there.
         on_layer: Told before each turn: name of the layer, turns done, turns in all.
     """
+    rates: dict[str, list[float]] = {name: [] for name, *_ in _LAYERS}
     with ExitStack() as stack:
-        opened: list[tuple[str, str, int, Slice]] = []
-        rates: dict[str, list[float]] = {}
-        for name, about, drones, open_ in _LAYERS:
+        opened: list[tuple[str, Slice]] = []
+        for name, _, _, open_ in _LAYERS:
             on_layer(f"opening {name}", 0, 1)
-            opened.append((name, about, drones, stack.enter_context(open_())))
-            rates[name] = []
+            opened.append((name, stack.enter_context(open_())))
         total, turn = (config.rounds + 1) * len(opened), 0
         for number in range(config.rounds + 1):
             first = number % len(opened)
-            for name, _, _, run in opened[first:] + opened[:first]:
+            for name, run in opened[first:] + opened[:first]:
                 on_layer(name, turn, total)
                 start = time.perf_counter()
                 steps = run(config.seconds)
@@ -199,7 +190,7 @@ def bench(
                 turn += 1
     layers = [
         Layer(name=name, about=about, drones=drones, rates=tuple(rates[name]))
-        for name, about, drones, _ in opened
+        for name, about, drones, _ in _LAYERS
     ]
     _write(layers, config, folder)
     return layers
@@ -283,27 +274,17 @@ def _batch_step(drones: int, timestep: float | None = None) -> Iterator[Slice]:
 
 
 @contextmanager
-def _env() -> Iterator[Slice]:
-    with closing(gym.make(ENV_ID, disable_env_checker=True).unwrapped) as env:
-        yield _single(env)
+def _local(drones: int) -> Iterator[Slice]:
+    one = drones == 1
+    made: Any = gym.make(ENV_ID, disable_env_checker=True) if one else gym.make_vec(ENV_ID, drones)
+    with closing(made.unwrapped) as env:
+        yield _single(env) if one else _vector(env)
 
 
 @contextmanager
-def _udp_single() -> Iterator[Slice]:
-    with socket_pair(ENV_ID) as env:
-        yield _single(env)
-
-
-@contextmanager
-def _vector_env(drones: int) -> Iterator[Slice]:
-    with closing(gym.make_vec(ENV_ID, num_envs=drones).unwrapped) as env:
-        yield _vector(env)
-
-
-@contextmanager
-def _udp_batch(drones: int) -> Iterator[Slice]:
+def _remote(drones: int) -> Iterator[Slice]:
     with socket_pair(ENV_ID, num_envs=drones) as env:
-        yield _vector(env)
+        yield _single(env) if drones == 1 else _vector(env)
 
 
 @contextmanager
@@ -492,7 +473,7 @@ _MANY: Final = (64, 1024, 4096)
 _CODEC: Final = ("encode State", "decode State", "encode Command", "decode Command")
 _LAYERS: Final[list[tuple[str, str, int, Callable[[], Any]]]] = [
     ("mj_step", "a loop over mj_step, substeps of one control step", 1, _mj_step),
-    ("env", "the single env's step", 1, _env),
+    ("env", "the single env's step", 1, lambda: _local(1)),
     ("Batch.step, 1024", "mujoco.batch, the same substeps", 1024, lambda: _batch_step(1024)),
     (
         "Batch.step at 5 ms, 1024",
@@ -500,13 +481,10 @@ _LAYERS: Final[list[tuple[str, str, int, Callable[[], Any]]]] = [
         1024,
         lambda: _batch_step(1024, _OLD_TIMESTEP),
     ),
-    *((f"vector env, {n}", "the vector env", n, lambda n=n: _vector_env(n)) for n in _MANY),
+    *((f"vector env, {n}", "the vector env", n, lambda n=n: _local(n)) for n in _MANY),
     ("UDP echo", "blocking sockets in Python, datagrams of the same sizes", 1, _echo),
-    ("UDP, 1", "RemoteEnv and a simulator", 1, _udp_single),
-    *(
-        (f"UDP, {n}", "RemoteVectorEnv and a simulator", n, lambda n=n: _udp_batch(n))
-        for n in _MANY
-    ),
+    ("UDP, 1", "RemoteEnv and a simulator", 1, lambda: _remote(1)),
+    *((f"UDP, {n}", "RemoteVectorEnv and a simulator", n, lambda n=n: _remote(n)) for n in _MANY),
     ("simulate", "physics, task and telemetry of one drone", 1, _simulate),
     *((name, "of one drone, binary", 1, lambda name=name: _codec(name)) for name in _CODEC),
     ("decide", "16 units, sampled", 1, lambda: _policy(1)),

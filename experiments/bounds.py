@@ -34,22 +34,15 @@ def elevation_bounds(
     """Mean returns of the two flights over episodes, by name.
 
     Args:
-        options: Of `rotorgram/Elevation-v0`.
-        vehicle: The vehicle.
+        options, vehicle: Of `rotorgram/Elevation-v0`.
         starts: E at the start of each episode, m, shape (n,).
     """
     steps, period = options.episode_length, options.control_period
     up, down, change = _limits(options, vehicle)
     rising = starts > 0
-    left = bang_bang(
-        np.abs(starts),
-        steps,
-        period,
-        np.where(rising, up, down),
-        np.where(rising, down, up),
-        change,
-        options.linear_drag,
-    )
+    towards, against = np.where(rising, up, down), np.where(rising, down, up)
+    drag = options.linear_drag
+    left = bang_bang(np.abs(starts), steps, period, towards, against, change, drag)
     fastest = elevation_reward(left).sum(axis=1)
     return {
         "time-optimal": float(fastest.mean()),
@@ -75,14 +68,9 @@ def elevation_reward(errors: Floats) -> Floats:
 
 
 def bang_bang(
-    distance: Floats,
-    steps: int,
-    period: float,
-    towards: Floats,
-    against: Floats,
-    change: float = np.inf,
-    drag: float = 0.0,
-) -> Floats:
+    distance: Floats, steps: int, period: float, towards: Floats, against: Floats,
+    change: float = np.inf, drag: float = 0.0,
+) -> Floats:  # fmt: skip
     """Distance left after each control step of the time-optimal flight between two rests.
 
     Args:

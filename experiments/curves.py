@@ -93,10 +93,6 @@ class Curves:
 def make_curves(folder: Path | str, results: Results) -> Curves:
     """Make all curves of a comparison.
 
-    Args:
-        folder: Where `rotorgram compare` wrote; the step rows are read from it.
-        results: As of `results.read_results(folder)`.
-
     Raises:
         ResultsError: The step rows are missing or are not what they should be.
     """
@@ -186,7 +182,6 @@ def flown_sizes(steps: pd.DataFrame, control_period: float, headline: Headline) 
     Args:
         steps: Evaluation steps of one agent, columns `step` and `value`; at least one row.
         control_period: Time between two control steps, s.
-        headline: Says what the size is.
     """
     last = int(steps["step"].max())
     moments = np.unique(np.linspace(0, last, min(last + 1, _MAX_MOMENTS)).round().astype(np.int64))

@@ -29,12 +29,8 @@ from matplotlib.ticker import EngFormatter  # noqa: E402
 
 __all__ = ["FIGURE_FILES", "draw_figures"]
 
-FIGURE_FILES: Final = (
-    "fig6_reward.png",
-    "fig7_cumulative_reward.png",
-    "fig8_error.png",
-    "learning_curve.png",
-)
+FIGURE_FILES: Final = ("fig6_reward.png", "fig7_cumulative_reward.png", "fig8_error.png",
+                       "learning_curve.png")  # fmt: skip
 
 _MAX_POINTS: Final = 2000
 _OUTER: Final = 0.18  # opacity of the 5–95 % band
@@ -58,12 +54,9 @@ _STYLE: Final[dict[Any, Any]] = {
 }
 
 _TIGHT: Final[dict[str, Any]] = {
-    "borderaxespad": 0.0,
-    "columnspacing": 1.0,
-    "handlelength": 1.2,
-    "handletextpad": 0.5,
+    "borderaxespad": 0.0, "columnspacing": 1.0, "handlelength": 1.2, "handletextpad": 0.5,
     "fontsize": 8.5,
-}
+}  # fmt: skip
 
 
 def draw_figures(
@@ -73,13 +66,8 @@ def draw_figures(
 
     Agents or runs that are missing are left out of the figures; a panel with nothing in it says so.
 
-    Args:
-        folder: Where `rotorgram compare` wrote.
-        results: As of `read_results(folder)`; None: read them.
-        curves: As of `make_curves(folder, results)`; None: make them.
-
-    Returns:
-        The PNG files, in the order of `FIGURE_FILES`.
+    Results and curves that are not given are made from the folder. Returns the PNG files, in the
+    order of `FIGURE_FILES`.
     """
     results = results or read_results(folder)
     drawn = curves or make_curves(folder, results)
@@ -245,14 +233,8 @@ def _plot(
     color = agent_color(agent)
     marker = "o" if len(spread.x) < 2 else marker
     axis.fill_between(spread.x, spread.low, spread.high, color=color, alpha=0.2, lw=0)
-    axis.plot(
-        spread.x,
-        spread.middle,
-        color=color,
-        marker=marker,
-        markersize=3.5,
-        label=label or agent_label(agent),
-    )
+    words = {"marker": marker, "markersize": 3.5, "label": label or agent_label(agent)}
+    axis.plot(spread.x, spread.middle, color=color, **words)  # type: ignore[arg-type]
 
 
 def _scatter_episodes(axis: Axes, episodes: pd.DataFrame, agent: str) -> None:
@@ -260,16 +242,10 @@ def _scatter_episodes(axis: Axes, episodes: pd.DataFrame, agent: str) -> None:
     shown = episodes.sample(min(len(episodes), _MAX_POINTS), random_state=0)
     few = len(shown) < 1000
     axis.plot(
-        episode_ends(shown),
-        shown["return"].to_numpy(),
-        ls="",
-        marker="o",
-        markersize=3.0 if few else 2.0,
-        color=agent_color(agent),
-        alpha=0.4 if few else 0.2,
-        markeredgewidth=0,
+        episode_ends(shown), shown["return"].to_numpy(), "o", markersize=3.0 if few else 2.0,
+        color=agent_color(agent), alpha=0.4 if few else 0.2, markeredgewidth=0,
         label="total reward",
-    )
+    )  # fmt: skip
 
 
 def _env_steps_axis(axis: Axes) -> None:

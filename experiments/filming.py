@@ -6,7 +6,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -34,8 +34,9 @@ MOST_FRAMES: Final = 1_000_000
 _SPACE: Final = 2  # pixels between panes
 _DARK: Final = (13, 18, 26)
 _ASPECT: Final = 1.2  # of a pane that shows a craft and its graph well
-_COMPARISON_SIZE: Final = (1280, 400)
-_COMPARISON_QUALITY: Final = 27
+_COMPARISON: Final[dict[str, Any]] = {
+    "width": 1280, "height": 400, "camera": "front", "fast": True, "quality": 27,
+}  # fmt: skip
 """Small enough for a page that holds the film in itself."""
 
 
@@ -229,15 +230,9 @@ class _Pane:
     """The picture of one flight, drawn again only where it changes."""
 
     def __init__(
-        self,
-        shot: Shot,
-        config: Film,
-        canvas: Canvas,
-        stage: Stage,
-        seconds: float,
-        scale: tuple[float, float],
-        named: bool,
-    ) -> None:
+        self, shot: Shot, config: Film, canvas: Canvas, stage: Stage, seconds: float,
+        scale: tuple[float, float], named: bool,
+    ) -> None:  # fmt: skip
         self._shot, self._config = shot, config
         self._canvas, self._stage = canvas, stage
         self._shown = (-1, -1)  # episode and step
@@ -314,7 +309,7 @@ def film_comparison(
         out: The film; one that exists is replaced.
         on_frame: Told how far it is.
         picture: JPEG of a moment of the film, written beside it; what a page shows before it plays.
-        world: Where.
+        world: Surroundings.
 
     Returns:
         Whether there is a film. Without OpenGL there is none, and a line in the log says why.
@@ -326,16 +321,7 @@ def film_comparison(
     from .results import read_results
 
     results = read_results(folder)
-    width, height = _COMPARISON_SIZE
-    config = Film(
-        width=width,
-        height=height,
-        camera="front",
-        world=world,
-        vehicle=results.config["vehicle"],
-        fast=True,
-        quality=_COMPARISON_QUALITY,
-    )
+    config = Film(**_COMPARISON, world=world, vehicle=results.config["vehicle"])
     fresh = out.with_name(f".fresh-{out.name}")
     fresh.unlink(missing_ok=True)
     try:

@@ -71,10 +71,7 @@ def render_page(
     """Make the page.
 
     Args:
-        results: As of `results.read_results`.
-        table: As of `metrics.results_table`.
-        verdicts: As of `report.verdicts_of`.
-        curves: As of `curves.make_curves`.
+        results, table, verdicts, curves: As `report.write_report` makes them.
         video: An MP4 of the agents side by side, shown where there is one.
         poster: A JPEG of it, shown before it is played.
         files: Files beside the page.

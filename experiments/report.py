@@ -80,10 +80,6 @@ def verdicts_of(results: Results) -> list[Verdict]:
 def write_report(folder: Path | str, results: Results | None = None) -> Path:
     """Draw the figures and write the page, the table and the verdicts into the folder.
 
-    Args:
-        folder: Where `rotorgram compare` wrote.
-        results: As of `results.read_results(folder)`; None: read them.
-
     Returns:
         The path of the page.
 
@@ -105,15 +101,8 @@ def write_report(folder: Path | str, results: Results | None = None) -> Path:
         path.read_bytes() if (path := folder / name).is_file() else None
         for name in (VIDEO_FILE, POSTER_FILE)
     )
-    page = render_page(
-        results,
-        table,
-        verdicts,
-        curves,
-        video=video,
-        poster=poster,
-        files=[FolderFile(name, text) for name, text in _FILES if (folder / name).exists()],
-    )
+    files = [FolderFile(name, text) for name, text in _FILES if (folder / name).exists()]
+    page = render_page(results, table, verdicts, curves, video, poster, files)
     report = folder / REPORT_FILE
     report.write_text(page, encoding="utf-8")
     return report

@@ -13,7 +13,7 @@ import socket
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -89,22 +89,16 @@ class Workers:
             jobs: By name.
             env: Env of the jobs: a worker imports the module of the user's task.
         """
-        home, versions = self._listener.home, software_versions()
         task = f"{env.module}:{env.env_id}" if env and env.module else None
-        return self._do(
-            [
-                _Order(
-                    name=name,
-                    job=job,
-                    function=function,
-                    task=task,
-                    home=home,
-                    versions=versions,
-                    parent=self._parent,
-                )
-                for name, job in jobs.items()
-            ]
+        order = partial(
+            _Order,
+            function=function,
+            task=task,
+            home=self._listener.home,
+            versions=software_versions(),
+            parent=self._parent,
         )
+        return self._do([order(name=name, job=job) for name, job in jobs.items()])
 
     def fly_all(
         self,
@@ -151,13 +145,9 @@ def open_workers(config: WorkersConfig, on_progress: OnProgress) -> Iterator[Wor
         InputError: There is no such Ray cluster.
         MissingPackage: There is no joblib, or no Ray.
     """
-    parent = os.getpid() if config.backend == "loky" else None
-    with _opened(config) as do, ProgressListener(on_progress) as listener:
-        yield Workers(do, listener, parent)
-
-
-def _opened(config: WorkersConfig) -> AbstractContextManager[_Do]:
-    return _ray(config) if config.backend == "ray" else _loky(config)
+    here = config.backend == "loky"
+    with _loky(config) if here else _ray(config) as do, ProgressListener(on_progress) as listener:
+        yield Workers(do, listener, os.getpid() if here else None)
 
 
 @contextmanager

@@ -60,7 +60,8 @@ class CollectiveThrust:
         self._rotors: Final = 0 if alike else slice(None)
         self._hover: Final = hover[self._rotors]
         self._per_action: Final = newtons * (hover / hover.mean())[self._rotors]
-        self._limits: Final = (low[self._rotors], high[self._rotors])
+        self._low: Final = low[self._rotors]
+        self._high: Final = high[self._rotors]
         self._increment = increment
 
     def thrust(self, action: Array, state: WorldState) -> Array:
@@ -73,7 +74,7 @@ class CollectiveThrust:
 
     def _clipped(self, thrust: Array, share: Array) -> Array:
         base = thrust if self._increment else constant(self._hover, thrust)
-        low, high = (constant(limit, thrust) for limit in self._limits)
+        low, high = constant(self._low, thrust), constant(self._high, thrust)
         return clip(base + constant(self._per_action, thrust) * share, low, high)
 
 

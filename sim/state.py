@@ -16,6 +16,8 @@ import numpy as np
 
 __all__ = ["Array", "Pose", "WorldState", "clip", "component", "constant", "on_host", "stack"]
 
+_PLAIN = (np.ndarray, float)
+
 Array = Any
 """A NumPy array or a torch tensor. Code for both uses operators and the namespace of the array
 API standard that its task or controller has as `xp`."""
@@ -72,7 +74,7 @@ def clip(array: Array, low: Any, high: Any) -> Array:
 
 def component(array: Array, index: int) -> Array:
     """`array[..., index]`; of a single drone a number, with which NumPy is ten times faster."""
-    return array[..., index][()]
+    return array[index] if array.ndim == 1 else array[..., index]
 
 
 def stack(parts: Sequence[Any]) -> Array:
@@ -94,7 +96,7 @@ def stack(parts: Sequence[Any]) -> Array:
 
 def constant(values: Any, like: Array) -> Array:
     """An array of the vehicle or the task as an array of the same kind as `like`."""
-    if isinstance(like, np.ndarray | float):
+    if isinstance(like, _PLAIN):
         return values
     values = np.asarray(values, np.float64)
     return _tensor(values.tobytes(), values.shape, like.dtype, like.device)

@@ -1,6 +1,7 @@
 """Metrics against values computed by hand."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -47,7 +48,7 @@ def test_the_steady_state_is_the_mean_size_of_the_last_quarter():
 
 
 def test_a_headline_says_how_its_numbers_are_read():
-    distance = Headline.of(spec_of(ERROR, low=0.0))
+    distance = Headline.of(spec_of(replace(ERROR, signed=False)))
     gates = Headline.of(spec_of(GATES))
     assert [one.signed for one in (HEADLINE, distance, gates)] == [True, False, False]
     assert [one.size_symbol for one in (HEADLINE, distance, gates)] == ["|E|", "E", "gates_passed"]

@@ -325,6 +325,7 @@ def test_ctrl_c_at_the_agent_ends_both_within_a_second(network: Any, codec: str)
             assert ends(simulator) == "the agent closed"
 
 
+@pytest.mark.quiet
 @posix
 def test_ctrl_c_at_the_agent_of_three_ends_all_within_a_second() -> None:
     with program(AGENT, address=ANY, num_simulators=3, num_envs=3) as agent, ExitStack() as stack:

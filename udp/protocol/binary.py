@@ -258,8 +258,10 @@ def _encode_state(m: State, layout: Layout | None) -> bytes:
     if len(arrays) != len(slots):
         raise InputError(f"State: expected {len(slots)} arrays, got {len(arrays)}")
     pieces = [_STATE_BODY.pack(m.time, m.nonce)]
-    for (slot, pad), array in zip(slots, arrays, strict=True):
-        pieces += (pad, _bytes_of("State", slot, array))
+    for (shape, dtype, _, pad), array in zip(slots, arrays, strict=True):
+        if array.shape != shape or (array.dtype is not dtype and array.dtype != dtype):
+            raise _misfit("State", shape, dtype, array)
+        pieces += (pad, array.tobytes())
     body = b"".join(pieces)
     numbers = layout.state_numbers
     if numbers is None or not _adds_up(numbers.unpack_from(body)):
@@ -278,7 +280,7 @@ def _decode_state(data: bytes, session: int, sequence: int, layout: Layout | Non
         _expect_finite("observation, reward, telemetry", data, time, floats)
     terminated, truncated = layout.flags
     _expect_flags(data[terminated.at : truncated.end], _FLAGS)
-    arrays = [np.ndarray(slot.shape, slot.dtype, data, slot.at) for slot, _ in layout.state_slots]
+    arrays = [np.ndarray(shape, dtype, data, at) for shape, dtype, at, _ in layout.state_slots]
     first = len(layout.observation)
     return State(
         session=session,
@@ -343,12 +345,16 @@ def _check_command(data: bytes, layout: Layout) -> None:
 
 def _bytes_of(what: str, slot: Slot, array: np.ndarray) -> bytes:
     """Bytes of an array that has to be that of a slot. Numbers are never converted."""
-    if array.shape != slot.shape or (array.dtype is not slot.dtype and array.dtype != slot.dtype):
-        raise InputError(
-            f"{what}: expected {slot.dtype.name} of shape {slot.shape}, "
-            f"got {array.dtype.name} of shape {array.shape}"
-        )
+    if array.shape != slot.shape or array.dtype != slot.dtype:
+        raise _misfit(what, slot.shape, slot.dtype, array)
     return array.tobytes()
+
+
+def _misfit(what: str, shape: tuple[int, ...], dtype: np.dtype, array: np.ndarray) -> InputError:
+    return InputError(
+        f"{what}: expected {dtype.name} of shape {shape}, "
+        f"got {array.dtype.name} of shape {array.shape}"
+    )
 
 
 def _adds_up(numbers: tuple[Any, ...]) -> bool:

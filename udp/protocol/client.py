@@ -375,7 +375,8 @@ class Client:
         """A message that may come now."""
         if isinstance(message, Command):
             self.state, self._transfer = state, None
-            self._record(message, plain)
+            if self._tap:
+                self._record(message, plain)
             self.statistics.round_trips.add(now - self._sent_at)
             self._round_trips.answered(now)
             return message
@@ -492,7 +493,8 @@ class Client:
     def _send(self, message: Hello | State | Close, now: float) -> None:
         """Send a message and repeat it until it is answered."""
         data = self._encode(message)
-        self._record(message, data)
+        if self._tap:
+            self._record(message, data)
         self._transfer = transfer = Transfer(data, self._largest, self._window)
         self._due = data[8:24]
         kind = type(message)
@@ -509,7 +511,7 @@ class Client:
         self.statistics.counters["sent"] += 1
 
     def _put(self, datagrams: list[bytes], key: Key | None) -> None:
-        sealed = self._sealed(datagrams, key)
+        sealed = self._sealed(datagrams, key) if key else datagrams
         self._outgoing += sealed
         if sealed:
             self._asking = sealed[-1]

@@ -79,6 +79,8 @@ class Transfer:
         window: Size of the bursts, of this side and peer.
     """
 
+    __slots__ = ("_burst", "_next", "_slice", "_window", "count", "message")
+
     def __init__(self, message: bytes, largest: int, window: Window) -> None:
         self.message = message
         self.count = 1

@@ -138,11 +138,17 @@ class Layout:
         return self._slots(self.flags[1].end, [(shape, "float64") for shape in self.telemetry])
 
     @cached_property
-    def state_slots(self) -> tuple[tuple[Slot, bytes], ...]:
-        """Every array of a State in its order, with the bytes before it that are 0."""
+    def state_slots(self) -> tuple[tuple[tuple[int, ...], np.dtype, int, bytes], ...]:
+        """Of every array of a State in its order: shape, dtype, first byte, and the zeros before.
+
+        Plain tuples, for they are looked at in each message.
+        """
         slots = (*self.observation_slots, self.rewards, *self.flags, *self.telemetry_slots)
         ends = (STATE_ARRAYS_AT, *(slot.end for slot in slots))
-        return tuple((slot, bytes(slot.at - end)) for slot, end in zip(slots, ends, strict=False))
+        return tuple(
+            (slot.shape, slot.dtype, slot.at, bytes(slot.at - end))
+            for slot, end in zip(slots, ends, strict=False)
+        )
 
     @cached_property
     def state_size(self) -> int:

@@ -404,7 +404,8 @@ class Server:
         session.sequence, session.state = state.sequence, _AFTER_STATE
         if session.asked_at is not None:
             self.statistics.round_trips.add(now - session.asked_at)
-        self._record(slot, state, plain, session)
+        if self._tap:
+            self._record(slot, state, plain, session)
         return Event(slot, state)
 
     def _join(
@@ -660,9 +661,10 @@ class Server:
         """
         data = text.encode(message) if session.is_text else binary.encode(message, session.layout)
         session.move(Way.SENT, type(message))
-        self._record(slot, message, data, session)
-        session.reply = self._transfer(data, session)
-        self._put(session.reply.start(), session.peer, session.key)
+        if self._tap:
+            self._record(slot, message, data, session)
+        session.reply = reply = self._transfer(data, session)
+        self._put(reply.start(), session.peer, session.key)
         self.statistics.counters["sent"] += 1
 
     def _repeat(self, session: Session) -> None:
@@ -687,7 +689,8 @@ class Server:
         return Transfer(data, session.largest, session.window)
 
     def _put(self, datagrams: list[bytes], address: Address, key: Key | None) -> None:
-        self._outgoing += [(key.seal(d) if key else d, address) for d in datagrams]
+        for datagram in datagrams:
+            self._outgoing.append((key.seal(datagram) if key else datagram, address))
 
     def _record(self, slot: int, message: Message, data: bytes, session: Session) -> None:
         if self._tap:

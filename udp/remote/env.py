@@ -188,5 +188,5 @@ class RemoteEnv(ServedEnv, gym.Env[Any, Any]):
     def _info(self, state: State) -> dict[str, Any]:
         numbers: list[float] = []
         for array in state.telemetry:
-            numbers += array.ravel().tolist()
+            numbers += array.tolist()[0] if array.ndim == 2 else array.ravel().tolist()
         return dict(zip(self._names, numbers, strict=True))

@@ -195,6 +195,7 @@ class Simulator:
         """Until the agent closes: its reason. Empty if this side was stopped."""
         link = self.link
         link.connect(time.monotonic())
+        self._flush()
         if self._text:  # the agent says nothing before the first State
             self._reset(link.hello.session)
             self._send_state(None)
@@ -228,7 +229,7 @@ class Simulator:
     def _step(self, command: Command) -> None:
         orders = command.orders
         try:
-            if orders.any():
+            if np.count_nonzero(orders):  # of few drones faster than `any`
                 self.stepped.advance(command.actions, command.resets, command.seeds, command.frozen)
             else:
                 self.stepped.advance(command.actions, None, None, None)
@@ -258,7 +259,6 @@ class Simulator:
         if self._journal:
             self._journal.write()
         while not self._stopped:
-            self._flush()
             timer = link.next_timer()
             assert timer is not None
             before = time.monotonic()
@@ -267,8 +267,10 @@ class Simulator:
                 sends = link.sends  # of what was not answered, not of the Close that follows
                 if not link.handle_timer(before):
                     raise PeerSilent(self._silence(sends))
+                self._flush()
                 continue
             message = self._receive(left)
+            self._flush()
             if isinstance(message, Refuse):
                 raise Refused(f"the agent at {address_text(self.server)} refused: {message.reason}")
             if message is not None:
@@ -308,6 +310,7 @@ class Simulator:
                 self.link.handle_timer(time.monotonic())
 
     def _flush(self) -> None:
+        """Send what is due, before any wait."""
         for datagram in self.link.take_outgoing():
             self._send(datagram)
         log_notices(self.link.statistics, time.monotonic())
