@@ -151,7 +151,9 @@ def parse_size(text: str) -> tuple[int, int]:
 def _told_apart(names: Sequence[str], what: Sequence[str]) -> list[str]:
     """The names; of those that are the same, what the user typed besides, then a number."""
     longer = [
-        name if names.count(name) == 1 or words == "pid" else f"{name}, {Path(words).stem}"
+        name
+        if names.count(name) == 1 or words in ("pid", "random")
+        else f"{name}, {Path(words).stem}"
         for name, words in zip(names, what, strict=True)
     ]
     return [

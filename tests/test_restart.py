@@ -30,7 +30,6 @@ from rotorgram.udp import (
 )
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.auth import OVERHEAD, write_key
-from rotorgram.udp.protocol.layout import Layout
 from rotorgram.udp.protocol.messages import Close, Command, Hello, State
 from rotorgram.udp.transport.relay import FaultConfig
 
