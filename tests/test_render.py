@@ -134,9 +134,8 @@ def test_panes_of_the_same_have_names_of_their_own(
         PID(shown[0].trajectories[0].spec), "rotorgram/Elevation-v0", {"episode_length": 10}, [1],
         of="final",
     )  # fmt: skip
-    telemetry = [one.telemetry["position"].tobytes()
-                 for one in (*evaluated, *shown[0].trajectories, *shown[3].trajectories)]  # fmt: skip
-    assert len(set(telemetry)) == 1
+    flown = (*evaluated, *shown[0].trajectories, *shown[3].trajectories)
+    assert len({one.telemetry["position"].tobytes() for one in flown}) == 1
 
 
 @pytest.mark.parametrize(
