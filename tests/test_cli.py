@@ -584,6 +584,7 @@ def test_a_key_a_relay_and_a_journal(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert run(capsys, "replay", journal)[0] == 0
 
 
+@pytest.mark.quiet
 def test_ctrl_c_while_nobody_answers(tmp_path: Path) -> None:
     """No update comes any more, for the simulator is stopped: it ends all the same."""
     address = f"127.0.0.1:{free_port()}"

@@ -30,6 +30,7 @@ from rotorgram.udp import (
 )
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.auth import message_of, write_key
+from rotorgram.udp.protocol.messages import Close, Command, Hello, State
 from rotorgram.udp.transport.relay import FaultConfig
 
 LOSSY = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.2, seed=2)
@@ -331,6 +332,7 @@ def test_ctrl_c_at_the_agent_ends_both_at_once(network: Any, codec: str) -> None
             assert ends(simulator) == "the agent closed"
 
 
+@pytest.mark.quiet
 @posix
 def test_ctrl_c_at_the_agent_of_three_ends_all_at_once() -> None:
     with program(AGENT, address=ANY, num_simulators=3, num_envs=3) as agent, ExitStack() as stack:
