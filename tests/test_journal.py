@@ -220,7 +220,7 @@ def test_nothing_that_a_journal_names_is_imported(
         path = tmp_path / "named.mcap"
         rewrite(flight.simulator, path, changed_spec(env_id=env_id))
         (session,) = verify(path).sessions
-        assert session.problem == (
+        assert session.problem.startswith(
             f"State 1 cannot be repeated: expected a registered env id, got {env_id!r}"
         )
         assert summarize(path).sessions[0].session.spec.env_id == env_id

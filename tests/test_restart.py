@@ -30,7 +30,6 @@ from rotorgram.udp import (
 )
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.auth import message_of, write_key
-from rotorgram.udp.protocol.messages import Close, Command, Hello, State
 from rotorgram.udp.transport.relay import FaultConfig
 
 LOSSY = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.2, seed=2)
