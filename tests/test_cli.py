@@ -96,14 +96,10 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["train", "a2c", "--set", "gamma=" + 9999 * "["], "gamma: expected a number from 0 to 1"),
         (["train", "vpg", "--listen", "8001"], "address: expected HOST:PORT"),
         (["train", "vpg", "--listen", "192.0.2.1:8001"], "is not a loopback address"),
-<<<<<<< HEAD
-        (["train", "vpg", "--resume", "nowhere"], "nowhere: cannot be written: No such file"),
         (["train", "a2c", "--resume", "/proc/self"], "/proc/self: cannot be written: "),
         (["train", "a2c", "--out", "/proc/run"], "out: cannot make /proc/run: "),
         (["train", "a2c", "--out", "/dev/null/run"], "out: cannot make /dev/null"),
-=======
         (["train", "vpg", "--resume", "nowhere"], "nowhere: expected a folder, there is none"),
->>>>>>> r1
         (["sim", "--server", "127.0.0.1:99999"], "address: expected HOST:PORT"),
         (["sim", "--bind", "127.0.0.1:0", "--env.target", "1"], "target: expected"),
         (["sim", "--env", "rotorgram/Nothing-v0"], "env: expected a registered id"),
