@@ -319,6 +319,7 @@ class Loop:
             self.terminated = (ended | self._none).reshape(n)
             self.truncated = late.reshape(n)
             may_end = True
+        self._expect_finite()
         if flown is not None:
             # A drone that did not fly gets no reward: nothing has ended, nothing was won.
             self.rewards = self._xp.where(flown, self.rewards, 0.0)
@@ -328,6 +329,18 @@ class Loop:
             if ends.any():
                 self._waiting, self._anyone_waits = self._waiting | ends, True
                 self.done = self.done | ends
+
+    def _expect_finite(self) -> None:
+        """Raise `InputError` where a task gave NaN or infinity, but on a GPU."""
+        if self._xp is not np:
+            return
+        for name, values in (*self.observations.items(), ("reward", self.rewards)):
+            if values.dtype.kind == "f" and not _is_finite(values):
+                bad = ~np.isfinite(values.reshape(self.num_envs, -1)).all(axis=1)
+                raise InputError(
+                    f"{self.spec.env_id}: expected finite numbers for {name}, got "
+                    f"{values[bad][0].tolist()} for env {int(bad.argmax())}"
+                )
 
     def _checked(self, actions: np.ndarray, flown: Array | None) -> np.ndarray:
         """Actions as controllers take them: float64, shape (N, k). Raises `InputError`."""
@@ -487,6 +500,14 @@ class OnHost:
     def close(self) -> None:
         """As `Loop.close`."""
         self.loop.close()
+
+
+def _is_finite(values: np.ndarray) -> bool:
+    if values.size <= _SMALL:
+        total = sum(values.ravel().tolist())
+        if total - total == 0.0:  # else one is NaN or infinite, or they add up to too much
+            return True
+    return bool(np.isfinite(values).all())
 
 
 def _columns(spec: EnvSpec) -> dict[str, slice]:

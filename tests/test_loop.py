@@ -211,3 +211,24 @@ def test_what_a_user_typed_is_imported_and_nothing_else(
 def test_options_are_a_plain_dataclass() -> None:
     assert registry.options_type(HOVER).from_options({"heading": 3}).heading == 3.0  # type: ignore[attr-defined]
     assert issubclass(registry.options_type(ID), TaskOptions)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("wrong", ["observation", "reward"])
+def test_numbers_of_a_task_that_are_not_finite_go_no_further(num_envs: int, wrong: str) -> None:
+    class Broken(registry.task_type(ID)):  # type: ignore[misc]
+        def observe(self, state: Any) -> Any:
+            seen = super().observe(state)
+            return {"observation": seen["observation"] * (np.nan if wrong == "observation" else 1)}
+
+        def outcome(self, state: Any) -> Any:
+            outcome = super().outcome(state)
+            factor = np.inf if wrong == "reward" else 1.0
+            outcome.reward = {name: x * factor for name, x in outcome.reward.items()}
+            return outcome
+
+    register("Broken-v0", Broken)
+    loop = Loop("Broken-v0", num_envs)
+    everybody = np.ones(num_envs, bool)
+    with pytest.raises(InputError, match=rf"Broken-v0: expected finite numbers for {wrong}"):
+        loop.advance(np.zeros((num_envs, 1), np.float32), everybody)
