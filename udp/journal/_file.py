@@ -14,7 +14,7 @@ from errno import EFBIG, EINTR
 from io import BytesIO
 from pathlib import Path
 from threading import RLock
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
 import zstandard
 from mcap.data_stream import RecordBuilder
