@@ -483,11 +483,14 @@ def _start(kind: int) -> bytes:
     return MAGIC + bytes((VERSION, kind))
 
 
-def _entry(kind: int, encoder: Callable[[Any, Layout | None], bytes]) -> tuple[Any, ...]:
+_Encoder = Callable[[Any, Layout | None], bytes]
+
+
+def _entry(kind: int, encoder: _Encoder) -> tuple[bytes, int, _Encoder]:
     return _start(kind), zlib.crc32(_start(kind)), encoder
 
 
-_ENCODERS: Final[dict[type, tuple[Any, ...]]] = {
+_ENCODERS: Final[dict[type, tuple[bytes, int, _Encoder]]] = {
     Hello: _entry(HELLO, _encode_hello),
     Welcome: _entry(_WELCOME, _encode_welcome),
     Refuse: _entry(REFUSE, _encode_reason),
