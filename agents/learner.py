@@ -7,22 +7,17 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..models.errors import InputError
 from .episodes import EpisodeLog
 from .networks import Actor, arrays_of, load_arrays, nn, torch
 from .policies import ActionMap, NetworkPolicy, flat_size
 from .presets import A2CConfig, VPGConfig
-from .rollouts import Collector, Rollout
+from .rollouts import Collector, Diverged, Rollout
 
 __all__ = ["Agent", "Diverged", "Learner", "OnUpdate", "Terms", "check_finite", "optimizer_arrays",
            "seeds_of", "set_optimizer_arrays", "updates_of"]  # fmt: skip
 
 OnUpdate = Callable[[], bool]
 """Called after every rollout and its update; training stops where it returns False."""
-
-
-class Diverged(InputError):
-    """Weights are not finite after an update. Checkpoints from before it are whole."""
 
 
 class Agent(Protocol):

@@ -34,7 +34,7 @@ class PID:
         spec: Of the env that it flies.
 
     Raises:
-        InputError: It is another env, or its options lack what the PID needs.
+        InputError: It is another env, or its options or telemetry lack what the PID needs.
     """
 
     def __init__(self, spec: EnvSpec) -> None:
@@ -46,8 +46,10 @@ class PID:
                 "pid: expected observation='full' and action_type='continuous', "
                 f"got {options['observation']!r} and {options['action_type']!r}"
             )
-        thrust = next(array for array in spec.telemetry if array.name == "thrust")
-        highest = thrust.bounds()[1]
+        telemetry = {array.name: array for array in spec.telemetry}
+        if "thrust" not in telemetry:
+            raise InputError(f"pid: expected the telemetry thrust, got {sorted(telemetry)}")
+        highest = telemetry["thrust"].bounds()[1]
         self._hover = float(highest[0]) / (1 + float(spec.observation[0].bounds()[1][2]))
         self._increment = options["action_mode"] == "increment"
         share = SHARES[options["action_mode"]]

@@ -175,4 +175,7 @@ def _check_shapes(weights: Mapping[str, np.ndarray], inputs: int, actions: Actio
     if not actions.discrete:
         expected["log_std"] = (actions.outputs,)
     if got != expected or not units:
-        raise InputError(f"policy: expected weights of shapes {expected}, got {got}")
+        raise InputError(
+            f"policy: expected weights of shapes {expected}, got {got}: it was trained for other "
+            "observations or actions; give the --vehicle and the --env options of its training"
+        )

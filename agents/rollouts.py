@@ -4,11 +4,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..models.errors import InputError
 from .episodes import EpisodeLog
 from .policies import NetworkPolicy
 from .returns import rewards_to_go
 
-__all__ = ["Collector", "Rollout"]
+__all__ = ["Collector", "Diverged", "Rollout"]
+
+
+class Diverged(InputError):
+    """Weights or actions are not finite. Checkpoints from before are whole."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +142,10 @@ class Collector:
             if not len(rows) % block:
                 noise = policy.draw_noise(self._rng, block * count).reshape(block, count, -1)
             actions = policy.sample(observations, noise[len(rows) % block])
+            if not np.isfinite(actions).all():
+                raise Diverged(
+                    "training diverged: actions are not finite; try a lower learning_rate"
+                )
             idle = done if waiting else None
             if stop is None:
                 log.fly(actions, begins=idle)

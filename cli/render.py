@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from tyro.conf import Positional
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from ..experiments.trajectories import Trajectory
 
 __all__ = ["Render", "parse_size"]
+
+_ALIKE: Final = ("pid", "random")  # their words tell no two of them apart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,7 +153,7 @@ def parse_size(text: str) -> tuple[int, int]:
 def _told_apart(names: Sequence[str], what: Sequence[str]) -> list[str]:
     """The names; of those that are the same, what the user typed besides, then a number."""
     longer = [
-        name if names.count(name) == 1 or words == "pid" else f"{name}, {Path(words).stem}"
+        f"{name}, {Path(words).stem}" if names.count(name) > 1 and words not in _ALIKE else name
         for name, words in zip(names, what, strict=True)
     ]
     return [

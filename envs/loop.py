@@ -6,6 +6,7 @@ flies the others for one control period: `advance` is that step, the step of the
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from math import prod
 from pathlib import Path
 from typing import Any, Final
 
@@ -38,7 +39,47 @@ def make_task(
     checked = kind.Options.from_options(options)
     craft = Vehicle.load(vehicle, linear_drag=checked.linear_drag)
     craft.substeps(checked.control_period)  # raises where they do not go together
-    return kind(checked, craft, shape, xp)
+    task = kind(checked, craft, shape, xp)
+    for name in ("controller", "observation"):
+        if not hasattr(task, name):
+            raise InputError(f"{env_id}: expected setup() to set self.{name}, it does not")
+    return task
+
+
+def _check_observed(spec: EnvSpec, observed: Any, num_envs: int) -> None:
+    """Tell the author of a task what `observe` has to return. Raises `InputError`."""
+    names = [array.name for array in spec.observation]
+    if not isinstance(observed, Mapping) or not observed.keys() >= set(names):
+        got = list(observed) if isinstance(observed, Mapping) else type(observed).__name__
+        raise InputError(
+            f"{spec.env_id}: expected observe() to return a dict of {names}, got {got}"
+        )
+    for array in spec.observation:
+        shape = tuple(getattr(observed[array.name], "shape", ()))
+        if prod(shape) != num_envs * prod(array.shape):
+            raise InputError(
+                f"{spec.env_id}: expected observe() to return {array.name} of shape "
+                f"{array.shape} for each of {num_envs} drones, got an array of shape {shape}"
+            )
+
+
+def _check_outcome(spec: EnvSpec, outcome: Any, many: bool) -> None:
+    """Tell the author of a task what `outcome` has to return. Raises `InputError`."""
+    if not isinstance(outcome, Outcome):
+        got = type(outcome).__name__
+        raise InputError(f"{spec.env_id}: expected outcome() to return an Outcome, got {got}")
+    for metric in spec.metrics:
+        if metric.name not in outcome.metrics:
+            got = list(outcome.metrics)
+            raise InputError(f"{spec.env_id}: expected the metric {metric.name!r}, got {got}")
+    if many and not any(hasattr(term, "shape") for term in outcome.reward.values()):
+        raise InputError(
+            f"{spec.env_id}: expected a reward for each drone, got {outcome.reward}: "
+            "make an array of it, as 1.0 + 0.0 * state.position[..., 2]"
+        )
+    kind = getattr(outcome.terminated, "dtype", type(outcome.terminated).__name__)
+    if "bool" not in str(kind):
+        raise InputError(f"{spec.env_id}: expected terminated as truth values, got {kind}")
 
 
 def spec_of(env_id: str, task: Task) -> EnvSpec:
@@ -249,11 +290,16 @@ class Loop:
         task, state, n = self.task, self.world.state, self.num_envs
         self._telemetry = None
         observed = task.observe(state)
+        if self._outcome is None:
+            _check_observed(self.spec, observed, n)
         self.observations = {
             name: _as_type(observed[name].reshape((n, *shape)), dtype)
             for name, shape, dtype in self._dtypes
         }
-        self._outcome = outcome = task.outcome(state)
+        outcome = task.outcome(state)
+        if self._outcome is None:
+            _check_outcome(self.spec, outcome, bool(self.world.shape))
+        self._outcome = outcome
         ended: Array = outcome.terminated
         total: Array = 0.0
         late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b

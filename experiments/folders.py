@@ -69,6 +69,8 @@ def locked(folder: Path) -> Iterator[None]:
     """
     try:
         file = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except FileNotFoundError:
+        raise InputError(f"{folder}: expected a folder, there is none") from None
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
     try:

@@ -97,7 +97,7 @@ def test_no_env_loads_what_draws() -> None:
 
 def test_an_agent_loads_neither_mujoco_nor_torch() -> None:
     program = (
-        "import sys; import rotorgram.udp, rotorgram.agents; "
+        "import sys; import rotorgram.agents; from rotorgram.udp import RemoteVectorEnv; "
         "print(sorted({'mujoco', 'torch', 'pandas', 'matplotlib'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

@@ -13,7 +13,9 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import pandas as pd
 import pytest
 from rotorgram.agents import load
@@ -26,6 +28,7 @@ from rotorgram.cli.serve import Serve
 from rotorgram.cli.sim import Sim
 from rotorgram.experiments.results import read_results, read_steps
 from rotorgram.models import QUAD_XML, InputError
+from rotorgram.udp import Simulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 
@@ -93,10 +96,10 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["train", "a2c", "--set", "gamma=" + 9999 * "["], "gamma: expected a number from 0 to 1"),
         (["train", "vpg", "--listen", "8001"], "address: expected HOST:PORT"),
         (["train", "vpg", "--listen", "192.0.2.1:8001"], "is not a loopback address"),
-        (["train", "vpg", "--resume", "nowhere"], "nowhere: cannot be written: No such file"),
         (["train", "a2c", "--resume", "/proc/self"], "/proc/self: cannot be written: "),
         (["train", "a2c", "--out", "/proc/run"], "out: cannot make /proc/run: "),
         (["train", "a2c", "--out", "/dev/null/run"], "out: cannot make /dev/null"),
+        (["train", "vpg", "--resume", "nowhere"], "nowhere: expected a folder, there is none"),
         (["sim", "--server", "127.0.0.1:99999"], "address: expected HOST:PORT"),
         (["sim", "--bind", "127.0.0.1:0", "--env.target", "1"], "target: expected"),
         (["sim", "--env", "rotorgram/Nothing-v0"], "env: expected a registered id"),
@@ -516,6 +519,35 @@ def test_sim_and_serve_meet(tmp_path: Path) -> None:
     assert "the agent closed" in out
 
 
+class Terse(gym.Env[Any, Any]):
+    """Elevation without position and attitude in its telemetry."""
+
+    def __init__(self) -> None:
+        self.env: Any = gym.make("rotorgram/Elevation-v0", episode_length=50).unwrapped
+        some = [a for a in self.env.env_spec.telemetry if a.name in ("thrust", "metrics")]
+        self.env_spec = replace(self.env.env_spec, telemetry=tuple(some))
+        self.observation_space, self.action_space = (
+            self.env.observation_space,
+            self.env.action_space,
+        )
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return self.env.reset(seed=seed)
+
+    def step(self, action: Any) -> Any:
+        return self.env.step(action)
+
+
+def test_a_simulator_of_other_telemetry_is_served() -> None:  # fault 12
+    port = free_port()
+    agent = start("serve", "pid", "--listen", f"127.0.0.1:{port}", "--episodes", 1)
+    with Simulator(Terse(), server=("127.0.0.1", port), bind=("127.0.0.1", 0)) as simulator:
+        assert simulator.run() == "the agent closed"
+    out, err = agent.communicate(timeout=30)
+    assert (agent.returncode, err) == (0, "")
+    assert "episode 0: return" in out
+
+
 def test_a_key_a_relay_and_a_journal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What a user does who flies over a bad network that others share."""
     key, journal = tmp_path / "key", tmp_path / "flight.mcap"
@@ -552,6 +584,7 @@ def test_a_key_a_relay_and_a_journal(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert run(capsys, "replay", journal)[0] == 0
 
 
+@pytest.mark.quiet
 def test_ctrl_c_while_nobody_answers(tmp_path: Path) -> None:
     """No update comes any more, for the simulator is stopped: it ends all the same."""
     address = f"127.0.0.1:{free_port()}"

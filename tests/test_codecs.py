@@ -351,3 +351,13 @@ def test_lines_of_the_page() -> None:
 def test_layouts_that_text_cannot_tell(of: Any) -> None:
     with pytest.raises(InputError, match="text codec"):
         text.check_layout(of)
+
+
+def test_a_hello_of_nothing_but_extensions_is_not_read() -> None:
+    """Four bytes each: a million of them fit into a Hello, and take seconds."""
+    start = struct.pack("<BB2xII4x", 2, 2, 1, 2) + b"{}"
+    some = binary.decode(binary.frame(binary.HELLO, 1, 0, start + bytes(4 * 64)))
+    assert isinstance(some, Hello)
+    assert len(some.extensions) == 64
+    with pytest.raises(DecodeError, match="extensions: expected at most 64"):
+        binary.decode(binary.frame(binary.HELLO, 1, 0, start + bytes(4 * 65)))

@@ -354,6 +354,25 @@ def test_a_training_that_diverges_says_so(algorithm: str) -> None:
         agent.train(log, 2000, lambda: pytest.fail("an update that could have been stored"))
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("algorithm", ["vpg", "a2c"])
+def test_huge_weights_of_a_training_that_diverges_are_no_error_of_the_env(algorithm: str) -> None:
+    """Finite weights may still overflow in the policy's sums, long before the next update."""
+    size = {"episodes_per_update": 2} if algorithm == "vpg" else {"steps_per_update": 16}
+    log = log_of("limit")
+    agent: Any = make_agent(algorithm, log, preset(algorithm, "paper", **size), 0)
+    step = agent._optimizer.step
+
+    def huge(*_: Any) -> None:
+        step()
+        for weights in agent._optimizer.param_groups[0]["params"]:
+            weights.data.fill_(3e38 if weights.ndim == 2 else 1.0)
+
+    agent._optimizer.step = huge
+    with pytest.raises(Diverged, match=r"training diverged: actions .* try a lower learning_rate"):
+        agent.train(log, 2000, lambda: True)
+
+
 @pytest.mark.parametrize("algorithm", ["vpg", "a2c", "sb3-a2c"])
 @pytest.mark.parametrize("name", ["paper", "tuned"])
 @pytest.mark.parametrize("action_type", ["continuous", "discrete"])

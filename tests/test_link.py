@@ -273,6 +273,35 @@ def test_silence_ends_a_simulator_and_a_pause_of_its_own_does_not() -> None:  # 
     assert link.state is SimulatorState.CLOSING
 
 
+def test_a_simulator_that_gives_up_tells_a_silent_agent() -> None:
+    link = to(simulator(), SimulatorState.WAITING, Wire("agent", False))
+    link.take_outgoing()
+    assert not link.handle_timer(100.0)
+    (last,) = link.take_outgoing()
+    assert plain(last) == close(1, reason="no answer from the agent for 10 s")
+
+
+def test_a_simulator_that_was_never_welcomed_closes_without_a_word() -> None:  # fault 35
+    link = simulator()
+    link.connect(0.0)
+    link.take_outgoing()
+    link.close("over", 1.0)
+    assert link.state is SimulatorState.CLOSED
+    assert link.next_timer() is None
+    assert not link.take_outgoing()
+
+
+def test_while_wait_comes_there_is_no_silence() -> None:
+    link, wire = simulator(), Wire("agent", False)
+    link.connect(0.0)
+    for now in range(0, 100, 9):
+        assert link.receive(wire(Wait(session=SESSION)), float(now)) is None
+        assert link.handle_timer(now + 8.0)
+    (notice,) = link.statistics.take_notices()
+    assert notice == "every slot of the agent is taken; waiting for a free one"
+    assert not link.handle_timer(200.0)
+
+
 def test_wrong_numbers_of_the_config() -> None:
     for wrong in ({"timeout": 0}, {"timeout": float("nan")}, {"max_datagram": 100}):
         with pytest.raises(InputError, match="expected"):

@@ -1,5 +1,7 @@
 """One drone over real sockets: parity, the env, strangers, and peers that others wrote."""
 
+import copy
+import pickle
 import re
 import threading
 import time
@@ -15,6 +17,7 @@ from peers import ANY, ENV_ID, Running, launch, plain_socket
 from remotes import QUICK, assert_parity, flying
 from rotorgram.udp import (
     RemoteEnv,
+    RemoteVectorEnv,
     Simulator,
 )
 from rotorgram.udp.protocol import binary
@@ -141,6 +144,16 @@ def test_wrong_actions_and_seeds_raise_and_nothing_has_happened() -> None:
         for action in (3, -1, 0.5, True):
             with pytest.raises(ValueError, match="action: expected"):
                 pair.remote.step(action)
+
+
+@pytest.mark.parametrize("kind", [RemoteEnv, RemoteVectorEnv])
+@pytest.mark.parametrize("copies", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_a_remote_env_is_not_copied(kind: Any, copies: Any) -> None:
+    """Two would take turns in answering the States of one simulator."""
+    env = kind(ANY, connect=False)
+    with pytest.raises(TypeError, match="cannot be copied or pickled: make another one"):
+        copies(env)
+    env.close()
 
 
 def test_observations_are_copies() -> None:

@@ -91,6 +91,7 @@ def test_an_agent_that_falls_silent_is_told() -> None:
     assert goodbye.reason == "no answer from the agent for 0.3 s"
 
 
+@pytest.mark.quiet
 def test_a_flood_of_junk_does_not_extend_either_wait() -> None:
     stop = threading.Event()
 
@@ -124,6 +125,7 @@ def test_a_flood_of_junk_does_not_extend_either_wait() -> None:
         remote.close()
 
 
+@pytest.mark.quiet
 def test_a_wait_may_be_longer_than_the_system_waits_in_one_go(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -151,6 +153,7 @@ def test_an_interrupted_wait_leaves_the_socket_as_it_was() -> None:
         assert sock.gettimeout() == 0
 
 
+@pytest.mark.quiet
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_signals_neither_end_nor_extend_a_wait() -> None:
     before = signal.signal(signal.SIGALRM, lambda *_: None)
@@ -209,6 +212,7 @@ def test_closed_by_another_thread_while_it_waits() -> None:
         closing.join()
 
 
+@pytest.mark.quiet
 def test_a_simulator_that_falls_silent() -> None:
     with RemoteEnv(ANY, connect=False, connect_timeout=1, timeout=0.5) as remote:
         running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))

@@ -11,6 +11,7 @@ import sys
 import textwrap
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
@@ -18,9 +19,11 @@ import pytest
 import rotorgram.rendering.gl as gl
 from pictures import HEIGHT, WIDTH, decoded, pixels
 from PIL import Image
+from rotorgram.agents import PID
 from rotorgram.agents.checkpoints import load
 from rotorgram.cli import main
 from rotorgram.envs.registry import env_spec
+from rotorgram.experiments import filming
 from rotorgram.experiments.filming import Film, Shot, film, film_comparison
 from rotorgram.experiments.results import (
     CONFIG_KEYS,
@@ -113,6 +116,26 @@ def test_gif_pictures_and_names(
     picture = tmp_path / "picture.png"
     assert run(capsys, "render", "pid", "--out", picture, "--at", 0.1, *settings)[0] == 0
     assert pixels(picture).shape == (HEIGHT, WIDTH, 3)
+
+
+def test_panes_of_the_same_have_names_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And show the episodes that `evaluate` flies."""
+    shown: list[Any] = []
+    monkeypatch.setattr(filming, "film", lambda out, shots, *_: shown.extend(shots) or 1)
+    monkeypatch.setattr(gl, "offscreen_context", lambda *_: SimpleNamespace(free=lambda: None))
+    what = ("pid", "pid", "random", "pid", "random")
+    settings = ("--env.episode-length", 10, "--episode", 1, "--out", tmp_path / "film.gif")
+    assert run(capsys, "render", *what, *settings)[0] == 0
+    names = [shot.name for shot in shown]
+    assert names == ["PID 1", "PID 2", "random 1", "PID 3", "random 2"]
+    evaluated = flown_trajectories(
+        PID(shown[0].trajectories[0].spec), "rotorgram/Elevation-v0", {"episode_length": 10}, [1],
+        of="final",
+    )  # fmt: skip
+    flown = (*evaluated, *shown[0].trajectories, *shown[3].trajectories)
+    assert len({one.telemetry["position"].tobytes() for one in flown}) == 1
 
 
 @pytest.mark.parametrize(

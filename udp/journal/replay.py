@@ -198,7 +198,10 @@ class _Repeat:
         session = self.verdict.session
         spec = session.spec
         if not is_known(spec.env_id):
-            raise InputError(f"expected a registered env id, got {spec.env_id!r}")
+            raise InputError(
+                f"expected a registered env id, got {spec.env_id!r}: "
+                "--env MODULE:NAME names the module that registers it"
+            )
         loop = Loop(spec.env_id, session.num_envs, vehicle=self._vehicle, options=spec.options)
         try:
             self._compare_specs(loop.spec)

@@ -90,6 +90,7 @@ _MISSING_BODY: Final = struct.Struct("<BxHH")
 _EXTENSION: Final = struct.Struct("<HH")
 _LENGTH: Final = struct.Struct("<H")
 _CRITICAL: Final = 1 << 15
+_MOST_EXTENSIONS: Final = 64
 _FLAGS: Final = b"\0\1"
 _ORDERS: Final = b"\0\1\2"
 _BOOL: Final = np.dtype(bool)
@@ -118,7 +119,8 @@ def encode(message: Message, layout: Layout | None = None) -> bytes:
     if len(rest) + 8 > MAX_MESSAGE:
         got = len(rest) + 8
         raise InputError(f"{kind.__name__}: expected at most {MAX_MESSAGE} bytes, got {got}")
-    return start + zlib.crc32(rest, crc).to_bytes(4, "little") + rest
+    data: bytes = start + zlib.crc32(rest, crc).to_bytes(4, "little") + rest
+    return data
 
 
 def frame(kind: int, session: int, sequence: int, body: bytes) -> bytes:
@@ -464,6 +466,8 @@ def _extensions(extensions: tuple[Extension, ...]) -> bytes:
 def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
     extensions = []
     while at < len(data):
+        if len(extensions) == _MOST_EXTENSIONS:
+            raise InputError(f"extensions: expected at most {_MOST_EXTENSIONS}, got more")
         number, size = _EXTENSION.unpack_from(data, at)
         at += _EXTENSION.size
         if size > len(data) - at:

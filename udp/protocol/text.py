@@ -48,8 +48,8 @@ def check_layout(layout: Layout) -> None:
         raise InputError(f"text codec: expected one drone, got {layout.drones}: use binary")
     if len(observation) != 1 or len(observation[0].shape) != 1 or observation[0].dtype != _FLOAT:
         raise InputError(
-            f"text codec: expected one flat array of float32 as observation, got {observation}: "
-            "use binary"
+            "text codec: expected one flat array of float32 as observation, got "
+            f"{', '.join(f'{a.dtype} of shape {a.shape}' for a in observation)}: use binary"
         )
     if action is not None and (len(action.shape) != 1 or action.dtype != _FLOAT):
         raise InputError(f"text codec: expected flat actions of float32, got {action}: use binary")

@@ -31,6 +31,10 @@ class ServedEnv:
         """Counts and round trips of the wire, over all simulators."""
         return self._agent.server.statistics
 
+    def __reduce__(self) -> Any:
+        """Raise `TypeError`: two envs cannot answer the States of one simulator."""
+        raise TypeError("a running env cannot be copied or pickled: make another one")
+
     def _spec_that_came(self) -> EnvSpec:
         spec = self._agent.spec
         assert spec is not None

@@ -171,7 +171,7 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
             raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
         sent = self._sent(actions, resets | frozen)
         numbers = None if seeds is None else np.asarray(seeds, np.uint64)
-        rows = frozen.reshape(self._shape).all(axis=1)
+        rows: np.ndarray = np.all(frozen.reshape(self._shape), axis=1)
         slots = [slot for slot in range(self.num_simulators) if not rows[slot]]
         self._flying = False  # until the answers are there
         self._agent.exchange(self._orders(slots, sent, resets, numbers, frozen))

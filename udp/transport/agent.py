@@ -190,9 +190,9 @@ class Agent:
         """Send what is due and answer what comes, until it is the agent's turn everywhere."""
         server, config, slots = self.server, self.config, self.server.slots
         now = time.monotonic()
-        for slot, session in enumerate(slots):
-            wait = config.timeout if session else config.connect_timeout
-            self._deadlines[slot] = now + wait
+        self._deadlines = [
+            now + (config.timeout if session else config.connect_timeout) for session in slots
+        ]
         self._flush()
         if self._journal:
             self._journal.write()
@@ -399,11 +399,11 @@ def _told(options: Mapping[str, Any], name: str) -> str:
 
 def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
     """Difference between a simulator and earlier ones, in a sentence; "" if there is none."""
-    if reason := _options_difference(ours.options, theirs.options, both_ways=True):
-        return reason
-    for name in ("env_id", "vehicle_hash", "control_period", "agents", "observation", "action",
-                 "telemetry", "metrics"):  # fmt: skip
+    for name in ("env_id", "options", "vehicle_hash", "control_period", "agents", "observation",
+                 "action", "telemetry", "metrics"):  # fmt: skip
         expected, got = getattr(ours, name), getattr(theirs, name)
+        if expected != got and name == "options":
+            return _options_difference(expected, got, both_ways=True)
         if expected != got:
             return f"{name}: expected {expected!r:.200} as before, got {got!r:.200}"
     return ""

@@ -132,9 +132,10 @@ def receive(sock: socket.socket, timeout: float) -> tuple[bytes, Address]:
             the clock.
         OSError: An earlier datagram came back, or the socket is closed.
     """
-    timeout = min(max(timeout, 1e-6), LONGEST_WAIT)
+    if timeout > LONGEST_WAIT:
+        timeout = LONGEST_WAIT
     if not timeout <= (sock.gettimeout() or 0.0) <= 1.1 * timeout:  # to set it is a system call
-        sock.settimeout(min(1.05 * timeout, LONGEST_WAIT))
+        sock.settimeout(min(max(1.05 * timeout, 1e-6), LONGEST_WAIT))
     return sock.recvfrom(_MAX_DATAGRAM)
 
 
