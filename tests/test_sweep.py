@@ -174,6 +174,7 @@ sweep(config, Path(sys.argv[1]), "", lambda *_: None)
 """
 
 
+@pytest.mark.quiet
 def test_workers_and_simulators_end_with_a_process_that_is_killed(tmp_path: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", SWEEP, str(tmp_path)]) as process:
         deadline = time.monotonic() + 60
