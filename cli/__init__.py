@@ -50,7 +50,7 @@ EXTRAS: Final = {
     "render": ("PIL", "imageio_ffmpeg"),
     "report": ("matplotlib", "jinja2"),
     "ray": ("ray",),
-    "gpu": ("mujoco_warp", "warp"),
+    "gpu": ("torch", "mujoco_warp", "warp"),
 }  # fmt: skip
 """Import names of the packages of each extra, as pyproject.toml lists them."""
 
