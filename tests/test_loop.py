@@ -223,8 +223,8 @@ def test_numbers_of_a_task_that_are_not_finite_go_no_further(num_envs: int, wron
 
         def outcome(self, state: Any) -> Any:
             outcome = super().outcome(state)
-            factor = np.inf if wrong == "reward" else 1.0
-            outcome.reward = {name: x * factor for name, x in outcome.reward.items()}
+            added = np.nan if wrong == "reward" else 0.0
+            outcome.reward = {name: x + added for name, x in outcome.reward.items()}
             return outcome
 
     register("Broken-v0", Broken)
