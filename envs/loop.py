@@ -66,8 +66,8 @@ def _check_observed(spec: EnvSpec, observed: Any, num_envs: int) -> None:
 def _check_outcome(spec: EnvSpec, outcome: Any, many: bool) -> None:
     """Tell the author of a task what `outcome` has to return. Raises `InputError`."""
     if not isinstance(outcome, Outcome):
-        got = type(outcome).__name__
-        raise InputError(f"{spec.env_id}: expected outcome() to return an Outcome, got {got}")
+        other = type(outcome).__name__
+        raise InputError(f"{spec.env_id}: expected outcome() to return an Outcome, got {other}")
     for metric in spec.metrics:
         if metric.name not in outcome.metrics:
             got = list(outcome.metrics)

@@ -111,12 +111,14 @@ def _fly(
     results = _evaluate(run.algorithm, run.seed, config, training.taken)
     steps = log.steps()
     steps["step"] = np.arange(1, len(steps["episode"]) + 1)
-    label = {"agent": run.algorithm, "seed": run.seed, "phase": "train"}
+    trained_steps = step_table(
+        results.metric, agent=run.algorithm, seed=run.seed, phase="train", **steps
+    )
     trained = replace(
         results,
         episodes=[episode_row(one, run.num_envs, log.env_steps) for one in log.episodes],
         runs=[row],
-        steps=[step_table(results.metric, **label, **steps), *results.steps],
+        steps=[trained_steps, *results.steps],
     )
     return trained, checkpoint
 
@@ -136,7 +138,8 @@ def _evaluate(
     with evaluation_pair(config, most) as env:
         spec = env.env_spec
         headline = Headline.of(spec)
-        for snapshot in taken or [None]:
+        snapshots: Sequence[Snapshot | None] = taken or [None]
+        for snapshot in snapshots:
             policy = NetworkPolicy(snapshot.actor, spec) if snapshot else PID(spec)
             if snapshot is None or snapshot is taken[-1]:
                 flown = fly_episodes(env, policy, config.episodes, "final")

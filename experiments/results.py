@@ -271,11 +271,12 @@ def evaluation_steps(
     agent: str, seed: int, headline: Headline, trajectories: Sequence[Trajectory]
 ) -> "list[pa.Table]":
     """Every env step of evaluation trajectories."""
-    label = {"agent": agent, "seed": seed, "phase": "evaluation"}
     return [
         step_table(
             headline.name,
-            **label,
+            agent=agent,
+            seed=seed,
+            phase="evaluation",
             episode=np.full(len(one), one.episode),
             step=np.arange(1, len(one) + 1),
             value=one.values(headline.name)[1:],

@@ -255,7 +255,7 @@ class McapFile:
 def _bytes(record: McapRecord) -> bytes:
     builder: Any = RecordBuilder()
     record.write(builder)
-    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    data: bytes = builder.end()
     return data
 
 

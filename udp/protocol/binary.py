@@ -464,7 +464,7 @@ def _extensions(extensions: tuple[Extension, ...]) -> bytes:
 
 
 def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
-    extensions = []
+    extensions: list[Extension] = []
     while at < len(data):
         if len(extensions) == _MOST_EXTENSIONS:
             raise InputError(f"extensions: expected at most {_MOST_EXTENSIONS}, got more")
