@@ -43,7 +43,7 @@ namespace Rotorgram
                  'components': ['elevation_error']}],
             'metrics': [{
                 'name': 'elevation_error', 'unit': 'm', 'goal': 'zero',
-                'settled': 0.05, 'held': 0.1, 'symbol': 'E'}]
+                'settled': 0.05, 'held': 0.1, 'symbol': 'E', 'signed': true}]
         }";
 
         readonly RotorgramSpec spec = new RotorgramSpec
