@@ -313,6 +313,8 @@ def test_a_film_without_end_is_refused(tmp_path: Path) -> None:
     """A peer may name a control period of a quarter of an hour; the film would hold hours."""
     flown = trajectory(*[5.0] * 50)
     slow = replace(flown, spec=replace(flown.spec, control_period=1e3))
-    with pytest.raises(InputError, match=r"film: expected at most 1,000,000 frames, got 1,22\d,\d+"):
+    with pytest.raises(
+        InputError, match=r"film: expected at most 1,000,000 frames, got 1,22\d,\d+"
+    ):
         film(tmp_path / "film.gif", [shot(slow)], FAST)
     assert not list(tmp_path.iterdir())
