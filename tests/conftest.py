@@ -1,10 +1,16 @@
-"""What all tests share: a busy machine is no failure."""
+"""What all tests share: a busy machine is no failure, and Ctrl-C reaches the programs of tests."""
+
+import signal
 
 import pytest
 from hypothesis import HealthCheck, settings
 
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")
+
+# A shell that starts the tests in the background has Ctrl-C ignored, by their programs too.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
