@@ -104,13 +104,13 @@ def _run(words: list[str]) -> int:
         known = ", ".join(COMMANDS)
         print(f"rotorgram: expected a command of {known}, got {name}", file=sys.stderr)
         return 2
-    from ..rendering.gl import tolerate_gl_setting
+    from ..rendering.gl import hidden_gl_setting
     from ._flags import parse
 
-    tolerate_gl_setting()  # MuJoCo raises at import, in commands that draw nothing too
-    with _wide_enough():
-        command = parse(_class_of(name), f"rotorgram {name}", words[1:])
-    return command.run()
+    with hidden_gl_setting():  # importing OpenGL takes time, also for a command that draws nothing
+        with _wide_enough():
+            command = parse(_class_of(name), f"rotorgram {name}", words[1:])
+        return command.run()
 
 
 def _class_of(name: str) -> "type[Command]":

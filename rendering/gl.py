@@ -3,17 +3,20 @@
 import ctypes.util
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, Final
 
-__all__ = ["NoOpenGL", "offscreen_context", "tolerate_gl_setting"]
+__all__ = ["NoOpenGL", "hidden_gl_setting", "offscreen_context"]
 
 _OFF: Final = ("disable", "disabled", "off", "false", "0")
 _ON: Final = ("enable", "enabled", "on", "true", "1", "glfw", "glx", "wgl")
 _LIBRARIES: Final = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "OpenGL"}
 
-_setting: str | None = None
-"""`MUJOCO_GL` as the user set it, if `tolerate_gl_setting` has hidden it from MuJoCo."""
+_HIDDEN: Final = "ROTORGRAM_GL"
+"""`MUJOCO_GL` as the user set it, if `hidden_gl_setting` has hidden it from MuJoCo. An environment
+variable, so that the processes that this one starts know it too."""
 
 
 class NoOpenGL(RuntimeError):
@@ -23,18 +26,26 @@ class NoOpenGL(RuntimeError):
     """Of a command that had to draw."""
 
 
-def tolerate_gl_setting() -> None:
-    """Let MuJoCo be imported although `MUJOCO_GL` names no OpenGL, or one that is not installed.
+@contextmanager
+def hidden_gl_setting() -> Iterator[None]:
+    """Let MuJoCo be imported without an OpenGL, also where `MUJOCO_GL` names one that is not there.
 
-    MuJoCo itself raises where it is imported, in commands that draw nothing too. Call this before
-    MuJoCo is imported; `offscreen_context` raises where something is to be drawn.
+    MuJoCo imports one when it is imported itself, which takes a tenth of a second, and raises where
+    that fails, in commands that draw nothing too. Enter this before MuJoCo is imported;
+    `offscreen_context` raises where something is to be drawn.
     """
-    global _setting
-    wanted = _wanted()
+    before, wanted = dict(os.environ), _wanted()
     library = _LIBRARIES.get(wanted, "")
-    if wanted in ("", *_OFF, *_ON) or (library and ctypes.util.find_library(library)):
+    if wanted in (*_OFF, *_ON) or (library and ctypes.util.find_library(library)):
+        yield
         return
-    _setting, os.environ["MUJOCO_GL"] = wanted, "disable"
+    os.environ[_HIDDEN], os.environ["MUJOCO_GL"] = wanted, "disable"
+    try:
+        yield
+    finally:
+        for name in (_HIDDEN, "MUJOCO_GL"):
+            os.environ.pop(name)
+            os.environ.update({name: before[name]} if name in before else {})
 
 
 def offscreen_context(width: int, height: int) -> Any:
@@ -64,7 +75,7 @@ def offscreen_context(width: int, height: int) -> Any:
 
 
 def _wanted() -> str:
-    return (_setting or os.environ.get("MUJOCO_GL", "")).lower().strip()
+    return os.environ.get(_HIDDEN, os.environ.get("MUJOCO_GL", "")).lower().strip()
 
 
 def _why(error: Exception) -> str:

@@ -2,10 +2,10 @@
 
 import os
 import re
-import resource
 import shutil
 import subprocess
 import sys
+import time
 import tomllib
 import zipfile
 from pathlib import Path
@@ -146,13 +146,15 @@ def test_flags_are_checked_before_anything_heavy_is_imported(command: str) -> No
     ids=" ".join,
 )  # fmt: skip
 def test_a_command_starts_in_time(arguments: list[str]) -> None:
-    def seconds() -> float:
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        subprocess.run([sys.executable, "-m", "rotorgram.cli", *arguments], capture_output=True)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    def seconds(*command: str) -> float:
+        begin = time.perf_counter()
+        subprocess.run([sys.executable, *command], capture_output=True)
+        return time.perf_counter() - begin
 
-    assert min(seconds() for _ in range(3)) < 0.6, "of the processor: others may use it too"
+    taken = min(seconds("-m", "rotorgram.cli", *arguments) for _ in range(5))
+    # 0.6 s is promised for a machine on which the libraries of `sim` take 0.46 s by themselves.
+    libraries = min(seconds("-c", "import gymnasium, mujoco, tyro") for _ in range(5))
+    assert taken < max(0.6, 0.6 / 0.46 * libraries)
 
 
 @pytest.fixture(scope="module")
