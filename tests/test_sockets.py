@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 import pytest
+from rotorgram.udp.transport import sockets
 from rotorgram.udp.transport.sockets import Port, open_socket
 
 ANY = ("127.0.0.1", 0)
@@ -95,7 +96,7 @@ def test_the_port_cannot_be_taken_while_a_simulator_joins(
     tried = []
     bind = socket.socket.bind
 
-    class Socket(socket.socket):
+    class Socket(sockets.Socket):
         def bind(self, address: object) -> None:
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as thief:
                 thief.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -104,6 +105,6 @@ def test_the_port_cannot_be_taken_while_a_simulator_joins(
                 tried.append(address)
             super().bind(address)
 
-    monkeypatch.setattr("rotorgram.udp.transport.sockets.socket.socket", Socket)
+    monkeypatch.setattr("rotorgram.udp.transport.sockets.Socket", Socket)
     port.keep([others[0].getsockname()])
     assert tried == [port.address]

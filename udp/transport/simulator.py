@@ -18,7 +18,7 @@ from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new
 from ..protocol.errors import LinkError, PeerSilent, Refused
 from ..protocol.messages import MAX_UINT64, Close, Command, Hello, Message, Refuse, State, Welcome
 from ..protocol.transitions import SimulatorState
-from .sockets import LONGEST_WAIT, address_text, log_notices, open_socket, receive, resolve
+from .sockets import LONGEST_WAIT, address_text, log_notices, open_socket, resolve
 from .stepped import Stepped, make_stepped
 
 if TYPE_CHECKING:
@@ -282,7 +282,7 @@ class Simulator:
 
     def _receive(self, timeout: float) -> Message | None:
         try:
-            datagram, _ = receive(self._socket, timeout)
+            datagram, _ = self._socket.receive(timeout)
         except TimeoutError:
             return None
         except ConnectionError:  # nothing listens there yet: the timer says when to ask again

@@ -1,13 +1,17 @@
 """Sockets: open them, with a clear sentence for each error, and wait on them.
 
-A wait is a blocking read. A loop of non-blocking reads that yields in between saves some
-microseconds on an idle machine, and takes three times as long as soon as another process wants the
-processor.
+A process that was asleep computes two to three times slower for a while: its core was asleep too.
+So a wait in a lock-step first looks again and again for as long as a step takes, and sleeps only
+then. Looking costs others the processor, so it ends where it does not pay: each wait in which
+nothing came, or in which another process had the core, lets more of the next waits sleep at once.
+`benchmarks/waiting.py` measures both ways, beside processes that want the same cores.
 """
 
 import errno
 import ipaddress
 import logging
+import math
+import select
 import selectors
 import socket
 import sys
@@ -23,6 +27,7 @@ from ..protocol.statistics import Statistics
 __all__ = [
     "LONGEST_WAIT",
     "Port",
+    "Socket",
     "address_text",
     "is_loopback",
     "log_notices",
@@ -32,6 +37,13 @@ __all__ = [
 
 LONGEST_WAIT: Final = 0.1
 """Longest wait in one go, s: flags that other threads and signals set are looked at as often."""
+
+_LOOK: Final = 200e-6
+"""A wait looks for so long before it sleeps, s: a step of one drone takes less."""
+_LOST: Final = 60e-6
+"""Two looks are so far apart if another process had the core in between, s; else 2e-6."""
+_MOST_ASLEEP: Final = 64
+"""Waits at most that sleep at once before one looks again."""
 
 _log: Final = logging.getLogger("rotorgram.udp")
 _STRANGERS_EVERY: Final = 0.01
@@ -82,8 +94,61 @@ def resolve(address: Address, *, insecure: bool) -> Address:
     return number, port
 
 
-def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -> socket.socket:
-    """A UDP socket bound to an address, to be read with `receive`. Port 0 takes a free one.
+class Socket(socket.socket):
+    """A UDP socket over IPv4 that never blocks, but in `receive`."""
+
+    def __init__(self) -> None:
+        super().__init__(socket.AF_INET, socket.SOCK_DGRAM)
+        self.setblocking(False)
+        self._asleep = 0  # of the next waits so many sleep at once
+        self._row = 1  # and so many after the next wait in which nothing came
+
+    def receive(self, timeout: float) -> tuple[bytes, Address]:
+        """The next datagram and where it came from.
+
+        Raises:
+            TimeoutError: Nothing came within `timeout`, s, or a millisecond more, or
+                `LONGEST_WAIT`: look at the clock.
+            OSError: An earlier datagram came back, or the socket is closed.
+        """
+        if self._asleep:
+            self._asleep -= 1
+        elif came := self._look(min(timeout, _LOOK)):
+            return came
+        _sleep(self.fileno(), min(timeout, LONGEST_WAIT))
+        try:
+            return self.recvfrom(_MAX_DATAGRAM)
+        except BlockingIOError:
+            raise TimeoutError from None
+
+    def _look(self, seconds: float) -> tuple[bytes, Address] | None:
+        """What comes so soon."""
+        begin = now = time.monotonic()
+        while now - begin < seconds:
+            with suppress(BlockingIOError):
+                came = self.recvfrom(_MAX_DATAGRAM)
+                self._row = max(1, self._row // 2)
+                return came
+            before, now = now, time.monotonic()
+            if now - before > _LOST:
+                self._row = _MOST_ASLEEP
+                break
+        self._asleep = self._row = min(4 * self._row, _MOST_ASLEEP)
+        return None
+
+
+def _sleep(fileno: int, timeout: float) -> None:
+    """Until a file can be read, or for `timeout`, s."""
+    if hasattr(select, "poll"):
+        poll = select.poll()
+        poll.register(fileno, select.POLLIN)
+        poll.poll(math.ceil(1e3 * timeout))
+    else:  # Windows
+        select.select([fileno], [], [], timeout)
+
+
+def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -> Socket:
+    """A UDP socket bound to an address. Port 0 takes a free one.
 
     With a resolved `peer` it is connected: the kernel drops what others send.
 
@@ -93,7 +158,7 @@ def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -
         OSError: The port is taken or may not be bound, or the peer cannot be reached from here.
     """
     address = resolve(bind, insecure=insecure)
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock = Socket()
     what = f"bind {address_text(bind)}"
     try:
         sock.bind(address)
@@ -104,7 +169,6 @@ def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -
         sock.close()
         raise OSError(error.errno, f"cannot {what}: {_explain(error)}") from None
     _enlarge_buffer(sock)
-    sock.settimeout(LONGEST_WAIT)
     return sock
 
 
@@ -124,21 +188,6 @@ def _explain(error: OSError) -> str:
     return sentences.get(error.errno or 0, str(error.strerror))
 
 
-def receive(sock: socket.socket, timeout: float) -> tuple[bytes, Address]:
-    """The next datagram and where it came from.
-
-    Raises:
-        TimeoutError: Nothing came within `timeout`, s, or a tenth more, or `LONGEST_WAIT`: look at
-            the clock.
-        OSError: An earlier datagram came back, or the socket is closed.
-    """
-    if timeout > LONGEST_WAIT:
-        timeout = LONGEST_WAIT
-    if not timeout <= (sock.gettimeout() or 0.0) <= 1.1 * timeout:  # to set it is a system call
-        sock.settimeout(min(max(1.05 * timeout, 1e-6), LONGEST_WAIT))
-    return sock.recvfrom(_MAX_DATAGRAM)
-
-
 class Port:
     """The agent's port: a socket for all senders and, if the system can, one for each simulator.
 
@@ -151,8 +200,7 @@ class Port:
 
     def __init__(self, address: Address, *, insecure: bool) -> None:
         self._everybody = open_socket(address, insecure=insecure)
-        self._everybody.setblocking(False)
-        self._own: dict[Address, socket.socket] = {}
+        self._own: dict[Address, Socket] = {}
         self._simulators = selectors.DefaultSelector()
         self._all = selectors.DefaultSelector()
         self._all.register(self._everybody, selectors.EVENT_READ)
@@ -186,7 +234,7 @@ class Port:
                 and then.
 
         Raises:
-            TimeoutError, OSError: As the function `receive`; a wait may end early.
+            TimeoutError, OSError: As `Socket.receive`; a wait may end early.
         """
         if strangers or self._missing or not self._own:
             return _receive_any(self._all, timeout)
@@ -198,7 +246,7 @@ class Port:
         if len(self._own) > 1:
             return _receive_any(self._simulators, timeout)
         (only,) = self._own.values()
-        return receive(only, timeout)
+        return only.receive(timeout)
 
     def send(self, datagram: bytes, address: Address) -> None:
         """Send a datagram. Raises `OSError`."""
@@ -217,7 +265,7 @@ class Port:
 
     def _add(self, peer: Address) -> None:
         try:
-            sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            sock = Socket()
         except OSError:  # too many open files
             return
         try:
@@ -232,14 +280,13 @@ class Port:
         finally:
             self._everybody.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
         _enlarge_buffer(sock)
-        sock.settimeout(LONGEST_WAIT)
         self._own[peer] = sock
         for selector in (self._simulators, self._all):
             selector.register(sock, selectors.EVENT_READ)
 
 
 def _receive_any(selector: selectors.BaseSelector, timeout: float) -> tuple[bytes, Address]:
-    """As `receive`, from any of several sockets."""
+    """As `Socket.receive`, from any of several sockets, without looking first."""
     for key, _ in selector.select(min(timeout, LONGEST_WAIT)):
         sock: Any = key.fileobj
         datagram, address = sock.recvfrom(_MAX_DATAGRAM)
