@@ -189,11 +189,11 @@ class Agent:
     def _gather(self) -> None:
         """Send what is due and answer what comes, until it is the agent's turn everywhere."""
         server, config, slots = self.server, self.config, self.server.slots
+        self._flush()  # before anything else: a simulator waits
         now = time.monotonic()
         self._deadlines = [
             now + (config.timeout if session else config.connect_timeout) for session in slots
         ]
-        self._flush()
         if self._journal:
             self._journal.write()
         pending = self._pending()
@@ -219,7 +219,8 @@ class Agent:
                 if event:
                     self._handle(event, address)
                     pending = self._pending()
-                self._flush()
+                if pending:
+                    self._flush()
 
     def _pending(self) -> list[int]:
         """Slots at which it is not the agent's turn."""

@@ -270,6 +270,8 @@ class Simulator:
                 self._flush()
                 continue
             message = self._receive(left)
+            if isinstance(message, Command):
+                return message  # nothing is due before its State
             self._flush()
             if isinstance(message, Refuse):
                 raise Refused(f"the agent at {address_text(self.server)} refused: {message.reason}")

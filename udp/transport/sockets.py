@@ -125,14 +125,16 @@ class Socket(socket.socket):
         """What comes so soon."""
         begin = now = time.monotonic()
         while now - begin < seconds:
-            with suppress(BlockingIOError):
+            try:
                 came = self.recvfrom(_MAX_DATAGRAM)
+            except BlockingIOError:
+                before, now = now, time.monotonic()
+                if now - before > _LOST:
+                    self._row = _MOST_ASLEEP
+                    break
+            else:
                 self._row = max(1, self._row // 2)
                 return came
-            before, now = now, time.monotonic()
-            if now - before > _LOST:
-                self._row = _MOST_ASLEEP
-                break
         self._asleep = self._row = min(4 * self._row, _MOST_ASLEEP)
         return None
 
