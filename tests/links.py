@@ -3,6 +3,7 @@
 import random
 from collections.abc import Callable
 from heapq import heappop, heappush
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from rotorgram.udp.protocol.messages import (
     Welcome,
 )
 from rotorgram.udp.protocol.server import Event, Server
+from rotorgram.udp.protocol.transitions import AgentState
 
 SESSION, OTHER, NONCE = 77, 78, 99
 HERE, STRANGER = ("127.0.0.1", 8000), ("127.0.0.1", 9999)
@@ -193,6 +195,55 @@ class Pair:
             self.steps.append(float(message.actions.flat[0]))
         if isinstance(message, Command | Welcome):
             send_state(self.client, len(self.steps), self.now)
+
+
+class Fleet:
+    """Simulators, one for each slot of an agent that answers all of their States at once."""
+
+    def __init__(self, clients: list[Client], server: Server, fate: Fate) -> None:
+        self.clients, self.server, self.fate = clients, server, fate
+        self.now = 0.0
+        self.steps = self._order = 0
+        self._flying: list[tuple[float, int, str, int, bytes]] = []
+
+    def run(self, steps: int) -> None:
+        for client in self.clients:
+            client.connect(self.now)
+        while self.steps < steps:
+            self._send()
+            timers = [client.next_timer() or inf for client in self.clients]
+            due = min(timers)
+            if self._flying and self._flying[0][0] <= due:
+                self._arrive()
+            else:
+                self.now = max(self.now, due)
+                assert self.clients[timers.index(due)].handle_timer(self.now), "silent"
+
+    def _send(self) -> None:
+        for number, client in enumerate(self.clients):
+            for datagram in client.take_outgoing():
+                self._put("agent", number, datagram)
+        for datagram, (_, number) in self.server.take_outgoing():
+            self._put("simulator", number, datagram)
+
+    def _put(self, to: str, number: int, datagram: bytes) -> None:
+        for delay, bytes_ in self.fate(datagram):
+            self._order += 1
+            heappush(self._flying, (self.now + delay, self._order, to, number, bytes_))
+
+    def _arrive(self) -> None:
+        self.now, _, to, number, datagram = heappop(self._flying)
+        if to == "simulator":
+            client = self.clients[number]
+            if isinstance(client.receive(datagram, self.now), Command | Welcome):
+                send_state(client, 0.0, self.now)
+            return
+        self.server.receive(datagram, (HERE[0], number), self.now)
+        slots = self.server.slots
+        if all(session and session.state is AgentState.DECIDING for session in slots):
+            self.steps += 1
+            for slot in range(len(slots)):
+                send_command(self.server, slot, 0.0, self.now)
 
 
 def lossy(share: float, delay: float = 1e-3, seed: int = 1) -> Fate:

@@ -13,6 +13,7 @@ from links import (
     SESSION,
     STRANGER,
     WELCOME,
+    Fleet,
     Pair,
     Wire,
     agent,
@@ -238,6 +239,17 @@ def test_waits_follow_the_round_trips() -> None:
     assert trips.wait(8) == pytest.approx(0.025, abs=1e-3)
     assert trips.wait(9) == pytest.approx(0.05, abs=2e-3)
     assert trips.wait(40) == 1.0
+
+
+@BOTH
+@pytest.mark.parametrize(("simulators", "milliseconds"), [(3, 18), (8, 32)])
+def test_the_losses_of_one_simulator_do_not_lengthen_the_waits_of_others(
+    simulators: int, milliseconds: float, sealed: bool
+) -> None:  # fault 16
+    clients = [simulator(said=hello(session=n + 1), sealed=sealed) for n in range(simulators)]
+    fleet = Fleet(clients, agent(slots=simulators, sealed=sealed), lossy(0.3, 1e-4))
+    fleet.run(300)
+    assert fleet.now / 300 < 1e-3 * milliseconds
 
 
 def test_one_pause_does_not_make_later_resends_late() -> None:

@@ -71,6 +71,8 @@ _PATIENCE: Final = 8
 """Resends before the waits double: most that was lost was lost by chance."""
 
 
+_LATER: Final = 1.25
+"""By so much each Alive for a State lengthens the wait before the next is asked for."""
 _TOO_EARLY: Final = 1.5
 """By so much round trips are taken for longer when answers come twice."""
 _AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING, Way.RECEIVED, Command]
@@ -110,14 +112,17 @@ class RoundTrips:
     """Measures round trips, and derives the time of a resend (RFC 6298).
 
     A round trip counts at most as twice the wait of then: a side that paused once, to learn for
-    example, does not make every resend of the next second late.
+    example, does not make every resend of the next second late. An agent of several simulators
+    answers one that asks again with Alive, while it waits for the others. Then a long wait for its
+    Command tells how the others fare, and counts no more: their losses would make the waits of this
+    simulator longer, and those theirs.
     """
 
     def __init__(self) -> None:
         self._smoothed: float | None = None
         self._variation = 0.0
         self._sent_at = 0.0
-        self._is_repeat = self._was_repeated = self._came_twice = False
+        self._is_repeat = self._was_repeated = self._came_twice = self._says_alive = False
         self._in_a_row = 0
         """Messages in a row that were repeated, and then answered twice."""
 
@@ -130,11 +135,17 @@ class RoundTrips:
             self._came_twice = False
         self._sent_at, self._is_repeat = now, not first
 
-    def answered(self, now: float) -> None:
-        """The answer came: to the last sending, but to which one is unclear if it came too soon."""
+    def answered(self, now: float, *, alive: bool = False) -> None:
+        """The answer came, or only Alive.
+
+        It is one to the last sending, but to which one is unclear if it came too soon.
+        """
         seconds = now - self._sent_at
+        self._says_alive |= alive
         if self._smoothed is None:
             self._smoothed, self._variation = seconds, seconds / 2
+        elif self._says_alive and not alive and seconds > self._smoothed:
+            return
         elif not (self._is_repeat and seconds < self._smoothed / 2):
             seconds = min(seconds, 2 * self.wait(0))
             self._variation += (abs(self._smoothed - seconds) - self._variation) / 4
@@ -203,7 +214,7 @@ class Client:
         self.layout = layout
         self.state = SimulatorState.READY if by_text else SimulatorState.IDLE
         self.sequence = 0
-        self.sends = self._tries = 0
+        self.sends = self._tries = self._alives = 0
         self.statistics = Statistics()
         self._config = config
         self._largest = largest
@@ -385,6 +396,12 @@ class Client:
             self._deadline = now + self._config.timeout
             self._resend_missing(message, now)
             return None
+        if isinstance(message, Alive):  # others are late
+            self._round_trips.answered(now, alive=True)
+            self._progress(now)
+            self._alives += 1
+            self._resend_at = now + self._round_trips.wait(1) * _LATER**self._alives
+            return None
         if isinstance(message, Wait):
             self._wait_for_slot(now)
             return None
@@ -502,6 +519,7 @@ class Client:
         self.state = SIMULATOR[self.state, Way.SENT, kind]
         self.sequence = 0 if isinstance(message, Hello) else message.sequence
         self.sends = self._tries = 1
+        self._alives = 0
         self._round_trips.sent(now, first=True)
         self._put(transfer.start(), self._transfer_key)
         closing = kind is Close

@@ -164,7 +164,8 @@ class Unknown:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Alive:
-    """Simulator to agent: the Command of this number came, and is still being computed."""
+    """Simulator to agent: the Command of this number came, and is still being computed. Agent to
+    simulator, that has asked again: the State of this number came, and is not yet answered."""
 
     session: int
     sequence: int

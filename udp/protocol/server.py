@@ -311,8 +311,7 @@ class Server:
         is_state = isinstance(message, State)
         number = getattr(message, "sequence", 0)
         if is_state and number == session.sequence:
-            if session.state is not AgentState.DECIDING:  # else the answer is not there yet
-                self._repeat(session)
+            self._answer_again(session)
             self._drop("duplicate", "", arrival)
             return None
         if is_state and number > session.sequence + 1 and not session.is_text:
@@ -607,8 +606,8 @@ class Server:
             return None
         elif sequence <= holder.sequence:
             is_repeat = sequence == holder.sequence
-            if is_repeat and asks(fragment) and holder.state is not AgentState.DECIDING:
-                self._repeat(holder)
+            if is_repeat and asks(fragment):
+                self._answer_again(holder)
             self._drop("duplicate" if is_repeat else "stale", "", arrival)
             return None
         elif holder.state is AgentState.WELCOMED:
@@ -672,6 +671,15 @@ class Server:
         assert session.reply is not None
         self._put(session.reply.start(), session.peer, session.key)
         self.statistics.counters["resent"] += 1
+
+    def _answer_again(self, session: Session) -> None:
+        """Answer a State that came again: with Alive, while its Command is not there yet."""
+        if session.state is not AgentState.DECIDING:
+            self._repeat(session)
+        elif not session.is_text:
+            alive = Alive(session=session.number, sequence=session.sequence)
+            self._put([binary.encode(alive)], session.peer, session.key)
+            self.statistics.counters["sent"] += 1
 
     def _refuse(
         self, number: int, reason: str, address: Address, size: int, key: Key | None
