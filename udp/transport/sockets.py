@@ -11,6 +11,7 @@ import errno
 import ipaddress
 import logging
 import math
+import os
 import select
 import selectors
 import socket
@@ -115,7 +116,9 @@ class Socket(socket.socket):
             self._asleep -= 1
         elif came := self._look(min(timeout, _LOOK)):
             return came
-        _sleep(self.fileno(), min(timeout, LONGEST_WAIT))
+        if (fileno := self.fileno()) < 0:  # another thread has closed it
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        _sleep(fileno, min(timeout, LONGEST_WAIT))
         try:
             return self.recvfrom(_MAX_DATAGRAM)
         except BlockingIOError:
