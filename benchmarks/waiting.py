@@ -16,7 +16,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
-
 from rotorgram.experiments.results import machine
 from rotorgram.udp import RemoteEnv
 from rotorgram.udp.transport import sockets

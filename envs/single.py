@@ -148,7 +148,7 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def _info(self) -> dict[str, Any]:
         loop = self._loop
-        info = dict(zip(self._names, loop.telemetry_table[0].tolist(), strict=True))
+        info = dict(zip(self._names, loop.row(), strict=True))
         for name, term in loop.terms.items():
             info["reward_" + name] = float(term)
         return info

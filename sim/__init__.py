@@ -5,7 +5,7 @@ Knows nothing of tasks, rewards or Gymnasium.
 
 from .control import CollectiveThrust, Controller, RotorThrust
 from .random import Draw
-from .state import Array, Pose, WorldState, clip, component, constant, on_host, stack
+from .state import Array, Pose, WorldState, clip, component, constant, on_host, plain, stack
 from .world import BACKENDS, Backend, PhysicsError, World, make_world
 
 __all__ = [
@@ -25,5 +25,6 @@ __all__ = [
     "constant",
     "make_world",
     "on_host",
+    "plain",
     "stack",
 ]

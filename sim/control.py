@@ -6,7 +6,7 @@ within bounds, or is one of some choices.
 
 from typing import TYPE_CHECKING, Final, Protocol
 
-from .state import Array, WorldState, clip, component, constant
+from .state import Array, WorldState, clip, component, constant, stack
 
 if TYPE_CHECKING:
     from ..models.vehicle import Vehicle
@@ -57,20 +57,19 @@ class CollectiveThrust:
         hover, low, high = vehicle.hover_thrust, vehicle.thrust_low, vehicle.thrust_high
         alike = all((values == values[0]).all() for values in (hover, low, high))
         # Rotors that are alike need one number for all of them.
-        self._rotors: Final = 0 if alike else slice(None)
-        self._hover: Final = hover[self._rotors]
-        self._per_action: Final = newtons * (hover / hover.mean())[self._rotors]
-        self._low: Final = low[self._rotors]
-        self._high: Final = high[self._rotors]
-        self._increment = increment
+        self._alike, self._increment = alike, increment
+        self._hover, self._per_action, self._low, self._high = (
+            values.item(0) if alike else values
+            for values in (hover, newtons * (hover / hover.mean()), low, high)
+        )
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
         share = component(action, 0)
         share = share - 1.0 if self.choices else clip(share, -1.0, 1.0)
-        if self._rotors == 0:
-            return self._clipped(component(state.thrust, 0), share)[..., None]
-        return self._clipped(state.thrust, share[..., None])
+        if self._alike:
+            return stack((self._clipped(component(state.thrust, 0), share),))
+        return self._clipped(state.thrust, stack((share,)))
 
     def _clipped(self, thrust: Array, share: Array) -> Array:
         base = thrust if self._increment else constant(self._hover, thrust)

@@ -14,7 +14,17 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Array", "Pose", "WorldState", "clip", "component", "constant", "on_host", "stack"]
+__all__ = [
+    "Array",
+    "Pose",
+    "WorldState",
+    "clip",
+    "component",
+    "constant",
+    "on_host",
+    "plain",
+    "stack",
+]
 
 _PLAIN = (np.ndarray, float)
 
@@ -66,15 +76,20 @@ class Pose:
 def clip(array: Array, low: Any, high: Any) -> Array:
     """The nearest numbers within bounds: numbers, or arrays of the same kind."""
     if isinstance(array, float):  # a single drone's number, NumPy's among them
-        return np.float64(low) if array < low else np.float64(high) if array > high else array
+        return low if array < low else high if array > high else array
     if isinstance(array, np.ndarray):
         return np.minimum(np.maximum(array, low), high)  # a third of the time of NumPy's clip
     return array.clip(low, high)
 
 
 def component(array: Array, index: int) -> Array:
-    """`array[..., index]`; of a single drone a number, with which NumPy is ten times faster."""
-    return array[index] if array.ndim == 1 else array[..., index]
+    """`array[..., index]`; of a single drone a Python number, twenty times faster than an array."""
+    return array.item(index) if array.ndim == 1 else array[..., index]
+
+
+def plain(array: Array) -> Array:
+    """A single drone's number as Python's own; other arrays as they are."""
+    return array.item() if array.ndim == 0 else array
 
 
 def stack(parts: Sequence[Any]) -> Array:

@@ -7,7 +7,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 
 from ...models.errors import InputError
-from ...sim import Array, CollectiveThrust, Draw, Pose, WorldState, component, stack
+from ...sim import Array, CollectiveThrust, Draw, Pose, WorldState, component, plain, stack
 from ..spec import ArraySpec, Metric
 from .task import Outcome, Task, TaskOptions, check_choice, check_number, finite
 
@@ -170,7 +170,7 @@ class Elevation(Task):
         if (chosen := draw.chosen("start")) is not None:
             start = chosen
         self._check(target, start, mask)
-        self.target = self.xp.where(mask, target, self.target)[()]
+        self.target = plain(self.xp.where(mask, target, self.target))
         self._goal = stack((0.0, 0.0, self.target))
         return Pose(position=stack((0.0, 0.0, start)))
 
@@ -178,7 +178,7 @@ class Elevation(Task):
         """E, its rate and the thrust; or E alone."""
         error = self.target - component(state.position, 2)
         if self.options.observation == "error":
-            return {"observation": error[..., None]}
+            return {"observation": stack((error,))}
         rate = 0.0 - component(state.velocity, 2)
         thrust = component(state.thrust, 0) / self._hover - 1.0
         return {"observation": stack((error, rate, thrust))}
@@ -188,7 +188,7 @@ class Elevation(Task):
         error = self.target - component(state.position, 2)
         distance = abs(error)
         outside = distance > self.options.flight_band
-        terminated = outside | state.touching[()] | (state.tilt_cosine < MAX_TILT_COSINE)
+        terminated = outside | plain(state.touching) | (state.tilt_cosine < MAX_TILT_COSINE)
         elevation = (ERROR_SCALE - distance) / (ERROR_SCALE + distance)
         termination = terminated * TERMINATION_REWARD + 0.0  # no negative zeros
         return Outcome(
