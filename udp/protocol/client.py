@@ -399,6 +399,7 @@ class Client:
         if isinstance(message, Alive):  # others are late
             self._round_trips.answered(now, alive=True)
             self._progress(now)
+            self._deadline = now + self._config.timeout
             self._alives += 1
             self._resend_at = now + self._round_trips.wait(1) * _LATER**self._alives
             return None
