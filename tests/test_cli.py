@@ -548,6 +548,29 @@ def test_a_simulator_of_other_telemetry_is_served() -> None:  # fault 12
     assert "episode 0: return" in out
 
 
+def test_serve_flies_as_many_drones_as_the_simulator_has(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:  # fault 12
+    """A checkpoint of one drone; each episode is bit for bit that of one drone alone."""
+    settings = ("--env-steps", 200, "--set", "steps_per_update=100", "--env.episode-length", 60)
+    assert run(capsys, "train", "a2c", "--out", tmp_path / "run", *settings)[0] == 0
+    told = []
+    for drones in (1, 3):
+        agent = start("serve", tmp_path / "run", "--listen", "127.0.0.1:0", "--episodes", 5)
+        assert agent.stdout is not None
+        server = agent.stdout.readline().split()[5]
+        status, out, _ = run(
+            capsys, "sim", "--server", server, "--bind", "127.0.0.1:0", "--num-envs", drones,
+            "--env.episode-length", 60,
+        )  # fmt: skip
+        assert (status, "the agent closed" in out) == (0, True)
+        out, err = agent.communicate(timeout=30)
+        assert (agent.returncode, err) == (0, "")
+        told.append(re.findall("episode .*", out))
+    assert len(told[0]) == 5
+    assert told[0] == told[1]
+
+
 def test_a_key_a_relay_and_a_journal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What a user does who flies over a bad network that others share."""
     key, journal = tmp_path / "key", tmp_path / "flight.mcap"
