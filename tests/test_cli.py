@@ -276,6 +276,14 @@ def test_standard_output_that_takes_nothing(command: str, status: int, error: st
     assert done.stderr.count("\n") == bool(error)
 
 
+@pytest.mark.parametrize("out", ["> /dev/full", "| true"])
+def test_a_training_goes_on_without_standard_output(out: str, tmp_path: Path) -> None:
+    done = shell(f"rotorgram train a2c --env-steps 600 --out {tmp_path}/run {out}")
+    assert done.returncode == (1 if "full" in out else 141)
+    assert done.stderr.count("\n") == ("full" in out)
+    assert load(tmp_path / "run" / "checkpoint.safetensors").position.env_steps == 600
+
+
 def test_standard_output_in_ascii() -> None:
     commands = ("rotorgram --help", "rotorgram render --help", "rotorgram check-model",
                 "rotorgram evaluate pid --episodes 1")  # fmt: skip
