@@ -13,7 +13,7 @@ from typing import Any, Final
 import gymnasium as gym
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import InputError, NotCopied
 from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..models.vehicle import Vehicle
 from ..sim import Array, Backend, PhysicsError, World, make_world, on_host
@@ -141,7 +141,7 @@ def has_goal(task: Task) -> bool:
     return type(task).goal is not Task.goal
 
 
-class Loop:
+class Loop(NotCopied):
     """N drones of one env, each in a world of its own.
 
     Args:
@@ -455,10 +455,6 @@ class Loop:
         if not self.world.shape:
             return np.array((values,))
         return _as_type(values.reshape(self.num_envs), values.dtype)
-
-    def __reduce__(self) -> Any:
-        """Raise `TypeError`: simulator memory cannot be copied; a copy would fly wrong numbers."""
-        raise TypeError("a running env cannot be copied or pickled: make another one")
 
 
 class OnHost:

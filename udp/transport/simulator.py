@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import gymnasium as gym
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, NotCopied
 from ..layouts import layout_of
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
@@ -39,7 +39,7 @@ Observer = Callable[[Message | None, State], None]
 the State after it: valid during the call only. None, by text: the reset before the first State."""
 
 
-class Simulator:
+class Simulator(NotCopied):
     """Simulated drones that an agent flies over UDP.
 
     Args:
