@@ -358,6 +358,35 @@ def test_unreachable_agent(capsys: pytest.CaptureFixture[str]) -> None:
     assert f"no answer from the agent at {server} for 0.5 s" in err
 
 
+def test_an_agent_that_is_late(capsys: pytest.CaptureFixture[str]) -> None:
+    """After a second the simulator tells, once, that nobody is there; it goes on asking."""
+    address = f"127.0.0.1:{free_port()}"
+    simulator = start("sim", "--server", address, "--bind", "127.0.0.1:0")
+    assert simulator.stderr is not None
+    began = time.monotonic()
+    sentence = simulator.stderr.readline()
+    assert time.monotonic() - began < 10
+    assert f"no answer from the agent at {address} for 1 s" in sentence
+    assert "; nothing listens on that port; asking for 120 s in all" in sentence
+    assert run(capsys, "serve", "pid", "--listen", address, "--episodes", 1)[0] == 0
+    out, err = simulator.communicate(timeout=30)
+    assert (simulator.returncode, err, "the agent closed" in out) == (0, "", True)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--vehicle", "nowhere.xml"], "vehicle: cannot read nowhere.xml: No such file"),
+        (["--env.control-period", "0.003"], "control_period: expected a positive multiple of the"),
+    ],
+)
+def test_an_error_of_our_own_simulator_is_told_once(
+    words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, _, err = run(capsys, "evaluate", "pid", "--episodes", 1, *words)
+    assert (status, err.startswith(f"rotorgram: {sentence}"), err.count("\n")) == (1, True, 1)
+
+
 def test_check_model(capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = run(capsys, "check-model")
     assert status == 0
@@ -516,9 +545,10 @@ def test_ctrl_c_stops_a_training_that_resumes_to_the_numbers_of_an_unbroken_one(
 
 
 def test_sim_and_serve_meet(tmp_path: Path) -> None:
-    address = f"127.0.0.1:{free_port()}"
+    agent = start("serve", "pid", "--listen", "127.0.0.1:0", "--episodes", 2)
+    assert agent.stdout is not None
+    address = agent.stdout.readline().split()[5]
     simulator = start("sim", "--server", address, "--bind", "127.0.0.1:0", "--codec", "text")
-    agent = start("serve", "pid", "--listen", address, "--episodes", 2)
     out, err = agent.communicate(timeout=30)
     assert (agent.returncode, err) == (0, "")
     assert "episode 1: return" in out
