@@ -23,7 +23,7 @@ from ..envs.spec import Discrete, EnvSpec
 from ..models.errors import InputError, require
 from .episodes import Episode, Position
 from .policies import NetworkPolicy, flat_size
-from .presets import PRESETS
+from .presets import PRESETS, preset
 
 __all__ = ["Checkpoint", "CheckpointError", "load", "software_versions", "store", "write_whole"]
 
@@ -198,6 +198,10 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
         **arrays["position"],
     )
     _check_shapes(position, spec)
+    config = vars(preset(meta["algorithm"], "paper", **meta["config"]))
+    _expect(config == meta["config"], f"a config of all of {sorted(config)}", meta["config"])
+    _check_steps(position, meta["env_steps"], arrays["state"].get("steps"))
+    _check_optimizer(arrays["state"])
     checkpoint = Checkpoint(
         **{name: meta[name] for name in _PLAIN},
         spec=spec,
@@ -254,6 +258,35 @@ def _check_shapes(position: Position, spec: EnvSpec) -> None:
     got = {name: (array.shape, array.dtype.kind) for name, array in arrays.items()}
     _expect(got == expected and count > 0, f"a position of shapes {expected}", got)
     _expect(position.lengths.max() == steps, f"an episode of {steps} steps", position.lengths)
+
+
+def _check_steps(position: Position, total: int, told: np.ndarray | None) -> None:
+    """Env steps are those of the episodes. `told` is SB3's count of them."""
+    steps, ended = position.env_steps, {episode.episode for episode in position.episodes}
+    running = zip(position.numbers.tolist(), position.lengths.tolist(), strict=True)
+    flown = sum(episode.length for episode in position.episodes)
+    flown += sum(length for number, length in running if number not in ended)
+    _expect(flown == steps, f"env_steps of the episodes, {flown}", steps)
+    _expect(steps < total + len(position.numbers), f"env_steps of {total} at most", steps)
+    _expect(told is None or told.tolist() == steps, f"steps of {steps}", told)
+    for name in ("numbers", "lengths", "first_steps"):
+        least = getattr(position, name).min()
+        _expect(least >= 0 or (not steps and least == -1), f"{name} of 0 or more", int(least))
+
+
+def _check_optimizer(state: Mapping[str, np.ndarray]) -> None:
+    """Adam's moments are like the weights. There are none before the first update."""
+
+    def like(begin: tuple[str, ...], end: str = "") -> list[tuple[tuple[int, ...], str]]:
+        arrays = [a for n, a in state.items() if n.startswith(begin) and n.endswith(end)]
+        return sorted((array.shape, str(array.dtype)) for array in arrays)
+
+    weights = like(("actor.", "critic.", "policy."))
+    moments = [like(("optimizer.",), name) for name in (".exp_avg", ".exp_avg_sq")]
+    fits = moments == [weights, weights] or not like(("optimizer.",))
+    _expect(fits, "exp_avg and exp_avg_sq of the optimizer like the weights", moments)
+    steps = {float(a) for n, a in state.items() if re.fullmatch(r"optimizer\..*\.step", n)}
+    _expect(len(steps) <= 1 and min(steps, default=1) >= 1, "one step of the optimizer", steps)
 
 
 def _expect(ok: bool, expected: str, got: object) -> None:

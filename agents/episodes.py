@@ -266,6 +266,8 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 f"resume: expected a training with {self.num_envs} drones, "
                 f"got one with {len(position.numbers)}"
             )
+        if position.numbers[0] < 0:  # it had not begun
+            return
         self.episodes = list(position.episodes)
         self._numbers[:], self._first_steps[:] = position.numbers, position.first_steps
         self._draw_seeds(self._all)

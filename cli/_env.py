@@ -131,7 +131,7 @@ def remote_env(
     options: dict[str, Any],
     *,
     required: bool = True,
-    num_envs: int = 1,
+    num_envs: int | None = 1,
     num_simulators: int = 1,
 ) -> Iterator[Any]:
     """A remote env with a simulator of its own, or those that come to `command.listen`.
@@ -145,7 +145,7 @@ def remote_env(
         options: Its options that are not the default.
         required: Whether simulators that come must fly this task, with these options if there are
             any; otherwise the first that comes decides.
-        num_envs: Drones.
+        num_envs: Drones. None: as many as the first simulator has, in a `RemoteVectorEnv`.
         num_simulators: Simulators to wait for.
 
     Raises:
@@ -171,7 +171,7 @@ def remote_env(
                 "module that registers it"
             )
         opened = socket_pair(
-            env_id, options, num_envs=num_envs, vehicle=command.vehicle, record=command.record
+            env_id, options, num_envs=num_envs or 1, vehicle=command.vehicle, record=command.record
         )
     with opened as env:
         try:
@@ -184,7 +184,7 @@ def remote_env(
 def _waiting(
     command: AgentFlags,
     required: tuple[str | None, dict[str, Any] | None],
-    num_envs: int,
+    num_envs: int | None,
     num_simulators: int,
 ) -> "Iterator[RemoteEnv | RemoteVectorEnv]":
     from ..udp import RemoteEnv, RemoteVectorEnv
@@ -219,8 +219,9 @@ def _waiting(
         )
     with closing(remote):
         waited = "a simulator" if num_simulators == 1 else f"{num_simulators} simulators"
-        share = f" of {num_envs // num_simulators} drones" if num_envs > num_simulators else ""
+        share = (num_envs or 0) // num_simulators
+        waited += f" of {share} drones" if share > 1 else ""
         here = "{}:{}".format(*remote.address)
-        print(f"waiting for {waited}{share} at {here} (Ctrl-C ends)", flush=True)
+        print(f"waiting for {waited} at {here} (Ctrl-C ends)", flush=True)
         remote.connect()
         yield remote

@@ -8,7 +8,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Final
 
 from rich.console import Console
@@ -83,7 +83,8 @@ class Lines:
         if words == "done" or now - self._last.get(name, now - _LINE_EVERY) >= _LINE_EVERY:
             self._last[name] = now
             figures = (_count(task), _rate(task), _times(task), words)
-            print(f"{name:14} {'  '.join(filter(None, figures))}", flush=True)
+            with suppress(OSError):  # no line is worth a run
+                print(f"{name:14} {'  '.join(filter(None, figures))}", flush=True)
 
 
 class _Pace:

@@ -1,5 +1,6 @@
 """`rotorgram serve`: a policy as a UDP server, for simulators that come."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +16,10 @@ __all__ = ["Serve"]
 
 @dataclass(frozen=True, kw_only=True)
 class Serve(AgentFlags):
-    """Fly simulators that come, one after the other, with a trained policy or the PID."""
+    """Fly simulators that come, one after the other, with a trained policy or the PID.
+
+    The first decides the number of drones: each flies an episode of its own at the same time.
+    """
 
     policy: Positional[str]
     """Checkpoint, folder of a training, or pid."""
@@ -26,19 +30,21 @@ class Serve(AgentFlags):
 
     def run(self) -> int:
         """Fly episode after episode."""
-        from ..experiments.trajectories import evaluation_seed, fly
+        from ..experiments.trajectories import fly_episodes
         from ._env import chosen_env, load_checkpoint, policy_for, remote_env, words_of
 
         check_count("episodes", self.episodes)
         checkpoint = load_checkpoint(self.policy)
         episode = 0
-        with remote_env(self, *chosen_env(self, checkpoint)) as env:
+        with remote_env(self, *chosen_env(self, checkpoint), num_envs=None) as env:
             policy = policy_for(self, checkpoint, env.env_spec)
+            drones = getattr(env, "num_envs", 1)
             while self.episodes is None or episode < self.episodes:
+                count = min(drones, (self.episodes or math.inf) - episode)
                 with _next_simulator():
-                    flown = fly(env, policy, evaluation_seed(episode), episode)
-                    print(f"episode {episode}: {words_of(flown)}", flush=True)
-                    episode += 1
+                    for flown in fly_episodes(env, policy, int(count), first=episode):
+                        print(f"episode {episode}: {words_of(flown)}", flush=True)
+                        episode += 1
         return 0
 
 

@@ -327,6 +327,7 @@ class _Stop:
         if self.asked:
             raise KeyboardInterrupt
         self.asked = True
-        print("stopping at the next update; Ctrl-C again stops now", flush=True)
+        with suppress(OSError):  # standard output may take no more
+            print("stopping at the next update; Ctrl-C again stops now", flush=True)
         if hasattr(signal, "setitimer"):
             signal.setitimer(signal.ITIMER_REAL, _UPDATE_WITHIN)

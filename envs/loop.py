@@ -13,10 +13,10 @@ from typing import Any, Final
 import gymnasium as gym
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import InputError, NotCopied
 from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..models.vehicle import Vehicle
-from ..sim import Array, Backend, PhysicsError, World, make_world, on_host
+from ..sim import Array, Backend, Draw, PhysicsError, Pose, World, make_world, on_host
 from . import registry
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
@@ -141,7 +141,7 @@ def has_goal(task: Task) -> bool:
     return type(task).goal is not Task.goal
 
 
-class Loop:
+class Loop(NotCopied):
     """N drones of one env, each in a world of its own.
 
     Args:
@@ -273,17 +273,31 @@ class Loop:
         if not self._begun:  # the first time a task wants all of them
             everybody = every.reshape(lead)[()]
             if not mask.all():
-                world.reset(everybody, self.task.begin(everybody, world.draw(everybody)))
+                world.reset(everybody, self._start(everybody, world.draw(everybody)))
             self._begun = True
         some = mask.reshape(lead)[()]
         if seeds is not None:
+            if len(seeds) != self.num_envs:
+                raise InputError(f"seeds: expected {self.num_envs}, got {len(seeds)}")
             world.seed(some, seeds)
         draws = {name: values.reshape(lead)[()] for name, values in chosen.items()}
-        world.reset(some, self.task.begin(some, world.draw(some, draws)))
+        world.reset(some, self._start(some, world.draw(some, draws)))
         self._steps = self._xp.where(some, 0, self._steps)[()]
         self._waiting = self._waiting & ~mask
         self._anyone_waits = bool(self._waiting.any())
         self.done = self.done & ~mask
+
+    def _start(self, mask: Array, draw: Draw) -> Pose:
+        """Starts of the drones of a mask. Raises `InputError` if a task gives another thing."""
+        pose = self.task.begin(mask, draw)
+        wanted = (*self.world.shape, 3)
+        got = tuple(getattr(pose.position, "shape", ())) if isinstance(pose, Pose) else type(pose)
+        if got != wanted:
+            raise InputError(
+                f"{self.spec.env_id}: expected begin() to return a Pose with a position of shape "
+                f"{wanted}, got {got}"
+            )
+        return pose
 
     def _look(self, flown: Array | None) -> None:
         """Observations, rewards and ends after a step."""
@@ -449,7 +463,12 @@ class Loop:
 
     def ours(self, mask: Array | None) -> Array | None:
         """A mask that the caller gave, NumPy's or a tensor, as an array of the world's kind."""
-        if mask is None or self._xp is np:
+        if mask is None:
+            return None
+        if "bool" not in str(getattr(mask, "dtype", "")) or tuple(mask.shape) != (self.num_envs,):
+            expected = f"bool of shape ({self.num_envs},)"
+            raise InputError(f"resets, frozen: expected {expected}, got {mask!r:.80}")
+        if self._xp is np:
             return mask
         return self._xp.asarray(mask, device=self._nobody.device)
 
@@ -457,10 +476,6 @@ class Loop:
         if not self.world.shape:
             return np.array((values,))
         return _as_type(values.reshape(self.num_envs), values.dtype)
-
-    def __reduce__(self) -> Any:
-        """Raise `TypeError`: simulator memory cannot be copied; a copy would fly wrong numbers."""
-        raise TypeError("a running env cannot be copied or pickled: make another one")
 
 
 class OnHost:

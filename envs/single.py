@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import InputError, NotCopied
 from .loop import Loop
 from .rendering import RENDER_MODES, checked_render_mode, moments, painter
 from .spaces import action_space, observation_space, telemetry_names
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["SingleEnv"]
 
 
-class SingleEnv(gym.Env[Any, Any]):
+class SingleEnv(NotCopied, gym.Env[Any, Any]):
     """A drone that flies a task, in process.
 
     `info` has every component of the telemetry by its name (positions and attitude in the paper's
@@ -152,11 +152,3 @@ class SingleEnv(gym.Env[Any, Any]):
         for name, term in loop.terms.items():
             info["reward_" + name] = float(term)
         return info
-
-    def __deepcopy__(self, memo: Any) -> Any:
-        """Raise `TypeError`, as its loop does."""
-        return self._loop.__reduce__()
-
-    def __reduce__(self) -> Any:
-        """Raise `TypeError`, as its loop does."""
-        return self._loop.__reduce__()

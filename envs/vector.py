@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from ..models.errors import InputError
+from ..models.errors import InputError, NotCopied
 from ..sim import Backend, on_host
 from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
 from .loop import Loop
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["LocalVectorEnv"]
 
 
-class LocalVectorEnv(AdvancingVectorEnv):
+class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
     """N drones that fly a task in process, bit for bit as N single ones do.
 
     Spaces, reward, start and ends are those of the task, with the drone as the first axis. `info`
@@ -200,11 +200,3 @@ class LocalVectorEnv(AdvancingVectorEnv):
                 f"{name}: expected a finite number, or shape ({self.num_envs},), got {value!r}"
             )
         return np.broadcast_to(values, self.num_envs).copy()
-
-    def __deepcopy__(self, memo: Any) -> Any:
-        """Raise `TypeError`, as its loop does."""
-        return self._loop.__reduce__()
-
-    def __reduce__(self) -> Any:
-        """Raise `TypeError`, as its loop does."""
-        return self._loop.__reduce__()

@@ -43,7 +43,7 @@ def socket_pair(
         record: MCAP file for the agent's journal.
 
     Raises:
-        PeerClosed: The simulator did not start, or ended; the sentence quotes its last words.
+        PeerClosed: The simulator did not start, or ended: its own sentence, or its last words.
         PeerSilent: The simulator runs and does not answer.
     """
     config = EnvConfig(
@@ -80,8 +80,9 @@ def socket_pair(
                 raise
             said.seek(0)
             words = said.read().strip() or "it said nothing"
-            status = process.returncode
-            raise PeerClosed(f"the simulator ended with status {status}: {words}") from error
+            _, own, sentence = words.rpartition("rotorgram simulator: ")
+            ended = f"the simulator ended with status {process.returncode}: "
+            raise PeerClosed(sentence if own else ended + words) from error
         finally:
             env.close()
             _end(process)

@@ -154,9 +154,9 @@ def _fly(
 
 
 def fly_episodes(
-    env: Any, policy: Policy, episodes: int, of: EpisodeSet = "curve"
+    env: Any, policy: Policy, episodes: int, of: EpisodeSet = "curve", first: int = 0
 ) -> list[Trajectory]:
-    """The first so many evaluation episodes of a policy, in their order.
+    """So many evaluation episodes of a policy, in their order.
 
     A vector env flies as many at a time as it has drones, each bit as if they were flown one after
     the other.
@@ -166,15 +166,16 @@ def fly_episodes(
         policy: Chooses the actions. Every drone of a vector env gets a copy.
         episodes: How many.
         of: Which.
+        first: Number of the first.
     """
-    seeds = [evaluation_seed(episode, of) for episode in range(episodes)]
+    seeds = {first + i: evaluation_seed(first + i, of) for i in range(episodes)}
     if not isinstance(env, AdvancingVectorEnv):
-        return [fly(env, policy, seed, episode) for episode, seed in enumerate(seeds)]
+        return [fly(env, policy, seed, episode) for episode, seed in seeds.items()]
     found: dict[int, Trajectory] = {}
-    while missing := [episode for episode in range(episodes) if episode not in found]:
+    while missing := [episode for episode in seeds if episode not in found]:
         batch = missing[: env.num_envs]  # again, where a simulator was lost
         found |= _fly_batch(env, policy, {episode: seeds[episode] for episode in batch})
-    return [found[episode] for episode in range(episodes)]
+    return [found[episode] for episode in seeds]
 
 
 def _fly_batch(

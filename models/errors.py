@@ -2,8 +2,9 @@
 
 from importlib import import_module
 from types import ModuleType
+from typing import Any
 
-__all__ = ["InputError", "MissingPackage", "require"]
+__all__ = ["InputError", "MissingPackage", "NotCopied", "require"]
 
 
 class InputError(ValueError):
@@ -16,6 +17,14 @@ class InputError(ValueError):
 
 class MissingPackage(ImportError):
     """An optional package is not installed. The message names the `pip install` that brings it."""
+
+
+class NotCopied:
+    """Base of what holds memory of a simulator, or a socket: a copy would fly wrong numbers."""
+
+    def __reduce__(self) -> Any:
+        """Raise `TypeError`."""
+        raise TypeError("a running env cannot be copied or pickled: make another one")
 
 
 def require(module: str, extra: str, purpose: str) -> ModuleType:

@@ -4,6 +4,7 @@ Only the ground affects the physics. A vehicle file keeps its own ground, sky an
 those that it lacks.
 """
 
+import math
 from pathlib import Path
 from typing import Any, Final, Literal
 from xml.etree import ElementTree
@@ -27,6 +28,10 @@ SCENE_PREFIX: Final = "scene/"
 
 MOST_HEIGHTS: Final = 4096
 """Most rows and columns of a height field: 16.8 million points, 0.3 GB."""
+
+MOST_ELEMENTS: Final = 10_000
+"""Most elements of a file, each as often as it is repeated: seconds to compile."""
+_REPEATED: Final = ("replicate", "composite", "flexcomp")
 
 _GROUNDS: Final = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 _SKY: Final = mujoco.mjtTexture.mjTEXTURE_SKYBOX
@@ -53,13 +58,13 @@ def build_scene(
             bit.
 
     Raises:
-        InputError: The world is not one of these, or a height field is too large.
+        InputError: The world is not one of these, or a part is too large.
         ValueError: The file is no MJCF.
     """
     if world not in ("plain", "airport"):
         raise InputError(f"world: expected 'plain' or 'airport', got {world!r}")
     path = Path(vehicle if vehicle is not None else QUAD_XML)
-    _check_height_fields(path, set())
+    _check_size(path)
     switch_off_log_file()
     spec = mujoco.MjSpec.from_file(str(path))
     has_ground = any(geom.type in _GROUNDS for geom in spec.worldbody.geoms)
@@ -86,29 +91,41 @@ def _attach_scene(spec: mujoco.MjSpec, *, ground: bool) -> None:
     spec.attach(scene, prefix=SCENE_PREFIX, frame=spec.worldbody.add_frame())
 
 
-def _check_height_fields(path: Path, seen: set[Path]) -> None:
-    """Raise `InputError` for a large height field in a file or what it includes.
+def _check_size(path: Path) -> None:
+    """Raise `InputError` if a file, with what it includes, has too many or too large parts.
 
-    MuJoCo allocates its memory while it reads, and aborts the process if there is too little.
+    MuJoCo allocates their memory while it reads, and aborts the process if there is too little.
     """
-    seen.add(path)
-    try:
-        elements = list(ElementTree.parse(path).iter())
-    except (OSError, ElementTree.ParseError):
-        return  # MuJoCo says what is wrong with it
-    for element in elements:
-        if element.tag == "hfield":
-            sides = [element.get(side, "0") for side in ("nrow", "ncol")]
+    seen, total, waiting = {path}, 0, [(_root(path), 1)]
+    while waiting:
+        element, times = waiting.pop()
+        if element.tag in ("hfield", "texture"):
+            sides = [element.get(side, "0") for side in ("nrow", "ncol", "width", "height")]
             if any(side.isdecimal() and int(side) > MOST_HEIGHTS for side in sides):
                 raise InputError(
-                    f"vehicle: expected a height field of at most {MOST_HEIGHTS} × {MOST_HEIGHTS} "
-                    f"points, got {' × '.join(sides)}"
+                    f"vehicle: expected a height field or texture of at most {MOST_HEIGHTS} × "
+                    f"{MOST_HEIGHTS} points, got {' × '.join(s for s in sides if s != '0')}"
                 )
-        elif (
-            element.tag == "include"
-            and (inner := path.parent / element.get("file", "")) not in seen
-        ):
-            _check_height_fields(inner, seen)
+        elif element.tag in _REPEATED:
+            times *= math.prod(int(n) for n in element.get("count", "").split() if n.isdecimal())
+        elif element.tag == "include":
+            inner = path.parent / element.get("file", "")
+            if inner not in seen:
+                seen.add(inner)
+                waiting.append((_root(inner), times))
+        total += times
+        if total > MOST_ELEMENTS:
+            raise InputError(
+                f"vehicle: expected at most {MOST_ELEMENTS} elements, got {total} or more"
+            )
+        waiting += [(child, times) for child in element]
+
+
+def _root(path: Path) -> ElementTree.Element:
+    try:
+        return ElementTree.parse(path).getroot()
+    except (OSError, ElementTree.ParseError):
+        return ElementTree.Element("")  # MuJoCo says what is wrong with it
 
 
 def switch_off_log_file() -> None:

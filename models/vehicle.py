@@ -26,6 +26,8 @@ __all__ = ["Rotor", "Vehicle"]
 
 LEAST_TIMESTEP: Final = 1e-5
 """Smallest physics step, s: a control step of 0.02 s then takes a hundredth of a second."""
+MOST_TIMESTEP: Final = 1.0
+"""Largest physics step, s: that of the longest control step."""
 MOST_HEIGHT: Final = 1e4
 """Height above which no craft may touch anything, m."""
 
@@ -168,25 +170,29 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
         spec.comment = ""
         text = spec.to_xml()
         model = spec.compile()
+        for name in dir(model):
+            array = getattr(model, name)
+            if getattr(array, "dtype", None) == np.float64 and not np.isfinite(array).all():
+                raise InputError(f"vehicle: expected finite numbers, got others in {name}")
+        body = _free_body(model)
+        data = mujoco.MjData(model)
+        data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
+        mujoco.mj_forward(model, data)
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         if isinstance(error, InputError):
             raise
         reason = " ".join(str(error).split())
         raise InputError(f"vehicle: expected an MJCF file, got {path.name}: {reason}") from None
-    body = _free_body(model)
-    data = mujoco.MjData(model)
-    data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
-    mujoco.mj_forward(model, data)
     mass, gravity = float(model.body_subtreemass[body]), -float(model.opt.gravity[2])
     if not (mass > 0 and gravity > 0 and not model.opt.gravity[:2].any()):
         raise InputError(
             f"vehicle: expected a mass > 0 and gravity along -z, got {mass:g} kg and "
             f"{model.opt.gravity.tolist()} m/s²"
         )
-    if not model.opt.timestep >= LEAST_TIMESTEP:
+    if not LEAST_TIMESTEP <= model.opt.timestep <= MOST_TIMESTEP:
         raise InputError(
-            f"vehicle: expected a physics step of at least {LEAST_TIMESTEP:g} s, "
-            f"got {model.opt.timestep:g}"
+            f"vehicle: expected a physics step of at least {LEAST_TIMESTEP:g} s and at most "
+            f"{MOST_TIMESTEP:g} s, got {model.opt.timestep:g}"
         )
     center = data.subtree_com[body].copy()
     rotors = tuple(_rotor(model, data, i, body) for i in range(model.nu))

@@ -184,6 +184,7 @@ def crafted(kept: Checkpoint, path: Path, change: Callable[[dict[str, Any]], Any
         {"spec": None},
         {"spec": "{}"},
         {"config": None},
+        {"config": {}},
         {"env_steps": 10**400},
         {"env_steps": 1.5},
         {"seed": -1},
@@ -230,6 +231,34 @@ def test_parts_that_do_not_fit_are_refused(algorithm: str) -> None:
         wrong = replace(kept, config={**kept.config, **config})
         with pytest.raises(CheckpointError, match="its parts do not fit together"):
             resume_agent(wrong, log_of(2))
+
+
+@pytest.mark.parametrize("algorithm", SMALL)
+def test_parts_that_cannot_be_of_a_training_are_not_loaded(algorithm: str, tmp_path: Path) -> None:
+    """The checksum is right, and resuming would fail later, or fly other numbers."""
+    log = log_of(2)
+    kept, path = checkpoint_of(algorithm, log, trained(algorithm, log, updates=3)), tmp_path / "c"
+    store(kept, path)
+    assert load(path).position.env_steps == kept.position.env_steps == log.env_steps
+    position = kept.position
+    optimizer = {k: v for k, v in kept.state.items() if k.startswith("optimizer.")}
+    one = next(name for name, v in optimizer.items() if v.ndim == 2 and name.endswith("_sq"))
+    negative = position.numbers - 1 - position.numbers.max()
+    changes: list[tuple[str, dict[str, Any]]] = [
+        ("gamma: expected a number", {"config": {**kept.config, "gamma": "[[["}}),
+        ("env_steps", {"env_steps": 3}),
+        ("env_steps", {"position": replace(position, env_steps=5)}),
+        ("env_steps", {"position": replace(position, episodes=())}),
+        ("numbers", {"position": replace(position, numbers=negative)}),
+        ("exp_avg_sq", {"state": {**kept.state, one: optimizer[one].T}}),
+        ("exp_avg_sq", {"state": {k: v for k, v in kept.state.items() if k != one}}),
+        ("step", {"state": {**kept.state, "optimizer.0.step": np.array(-5, np.float32)}}),
+        ("steps", {"state": {**kept.state, "steps": np.array(1)}}),
+    ]
+    for field, change in changes:
+        store(replace(kept, **change), path)
+        with pytest.raises(CheckpointError, match=rf"c: expected a rotorgram .*{field}"):
+            load(path)
 
 
 def test_a_position_of_other_shapes_is_refused(kept: Checkpoint, tmp_path: Path) -> None:

@@ -276,6 +276,14 @@ def test_standard_output_that_takes_nothing(command: str, status: int, error: st
     assert done.stderr.count("\n") == bool(error)
 
 
+@pytest.mark.parametrize("out", ["> /dev/full", "| true"])
+def test_a_training_goes_on_without_standard_output(out: str, tmp_path: Path) -> None:
+    done = shell(f"rotorgram train a2c --env-steps 600 --out {tmp_path}/run {out}")
+    assert done.returncode == (1 if "full" in out else 141)
+    assert done.stderr.count("\n") == ("full" in out)
+    assert load(tmp_path / "run" / "checkpoint.safetensors").position.env_steps == 600
+
+
 def test_standard_output_in_ascii() -> None:
     commands = ("rotorgram --help", "rotorgram render --help", "rotorgram check-model",
                 "rotorgram evaluate pid --episodes 1")  # fmt: skip
@@ -348,6 +356,35 @@ def test_unreachable_agent(capsys: pytest.CaptureFixture[str]) -> None:
     )
     assert status == 1
     assert f"no answer from the agent at {server} for 0.5 s" in err
+
+
+def test_an_agent_that_is_late(capsys: pytest.CaptureFixture[str]) -> None:
+    """After a second the simulator tells, once, that nobody is there; it goes on asking."""
+    address = f"127.0.0.1:{free_port()}"
+    simulator = start("sim", "--server", address, "--bind", "127.0.0.1:0")
+    assert simulator.stderr is not None
+    began = time.monotonic()
+    sentence = simulator.stderr.readline()
+    assert time.monotonic() - began < 10
+    assert f"no answer from the agent at {address} for 1 s" in sentence
+    assert "; nothing listens on that port; asking for 120 s in all" in sentence
+    assert run(capsys, "serve", "pid", "--listen", address, "--episodes", 1)[0] == 0
+    out, err = simulator.communicate(timeout=30)
+    assert (simulator.returncode, err, "the agent closed" in out) == (0, "", True)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--vehicle", "nowhere.xml"], "vehicle: cannot read nowhere.xml: No such file"),
+        (["--env.control-period", "0.003"], "control_period: expected a positive multiple of the"),
+    ],
+)
+def test_an_error_of_our_own_simulator_is_told_once(
+    words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, _, err = run(capsys, "evaluate", "pid", "--episodes", 1, *words)
+    assert (status, err.startswith(f"rotorgram: {sentence}"), err.count("\n")) == (1, True, 1)
 
 
 def test_check_model(capsys: pytest.CaptureFixture[str]) -> None:
@@ -508,9 +545,10 @@ def test_ctrl_c_stops_a_training_that_resumes_to_the_numbers_of_an_unbroken_one(
 
 
 def test_sim_and_serve_meet(tmp_path: Path) -> None:
-    address = f"127.0.0.1:{free_port()}"
+    agent = start("serve", "pid", "--listen", "127.0.0.1:0", "--episodes", 2)
+    assert agent.stdout is not None
+    address = agent.stdout.readline().split()[5]
     simulator = start("sim", "--server", address, "--bind", "127.0.0.1:0", "--codec", "text")
-    agent = start("serve", "pid", "--listen", address, "--episodes", 2)
     out, err = agent.communicate(timeout=30)
     assert (agent.returncode, err) == (0, "")
     assert "episode 1: return" in out
@@ -546,6 +584,29 @@ def test_a_simulator_of_other_telemetry_is_served() -> None:  # fault 12
     out, err = agent.communicate(timeout=30)
     assert (agent.returncode, err) == (0, "")
     assert "episode 0: return" in out
+
+
+def test_serve_flies_as_many_drones_as_the_simulator_has(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:  # fault 12
+    """A checkpoint of one drone; each episode is bit for bit that of one drone alone."""
+    settings = ("--env-steps", 200, "--set", "steps_per_update=100", "--env.episode-length", 60)
+    assert run(capsys, "train", "a2c", "--out", tmp_path / "run", *settings)[0] == 0
+    told = []
+    for drones in (1, 3):
+        agent = start("serve", tmp_path / "run", "--listen", "127.0.0.1:0", "--episodes", 5)
+        assert agent.stdout is not None
+        server = agent.stdout.readline().split()[5]
+        status, out, _ = run(
+            capsys, "sim", "--server", server, "--bind", "127.0.0.1:0", "--num-envs", drones,
+            "--env.episode-length", 60,
+        )  # fmt: skip
+        assert (status, "the agent closed" in out) == (0, True)
+        out, err = agent.communicate(timeout=30)
+        assert (agent.returncode, err) == (0, "")
+        told.append(re.findall("episode .*", out))
+    assert len(told[0]) == 5
+    assert told[0] == told[1]
 
 
 def test_a_key_a_relay_and_a_journal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

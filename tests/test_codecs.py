@@ -162,6 +162,32 @@ def test_any_flipped_bit_and_any_cut_is_seen() -> None:
             binary.decode(data + b"\0", of)
 
 
+@pytest.mark.parametrize("due", [state(7), command(7)])
+def test_only_the_datagram_that_is_due_takes_the_short_way(due: Message) -> None:
+    """Every value of every byte of the header, with and without a checksum made right."""
+    data = binary.encode(due, ONE)
+    session, sequence = struct.unpack_from("<QQ", data, 8)
+
+    def read(datagram: bytes) -> Message | None:
+        return binary.decode_due(data[3], datagram, data[8:24], session, sequence, ONE)
+
+    taken = read(data)
+    assert taken is not None
+    assert binary.encode(taken, ONE) == data
+    for at in range(24):
+        for value in range(256):
+            near = bytearray(data)
+            near[at] = value
+            assert (read(bytes(near)) is None) == (value != data[at])
+            crc = zlib.crc32(near[8:], zlib.crc32(near[:4]))
+            near[4:8] = crc.to_bytes(4, "little")
+            assert (read(bytes(near)) is None) == (near != data)
+    for end in range(len(data)):
+        assert read(data[:end]) is None
+    for body in (b"", data[24:-1], data[24:] + b"\0"):  # with a right checksum
+        assert read(binary.frame(data[3], session, sequence, body)) is None
+
+
 @given(st.binary(max_size=100), st.integers(0, 255), st.integers(0, 20))
 def test_any_bytes_with_a_right_checksum_are_read_or_refused(
     body: bytes, kind: int, sequence: int

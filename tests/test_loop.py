@@ -65,6 +65,19 @@ def test_flags_of_those_that_do_not_fly() -> None:
     assert loop.steps.tolist() == [0, 1]
 
 
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_masks_and_seeds_of_another_shape_are_refused(num_envs: int) -> None:
+    loop, actions = started(num_envs=num_envs)
+    before, every = shown(loop, 0), np.ones(num_envs, bool)
+    for wrong in (np.ones(3, bool), np.ones(num_envs), np.bool_(True), [True] * num_envs):
+        for name in ("resets", "frozen"):
+            with pytest.raises(InputError, match=r"^resets, frozen: expected bool of shape"):
+                loop.advance(actions, **{name: wrong})  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=rf"^seeds: expected {num_envs}, got 3"):
+        loop.advance(actions, every, [1, 2, 3])
+    assert shown(loop, 0) == before
+
+
 def test_the_first_reset_may_be_of_some() -> None:
     loop, every = Loop(ID, 3), np.ones(3, bool)
     still, some = np.zeros((3, 1), np.float32), np.array([False, True, False])
@@ -232,3 +245,25 @@ def test_numbers_of_a_task_that_are_not_finite_go_no_further(num_envs: int, wron
     everybody = np.ones(num_envs, bool)
     with pytest.raises(InputError, match=rf"Broken-v0: expected finite numbers for {wrong}"):
         loop.advance(np.zeros((num_envs, 1), np.float32), everybody)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize(
+    ("start", "got"),
+    [
+        (None, "<class 'NoneType'>"),
+        (np.zeros(3), "<class 'numpy.ndarray'>"),
+        (Pose(position=[0.0, 0.0, 3.0]), r"\(\)"),
+        (Pose(position=np.zeros(2)), r"\(2,\)"),
+    ],
+)
+def test_a_start_that_is_none(num_envs: int, start: Any, got: str) -> None:
+    class Lost(registry.task_type(ID)):  # type: ignore[misc]
+        def begin(self, mask: Any, draw: Any) -> Any:
+            return start
+
+    register("Lost-v0", Lost)
+    loop = Loop("Lost-v0", num_envs)
+    sentence = rf"^Lost-v0: expected begin\(\) to return a Pose with a position of .*, got {got}$"
+    with pytest.raises(InputError, match=sentence):
+        loop.advance(np.zeros((num_envs, 1), np.float32), np.ones(num_envs, bool))

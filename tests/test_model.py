@@ -292,6 +292,10 @@ FREE = '<freejoint name="free"/>'
 WALL = '<worldbody><geom type="plane" size="1 1 1"/><geom type="plane" size="1 1 1" zaxis="1 0 0"/>'
 SECOND = '<body pos="3 0 0"><freejoint/><geom size="0.1" mass="1"/></body></worldbody>'
 ROTOR1 = '<motor name="rotor1" class="quad" site="rotor1" gear="0 0 1 0 0  0.05"/>'
+SPHERES = '<replicate count="3000000" offset="0 0 1"><geom size="0.1"/></replicate>'
+NESTED = 2 * '<replicate count="300">' + '<geom size="0.1"/>' + 2 * "</replicate>"
+GRID = '<flexcomp name="f" type="grid" count="300 300 300" spacing="1 1 1" dim="3"/>'
+COLOURS = '<texture name="t" type="2d" builtin="flat" width="100000" height="100000"/></asset>'
 HEIGHTS = '<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>'
 
 
@@ -316,7 +320,23 @@ HEIGHTS = '<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>
         ("<worldbody>", WALL, "free above the ground, got one that touches something at .* m"),
         ('timestep="0.01"', 'timestep="1e-8"', "physics step of at least .* s, got 1e-08"),
         ('mass="', 'mass="0" user="', "expected an MJCF file, got quad.xml: .*mass"),
-        ("</asset>", HEIGHTS, "height field of at most 4096 × 4096 points, got 100000 × 100000"),
+        (
+            "</asset>",
+            HEIGHTS,
+            "field or texture of at most 4096 × 4096 points, got",
+        ),
+        ("</asset>", COLOURS, "texture of at most 4096 × 4096 points, got 100000 × 100000"),
+        ("</worldbody>", SPHERES + "</worldbody>", "expected at most 10000 elements, got 30000"),
+        ("</worldbody>", NESTED + "</worldbody>", "expected at most 10000 elements"),
+        ("<worldbody>", '<size memory="1"/><worldbody>', "expected an MJCF file, .* out of memory"),
+        ("</worldbody>", GRID + "</worldbody>", "expected at most 10000 elements, got 270000"),
+        ('timestep="0.01"', 'timestep="1e300"', "physics step of .* at most 1 s, got 1e"),
+        ('ctrlrange="0 100"', 'ctrlrange="0 inf"', "finite numbers, got others in actuator_c"),
+        (
+            'name="rotor1" pos="',
+            'name="rotor1" pos="nan 0 0" user="',
+            "finite numbers, got others in ",
+        ),
         ("<mujoco", "<robot", "expected an MJCF file, got quad.xml: "),
     ],
 )

@@ -654,6 +654,8 @@ public static class Physics {
     public static void Simulate(float step) {} public static void SyncTransforms() {} }
 public static class Debug { public static void Log(object message) {} }
 public class RequireComponent : Attribute { public RequireComponent(Type type) {} }
+public static class Uses { // it fails to compile without the script
+    public static MonoBehaviour Script(Rotorgram.RotorgramBehaviour script) { return script; } }
 }
 """
 

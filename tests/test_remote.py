@@ -146,11 +146,18 @@ def test_wrong_actions_and_seeds_raise_and_nothing_has_happened() -> None:
                 pair.remote.step(action)
 
 
-@pytest.mark.parametrize("kind", [RemoteEnv, RemoteVectorEnv])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: RemoteEnv(ANY, connect=False),
+        lambda: RemoteVectorEnv(ANY, connect=False),
+        lambda: Simulator(bind=ANY),
+    ],
+)
 @pytest.mark.parametrize("copies", [copy.copy, copy.deepcopy, pickle.dumps])
-def test_a_remote_env_is_not_copied(kind: Any, copies: Any) -> None:
+def test_no_side_is_copied(make: Any, copies: Any) -> None:
     """Two would take turns in answering the States of one simulator."""
-    env = kind(ANY, connect=False)
+    env = make()
     with pytest.raises(TypeError, match="cannot be copied or pickled: make another one"):
         copies(env)
     env.close()

@@ -308,11 +308,16 @@ def test_a_forked_child_does_not_close_its_parents_flight() -> None:  # fault 34
         pair.remote.reset(seed=1)
         child = os.fork()
         if not child:
-            pair.remote.close()
-            os._exit(0)
-        os.waitpid(child, 0)
-        for _ in range(3):
-            pair.remote.step(np.zeros(1))
+            status = 1
+            try:
+                pair.remote.close()
+                status = 0
+            finally:
+                os._exit(status)
+        assert os.waitpid(child, 0)[1] == 0
+        infos = [pair.remote.step(np.zeros(1))[-1] for _ in range(3)]
+        assert not any("simulator_lost" in info for info in infos)
+        assert pair.simulator.link.sequence == 5, "States: the first, the reset's and three"
 
 
 def test_an_agent_that_flies_on_after_the_end() -> None:

@@ -16,7 +16,8 @@ QUIET = ["sim", "--bind", "127.0.0.1:0", "--timeout", "0.3", "--server"]
 
 
 def quoted(part: str) -> bool:
-    return part in " ".join(PAGE.split())
+    """Whether the page has it as code, between backquotes."""
+    return any(part in code for code in " ".join(PAGE.split()).split("`")[1::2])
 
 
 @pytest.fixture
@@ -36,7 +37,9 @@ def key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
 def check(arguments: list[str], parts: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     """That the command fails with one sentence of these parts, and that the page quotes them."""
     assert main(arguments) != 0
-    sentence = capsys.readouterr().err
+    *logged, sentence = capsys.readouterr().err.splitlines()
+    assert sentence.startswith("rotorgram: ")
+    assert all(line.startswith("rotorgram: dropped a datagram") for line in logged)
     for part in parts:
         assert part in sentence
         assert quoted(part), part
@@ -54,7 +57,9 @@ def test_an_agent_that_drops_everything(port: int, capsys: pytest.CaptureFixture
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", port))
         assert main([*QUIET, f"127.0.0.1:{port}"]) == 1
-    assert "nothing listens" not in capsys.readouterr().err
+    sentence = capsys.readouterr().err
+    assert "no answer from the agent at" in sentence
+    assert "nothing listens" not in sentence
 
 
 @pytest.mark.parametrize(

@@ -162,7 +162,8 @@ def fuzz_fragments(data: bytes) -> None:
     came: dict[tuple[int, int, int], set[bytes]] = {}
     while program:
         sequence, number, count = program.byte() % 3, program.byte() % 5, program.byte() % 5
-        piece = program.piece()
+        head = b"" if number else binary.frame(binary.STATE, SESSION, sequence, b"")
+        piece = head + program.piece()
         fragment = fragment_of(binary.STATE, SESSION, sequence, number, count, piece)
         expect(is_fragment(fragment), "no fragment")
         with suppress(DecodeError):

@@ -36,10 +36,12 @@ from mcap.records import (
 )
 from mcap.stream_reader import StreamReader, breakup_chunk
 
+from ..protocol.layout import MAX_MESSAGE
+
 __all__ = ["MAGIC", "MAX_CHUNK", "Entry", "McapFile", "read_records"]
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-MAX_CHUNK: Final = 1 << 26
+MAX_CHUNK: Final = 2 * MAX_MESSAGE
 """Most bytes of a record or of a decompressed chunk that is read. Ours are of 64 KiB, or of one
 message and 256 KiB where that is longer."""
 _MAX_CHANNELS: Final = 0xFFFF
@@ -263,14 +265,23 @@ def read_records(file: BinaryIO) -> Iterator[McapRecord]:
     """The records of an MCAP file, those in chunks too, in order.
 
     Raises:
-        ValueError: A record or chunk is larger than `MAX_CHUNK`, or compressed in another way.
+        ValueError: A record or chunk is larger than `MAX_CHUNK`, or compressed in another way, or
+            a chunk has more records than bytes: each of ours has a checksum, and that stays.
         OSError: The file cannot be read.
         Exception: Any other, of the package `mcap`, where the file is damaged or cut off.
     """
     reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_CHUNK)
     for record in reader.records:
         if isinstance(record, Chunk):
-            yield from breakup_chunk(_decompressed(record), validate_crc=True)
+            chunk = _decompressed(record)
+            at = count = 0
+            while at < len(chunk.data):  # before all of them are made
+                at += _OPCODE_AND_LENGTH + int.from_bytes(chunk.data[at + 1 : at + 9], "little")
+                count += 1
+                if count > len(record.data):
+                    most = len(record.data)
+                    raise ValueError(f"expected at most {most} records in so many bytes, got more")
+            yield from breakup_chunk(chunk, validate_crc=True)
         else:
             yield record
 

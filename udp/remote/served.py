@@ -5,7 +5,7 @@ from typing import Any, Final
 import numpy as np
 
 from ...envs.spec import Discrete, EnvSpec
-from ...models.errors import InputError
+from ...models.errors import InputError, NotCopied
 from ..protocol.client import Address
 from ..protocol.statistics import Statistics
 from ..transport.agent import Agent
@@ -16,7 +16,7 @@ LOST: Final = "simulator_lost"
 """Key of `info`: why the simulator was lost whose episode ends here as truncated."""
 
 
-class ServedEnv:
+class ServedEnv(NotCopied):
     """An env with drones in remote simulators. For a class that is a Gymnasium env too."""
 
     _agent: Agent
@@ -30,10 +30,6 @@ class ServedEnv:
     def statistics(self) -> Statistics:
         """Counts and round trips of the wire, over all simulators."""
         return self._agent.server.statistics
-
-    def __reduce__(self) -> Any:
-        """Raise `TypeError`: two envs cannot answer the States of one simulator."""
-        raise TypeError("a running env cannot be copied or pickled: make another one")
 
     def _spec_that_came(self) -> EnvSpec:
         spec = self._agent.spec

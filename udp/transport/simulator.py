@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import gymnasium as gym
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, NotCopied
 from ..layouts import layout_of
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
@@ -31,6 +31,8 @@ DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
 
 _ALIVE_EVERY: Final = 0.5
 """Period of the message Alive while a long step is computed, s."""
+_COMPLAIN_AFTER: Final = 1.0
+"""A wait for the agent that is told, once, s."""
 _PAUSE: Final = 1.0
 """A wait that took so much longer than it should, s: this process was stopped meanwhile."""
 
@@ -39,7 +41,7 @@ Observer = Callable[[Message | None, State], None]
 the State after it: valid during the call only. None, by text: the reset before the first State."""
 
 
-class Simulator:
+class Simulator(NotCopied):
     """Simulated drones that an agent flies over UDP.
 
     Args:
@@ -258,6 +260,7 @@ class Simulator:
         link = self.link
         if self._journal:
             self._journal.write()
+        complain_at: float | None = time.monotonic() + _COMPLAIN_AFTER
         while not self._stopped:
             timer = link.next_timer()
             assert timer is not None
@@ -266,7 +269,11 @@ class Simulator:
             if left <= 0:
                 sends = link.sends  # of what was not answered, not of the Close that follows
                 if not link.handle_timer(before):
-                    raise PeerSilent(self._silence(sends))
+                    raise PeerSilent(self._silence(sends, self.config.timeout))
+                if complain_at and before > complain_at and (self._trouble or not link.sequence):
+                    told = self._silence(link.sends, _COMPLAIN_AFTER)
+                    link.statistics.notice(f"{told}; asking for {self.config.timeout:g} s in all")
+                    complain_at = None
                 self._flush()
                 continue
             message = self._receive(left)
@@ -335,7 +342,7 @@ class Simulator:
                 for datagram in self.link.alive():
                     self._send(datagram)
 
-    def _silence(self, sends: int) -> str:
+    def _silence(self, sends: int, seconds: float) -> str:
         what = "Hello" if self.link.sequence == 0 else f"State {self.link.sequence}"
         key = ""
         if self._keyed and what == "Hello":
@@ -345,7 +352,7 @@ class Simulator:
         dropped = f"; last datagram dropped: {last}" if last else ""
         return (
             f"no answer from the agent at {address_text(self.server)} "
-            f"for {self.config.timeout:g} s, {what} sent {sends} times{why}{key}{dropped}"
+            f"for {seconds:g} s, {what} sent {sends} times{why}{key}{dropped}"
         )
 
 
