@@ -16,10 +16,10 @@ from ..layouts import layout_of
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
 from ..protocol.errors import LinkError, PeerSilent, Refused
-from ..protocol.messages import MAX_UINT64, Close, Command, Hello, Message, Refuse, State, Welcome
+from ..protocol.messages import Close, Command, Hello, Message, Refuse, State, Welcome
 from ..protocol.transitions import SimulatorState
 from .sockets import LONGEST_WAIT, address_text, log_notices, open_socket, resolve
-from .stepped import Stepped, make_stepped
+from .stepped import Stepped, make_stepped, reset_all
 
 if TYPE_CHECKING:
     from ..journal import Journal
@@ -197,7 +197,7 @@ class Simulator:
         link.connect(time.monotonic())
         self._flush()
         if self._text:  # the agent says nothing before the first State
-            self._reset(link.hello.session)
+            reset_all(self.stepped, link.layout, link.hello.session)
             self._send_state(None)
         while not self._stopped:
             message = self._wait()
@@ -212,19 +212,13 @@ class Simulator:
                 return message.reason or "the agent closed"
             self._began_at = time.monotonic()
             if isinstance(message, Welcome):
-                self._reset(message.session if message.seed is None else message.seed)
+                seed = message.session if message.seed is None else message.seed
+                reset_all(self.stepped, link.layout, seed)
             elif isinstance(message, Command):
                 self._step(message)
             self._began_at = None
             self._send_state(message)
         return ""
-
-    def _reset(self, seed: int) -> None:
-        """Reset every drone: drone i with seed + i, modulo 2^64."""
-        layout, count = self.link.layout, self.stepped.num_envs
-        seeds = np.array([(seed + i) & MAX_UINT64 for i in range(count)], np.uint64)
-        actions = np.zeros(layout.actions.shape, layout.actions.dtype)
-        self.stepped.advance(actions, np.ones(count, bool), seeds, None)
 
     def _step(self, command: Command) -> None:
         orders = command.orders

@@ -13,9 +13,10 @@ from ...envs import registry
 from ...envs.spaces import action_space, observation_space
 from ...envs.spec import ArraySpec, Discrete, EnvSpec, canonical_id, component_names
 from ...models.errors import InputError
-from ..protocol.layout import MAX_DRONES
+from ..protocol.layout import MAX_DRONES, Layout
+from ..protocol.messages import MAX_UINT64
 
-__all__ = ["Stepped", "make_stepped", "spec_of_gymnasium"]
+__all__ = ["Stepped", "make_stepped", "reset_all", "spec_of_gymnasium"]
 
 
 class Stepped(Protocol):
@@ -90,6 +91,13 @@ def make_stepped(
     if vehicle is not None or backend != "mujoco":
         raise InputError(f"vehicle, backend: expected none for {env!r}, which is no task of ours")
     return _Singles(envs, options)
+
+
+def reset_all(stepped: Stepped, layout: Layout, seed: int) -> None:
+    """A simulator's own first reset: drone i takes seed + i, modulo 2^64."""
+    actions, count = layout.actions, layout.drones
+    seeds = np.array([(seed + i) & MAX_UINT64 for i in range(count)], np.uint64)
+    stepped.advance(np.zeros(actions.shape, actions.dtype), np.ones(count, bool), seeds, None)
 
 
 def _make(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
