@@ -11,9 +11,7 @@ from .protocol.client import Address, LinkConfig
 from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Refused
 
 if TYPE_CHECKING:
-    from .remote.env import RemoteEnv
-    from .remote.served import LOST
-    from .remote.vector import RemoteVectorEnv
+    from .remote import LOST, RemoteEnv, RemoteVectorEnv
     from .transport.simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, Simulator
 
 __all__ = [
@@ -35,9 +33,9 @@ __all__ = [
 _HOMES: Final = {
     "DEFAULT_AGENT": "transport.simulator",
     "DEFAULT_SIMULATOR": "transport.simulator",
-    "LOST": "remote.served",
-    "RemoteEnv": "remote.env",
-    "RemoteVectorEnv": "remote.vector",
+    "LOST": "remote",
+    "RemoteEnv": "remote",
+    "RemoteVectorEnv": "remote",
     "Simulator": "transport.simulator",
 }
 

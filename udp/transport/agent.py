@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypedDict
 
 import gymnasium as gym
 import numpy as np
@@ -33,7 +33,7 @@ from .sockets import LONGEST_WAIT, Port, address_text, log_notices
 if TYPE_CHECKING:
     from ..journal import Journal
 
-__all__ = ["Agent", "AgentConfig", "Order"]
+__all__ = ["Agent", "AgentConfig", "AgentSettings", "Order"]
 
 _log: Final = logging.getLogger("rotorgram.udp")
 _PAUSE: Final = 1.0
@@ -43,27 +43,46 @@ Order = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 """Actions, orders and seeds of the drones of one simulator: see `messages.Command`."""
 
 
+class AgentSettings(TypedDict, total=False):
+    """Settings of an env over UDP."""
+
+    env_id: str | None
+    """A simulator of another env is refused; None flies any."""
+    options: Mapping[str, Any] | None
+    """A simulator of other options is refused; None takes any. Those that are not here have their
+    defaults if the env is registered here, and any value otherwise."""
+    vehicle_hash: str | None
+    """A simulator of another vehicle is refused; None takes any."""
+    connect_timeout: float
+    """Longest wait for a simulator, s, the first or one that replaces another; 60."""
+    timeout: float
+    """Longest wait for an answer from it, s, before another may take its slot; 30. While it
+    computes, it says so."""
+    max_datagram: int | None
+    """Largest datagram, bytes, a seal not counted. None: 65,483 on loopback, 1,200 elsewhere."""
+    key_file: Path | str | None
+    """File with the key that the simulators have too (`rotorgram key`). With it any address is
+    allowed, because only holders of the key can take part."""
+    insecure: bool
+    """Allow an address that is not loopback without a key."""
+    record: Path | str | None
+    """MCAP file to write every message to; it must not exist."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig:
-    """Settings of an agent: keys and sizes, accepted simulators, and times."""
+    """The settings, their defaults, and the size of the fleet."""
 
     env_id: str | None = None
-    """A simulator of another env is refused; None flies any."""
     options: Mapping[str, Any] | None = None
-    """A simulator of other options is refused; None takes any. Those that are not here have their
-    defaults if the env is known here, and any value otherwise."""
     vehicle_hash: str | None = None
-    """A simulator of another vehicle is refused; None takes any."""
     worlds: int | None = None
     """Worlds of each simulator; None: as many as the first has."""
     slots: int = 1
     """Simulators to fly at the same time."""
     connect_timeout: float = 60.0
-    """Longest wait for a simulator to take a slot that is free, s."""
     timeout: float = 30.0
-    """Longest wait for an answer from one that has a slot, s. Then its slot is free."""
     max_datagram: int | None = None
-    """As `LinkConfig.max_datagram`."""
     key_file: Path | str | None = None
     insecure: bool = False
     record: Path | str | None = None

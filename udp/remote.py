@@ -1,28 +1,199 @@
-"""The drones of one or many remote simulators as one vector env of the agent."""
+"""Drones in remote simulators as Gymnasium envs of the agent: one drone, or many."""
 
-from collections.abc import Collection, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Collection
+from typing import Any, Final, Unpack
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from ...envs.autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
-from ...envs.spaces import joined
-from ...envs.spec import Discrete, EnvSpec
-from ...models.errors import InputError
-from ..protocol.client import Address
-from ..protocol.layout import MAX_DRONES
-from ..protocol.messages import FREEZE, MAX_UINT64, RESET
-from ..transport.agent import Agent, AgentConfig, Order
-from ..transport.simulator import DEFAULT_AGENT
-from .served import LOST, ServedEnv, action_dtype, checked_actions
+from ..envs.autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
+from ..envs.spaces import action_space, joined, observation_space
+from ..envs.spec import Discrete, EnvSpec, component_names
+from ..models.errors import InputError
+from .protocol.client import Address
+from .protocol.layout import MAX_DRONES
+from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET, State
+from .protocol.statistics import Statistics
+from .transport.agent import Agent, AgentConfig, AgentSettings, Order
+from .transport.simulator import DEFAULT_AGENT
 
-__all__ = ["RemoteVectorEnv"]
+__all__ = ["LOST", "RemoteEnv", "RemoteVectorEnv"]
+
+LOST: Final = "simulator_lost"
+"""Key of `info`: why the simulator was lost whose episode ends here as truncated."""
+
+_FLY: Final = np.array([FLY], np.uint8)
+_RESET: Final = np.array([RESET], np.uint8)
 
 
-class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
+class _Remote:
+    """Base of both envs: the `Agent` behind them, and actions as they cross the wire."""
+
+    _agent: Agent
+
+    @property
+    def address(self) -> Address:
+        """Address that this side listens on."""
+        return self._agent.address
+
+    @property
+    def statistics(self) -> Statistics:
+        """Counts and round trips of the wire, over all simulators."""
+        return self._agent.server.statistics
+
+    def __reduce__(self) -> Any:
+        """Raise `TypeError`: two envs cannot answer the States of one simulator."""
+        raise TypeError("a running env cannot be copied or pickled: make another one")
+
+    def _take_actions(self, action: Any, count: int) -> None:
+        """Take dtype and shape of the actions of so many drones as they cross the wire."""
+        is_discrete = isinstance(action, Discrete)
+        self._row: tuple[int, ...] = () if is_discrete else action.shape
+        self._dtype = np.dtype(np.int64 if is_discrete else action.dtype)
+        self._nothing: np.ndarray = np.zeros((count, *self._row), self._dtype)
+
+
+class RemoteEnv(_Remote, gym.Env[Any, Any]):
+    """A drone in a remote simulator, flown in lock-step over UDP.
+
+    The simulator may start before or after. Its Hello brings the spec of its env, and the spaces
+    follow from that: this side needs neither the env's code nor MuJoCo. A text simulator says no
+    Hello, and is read by the spec of `env_id` with `options`, which must be registered here.
+    Observations, rewards, ends of episodes and telemetry are those of the env in the simulator, bit
+    for bit; `info` carries the telemetry by its components.
+
+    A simulator that is killed and started again, or another one that comes in its place, goes on:
+    the running episode ends as truncated, with the observation before it, reward 0 and the reason
+    in `info["simulator_lost"]`. If none comes, `PeerSilent` is raised; the next `reset` waits
+    again. The simulator is told when the env is closed, garbage-collected, or its program ends.
+
+    Args:
+        address: Address (host, port) to listen on; port 0 takes a free one (see `address`).
+        connect: Wait for the simulator now. Otherwise `connect` or the first `reset` waits.
+        settings: Those of `AgentSettings`: `env_id`, `options` and `vehicle_hash` of the simulators
+            that are taken, `connect_timeout`, `timeout`, `max_datagram`, `key_file`, `insecure`,
+            `record`.
+
+    Attributes:
+        env_spec: The `EnvSpec` of the env, once a simulator has come.
+        control_period: Time of a step, s, likewise.
+
+    Raises:
+        InputError: An address, option, key file, action or seed is not what it should be; nothing
+            was sent.
+        OSError: The port is in use.
+        PeerSilent: No simulator came, or it fell silent and no other came.
+        PeerClosed: The simulator ended the exchange.
+        gymnasium.error.ResetNeeded: A step before a reset, or after an episode's end.
+        gymnasium.error.ClosedEnvironmentError: A reset after `close`.
+    """
+
+    def __init__(
+        self,
+        address: Address = DEFAULT_AGENT,
+        *,
+        connect: bool = True,
+        **settings: Unpack[AgentSettings],
+    ) -> None:
+        self.render_mode = None
+        self._flying = False
+        self._agent = Agent(address, AgentConfig(worlds=1, **settings))
+        if connect:
+            try:
+                self.connect()
+            except BaseException:
+                self.close()
+                raise
+
+    def connect(self) -> None:
+        """Wait until it is the agent's turn: for the simulator's first State, if none has come."""
+        self._agent.connect()
+        self._take_spec()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode in the simulator, with its generator seeded where a seed is given."""
+        if seed is not None and not 0 <= seed <= MAX_UINT64:
+            raise InputError(f"seed: expected 0 to 2^64 - 1, got {seed}")
+        if options:
+            raise InputError(f"options: expected none over UDP, got {options}")
+        super().reset(seed=seed)
+        self._flying = False
+        self.connect()
+        seeds = None if seed is None else np.array([seed], np.uint64)
+        self._agent.exchange({0: (self._nothing, _RESET, seeds)})
+        while self._agent.lost[0]:  # the simulator that has come instead was not reset
+            self._agent.exchange({0: (self._nothing, _RESET, seeds)})
+        self._take_spec()
+        self._flying = True
+        self._state = self._take_state()
+        return self._observation(self._state), self._info(self._state)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Fly for one control period. The action is sent in the dtype of its space."""
+        if not self._flying:
+            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        actions = _checked_actions(action, self._dtype, self._row)[np.newaxis]
+        self._flying = False  # until the answer is there
+        try:
+            self._agent.exchange({0: (actions, _FLY, None)})
+        except InputError:  # an action that is wrong, and nothing has happened
+            self._flying = True
+            raise
+        if reason := self._agent.lost[0]:
+            info = {**self._info(self._state), LOST: reason}
+            return self._observation(self._state), 0.0, False, True, info
+        self._state = state = self._take_state()
+        terminated, truncated = state.terminated.item(), state.truncated.item()
+        self._flying = not (terminated or truncated)
+        observation = self._observation(state)
+        return observation, state.rewards.item(), terminated, truncated, self._info(state)
+
+    def close(self) -> None:
+        """Tell the simulator and close the socket. May be called again."""
+        self._agent.close()
+        self._flying = False
+
+    def _take_state(self) -> State:
+        state = self._agent.states[0]
+        assert state is not None
+        return state
+
+    def _take_spec(self) -> None:
+        """Set spaces and other attributes from the spec. Spaces that have not changed are kept:
+        their generators may have been seeded.
+        """
+        spec = self._agent.spec
+        assert spec is not None
+        if getattr(self, "env_spec", None) == spec:
+            return
+        self.env_spec: EnvSpec = spec
+        self.control_period = spec.control_period
+        self.observation_space = observation_space(spec)
+        self.action_space = action_space(spec)
+        fps = max(1, round(1 / spec.control_period))
+        self.metadata = {"render_modes": [], "render_fps": fps}
+        self._arrays = tuple(array.name for array in spec.observation)
+        self._names = tuple(n for array in spec.telemetry for n in component_names(array))
+        self._take_actions(spec.action, 1)
+
+    def _observation(self, state: State) -> Any:
+        """As the space has it, a copy."""
+        arrays = state.observations
+        if len(arrays) == 1:
+            return np.array(arrays[0][0])
+        return {name: np.array(a[0]) for name, a in zip(self._arrays, arrays, strict=True)}
+
+    def _info(self, state: State) -> dict[str, Any]:
+        numbers: list[float] = []
+        for array in state.telemetry:
+            numbers += array.tolist()[0] if array.ndim == 2 else array.ravel().tolist()
+        return dict(zip(self._names, numbers, strict=True))
+
+
+class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
     """The M · N drones of M simulators with N drones each, in lock-step over one socket.
 
     The simulators may be on any machines, and come in any order: each takes the first slot that is
@@ -44,8 +215,7 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
             is that of the first simulator that comes.
         autoreset_mode: `AutoresetMode`, or its value.
         connect: Wait for the simulators now. Otherwise `connect` or the first `reset` waits.
-        env_id, options, vehicle_hash, connect_timeout, timeout, max_datagram: As `RemoteEnv`.
-        key_file, insecure, record: As `RemoteEnv`.
+        settings: As `RemoteEnv`.
 
     Raises:
         InputError: An address, number, option, key file, action or seed is not what it should be;
@@ -64,17 +234,9 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
         *,
         num_simulators: int = 1,
         num_envs: int | None = None,
-        env_id: str | None = None,
-        options: Mapping[str, Any] | None = None,
-        vehicle_hash: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         connect: bool = True,
-        connect_timeout: float = 60.0,
-        timeout: float = 30.0,
-        max_datagram: int | None = None,
-        key_file: Path | str | None = None,
-        insecure: bool = False,
-        record: Path | str | None = None,
+        **settings: Unpack[AgentSettings],
     ) -> None:
         self.closed = True  # nothing is open yet
         if type(num_simulators) is not int or not 1 <= num_simulators <= MAX_DRONES:
@@ -91,21 +253,9 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
         self._broken: tuple[np.ndarray, np.ndarray] | None = None
         self._mode = autoreset_mode
         self._flying = False
-        config = AgentConfig(
-            env_id=env_id,
-            options=options,
-            vehicle_hash=vehicle_hash,
-            worlds=num_envs // num_simulators if num_envs else None,
-            slots=num_simulators,
-            connect_timeout=connect_timeout,
-            timeout=timeout,
-            max_datagram=max_datagram,
-            key_file=key_file,
-            insecure=insecure,
-            record=record,
-        )
         self.metadata = {"render_modes": [], "autoreset_mode": _checked_mode(autoreset_mode)}
-        self._agent = Agent(address, config)
+        worlds = num_envs // num_simulators if num_envs else None
+        self._agent = Agent(address, AgentConfig(worlds=worlds, slots=num_simulators, **settings))
         self.closed = False
         if connect:
             try:
@@ -117,7 +267,15 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
     def connect(self) -> None:
         """Wait until every slot is taken."""
         self._agent.connect()
-        self._take(self._spec_that_came())
+        spec = self._agent.spec
+        assert spec is not None
+        num_envs = self.num_simulators * self._agent.worlds * len(spec.agents)
+        self._take_spec(spec, num_envs, self._mode)
+        self._take_actions(spec.action, num_envs)
+        self._shape = self.num_simulators, num_envs // self.num_simulators
+        if not self._flying:
+            self.done = np.zeros(num_envs, bool)
+            self._idle = np.ones(num_envs, bool)  # those that no reset has begun
 
     def reset(
         self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
@@ -200,19 +358,6 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
         self._agent.close()
         self._flying = False
 
-    def _take(self, spec: EnvSpec) -> None:
-        """Set spaces and other attributes from the spec."""
-        worlds = self._agent.worlds
-        num_envs = self.num_simulators * worlds * len(spec.agents)
-        self._take_spec(spec, num_envs, self._mode)
-        self._shape = self.num_simulators, num_envs // self.num_simulators
-        self._dtype = action_dtype(spec)
-        self._row = () if isinstance(spec.action, Discrete) else spec.action.shape
-        self._nothing: np.ndarray = np.zeros((num_envs, *self._row), self._dtype)
-        if not self._flying:
-            self.done = np.zeros(num_envs, bool)
-            self._idle = np.ones(num_envs, bool)  # those that no reset has begun
-
     def _seeds(self, seed: Any) -> np.ndarray | None:
         seeds = checked_seeds(seed, self.num_envs, MAX_UINT64)
         return None if seeds is None else np.array(seeds, np.uint64)
@@ -283,7 +428,7 @@ class RemoteVectorEnv(ServedEnv, AdvancingVectorEnv):
                 array = np.where(idle, 0, array)
             if array.dtype.kind == "f" and (array % 1 == 0).all():
                 array = array.astype(np.int64)
-        sent = checked_actions(array, self._dtype, shape)
+        sent = _checked_actions(array, self._dtype, shape)
         if idle.any() and sent.shape == shape:
             sent = sent.copy()
             sent[idle] = 0
@@ -311,3 +456,25 @@ def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
     except ValueError:
         expected = " or ".join(repr(m.value) for m in AutoresetMode)
         raise InputError(f"autoreset_mode: expected {expected}, got {mode!r}") from None
+
+
+def _checked_actions(action: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
+    """Actions as they cross the wire; the env checks bounds.
+
+    Raises `InputError` for another shape, and what is not real or cannot be of that dtype.
+    """
+    array = np.asarray(action)
+    if array.shape != shape:
+        raise InputError(f"action: expected an array of shape {shape}, got shape {array.shape}")
+    if array.dtype == dtype:
+        return array
+    if array.dtype.kind not in ("iuf" if dtype.kind == "f" else "iu"):
+        expected = "real" if dtype.kind == "f" else "whole"
+        raise InputError(f"action: expected {expected} numbers, got {array.dtype}")
+    if dtype.kind == "f":
+        with np.errstate(over="ignore", under="ignore"):  # independent of the program's settings
+            return array.astype(dtype)  # an overflow is infinite, and refused as such
+    whole = array.astype(dtype)
+    if (whole != array).any():
+        raise InputError(f"action: expected numbers of {dtype}, got {array}")
+    return whole
