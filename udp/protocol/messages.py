@@ -178,13 +178,22 @@ class Missing:
     sequence: int
     """Number of the message; 0 for a Hello."""
     kind: int
-    """Type of the message: Hello, State or Command."""
+    """Type of the message in the binary codec: 1 Hello, 4 State, 5 Command."""
     count: int
     """Number of its fragments."""
     first: int
     """Number of the fragment that the first bit stands for."""
     bitmap: bytes
     """Bit i of byte j (bit 0 is the lowest) is set if fragment first + 8 j + i is missing."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in (1, 4, 5):
+            raise InputError(f"expected a Hello, State or Command, got type {self.kind}")
+        size, count = len(self.bitmap), self.count
+        if not size or self.first >= count or self.first + 8 * (size - 1) >= count:
+            raise InputError(f"expected a bitmap of {count} fragments, got {size} bytes")
+        if (numbers := self.numbers()) and numbers[-1] >= count:
+            raise InputError(f"expected fragments below {count}, got {numbers[-1]}")
 
     def numbers(self) -> list[int]:
         """Numbers of the fragments that are missing, in their order."""
