@@ -94,7 +94,7 @@ class Session:
     """Bytes of the largest datagram to it, a seal not counted; 0 before the first message."""
     due: bytes = b""
     """Bytes 8 to 23 of the State that is expected; empty where it is sealed, or a line of text."""
-    asked_at: float | None = None
+    asked_at: float = 0.0
     """When the Command was sent whose State is expected."""
     heard_at: float = 0.0
     """When it last said that it lives, or brought a fragment that was missing."""
@@ -191,16 +191,8 @@ class Server:
         datagram, address, _ = arrival
         try:
             if text.is_text(datagram):
-                layout = None if self._keys else self._text_layout()
-                if layout is not None:
-                    return self._receive_text(slot, session, layout, arrival)
-                self._turn_text_away(arrival)
-                return None
-            plain, key = (
-                (datagram, None)
-                if not (self._keys or is_sealed(datagram))
-                else self._open(arrival, session)
-            )
+                return self._receive_text(slot, session, arrival)
+            plain, key = self._open(arrival, session)
             kind, number, _ = binary.peek(plain)
             holder = session
             if session is None or session.number != number or session.is_text:
@@ -347,8 +339,7 @@ class Server:
         if session.reply is None or missing.kind != binary.COMMAND:
             self._drop("stale", "", arrival)
             return
-        self._put(session.reply.resend(missing), session.peer, session.key)
-        self.statistics.counters["resent"] += 1
+        self._put(session.reply.resend(missing), session.peer, session.key, "resent")
 
     # ---- a simulator that comes
 
@@ -386,13 +377,11 @@ class Server:
         opening.move(Way.SENT, Welcome)
         opening.reply = self._transfer(binary.encode(welcome), opening)
         self._put(opening.reply.start(), address, key)
-        self.statistics.counters["sent"] += 1
         _keep(self._openings, (address, hello.session), opening)
 
     def _let_wait(self, session: Session, size: int) -> None:
         wait = binary.encode(Wait(session=session.number))
         self._put([wait], session.peer, session.key)
-        self.statistics.counters["sent"] += 1
         session.move(Way.SENT, Wait)
         session.room = size - len(wait)
         _keep(self._queue, session.peer, session)
@@ -402,8 +391,7 @@ class Server:
     ) -> Event:
         """The next State of a slot."""
         session.sequence, session.state = state.sequence, _AFTER_STATE
-        if session.asked_at is not None:
-            self.statistics.round_trips.add(now - session.asked_at)
+        self.statistics.round_trips.add(now - session.asked_at)
         if self._tap:
             self._record(slot, state, plain, session)
         return Event(slot, state)
@@ -426,7 +414,6 @@ class Server:
             words = _cut(layout, len(plain) - _REASON_AT)
             close = Close(session=opening.number, sequence=1, reason=words)
             self._put([binary.encode(close)], opening.peer, self._session_key(opening))
-            self.statistics.counters["sent"] += 1
             opening.move(Way.SENT, Close)
             self._drop("refused", layout, arrival)
             return None
@@ -481,8 +468,7 @@ class Server:
             if key is None:
                 return
             reply = key.seal(reply, datagram)
-        self._outgoing.append((reply, address))
-        self.statistics.counters["sent"] += 1
+        self._put([reply], address, None)
 
     def _seated(self, number: int, elsewhere: Address | None = None) -> bool:
         """Whether a session of that number has a slot (not of this address)."""
@@ -505,10 +491,19 @@ class Server:
 
     # ---- text
 
-    def _receive_text(
-        self, slot: int, session: Session | None, layout: Layout, arrival: _Arrival
-    ) -> Event | None:
+    def _receive_text(self, slot: int, session: Session | None, arrival: _Arrival) -> Event | None:
         datagram, address, now = arrival
+        layout = None if self._keys else self._text_layout()
+        if layout is None:
+            sequence, fields = text.split(datagram)
+            cause, reason = "refused", "text is not flown here"
+            if self._keys:
+                cause, reason = "forged", "key: this agent has one (--key-file), text has none"
+            if fields == ["close"]:  # two agents would answer each other's Closes for ever
+                self._drop(cause, reason, arrival)
+            else:
+                self._turn_text_away(sequence, cause, reason, arrival)
+            return None
         message = text.decode_state(datagram, layout)
         if session and session.is_text:
             event = self._receive_known(slot, session, message, b"", arrival)
@@ -531,24 +526,15 @@ class Server:
         else:
             joining = Session(address, 0, layout, None, last=datagram)
             return self._seat(joining, message, b"")
-        line = text.encode(Close(session=0, sequence=message.sequence, reason=""))
-        self._put([line], address, None)
-        self.statistics.counters["sent"] += 1
-        self._drop("refused", reason, arrival)
+        self._turn_text_away(message.sequence, "refused", reason, arrival)
         return None
 
-    def _turn_text_away(self, arrival: _Arrival) -> None:
-        """Answer a line where no text is flown. Raises `DecodeError`."""
-        sequence, fields = text.split(arrival.datagram)
+    def _turn_text_away(self, sequence: int, cause: str, reason: str, arrival: _Arrival) -> None:
+        """Answer a line that is not flown, with no more bytes than it has."""
         line = text.encode(Close(session=0, sequence=sequence, reason=""))
-        if fields != ["close"] and len(line) <= len(arrival.datagram):
-            # Else two agents would answer each other's Closes for ever.
+        if len(line) <= len(arrival.datagram):
             self._put([line], arrival.address, None)
-            self.statistics.counters["sent"] += 1
-        if self._keys:
-            self._drop("forged", "key: this agent has one (--key-file), text has none", arrival)
-        else:
-            self._drop("refused", "text is not flown here", arrival)
+        self._drop(cause, reason, arrival)
 
     # ---- from a datagram to a message
 
@@ -561,6 +547,8 @@ class Server:
         NoSuchSession: No session of that address and number has a key here.
         """
         datagram, address, _ = arrival
+        if not (self._keys or is_sealed(datagram)):
+            return datagram, None
         if not self._keys:
             raise KeyMismatch("key: this agent has none (--key-file), and the simulator has")
         if not is_sealed(datagram):
@@ -665,13 +653,11 @@ class Server:
             self._record(slot, message, data, session)
         session.reply = reply = self._transfer(data, session)
         self._put(reply.start(), session.peer, session.key)
-        self.statistics.counters["sent"] += 1
 
     def _repeat(self, session: Session) -> None:
         """Send the last answer again, the same bytes."""
         assert session.reply is not None
-        self._put(session.reply.start(), session.peer, session.key)
-        self.statistics.counters["resent"] += 1
+        self._put(session.reply.start(), session.peer, session.key, "resent")
 
     def _refuse(
         self, number: int, reason: str, address: Address, size: int, key: Key | None
@@ -681,16 +667,18 @@ class Server:
         if room >= 0:
             refuse = Refuse(session=number, reason=_cut(reason, room))
             self._put([binary.encode(refuse)], address, key)
-            self.statistics.counters["sent"] += 1
 
     def _transfer(self, data: bytes, session: Session) -> Transfer:
         if not session.largest:
             session.largest = largest_datagram(session.peer, self._max_datagram)
         return Transfer(data, session.largest, session.window)
 
-    def _put(self, datagrams: list[bytes], address: Address, key: Key | None) -> None:
+    def _put(
+        self, datagrams: list[bytes], address: Address, key: Key | None, count: str = "sent"
+    ) -> None:
         for datagram in datagrams:
             self._outgoing.append((key.seal(datagram) if key else datagram, address))
+        self.statistics.counters[count] += 1
 
     def _record(self, slot: int, message: Message, data: bytes, session: Session) -> None:
         if self._tap:
