@@ -130,7 +130,14 @@ class Agent:
         self.spec: EnvSpec | None = None
         self._required = _Required(config)
         keys = read_keys(config.key_file) if config.key_file else ()
-        journal = self._journal = self._make_journal() if config.record else None
+        self._journal: Any = None
+        if config.record:
+            from ..journal import Journal
+
+            spec = self._required.text_spec()
+            hello = Hello(session=0, spec=spec.to_json()) if spec else None
+            self._journal = Journal(config.record, side="agent", text_hello=hello)
+        journal = self._journal
         self.server = Server(
             self._required.accept,
             self._required.text_layout,
@@ -175,13 +182,10 @@ class Agent:
         self.lost = [""] * len(self.lost)
 
     def exchange(self, orders: Mapping[int, Order]) -> None:
-        """Send each slot its Command, and wait for the States of all.
+        """Send each of these slots its Command, and wait for the States of all.
 
         A simulator that is lost meanwhile is replaced by another that comes; then `lost` says why
         and `states` has the first State of that one.
-
-        Args:
-            orders: By the number of the slot.
 
         Raises:
             InputError: The first order is not of the layout, or not finite; nothing was sent.
@@ -192,16 +196,6 @@ class Agent:
             self.server.send_command(slot, actions, what, seeds, now)
         self.lost = [""] * len(self.lost)
         self._gather()
-
-    def _make_journal(self) -> "Journal":
-        from ..journal import Journal
-
-        config = self.config
-        assert config.record is not None
-        hello = None
-        if spec := self._required.text_spec():
-            hello = Hello(session=0, spec=spec.to_json())
-        return Journal(config.record, side="agent", text_hello=hello)
 
     # ---- the exchange
 
@@ -268,13 +262,10 @@ class Agent:
         session = self.server.slots[slot]
         assert session is not None
         self._keep_sockets()
+        self.spec, self._required.worlds = self._required.text_spec(), 1
         if session.hello:
             self.server.takes_text = False
-            self.spec = _spec(session.hello.spec)
-            self._required.worlds = session.hello.worlds
-        else:
-            self.spec = self._required.text_spec()
-            self._required.worlds = 1
+            self.spec, self._required.worlds = _spec(session.hello.spec), session.hello.worlds
         self._required.spec = self.spec
         if self.states[slot] is not None and not self.lost[slot]:
             self._lose(slot, f"the simulator at {address_text(address)} was started anew")
@@ -287,7 +278,12 @@ class Agent:
                 continue
             session = self.server.slots[slot]
             if session is None:
-                raise PeerSilent(self._nobody_came(self.lost[slot]))
+                lost, dropped = self.lost[slot], self._last_dropped()
+                raise PeerSilent(
+                    f"{f'{lost}; no other' if lost else 'no simulator'} came to "
+                    f"{address_text(self.address)} for {self.config.connect_timeout:g} s"
+                    f"{'' if dropped in lost else dropped}"
+                )
             if now < session.heard_at + self.config.timeout:  # it lives, and computes
                 self._deadlines[slot] = session.heard_at + self.config.timeout
                 continue
@@ -313,14 +309,6 @@ class Agent:
         here, wait = address_text(self.address), self.config.connect_timeout
         long = f"{wait:g} s " if wait < 86_400 else ""  # commands wait without limit
         _log.warning("%s; waiting %sfor another at %s", self.lost[slot], long, here)
-
-    def _nobody_came(self, lost: str) -> str:
-        which = f"{lost}; no other" if lost else "no simulator"
-        dropped = self._last_dropped()
-        return (
-            f"{which} came to {address_text(self.address)} for {self.config.connect_timeout:g} s"
-            f"{'' if dropped in lost else dropped}"
-        )
 
     def _last_dropped(self) -> str:
         last = self.server.statistics.last_error
@@ -356,7 +344,8 @@ class _Required:
         if config.env_id is not None and env_id != config.env_id:
             return f"expected a simulator of {config.env_id}, got one of {env_id}"
         if self.worlds is not None and worlds != self.worlds:
-            return f"expected a simulator of {_worlds(self.worlds)}, got one of {worlds}"
+            drones = "one drone" if self.worlds == 1 else f"{self.worlds} drones"
+            return f"expected a simulator of {drones}, got one of {worlds}"
         if config.vehicle_hash is not None and spec.vehicle_hash != config.vehicle_hash:
             return (
                 f"expected a vehicle of hash {config.vehicle_hash}, "
@@ -376,28 +365,22 @@ class _Required:
             return None
         if config.worlds not in (None, 1):
             return None
-        return registry.env_spec(config.env_id, dict(config.options or {}))
+        spec = registry.env_spec(config.env_id, dict(config.options or {}))
+        try:
+            text.check_layout(layout_of(spec))
+        except InputError:
+            return None
+        return spec
 
     def _text_layout(self) -> Layout | None:
         spec = self.text_spec()
-        if spec is None:
-            return None
-        layout = layout_of(spec)
-        try:
-            text.check_layout(layout)
-        except InputError:
-            return None
-        return layout
+        return layout_of(spec) if spec else None
 
 
 @lru_cache(maxsize=4)
 def _spec(text: str) -> EnvSpec:
     """Raises `SpecError`."""
     return EnvSpec.from_json(text)
-
-
-def _worlds(count: int) -> str:
-    return "one drone" if count == 1 else f"{count} drones"
 
 
 def _options_difference(
@@ -434,16 +417,14 @@ def _leave(pid: int, server: Server, port: Port, journal: "Journal | None") -> N
     if os.getpid() != pid:  # a fork of the process that owns the agent
         return
     server.close("the agent closed", time.monotonic())
-    while True:
-        _flush(server, port)
-        timer = server.next_timer()
-        if timer is None:
-            break
+    _flush(server, port)
+    while (timer := server.next_timer()) is not None:
         left = max(timer - time.monotonic(), 0.0)
         with suppress(OSError):  # nothing came
             datagram, address = port.receive(left, strangers=False)
             server.receive(datagram, address, time.monotonic())
         server.handle_timer(time.monotonic())
+        _flush(server, port)
     port.close()
     if journal:
         journal.close()

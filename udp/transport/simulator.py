@@ -22,7 +22,7 @@ from .sockets import LONGEST_WAIT, address_text, log_notices, open_socket, resol
 from .stepped import Stepped, make_stepped, reset_all
 
 if TYPE_CHECKING:
-    from ..journal import Journal
+    pass
 
 __all__ = ["DEFAULT_AGENT", "DEFAULT_SIMULATOR", "Observer", "Simulator"]
 
@@ -106,7 +106,13 @@ class Simulator:
             failing.callback(self.stepped.close)
             self.spec = self.stepped.spec
             hello = Hello(session=new_session(), spec=self.spec.to_json(), worlds=num_envs)
-            self._journal = self._make_journal(record, hello) if record else None
+            self._journal: Any = None
+            if record:
+                from ..journal import Journal
+                from ..journal.writer import model_of
+
+                model = model_of(self.stepped)
+                self._journal = Journal(record, side="simulator", text_hello=hello, model=model)
             self.link = Client(
                 hello,
                 layout_of(self.spec, num_envs),
@@ -182,12 +188,6 @@ class Simulator:
     def __exit__(self, *_: object) -> None:
         """Close."""
         self.close()
-
-    def _make_journal(self, record: Path | str, hello: Hello) -> "Journal":
-        from ..journal import Journal
-        from ..journal.writer import model_of
-
-        return Journal(record, side="simulator", text_hello=hello, model=model_of(self.stepped))
 
     # ---- the exchange
 
@@ -281,29 +281,24 @@ class Simulator:
             datagram, _ = self._socket.receive(timeout)
         except TimeoutError:
             return None
-        except ConnectionError:  # nothing listens there yet: the timer says when to ask again
-            self._trouble = "nothing listens on that port"
-            return None
-        except OSError as error:  # no way there, a firewall says: the same
+        except OSError as error:  # nothing listens there yet: the timer says when to ask again
             if self._socket.fileno() < 0:
                 raise
-            self._trouble = f"receiving failed: {error.strerror}"
+            self._note_trouble("receiving", error)
             return None
         self._trouble = ""
         return self.link.receive(datagram, time.monotonic())
 
     def _exchange_until_closed(self) -> None:
         """Until the agent has answered our Close, or will not."""
-        while self._socket.fileno() >= 0:
-            self._flush()
-            timer = self.link.next_timer()
-            if timer is None:
-                return
+        self._flush()
+        while self._socket.fileno() >= 0 and (timer := self.link.next_timer()) is not None:
             left = timer - time.monotonic()
             if left > 0:
                 self._receive(left)
             else:
                 self.link.handle_timer(time.monotonic())
+            self._flush()
 
     def _flush(self) -> None:
         """Send what is due, before any wait."""
@@ -314,12 +309,15 @@ class Simulator:
     def _send(self, datagram: bytes) -> None:
         try:
             self._socket.send(datagram)
-        except ConnectionError:
-            self.link.statistics.counters["unsent"] += 1
-            self._trouble = "nothing listens on that port"
         except OSError as error:  # a full buffer or a network that is down: as good as lost
             self.link.statistics.counters["unsent"] += 1
-            self._trouble = f"sending failed: {error.strerror}"
+            self._note_trouble("sending", error)
+
+    def _note_trouble(self, what: str, error: OSError) -> None:
+        refused = isinstance(error, ConnectionError)
+        self._trouble = (
+            "nothing listens on that port" if refused else f"{what} failed: {error.strerror}"
+        )
 
     def _say_alive(self, finished: threading.Event) -> None:
         """In a thread: tell the agent of a long step that it is being computed."""
@@ -331,9 +329,8 @@ class Simulator:
 
     def _silence(self, sends: int) -> str:
         what = "Hello" if self.link.sequence == 0 else f"State {self.link.sequence}"
-        key = ""
-        if self._keyed and what == "Hello":
-            key = "; an agent with another key does not answer"
+        locked = self._keyed and what == "Hello"
+        key = "; an agent with another key does not answer" if locked else ""
         why = f"; {self._trouble}" if self._trouble else ""
         last = self.link.statistics.last_error
         dropped = f"; last datagram dropped: {last}" if last else ""
