@@ -83,10 +83,8 @@ class Extension:
     def __post_init__(self) -> None:
         if not 0 <= self.number < 1 << 15:
             raise InputError(f"extension: expected a number 0 to 32767, got {self.number}")
-        if len(self.value) > MAX_TEXT:
-            raise InputError(
-                f"extension {self.number}: expected at most {MAX_TEXT} bytes, got {len(self.value)}"
-            )
+        if (size := len(self.value)) > MAX_TEXT:
+            raise InputError(f"extension: expected at most {MAX_TEXT} bytes, got {size}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -120,8 +118,7 @@ class Welcome:
 
     session: int
     nonce: int
-    """Random 64-bit number, new for every session. State 1 echoes it; it enters the session's
-    key."""
+    """Random 64-bit number, new for every session: State 1 echoes it, the session's key has it."""
     version: int = 2
     """Version of all that follows."""
     seed: int | None = None
@@ -248,14 +245,12 @@ class Command:
     @property
     def resets(self) -> np.ndarray:
         """bool, shape (N,): reset instead of flown."""
-        mask: np.ndarray = self.orders == RESET
-        return mask
+        return np.equal(self.orders, RESET)
 
     @property
     def frozen(self) -> np.ndarray:
         """bool, shape (N,): neither reset nor flown."""
-        mask: np.ndarray = self.orders == FREEZE
-        return mask
+        return np.equal(self.orders, FREEZE)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
