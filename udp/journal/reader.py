@@ -18,17 +18,7 @@ from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.errors import DecodeError
 from ..protocol.layout import Layout
-from ..protocol.messages import (
-    FLY,
-    Close,
-    Command,
-    Hello,
-    Message,
-    Refuse,
-    State,
-    Unknown,
-    Welcome,
-)
+from ..protocol.messages import FLY, Close, Command, Hello, Message, Refuse, State, Unknown, Welcome
 from ._file import MAGIC, read_records
 from .writer import ABOUT, FORMAT
 

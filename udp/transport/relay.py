@@ -75,7 +75,7 @@ class FaultConfig:
                 1,
                 "a probability from 0 to 1",
             ),
-            ("delay jitter reorder_by".split(), 3600, "seconds from 0 to 3600"),
+            (["delay", "jitter", "reorder_by"], 3600, "seconds from 0 to 3600"),
         ):
             for name in names:
                 value = getattr(self, name)
