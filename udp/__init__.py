@@ -5,7 +5,7 @@ envs of it, and `journal` files. Protocol and relay need no Gymnasium.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from .protocol.client import Address, LinkConfig
 from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Refused
@@ -30,18 +30,11 @@ __all__ = [
     "Simulator",
 ]
 
-_HOMES: Final = {
-    "DEFAULT_AGENT": "transport.simulator",
-    "DEFAULT_SIMULATOR": "transport.simulator",
-    "LOST": "remote",
-    "RemoteEnv": "remote",
-    "RemoteVectorEnv": "remote",
-    "Simulator": "transport.simulator",
-}
-
 
 def __getattr__(name: str) -> Any:
     """Import what needs Gymnasium on first use (PEP 562)."""
-    if name not in _HOMES:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f".{_HOMES[name]}", __name__), name)
+    is_remote = name == "LOST" or name.startswith("Remote")
+    module = import_module(".remote" if is_remote else ".transport.simulator", __name__)
+    return getattr(module, name)

@@ -12,7 +12,7 @@ from errno import EFBIG, EINTR
 from io import BytesIO
 from pathlib import Path
 from threading import RLock
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
 import zstandard
 from mcap.records import Chunk, McapRecord
@@ -63,7 +63,7 @@ class McapFile:
         self.pending: list[Entry] = []
         self._file = path.open("xb")
         self._waiting = _Waiting()
-        self._writer = Writer(self._waiting, chunk_size=sys.maxsize, use_summary_offsets=False)
+        self._writer: Any = Writer(self._waiting, chunk_size=sys.maxsize, use_summary_offsets=False)
         self._lock = RLock()
         self._broken = self._busy = False
         try:
@@ -77,12 +77,13 @@ class McapFile:
     def add_schema(self, name: str, encoding: str, text: str) -> int:
         """Its id."""
         with self._lock:
-            return self._writer.register_schema(name, encoding, text.encode())
+            number: int = self._writer.register_schema(name, encoding, text.encode())
+            return number
 
     def add_channel(self, topic: str, encoding: str, schema: int) -> int:
         """Its id. A file has at most 65,535 channels."""
         with self._lock:
-            number = self._writer.register_channel(topic, encoding, schema)
+            number: int = self._writer.register_channel(topic, encoding, schema)
             if number > _MAX_CHANNELS:
                 raise OSError(EFBIG, f"more than {_MAX_CHANNELS} channels")
             return number

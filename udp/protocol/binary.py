@@ -156,9 +156,10 @@ def decode(datagram: bytes, layout: Layout | None = None) -> Message:
     message, _, decoder = _MESSAGES[kind]
     try:
         if message in _LAID_OUT:
-            return decoder(datagram, session, sequence, _expect(layout))
-        numbers = {"sequence": sequence} if kind in _NUMBERED else {}
-        whole: Message = message(session=session, **numbers, **decoder(datagram[HEADER_SIZE:]))
+            whole: Message = decoder(datagram, session, sequence, _expect(layout))
+        else:
+            numbers = {"sequence": sequence} if kind in _NUMBERED else {}
+            whole = message(session=session, **numbers, **decoder(datagram[HEADER_SIZE:]))
         return whole
     except (ValueError, struct.error) as error:
         raise DecodeError(f"{message.__name__.lower()}: {error}") from None

@@ -245,12 +245,12 @@ class Command:
     @property
     def resets(self) -> np.ndarray:
         """bool, shape (N,): reset instead of flown."""
-        return np.equal(self.orders, RESET)
+        return np.asarray(self.orders == RESET)
 
     @property
     def frozen(self) -> np.ndarray:
         """bool, shape (N,): neither reset nor flown."""
-        return np.equal(self.orders, FREEZE)
+        return np.asarray(self.orders == FREEZE)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -131,8 +131,6 @@ class Server:
             gives the layout to read it by. None, or a result of None: text is not flown.
         slots: Simulators to fly at the same time. Others wait until a slot is free.
         keys: Shared with the simulators, any of them. Then nothing unsealed is taken.
-        max_datagram: As `LinkConfig.max_datagram`.
-        tap: Sees every message once.
         draw_nonce: Gives a random 64-bit number for each Welcome.
 
     Attributes:
@@ -280,8 +278,7 @@ class Server:
 
     def handle_timer(self, now: float) -> None:
         """Repeat what is due: a Close that nobody has answered, until nobody will."""
-        timer = self.next_timer()
-        if timer is None or now < timer:
+        if (timer := self.next_timer()) is None or now < timer:
             return
         for slot, session in enumerate(self.slots):
             if session and now >= self._deadline:
@@ -321,8 +318,10 @@ class Server:
                 return self._take_state(slot, session, message, plain, arrival.now)
             case Alive():
                 session.heard_at = arrival.now
+            case Missing() if session.reply and message.kind == binary.COMMAND:
+                self._put(session.reply.resend(message), session.peer, session.key, "resent")
             case Missing():
-                self._resend(session, message, arrival)
+                self._drop("stale", "", arrival)
             case Close():
                 self._record(slot, message, plain, session)
                 if session.state is not AgentState.CLOSING:
@@ -333,13 +332,6 @@ class Server:
                 self.free(slot)
                 return Event(slot, message)
         return None
-
-    def _resend(self, session: Session, missing: Missing, arrival: _Arrival) -> None:
-        """Send the fragments of the last Command that did not arrive."""
-        if session.reply is None or missing.kind != binary.COMMAND:
-            self._drop("stale", "", arrival)
-            return
-        self._put(session.reply.resend(missing), session.peer, session.key, "resent")
 
     # ---- a simulator that comes
 
@@ -408,7 +400,13 @@ class Server:
             self._forget(opening)
             self._disown(plain, arrival)
             return None
-        self._forget_until(opening)
+        for key, other in list(self._openings.items()):
+            # It, and what the same address began before it. Later ones stay: if this State came
+            # late, their Hello may still be repeated.
+            if key[0] == opening.peer:
+                self._forget(other)
+            if other is opening:
+                break
         layout = self._fit(opening.hello)  # another one may have come since its Hello
         if isinstance(layout, str):
             words = _cut(layout, len(plain) - _REASON_AT)
@@ -477,17 +475,6 @@ class Server:
     def _forget(self, opening: Session) -> None:
         del self._openings[opening.peer, opening.number]
         self._assembling.pop((opening.peer, opening.number), None)
-
-    def _forget_until(self, opening: Session) -> None:
-        """Forget the opening of a State 1, and what the same address began before it.
-
-        Keep later openings: if this State came late, their Hello may still be repeated.
-        """
-        for key, other in list(self._openings.items()):
-            if key[0] == opening.peer:
-                self._forget(other)
-                if other is opening:
-                    return
 
     # ---- text
 
@@ -603,8 +590,7 @@ class Server:
             assembler = self._assembler((holder.peer, number), holder.layout.state_size)
             key = self._session_key(holder)
         else:
-            if holder.assembler is None:
-                holder.assembler = Assembler(holder.layout.state_size)
+            holder.assembler = holder.assembler or Assembler(holder.layout.state_size)
             assembler, key = holder.assembler, holder.key
             holder.heard_at = arrival.now
         whole = assembler.take(fragment)
