@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -258,16 +258,23 @@ class SessionSummary:
         self.returns += float(self._returns[ended].sum())
 
 
-@dataclass(kw_only=True)
-class Summary:
-    """Counts of a journal."""
+class Summary(Recording):
+    """Counts of a journal.
 
-    path: Path
-    side: str
-    """`simulator` or `agent`."""
-    complete: bool
-    ending: str
-    sessions: list[SessionSummary] = field(default_factory=list)
+    Attributes:
+        side: `simulator` or `agent`.
+        sessions: Counts of each session.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        super().__init__(path)
+        self.side = self.about.get("side", "")
+        of: dict[int, SessionSummary] = {}
+        for item in self:
+            if item.session.index not in of:
+                of[item.session.index] = SessionSummary(session=item.session, first=item.time)
+            of[item.session.index].take(item)
+        self.sessions = list(of.values())
 
     @property
     def steps(self) -> int:
@@ -291,22 +298,7 @@ class Summary:
         return printable([head, *map(str, self.sessions)])
 
 
-def summarize(path: Path | str) -> Summary:
-    """Counts of a journal. Raises as `read_journal`."""
-    recording = Recording(path)
-    sessions: dict[int, SessionSummary] = {}
-    for item in recording:
-        session = item.session
-        if session.index not in sessions:
-            sessions[session.index] = SessionSummary(session=session, first=item.time)
-        sessions[session.index].take(item)
-    return Summary(
-        path=recording.path,
-        side=recording.about.get("side", ""),
-        complete=recording.complete,
-        ending=recording.ending,
-        sessions=list(sessions.values()),
-    )
+summarize: Final = Summary
 
 
 def count_of(count: int, what: str) -> str:

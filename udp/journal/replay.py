@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from ...envs.spec import component_names
 from ...models.errors import InputError
 from ..protocol.messages import Command, State
 from ..transport.stepped import reset_all
-from .reader import Item, Session, count_of, printable, read_journal
+from .reader import Item, Recording, Session, count_of, printable
 from .writer import software
 
 __all__ = ["Difference", "SessionVerdict", "Verification", "verify"]
@@ -144,16 +144,42 @@ class SessionVerdict:
             self.same += 1
 
 
-@dataclass(kw_only=True)
-class Verification:
-    """Result of repeating a journal."""
+class Verification(Recording):
+    """Every session of a journal simulated again, and every bit of every State compared.
 
-    path: Path
-    complete: bool
-    ending: str
-    notes: list[str]
-    """Versions that have changed."""
-    sessions: list[SessionVerdict] = field(default_factory=list)
+    Only an env that is registered here is simulated: nothing that the file names is imported.
+
+    Args:
+        path: The journal.
+        vehicle: MJCF of the vehicle that was flown; None: the paper's.
+
+    Attributes:
+        notes: Versions that have changed.
+        sessions: The verdict on each.
+
+    Raises:
+        InputError: It is not a journal.
+        OSError: It cannot be read.
+    """
+
+    def __init__(self, path: Path | str, *, vehicle: Path | str | None = None) -> None:
+        super().__init__(path)
+        self.notes = _other_versions(self.about)
+        self.sessions: list[SessionVerdict] = []
+        flying: dict[int, SessionVerdict] = {}  # the last of each slot
+        try:
+            for item in self:
+                verdict = flying.get(item.session.slot)
+                if verdict is None or verdict.session is not item.session:
+                    if verdict:
+                        verdict.close()
+                    verdict = SessionVerdict(session=item.session, vehicle=vehicle)
+                    flying[item.session.slot] = verdict
+                    self.sessions.append(verdict)
+                verdict.take(item)
+        finally:
+            for verdict in flying.values():
+                verdict.close()
 
     @property
     def identical(self) -> bool:
@@ -178,42 +204,7 @@ class Verification:
         return printable(lines)
 
 
-def verify(path: Path | str, *, vehicle: Path | str | None = None) -> Verification:
-    """Simulate every session of a journal again, and compare every bit of every State.
-
-    Only an env that is registered here is simulated: nothing that the file names is imported.
-
-    Args:
-        path: The journal.
-        vehicle: MJCF of the vehicle that was flown; None: the paper's.
-
-    Raises:
-        InputError: It is not a journal.
-        OSError: It cannot be read.
-    """
-    recording = read_journal(path)
-    verdicts: list[SessionVerdict] = []
-    flying: dict[int, SessionVerdict] = {}  # the last of each slot
-    try:
-        for item in recording:
-            verdict = flying.get(item.session.slot)
-            if verdict is None or verdict.session is not item.session:
-                if verdict:
-                    verdict.close()
-                verdict = SessionVerdict(session=item.session, vehicle=vehicle)
-                flying[item.session.slot] = verdict
-                verdicts.append(verdict)
-            verdict.take(item)
-    finally:
-        for verdict in flying.values():
-            verdict.close()
-    return Verification(
-        path=recording.path,
-        complete=recording.complete,
-        ending=recording.ending,
-        notes=_other_versions(recording.about),
-        sessions=verdicts,
-    )
+verify: Final = Verification
 
 
 def _difference(recorded: State, loop: Loop) -> Difference | None:

@@ -79,7 +79,6 @@ class Journal:
         self._side = side
         self._model = model
         self._text_hello = text_hello
-        self._text_layout = _layout_of(text_hello) if text_hello else None
         self._slots: Sequence[object] = ()
         self._holders: dict[int, object] = {}
         self._schemas: dict[str, dict[str, int]] = {}
@@ -133,7 +132,6 @@ class Journal:
                 self._begin(slot, message, datagram, "binary", now)
             elif not message.session or (slot, binary.STATE) not in self._channels:
                 self._begin_by_text(slot, now)
-                datagram = datagram or binary.encode(message, self._text_layout)
             if isinstance(message, State | Command):
                 seeded = isinstance(message, Command) and message.seeds is not None
                 channel = self._channels[slot, _SEEDED if seeded else datagram[3]]
@@ -197,7 +195,7 @@ class Journal:
         self._flush(now)
         self._sessions += 1
         spec = EnvSpec.from_json(hello.spec)
-        layout = _layout_of(hello)
+        layout = layout_of(spec, hello.worlds)
         words = {
             "index": str(self._sessions),
             "slot": str(slot),
@@ -301,10 +299,6 @@ def _field_names(prefix: str, names: Iterable[str]) -> list[str]:
             field += "_"
         fields.append(field)
     return fields
-
-
-def _layout_of(hello: Hello) -> Layout:
-    return layout_of(EnvSpec.from_json(hello.spec), hello.worlds)
 
 
 def _words(message: Message, datagram: bytes) -> dict[str, Any]:
