@@ -200,9 +200,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
     free, and one that comes too late waits until another leaves. Drone i of slot p is env
     p · N + i. A slow simulator delays the others and changes nothing else.
 
-    Autoreset is Gymnasium's NEXT_STEP (the default), SAME_STEP or DISABLED, as of the vector envs
-    in process; with SAME_STEP a step in which an episode ends takes a second round trip, in which
-    the other drones are frozen. `info` has the telemetry, an array for each component.
+    With SAME_STEP a step in which an episode ends takes a second round trip, in which the other
+    drones are frozen. `info` has the telemetry, an array for each component.
 
     A simulator that is lost is replaced by the next that comes. The running episodes of its drones
     end as truncated, with the observation before, reward 0 and the reason in
@@ -218,14 +217,11 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         settings: As `RemoteEnv`.
 
     Raises:
-        InputError: An address, number, option, key file, action or seed is not what it should be;
-            nothing was sent.
-        OSError: The port is in use.
         PeerSilent: A slot stayed free for `connect_timeout`.
         PeerClosed: The last simulator ended the exchange.
         gymnasium.error.ResetNeeded: A step before every drone was reset, or (DISABLED) after an
             episode's end.
-        gymnasium.error.ClosedEnvironmentError: A reset after `close`.
+        Exception: All others as `RemoteEnv`.
     """
 
     def __init__(
@@ -367,10 +363,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
     ) -> list[str]:
         """Reset drones, again where another simulator comes meanwhile; which were lost, and why.
 
-        Args:
-            resets: Which, bool, shape (N,).
-            seeds: Of all drones, or None.
-            lost: For each slot why its simulator was lost before; None: all are to be reset.
+        `lost` says for each slot why its simulator was lost before; None: all are to be reset.
         """
         wanted: np.ndarray = np.any(resets.reshape(self._shape), axis=1)
         reasons = lost or [""] * self.num_simulators
@@ -419,27 +412,20 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
 
     def _sent(self, actions: np.ndarray, idle: np.ndarray) -> np.ndarray:
         """Actions as they cross the wire; those of drones that do not fly are 0."""
-        shape = (self.num_envs, *self._row)
-        array = np.asarray(actions)
-        if isinstance(self.env_spec.action, Discrete):
-            if array.shape == (self.num_envs, 1):
-                array = array[:, 0]
-            if idle.any():
-                array = np.where(idle, 0, array)
-            if array.dtype.kind == "f" and (array % 1 == 0).all():
-                array = array.astype(np.int64)
+        shape, action = (self.num_envs, *self._row), self.env_spec.action
+        array = np.array(actions)
+        if isinstance(action, Discrete) and array.shape == (*shape, 1):
+            array = array[:, 0]
+        if array.shape == shape:
+            array[idle] = 0
+        if isinstance(action, Discrete) and array.dtype.kind == "f" and not (array % 1).any():
+            array = array.astype(np.int64)
         sent = _checked_actions(array, self._dtype, shape)
-        if idle.any() and sent.shape == shape:
-            sent = sent.copy()
-            sent[idle] = 0
         if self._dtype.kind == "f" and not (finite := np.isfinite(sent)).all():
             first = np.argwhere(~finite)[0].tolist()
             raise InputError(f"action: expected finite numbers, got {sent[*first]} at {first}")
-        if isinstance(self.env_spec.action, Discrete):
-            wrong = (sent < 0) | (sent >= self.env_spec.action.n)
-            if wrong.any():
-                last = self.env_spec.action.n - 1
-                raise InputError(f"action: expected 0 to {last}, got {sent[wrong][0]}")
+        if isinstance(action, Discrete) and (wrong := (sent < 0) | (sent >= action.n)).any():
+            raise InputError(f"action: expected 0 to {action.n - 1}, got {sent[wrong][0]}")
         return sent
 
     def _info(self, mask: np.ndarray) -> dict[str, Any]:
