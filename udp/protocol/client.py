@@ -236,10 +236,9 @@ class Client:
         telemetry: tuple[np.ndarray, ...],
         now: float,
     ) -> State:
-        """Send the next State: see `messages.State`. Returns it.
+        """Send the next State, and return it: see `messages.State`.
 
-        Raises:
-            InputError: An array is not that of the layout, or not finite; nothing was sent.
+        Raises `InputError` for an array that is not of the layout, or not finite; nothing was sent.
         """
         if self.state is not SimulatorState.READY:
             raise ValueError(f"send_state: expected state ready, got {self.state.value}")

@@ -75,7 +75,6 @@ class Extension:
     """Something of a later version or of a user, in Hello or Welcome."""
 
     number: int
-    """0 to 32,767."""
     value: bytes
     critical: bool = False
     """Whether a side that does not know it must not go on."""

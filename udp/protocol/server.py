@@ -78,8 +78,7 @@ class Session:
     number: int
     """Session number; 0 with the text codec."""
     layout: Layout
-    hello: Hello | None
-    """None if it speaks text."""
+    hello: Hello | None  # none if it speaks text
     state: AgentState = AgentState.NEW
     sequence: int = 0
     """Number of the State that came last."""
@@ -100,8 +99,7 @@ class Session:
     """When it last said that it lives, or brought a fragment that was missing."""
     room: int = 0
     """Bytes that a Refuse may have, while it waits for a slot."""
-    last: bytes = b""
-    """The last line, by text."""
+    last: bytes = b""  # line, by text
 
     @property
     def is_text(self) -> bool:
@@ -229,23 +227,19 @@ class Server:
     ) -> None:
         """Answer the last State of a slot: see `messages.Command`.
 
-        Raises:
-            InputError: An array is not that of the layout, or not finite; nothing was sent.
+        Raises `InputError` for an array that is not of the layout, or not finite; nothing was sent.
         """
         session = self.slots[slot]
         if session is None or session.state is not AgentState.DECIDING:
             got = session.state.value if session else "a free slot"
             raise ValueError(f"send_command: expected a session that is deciding, got {got}")
+        number, sequence = session.number, session.sequence
         command = Command(
-            session=session.number,
-            sequence=session.sequence,
-            actions=actions,
-            orders=orders,
-            seeds=seeds,
+            session=number, sequence=sequence, actions=actions, orders=orders, seeds=seeds
         )
         self._answer(slot, session, command)
         if session.key is None and not session.is_text:
-            session.due = binary.numbers_of(session.number, session.sequence + 1)
+            session.due = binary.numbers_of(number, sequence + 1)
         session.asked_at = session.heard_at = now
 
     def free(self, slot: int) -> None:
@@ -528,10 +522,7 @@ class Server:
     def _open(self, arrival: _Arrival, session: Session | None) -> tuple[bytes, Key | None]:
         """A binary datagram without its seal, and the shared key that it was sealed with.
 
-        Raises:
-            KeyMismatch: One side has a key, the other has none, or another.
-            Forged: The seal is not of that key.
-        NoSuchSession: No session of that address and number has a key here.
+        Raises `KeyMismatch`, `Forged`, or `NoSuchSession` where it has no key here.
         """
         datagram, address, _ = arrival
         if not (self._keys or is_sealed(datagram)):
@@ -623,8 +614,7 @@ class Server:
             trusted = under_seal and not isinstance(error, KeyMismatch)
             key = self._keys.get(key_id(datagram)) if trusted else None
             self._refuse(number, str(error), address, size, key)
-        cause = "forged" if isinstance(error, Forged) else "malformed"
-        self._drop(cause, str(error), arrival)
+        self._drop("forged" if isinstance(error, Forged) else "malformed", str(error), arrival)
 
     # ---- what is sent
 

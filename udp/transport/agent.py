@@ -115,7 +115,6 @@ class Agent:
     """Exchanges Commands for States with all simulators at the same time.
 
     Attributes:
-        server: The state machine.
         spec: Of the simulator that joined last; None before the first.
         states: The last State of each slot; None before the first.
         lost: For each slot why its simulator was lost during the last exchange; "" if it was not.
@@ -288,14 +287,13 @@ class Agent:
                 self._deadlines[slot] = session.heard_at + self.config.timeout
                 continue
             here, there = address_text(self.address), address_text(session.peer)
-            number = session.sequence + 1
+            reason = (
+                f"no datagram from the simulator at {there} for {self.config.timeout:g} s, "
+                f"waiting at {here} for State {session.sequence + 1}{self._last_dropped()}"
+            )
             self.server.free(slot)
             self._keep_sockets()
-            self._lose(
-                slot,
-                f"no datagram from the simulator at {there} for {self.config.timeout:g} s, "
-                f"waiting at {here} for State {number}{self._last_dropped()}",
-            )
+            self._lose(slot, reason)
             self._say_waiting(slot)
 
     def _keep_sockets(self) -> None:

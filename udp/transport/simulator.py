@@ -49,13 +49,9 @@ class Simulator:
         num_envs: Number of worlds.
         bind: Address of this side; port 0 takes a free port.
         codec: `binary`, or the paper's `text`.
-        vehicle: MJCF file; None is the paper's.
-        backend: `mujoco` or `warp`.
+        vehicle, backend: As `make_stepped`.
         config: Times of the exchange.
-        key_file: File with the key that the agent has too (`rotorgram key`). With it any address
-            is allowed, because only holders of the key can take part.
-        insecure: Allow an address that is not loopback without a key.
-        record: MCAP file to write every message to; it must not exist.
+        key_file, insecure, record: As `AgentSettings`.
         options: Options of the env, by name.
 
     Attributes:
@@ -182,11 +178,9 @@ class Simulator:
             self._journal.close()
 
     def __enter__(self) -> "Simulator":
-        """Return the simulator, to be closed at the end of the block."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
         self.close()
 
     # ---- the exchange
