@@ -1,12 +1,14 @@
 """Messages larger than a datagram: only what is missing is sent again."""
 
 import random
+import struct
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from links import Pair, agent, hello, layout, lossy, simulator, state
+from rotorgram.models.errors import InputError
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.errors import DecodeError
 from rotorgram.udp.protocol.fragments import (
@@ -85,7 +87,7 @@ def test_a_large_message_goes_in_bursts_that_grow_and_shrink() -> None:
     burst = transfer.start()
     assert sum(map(len, burst)) <= 210_000
     assert [asks(d) for d in burst].index(True) == len(burst) - 1
-    all_missing = Missing(session=0, sequence=0, kind=0, count=transfer.count, first=len(burst),
+    all_missing = Missing(session=0, sequence=0, kind=1, count=transfer.count, first=len(burst),
                           bitmap=b"\xff")  # fmt: skip
     assert len(transfer.resend(all_missing)) > len(burst)
     before = window.size
@@ -125,9 +127,11 @@ def test_fragments_of_another_message_inside() -> None:
 
 def test_a_missing_bitmap_has_the_size_of_its_numbers() -> None:
     for first, bitmap in ((20, b"\1"), (0, b""), (0, bytes(4)), (16, b"\x10")):
-        wrong = Missing(session=1, sequence=1, kind=4, count=20, first=first, bitmap=bitmap)
+        with pytest.raises(InputError, match=r"bitmap|below"):
+            Missing(session=1, sequence=1, kind=4, count=20, first=first, bitmap=bitmap)
+        body = struct.pack("<BxHH", 4, 20, first) + bitmap
         with pytest.raises(DecodeError, match=r"bitmap|below"):
-            binary.decode(binary.encode(wrong))
+            binary.decode(binary.frame(binary.MISSING, 1, 1, body))
 
 
 # ---- fault 15: datagrams beyond one machine

@@ -5,15 +5,13 @@ envs of it, and `journal` files. Protocol and relay need no Gymnasium.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from .protocol.client import Address, LinkConfig
 from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Refused
 
 if TYPE_CHECKING:
-    from .remote.env import RemoteEnv
-    from .remote.served import LOST
-    from .remote.vector import RemoteVectorEnv
+    from .remote import LOST, RemoteEnv, RemoteVectorEnv
     from .transport.simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, Simulator
 
 __all__ = [
@@ -32,18 +30,11 @@ __all__ = [
     "Simulator",
 ]
 
-_HOMES: Final = {
-    "DEFAULT_AGENT": "transport.simulator",
-    "DEFAULT_SIMULATOR": "transport.simulator",
-    "LOST": "remote.served",
-    "RemoteEnv": "remote.env",
-    "RemoteVectorEnv": "remote.vector",
-    "Simulator": "transport.simulator",
-}
-
 
 def __getattr__(name: str) -> Any:
     """Import what needs Gymnasium on first use (PEP 562)."""
-    if name not in _HOMES:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f".{_HOMES[name]}", __name__), name)
+    is_remote = name == "LOST" or name.startswith("Remote")
+    module = import_module(".remote" if is_remote else ".transport.simulator", __name__)
+    return getattr(module, name)

@@ -49,19 +49,19 @@ def main() -> int:
                 simulator.stop()
 
             signal.signal(signal.SIGTERM, end)
+
+            def stop_with_stdin() -> None:
+                while os.read(0, 1024):
+                    pass
+                simulator.stop()
+
             if ends_with_stdin:
-                Thread(target=_stop_with_stdin, args=(simulator,), daemon=True).start()
+                Thread(target=stop_with_stdin, daemon=True).start()
             simulator.run()
             return 128 + ended[0] if ended else 0
     except (LinkError, OSError, InputError) as error:
         print(f"rotorgram simulator: {error}", file=sys.stderr)
         return 1
-
-
-def _stop_with_stdin(simulator: Simulator) -> None:
-    while os.read(0, 1024):
-        pass
-    simulator.stop()
 
 
 def parse_arguments(words: list[str]) -> dict[str, Any]:

@@ -1,12 +1,10 @@
 """MCAP files: written so that a killed program leaves a readable file, and read in bounded memory.
 
-The records are those of the package `mcap`. Messages wait in a list, which costs the exchange
-next to nothing, and a chunk of them is written at once.
+Messages wait in a list, which costs the exchange next to nothing. The package `mcap` makes a chunk
+of them in memory, and whole records reach the file at once.
 """
 
-import struct
-import zlib
-from collections import defaultdict
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -17,24 +15,9 @@ from threading import RLock
 from typing import Any, BinaryIO, Final
 
 import zstandard
-from mcap.data_stream import RecordBuilder
-from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import Chunk, McapRecord
 from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import Writer
 
 from ..protocol.layout import MAX_MESSAGE
 
@@ -45,14 +28,19 @@ MAX_CHUNK: Final = 2 * MAX_MESSAGE
 """Most bytes of a record or of a decompressed chunk that is read. Ours are of 64 KiB, or of one
 message and 256 KiB where that is longer."""
 _MAX_CHANNELS: Final = 0xFFFF
-_MESSAGE: Final = struct.Struct("<BQHIQQ")
-"""A message before its data: opcode, length, channel, sequence, times of log and publication."""
-_MESSAGE_INDEX: Final = struct.Struct("<BQHI")
-_FOOTER: Final = struct.Struct("<BQQQ")
-_OPCODE_AND_LENGTH: Final = 9  # bytes, of every record
 
 Entry = tuple[int, int, int, bytes]
 """A message that waits to be written: channel, nanoseconds since 1970, sequence number, data."""
+
+
+class _Waiting(BytesIO):
+    """Whole records that are not in the file yet."""
+
+    begin = 0
+    """Where they will begin in the file."""
+
+    def tell(self) -> int:
+        return self.begin + super().tell()
 
 
 class McapFile:
@@ -75,21 +63,14 @@ class McapFile:
 
     def __init__(self, path: Path, library: str) -> None:
         self.pending: list[Entry] = []
-        self._definitions: list[bytes] = []  # schemas and channels of the next chunk
-        self._schemas: list[Schema] = []
-        self._channels: list[Channel] = []
-        self._indexes: list[McapRecord] = []
-        self._counts: defaultdict[int, int] = defaultdict(int)
-        """Messages of each channel."""
-        self._times: list[int] = []
-        """First and last of each chunk."""
         self._file = path.open("xb")
+        self._waiting = _Waiting()
+        self._writer: Any = Writer(self._waiting, chunk_size=sys.maxsize, use_summary_offsets=False)
         self._lock = RLock()
         self._broken = self._busy = False
-        self._end = 0
         try:
             with self._whole():
-                self._write(MAGIC + _bytes(Header("", library)))
+                self._writer.start("", library)
         except BaseException:
             self.abandon()
             path.unlink()
@@ -98,63 +79,45 @@ class McapFile:
     def add_schema(self, name: str, encoding: str, text: str) -> int:
         """Its id."""
         with self._lock:
-            number = len(self._schemas) + 1
-            schema = Schema(id=number, data=text.encode(), encoding=encoding, name=name)
-            self._schemas.append(schema)
-            self._definitions.append(_bytes(schema))
+            number: int = self._writer.register_schema(name, encoding, text.encode())
             return number
 
     def add_channel(self, topic: str, encoding: str, schema: int) -> int:
         """Its id. A file has at most 65,535 channels."""
         with self._lock:
-            number = len(self._channels) + 1
+            number: int = self._writer.register_channel(topic, encoding, schema)
             if number > _MAX_CHANNELS:
                 raise OSError(EFBIG, f"more than {_MAX_CHANNELS} channels")
-            channel = Channel(
-                id=number, topic=topic, message_encoding=encoding, schema_id=schema, metadata={}
-            )
-            self._channels.append(channel)
-            self._definitions.append(_bytes(channel))
             return number
 
     def add_metadata(self, name: str, words: Mapping[str, str]) -> None:
         """Names and values, after all messages before."""
         with self._lock:
             self.flush()
-            record = _bytes(Metadata(name=name, metadata=dict(words)))
-            self._indexes.append(MetadataIndex(offset=self._end, length=len(record), name=name))
             with self._whole():
-                self._write(record)
+                self._writer.add_metadata(name, dict(words))
 
     def add_attachment(self, name: str, media_type: str, data: bytes, time: int) -> None:
         """A whole file."""
         with self._lock:
             self.flush()
-            whole = Attachment(
-                create_time=0, log_time=time, name=name, media_type=media_type, data=data
-            )
-            record = _bytes(whole)
-            index = AttachmentIndex(
-                offset=self._end, length=len(record), create_time=0, log_time=time,
-                data_size=len(data), name=name, media_type=media_type,
-            )  # fmt: skip
-            self._indexes.append(index)
             with self._whole():
-                self._write(record)
+                self._writer.add_attachment(0, time, name, media_type, data)
 
     def flush(self) -> None:
         """Write all messages as one chunk."""
         with self._lock:
             # Busy: called by a signal handler that interrupted us.
-            if self._busy or self._file.closed:
+            if self._busy or self._file.closed or not self.pending:
                 return
             self._busy = True
             try:
                 count = len(self.pending)  # another thread may append meanwhile
-                if count:
-                    with self._whole():
-                        self._write_chunk(self.pending[:count])
-                        del self.pending[:count]
+                with self._whole():
+                    for channel, time, sequence, data in self.pending[:count]:
+                        self._writer.add_message(channel, time, data, time, sequence & 0xFFFFFFFF)
+                    del self.pending[:count]
+                    self._writer.flush()
             finally:
                 self._busy = False
 
@@ -164,26 +127,8 @@ class McapFile:
             if self._busy or self._file.closed:
                 return
             self.flush()
-            end = _bytes(DataEnd(0))
-            begin, kinds = self._end + len(end), [type(index) for index in self._indexes]
-            counted = Statistics(
-                attachment_count=kinds.count(AttachmentIndex),
-                channel_count=len(self._channels),
-                channel_message_counts=self._counts,
-                chunk_count=kinds.count(ChunkIndex),
-                message_count=sum(self._counts.values()),
-                metadata_count=kinds.count(MetadataIndex),
-                message_start_time=min(self._times, default=0),
-                message_end_time=max(self._times, default=0),
-                schema_count=len(self._schemas),
-            )
-            indexes = sorted(self._indexes, key=lambda index: type(index).__name__)  # in groups
-            records = (*self._schemas, *self._channels, counted, *indexes)
-            summary = b"".join(map(_bytes, records))
-            crc = zlib.crc32(_FOOTER.pack(Opcode.FOOTER, 20, begin, 0), zlib.crc32(summary))
-            footer = Footer(summary_start=begin, summary_offset_start=0, summary_crc=crc)
             with self._whole():
-                self._write(end + summary + _bytes(footer) + MAGIC)
+                self._writer.finish()
             self._file.close()
 
     def abandon(self) -> None:
@@ -193,72 +138,23 @@ class McapFile:
                 return
             raw = self._file.raw  # its buffer still holds the bytes that a full device refused
             with suppress(OSError):
-                raw.truncate(self._end)
+                raw.truncate(self._waiting.begin)
             raw.close()
-
-    def _write_chunk(self, entries: list[Entry]) -> None:
-        """Without the package's own writer, which takes 4 µs for each message."""
-        pieces = self._definitions.copy()
-        at = sum(map(len, pieces))
-        places: defaultdict[int, list[int]] = defaultdict(list)
-        """Of each channel: time and offset of each message."""
-        for channel, time, sequence, data in entries:
-            places[channel] += (time, at)
-            length = _MESSAGE.size - _OPCODE_AND_LENGTH + len(data)
-            pieces.append(
-                _MESSAGE.pack(Opcode.MESSAGE, length, channel, sequence & 0xFFFFFFFF, time, time)
-            )
-            pieces.append(data)
-            at += _OPCODE_AND_LENGTH + length
-        raw = b"".join(pieces)
-        data = zstandard.compress(raw)
-        first, last = min(entry[1] for entry in entries), max(entry[1] for entry in entries)
-        chunk = _bytes(
-            Chunk(
-                compression="zstd", data=data, message_start_time=first, message_end_time=last,
-                uncompressed_crc=zlib.crc32(raw), uncompressed_size=len(raw),
-            )
-        )  # fmt: skip
-        records, offsets = chunk, {}
-        for channel, numbers in places.items():
-            offsets[channel] = self._end + len(records)
-            size = 8 * len(numbers)
-            records += _MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + size, channel, size)
-            records += struct.pack(f"<{len(numbers)}Q", *numbers)
-        index = ChunkIndex(
-            message_start_time=first, message_end_time=last, chunk_start_offset=self._end,
-            chunk_length=len(chunk), message_index_offsets=offsets,
-            message_index_length=len(records) - len(chunk), compression="zstd",
-            compressed_size=len(data), uncompressed_size=len(raw),
-        )  # fmt: skip
-        self._write(records)
-        self._definitions.clear()
-        self._indexes.append(index)
-        self._times += (first, last)
-        for channel, numbers in places.items():
-            self._counts[channel] += len(numbers) // 2
-
-    def _write(self, records: bytes) -> None:
-        """Write whole records, up to the device."""
-        self._file.write(records)
-        self._file.flush()
-        self._end += len(records)
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
-        """What an exception interrupts here is the last that is written."""
+        """Write what is added here, up to the device. If that is interrupted, it is the last."""
         if self._broken:
             raise OSError(EINTR, "a write was interrupted")
         self._broken = True
         yield
+        records = self._waiting.getvalue()
+        self._file.write(records)
+        self._file.flush()
+        self._waiting.begin += len(records)
+        self._waiting.seek(0)
+        self._waiting.truncate(0)
         self._broken = False
-
-
-def _bytes(record: McapRecord) -> bytes:
-    builder: Any = RecordBuilder()
-    record.write(builder)
-    data: bytes = builder.end()
-    return data
 
 
 def read_records(file: BinaryIO) -> Iterator[McapRecord]:

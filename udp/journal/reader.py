@@ -1,10 +1,9 @@
 """Reads and summarizes a journal, whole or cut off."""
 
 import json
-import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -19,17 +18,7 @@ from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.errors import DecodeError
 from ..protocol.layout import Layout
-from ..protocol.messages import (
-    FLY,
-    Close,
-    Command,
-    Hello,
-    Message,
-    Refuse,
-    State,
-    Unknown,
-    Welcome,
-)
+from ..protocol.messages import FLY, Close, Command, Hello, Message, Refuse, State, Unknown, Welcome
 from ._file import MAGIC, read_records
 from .writer import ABOUT, FORMAT
 
@@ -101,7 +90,8 @@ class Item(NamedTuple):
 class Recording:
     """The messages of a journal, in the order in which they were written. May be iterated again.
 
-    Nothing that the file names is imported or made: a spec is data.
+    One that a crash cut off is read up to the cut. Nothing that the file names is imported or made:
+    a spec is data.
 
     Attributes:
         path: The file.
@@ -112,7 +102,8 @@ class Recording:
 
     Raises:
         OSError: The file cannot be read.
-        InputError: It is not a journal, or one of another version.
+        InputError: It is not a journal, or one of another version; while iterating: a message in it
+            cannot be read.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -121,9 +112,9 @@ class Recording:
         self.attachments: dict[str, bytes] = {}
         with self.path.open("rb") as file:
             head = file.read(len(MAGIC))
-            if head != MAGIC[: len(head)]:
+            if not MAGIC.startswith(head):
                 raise InputError(f"{self.path}: expected an MCAP file, got another")
-            file.seek(-min(len(MAGIC), os.fstat(file.fileno()).st_size), os.SEEK_END)
+            file.seek(-len(head), 2)
             self.complete = file.read() == MAGIC
         self.ending = "complete" if self.complete else "cut off before its end"
         for record in self._records():
@@ -194,14 +185,7 @@ class Recording:
                 yield record
 
 
-def read_journal(path: Path | str) -> Recording:
-    """The messages of a journal. One that a crash cut off is read up to the cut.
-
-    Raises:
-        OSError: The file cannot be read.
-        InputError: It is not a journal; while iterating: a message in it cannot be read.
-    """
-    return Recording(path)
+read_journal: Final = Recording
 
 
 # ---- what is in it
@@ -214,7 +198,7 @@ class SessionSummary:
     session: Session
     first: int
     """Time of its first message, nanoseconds since 1970."""
-    last: int
+    last: int = 0
     states: int = 0
     steps: int = 0
     """Of all drones together; resets do not count."""
@@ -224,6 +208,10 @@ class SessionSummary:
     """Sum of their returns."""
     ending: str = "not closed"
     """Reason of its Close or Refuse."""
+    _command: Command | None = None
+
+    def __post_init__(self) -> None:
+        self._returns = np.zeros(self.session.num_envs)
 
     @property
     def seconds(self) -> float:
@@ -232,24 +220,61 @@ class SessionSummary:
 
     def __str__(self) -> str:
         session = self.session
+        began = datetime.fromtimestamp(self.first // 10**9, UTC)
         mean = f", mean return {self.returns / self.episodes:.2f}" if self.episodes else ""
         return (
             f"{session}: {count_of(session.num_envs, 'drone')} of {session.spec.env_id}, "
-            f"{session.codec}, {_clock(self.first)}, {self.seconds:.1f} s, {self.steps} steps, "
-            f"{self.episodes} episodes{mean}; {self.ending}"
+            f"{session.codec}, {began:%Y-%m-%d %H:%M:%S} UTC, {self.seconds:.1f} s, "
+            f"{self.steps} steps, {self.episodes} episodes{mean}; {self.ending}"
         )
 
+    def take(self, item: Item) -> None:
+        """Count a message of the session."""
+        self.last = item.time
+        match item.message:
+            case Command() as command:
+                self._command = command
+            case State() as state:
+                self._take_state(state)
+            case Close(reason=reason) if reason:
+                self.ending = f"closed: {reason}"
+            case Close() if not self.ending.startswith("closed"):
+                self.ending = "closed"
+            case Refuse(reason=reason):
+                self.ending = f"refused: {reason}"
+            case Unknown():
+                self.ending = "the agent does not know this session"
 
-@dataclass(kw_only=True)
-class Summary:
-    """Counts of a journal."""
+    def _take_state(self, state: State) -> None:
+        command = self._command
+        self.states += 1
+        resets = np.ones(len(state.rewards), bool) if command is None else command.resets
+        stepped = ~resets if command is None else command.orders == FLY
+        self._returns[resets] = 0.0
+        self._returns += np.where(stepped, state.rewards, 0.0)
+        self.steps += int(stepped.sum())
+        ended = (state.terminated | state.truncated) & stepped
+        self.episodes += int(ended.sum())
+        self.returns += float(self._returns[ended].sum())
 
-    path: Path
-    side: str
-    """`simulator` or `agent`."""
-    complete: bool
-    ending: str
-    sessions: list[SessionSummary] = field(default_factory=list)
+
+class Summary(Recording):
+    """Counts of a journal.
+
+    Attributes:
+        side: `simulator` or `agent`.
+        sessions: Counts of each session.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        super().__init__(path)
+        self.side = self.about.get("side", "")
+        of: dict[int, SessionSummary] = {}
+        for item in self:
+            if item.session.index not in of:
+                of[item.session.index] = SessionSummary(session=item.session, first=item.time)
+            of[item.session.index].take(item)
+        self.sessions = list(of.values())
 
     @property
     def steps(self) -> int:
@@ -273,64 +298,7 @@ class Summary:
         return printable([head, *map(str, self.sessions)])
 
 
-class _Tally:
-    """Counts the steps, episodes and returns of one session."""
-
-    def __init__(self, summary: SessionSummary) -> None:
-        self.summary = summary
-        self._returns = np.zeros(summary.session.num_envs)
-        self._command: Command | None = None
-
-    def take(self, item: Item) -> None:
-        summary, message = self.summary, item.message
-        summary.last = item.time
-        match message:
-            case Command():
-                self._command = message
-            case State():
-                self._take_state(message)
-            case Close(reason=reason) if reason:
-                summary.ending = f"closed: {reason}"
-            case Close() if not summary.ending.startswith("closed"):
-                summary.ending = "closed"
-            case Refuse(reason=reason):
-                summary.ending = f"refused: {reason}"
-            case Unknown():
-                summary.ending = "the agent does not know this session"
-
-    def _take_state(self, state: State) -> None:
-        summary, command = self.summary, self._command
-        summary.states += 1
-        resets = np.ones(len(state.rewards), bool) if command is None else command.resets
-        stepped = ~resets if command is None else command.orders == FLY
-        self._returns[resets] = 0.0
-        self._returns += np.where(stepped, state.rewards, 0.0)
-        summary.steps += int(stepped.sum())
-        ended = (state.terminated | state.truncated) & stepped
-        summary.episodes += int(ended.sum())
-        summary.returns += float(self._returns[ended].sum())
-
-
-def summarize(path: Path | str) -> Summary:
-    """Counts of a journal. Raises as `read_journal`."""
-    recording = read_journal(path)
-    tallies: dict[int, _Tally] = {}
-    for item in recording:
-        if item.session.index not in tallies:
-            summary = SessionSummary(session=item.session, first=item.time, last=item.time)
-            tallies[item.session.index] = _Tally(summary)
-        tallies[item.session.index].take(item)
-    return Summary(
-        path=recording.path,
-        side=recording.about.get("side", ""),
-        complete=recording.complete,
-        ending=recording.ending,
-        sessions=[tally.summary for tally in tallies.values()],
-    )
-
-
-def _clock(time: int) -> str:
-    return datetime.fromtimestamp(time // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+summarize: Final = Summary
 
 
 def count_of(count: int, what: str) -> str:

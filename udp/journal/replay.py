@@ -3,16 +3,17 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from ...envs.loop import Loop
 from ...envs.registry import is_known
-from ...envs.spec import EnvSpec, component_names
+from ...envs.spec import component_names
 from ...models.errors import InputError
 from ..protocol.messages import Command, State
-from .reader import Item, Session, count_of, printable, read_journal
+from ..transport.stepped import reset_all
+from .reader import Item, Recording, Session, count_of, printable
 from .writer import software
 
 __all__ = ["Difference", "SessionVerdict", "Verification", "verify"]
@@ -39,9 +40,11 @@ class Difference:
 
 @dataclass(kw_only=True)
 class SessionVerdict:
-    """Result of repeating one session."""
+    """Simulates one session again, and counts what is the same."""
 
     session: Session
+    vehicle: Path | str | None = None
+    """MJCF of the vehicle that was flown; None: the paper's."""
     same: int = 0
     """States that are the same in every bit."""
     unchecked: int = 0
@@ -54,6 +57,11 @@ class SessionVerdict:
     """Reason if it cannot be repeated, or not to its end."""
     notes: list[str] = field(default_factory=list)
     """Other things that have changed."""
+    _loop: Loop | None = None
+    _sequence: int | None = None
+    _command: Command | None = None
+    _known: bool = False
+    """Whether the simulated drones are where the recorded ones were."""
 
     @property
     def identical(self) -> bool:
@@ -70,17 +78,108 @@ class SessionVerdict:
         lines += [f"  {self.problem}"] if self.problem else []
         return lines + [f"  note: {note}" for note in self.notes]
 
+    def take(self, item: Item) -> None:
+        """Repeat a message."""
+        if self.problem:
+            return
+        if isinstance(item.message, Command):
+            self._command = item.message
+        elif isinstance(item.message, State):
+            try:
+                self._repeat(item.message.sequence)
+            except Exception as error:  # the env's: the recorded run ended with it too
+                what = str(error) or type(error).__name__
+                self.problem = f"State {item.message.sequence} cannot be repeated: {what}"
+            else:
+                self._compare(item.message)
 
-@dataclass(kw_only=True)
-class Verification:
-    """Result of repeating a journal."""
+    def close(self) -> None:
+        """Release the drones."""
+        if self._loop:
+            self._loop.close()
 
-    path: Path
-    complete: bool
-    ending: str
-    notes: list[str]
-    """Versions that have changed."""
-    sessions: list[SessionVerdict] = field(default_factory=list)
+    def _repeat(self, sequence: int) -> None:
+        """Bring the drones to that State."""
+        command, seed = self._command, self.session.seed
+        if self._loop is None:
+            self._loop = self._make()
+            if seed is not None:
+                reset_all(self._loop, self.session.layout, seed)
+                self._known = True
+        elif command is None or not self._sequence == command.sequence == sequence - 1:
+            number = command.sequence if command else "none"
+            raise InputError(f"expected Command {sequence - 1} before it, got {number}")
+        elif self._known or (command.seeds is not None and command.resets.all()):
+            self._loop.advance(command.actions, command.resets, command.seeds, command.frozen)
+            self._known = True
+        self._sequence = sequence
+
+    def _make(self) -> Loop:
+        """The drones. Raises `InputError` unless their arrays are those of the recorded spec."""
+        spec = self.session.spec
+        if not is_known(spec.env_id):
+            raise InputError(
+                f"expected a registered env id, got {spec.env_id!r}: "
+                "--env MODULE:NAME names the module that registers it"
+            )
+        count = self.session.num_envs
+        loop = Loop(spec.env_id, count, vehicle=self.vehicle, options=spec.options)
+        for name in ("observation", "action", "telemetry", "control_period"):
+            was, now = getattr(spec, name), getattr(loop.spec, name)
+            if was != now:
+                loop.close()
+                raise InputError(f"expected an env of the {name} {was}, got one of {now}")
+        was, now = spec.vehicle_hash, loop.spec.vehicle_hash
+        if was.strip("0") and was != now:
+            self.notes.append(f"the vehicle was {was}, and is {now} here")
+        return loop
+
+    def _compare(self, recorded: State) -> None:
+        if not self._known or self._loop is None:
+            self.unchecked += 1
+        elif difference := _difference(recorded, self._loop):
+            self.differing += 1
+            self.difference = self.difference or difference
+        else:
+            self.same += 1
+
+
+class Verification(Recording):
+    """Every session of a journal simulated again, and every bit of every State compared.
+
+    Only an env that is registered here is simulated: nothing that the file names is imported.
+
+    Args:
+        path: The journal.
+        vehicle: MJCF of the vehicle that was flown; None: the paper's.
+
+    Attributes:
+        notes: Versions that have changed.
+        sessions: The verdict on each.
+
+    Raises:
+        InputError: It is not a journal.
+        OSError: It cannot be read.
+    """
+
+    def __init__(self, path: Path | str, *, vehicle: Path | str | None = None) -> None:
+        super().__init__(path)
+        self.notes = _other_versions(self.about)
+        self.sessions: list[SessionVerdict] = []
+        flying: dict[int, SessionVerdict] = {}  # the last of each slot
+        try:
+            for item in self:
+                verdict = flying.get(item.session.slot)
+                if verdict is None or verdict.session is not item.session:
+                    if verdict:
+                        verdict.close()
+                    verdict = SessionVerdict(session=item.session, vehicle=vehicle)
+                    flying[item.session.slot] = verdict
+                    self.sessions.append(verdict)
+                verdict.take(item)
+        finally:
+            for verdict in flying.values():
+                verdict.close()
 
     @property
     def identical(self) -> bool:
@@ -105,134 +204,7 @@ class Verification:
         return printable(lines)
 
 
-def verify(path: Path | str, *, vehicle: Path | str | None = None) -> Verification:
-    """Simulate every session of a journal again, and compare every bit of every State.
-
-    Only an env that is registered here is simulated: nothing that the file names is imported.
-
-    Args:
-        path: The journal.
-        vehicle: MJCF of the vehicle that was flown; None: the paper's.
-
-    Raises:
-        InputError: It is not a journal.
-        OSError: It cannot be read.
-    """
-    recording = read_journal(path)
-    repeats: dict[int, _Repeat] = {}
-    verdicts: list[SessionVerdict] = []
-    try:
-        for item in recording:
-            slot = item.session.slot
-            if slot not in repeats or repeats[slot].verdict.session is not item.session:
-                if slot in repeats:
-                    repeats[slot].close()
-                verdicts.append(SessionVerdict(session=item.session))
-                repeats[slot] = _Repeat(verdicts[-1], vehicle)
-            repeats[slot].take(item)
-    finally:
-        for repeat in repeats.values():
-            repeat.close()
-    return Verification(
-        path=recording.path,
-        complete=recording.complete,
-        ending=recording.ending,
-        notes=_other_versions(recording.about),
-        sessions=verdicts,
-    )
-
-
-class _Repeat:
-    """Simulates one session again."""
-
-    def __init__(self, verdict: SessionVerdict, vehicle: Path | str | None) -> None:
-        self.verdict = verdict
-        self._vehicle = vehicle
-        self._loop: Loop | None = None
-        self._sequence: int | None = None
-        self._command: Command | None = None
-        self._known = False
-        """Whether the simulated drones are where the recorded ones were."""
-
-    def take(self, item: Item) -> None:
-        if self.verdict.problem:
-            return
-        if isinstance(item.message, Command):
-            self._command = item.message
-        elif isinstance(item.message, State):
-            try:
-                self._repeat(item.message.sequence)
-            except Exception as error:  # the env's: the recorded run ended with it too
-                what = str(error) or type(error).__name__
-                self.verdict.problem = f"State {item.message.sequence} cannot be repeated: {what}"
-            else:
-                self._compare(item.message)
-
-    def close(self) -> None:
-        if self._loop:
-            self._loop.close()
-
-    def _repeat(self, sequence: int) -> None:
-        """Bring the drones to that State."""
-        command, session = self._command, self.verdict.session
-        if self._loop is None:
-            self._loop = self._make()
-            if session.seed is not None:
-                self._reset(self._loop, session.seed)
-                self._known = True
-        elif command is None or not self._sequence == command.sequence == sequence - 1:
-            number = command.sequence if command else "none"
-            raise InputError(f"expected Command {sequence - 1} before it, got {number}")
-        elif self._known or (command.seeds is not None and command.resets.all()):
-            self._loop.advance(command.actions, command.resets, command.seeds, command.frozen)
-            self._known = True
-        self._sequence = sequence
-
-    def _reset(self, loop: Loop, seed: int) -> None:
-        """The simulator's own first reset: drone i takes seed + i, modulo 2^64."""
-        count, actions = loop.num_envs, self.verdict.session.layout.actions
-        seeds = np.array([(seed + i) % 2**64 for i in range(count)], np.uint64)
-        loop.advance(np.zeros(actions.shape, actions.dtype), np.ones(count, bool), seeds)
-
-    def _make(self) -> Loop:
-        session = self.verdict.session
-        spec = session.spec
-        if not is_known(spec.env_id):
-            raise InputError(
-                f"expected a registered env id, got {spec.env_id!r}: "
-                "--env MODULE:NAME names the module that registers it"
-            )
-        loop = Loop(spec.env_id, session.num_envs, vehicle=self._vehicle, options=spec.options)
-        try:
-            self._compare_specs(loop.spec)
-        except BaseException:
-            loop.close()
-            raise
-        return loop
-
-    def _compare_specs(self, here: EnvSpec) -> None:
-        """Raise `InputError` unless the arrays are those of the recorded spec."""
-        recorded, notes = self.verdict.session.spec, self.verdict.notes
-        for name in ("observation", "action", "telemetry", "control_period"):
-            was, now = getattr(recorded, name), getattr(here, name)
-            if was != now:
-                raise InputError(f"expected an env of the {name} {was}, got one of {now}")
-        if recorded.vehicle_hash.strip("0") and recorded.vehicle_hash != here.vehicle_hash:
-            notes.append(
-                f"the vehicle was {recorded.vehicle_hash}, and is {here.vehicle_hash} here"
-            )
-
-    def _compare(self, recorded: State) -> None:
-        verdict, loop = self.verdict, self._loop
-        if not self._known or loop is None:
-            verdict.unchecked += 1
-            return
-        difference = _difference(recorded, loop)
-        if difference is None:
-            verdict.same += 1
-            return
-        verdict.differing += 1
-        verdict.difference = verdict.difference or difference
+verify: Final = Verification
 
 
 def _difference(recorded: State, loop: Loop) -> Difference | None:

@@ -21,7 +21,7 @@ from ...envs.spec import EnvSpec
 from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.layout import COMMAND_ARRAYS_AT, STATE_ARRAYS_AT, Layout, Slot
-from ..protocol.messages import Close, Command, Hello, Message, Refuse, State, Welcome
+from ..protocol.messages import Command, Hello, Message, State
 from ..protocol.statistics import Statistics
 from ._file import McapFile
 
@@ -44,34 +44,17 @@ _PACKAGES: Final = ("rotorgram", "mujoco", "gymnasium", "numpy", "mcap")
 
 _log: Final = logging.getLogger("rotorgram.udp")
 
-_HEADER: Final = (
-    "uint8[2] magic",
-    "uint8 version",
-    "uint8 type",
-    "uint32 crc",
-    "uint64 session",
-    "uint64 sequence",
-)
-_ROS_TYPES: Final = {"b": "bool", "f": "float", "i": "int", "u": "uint"}
-_EVENT: Final = (
-    "rotorgram.Event",
-    json.dumps(
-        {
-            "type": "object",
-            "required": ["type", "session", "datagram"],
-            "properties": {
-                "type": {"type": "string"},
-                "session": {"type": "string", "description": "number, hexadecimal"},
-                "sequence": {"type": "integer"},
-                "reason": {"type": "string"},
-                "datagram": {"type": "string", "description": "its binary message, hexadecimal"},
-            },
-        }
-    ),
-)
+_HEADER: Final = """uint8[2] magic
+uint8 version
+uint8 type
+uint32 crc
+uint64 session
+uint64 sequence
+"""
+_EVENT: Final = "rotorgram.Event", '{"type": "object"}'
 _NUMBERS: Final = (
     "rotorgram.Statistics",
-    json.dumps({"type": "object", "additionalProperties": {"type": "number"}}),
+    '{"type": "object", "additionalProperties": {"type": "number"}}',
 )
 
 
@@ -96,7 +79,6 @@ class Journal:
         self._side = side
         self._model = model
         self._text_hello = text_hello
-        self._text_layout = _layout_of(text_hello) if text_hello else None
         self._slots: Sequence[object] = ()
         self._holders: dict[int, object] = {}
         self._schemas: dict[str, dict[str, int]] = {}
@@ -141,31 +123,21 @@ class Journal:
         self._open = True
 
     def tap(self, slot: int, message: Message, datagram: bytes) -> None:
-        """Take note of a message. `write` pays for writing it.
-
-        Args:
-            slot: Of the agent; 0 at a simulator.
-            message: Any message.
-            datagram: Its whole binary message, not sealed. Empty for one by text.
-        """
+        """Take note of a message: a `Tap`. `write` pays for writing it."""
         now = time.time_ns()
         if not self._open:
             return
         try:
-            if not isinstance(message, Hello) and (
-                not message.session or (slot, binary.STATE) not in self._channels
-            ):
+            if isinstance(message, Hello):
+                self._begin(slot, message, datagram, "binary", now)
+            elif not message.session or (slot, binary.STATE) not in self._channels:
                 self._begin_by_text(slot, now)
-                datagram = datagram or binary.encode(message, self._text_layout)
             if isinstance(message, State | Command):
                 seeded = isinstance(message, Command) and message.seeds is not None
                 channel = self._channels[slot, _SEEDED if seeded else datagram[3]]
                 self._pending.append((channel, now, message.sequence, datagram))
-            else:
-                if isinstance(message, Hello):
-                    self._begin(slot, message, "binary", now)
-                words = _words(message, datagram)
-                self._add_json(f"/slot{slot}/events", _EVENT, words, now)
+            elif not isinstance(message, Hello):
+                self._add_json(f"/slot{slot}/events", _EVENT, _words(message, datagram), now)
             self._size += len(datagram)
             if self._size > 4 * _CHUNK:  # nobody calls `write`
                 self._flush(now)
@@ -216,16 +188,14 @@ class Journal:
         holder = self._slots[slot] if self._slots else _ONE  # a simulator has one agent
         if holder is not self._holders.get(slot):
             self._holders[slot] = holder
-            self._begin(slot, hello, "text", now)
-            words = _words(hello, binary.encode(hello)) | {"codec": "text"}
-            self._add_json(f"/slot{slot}/events", _EVENT, words, now)
+            self._begin(slot, hello, binary.encode(hello), "text", now)
 
-    def _begin(self, slot: int, hello: Hello, codec: str, now: int) -> None:
+    def _begin(self, slot: int, hello: Hello, datagram: bytes, codec: str, now: int) -> None:
         """Take note of a new session, whose messages may have another layout."""
         self._flush(now)
         self._sessions += 1
         spec = EnvSpec.from_json(hello.spec)
-        layout = _layout_of(hello)
+        layout = layout_of(spec, hello.worlds)
         words = {
             "index": str(self._sessions),
             "slot": str(slot),
@@ -242,6 +212,8 @@ class Journal:
         ):
             schema = self._schema(f"rotorgram/{name}", "ros1msg", text)
             self._channels[slot, kind] = self._topic(f"/slot{slot}/{topic}", "ros1", schema)
+        words = _words(hello, datagram) | {"codec": codec}
+        self._add_json(f"/slot{slot}/events", _EVENT, words, now)
 
     def _count(self, now: int) -> None:
         self._counted = now
@@ -278,22 +250,13 @@ def software() -> dict[str, str]:
 
 
 def model_of(stepped: Any) -> str:
-    """The whole MJCF of what a simulator steps, its includes resolved; "" if it has none."""
+    """The whole MJCF of our tasks' vehicle, its includes resolved; "" for another env."""
     task = getattr(stepped, "task", None)
-    if task is not None:
-        from ...models.scene import build_scene
-
-        return str(build_scene(task.vehicle.path, visual=False).to_xml())
-    # As the MuJoCo envs of Gymnasium have it.
-    path = getattr(stepped.envs[0].unwrapped, "fullpath", None)
-    if not isinstance(path, str):
+    if task is None:
         return ""
-    try:
-        import mujoco
+    from ...models.scene import build_scene
 
-        return str(mujoco.MjSpec.from_file(path).to_xml())
-    except (ImportError, ValueError, OSError):
-        return ""
+    return str(build_scene(task.vehicle.path, visual=False).to_xml())
 
 
 # ---- ROS 1 messages
@@ -305,28 +268,26 @@ def _state_schema(spec: EnvSpec, layout: Layout) -> str:
     telemetry = _field_names("telemetry", (array.name for array in spec.telemetry))
     slots = (*layout.observation_slots, layout.rewards, *layout.flags, *layout.telemetry_slots)
     names = (*observation, "rewards", "terminated", "truncated", *telemetry)
-    fixed = ("float64 time", "uint64 nonce")
+    fixed = "float64 time\nuint64 nonce\n"
     return _schema_text(fixed, STATE_ARRAYS_AT, zip(names, slots, strict=True))
 
 
 def _command_schema(layout: Layout, *, seeded: bool) -> str:
     """A Command of this layout as a ROS 1 message."""
     arrays = [("actions", layout.actions), ("orders", layout.orders), ("seeds", layout.seeds)]
-    fixed = ("uint32 seed_count", "uint8[4] reserved")
+    fixed = "uint32 seed_count\nuint8[4] reserved\n"
     return _schema_text(fixed, COMMAND_ARRAYS_AT, arrays if seeded else arrays[:2])
 
 
-def _schema_text(fixed: Iterable[str], at: int, arrays: Iterable[tuple[str, Slot]]) -> str:
-    lines = [*_HEADER, *fixed]
+def _schema_text(fixed: str, at: int, arrays: Iterable[tuple[str, Slot]]) -> str:
+    text = _HEADER + fixed
     for name, slot in arrays:
         if slot.at > at:
-            lines.append(f"uint8[{slot.at - at}] padding{at}")
-        dtype = slot.dtype
-        bits = "" if dtype.kind == "b" else str(8 * dtype.itemsize)
-        count = (slot.end - slot.at) // dtype.itemsize
-        lines.append(f"{_ROS_TYPES[dtype.kind]}{bits}[{count}] {name}")
+            text += f"uint8[{slot.at - at}] padding{at}\n"
+        count = (slot.end - slot.at) // slot.dtype.itemsize
+        text += f"{slot.dtype.name}[{count}] {name}\n"
         at = slot.end
-    return "\n".join(lines) + "\n"
+    return text
 
 
 def _field_names(prefix: str, names: Iterable[str]) -> list[str]:
@@ -340,22 +301,12 @@ def _field_names(prefix: str, names: Iterable[str]) -> list[str]:
     return fields
 
 
-def _layout_of(hello: Hello) -> Layout:
-    return layout_of(EnvSpec.from_json(hello.spec), hello.worlds)
-
-
 def _words(message: Message, datagram: bytes) -> dict[str, Any]:
     """A message for readers, and its datagram for programs."""
     words: dict[str, Any] = {"type": type(message).__name__, "session": f"{message.session:016x}"}
-    match message:
-        case Hello():
-            words |= {"codec": "binary", "worlds": message.worlds, "spec": message.spec}
-        case Welcome(seed=seed):
-            words["seed"] = None if seed is None else str(seed)
-        case Close(sequence=sequence, reason=reason):
-            words |= {"sequence": sequence, "reason": reason}
-        case Refuse(reason=reason):
-            words["reason"] = reason
+    for name in ("worlds", "spec", "seed", "sequence", "reason"):
+        if hasattr(message, name):
+            words[name] = getattr(message, name)
     return words | {"datagram": datagram.hex()}
 
 
@@ -371,10 +322,7 @@ def _finish(file: McapFile, path: Path) -> None:
 
 
 def _abandon(file: McapFile, path: Path, error: OSError) -> None:
-    _log.warning(
-        "record: writing %s failed (%s): the flight goes on, its journal ends here",
-        path,
-        error.strerror or error,
-    )
+    sentence = "record: writing %s failed (%s): the flight goes on, its journal ends here"
+    _log.warning(sentence, path, error.strerror or error)
     with suppress(OSError):  # what was written can be read
         file.abandon()

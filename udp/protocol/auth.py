@@ -21,16 +21,7 @@ from typing import Final, Literal
 from ...models.errors import InputError
 from .errors import Forged
 
-__all__ = [
-    "KEY_SIZE",
-    "OVERHEAD",
-    "Key",
-    "is_sealed",
-    "key_id",
-    "message_of",
-    "read_keys",
-    "write_key",
-]
+__all__ = ["OVERHEAD", "Key", "is_sealed", "key_id", "message_of", "read_keys", "write_key"]
 
 KEY_SIZE: Final = 32
 """Bytes of a shared key."""
@@ -48,12 +39,10 @@ Side = Literal["simulator", "agent"]
 
 
 class Key:
-    """Seals and opens datagrams. Each side's tags are its own: none can be sent back to it.
+    """Seals and opens datagrams of the side that is here with `KEY_SIZE` bytes that both hold.
 
-    Args:
-        secret: `KEY_SIZE` bytes that both sides hold.
-        side: The side that is here.
-        id_: Id in the envelope; empty: that of this secret.
+    Each side's tags are its own: none can be sent back to it. A session's key has the id of the
+    shared one.
     """
 
     def __init__(self, secret: bytes, side: Side, *, id_: bytes = b"") -> None:
@@ -61,7 +50,7 @@ class Key:
             raise InputError(f"key: expected {KEY_SIZE} bytes, got {len(secret)}")
         self._secret = secret
         self.id = id_ or blake2b(key=secret, digest_size=_ID_SIZE, person=b"key id").digest()
-        """Of the shared key, 6 bytes; a session's key has that of the shared one."""
+        """6 bytes."""
         self._envelope = _MAGIC + self.id
         self._side = side
         there = "agent" if side == "simulator" else "simulator"
@@ -145,9 +134,8 @@ def write_key(path: Path) -> None:
         FileExistsError: There is such a file; a key is never replaced.
         OSError: It cannot be written; then there is no file.
     """
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     try:
-        descriptor = os.open(path, flags, 0o600)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError as error:
         sentence = "expected a new file, got one that is there; a key is never replaced"
         raise FileExistsError(error.errno, sentence, str(path)) from None

@@ -6,7 +6,7 @@ constants and structs below follow it, and `tests/golden.py` writes the bytes th
 
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from math import isfinite
 from typing import Any, Final
 
@@ -78,7 +78,6 @@ OF_SESSION: Final = frozenset({STATE, COMMAND, CLOSE, ALIVE})
 
 _NUMBERED: Final = OF_SESSION | {UNKNOWN, MISSING}
 """Types that have a sequence number."""
-_MAY_BE_CUT: Final = (HELLO, STATE, COMMAND)
 
 _HEADER: Final = struct.Struct("<2sBBIQQ")
 _NUMBERS: Final = struct.Struct("<QQ")  # session, sequence: the end of the header
@@ -91,11 +90,6 @@ _EXTENSION: Final = struct.Struct("<HH")
 _LENGTH: Final = struct.Struct("<H")
 _CRITICAL: Final = 1 << 15
 _MOST_EXTENSIONS: Final = 64
-_FLAGS: Final = b"\0\1"
-_ORDERS: Final = b"\0\1\2"
-_BOOL: Final = np.dtype(bool)
-_U8: Final = np.dtype(np.uint8)
-_F8: Final = np.dtype("<f8")
 _PADS: Final = tuple(bytes(size) for size in range(8))
 
 
@@ -110,10 +104,11 @@ def encode(message: Message, layout: Layout | None = None) -> bytes:
         InputError: A number, an array or the whole does not fit.
     """
     kind = type(message)
-    start, crc, encoder = _ENCODERS[kind]
+    start, crc, encoder, laid_out = _ENCODERS[kind]
     try:
         numbers = _NUMBERS.pack(message.session, getattr(message, "sequence", 0))
-        rest = numbers + encoder(message, layout)
+        body = encoder(message, layout or _expect(layout)) if laid_out else encoder(message)
+        rest = numbers + body
     except struct.error as error:
         raise InputError(f"{kind.__name__}: {error}") from None
     if len(rest) + 8 > MAX_MESSAGE:
@@ -125,9 +120,8 @@ def encode(message: Message, layout: Layout | None = None) -> bytes:
 
 def frame(kind: int, session: int, sequence: int, body: bytes) -> bytes:
     """A datagram: header and body."""
-    start, numbers = MAGIC + bytes((VERSION, kind)), _NUMBERS.pack(session, sequence)
-    crc = zlib.crc32(body, zlib.crc32(numbers, zlib.crc32(start)))
-    return b"".join((start, crc.to_bytes(4, "little"), numbers, body))
+    start, rest = MAGIC + bytes((VERSION, kind)), _NUMBERS.pack(session, sequence) + body
+    return start + zlib.crc32(rest, zlib.crc32(start)).to_bytes(4, "little") + rest
 
 
 def check(datagram: bytes) -> tuple[int, int, int]:
@@ -157,13 +151,18 @@ def decode(datagram: bytes, layout: Layout | None = None) -> Message:
         layout: That of the Hello; without it no State and no Command can be read.
     """
     kind, session, sequence = check(datagram)
-    decoder = _DECODERS.get(kind)
-    if decoder is None:
-        raise DecodeError(f"type: expected 1 to {len(_DECODERS)}, got {kind}")
+    if kind not in _MESSAGES:
+        raise DecodeError(f"type: expected 1 to {len(_MESSAGES)}, got {kind}")
+    message, _, decoder = _MESSAGES[kind]
     try:
-        return decoder(datagram, session, sequence, layout)
+        if message in _LAID_OUT:
+            whole: Message = decoder(datagram, session, sequence, _expect(layout))
+        else:
+            numbers = {"sequence": sequence} if kind in _NUMBERED else {}
+            whole = message(session=session, **numbers, **decoder(datagram[HEADER_SIZE:]))
+        return whole
     except (ValueError, struct.error) as error:
-        raise DecodeError(f"{decoder.__name__[8:]}: {error}") from None
+        raise DecodeError(f"{message.__name__.lower()}: {error}") from None
 
 
 def decode_due(
@@ -171,23 +170,18 @@ def decode_due(
 ) -> Message | None:
     """The message that is waited for, if this datagram is that one and whole.
 
-    The short way of a lock-step: only one header can come, so it is compared, not read. None
-    sends any other datagram, and one that is wrong, the way of `decode`, which tells why.
-
-    Args:
-        kind: Its type.
-        datagram: What came.
-        numbers: Bytes 8 to 23 of the message.
-        session, sequence: The same as numbers.
-        layout: That of the Hello.
+    The short way of a lock-step: only one header can come, so it is compared, not read. Its bytes 8
+    to 23 are `numbers`, from `session` and `sequence`. None sends any other datagram, and one that
+    is wrong, the way of `decode`, which tells why.
     """
-    start, crc = _STARTS[kind]
+    start, crc, decoder = _DUE[kind]
     if datagram[:4] != start or datagram[8:24] != numbers:
         return None
     if zlib.crc32(datagram[8:], crc) != int.from_bytes(datagram[4:8], "little"):
         return None
     try:
-        return _DECODERS[kind](datagram, session, sequence, layout)
+        message: Message = decoder(datagram, session, sequence, layout)
+        return message
     except (ValueError, struct.error):
         return None
 
@@ -211,8 +205,7 @@ def peek(datagram: bytes) -> tuple[int, int, int]:
 # ---- State and Command
 
 
-def _encode_state(m: State, layout: Layout | None) -> bytes:
-    layout = _expect(layout)
+def _encode_state(m: State, layout: Layout) -> bytes:
     slots = layout.state_slots
     arrays = (*m.observations, m.rewards, m.terminated, m.truncated, *m.telemetry)
     if len(arrays) != len(slots):
@@ -225,21 +218,18 @@ def _encode_state(m: State, layout: Layout | None) -> bytes:
     body = b"".join(pieces)
     numbers = layout.state_numbers
     if numbers is None or not _adds_up(numbers.unpack_from(body)):
-        floats = (*layout.observation_slots, layout.rewards, *layout.telemetry_slots)
-        _expect_finite("observation, reward, telemetry", _HEADERLESS + body, m.time, floats)
+        _expect_finite_state(_HEADERLESS + body, m.time, layout)
     return body
 
 
-def _decode_state(data: bytes, session: int, sequence: int, layout: Layout | None) -> State:
-    layout = _expect(layout)
+def _decode_state(data: bytes, session: int, sequence: int, layout: Layout) -> State:
     _expect_size(data, layout.state_size)
     time, nonce = _STATE_BODY.unpack_from(data, HEADER_SIZE)
     numbers = layout.state_numbers
     if numbers is None or not _adds_up(numbers.unpack_from(data, HEADER_SIZE)):
-        floats = (*layout.observation_slots, layout.rewards, *layout.telemetry_slots)
-        _expect_finite("observation, reward, telemetry", data, time, floats)
+        _expect_finite_state(data, time, layout)
     terminated, truncated = layout.flags
-    _expect_flags(data[terminated.at : truncated.end], _FLAGS)
+    _expect_flags(data[terminated.at : truncated.end], b"\0\1")
     arrays = [np.ndarray(shape, dtype, data, at) for shape, dtype, at, _ in layout.state_slots]
     first = len(layout.observation)
     return State(
@@ -255,24 +245,23 @@ def _decode_state(data: bytes, session: int, sequence: int, layout: Layout | Non
     )
 
 
-def _encode_command(m: Command, layout: Layout | None) -> bytes:
-    layout = _expect(layout)
-    actions, orders = layout.actions, layout.orders
-    pieces = [
-        _COMMAND_BODY.pack(0 if m.seeds is None else layout.drones),
-        _bytes_of("Command", actions, m.actions),
-        _PADS[orders.at - actions.end],
-        _bytes_of("Command", orders, m.orders),
-    ]
+def _encode_command(m: Command, layout: Layout) -> bytes:
+    arrays = [(layout.actions, m.actions), (layout.orders, m.orders)]
     if m.seeds is not None:
-        pieces += [_PADS[layout.seeds.at - orders.end], _bytes_of("Command", layout.seeds, m.seeds)]
+        arrays.append((layout.seeds, m.seeds))
+    pieces = [_COMMAND_BODY.pack(0 if m.seeds is None else layout.drones)]
+    end = COMMAND_ARRAYS_AT
+    for slot, array in arrays:
+        if array.shape != slot.shape or array.dtype != slot.dtype:  # numbers are never converted
+            raise _misfit("Command", slot.shape, slot.dtype, array)
+        pieces += (bytes(slot.at - end), array.tobytes())
+        end = slot.end
     body = b"".join(pieces)
     _check_command(_HEADERLESS + body, layout)
     return body
 
 
-def _decode_command(data: bytes, session: int, sequence: int, layout: Layout | None) -> Command:
-    layout = _expect(layout)
+def _decode_command(data: bytes, session: int, sequence: int, layout: Layout) -> Command:
     (count,) = _COMMAND_BODY.unpack_from(data, HEADER_SIZE)
     if count not in (0, layout.drones):
         raise InputError(f"seeds: expected 0 or {layout.drones}, got {count}")
@@ -289,7 +278,7 @@ def _decode_command(data: bytes, session: int, sequence: int, layout: Layout | N
 
 def _check_command(data: bytes, layout: Layout) -> None:
     actions, orders = layout.actions, layout.orders
-    _expect_flags(data[orders.at : orders.end], _ORDERS)
+    _expect_flags(data[orders.at : orders.end], b"\0\1\2")
     if layout.choices:
         numbers = actions.view(data)
         wrong = (numbers < 0) | (numbers >= layout.choices)
@@ -300,14 +289,7 @@ def _check_command(data: bytes, layout: Layout) -> None:
         return
     quick = layout.command_numbers
     if quick is None or not _adds_up(quick.unpack_from(data, COMMAND_ARRAYS_AT)):
-        _expect_finite("action", data, 0.0, (actions,))
-
-
-def _bytes_of(what: str, slot: Slot, array: np.ndarray) -> bytes:
-    """Bytes of an array that has to be that of a slot. Numbers are never converted."""
-    if array.shape != slot.shape or array.dtype != slot.dtype:
-        raise _misfit(what, slot.shape, slot.dtype, array)
-    return array.tobytes()
+        _expect_finite("action", data, (actions,))
 
 
 def _misfit(what: str, shape: tuple[int, ...], dtype: np.dtype, array: np.ndarray) -> InputError:
@@ -322,16 +304,19 @@ def _adds_up(numbers: tuple[Any, ...]) -> bool:
     return isfinite(sum(numbers))
 
 
-def _expect_finite(what: str, data: bytes, time: float, slots: tuple[Slot, ...]) -> None:
+def _expect_finite_state(data: bytes, time: float, layout: Layout) -> None:
     if not isfinite(time):
         raise InputError(f"time: expected a finite number, got {time}")
+    _expect_finite("observation, reward, telemetry", data, layout.state_floats)
+
+
+def _expect_finite(what: str, data: bytes, slots: Iterable[Slot]) -> None:
     for slot in slots:
-        if slot.dtype.kind == "f":
-            array = slot.view(data)
-            finite = np.isfinite(array)
-            if not finite.all():
-                first = np.argwhere(~finite)[0].tolist()
-                raise InputError(f"{what}: expected finite numbers, got {array[*first]} at {first}")
+        array = slot.view(data)
+        finite = np.isfinite(array)
+        if not finite.all():
+            first = np.argwhere(~finite)[0].tolist()
+            raise InputError(f"{what}: expected finite numbers, got {array[*first]} at {first}")
 
 
 def _expect(layout: Layout | None) -> Layout:
@@ -353,107 +338,68 @@ def _expect_flags(flags: bytes, allowed: bytes) -> None:
 _HEADERLESS: Final = bytes(HEADER_SIZE)
 
 
-# ---- all others
+# ---- all others: the body of a message, and its fields
 
 
-def _encode_hello(m: Hello, layout: Layout | None) -> bytes:
+def _encode_hello(m: Hello) -> bytes:
     spec = m.spec.encode()
     return _HELLO_BODY.pack(*m.versions, m.worlds, len(spec)) + spec + _extensions(m.extensions)
 
 
-def _decode_hello(data: bytes, session: int, sequence: int, layout: Layout | None) -> Hello:
-    low, high, worlds, size = _HELLO_BODY.unpack_from(data, HEADER_SIZE)
-    at = HEADER_SIZE + _HELLO_BODY.size
-    end = at + size
-    if size > MAX_SPEC or len(data) < end:
-        raise InputError(
-            f"spec: expected at most {min(MAX_SPEC, len(data) - at)} bytes, got {size}"
-        )
-    return Hello(
-        session=session,
-        spec=data[at:end].decode(),
-        worlds=worlds,
-        versions=(low, high),
-        extensions=_take_extensions(data, end),
-    )
+def _decode_hello(body: bytes) -> dict[str, Any]:
+    low, high, worlds, size = _HELLO_BODY.unpack_from(body)
+    at = _HELLO_BODY.size
+    most = min(MAX_SPEC, len(body) - at)
+    if size > most:
+        raise InputError(f"spec: expected at most {most} bytes, got {size}")
+    spec, extensions = body[at : at + size].decode(), _take_extensions(body, at + size)
+    return {"spec": spec, "worlds": worlds, "versions": (low, high), "extensions": extensions}
 
 
-def _encode_welcome(m: Welcome, layout: Layout | None) -> bytes:
+def _encode_welcome(m: Welcome) -> bytes:
     body = _WELCOME_BODY.pack(m.nonce, m.seed or 0, m.seed is not None, m.version)
     return body + _extensions(m.extensions)
 
 
-def _decode_welcome(data: bytes, session: int, sequence: int, layout: Layout | None) -> Welcome:
-    nonce, seed, has_seed, version = _WELCOME_BODY.unpack_from(data, HEADER_SIZE)
+def _decode_welcome(body: bytes) -> dict[str, Any]:
+    nonce, seed, has_seed, version = _WELCOME_BODY.unpack_from(body)
     if has_seed > 1:
         raise InputError(f"has seed: expected 0 or 1, got {has_seed}")
-    return Welcome(
-        session=session,
-        nonce=nonce,
-        version=version,
-        seed=seed if has_seed else None,
-        extensions=_take_extensions(data, HEADER_SIZE + _WELCOME_BODY.size),
-    )
+    extensions = _take_extensions(body, _WELCOME_BODY.size)
+    seed = seed if has_seed else None
+    return {"nonce": nonce, "version": version, "seed": seed, "extensions": extensions}
 
 
-def _encode_nothing(m: Wait | Unknown | Alive, layout: Layout | None) -> bytes:
+def _encode_nothing(m: Wait | Unknown | Alive) -> bytes:
     return b""
 
 
-def _decode_wait(data: bytes, session: int, sequence: int, layout: Layout | None) -> Wait:
-    _expect_size(data, HEADER_SIZE)
-    return Wait(session=session)
+def _decode_nothing(body: bytes) -> dict[str, Any]:
+    _expect_size(body, 0)
+    return {}
 
 
-def _decode_unknown(data: bytes, session: int, sequence: int, layout: Layout | None) -> Unknown:
-    _expect_size(data, HEADER_SIZE)
-    return Unknown(session=session, sequence=sequence)
-
-
-def _decode_alive(data: bytes, session: int, sequence: int, layout: Layout | None) -> Alive:
-    _expect_size(data, HEADER_SIZE)
-    return Alive(session=session, sequence=sequence)
-
-
-def _encode_missing(m: Missing, layout: Layout | None) -> bytes:
+def _encode_missing(m: Missing) -> bytes:
     return _MISSING_BODY.pack(m.kind, m.count, m.first) + m.bitmap
 
 
-def _decode_missing(data: bytes, session: int, sequence: int, layout: Layout | None) -> Missing:
-    kind, count, first = _MISSING_BODY.unpack_from(data, HEADER_SIZE)
-    bitmap = data[HEADER_SIZE + _MISSING_BODY.size :]
-    if kind not in _MAY_BE_CUT or (kind == HELLO) != (sequence == 0):
-        raise InputError(f"expected a Hello, State or Command, got type {kind} of {sequence}")
-    if not bitmap or first >= count or first + 8 * (len(bitmap) - 1) >= count:
-        raise InputError(f"expected a bitmap of {count} fragments, got {len(bitmap)} bytes")
-    message = Missing(
-        session=session, sequence=sequence, kind=kind, count=count, first=first, bitmap=bitmap
-    )
-    if (numbers := message.numbers()) and numbers[-1] >= count:
-        raise InputError(f"expected fragments below {count}, got {numbers[-1]}")
-    return message
+def _decode_missing(body: bytes) -> dict[str, Any]:
+    kind, count, first = _MISSING_BODY.unpack_from(body)
+    bitmap = body[_MISSING_BODY.size :]
+    return {"kind": kind, "count": count, "first": first, "bitmap": bitmap}
 
 
-def _encode_reason(m: Refuse | Close, layout: Layout | None) -> bytes:
+def _encode_reason(m: Refuse | Close) -> bytes:
     raw = m.reason.encode()
     return _LENGTH.pack(len(raw)) + raw
 
 
-def _decode_refuse(data: bytes, session: int, sequence: int, layout: Layout | None) -> Refuse:
-    return Refuse(session=session, reason=_reason(data))
-
-
-def _decode_close(data: bytes, session: int, sequence: int, layout: Layout | None) -> Close:
-    return Close(session=session, sequence=sequence, reason=_reason(data))
-
-
-def _reason(data: bytes) -> str:
-    (size,) = _LENGTH.unpack_from(data, HEADER_SIZE)
-    at = HEADER_SIZE + _LENGTH.size
+def _decode_reason(body: bytes) -> dict[str, Any]:
+    (size,) = _LENGTH.unpack_from(body)
     if size > MAX_TEXT:
         raise InputError(f"reason: expected at most {MAX_TEXT} bytes, got {size}")
-    _expect_size(data, at + size)
-    return data[at:].decode()
+    _expect_size(body, _LENGTH.size + size)
+    return {"reason": body[_LENGTH.size :].decode()}
 
 
 def _extensions(extensions: tuple[Extension, ...]) -> bytes:
@@ -479,43 +425,31 @@ def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
     return tuple(extensions)
 
 
-def _start(kind: int) -> bytes:
-    return MAGIC + bytes((VERSION, kind))
+_LAID_OUT: Final = (State, Command)
+"""Messages that mean something with a layout only: their codecs take it, and whole datagrams."""
 
-
-_Encoder = Callable[[Any, Layout | None], bytes]
-
-
-def _entry(kind: int, encoder: _Encoder) -> tuple[bytes, int, _Encoder]:
-    return _start(kind), zlib.crc32(_start(kind)), encoder
-
-
-_ENCODERS: Final[dict[type, tuple[bytes, int, _Encoder]]] = {
-    Hello: _entry(HELLO, _encode_hello),
-    Welcome: _entry(_WELCOME, _encode_welcome),
-    Refuse: _entry(REFUSE, _encode_reason),
-    State: _entry(STATE, _encode_state),
-    Command: _entry(COMMAND, _encode_command),
-    Close: _entry(CLOSE, _encode_reason),
-    Wait: _entry(_WAIT, _encode_nothing),
-    Unknown: _entry(UNKNOWN, _encode_nothing),
-    Alive: _entry(ALIVE, _encode_nothing),
-    Missing: _entry(MISSING, _encode_missing),
-}
-"""First four bytes of a message, their CRC-32, and the function for what follows the header."""
-
-_DECODERS: Final[dict[int, Callable[[bytes, int, int, Layout | None], Message]]] = {
-    HELLO: _decode_hello,
-    _WELCOME: _decode_welcome,
-    REFUSE: _decode_refuse,
-    STATE: _decode_state,
-    COMMAND: _decode_command,
-    CLOSE: _decode_close,
-    _WAIT: _decode_wait,
-    UNKNOWN: _decode_unknown,
-    ALIVE: _decode_alive,
-    MISSING: _decode_missing,
+_MESSAGES: Final[dict[int, tuple[Callable[..., Any], Callable[..., bytes], Callable[..., Any]]]] = {
+    HELLO: (Hello, _encode_hello, _decode_hello),
+    _WELCOME: (Welcome, _encode_welcome, _decode_welcome),
+    REFUSE: (Refuse, _encode_reason, _decode_reason),
+    STATE: (State, _encode_state, _decode_state),
+    COMMAND: (Command, _encode_command, _decode_command),
+    CLOSE: (Close, _encode_reason, _decode_reason),
+    _WAIT: (Wait, _encode_nothing, _decode_nothing),
+    UNKNOWN: (Unknown, _encode_nothing, _decode_nothing),
+    ALIVE: (Alive, _encode_nothing, _decode_nothing),
+    MISSING: (Missing, _encode_missing, _decode_missing),
 }
 
-_STARTS: Final = {kind: (_start(kind), zlib.crc32(_start(kind))) for kind in _DECODERS}
-"""First four bytes of a message, and their CRC-32."""
+_STARTS: Final = {kind: MAGIC + bytes((VERSION, kind)) for kind in _MESSAGES}
+"""First four bytes of a message. The CRC-32 goes on from theirs."""
+
+_ENCODERS: Final = {
+    message: (_STARTS[kind], zlib.crc32(_STARTS[kind]), encoder, message in _LAID_OUT)
+    for kind, (message, encoder, _) in _MESSAGES.items()
+}
+
+_DUE: Final = {
+    kind: (_STARTS[kind], zlib.crc32(_STARTS[kind]), _MESSAGES[kind][2])
+    for kind in (STATE, COMMAND)
+}

@@ -179,17 +179,13 @@ class Client:
     """Says Hello, then exchanges States for Commands.
 
     Args:
-        hello: Hello to send: the spec and the number of worlds.
-        layout: That of the Hello.
-        config: Times of the exchange.
+        hello: Hello to send, and the layout of its spec.
         largest: Bytes of the largest datagram, a seal not counted.
         by_text: Speak text instead of binary.
         key: Shared with the agent. Then nothing unsealed is taken.
-        tap: Sees every message once.
         draw_session: Gives the number of the next session.
 
     Attributes:
-        state: See `transitions`.
         sequence: Number of the State sent last: they count from 1.
         sends: How often the outstanding message was sent.
     """
@@ -251,10 +247,9 @@ class Client:
         telemetry: tuple[np.ndarray, ...],
         now: float,
     ) -> State:
-        """Send the next State: see `messages.State`. Returns it.
+        """Send the next State, and return it: see `messages.State`.
 
-        Raises:
-            InputError: An array is not that of the layout, or not finite; nothing was sent.
+        Raises `InputError` for an array that is not of the layout, or not finite; nothing was sent.
         """
         if self.state is not SimulatorState.READY:
             raise ValueError(f"send_state: expected state ready, got {self.state.value}")
@@ -279,10 +274,8 @@ class Client:
         """
         if self._text or self.state is not SimulatorState.READY or not self.sequence:
             return []
-        return self._sealed(
-            [binary.encode(Alive(session=self.hello.session, sequence=self.sequence))],
-            self._session_key,
-        )
+        alive = binary.encode(Alive(session=self.hello.session, sequence=self.sequence))
+        return [self._session_key.seal(alive) if self._session_key else alive]
 
     def close(self, reason: str, now: float) -> None:
         """End the exchange. An agent that has welcomed this simulator is told, until it answers."""
@@ -320,18 +313,19 @@ class Client:
                     plain = whole
                 message = binary.decode(plain, self.layout)
         except DecodeError as error:
-            self._drop_undecoded(error, datagram, now)
+            cause, reason = "forged" if isinstance(error, Forged) else "malformed", str(error)
+            if self._key is None and is_sealed(datagram):
+                cause = "forged"
+                reason = "key: the agent has one, this simulator has none (--key-file)"
+            self._drop(cause, reason, now)
             return None
         if message.session != self.hello.session:
             self._drop("foreign", f"session {message.session:016x}", now)
             return None
         state = SIMULATOR.get((self.state, Way.RECEIVED, type(message)))
+        number = getattr(message, "sequence", self.sequence)
         # There is one Close in a session, so its number does not matter.
-        is_current = (
-            isinstance(message, Close)
-            or getattr(message, "sequence", self.sequence) == self.sequence
-        )
-        if state is None or not is_current:
+        if state is None or (number != self.sequence and not isinstance(message, Close)):
             if isinstance(message, Command) and self.sequence - message.sequence <= 1:
                 self._round_trips.answered_again()
             self._drop("stale", "", now)
@@ -392,19 +386,18 @@ class Client:
             self._round_trips.answered(now)
             return message
         was_closing = self.state is SimulatorState.CLOSING
-        if isinstance(message, Missing):
+        if isinstance(message, Missing | Wait | Alive):  # the agent is there: this is no silence
             self._deadline = now + self._config.timeout
-            self._resend_missing(message, now)
-            return None
-        if isinstance(message, Alive):  # others are late
-            self._round_trips.answered(now, alive=True)
-            self._progress(now)
-            self._deadline = now + self._config.timeout
-            self._alives += 1
-            self._resend_at = now + self._round_trips.wait(1) * _LATER**self._alives
-            return None
-        if isinstance(message, Wait):
-            self._wait_for_slot(now)
+            if isinstance(message, Missing):
+                self._resend_missing(message, now)
+            elif isinstance(message, Alive):  # others are late
+                self._round_trips.answered(now, alive=True)
+                self._progress(now)
+                self._alives += 1
+                self._resend_at = now + self._round_trips.wait(1) * _LATER**self._alives
+            elif not self._is_queued:
+                self._is_queued = True
+                self.statistics.notice("every slot of the agent is taken; waiting for a free one")
             return None
         if isinstance(message, Welcome) and (reason := self._unfit(message)):
             self._drop("malformed", reason, now)
@@ -421,7 +414,11 @@ class Client:
             if self._key:
                 self._session_key = self._key.for_session(message.session, message.nonce)
         elif isinstance(message, Close) and not was_closing:
-            self._answer_close()
+            close = Close(session=message.session, sequence=self.sequence, reason="")
+            data = self._encode(close)
+            self._put([data], self._session_key)
+            self.statistics.counters["sent"] += 1
+            self._record(close, data)
         assert isinstance(message, Welcome | Refuse | Close)
         return message
 
@@ -482,13 +479,6 @@ class Client:
         unknown = [e.number for e in welcome.extensions if e.critical]
         return f"Welcome: expected no critical extension {unknown[0]}" if unknown else ""
 
-    def _wait_for_slot(self, now: float) -> None:
-        """The agent is there: as long as it says so, this is no silence."""
-        self._deadline = now + self._config.timeout
-        if not self._is_queued:
-            self._is_queued = True
-            self.statistics.notice("every slot of the agent is taken; waiting for a free one")
-
     def _begin_again(self, now: float) -> None:
         """Say Hello to an agent that knows nothing of the session."""
         self.statistics.notice(
@@ -498,13 +488,6 @@ class Client:
         self.sequence, self._session_key, self._is_queued = 0, None, False
         self._assembler = Assembler(self.layout.command_size)
         self._send(self.hello, now)
-
-    def _answer_close(self) -> None:
-        close = Close(session=self.hello.session, sequence=self.sequence, reason="")
-        data = self._encode(close)
-        self._put([data], self._session_key)
-        self.statistics.counters["sent"] += 1
-        self._record(close, data)
 
     # ---- what is sent
 
@@ -530,14 +513,10 @@ class Client:
         self.statistics.counters["sent"] += 1
 
     def _put(self, datagrams: list[bytes], key: Key | None) -> None:
-        sealed = self._sealed(datagrams, key) if key else datagrams
+        sealed = [key.seal(datagram) for datagram in datagrams] if key else datagrams
         self._outgoing += sealed
         if sealed:
             self._asking = sealed[-1]
-
-    @staticmethod
-    def _sealed(datagrams: list[bytes], key: Key | None) -> list[bytes]:
-        return [key.seal(datagram) for datagram in datagrams] if key else datagrams
 
     def _encode(self, message: Hello | State | Close) -> bytes:
         if self._text and isinstance(message, State | Close):
@@ -550,11 +529,6 @@ class Client:
 
     def _end(self) -> None:
         self.state, self._transfer = SimulatorState.CLOSED, None
-
-    def _drop_undecoded(self, error: DecodeError, datagram: bytes, now: float) -> None:
-        if self._key is None and is_sealed(datagram):
-            error = Forged("key: the agent has one, this simulator has none (--key-file)")
-        self._drop("forged" if isinstance(error, Forged) else "malformed", str(error), now)
 
     def _drop(self, cause: str, reason: str, now: float) -> None:
         self.statistics.drop(cause, f"from the agent: {reason}", now)

@@ -21,17 +21,7 @@ from .errors import DecodeError
 from .layout import MAX_MESSAGE
 from .messages import Missing
 
-__all__ = [
-    "FAR",
-    "MAX_FRAGMENTS",
-    "NEAR",
-    "Assembler",
-    "Transfer",
-    "Window",
-    "asks",
-    "is_first",
-    "is_fragment",
-]
+__all__ = ["FAR", "NEAR", "Assembler", "Transfer", "Window", "asks", "is_fragment"]
 
 NEAR: Final = 65_507 - 24
 """Largest datagram of the binary codec on loopback, bytes: UDP's over IPv4, less a seal."""
@@ -67,25 +57,15 @@ class Window:
 
 
 class Transfer:
-    """One message on its way: in one datagram, or in fragments.
+    """One message on its way, or a line of text: in one datagram, or in fragments.
 
     Args:
-        message: The bytes of a message of the binary codec, or a line of text.
+        message: Its bytes.
         largest: Bytes of the largest datagram, a seal not counted.
         window: Size of the bursts, of this side and peer.
     """
 
-    __slots__ = (
-        "_burst",
-        "_crc",
-        "_next",
-        "_numbers",
-        "_slice",
-        "_start",
-        "_window",
-        "count",
-        "message",
-    )
+    __slots__ = ("_burst", "_crc", "_next", "_slice", "_start", "_window", "count", "message")
 
     def __init__(self, message: bytes, largest: int, window: Window) -> None:
         self.message = message
@@ -95,8 +75,7 @@ class Transfer:
             self._slice = ceil(len(message) / self.count)
             self.count = ceil(len(message) / self._slice)  # fewer, where rounding made empty ones
             self._start = message[:3] + bytes((message[3] | binary.FRAGMENT,))
-            self._numbers = message[8:HEADER_SIZE]
-            self._crc = crc32(self._numbers, crc32(self._start))
+            self._crc = crc32(message[8:HEADER_SIZE], crc32(self._start))
         self._window = window
         self._burst: list[int] = []
         self._next = 0  # no fragment from this one on was sent
@@ -138,17 +117,12 @@ class Transfer:
         head = _FRAGMENT.pack(number, self.count, asks)
         slice_ = self.message[at : at + self._slice]
         crc = crc32(slice_, crc32(head, self._crc)).to_bytes(4, "little")
-        return b"".join((self._start, crc, self._numbers, head, slice_))
+        return b"".join((self._start, crc, self.message[8:HEADER_SIZE], head, slice_))
 
 
 def is_fragment(datagram: bytes) -> bool:
     """Whether a datagram, not sealed, says of itself that it is a fragment."""
     return len(datagram) > 3 and datagram[3] >= binary.FRAGMENT
-
-
-def is_first(datagram: bytes) -> bool:
-    """Whether a datagram, not sealed, is a whole message or the first fragment of one."""
-    return not is_fragment(datagram) or datagram[HEADER_SIZE : HEADER_SIZE + 2] == b"\0\0"
 
 
 def asks(datagram: bytes) -> bool:
@@ -212,13 +186,10 @@ class Assembler:
         span = min(self._count - first, 8 * _LARGEST_BITMAP)
         lacking = np.array([first + i not in self._slices for i in range(span)])
         kind, session, sequence = self._header
+        bitmap = np.packbits(lacking, bitorder="little").tobytes()
+        count = self._count
         return Missing(
-            session=session,
-            sequence=sequence,
-            kind=kind,
-            count=self._count,
-            first=first,
-            bitmap=np.packbits(lacking, bitorder="little").tobytes(),
+            session=session, sequence=sequence, kind=kind, count=count, first=first, bitmap=bitmap
         )
 
     def _begin(self, header: tuple[int, int, int], count: int) -> None:

@@ -8,8 +8,7 @@ import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -42,14 +41,8 @@ class ArrayLayout:
         if self.dtype not in _LETTERS:
             raise InputError(f"dtype: expected one of {', '.join(_LETTERS)}, got {self.dtype!r}")
 
-    @property
-    def size(self) -> int:
-        """Number of elements."""
-        return math.prod(self.shape)
 
-
-@dataclass(frozen=True, kw_only=True)
-class Slot:
+class Slot(NamedTuple):
     """An array of all drones, at its place in a message."""
 
     at: int
@@ -66,139 +59,93 @@ class Slot:
         return np.ndarray(self.shape, self.dtype, data, self.at)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Layout:
     """Layout of the messages of one simulator.
+
+    Args:
+        drones: N, of all worlds together.
+        observation: Of one drone.
+        action: None if actions are discrete.
+        choices: Discrete actions are 0 ... choices - 1; 0 if actions are an array.
+        telemetry: Shape of each telemetry array of one drone.
+
+    Attributes:
+        observation_slots: Of each observation array in a State.
+        rewards: float64, shape (N,).
+        flags: terminated and truncated, bool, shape (N,).
+        telemetry_slots: Of each telemetry array in a State, float64.
+        state_slots: Every array of a State in its order: shape, dtype, first byte, and the zeros
+            before. Plain tuples, for they are looked at in each message.
+        state_floats: Slots of those that have to be finite.
+        state_numbers: Reads every float of a State after its header, for a quick look at whether
+            all are finite. None where there are so many that NumPy is faster.
+        actions: Of the actions in a Command: (N, *shape), or int64 of shape (N,) if discrete.
+        orders: uint8, shape (N,).
+        seeds: uint64, shape (N,), in a Command that has any; others end before.
+        command_numbers: Reads every float of a Command, as `state_numbers`.
+        state_size, command_size: Bytes of a State, and of a Command with seeds.
 
     Raises:
         InputError: The drones are too many, or a message would be larger than `MAX_MESSAGE`.
     """
 
-    drones: int
-    """N, of all worlds together."""
-    observation: tuple[ArrayLayout, ...]
-    action: ArrayLayout | None
-    """None if actions are discrete."""
-    choices: int = 0
-    """Discrete actions are 0 ... choices - 1; 0 if actions are an array."""
-    telemetry: tuple[tuple[int, ...], ...] = ()
-    """Shape of each telemetry array."""
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.drones <= MAX_DRONES:
-            raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {self.drones}")
-        if (self.action is None) != (self.choices >= 1):
+    def __init__(
+        self,
+        *,
+        drones: int,
+        observation: tuple[ArrayLayout, ...],
+        action: ArrayLayout | None,
+        choices: int = 0,
+        telemetry: tuple[tuple[int, ...], ...] = (),
+    ) -> None:
+        if not 1 <= drones <= MAX_DRONES:
+            raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {drones}")
+        if (action is None) != (choices >= 1):
             raise InputError("action: expected an array or a number of choices, not both")
-        size = max(self.state_size, self.command_size)
-        if size > MAX_MESSAGE:
+        self.drones, self.observation, self.action = drones, observation, action
+        self.choices, self.telemetry = choices, telemetry
+
+        arrays = [*((array.shape, array.dtype) for array in observation), ((), "float64")]
+        *slots, self.rewards = _slots(STATE_ARRAYS_AT, drones, arrays)
+        at, end, flag = self.rewards.end, self.rewards.end + drones, np.dtype(bool)
+        self.flags = Slot(at, end, (drones,), flag), Slot(end, end + drones, (drones,), flag)
+        told = _slots(end + drones, drones, [(shape, "float64") for shape in telemetry])
+        self.observation_slots, self.telemetry_slots = tuple(slots), tuple(told)
+        slots += [self.rewards, *self.flags, *told]
+        ends = [STATE_ARRAYS_AT, *(slot.end for slot in slots)]
+        self.state_slots = tuple(
+            (slot.shape, slot.dtype, slot.at, bytes(slot.at - end))
+            for slot, end in zip(slots, ends, strict=False)
+        )
+        self.state_size = ends[-1]
+        self.state_floats = [slot for slot in slots if slot.dtype.kind == "f"]
+        self.state_numbers = _numbers("d8x", STATE_ARRAYS_AT, self.state_floats)
+
+        actions = (action.shape, action.dtype) if action else ((), "int64")
+        self.actions, self.orders, self.seeds = _slots(
+            COMMAND_ARRAYS_AT, drones, [actions, ((), "uint8"), ((), "uint64")]
+        )
+        self.command_size = self.seeds.end
+        self.command_numbers = _numbers("", COMMAND_ARRAYS_AT, [self.actions] if action else [])
+        if (size := max(self.state_size, self.command_size)) > MAX_MESSAGE:
             raise InputError(
                 f"expected States and Commands of at most {MAX_MESSAGE} bytes, got {size}"
             )
 
-    # ---- State
 
-    @cached_property
-    def observation_slots(self) -> tuple[Slot, ...]:
-        """Of each observation array in a State."""
-        return self._slots(STATE_ARRAYS_AT, [(a.shape, a.dtype) for a in self.observation])
-
-    @cached_property
-    def rewards(self) -> Slot:
-        """float64, shape (N,)."""
-        (slot,) = self._slots(self.observation_slots[-1].end, [((), "float64")])
-        return slot
-
-    @cached_property
-    def flags(self) -> tuple[Slot, Slot]:
-        """terminated and truncated, bool, shape (N,)."""
-        at, count = self.rewards.end, self.drones
-        flag = np.dtype(bool)
-        return (
-            Slot(at=at, end=at + count, shape=(count,), dtype=flag),
-            Slot(at=at + count, end=at + 2 * count, shape=(count,), dtype=flag),
-        )
-
-    @cached_property
-    def telemetry_slots(self) -> tuple[Slot, ...]:
-        """Of each telemetry array in a State, float64."""
-        return self._slots(self.flags[1].end, [(shape, "float64") for shape in self.telemetry])
-
-    @cached_property
-    def state_slots(self) -> tuple[tuple[tuple[int, ...], np.dtype, int, bytes], ...]:
-        """Of every array of a State in its order: shape, dtype, first byte, and the zeros before.
-
-        Plain tuples, for they are looked at in each message.
-        """
-        slots = (*self.observation_slots, self.rewards, *self.flags, *self.telemetry_slots)
-        ends = (STATE_ARRAYS_AT, *(slot.end for slot in slots))
-        return tuple(
-            (slot.shape, slot.dtype, slot.at, bytes(slot.at - end))
-            for slot, end in zip(slots, ends, strict=False)
-        )
-
-    @cached_property
-    def state_size(self) -> int:
-        """Bytes of a State."""
-        return (self.telemetry_slots or self.flags)[-1].end
-
-    @cached_property
-    def state_numbers(self) -> struct.Struct | None:
-        """Every float of a State after its header, for a quick look at whether all are finite.
-
-        None where there are so many that NumPy is faster.
-        """
-        slots = [*self.observation_slots, self.rewards, *self.telemetry_slots]
-        return _floats(24, "d8x", STATE_ARRAYS_AT, slots)
-
-    # ---- Command
-
-    @cached_property
-    def actions(self) -> Slot:
-        """Of the actions in a Command: (N, *shape), or int64 of shape (N,) if discrete."""
-        array = self.action or ArrayLayout(shape=(), dtype="int64")
-        (slot,) = self._slots(COMMAND_ARRAYS_AT, [(array.shape, array.dtype)])
-        return slot
-
-    @cached_property
-    def orders(self) -> Slot:
-        """Of the orders in a Command, uint8, shape (N,)."""
-        (slot,) = self._slots(self.actions.end, [((), "uint8")])
-        return slot
-
-    @cached_property
-    def seeds(self) -> Slot:
-        """Of the seeds in a Command that has any, uint64, shape (N,)."""
-        at = _aligned(self.orders.end)
-        end = at + 8 * self.drones
-        return Slot(at=at, end=end, shape=(self.drones,), dtype=np.dtype("<u8"))
-
-    @property
-    def command_size(self) -> int:
-        """Bytes of a Command with seeds. Without seeds it ends with the orders."""
-        return self.seeds.end
-
-    @cached_property
-    def command_numbers(self) -> struct.Struct | None:
-        """Every float of a Command, as `state_numbers`."""
-        return _floats(COMMAND_ARRAYS_AT, "", COMMAND_ARRAYS_AT, [self.actions])
-
-    def _slots(self, at: int, arrays: Sequence[tuple[tuple[int, ...], str]]) -> tuple[Slot, ...]:
-        slots = []
-        for shape, name in arrays:
-            at = _aligned(at)
-            dtype = np.dtype("<" + np.dtype(name).str[1:])  # NumPy's own object: quick to compare
-            end = at + self.drones * math.prod(shape) * dtype.itemsize
-            slots.append(Slot(at=at, end=end, shape=(self.drones, *shape), dtype=dtype))
-            at = end
-        return tuple(slots)
+def _slots(at: int, drones: int, arrays: Sequence[tuple[tuple[int, ...], str]]) -> list[Slot]:
+    slots = []
+    for shape, name in arrays:
+        at = -(-at // 8) * 8
+        dtype = np.dtype("<" + np.dtype(name).str[1:])  # NumPy's own object: quick to compare
+        end = at + drones * math.prod(shape) * dtype.itemsize
+        slots.append(Slot(at, end, (drones, *shape), dtype))
+        at = end
+    return slots
 
 
-def _aligned(at: int) -> int:
-    return -(-at // 8) * 8
-
-
-def _floats(start: int, fixed: str, at: int, slots: list[Slot]) -> struct.Struct | None:
-    """Reads the floats of all slots, from byte `start` on; None if there are many."""
+def _numbers(fixed: str, at: int, slots: list[Slot]) -> struct.Struct | None:
+    """Reads the floats of all slots behind `fixed`, which ends at that byte; None if many."""
     form = "<" + fixed
     count = 0
     for slot in slots:

@@ -75,7 +75,6 @@ class Extension:
     """Something of a later version or of a user, in Hello or Welcome."""
 
     number: int
-    """0 to 32,767."""
     value: bytes
     critical: bool = False
     """Whether a side that does not know it must not go on."""
@@ -83,10 +82,8 @@ class Extension:
     def __post_init__(self) -> None:
         if not 0 <= self.number < 1 << 15:
             raise InputError(f"extension: expected a number 0 to 32767, got {self.number}")
-        if len(self.value) > MAX_TEXT:
-            raise InputError(
-                f"extension {self.number}: expected at most {MAX_TEXT} bytes, got {len(self.value)}"
-            )
+        if (size := len(self.value)) > MAX_TEXT:
+            raise InputError(f"extension: expected at most {MAX_TEXT} bytes, got {size}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -120,8 +117,7 @@ class Welcome:
 
     session: int
     nonce: int
-    """Random 64-bit number, new for every session. State 1 echoes it; it enters the session's
-    key."""
+    """Random 64-bit number, new for every session: State 1 echoes it, the session's key has it."""
     version: int = 2
     """Version of all that follows."""
     seed: int | None = None
@@ -179,13 +175,22 @@ class Missing:
     sequence: int
     """Number of the message; 0 for a Hello."""
     kind: int
-    """Type of the message: Hello, State or Command."""
+    """Type of the message in the binary codec: 1 Hello, 4 State, 5 Command."""
     count: int
     """Number of its fragments."""
     first: int
     """Number of the fragment that the first bit stands for."""
     bitmap: bytes
     """Bit i of byte j (bit 0 is the lowest) is set if fragment first + 8 j + i is missing."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in (1, 4, 5):
+            raise InputError(f"expected a Hello, State or Command, got type {self.kind}")
+        size, count = len(self.bitmap), self.count
+        if not size or self.first >= count or self.first + 8 * (size - 1) >= count:
+            raise InputError(f"expected a bitmap of {count} fragments, got {size} bytes")
+        if (numbers := self.numbers()) and numbers[-1] >= count:
+            raise InputError(f"expected fragments below {count}, got {numbers[-1]}")
 
     def numbers(self) -> list[int]:
         """Numbers of the fragments that are missing, in their order."""
@@ -240,14 +245,12 @@ class Command:
     @property
     def resets(self) -> np.ndarray:
         """bool, shape (N,): reset instead of flown."""
-        mask: np.ndarray = self.orders == RESET
-        return mask
+        return np.asarray(self.orders == RESET)
 
     @property
     def frozen(self) -> np.ndarray:
         """bool, shape (N,): neither reset nor flown."""
-        mask: np.ndarray = self.orders == FREEZE
-        return mask
+        return np.asarray(self.orders == FREEZE)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -78,8 +78,7 @@ class Session:
     number: int
     """Session number; 0 with the text codec."""
     layout: Layout
-    hello: Hello | None
-    """None if it speaks text."""
+    hello: Hello | None  # none if it speaks text
     state: AgentState = AgentState.NEW
     sequence: int = 0
     """Number of the State that came last."""
@@ -94,14 +93,13 @@ class Session:
     """Bytes of the largest datagram to it, a seal not counted; 0 before the first message."""
     due: bytes = b""
     """Bytes 8 to 23 of the State that is expected; empty where it is sealed, or a line of text."""
-    asked_at: float | None = None
+    asked_at: float = 0.0
     """When the Command was sent whose State is expected."""
     heard_at: float = 0.0
     """When it last said that it lives, or brought a fragment that was missing."""
     room: int = 0
     """Bytes that a Refuse may have, while it waits for a slot."""
-    last: bytes = b""
-    """The last line, by text."""
+    last: bytes = b""  # line, by text
 
     @property
     def is_text(self) -> bool:
@@ -131,8 +129,6 @@ class Server:
             gives the layout to read it by. None, or a result of None: text is not flown.
         slots: Simulators to fly at the same time. Others wait until a slot is free.
         keys: Shared with the simulators, any of them. Then nothing unsealed is taken.
-        max_datagram: As `LinkConfig.max_datagram`.
-        tap: Sees every message once.
         draw_nonce: Gives a random 64-bit number for each Welcome.
 
     Attributes:
@@ -191,16 +187,8 @@ class Server:
         datagram, address, _ = arrival
         try:
             if text.is_text(datagram):
-                layout = None if self._keys else self._text_layout()
-                if layout is not None:
-                    return self._receive_text(slot, session, layout, arrival)
-                self._turn_text_away(arrival)
-                return None
-            plain, key = (
-                (datagram, None)
-                if not (self._keys or is_sealed(datagram))
-                else self._open(arrival, session)
-            )
+                return self._receive_text(slot, session, arrival)
+            plain, key = self._open(arrival, session)
             kind, number, _ = binary.peek(plain)
             holder = session
             if session is None or session.number != number or session.is_text:
@@ -239,23 +227,19 @@ class Server:
     ) -> None:
         """Answer the last State of a slot: see `messages.Command`.
 
-        Raises:
-            InputError: An array is not that of the layout, or not finite; nothing was sent.
+        Raises `InputError` for an array that is not of the layout, or not finite; nothing was sent.
         """
         session = self.slots[slot]
         if session is None or session.state is not AgentState.DECIDING:
             got = session.state.value if session else "a free slot"
             raise ValueError(f"send_command: expected a session that is deciding, got {got}")
+        number, sequence = session.number, session.sequence
         command = Command(
-            session=session.number,
-            sequence=session.sequence,
-            actions=actions,
-            orders=orders,
-            seeds=seeds,
+            session=number, sequence=sequence, actions=actions, orders=orders, seeds=seeds
         )
         self._answer(slot, session, command)
         if session.key is None and not session.is_text:
-            session.due = binary.numbers_of(session.number, session.sequence + 1)
+            session.due = binary.numbers_of(number, sequence + 1)
         session.asked_at = session.heard_at = now
 
     def free(self, slot: int) -> None:
@@ -288,8 +272,7 @@ class Server:
 
     def handle_timer(self, now: float) -> None:
         """Repeat what is due: a Close that nobody has answered, until nobody will."""
-        timer = self.next_timer()
-        if timer is None or now < timer:
+        if (timer := self.next_timer()) is None or now < timer:
             return
         for slot, session in enumerate(self.slots):
             if session and now >= self._deadline:
@@ -328,8 +311,10 @@ class Server:
                 return self._take_state(slot, session, message, plain, arrival.now)
             case Alive():
                 session.heard_at = arrival.now
+            case Missing() if session.reply and message.kind == binary.COMMAND:
+                self._put(session.reply.resend(message), session.peer, session.key, "resent")
             case Missing():
-                self._resend(session, message, arrival)
+                self._drop("stale", "", arrival)
             case Close():
                 self._record(slot, message, plain, session)
                 if session.state is not AgentState.CLOSING:
@@ -340,14 +325,6 @@ class Server:
                 self.free(slot)
                 return Event(slot, message)
         return None
-
-    def _resend(self, session: Session, missing: Missing, arrival: _Arrival) -> None:
-        """Send the fragments of the last Command that did not arrive."""
-        if session.reply is None or missing.kind != binary.COMMAND:
-            self._drop("stale", "", arrival)
-            return
-        self._put(session.reply.resend(missing), session.peer, session.key)
-        self.statistics.counters["resent"] += 1
 
     # ---- a simulator that comes
 
@@ -385,13 +362,11 @@ class Server:
         opening.move(Way.SENT, Welcome)
         opening.reply = self._transfer(binary.encode(welcome), opening)
         self._put(opening.reply.start(), address, key)
-        self.statistics.counters["sent"] += 1
         _keep(self._openings, (address, hello.session), opening)
 
     def _let_wait(self, session: Session, size: int) -> None:
         wait = binary.encode(Wait(session=session.number))
         self._put([wait], session.peer, session.key)
-        self.statistics.counters["sent"] += 1
         session.move(Way.SENT, Wait)
         session.room = size - len(wait)
         _keep(self._queue, session.peer, session)
@@ -401,8 +376,7 @@ class Server:
     ) -> Event:
         """The next State of a slot."""
         session.sequence, session.state = state.sequence, _AFTER_STATE
-        if session.asked_at is not None:
-            self.statistics.round_trips.add(now - session.asked_at)
+        self.statistics.round_trips.add(now - session.asked_at)
         if self._tap:
             self._record(slot, state, plain, session)
         return Event(slot, state)
@@ -419,13 +393,18 @@ class Server:
             self._forget(opening)
             self._disown(plain, arrival)
             return None
-        self._forget_until(opening)
+        for key, other in list(self._openings.items()):
+            # It, and what the same address began before it. Later ones stay: if this State came
+            # late, their Hello may still be repeated.
+            if key[0] == opening.peer:
+                self._forget(other)
+            if other is opening:
+                break
         layout = self._fit(opening.hello)  # another one may have come since its Hello
         if isinstance(layout, str):
             words = _cut(layout, len(plain) - _REASON_AT)
             close = Close(session=opening.number, sequence=1, reason=words)
             self._put([binary.encode(close)], opening.peer, self._session_key(opening))
-            self.statistics.counters["sent"] += 1
             opening.move(Way.SENT, Close)
             self._drop("refused", layout, arrival)
             return None
@@ -480,8 +459,7 @@ class Server:
             if key is None:
                 return
             reply = key.seal(reply, datagram)
-        self._outgoing.append((reply, address))
-        self.statistics.counters["sent"] += 1
+        self._put([reply], address, None)
 
     def _seated(self, number: int, elsewhere: Address | None = None) -> bool:
         """Whether a session of that number has a slot (not of this address)."""
@@ -491,23 +469,21 @@ class Server:
         del self._openings[opening.peer, opening.number]
         self._assembling.pop((opening.peer, opening.number), None)
 
-    def _forget_until(self, opening: Session) -> None:
-        """Forget the opening of a State 1, and what the same address began before it.
-
-        Keep later openings: if this State came late, their Hello may still be repeated.
-        """
-        for key, other in list(self._openings.items()):
-            if key[0] == opening.peer:
-                self._forget(other)
-                if other is opening:
-                    return
-
     # ---- text
 
-    def _receive_text(
-        self, slot: int, session: Session | None, layout: Layout, arrival: _Arrival
-    ) -> Event | None:
+    def _receive_text(self, slot: int, session: Session | None, arrival: _Arrival) -> Event | None:
         datagram, address, now = arrival
+        layout = None if self._keys else self._text_layout()
+        if layout is None:
+            sequence, fields = text.split(datagram)
+            cause, reason = "refused", "text is not flown here"
+            if self._keys:
+                cause, reason = "forged", "key: this agent has one (--key-file), text has none"
+            if fields == ["close"]:  # two agents would answer each other's Closes for ever
+                self._drop(cause, reason, arrival)
+            else:
+                self._turn_text_away(sequence, cause, reason, arrival)
+            return None
         message = text.decode_state(datagram, layout)
         if session and session.is_text:
             event = self._receive_known(slot, session, message, b"", arrival)
@@ -530,36 +506,26 @@ class Server:
         else:
             joining = Session(address, 0, layout, None, last=datagram)
             return self._seat(joining, message, b"")
-        line = text.encode(Close(session=0, sequence=message.sequence, reason=""))
-        self._put([line], address, None)
-        self.statistics.counters["sent"] += 1
-        self._drop("refused", reason, arrival)
+        self._turn_text_away(message.sequence, "refused", reason, arrival)
         return None
 
-    def _turn_text_away(self, arrival: _Arrival) -> None:
-        """Answer a line where no text is flown. Raises `DecodeError`."""
-        sequence, fields = text.split(arrival.datagram)
+    def _turn_text_away(self, sequence: int, cause: str, reason: str, arrival: _Arrival) -> None:
+        """Answer a line that is not flown, with no more bytes than it has."""
         line = text.encode(Close(session=0, sequence=sequence, reason=""))
-        if fields != ["close"] and len(line) <= len(arrival.datagram):
-            # Else two agents would answer each other's Closes for ever.
+        if len(line) <= len(arrival.datagram):
             self._put([line], arrival.address, None)
-            self.statistics.counters["sent"] += 1
-        if self._keys:
-            self._drop("forged", "key: this agent has one (--key-file), text has none", arrival)
-        else:
-            self._drop("refused", "text is not flown here", arrival)
+        self._drop(cause, reason, arrival)
 
     # ---- from a datagram to a message
 
     def _open(self, arrival: _Arrival, session: Session | None) -> tuple[bytes, Key | None]:
         """A binary datagram without its seal, and the shared key that it was sealed with.
 
-        Raises:
-            KeyMismatch: One side has a key, the other has none, or another.
-            Forged: The seal is not of that key.
-        NoSuchSession: No session of that address and number has a key here.
+        Raises `KeyMismatch`, `Forged`, or `NoSuchSession` where it has no key here.
         """
         datagram, address, _ = arrival
+        if not (self._keys or is_sealed(datagram)):
+            return datagram, None
         if not self._keys:
             raise KeyMismatch("key: this agent has none (--key-file), and the simulator has")
         if not is_sealed(datagram):
@@ -614,8 +580,7 @@ class Server:
             assembler = self._assembler((holder.peer, number), holder.layout.state_size)
             key = self._session_key(holder)
         else:
-            if holder.assembler is None:
-                holder.assembler = Assembler(holder.layout.state_size)
+            holder.assembler = holder.assembler or Assembler(holder.layout.state_size)
             assembler, key = holder.assembler, holder.key
             holder.heard_at = arrival.now
         whole = assembler.take(fragment)
@@ -648,8 +613,7 @@ class Server:
             trusted = under_seal and not isinstance(error, KeyMismatch)
             key = self._keys.get(key_id(datagram)) if trusted else None
             self._refuse(number, str(error), address, size, key)
-        cause = "forged" if isinstance(error, Forged) else "malformed"
-        self._drop(cause, str(error), arrival)
+        self._drop("forged" if isinstance(error, Forged) else "malformed", str(error), arrival)
 
     # ---- what is sent
 
@@ -664,13 +628,11 @@ class Server:
             self._record(slot, message, data, session)
         session.reply = reply = self._transfer(data, session)
         self._put(reply.start(), session.peer, session.key)
-        self.statistics.counters["sent"] += 1
 
     def _repeat(self, session: Session) -> None:
         """Send the last answer again, the same bytes."""
         assert session.reply is not None
-        self._put(session.reply.start(), session.peer, session.key)
-        self.statistics.counters["resent"] += 1
+        self._put(session.reply.start(), session.peer, session.key, "resent")
 
     def _answer_again(self, session: Session) -> None:
         """Answer a State that came again: with Alive, while its Command is not there yet."""
@@ -689,16 +651,18 @@ class Server:
         if room >= 0:
             refuse = Refuse(session=number, reason=_cut(reason, room))
             self._put([binary.encode(refuse)], address, key)
-            self.statistics.counters["sent"] += 1
 
     def _transfer(self, data: bytes, session: Session) -> Transfer:
         if not session.largest:
             session.largest = largest_datagram(session.peer, self._max_datagram)
         return Transfer(data, session.largest, session.window)
 
-    def _put(self, datagrams: list[bytes], address: Address, key: Key | None) -> None:
+    def _put(
+        self, datagrams: list[bytes], address: Address, key: Key | None, count: str = "sent"
+    ) -> None:
         for datagram in datagrams:
             self._outgoing.append((key.seal(datagram) if key else datagram, address))
+        self.statistics.counters[count] += 1
 
     def _record(self, slot: int, message: Message, data: bytes, session: Session) -> None:
         if self._tap:

@@ -59,7 +59,8 @@ class Statistics:
         `malformed`, `forged`, `foreign`, `refused`, `duplicate`, `stale`."""
         self.round_trips = Durations()
         """From the first sending of a message to the answer that counts."""
-        self._last = ""
+        self.last_error = ""
+        """Why the last unexpected datagram was dropped; "" if none was."""
         self._notices: list[str] = []
         self._next_notice: dict[str, float] = {}
         self._unsaid: Counter[str] = Counter()
@@ -70,18 +71,13 @@ class Statistics:
         self.counters[cause] += 1
         if cause in _QUIET:
             return
-        self._last = f"{cause} {reason}"
+        self.last_error = one_line(f"{cause} {reason}")
         if now >= self._next_notice.get(cause, now):
             more = f" ({self._unsaid.pop(cause)} more before)" if self._unsaid[cause] else ""
             self._notices.append(f"dropped a datagram: {self.last_error}{more}")
             self._next_notice[cause] = now + NOTICE_INTERVAL
         else:
             self._unsaid[cause] += 1
-
-    @property
-    def last_error(self) -> str:
-        """Why the last unexpected datagram was dropped; "" if none was."""
-        return one_line(self._last)
 
     def notice(self, sentence: str) -> None:
         """Keep a notice for the log."""
@@ -98,12 +94,10 @@ class Statistics:
 
     def report_due(self, now: float) -> bool:
         """Whether a minute has passed since the last report, or since the first call."""
-        if self._next_report is None:
+        is_due = self._next_report is not None and now >= self._next_report
+        if is_due or self._next_report is None:
             self._next_report = now + REPORT_INTERVAL
-        if now < self._next_report:
-            return False
-        self._next_report = now + REPORT_INTERVAL
-        return True
+        return is_due
 
     def numbers(self) -> dict[str, float]:
         """All of it as numbers by name, round trips in milliseconds: for logs of training."""

@@ -8,6 +8,7 @@ is written as the float64 of the same value.
 """
 
 import re
+from itertools import islice
 from math import isfinite, prod
 from typing import Final
 
@@ -18,27 +19,17 @@ from .errors import DecodeError
 from .layout import Layout
 from .messages import FLY, MAX_UINT64, RESET, Close, Command, State
 
-__all__ = [
-    "MAX_LINE",
-    "check_layout",
-    "decode_command",
-    "decode_state",
-    "encode",
-    "is_text",
-    "split",
-]
+__all__ = ["check_layout", "decode_command", "decode_state", "encode", "is_text", "split"]
 
 MAX_LINE: Final = 1024
-_DIGITS: Final = frozenset(b"0123456789")
 _FLOAT: Final = "float32"
-_FLAGS: Final = {"0": False, "1": True}
 _WHOLE: Final = re.compile(r"0|[1-9][0-9]{0,19}")
 _NUMBER: Final = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 def is_text(datagram: bytes) -> bool:
     """Whether a datagram can be a text message: every one begins with a digit."""
-    return bool(datagram) and datagram[0] in _DIGITS
+    return datagram[:1].isdigit()
 
 
 def check_layout(layout: Layout) -> None:
@@ -72,10 +63,11 @@ def encode(message: State | Command | Close) -> bytes:
 
 def _state_fields(message: State) -> list[str]:
     flags = ["01"[message.terminated.item()], "01"[message.truncated.item()]]
-    arrays = (*message.observations, *message.telemetry)
+    arrays = (message.rewards, *message.observations, *message.telemetry)
     numbers = [number for array in arrays for number in array.ravel().tolist()]
-    _expect_finite([message.rewards.item(), *numbers])
-    return [repr(message.rewards.item()), *flags, *map(repr, numbers)]
+    _expect_finite(numbers)
+    reward, *others = map(repr, numbers)
+    return [reward, *flags, *others]
 
 
 def _command_fields(message: Command) -> list[str]:
@@ -108,8 +100,8 @@ def decode_state(datagram: bytes, layout: Layout) -> State | Close:
             f"state: expected {expected + 1} fields (sequence, reward, terminated, truncated, "
             f"{size} of observation, {sum(sizes)} of telemetry), got {len(fields) + 1}"
         )
-    ends = [3 + size + sum(sizes[:i]) for i in range(len(sizes) + 1)]
     try:
+        told = iter(_floats("telemetry", fields[3 + size :]))
         return State(
             session=0,
             sequence=sequence,
@@ -119,8 +111,8 @@ def decode_state(datagram: bytes, layout: Layout) -> State | Close:
             truncated=np.array([_flag("truncated", fields[2])]),
             observations=(_float32("observation", fields[3 : 3 + size]),),
             telemetry=tuple(
-                np.array(_floats("telemetry", fields[at : at + count])).reshape(slot.shape)
-                for slot, at, count in zip(telemetry, ends, sizes, strict=False)
+                np.array([*islice(told, count)]).reshape(slot.shape)
+                for slot, count in zip(telemetry, sizes, strict=True)
             ),
         )
     except ValueError as error:
@@ -185,9 +177,9 @@ def _whole(name: str, field: str) -> int:
 
 
 def _flag(name: str, field: str) -> bool:
-    if field not in _FLAGS:
+    if field not in ("0", "1"):
         raise InputError(f"{name}: expected 0 or 1, got {field[:80]!r}")
-    return _FLAGS[field]
+    return field == "1"
 
 
 def _floats(name: str, fields: list[str]) -> list[float]:

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypedDict
 
 import gymnasium as gym
 import numpy as np
@@ -33,7 +33,7 @@ from .sockets import LONGEST_WAIT, Port, address_text, log_notices
 if TYPE_CHECKING:
     from ..journal import Journal
 
-__all__ = ["Agent", "AgentConfig", "Order"]
+__all__ = ["Agent", "AgentConfig", "AgentSettings", "Order"]
 
 _log: Final = logging.getLogger("rotorgram.udp")
 _PAUSE: Final = 1.0
@@ -43,27 +43,46 @@ Order = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 """Actions, orders and seeds of the drones of one simulator: see `messages.Command`."""
 
 
+class AgentSettings(TypedDict, total=False):
+    """Settings of an env over UDP."""
+
+    env_id: str | None
+    """A simulator of another env is refused; None flies any."""
+    options: Mapping[str, Any] | None
+    """A simulator of other options is refused; None takes any. Those that are not here have their
+    defaults if the env is registered here, and any value otherwise."""
+    vehicle_hash: str | None
+    """A simulator of another vehicle is refused; None takes any."""
+    connect_timeout: float
+    """Longest wait for a simulator, s, the first or one that replaces another; 60."""
+    timeout: float
+    """Longest wait for an answer from it, s, before another may take its slot; 30. While it
+    computes, it says so."""
+    max_datagram: int | None
+    """Largest datagram, bytes, a seal not counted. None: 65,483 on loopback, 1,200 elsewhere."""
+    key_file: Path | str | None
+    """File with the key that the simulators have too (`rotorgram key`). With it any address is
+    allowed, because only holders of the key can take part."""
+    insecure: bool
+    """Allow an address that is not loopback without a key."""
+    record: Path | str | None
+    """MCAP file to write every message to; it must not exist."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig:
-    """Settings of an agent: keys and sizes, accepted simulators, and times."""
+    """The settings, their defaults, and the size of the fleet."""
 
     env_id: str | None = None
-    """A simulator of another env is refused; None flies any."""
     options: Mapping[str, Any] | None = None
-    """A simulator of other options is refused; None takes any. Those that are not here have their
-    defaults if the env is known here, and any value otherwise."""
     vehicle_hash: str | None = None
-    """A simulator of another vehicle is refused; None takes any."""
     worlds: int | None = None
     """Worlds of each simulator; None: as many as the first has."""
     slots: int = 1
     """Simulators to fly at the same time."""
     connect_timeout: float = 60.0
-    """Longest wait for a simulator to take a slot that is free, s."""
     timeout: float = 30.0
-    """Longest wait for an answer from one that has a slot, s. Then its slot is free."""
     max_datagram: int | None = None
-    """As `LinkConfig.max_datagram`."""
     key_file: Path | str | None = None
     insecure: bool = False
     record: Path | str | None = None
@@ -96,7 +115,6 @@ class Agent:
     """Exchanges Commands for States with all simulators at the same time.
 
     Attributes:
-        server: The state machine.
         spec: Of the simulator that joined last; None before the first.
         states: The last State of each slot; None before the first.
         lost: For each slot why its simulator was lost during the last exchange; "" if it was not.
@@ -111,7 +129,14 @@ class Agent:
         self.spec: EnvSpec | None = None
         self._required = _Required(config)
         keys = read_keys(config.key_file) if config.key_file else ()
-        journal = self._journal = self._make_journal() if config.record else None
+        self._journal: Any = None
+        if config.record:
+            from ..journal import Journal
+
+            spec = self._required.text_spec()
+            hello = Hello(session=0, spec=spec.to_json()) if spec else None
+            self._journal = Journal(config.record, side="agent", text_hello=hello)
+        journal = self._journal
         self.server = Server(
             self._required.accept,
             self._required.text_layout,
@@ -156,13 +181,10 @@ class Agent:
         self.lost = [""] * len(self.lost)
 
     def exchange(self, orders: Mapping[int, Order]) -> None:
-        """Send each slot its Command, and wait for the States of all.
+        """Send each of these slots its Command, and wait for the States of all.
 
         A simulator that is lost meanwhile is replaced by another that comes; then `lost` says why
         and `states` has the first State of that one.
-
-        Args:
-            orders: By the number of the slot.
 
         Raises:
             InputError: The first order is not of the layout, or not finite; nothing was sent.
@@ -173,16 +195,6 @@ class Agent:
             self.server.send_command(slot, actions, what, seeds, now)
         self.lost = [""] * len(self.lost)
         self._gather()
-
-    def _make_journal(self) -> "Journal":
-        from ..journal import Journal
-
-        config = self.config
-        assert config.record is not None
-        hello = None
-        if spec := self._required.text_spec():
-            hello = Hello(session=0, spec=spec.to_json())
-        return Journal(config.record, side="agent", text_hello=hello)
 
     # ---- the exchange
 
@@ -249,13 +261,10 @@ class Agent:
         session = self.server.slots[slot]
         assert session is not None
         self._keep_sockets()
+        self.spec, self._required.worlds = self._required.text_spec(), 1
         if session.hello:
             self.server.takes_text = False
-            self.spec = _spec(session.hello.spec)
-            self._required.worlds = session.hello.worlds
-        else:
-            self.spec = self._required.text_spec()
-            self._required.worlds = 1
+            self.spec, self._required.worlds = _spec(session.hello.spec), session.hello.worlds
         self._required.spec = self.spec
         if self.states[slot] is not None and not self.lost[slot]:
             self._lose(slot, f"the simulator at {address_text(address)} was started anew")
@@ -268,19 +277,23 @@ class Agent:
                 continue
             session = self.server.slots[slot]
             if session is None:
-                raise PeerSilent(self._nobody_came(self.lost[slot]))
+                lost, dropped = self.lost[slot], self._last_dropped()
+                raise PeerSilent(
+                    f"{f'{lost}; no other' if lost else 'no simulator'} came to "
+                    f"{address_text(self.address)} for {self.config.connect_timeout:g} s"
+                    f"{'' if dropped in lost else dropped}"
+                )
             if now < session.heard_at + self.config.timeout:  # it lives, and computes
                 self._deadlines[slot] = session.heard_at + self.config.timeout
                 continue
             here, there = address_text(self.address), address_text(session.peer)
-            number = session.sequence + 1
+            reason = (
+                f"no datagram from the simulator at {there} for {self.config.timeout:g} s, "
+                f"waiting at {here} for State {session.sequence + 1}{self._last_dropped()}"
+            )
             self.server.free(slot)
             self._keep_sockets()
-            self._lose(
-                slot,
-                f"no datagram from the simulator at {there} for {self.config.timeout:g} s, "
-                f"waiting at {here} for State {number}{self._last_dropped()}",
-            )
+            self._lose(slot, reason)
             self._say_waiting(slot)
 
     def _keep_sockets(self) -> None:
@@ -294,14 +307,6 @@ class Agent:
         here, wait = address_text(self.address), self.config.connect_timeout
         long = f"{wait:g} s " if wait < 86_400 else ""  # commands wait without limit
         _log.warning("%s; waiting %sfor another at %s", self.lost[slot], long, here)
-
-    def _nobody_came(self, lost: str) -> str:
-        which = f"{lost}; no other" if lost else "no simulator"
-        dropped = self._last_dropped()
-        return (
-            f"{which} came to {address_text(self.address)} for {self.config.connect_timeout:g} s"
-            f"{'' if dropped in lost else dropped}"
-        )
 
     def _last_dropped(self) -> str:
         last = self.server.statistics.last_error
@@ -337,7 +342,8 @@ class _Required:
         if config.env_id is not None and env_id != config.env_id:
             return f"expected a simulator of {config.env_id}, got one of {env_id}"
         if self.worlds is not None and worlds != self.worlds:
-            return f"expected a simulator of {_worlds(self.worlds)}, got one of {worlds}"
+            drones = "one drone" if self.worlds == 1 else f"{self.worlds} drones"
+            return f"expected a simulator of {drones}, got one of {worlds}"
         if config.vehicle_hash is not None and spec.vehicle_hash != config.vehicle_hash:
             return (
                 f"expected a vehicle of hash {config.vehicle_hash}, "
@@ -357,28 +363,22 @@ class _Required:
             return None
         if config.worlds not in (None, 1):
             return None
-        return registry.env_spec(config.env_id, dict(config.options or {}))
+        spec = registry.env_spec(config.env_id, dict(config.options or {}))
+        try:
+            text.check_layout(layout_of(spec))
+        except InputError:
+            return None
+        return spec
 
     def _text_layout(self) -> Layout | None:
         spec = self.text_spec()
-        if spec is None:
-            return None
-        layout = layout_of(spec)
-        try:
-            text.check_layout(layout)
-        except InputError:
-            return None
-        return layout
+        return layout_of(spec) if spec else None
 
 
 @lru_cache(maxsize=4)
 def _spec(text: str) -> EnvSpec:
     """Raises `SpecError`."""
     return EnvSpec.from_json(text)
-
-
-def _worlds(count: int) -> str:
-    return "one drone" if count == 1 else f"{count} drones"
 
 
 def _options_difference(
@@ -415,16 +415,14 @@ def _leave(pid: int, server: Server, port: Port, journal: "Journal | None") -> N
     if os.getpid() != pid:  # a fork of the process that owns the agent
         return
     server.close("the agent closed", time.monotonic())
-    while True:
-        _flush(server, port)
-        timer = server.next_timer()
-        if timer is None:
-            break
+    _flush(server, port)
+    while (timer := server.next_timer()) is not None:
         left = max(timer - time.monotonic(), 0.0)
         with suppress(OSError):  # nothing came
             datagram, address = port.receive(left, strangers=False)
             server.receive(datagram, address, time.monotonic())
         server.handle_timer(time.monotonic())
+        _flush(server, port)
     port.close()
     if journal:
         journal.close()

@@ -15,6 +15,7 @@ from heapq import heappop, heappush
 from typing import Final
 
 from ...models.errors import InputError
+from ..protocol.client import Address
 from .sockets import is_loopback, open_socket, resolve
 
 __all__ = ["FaultConfig", "Faults", "Relay"]
@@ -27,10 +28,9 @@ _MAX_CLIENTS: Final = 200
 """Beyond, the longest idle one is forgotten: each takes a file, and some systems lend only 256."""
 _MAX_HELD: Final = 16_384
 """Most datagrams that are held back at one time; more are not sent."""
-_LARGEST: Final = 65_535  # bytes that a datagram can have
+_LARGEST: Final = 65_535  # bytes that a packet can have
 _IP_HEADER: Final = 20
 _UDP_HEADER: Final = 8
-_MAX_MTU: Final = 65_535
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,32 +65,30 @@ class FaultConfig:
     def __post_init__(self) -> None:
         if type(self.seed) is not int:
             raise InputError(f"seed: expected a whole number, got {self.seed!r}")
-        if type(self.mtu) is not int or not (self.mtu == 0 or 68 <= self.mtu <= _MAX_MTU):
-            raise InputError(f"mtu: expected 0 or 68 to {_MAX_MTU} bytes, got {self.mtu!r}")
+        if type(self.mtu) is not int or not (self.mtu == 0 or 68 <= self.mtu <= _LARGEST):
+            raise InputError(f"mtu: expected 0 or 68 to {_LARGEST} bytes, got {self.mtu!r}")
         if self.black_hole and not self.mtu:
             raise InputError("black_hole: expected an mtu with it, got none")
-        for name in ("drop", "duplicate", "reorder", "truncate", "corrupt"):
-            self._check(name, 1, "a probability from 0 to 1")
-        for name in ("delay", "jitter", "reorder_by"):
-            self._check(name, 3600, "seconds from 0 to 3600")
-
-    def _check(self, name: str, most: float, expected: str) -> None:
-        value = getattr(self, name)
-        if not (isinstance(value, int | float) and 0 <= value <= most):
-            raise InputError(f"{name}: expected {expected}, got {value!r}")
+        for names, most, expected in (
+            (
+                ("drop", "duplicate", "reorder", "truncate", "corrupt"),
+                1,
+                "a probability from 0 to 1",
+            ),
+            (["delay", "jitter", "reorder_by"], 3600, "seconds from 0 to 3600"),
+        ):
+            for name in names:
+                value = getattr(self, name)
+                if not (isinstance(value, int | float) and 0 <= value <= most):
+                    raise InputError(f"{name}: expected {expected}, got {value!r}")
 
 
 class Faults:
     """Decides the fates of the datagrams of one stream: one direction of one client.
 
+    Its random numbers depend on its name and the seed only, so not on how streams interleave.
     `counters` holds `received`, `forwarded` (copies that come out: received − dropped +
     duplicated), `dropped`, `duplicated`, `reordered`, `truncated` and `corrupted`.
-
-    Args:
-        config: Probabilities, times and the seed.
-        stream: Name of the stream. Its random numbers depend on it and the seed only, so not on
-            how streams interleave.
-        counters: Where to count, if not in a counter of its own.
     """
 
     def __init__(
@@ -148,7 +146,7 @@ def _flip(datagram: bytes, places: list[float]) -> bytes:
     return bytes(flipped)
 
 
-def _reachable(address: tuple[str, int], insecure: bool) -> tuple[str, int]:
+def _reachable(address: Address, insecure: bool) -> Address:
     found = resolve(address, insecure=True)
     if not (insecure or is_loopback(found)):
         raise InputError(
@@ -160,7 +158,7 @@ def _reachable(address: tuple[str, int], insecure: bool) -> tuple[str, int]:
 
 @dataclass(eq=False, slots=True)
 class _Client:
-    address: tuple[str, int]
+    address: Address
     upstream: socket.socket
     """Connected to the server, for this client alone: to the server it is the client."""
     faults: tuple[Faults, Faults]
@@ -191,8 +189,8 @@ class Relay:
 
     def __init__(
         self,
-        listen: tuple[str, int],
-        server: tuple[str, int],
+        listen: Address,
+        server: Address,
         config: FaultConfig | None = None,
         *,
         insecure: bool = False,
@@ -205,8 +203,8 @@ class Relay:
         if self.server == _reachable(listen, insecure):
             raise InputError(f"listen: expected another address than the server's, got {listen}")
         self._any = ("0.0.0.0" if insecure else "127.0.0.1", 0)
-        self._clients: OrderedDict[tuple[str, int], _Client] = OrderedDict()
-        self._client_numbers = itertools.count(1)
+        self._clients: OrderedDict[Address, _Client] = OrderedDict()
+        self._last_number = 0
         self._held: list[tuple[float, int, bytes, _Client, bool]] = []
         self._held_numbers = itertools.count()
         self._stopped = threading.Event()
@@ -217,7 +215,7 @@ class Relay:
         self._selector.register(self._socket, selectors.EVENT_READ)
 
     @property
-    def address(self) -> tuple[str, int]:
+    def address(self) -> Address:
         """Address that clients send to."""
         host, port = self._socket.getsockname()
         return host, port
@@ -294,15 +292,15 @@ class Relay:
                 self.counters["unsent"] += 1
         return _NAP
 
-    def _new_client(self, address: tuple[str, int]) -> _Client | None:
+    def _new_client(self, address: Address) -> _Client | None:
         try:
             upstream = open_socket(self._any, insecure=self._any[0] == "0.0.0.0", peer=self.server)
         except OSError:  # too many open files, or no way there
             self.counters["unsent"] += 1
             return None
-        number = next(self._client_numbers)
-        down = Faults(self.config, f"down/{number}", self.counters)
-        up = Faults(self.config, f"up/{number}", self.counters)
+        self._last_number += 1
+        down = Faults(self.config, f"down/{self._last_number}", self.counters)
+        up = Faults(self.config, f"up/{self._last_number}", self.counters)
         client = self._clients[address] = _Client(address, upstream, (down, up))
         self._selector.register(upstream, selectors.EVENT_READ, client)
         return client

@@ -16,13 +16,13 @@ from ..layouts import layout_of
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
 from ..protocol.errors import LinkError, PeerSilent, Refused
-from ..protocol.messages import MAX_UINT64, Close, Command, Hello, Message, Refuse, State, Welcome
+from ..protocol.messages import Close, Command, Hello, Message, Refuse, State, Welcome
 from ..protocol.transitions import SimulatorState
 from .sockets import LONGEST_WAIT, address_text, log_notices, open_socket, resolve
-from .stepped import Stepped, make_stepped
+from .stepped import Stepped, make_stepped, reset_all
 
 if TYPE_CHECKING:
-    from ..journal import Journal
+    pass
 
 __all__ = ["DEFAULT_AGENT", "DEFAULT_SIMULATOR", "Observer", "Simulator"]
 
@@ -51,13 +51,9 @@ class Simulator(NotCopied):
         num_envs: Number of worlds.
         bind: Address of this side; port 0 takes a free port.
         codec: `binary`, or the paper's `text`.
-        vehicle: MJCF file; None is the paper's.
-        backend: `mujoco` or `warp`.
+        vehicle, backend: As `make_stepped`.
         config: Times of the exchange.
-        key_file: File with the key that the agent has too (`rotorgram key`). With it any address
-            is allowed, because only holders of the key can take part.
-        insecure: Allow an address that is not loopback without a key.
-        record: MCAP file to write every message to; it must not exist.
+        key_file, insecure, record: As `AgentSettings`.
         options: Options of the env, by name.
 
     Attributes:
@@ -108,7 +104,13 @@ class Simulator(NotCopied):
             failing.callback(self.stepped.close)
             self.spec = self.stepped.spec
             hello = Hello(session=new_session(), spec=self.spec.to_json(), worlds=num_envs)
-            self._journal = self._make_journal(record, hello) if record else None
+            self._journal: Any = None
+            if record:
+                from ..journal import Journal
+                from ..journal.writer import model_of
+
+                model = model_of(self.stepped)
+                self._journal = Journal(record, side="simulator", text_hello=hello, model=model)
             self.link = Client(
                 hello,
                 layout_of(self.spec, num_envs),
@@ -178,18 +180,10 @@ class Simulator(NotCopied):
             self._journal.close()
 
     def __enter__(self) -> "Simulator":
-        """Return the simulator, to be closed at the end of the block."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
         self.close()
-
-    def _make_journal(self, record: Path | str, hello: Hello) -> "Journal":
-        from ..journal import Journal
-        from ..journal.writer import model_of
-
-        return Journal(record, side="simulator", text_hello=hello, model=model_of(self.stepped))
 
     # ---- the exchange
 
@@ -199,7 +193,7 @@ class Simulator(NotCopied):
         link.connect(time.monotonic())
         self._flush()
         if self._text:  # the agent says nothing before the first State
-            self._reset(link.hello.session)
+            reset_all(self.stepped, link.layout, link.hello.session)
             self._send_state(None)
         while not self._stopped:
             message = self._wait()
@@ -214,19 +208,13 @@ class Simulator(NotCopied):
                 return message.reason or "the agent closed"
             self._began_at = time.monotonic()
             if isinstance(message, Welcome):
-                self._reset(message.session if message.seed is None else message.seed)
+                seed = message.session if message.seed is None else message.seed
+                reset_all(self.stepped, link.layout, seed)
             elif isinstance(message, Command):
                 self._step(message)
             self._began_at = None
             self._send_state(message)
         return ""
-
-    def _reset(self, seed: int) -> None:
-        """Reset every drone: drone i with seed + i, modulo 2^64."""
-        layout, count = self.link.layout, self.stepped.num_envs
-        seeds = np.array([(seed + i) & MAX_UINT64 for i in range(count)], np.uint64)
-        actions = np.zeros(layout.actions.shape, layout.actions.dtype)
-        self.stepped.advance(actions, np.ones(count, bool), seeds, None)
 
     def _step(self, command: Command) -> None:
         orders = command.orders
@@ -294,29 +282,24 @@ class Simulator(NotCopied):
             datagram, _ = self._socket.receive(timeout)
         except TimeoutError:
             return None
-        except ConnectionError:  # nothing listens there yet: the timer says when to ask again
-            self._trouble = "nothing listens on that port"
-            return None
-        except OSError as error:  # no way there, a firewall says: the same
+        except OSError as error:  # nothing listens there yet: the timer says when to ask again
             if self._socket.fileno() < 0:
                 raise
-            self._trouble = f"receiving failed: {error.strerror}"
+            self._note_trouble("receiving", error)
             return None
         self._trouble = ""
         return self.link.receive(datagram, time.monotonic())
 
     def _exchange_until_closed(self) -> None:
         """Until the agent has answered our Close, or will not."""
-        while self._socket.fileno() >= 0:
-            self._flush()
-            timer = self.link.next_timer()
-            if timer is None:
-                return
+        self._flush()
+        while self._socket.fileno() >= 0 and (timer := self.link.next_timer()) is not None:
             left = timer - time.monotonic()
             if left > 0:
                 self._receive(left)
             else:
                 self.link.handle_timer(time.monotonic())
+            self._flush()
 
     def _flush(self) -> None:
         """Send what is due, before any wait."""
@@ -327,12 +310,15 @@ class Simulator(NotCopied):
     def _send(self, datagram: bytes) -> None:
         try:
             self._socket.send(datagram)
-        except ConnectionError:
-            self.link.statistics.counters["unsent"] += 1
-            self._trouble = "nothing listens on that port"
         except OSError as error:  # a full buffer or a network that is down: as good as lost
             self.link.statistics.counters["unsent"] += 1
-            self._trouble = f"sending failed: {error.strerror}"
+            self._note_trouble("sending", error)
+
+    def _note_trouble(self, what: str, error: OSError) -> None:
+        refused = isinstance(error, ConnectionError)
+        self._trouble = (
+            "nothing listens on that port" if refused else f"{what} failed: {error.strerror}"
+        )
 
     def _say_alive(self, finished: threading.Event) -> None:
         """In a thread: tell the agent of a long step that it is being computed."""
@@ -344,9 +330,8 @@ class Simulator(NotCopied):
 
     def _silence(self, sends: int, seconds: float) -> str:
         what = "Hello" if self.link.sequence == 0 else f"State {self.link.sequence}"
-        key = ""
-        if self._keyed and what == "Hello":
-            key = "; an agent with another key does not answer"
+        locked = self._keyed and what == "Hello"
+        key = "; an agent with another key does not answer" if locked else ""
         why = f"; {self._trouble}" if self._trouble else ""
         last = self.link.statistics.last_error
         dropped = f"; last datagram dropped: {last}" if last else ""

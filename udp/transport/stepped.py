@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import gymnasium as gym
 import numpy as np
@@ -13,9 +13,13 @@ from ...envs import registry
 from ...envs.spaces import action_space, observation_space
 from ...envs.spec import ArraySpec, Discrete, EnvSpec, canonical_id, component_names
 from ...models.errors import InputError
-from ..protocol.layout import MAX_DRONES
+from ..protocol.layout import MAX_DRONES, Layout
+from ..protocol.messages import MAX_UINT64
 
-__all__ = ["Stepped", "make_stepped", "spec_of_gymnasium"]
+__all__ = ["Stepped", "make_stepped", "reset_all", "spec_of_gymnasium"]
+
+
+_Some = np.ndarray | None
 
 
 class Stepped(Protocol):
@@ -36,13 +40,7 @@ class Stepped(Protocol):
     def telemetry(self) -> dict[str, np.ndarray]:
         """By name, float64, shape (N, *shape)."""
 
-    def advance(
-        self,
-        actions: np.ndarray,
-        resets: np.ndarray | None,
-        seeds: np.ndarray | None,
-        frozen: np.ndarray | None,
-    ) -> None:
+    def advance(self, actions: np.ndarray, resets: _Some, seeds: _Some, frozen: _Some) -> None:
         """Reset some drones, freeze some, and fly the others for one control period."""
 
     def close(self) -> None:
@@ -62,7 +60,7 @@ def make_stepped(
     Args:
         env: Id of a registered task, of an env of Gymnasium, or one env itself.
         num_envs: N.
-        vehicle: MJCF file, for a registered task.
+        vehicle: MJCF file, for a registered task; None is the paper's.
         backend: `mujoco` or `warp`, for a registered task.
         options: Of the env, by name.
 
@@ -75,10 +73,8 @@ def make_stepped(
         if registry.is_known(env):
             from ...envs.loop import Loop, OnHost
 
-            name: Any = backend
-            loop: Any = Loop(
-                canonical_id(env), num_envs, vehicle=vehicle, backend=name, options=options
-            )
+            name, chosen = canonical_id(env), cast(Any, backend)
+            loop: Any = Loop(name, num_envs, vehicle=vehicle, backend=chosen, options=options)
             return loop if backend == "mujoco" else OnHost(loop)
         envs = [_make(env, options) for _ in range(num_envs)]
     else:
@@ -90,6 +86,13 @@ def make_stepped(
     if vehicle is not None or backend != "mujoco":
         raise InputError(f"vehicle, backend: expected none for {env!r}, which is no task of ours")
     return _Singles(envs, options)
+
+
+def reset_all(stepped: Stepped, layout: Layout, seed: int) -> None:
+    """A simulator's own first reset: drone i takes seed + i, modulo 2^64."""
+    actions, count = layout.actions, layout.drones
+    seeds = np.array([(seed + i) & MAX_UINT64 for i in range(count)], np.uint64)
+    stepped.advance(np.zeros(actions.shape, actions.dtype), np.ones(count, bool), seeds, None)
 
 
 def _make(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
@@ -107,52 +110,35 @@ class _Singles:
     def __init__(self, envs: Sequence[gym.Env[Any, Any]], options: Mapping[str, Any]) -> None:
         self.envs, self.num_envs = envs, len(envs)
         self.spec = spec_of_gymnasium(envs[0], options)
-        count = (self.num_envs,)
-        self.observations = {
-            array.name: np.zeros(count + array.shape, array.dtype)
-            for array in self.spec.observation
-        }
-        self.telemetry = {
-            array.name: np.zeros(count + array.shape) for array in self.spec.telemetry
-        }
-        self.rewards = np.zeros(count)
-        self.terminated, self.truncated = np.zeros(count, bool), np.zeros(count, bool)
-        self._waiting = np.ones(count, bool)  # for a reset
+        n, spec = self.num_envs, self.spec
+        self.observations = {a.name: np.zeros((n, *a.shape), a.dtype) for a in spec.observation}
+        self.telemetry = {a.name: np.zeros((n, *a.shape)) for a in spec.telemetry}
+        self.rewards = np.zeros(n)
+        self.terminated, self.truncated = np.zeros(n, bool), np.zeros(n, bool)
+        self._waiting = np.ones(n, bool)  # for a reset
 
-    def advance(
-        self,
-        actions: np.ndarray,
-        resets: np.ndarray | None,
-        seeds: np.ndarray | None,
-        frozen: np.ndarray | None,
-    ) -> None:
+    def advance(self, actions: np.ndarray, resets: _Some, seeds: _Some, frozen: _Some) -> None:
         none = np.zeros(self.num_envs, bool)
         resets, frozen = none if resets is None else resets, none if frozen is None else frozen
         waiting = self._waiting & ~resets & ~frozen
         if waiting.any():
             raise gym.error.ResetNeeded(f"step: expected a reset of env {waiting.argmax()} first")
         for i, env in enumerate(self.envs):
-            if frozen[i]:
-                self._keep_flags(i, 0.0, False, False)
-            elif resets[i]:
+            reward: Any = 0.0
+            terminated = truncated = False
+            if resets[i]:
                 observation, info = env.reset(seed=None if seeds is None else int(seeds[i]))
                 self._keep(i, observation, info)
-                self._keep_flags(i, 0.0, False, False)
-                self._waiting[i] = False
-            else:
+            elif not frozen[i]:
                 action = int(actions[i]) if isinstance(self.spec.action, Discrete) else actions[i]
                 observation, reward, terminated, truncated, info = env.step(action)
                 self._keep(i, observation, info)
-                self._keep_flags(i, float(reward), bool(terminated), bool(truncated))
-                self._waiting[i] = terminated or truncated
+            self.rewards[i], self.terminated[i], self.truncated[i] = reward, terminated, truncated
+            self._waiting[i] = terminated or truncated or (frozen[i] and self._waiting[i])
 
     def close(self) -> None:
         for env in self.envs:
             env.close()
-
-    def _keep_flags(self, i: int, reward: float, terminated: bool, truncated: bool) -> None:
-        self.rewards[i] = reward
-        self.terminated[i], self.truncated[i] = terminated, truncated
 
     def _keep(self, i: int, observation: Any, info: Mapping[str, Any]) -> None:
         arrays = self.spec.observation
@@ -194,12 +180,11 @@ def spec_of_gymnasium(env: gym.Env[Any, Any], options: Mapping[str, Any]) -> Env
         json.dumps(dict(options))
     except (TypeError, ValueError):
         raise InputError(f"options: expected JSON values, got {options!r:.80}") from None
+    fps = env.metadata.get("render_fps") or 50
     return EnvSpec(
         env_id=canonical_id(env.spec.id) if env.spec else type(base).__name__,
         options=dict(options),
-        control_period=float(
-            getattr(base, "control_period", 1 / (env.metadata.get("render_fps") or 50))
-        ),
+        control_period=float(getattr(base, "control_period", 1 / fps)),
         observation=arrays,
         action=action,
     )
@@ -208,7 +193,5 @@ def spec_of_gymnasium(env: gym.Env[Any, Any], options: Mapping[str, Any]) -> Env
 def _array(name: str, space: Any) -> ArraySpec:
     if not isinstance(space, spaces.Box):
         raise InputError(f"{name} space: expected Box, a Dict of Box, or Discrete, got {space}")
-    low, high = (b.astype(np.float64).ravel().tolist() for b in (space.low, space.high))
-    return ArraySpec(
-        name=name, shape=space.shape, dtype=str(space.dtype), low=tuple(low), high=tuple(high)
-    )
+    low, high = (tuple(b.astype(np.float64).ravel().tolist()) for b in (space.low, space.high))
+    return ArraySpec(name=name, shape=space.shape, dtype=str(space.dtype), low=low, high=high)

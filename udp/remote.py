@@ -1,0 +1,462 @@
+"""Drones in remote simulators as Gymnasium envs of the agent: one drone, or many."""
+
+from collections.abc import Collection
+from typing import Any, Final, Unpack
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from ..envs.autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
+from ..envs.spaces import action_space, joined, observation_space
+from ..envs.spec import Discrete, EnvSpec, component_names
+from ..models.errors import InputError, NotCopied
+from .protocol.client import Address
+from .protocol.layout import MAX_DRONES
+from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET, State
+from .protocol.statistics import Statistics
+from .transport.agent import Agent, AgentConfig, AgentSettings, Order
+from .transport.simulator import DEFAULT_AGENT
+
+__all__ = ["LOST", "RemoteEnv", "RemoteVectorEnv"]
+
+LOST: Final = "simulator_lost"
+"""Key of `info`: why the simulator was lost whose episode ends here as truncated."""
+
+_FLY: Final = np.array([FLY], np.uint8)
+_RESET: Final = np.array([RESET], np.uint8)
+
+
+class _Remote(NotCopied):
+    """Base of both envs: the `Agent` behind them, and actions as they cross the wire."""
+
+    _agent: Agent
+
+    @property
+    def address(self) -> Address:
+        """Address that this side listens on."""
+        return self._agent.address
+
+    @property
+    def statistics(self) -> Statistics:
+        """Counts and round trips of the wire, over all simulators."""
+        return self._agent.server.statistics
+
+    def _take_actions(self, action: Any, count: int) -> None:
+        """Take dtype and shape of the actions of so many drones as they cross the wire."""
+        is_discrete = isinstance(action, Discrete)
+        self._row: tuple[int, ...] = () if is_discrete else action.shape
+        self._dtype = np.dtype(np.int64 if is_discrete else action.dtype)
+        self._nothing: np.ndarray = np.zeros((count, *self._row), self._dtype)
+
+
+class RemoteEnv(_Remote, gym.Env[Any, Any]):
+    """A drone in a remote simulator, flown in lock-step over UDP.
+
+    The simulator may start before or after. Its Hello brings the spec of its env, and the spaces
+    follow from that: this side needs neither the env's code nor MuJoCo. A text simulator says no
+    Hello, and is read by the spec of `env_id` with `options`, which must be registered here.
+    Observations, rewards, ends of episodes and telemetry are those of the env in the simulator, bit
+    for bit; `info` carries the telemetry by its components.
+
+    A simulator that is killed and started again, or another one that comes in its place, goes on:
+    the running episode ends as truncated, with the observation before it, reward 0 and the reason
+    in `info["simulator_lost"]`. If none comes, `PeerSilent` is raised; the next `reset` waits
+    again. The simulator is told when the env is closed, garbage-collected, or its program ends.
+
+    Args:
+        address: Address (host, port) to listen on; port 0 takes a free one (see `address`).
+        connect: Wait for the simulator now. Otherwise `connect` or the first `reset` waits.
+        settings: Those of `AgentSettings`: `env_id`, `options` and `vehicle_hash` of the simulators
+            that are taken, `connect_timeout`, `timeout`, `max_datagram`, `key_file`, `insecure`,
+            `record`.
+
+    Attributes:
+        env_spec: The `EnvSpec` of the env, once a simulator has come.
+        control_period: Time of a step, s, likewise.
+
+    Raises:
+        InputError: An address, option, key file, action or seed is not what it should be; nothing
+            was sent.
+        OSError: The port is in use.
+        PeerSilent: No simulator came, or it fell silent and no other came.
+        PeerClosed: The simulator ended the exchange.
+        gymnasium.error.ResetNeeded: A step before a reset, or after an episode's end.
+        gymnasium.error.ClosedEnvironmentError: A reset after `close`.
+    """
+
+    def __init__(
+        self,
+        address: Address = DEFAULT_AGENT,
+        *,
+        connect: bool = True,
+        **settings: Unpack[AgentSettings],
+    ) -> None:
+        self.render_mode = None
+        self._flying = False
+        self._agent = Agent(address, AgentConfig(worlds=1, **settings))
+        if connect:
+            try:
+                self.connect()
+            except BaseException:
+                self.close()
+                raise
+
+    def connect(self) -> None:
+        """Wait until it is the agent's turn: for the simulator's first State, if none has come."""
+        self._agent.connect()
+        self._take_spec()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode in the simulator, with its generator seeded where a seed is given."""
+        if seed is not None and not 0 <= seed <= MAX_UINT64:
+            raise InputError(f"seed: expected 0 to 2^64 - 1, got {seed}")
+        if options:
+            raise InputError(f"options: expected none over UDP, got {options}")
+        super().reset(seed=seed)
+        self._flying = False
+        self.connect()
+        seeds = None if seed is None else np.array([seed], np.uint64)
+        self._agent.exchange({0: (self._nothing, _RESET, seeds)})
+        while self._agent.lost[0]:  # the simulator that has come instead was not reset
+            self._agent.exchange({0: (self._nothing, _RESET, seeds)})
+        self._take_spec()
+        self._flying = True
+        self._state = self._take_state()
+        return self._observation(self._state), self._info(self._state)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Fly for one control period. The action is sent in the dtype of its space."""
+        if not self._flying:
+            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        actions = _checked_actions(action, self._dtype, self._row)[np.newaxis]
+        self._flying = False  # until the answer is there
+        try:
+            self._agent.exchange({0: (actions, _FLY, None)})
+        except InputError:  # an action that is wrong, and nothing has happened
+            self._flying = True
+            raise
+        if reason := self._agent.lost[0]:
+            info = {**self._info(self._state), LOST: reason}
+            return self._observation(self._state), 0.0, False, True, info
+        self._state = state = self._take_state()
+        terminated, truncated = state.terminated.item(), state.truncated.item()
+        self._flying = not (terminated or truncated)
+        observation = self._observation(state)
+        return observation, state.rewards.item(), terminated, truncated, self._info(state)
+
+    def close(self) -> None:
+        """Tell the simulator and close the socket. May be called again."""
+        self._agent.close()
+        self._flying = False
+
+    def _take_state(self) -> State:
+        state = self._agent.states[0]
+        assert state is not None
+        return state
+
+    def _take_spec(self) -> None:
+        """Set spaces and other attributes from the spec. Spaces that have not changed are kept:
+        their generators may have been seeded.
+        """
+        spec = self._agent.spec
+        assert spec is not None
+        if getattr(self, "env_spec", None) == spec:
+            return
+        self.env_spec: EnvSpec = spec
+        self.control_period = spec.control_period
+        self.observation_space = observation_space(spec)
+        self.action_space = action_space(spec)
+        fps = max(1, round(1 / spec.control_period))
+        self.metadata = {"render_modes": [], "render_fps": fps}
+        self._arrays = tuple(array.name for array in spec.observation)
+        self._names = tuple(n for array in spec.telemetry for n in component_names(array))
+        self._take_actions(spec.action, 1)
+
+    def _observation(self, state: State) -> Any:
+        """As the space has it, a copy."""
+        arrays = state.observations
+        if len(arrays) == 1:
+            return np.array(arrays[0][0])
+        return {name: np.array(a[0]) for name, a in zip(self._arrays, arrays, strict=True)}
+
+    def _info(self, state: State) -> dict[str, Any]:
+        numbers: list[float] = []
+        for array in state.telemetry:
+            numbers += array.tolist()[0] if array.ndim == 2 else array.ravel().tolist()
+        return dict(zip(self._names, numbers, strict=True))
+
+
+class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
+    """The M · N drones of M simulators with N drones each, in lock-step over one socket.
+
+    The simulators may be on any machines, and come in any order: each takes the first slot that is
+    free, and one that comes too late waits until another leaves. Drone i of slot p is env
+    p · N + i. A slow simulator delays the others and changes nothing else.
+
+    With SAME_STEP a step in which an episode ends takes a second round trip, in which the other
+    drones are frozen. `info` has the telemetry, an array for each component.
+
+    A simulator that is lost is replaced by the next that comes. The running episodes of its drones
+    end as truncated, with the observation before, reward 0 and the reason in
+    `info["simulator_lost"]`. The other slots wait meanwhile.
+
+    Args:
+        address: Address (host, port) to listen on; port 0 takes a free one.
+        num_simulators: M.
+        num_envs: Drones in all, M · N; a simulator with another share of them is refused. None: N
+            is that of the first simulator that comes.
+        autoreset_mode: `AutoresetMode`, or its value.
+        connect: Wait for the simulators now. Otherwise `connect` or the first `reset` waits.
+        settings: As `RemoteEnv`.
+
+    Raises:
+        PeerSilent: A slot stayed free for `connect_timeout`.
+        PeerClosed: The last simulator ended the exchange.
+        gymnasium.error.ResetNeeded: A step before every drone was reset, or (DISABLED) after an
+            episode's end.
+        Exception: All others as `RemoteEnv`.
+    """
+
+    def __init__(
+        self,
+        address: Address = DEFAULT_AGENT,
+        *,
+        num_simulators: int = 1,
+        num_envs: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        connect: bool = True,
+        **settings: Unpack[AgentSettings],
+    ) -> None:
+        self.closed = True  # nothing is open yet
+        if type(num_simulators) is not int or not 1 <= num_simulators <= MAX_DRONES:
+            raise InputError(f"num_simulators: expected 1 to {MAX_DRONES}, got {num_simulators!r}")
+        most = num_simulators * MAX_DRONES
+        if num_envs is not None and (
+            type(num_envs) is not int or not 1 <= num_envs <= most or num_envs % num_simulators
+        ):
+            raise InputError(
+                f"num_envs: expected a multiple of num_simulators = {num_simulators}, at most "
+                f"{most}, got {num_envs!r}"
+            )
+        self.num_simulators, self.num_envs = num_simulators, num_envs or 0
+        self._broken: tuple[np.ndarray, np.ndarray] | None = None
+        self._mode = autoreset_mode
+        self._flying = False
+        self.metadata = {"render_modes": [], "autoreset_mode": _checked_mode(autoreset_mode)}
+        worlds = num_envs // num_simulators if num_envs else None
+        self._agent = Agent(address, AgentConfig(worlds=worlds, slots=num_simulators, **settings))
+        self.closed = False
+        if connect:
+            try:
+                self.connect()
+            except BaseException:
+                self.close()
+                raise
+
+    def connect(self) -> None:
+        """Wait until every slot is taken."""
+        self._agent.connect()
+        spec = self._agent.spec
+        assert spec is not None
+        num_envs = self.num_simulators * self._agent.worlds * len(spec.agents)
+        self._take_spec(spec, num_envs, self._mode)
+        self._take_actions(spec.action, num_envs)
+        self._shape = self.num_simulators, num_envs // self.num_simulators
+        if not self._flying:
+            self.done = np.zeros(num_envs, bool)
+            self._idle = np.ones(num_envs, bool)  # those that no reset has begun
+
+    def reset(
+        self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode, for all drones or some.
+
+        Where none is under way, before the first reset or after an error, a step wants a reset of
+        every drone: with several masks too, as of the vector envs in process.
+
+        Args:
+            seed: Drone i gets seed + i, or the i-th of N seeds; None leaves its generator as it is.
+            options: `reset_mask`: bool, shape (N,): which drones; the others are frozen.
+        """
+        options = options or {}
+        if unknown := [name for name in options if name != "reset_mask"]:
+            raise InputError(f"options: expected reset_mask or none over UDP, got {unknown[0]!r}")
+        if "reset_mask" in options and self._flying:
+            mask = checked_mask(options["reset_mask"], self.num_envs)
+            self.advance(self._nothing, mask, self._seeds(seed), ~mask)
+            return self._observed(), self._info(mask)
+        self._flying = False
+        self.connect()
+        mask, seeds = checked_mask(options.get("reset_mask"), self.num_envs), self._seeds(seed)
+        self._reset_until_done(mask, seeds)
+        self.done, self._idle = np.zeros(self.num_envs, bool), ~mask
+        self._flying = True
+        self._take_states(np.ones(self.num_envs, bool))
+        return self._observed(), self._info(mask)
+
+    def step(self, actions: Any) -> Any:
+        """Fly every drone for one control period; what follows an episode, the autoreset says."""
+        if not self._flying:
+            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        return super().step(actions)
+
+    def advance(
+        self,
+        actions: np.ndarray,
+        resets: np.ndarray | None = None,
+        seeds: Seeds | None = None,
+        frozen: np.ndarray | None = None,
+    ) -> None:
+        """Reset some drones, freeze some, and fly the others: see `AdvancingVectorEnv`."""
+        if not self._flying:
+            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        nobody = np.zeros(self.num_envs, bool)
+        resets, frozen = nobody if resets is None else resets, nobody if frozen is None else frozen
+        grounded = self.done | self._idle
+        if (waiting := grounded & ~(resets | frozen)).any():
+            first = int(waiting.argmax())
+            raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
+        sent = self._sent(actions, resets | frozen)
+        numbers = None if seeds is None else np.asarray(seeds, np.uint64)
+        rows: np.ndarray = np.all(frozen.reshape(self._shape), axis=1)
+        slots = [slot for slot in range(self.num_simulators) if not rows[slot]]
+        self._flying = False  # until the answers are there
+        self._agent.exchange(self._orders(slots, sent, resets, numbers, frozen))
+        lost = self._agent.lost
+        if any(lost) and seeds is not None:  # a simulator in place of a lost one knows none
+            lost = self._reset_until_done(resets, numbers, lost)
+        before, telemetry = self._arrays, self.telemetry
+        self._take_states(resets | frozen)
+        reasons = np.repeat(np.array(lost, object), self._shape[1])
+        broken = (reasons != "") & ~resets & ~grounded
+        if broken.any():  # these States are the start of the next episodes
+            for now, then in ((self._arrays, before), (self.telemetry, telemetry)):
+                for name, array in now.items():
+                    array[broken] = then[name][broken]
+            self.rewards[broken] = 0.0
+            self.terminated[broken] = False
+            self.truncated[broken] = True
+            reasons[~broken] = None
+            self._broken, self.lost = (reasons, broken), broken.copy()
+        self.done = self.terminated | self.truncated | (self.done & ~resets)
+        self._idle = self._idle & ~resets
+        self._flying = True
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Tell the simulators and close the socket."""
+        self._agent.close()
+        self._flying = False
+
+    def _seeds(self, seed: Any) -> np.ndarray | None:
+        seeds = checked_seeds(seed, self.num_envs, MAX_UINT64)
+        return None if seeds is None else np.array(seeds, np.uint64)
+
+    def _reset_until_done(
+        self, resets: np.ndarray, seeds: np.ndarray | None, lost: list[str] | None = None
+    ) -> list[str]:
+        """Reset drones, again where another simulator comes meanwhile; which were lost, and why.
+
+        `lost` says for each slot why its simulator was lost before; None: all are to be reset.
+        """
+        wanted: np.ndarray = np.any(resets.reshape(self._shape), axis=1)
+        reasons = lost or [""] * self.num_simulators
+        anew = [not lost or bool(reason) for reason in reasons]
+        while slots := [s for s in range(self.num_simulators) if anew[s] and wanted[s]]:
+            self._agent.exchange(self._orders(slots, self._nothing, resets, seeds, ~resets))
+            reasons = [new or old for new, old in zip(self._agent.lost, reasons, strict=True)]
+            anew = [bool(reason) for reason in self._agent.lost]
+        return reasons
+
+    def _orders(
+        self,
+        slots: Collection[int],
+        actions: np.ndarray,
+        resets: np.ndarray,
+        seeds: np.ndarray | None,
+        frozen: np.ndarray,
+    ) -> dict[int, Order]:
+        """Order of each simulator. The arrays are those of all drones."""
+        orders = (RESET * resets + FREEZE * frozen).astype(np.uint8).reshape(self._shape)
+        rows = actions.reshape(*self._shape, *self._row)
+        numbers = None if seeds is None else seeds.reshape(self._shape)
+        return {
+            slot: (rows[slot], orders[slot], None if numbers is None else numbers[slot])
+            for slot in slots
+        }
+
+    def _take_states(self, still: np.ndarray) -> None:
+        """Take over the States; rewards and flags are 0 for the drones that did not fly."""
+        states = [state for state in self._agent.states if state]
+        spec = self.env_spec
+        self._arrays = {
+            array.name: np.concatenate([state.observations[i] for state in states])
+            for i, array in enumerate(spec.observation)
+        }
+        self.observations = joined(spec, self._arrays)
+        self.telemetry = {
+            array.name: np.concatenate([state.telemetry[i] for state in states])
+            for i, array in enumerate(spec.telemetry)
+        }
+        self.rewards = np.where(still, 0.0, np.concatenate([s.rewards for s in states]))
+        self.terminated = np.concatenate([s.terminated for s in states]) & ~still
+        self.truncated = np.concatenate([s.truncated for s in states]) & ~still
+        self._broken = None
+        self.lost = np.zeros(self.num_envs, bool)
+
+    def _sent(self, actions: np.ndarray, idle: np.ndarray) -> np.ndarray:
+        """Actions as they cross the wire; those of drones that do not fly are 0."""
+        shape, action = (self.num_envs, *self._row), self.env_spec.action
+        array = np.array(actions)
+        if isinstance(action, Discrete) and array.shape == (*shape, 1):
+            array = array[:, 0]
+        if array.shape == shape:
+            array[idle] = 0
+        if isinstance(action, Discrete) and array.dtype.kind == "f" and not (array % 1).any():
+            array = array.astype(np.int64)
+        sent = _checked_actions(array, self._dtype, shape)
+        if self._dtype.kind == "f" and not (finite := np.isfinite(sent)).all():
+            first = np.argwhere(~finite)[0].tolist()
+            raise InputError(f"action: expected finite numbers, got {sent[*first]} at {first}")
+        if isinstance(action, Discrete) and (wrong := (sent < 0) | (sent >= action.n)).any():
+            raise InputError(f"action: expected 0 to {action.n - 1}, got {sent[wrong][0]}")
+        return sent
+
+    def _info(self, mask: np.ndarray) -> dict[str, Any]:
+        info = super()._info(mask)
+        if self._broken:
+            info[LOST], info[f"_{LOST}"] = self._broken
+        return info
+
+
+def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    """Raises `InputError` if it is no autoreset mode."""
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        expected = " or ".join(repr(m.value) for m in AutoresetMode)
+        raise InputError(f"autoreset_mode: expected {expected}, got {mode!r}") from None
+
+
+def _checked_actions(action: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
+    """Actions as they cross the wire; the env checks bounds.
+
+    Raises `InputError` for another shape, and what is not real or cannot be of that dtype.
+    """
+    array = np.asarray(action)
+    if array.shape != shape:
+        raise InputError(f"action: expected an array of shape {shape}, got shape {array.shape}")
+    if array.dtype == dtype:
+        return array
+    if array.dtype.kind not in ("iuf" if dtype.kind == "f" else "iu"):
+        expected = "real" if dtype.kind == "f" else "whole"
+        raise InputError(f"action: expected {expected} numbers, got {array.dtype}")
+    if dtype.kind == "f":
+        with np.errstate(over="ignore", under="ignore"):  # independent of the program's settings
+            return array.astype(dtype)  # an overflow is infinite, and refused as such
+    whole = array.astype(dtype)
+    if (whole != array).any():
+        raise InputError(f"action: expected numbers of {dtype}, got {array}")
+    return whole

@@ -1,1 +1,0 @@
-"""Drones in remote simulators as Gymnasium envs of the agent."""
