@@ -10,7 +10,7 @@ Body frame: that of the free body, x forward, y left, z up; SI units.
 import math
 import struct
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Final, Self
@@ -29,7 +29,6 @@ LEAST_TIMESTEP: Final = 1e-5
 MOST_HEIGHT: Final = 1e4
 """Height above which no craft may touch anything, m."""
 
-_HASH_BYTES: Final = 16
 _RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves
 
 
@@ -101,12 +100,16 @@ class Vehicle:
             InputError: There is no such file, or it is no vehicle.
         """
         file = Path(path if path is not None else QUAD_XML).resolve()
-        drag = _checked_drag(linear_drag)
+        number = isinstance(linear_drag, int | float | np.floating)
+        if not (number and 0.0 <= linear_drag <= MOST_DRAG):
+            raise InputError(
+                f"linear_drag: expected a number from 0 to {MOST_DRAG:g} /s, got {linear_drag!r}"
+            )
         try:
             changed = file.stat().st_mtime_ns
         except OSError as error:
             raise InputError(f"vehicle: cannot read {path}: {error.strerror}") from None
-        return _load(file, drag, changed)
+        return _load(file, float(linear_drag) + 0.0, changed)  # no negative zero
 
     @property
     def num_rotors(self) -> int:
@@ -131,11 +134,9 @@ class Vehicle:
     @property
     def max_acceleration(self) -> float:
         """Largest vertical acceleration of the level craft, up or down, m/s²."""
-        vertical = self.allocation[0]
-        most = np.maximum(vertical * self.thrust_high, vertical * self.thrust_low).sum()
-        least = np.minimum(vertical * self.thrust_high, vertical * self.thrust_low).sum()
-        up, down = most / self.mass - self.gravity, self.gravity - least / self.mass
-        return float(max(up, down))
+        ends = self.allocation[0] * (self.thrust_low, self.thrust_high)
+        most, least = ends.max(axis=0).sum(), ends.min(axis=0).sum()
+        return float(max(most / self.mass - self.gravity, self.gravity - least / self.mass))
 
     def substeps(self, period: float) -> int:
         """Physics steps in a control period of so many seconds. Raises `InputError`."""
@@ -153,11 +154,7 @@ class Vehicle:
 
     def __reduce__(self) -> Any:
         """Loaded again from its file."""
-        return _again, (str(self.path), self.linear_drag)
-
-
-def _again(path: str, drag: float) -> Vehicle:
-    return Vehicle.load(path, linear_drag=drag)
+        return partial(Vehicle.load, linear_drag=self.linear_drag), (str(self.path),)
 
 
 @lru_cache(maxsize=32)
@@ -173,7 +170,15 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
             raise
         reason = " ".join(str(error).split())
         raise InputError(f"vehicle: expected an MJCF file, got {path.name}: {reason}") from None
-    body = _free_body(model)
+    free = int((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).sum())
+    if (free, model.njnt) != (1, 1):
+        raise InputError(
+            f"vehicle: expected one free body and no other joints, "
+            f"got {free} free of {model.njnt} joints"
+        )
+    if model.nu == 0:
+        raise InputError("vehicle: expected at least one rotor, an actuator at a site, got none")
+    body = int(model.jnt_bodyid[0])
     data = mujoco.MjData(model)
     data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
     mujoco.mj_forward(model, data)
@@ -209,19 +214,6 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
     )
 
 
-def _free_body(model: mujoco.MjModel) -> int:
-    """Number of the one free body. Raises `InputError` for any other kind of model."""
-    free = int((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).sum())
-    if (free, model.njnt) != (1, 1):
-        raise InputError(
-            f"vehicle: expected one free body and no other joints, "
-            f"got {free} free of {model.njnt} joints"
-        )
-    if model.nu == 0:
-        raise InputError("vehicle: expected at least one rotor, an actuator at a site, got none")
-    return int(model.jnt_bodyid[0])
-
-
 def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
     """The rotor of an actuator; `data` is at the origin and level. Raises `InputError`."""
     name = model.actuator(index).name or f"rotor{index + 1}"
@@ -231,12 +223,11 @@ def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
         raise InputError(f"vehicle: expected rotor {name} to be an actuator at a site of the body")
     if model.actuator_trnid[index, 1] >= 0:
         raise InputError(f"vehicle: expected rotor {name} to act without a reference site")
-    plain = (
-        model.actuator_gaintype[index] == mujoco.mjtGain.mjGAIN_FIXED
-        and model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
-        and model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_NONE
-    )
-    if not plain:
+    if (
+        model.actuator_gaintype[index] != mujoco.mjtGain.mjGAIN_FIXED
+        or model.actuator_biastype[index] != mujoco.mjtBias.mjBIAS_NONE
+        or model.actuator_dyntype[index] != mujoco.mjtDyn.mjDYN_NONE
+    ):
         raise InputError(f"vehicle: expected the thrust of rotor {name} to be gain times control")
     force, torque = model.actuator_gear[index, :3], model.actuator_gear[index, 3:]
     size = math.hypot(*force)
@@ -333,19 +324,9 @@ def _touches(model: mujoco.MjModel, data: Any, height: float) -> bool:
 
 
 def _hash(spec: mujoco.MjSpec, text: str, path: Path, drag: float) -> str:
-    digest = blake2b(text.encode() + b"\0" + struct.pack("<d", drag), digest_size=_HASH_BYTES)
-    for assets, folder in ((spec.meshes, spec.meshdir), (spec.hfields, spec.meshdir)):
-        for asset in assets:
-            file = path.parent / folder / asset.file
-            if asset.file and file.is_file():
-                digest.update(file.read_bytes())
+    digest = blake2b(text.encode() + b"\0" + struct.pack("<d", drag), digest_size=16)
+    for asset in (*spec.meshes, *spec.hfields):
+        file = path.parent / spec.meshdir / asset.file
+        if asset.file and file.is_file():
+            digest.update(file.read_bytes())
     return digest.hexdigest()
-
-
-def _checked_drag(linear_drag: Any) -> float:
-    number = isinstance(linear_drag, int | float | np.floating)
-    if not (number and 0.0 <= linear_drag <= MOST_DRAG):
-        raise InputError(
-            f"linear_drag: expected a number from 0 to {MOST_DRAG:g} /s, got {linear_drag!r}"
-        )
-    return float(linear_drag) + 0.0  # no negative zero
