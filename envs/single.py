@@ -1,18 +1,15 @@
 """One drone behind Gymnasium's single signature: the loop with one world."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from ..models.errors import InputError
 from .loop import Loop
-from .rendering import RENDER_MODES, checked_render_mode, moments, painter
+from .rendering import RENDER_MODES, Renderer
 from .spaces import action_space, observation_space, telemetry_names
-
-if TYPE_CHECKING:
-    from ..rendering.painter import Painter
 
 __all__ = ["SingleEnv"]
 
@@ -55,8 +52,8 @@ class SingleEnv(gym.Env[Any, Any]):
         vehicle: Path | str | None = None,
         **options: Any,
     ) -> None:
-        self.render_mode = checked_render_mode(render_mode)
         self._loop = loop = Loop(env_id, vehicle=vehicle, options=options)
+        self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
         self.env_spec = loop.spec
         self.control_period = loop.spec.control_period
         fps = max(1, round(1 / self.control_period))
@@ -69,7 +66,6 @@ class SingleEnv(gym.Env[Any, Any]):
         self._all = np.ones(1, bool)
         self._no_action = np.zeros((1, len(loop.task.controller.low)), np.float32)
         self._episodes = 0
-        self._painter: Painter | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -101,21 +97,12 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def render(self) -> Any:
         """A picture of now, uint8, shape (360, 480, 3), with `rgb_array`; None otherwise."""
-        if self.render_mode is None:
-            gym.logger.warn("render: expected render_mode='rgb_array' or 'human', got None")
-            return None
-        if self._episodes == 0:
-            raise gym.error.ResetNeeded("render: expected a call of reset() first")
-        if self._painter is None:
-            self._painter = painter(self.render_mode, self._loop)
-        pictures = self._painter.pictures(moments(self._loop, [self._episodes - 1]))
+        pictures = self._renderer.render([self._episodes])
         return pictures[0] if pictures else None
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        if self._painter is not None:
-            self._painter.close()
-            self._painter = None
+        self._renderer.close()
         self._loop.close()
 
     def _checked(self, action: Any) -> np.ndarray:

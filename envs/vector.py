@@ -1,9 +1,8 @@
 """Many drones behind Gymnasium's vector signature: the loop with a world for each."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
@@ -11,11 +10,8 @@ from ..models.errors import InputError
 from ..sim import Backend, on_host
 from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
 from .loop import Loop
-from .rendering import RENDER_MODES, checked_render_mode, moments, painter
+from .rendering import RENDER_MODES, Renderer
 from .spaces import joined
-
-if TYPE_CHECKING:
-    from ..rendering.painter import Painter
 
 __all__ = ["LocalVectorEnv"]
 
@@ -66,7 +62,6 @@ class LocalVectorEnv(AdvancingVectorEnv):
         **options: Any,
     ) -> None:
         self.closed = True  # nothing is open yet
-        self.render_mode = checked_render_mode(render_mode)
         settings = {"num_threads": num_threads, "device": device}
         self._loop = loop = Loop(
             env_id,
@@ -76,12 +71,12 @@ class LocalVectorEnv(AdvancingVectorEnv):
             options=options,
             **{name: value for name, value in settings.items() if value is not None},
         )
+        self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
         self._on_device = not isinstance(loop.done, np.ndarray)
         self._nobody = self.lost = self.done = loop.done
         self._episodes = np.zeros(num_envs, int)
-        self._painter: Painter | None = None
         self.closed = False
 
     def reset(
@@ -120,20 +115,11 @@ class LocalVectorEnv(AdvancingVectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """With `rgb_array` a picture of each drone, uint8, shape (180, 240, 3); otherwise None."""
-        if self.render_mode is None:
-            gym.logger.warn("render: expected render_mode='rgb_array' or 'human', got None")
-            return None
-        if not self._episodes.all():
-            raise gym.error.ResetNeeded("render: expected a call of reset() first")
-        if self._painter is None:
-            self._painter = painter(self.render_mode, self._loop)
-        return self._painter.pictures(moments(self._loop, (self._episodes - 1).tolist()))
+        return self._renderer.render(self._episodes.tolist())
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window, if there is one."""
-        if self._painter is not None:
-            self._painter.close()
-            self._painter = None
+        self._renderer.close()
         self._loop.close()
 
     def _advance(
