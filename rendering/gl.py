@@ -15,8 +15,8 @@ _ON: Final = ("enable", "enabled", "on", "true", "1", "glfw", "glx", "wgl")
 _LIBRARIES: Final = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "OpenGL"}
 
 _HIDDEN: Final = "ROTORGRAM_GL"
-"""`MUJOCO_GL` as the user set it, if `hidden_gl_setting` has hidden it from MuJoCo. An environment
-variable, so that the processes that this one starts know it too."""
+"""Keeps `MUJOCO_GL` as the user set it while `hidden_gl_setting` hides it from MuJoCo. An
+environment variable, so that the processes that this one starts know it too."""
 
 
 class NoOpenGL(RuntimeError):

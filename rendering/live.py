@@ -5,8 +5,9 @@ pictures; the simulation goes on, slowed only by the processor that both share.
 """
 
 import time
+from contextlib import AbstractContextManager
 from threading import Event, Thread
-from typing import Final, Literal, Protocol, Self
+from typing import Final, Literal, Protocol
 
 import mujoco
 import numpy as np
@@ -20,11 +21,8 @@ __all__ = ["MOST_DRONES", "Aim", "Lines", "LiveView", "Surface", "lines_over", "
 
 MOST_DRONES: Final = 16
 """Most craft side by side; of more, the first ones are shown."""
-DEFAULT_PORT: Final = 8080
-_PICTURES: Final = 30.0
-"""Most pictures a second."""
-_NAP: Final = 0.02
-"""Longest sleep before keys are looked at again, s."""
+_PICTURES: Final = 30.0  # a second, at most
+_NAP: Final = 0.02  # s, at most, before keys are looked at again
 
 Lines = list[tuple[str, str]]
 """Names and values."""
@@ -71,7 +69,7 @@ class Surface(Protocol):
         """Close it."""
 
 
-class LiveView:
+class LiveView(AbstractContextManager["LiveView"]):
     """Draws the latest moments in a thread of its own.
 
     Args:
@@ -98,11 +96,6 @@ class LiveView:
             error, self._error = self._error, None
             raise error
         return self._thread.is_alive() and not self._closing.is_set()
-
-    @property
-    def is_watched(self) -> bool:
-        """Whether there is a viewer: of a page, whether a browser has opened it."""
-        return self.surface.is_watched()
 
     @property
     def wants(self) -> bool:
@@ -135,12 +128,7 @@ class LiveView:
             finally:  # Ctrl-C twice too
                 self.surface.close()
 
-    def __enter__(self) -> Self:
-        """Return the view, to be closed at the end of the block."""
-        return self
-
     def __exit__(self, *_: object) -> None:
-        """Close it."""
         self.close()
 
     def _paint(self) -> None:
@@ -171,13 +159,9 @@ class LiveView:
 
 
 def lines_over(moments: tuple[Moment, ...], thrust_high: float, pace: str, drones: int) -> Lines:
-    """The lines of an overlay: those of the first craft, and the speed.
+    """The lines of an overlay: those of the first craft, and the speed in words.
 
-    Args:
-        moments: Of the craft that are shown.
-        thrust_high: Largest thrust of a rotor, N.
-        pace: The speed in words.
-        drones: Number of drones, shown or not.
+    `moments` are those of the craft that are shown, of so many drones; `thrust_high` in N.
     """
     lines = [*moments[0].lines(thrust_high), ("speed", pace)]
     if drones > 1:
@@ -187,7 +171,7 @@ def lines_over(moments: tuple[Moment, ...], thrust_high: float, pace: str, drone
 
 
 def open_surface(
-    kind: Literal["window", "web"], stage: Stage, pace: Pace, port: int = DEFAULT_PORT
+    kind: Literal["window", "web"], stage: Stage, pace: Pace, port: int = 8080
 ) -> Surface:
     """A window on the display, or a page for browsers.
 

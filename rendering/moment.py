@@ -59,10 +59,7 @@ class Moment:
 
     @classmethod
     def of(
-        cls,
-        telemetry: Mapping[str, Any],
-        metrics: Sequence[tuple[str, str, str]] = (),
-        **rest: Any,
+        cls, telemetry: Mapping[str, Any], metrics: Sequence[tuple[str, str, str]], **rest: Any
     ) -> Self:
         """Read one drone's telemetry.
 
@@ -72,14 +69,18 @@ class Moment:
             metrics: Name, unit and symbol of each of the M metrics.
             rest: Fields that telemetry does not have: `reward`, `step`, `episode`.
         """
-        values = np.asarray(telemetry["metrics"]).tolist() if metrics else []
+
+        def told(name: str) -> tuple[Any, ...]:
+            return tuple(np.asarray(telemetry[name], float).tolist())
+
+        values = told("metrics") if metrics else ()
         return cls(
-            position=_vector(telemetry["position"]),
-            attitude=_vector(telemetry["attitude"]),
-            thrusts=tuple(np.asarray(telemetry["thrust"], float).tolist()),
-            goal=_vector(telemetry["goal"]) if "goal" in telemetry else None,
+            position=told("position"),
+            attitude=told("attitude"),
+            thrusts=told("thrust"),
+            goal=told("goal") if "goal" in telemetry else None,
             metrics=tuple(
-                MetricValue(name, float(value), unit, symbol)
+                MetricValue(name, value, unit, symbol)
                 for (name, unit, symbol), value in zip(metrics, values, strict=True)
             ),
             **rest,
@@ -113,21 +114,9 @@ class Moment:
         if rotors > _MOST_THRUSTS:
             name, shown = f"{name}, mean", (float(np.mean(shown)),)
         thrusts = " ".join(f"{scale * thrust:.{decimals}f}" for thrust in shown)
-        lines += [
-            (name, f"{thrusts} {unit}"),
-            ("reward", f"{self.reward:+.3f}"),
-            ("step", str(self.step)),
-            ("episode", str(self.episode)),
-        ]
-        return lines
+        lines += [(name, f"{thrusts} {unit}"), ("reward", f"{self.reward:+.3f}")]
+        return [*lines, ("step", str(self.step)), ("episode", str(self.episode))]
 
 
-_MOST_METRICS = 4
-"""Metrics with a line of their own."""
-_MOST_THRUSTS = 4
-"""Rotors with a number of their own."""
-
-
-def _vector(values: Any) -> Vector:
-    x, y, z = np.asarray(values, float).tolist()
-    return x, y, z
+_MOST_METRICS = 4  # with a line of their own
+_MOST_THRUSTS = 4  # rotors with a number of their own
