@@ -21,11 +21,9 @@ Seeds = Sequence[int | None] | np.ndarray
 class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
     """A vector env that is stepped by `advance`, the step of the wire.
 
-    A derived class sets the attributes below in `advance` to new arrays; arrays of earlier steps
-    do not change.
+    `advance` sets the arrays below to new ones; those of earlier steps do not change.
 
     Attributes:
-        env_spec: The `EnvSpec` of the env.
         control_period: Time of a step, s.
         observations: float32, shape (N, n), where the spec has one array; else a dict of arrays.
         rewards: float64, shape (N,).
@@ -44,12 +42,6 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
     done: np.ndarray
     lost: np.ndarray
     telemetry: Mapping[str, np.ndarray]
-
-    @abstractmethod
-    def reset(
-        self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode, for all drones or some."""
 
     @abstractmethod
     def advance(
@@ -73,10 +65,9 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
 
     def step(self, actions: Any) -> Step:
         """Fly every drone for one control period; after an episode the autoreset mode decides."""
-        array = self._shaped(actions)
         mode = self.metadata["autoreset_mode"]
         resets = self.done if mode == AutoresetMode.NEXT_STEP and self.done.any() else None
-        self.advance(array, resets)
+        self.advance(self._shaped(actions), resets)
         rewards, terminated, truncated = self.rewards, self.terminated, self.truncated
         info = self._info(~self._nobody)
         if mode == AutoresetMode.SAME_STEP and self.done.any():
@@ -104,13 +95,11 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         fps = max(1, round(1 / spec.control_period))
         self.metadata = {"render_modes": [], "render_fps": fps, "autoreset_mode": mode}
 
-    def _shaped(self, actions: Any) -> np.ndarray:
-        array = np.asarray(actions)
-        if array.shape != self.action_space.shape:
-            raise InputError(
-                f"actions: expected an array of shape {self.action_space.shape}, "
-                f"got shape {array.shape}"
-            )
+    def _shaped(self, actions: Any) -> Any:
+        array, expected = np.asarray(actions), self.action_space.shape
+        if array.shape != expected:
+            got = f"got shape {array.shape}"
+            raise InputError(f"actions: expected an array of shape {expected}, {got}")
         return array
 
     def _no_actions(self) -> np.ndarray:
@@ -143,10 +132,8 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _info(self, mask: np.ndarray) -> dict[str, Any]:
         """The telemetry of the drones by its components, each name with its mask."""
-        info: dict[str, Any] = {
-            name: column.copy()
-            for name, column in info_columns(self.env_spec, self.telemetry).items()
-        }
+        columns = info_columns(self.env_spec, self.telemetry)
+        info: dict[str, Any] = {name: column.copy() for name, column in columns.items()}
         return info | {f"_{name}": mask for name in info}
 
 
@@ -154,43 +141,34 @@ def checked_mask(mask: Any, num_envs: int) -> np.ndarray:
     """The `reset_mask` of a reset's options, bool, shape (N,); None is all. Raises `InputError`."""
     if mask is None:
         return np.ones(num_envs, bool)
-    if (
-        not isinstance(mask, np.ndarray)
-        or (mask.dtype, mask.shape) != (bool, (num_envs,))
-        or not mask.any()
-    ):
+    right = isinstance(mask, np.ndarray) and (mask.dtype, mask.shape) == (bool, (num_envs,))
+    if not (right and mask.any()):
         raise InputError(
             f"reset_mask: expected an array of {num_envs} bool, one of them True, got {mask!r}"
         )
-    return mask.copy()
+    return np.array(mask)
 
 
 def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | None:
     """One seed for each env, from one number, N of them, or None. Raises `InputError`.
 
-    Args:
-        seed: As Gymnasium's reset takes it.
-        num_envs: N.
-        most: Largest seed; where there is one, every env needs one.
+    Where there is a largest seed, `most`, every env needs one.
     """
     if seed is None:
         return None
+
+    def is_seed(number: Any) -> bool:
+        if number is None:
+            return most is None
+        return isinstance(number, int | np.integer) and 0 <= int(number) <= (most or int(number))
+
     numbers = seed
     if isinstance(seed, int | np.integer):
         numbers = range(int(seed), int(seed) + num_envs)
-    if (
-        not isinstance(numbers, Sequence | np.ndarray)
-        or len(numbers) != num_envs
-        or not all(_is_seed(number, most) for number in numbers)
-    ):
+    several = isinstance(numbers, Sequence | np.ndarray) and len(numbers) == num_envs
+    if not (several and all(map(is_seed, numbers))):
         up_to = "from 0 on" if most is None else f"from 0 to 2^{most.bit_length()} - 1"
         raise InputError(
             f"seed: expected a whole number {up_to}, or {num_envs} of them, got {seed!r}"
         )
     return numbers
-
-
-def _is_seed(number: Any, most: int | None) -> bool:
-    if number is None:
-        return most is None
-    return isinstance(number, int | np.integer) and 0 <= int(number) <= (most or int(number))

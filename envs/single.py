@@ -84,16 +84,10 @@ class SingleEnv(gym.Env[Any, Any]):
         """Fly for one control period. See the task for shapes, units and ends."""
         loop = self._loop
         loop.advance(self._checked(action))
-        result = (
-            self._observation(),
-            loop.rewards.item(),
-            loop.terminated.item(),
-            loop.truncated.item(),
-            self._info(),
-        )
         if self.render_mode == "human":
             self.render()
-        return result
+        ends = loop.terminated.item(), loop.truncated.item()
+        return self._observation(), loop.rewards.item(), *ends, self._info()
 
     def render(self) -> Any:
         """A picture of now, uint8, shape (360, 480, 3), with `rgb_array`; None otherwise."""
@@ -139,10 +133,6 @@ class SingleEnv(gym.Env[Any, Any]):
         for name, term in loop.terms.items():
             info["reward_" + name] = float(term)
         return info
-
-    def __deepcopy__(self, memo: Any) -> Any:
-        """Raise `TypeError`, as its loop does."""
-        return self._loop.__reduce__()
 
     def __reduce__(self) -> Any:
         """Raise `TypeError`, as its loop does."""

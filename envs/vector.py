@@ -1,5 +1,6 @@
 """Many drones behind Gymnasium's vector signature: the loop with a world for each."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -80,10 +81,7 @@ class LocalVectorEnv(AdvancingVectorEnv):
         self.closed = False
 
     def reset(
-        self,
-        *,
-        seed: int | Seeds | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode, for all drones or some.
 
@@ -93,25 +91,15 @@ class LocalVectorEnv(AdvancingVectorEnv):
                 By the names of the task's `choices`: numbers, one or shape (N,), in place of those
                 that the seed gives.
         """
-        options, names = dict(options or {}), self._loop.task.choices
-        asked = options.pop("reset_mask", None)
-        mask = checked_mask(self._given(asked), self.num_envs)
-        chosen = {
-            name: self._choice(name, self._given(value), names) for name, value in options.items()
+        given = {
+            name: on_host(value) if hasattr(value, "detach") else value
+            for name, value in (options or {}).items()
         }
+        mask = checked_mask(given.pop("reset_mask", None), self.num_envs)
+        chosen = {name: self._choice(name, value) for name, value in given.items()}
         seeds = checked_seeds(seed, self.num_envs)
-        self._advance(self._no_actions(), mask, seeds, ~mask, chosen)
+        self.advance(self._no_actions(), mask, seeds, ~mask, chosen)
         return self._observed(), self._info(mask)
-
-    def advance(
-        self,
-        actions: np.ndarray,
-        resets: np.ndarray | None = None,
-        seeds: Seeds | None = None,
-        frozen: np.ndarray | None = None,
-    ) -> None:
-        """Reset some drones, freeze some, and fly the others: see `AdvancingVectorEnv`."""
-        self._advance(actions, resets, seeds, frozen, None)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """With `rgb_array` a picture of each drone, uint8, shape (180, 240, 3); otherwise None."""
@@ -122,14 +110,15 @@ class LocalVectorEnv(AdvancingVectorEnv):
         self._renderer.close()
         self._loop.close()
 
-    def _advance(
+    def advance(
         self,
         actions: np.ndarray,
-        resets: np.ndarray | None,
-        seeds: Seeds | None,
-        frozen: np.ndarray | None,
-        chosen: Any,
+        resets: np.ndarray | None = None,
+        seeds: Seeds | None = None,
+        frozen: np.ndarray | None = None,
+        chosen: Mapping[str, np.ndarray] | None = None,
     ) -> None:
+        """As `AdvancingVectorEnv.advance`; `chosen` as of `Loop.advance`."""
         loop = self._loop
         loop.advance(actions, resets, seeds, frozen, chosen)
         self.observations = joined(loop.spec, loop.observations)
@@ -157,24 +146,15 @@ class LocalVectorEnv(AdvancingVectorEnv):
 
     def _info(self, mask: Any) -> dict[str, Any]:
         loop = self._loop
-        if self._on_device:
-            which = loop.ours(mask)
-            info = {}
-            for name, values in loop.metrics.items():
-                info[name], info[f"_{name}"] = values, which
-        else:
-            which, info = mask, super()._info(mask)
-        for name, term in loop.reward_terms.items():
-            info[f"reward_{name}"], info[f"_reward_{name}"] = term, which
-        return info
+        told = {f"reward_{name}": term for name, term in loop.reward_terms.items()}
+        if not self._on_device:
+            return super()._info(mask) | told | {f"_{name}": mask for name in told}
+        told, which = loop.metrics | told, loop.ours(mask)
+        return told | {f"_{name}": which for name in told}
 
-    def _given(self, value: Any) -> Any:
-        """An argument of the caller; a tensor as a NumPy array."""
-        return on_host(value) if self._on_device and hasattr(value, "detach") else value
-
-    def _choice(self, name: str, value: Any, names: tuple[str, ...]) -> np.ndarray:
-        if name not in names:
-            expected = ", ".join(("reset_mask", *names))
+    def _choice(self, name: str, value: Any) -> np.ndarray:
+        if name not in self._loop.task.choices:
+            expected = ", ".join(("reset_mask", *self._loop.task.choices))
             raise InputError(f"options: expected some of {expected}, got {name!r}")
         try:
             values = np.asarray(value, np.float64)
@@ -186,10 +166,6 @@ class LocalVectorEnv(AdvancingVectorEnv):
                 f"{name}: expected a finite number, or shape ({self.num_envs},), got {value!r}"
             )
         return np.broadcast_to(values, self.num_envs).copy()
-
-    def __deepcopy__(self, memo: Any) -> Any:
-        """Raise `TypeError`, as its loop does."""
-        return self._loop.__reduce__()
 
     def __reduce__(self) -> Any:
         """Raise `TypeError`, as its loop does."""
