@@ -10,7 +10,6 @@ import numpy as np
 from .episodes import EpisodeLog
 from .networks import Actor, arrays_of, load_arrays, nn, torch
 from .policies import ActionMap, NetworkPolicy, flat_size
-from .presets import A2CConfig, VPGConfig
 from .rollouts import Collector, Diverged, Rollout
 
 __all__ = ["Agent", "Diverged", "Learner", "OnUpdate", "Terms", "check_finite", "optimizer_arrays",
@@ -24,11 +23,7 @@ class Agent(Protocol):
     """An algorithm in training. Its state is plain arrays, whole at every update."""
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
-        """Train until the log counts `env_steps`, from the current state on.
-
-        Raises:
-            Diverged: Weights are not finite after an update.
-        """
+        """Train until the log counts `env_steps`, from the current state on. Raises `Diverged`."""
 
     def last_step(self, env_steps: int) -> int:
         """Env steps after which a training of so many ends: fewer where rollouts must be whole."""
@@ -51,21 +46,14 @@ class Agent(Protocol):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Terms:
-    """Terms of the loss of an update, as tensors: few updates are logged.
-
-    Those of the critic are None where there is none.
-    """
+    """Terms of the loss of an update, as tensors: few updates are logged."""
 
     gain: torch.Tensor
     """Mean of weight · log P, which the actor climbs."""
     entropy: torch.Tensor
     """Of the policy at each step, nats: shape (T,)."""
-    value_loss: torch.Tensor | None = None
-    """Mean squared error of the values."""
-    values: torch.Tensor | None = None
-    """V(s_t) before the update, shape (T,)."""
-    targets: torch.Tensor | None = None
-    """Their targets, shape (T,)."""
+    critic: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
+    """Mean squared error of the values; V(s_t) before the update and its targets, shape (T,)."""
 
     def numbers(self) -> dict[str, float]:
         """By SB3's names and with its signs."""
@@ -73,11 +61,10 @@ class Terms:
             "train/policy_loss": -float(self.gain),
             "train/entropy_loss": -float(self.entropy.mean()),
         }
-        if self.value_loss is not None:
-            numbers["train/value_loss"] = float(self.value_loss)
-        if self.values is not None and self.targets is not None:
-            values, targets = self.values.numpy(), self.targets.numpy()
+        if self.critic is not None:
+            loss, values, targets = (tensor.numpy() for tensor in self.critic)
             spread, left = float(np.var(targets)), float(np.var(targets - values))
+            numbers["train/value_loss"] = float(loss)
             numbers["train/explained_variance"] = 1 - left / spread if spread else np.nan
         return numbers
 
@@ -87,14 +74,14 @@ class Learner:
 
     Args:
         log: Gives the sizes; it is not kept.
-        config: Hyperparameters.
+        config: `VPGConfig` or `A2CConfig`.
         seed: Seed of the run: weights and actions.
     """
 
-    def __init__(self, log: EpisodeLog, config: VPGConfig | A2CConfig, seed: int) -> None:
+    def __init__(self, log: EpisodeLog, config: Any, seed: int) -> None:
         weights_seed, self._rng = seeds_of(seed)
         torch.manual_seed(weights_seed)
-        self.spec = log.spec
+        self.spec, self.config = log.spec, config
         actions = ActionMap(log.spec.action)
         self._actor = Actor(
             flat_size(log.spec),
@@ -103,15 +90,14 @@ class Learner:
             hidden=config.hidden,
             log_std=config.log_std,
         )
-        self.networks: dict[str, nn.Module] = {"actor": self._actor, **self.others(config)}
-        self._learning_rate, self._anneal = config.learning_rate, config.anneal
+        self.networks: dict[str, nn.Module] = {"actor": self._actor, **self.others()}
         parameters = [p for network in self.networks.values() for p in network.parameters()]
         # foreach: one call for all parameters instead of one for each; same arithmetic.
-        self._optimizer = torch.optim.Adam(parameters, lr=self._learning_rate, foreach=True)
+        self._optimizer = torch.optim.Adam(parameters, lr=config.learning_rate, foreach=True)
         self.terms: Terms | None = None
         """Of the last update."""
 
-    def others(self, config: Any) -> dict[str, nn.Module]:
+    def others(self) -> dict[str, nn.Module]:
         """Networks besides the actor, by name."""
         return {}
 
@@ -129,19 +115,17 @@ class Learner:
         while log.env_steps < env_steps:
             policy, before = NetworkPolicy(self.actor(), self.spec), log.env_steps
             rollout = self.collect(collector, policy, env_steps - before)
-            if self._anneal:
-                self._set_learning_rate(1 - before / env_steps)
+            if self.config.anneal:
+                for group in self._optimizer.param_groups:
+                    group["lr"] = self.config.learning_rate * (1 - before / env_steps)
             if len(rollout):
-                self._update(rollout)
+                self._optimizer.zero_grad()
+                self.loss(rollout).backward()  # type: ignore[no-untyped-call]
+                self._optimizer.step()
+                self._actor.clamp_()
+                check_finite(self._optimizer)
             if not on_update():
                 return
-
-    def _update(self, rollout: Rollout) -> None:
-        self._optimizer.zero_grad()
-        self.loss(rollout).backward()  # type: ignore[no-untyped-call]
-        self._optimizer.step()
-        self._actor.clamp_()
-        check_finite(self._optimizer)
 
     def last_step(self, env_steps: int) -> int:
         """Env steps after which a training of so many ends: all are flown."""
@@ -181,10 +165,6 @@ class Learner:
         if self._actor.log_std is not None:
             numbers["train/std"] = float(self._actor.log_std.detach().exp().mean())
         return numbers
-
-    def _set_learning_rate(self, share: float) -> None:
-        for group in self._optimizer.param_groups:
-            group["lr"] = self._learning_rate * share
 
 
 def check_finite(optimizer: torch.optim.Optimizer) -> None:

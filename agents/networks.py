@@ -46,14 +46,9 @@ class Actor(nn.Module):
     """
 
     def __init__(
-        self,
-        inputs: int,
-        outputs: int,
-        *,
-        discrete: bool = False,
-        hidden: int = 16,
+        self, inputs: int, outputs: int, *, discrete: bool = False, hidden: int = 16,
         log_std: float = -0.5,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         self.hidden = _layer(inputs, hidden, math.sqrt(2))
         # Near zero: the first policy gives the middle of the action space, whatever it sees.
@@ -108,10 +103,7 @@ def arrays_of(module: nn.Module) -> dict[str, np.ndarray]:
 
 def load_arrays(module: nn.Module, arrays: Mapping[str, np.ndarray], prefix: str = "") -> None:
     """Set a module's parameters from the arrays whose names begin with a prefix."""
+    given = {name: array for name, array in arrays.items() if name.startswith(prefix)}
     module.load_state_dict(
-        {
-            name.removeprefix(prefix): torch.from_numpy(array.copy())
-            for name, array in arrays.items()
-            if name.startswith(prefix)
-        }
+        {name.removeprefix(prefix): torch.from_numpy(a.copy()) for name, a in given.items()}
     )

@@ -1,6 +1,6 @@
 """Stable-Baselines3: its A2C as the reference, and vector envs as it wants them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from .learner import (
     set_optimizer_arrays,
     updates_of,
 )
-from .networks import load_arrays, torch
+from .networks import arrays_of, load_arrays, torch
 from .presets import A2CConfig
 
 if TYPE_CHECKING:
@@ -37,11 +37,7 @@ class SB3VecEnv(sb3_vec.VecEnv):
     Where an episode ended, `infos` has SB3's `terminal_observation` and `TimeLimit.truncated`; the
     rest of `info` is left out, for SB3 would want a dictionary for each env and step.
 
-    Args:
-        env: The vector env; it is closed by `close`.
-
-    Raises:
-        InputError: Its autoreset is another one.
+    `close` closes it. One of another autoreset raises `InputError`.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
@@ -85,21 +81,15 @@ class SB3VecEnv(sb3_vec.VecEnv):
         """An attribute of the vector env, which all envs share."""
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, *_: Any, **__: Any) -> None:
-        """Not possible: the envs are one."""
-        raise NotImplementedError("set_attr: the envs of a vector env have no attributes to set")
+    def env_method(self, *_: Any, **__: Any) -> Any:
+        """Not possible: the envs are one, without attributes to set and methods to call."""
+        raise NotImplementedError("the envs of a vector env are one")
 
-    def env_method(self, *_: Any, **__: Any) -> list[Any]:
-        """Not possible: the envs are one."""
-        raise NotImplementedError("env_method: the envs of a vector env have no methods to call")
+    set_attr = env_method
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """False: wrappers of single envs are not here."""
         return [False] * len(list(self._get_indices(indices)))
-
-    def get_images(self) -> Sequence[np.ndarray | None]:
-        """None: nothing is drawn."""
-        return [None] * self.num_envs
 
 
 class SB3A2C:
@@ -167,16 +157,13 @@ class SB3A2C:
 
     def actor(self) -> dict[str, np.ndarray]:
         """Weights of the policy, under our names."""
-        weights = {k: v.numpy().copy() for k, v in self._model.policy.state_dict().items()}
+        weights = arrays_of(self._model.policy)
         return {ours: weights[theirs] for ours, theirs in _NAMES.items() if theirs in weights}
 
     def state(self) -> dict[str, np.ndarray]:
         """Weights, optimizer, both generators and the state of SB3 between rollouts."""
         model = self._model
-        state = {
-            f"policy.{name}": value.numpy().copy()
-            for name, value in model.policy.state_dict().items()
-        }
+        state = {f"policy.{name}": array for name, array in arrays_of(model.policy).items()}
         state |= optimizer_arrays(model.policy.optimizer)
         state["rng.torch"] = torch.get_rng_state().numpy().copy()
         _, keys, place, *_ = np.random.get_state()  # noqa: NPY002
@@ -199,8 +186,7 @@ class SB3A2C:
         model.num_timesteps = int(state["steps"])
         if "observation" in state:
             shapes = state["observation"].shape, state["starts"].shape
-            sizes = model.observation_space.shape or ()
-            expected = (model.n_envs, *sizes), (model.n_envs,)
+            expected = (model.n_envs, *(model.observation_space.shape or ())), (model.n_envs,)
             if shapes != expected:
                 raise ValueError(f"observation, starts: expected shapes {expected}, got {shapes}")
             model._last_obs = state["observation"]

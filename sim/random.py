@@ -23,12 +23,10 @@ class Draw(Protocol):
     def uniform(
         self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
     ) -> Array:
-        """Uniform numbers, float64, shape (W, A, *size).
+        """Uniform numbers, float64, shape (W, A, *size), with `size` that of one drone.
 
-        Args:
-            low, high: Range; equal ends give that number, and a number is drawn all the same.
-            size: Of one drone.
-            name: Under this name a reset's options may give values in place of the draw.
+        Equal ends give that number, and a number is drawn all the same. Under `name` a reset's
+        options may give values in place of the draw.
         """
 
     def normal(self, scale: float, size: tuple[int, ...] = (), *, name: str = "") -> Array:
@@ -41,9 +39,7 @@ class Draw(Protocol):
 class Streams:
     """A generator for each of W worlds, seeded by `seed`; unpredictable until it is.
 
-    Args:
-        num_worlds: W.
-        use: Which child of a world's seed.
+    `use` is the number of the child of a world's seed.
     """
 
     def __init__(self, num_worlds: int, use: int = START) -> None:
@@ -66,14 +62,10 @@ class Streams:
 
 
 class NumpyDraw:
-    """`Draw` from streams, for some of W worlds of A drones.
+    """`Draw` from streams, for the worlds `ids` of W worlds of A drones.
 
-    Args:
-        streams: Of all worlds.
-        ids: Worlds that draw.
-        shape: (W, A), or () for a single drone.
-        chosen: Values that a reset's options give in place of draws, by name: shape
-            (W, A, *size).
+    `shape` is (W, A), or () for a single drone; `chosen` has by name what a reset's options give in
+    place of draws, shape (W, A, *size).
     """
 
     def __init__(
@@ -83,10 +75,7 @@ class NumpyDraw:
         shape: tuple[int, ...],
         chosen: Mapping[str, Any] | None = None,
     ) -> None:
-        self._streams = streams
-        self._ids = ids
-        self._shape = shape
-        self._chosen = chosen or {}
+        self._streams, self._ids, self._shape, self._chosen = streams, ids, shape, chosen or {}
 
     def uniform(
         self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
