@@ -106,8 +106,7 @@ def software_versions() -> dict[str, str]:
 def store(checkpoint: Checkpoint, path: Path) -> None:
     """Write a checkpoint: after a crash at any moment, `path` holds the old one or the new one.
 
-    Raises:
-        CheckpointError: A number is not finite: training diverged. The old file stays.
+    Raises `CheckpointError` where a number is not finite: training diverged. The old file stays.
     """
     where = checkpoint.position
     parts: dict[str, Mapping[str, Any]] = {
@@ -140,13 +139,7 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
 
 
 def load(path: Path) -> Checkpoint:
-    """Read a checkpoint.
-
-    Raises:
-        CheckpointError: There is no such file, it is damaged, or it is not a checkpoint of this
-            format.
-        MissingPackage: safetensors is not installed.
-    """
+    """Read a checkpoint. Raises `CheckpointError` or `MissingPackage`."""
     numpy = require("safetensors.numpy", "train", "reading checkpoints")
     if not path.is_file():
         raise CheckpointError(f"checkpoint: no file {path}")
@@ -237,10 +230,7 @@ def _expect(ok: bool, expected: str, got: object) -> None:
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file: after a crash at any moment, `path` holds the old one or the new one.
 
-    Two processes may write it at the same time: one of them writes last.
-
-    Raises:
-        OSError: It cannot be written; the error names the file.
+    Two processes may write it at the same time: one of them writes last. `OSError` names the file.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
     try:

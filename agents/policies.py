@@ -90,8 +90,7 @@ class NetworkPolicy:
             `output.bias` (k,), all float32, and for continuous actions `log_std` (k,).
         spec: Of the env that it flies.
 
-    Raises:
-        InputError: A weight is missing, or the shapes are not those that the env needs.
+    Raises `InputError`: a weight is missing, or the shapes are not those that the env needs.
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray], spec: EnvSpec) -> None:

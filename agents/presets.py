@@ -16,8 +16,7 @@ AlgorithmName = Literal["vpg", "a2c", "sb3-a2c"]
 PresetName = Literal["paper", "tuned"]
 
 
-_Rule = tuple[str, Callable[[Any], bool]]
-"""What is expected, and whether a value is that."""
+_Rule = tuple[str, Callable[[Any], bool]]  # What is expected, and whether a value is that
 
 
 def _is_number(value: Any, low: float, high: float = math.inf) -> bool:

@@ -23,8 +23,7 @@ from .tasks.task import Outcome, Task
 
 __all__ = ["Loop", "OnHost", "make_task", "spec_of"]
 
-_SMALL: Final = 64
-"""Up to this many numbers Python's loop is faster than NumPy's call."""
+_SMALL: Final = 64  # Up to this many numbers Python's loop is faster than NumPy's call
 
 
 def make_task(

@@ -26,8 +26,7 @@ def register(env_id: str, task: "str | type[Task]") -> None:
         env_id: As Gymnasium's: `name-v0` or `namespace/name-v0`.
         task: A class derived from `Task`, or "module:Class", which is imported when needed.
 
-    Raises:
-        InputError: The id is not of that form, or belongs to another package's env.
+    Raises `InputError`: the id is not of that form, or belongs to another package's env.
     """
     if not (isinstance(env_id, str) and _ID.fullmatch(env_id)):
         raise InputError(f"env id: expected name-v0 or namespace/name-v0, got {env_id!r}")
@@ -47,10 +46,8 @@ def register(env_id: str, task: "str | type[Task]") -> None:
 def load(env_id: str) -> str:
     """Import the module of an id and return the id without it. For ids that a user typed only.
 
-    The module of "module:Name-v0" is looked for in the working folder too.
-
-    Raises:
-        InputError: There is no such module, or it registers no such env.
+    The module of "module:Name-v0" is looked for in the working folder too. Raises `InputError`:
+    there is no such module, or it registers no such env.
     """
     module, colon, name = env_id.rpartition(":")
     if colon:
@@ -102,8 +99,7 @@ def env_spec(env_id: str, options: Any = None, vehicle: Any = None) -> EnvSpec:
         options: By name; the others have their defaults.
         vehicle: MJCF file; None is the paper's.
 
-    Raises:
-        InputError: An option or the vehicle is not what it should be.
+    Raises `InputError`: an option or the vehicle is not what it should be.
     """
     from .loop import make_task, spec_of
 

@@ -26,8 +26,7 @@ class Renderer:
         mode: None, `rgb_array` or `human`.
         loop: What flies.
 
-    Raises:
-        InputError: There is no such mode.
+    Raises `InputError`: there is no such mode.
     """
 
     def __init__(self, mode: str | None, loop: "Loop") -> None:

@@ -32,8 +32,7 @@ _STEPS_AT_ONCE: Final = 1000  # Ctrl-C waits for no more
 _HEIGHT: Final = 1000.0  # m: flights begin here, and none reaches the floor
 _SPIN: Final = (1.0, 2.0, 3.0)  # rad/s: tumbling begins about no axis of symmetry
 
-_EXACT: Final = 1e-9
-"""Tolerance where the integrator is exact: the rounding errors of a flight."""
+_EXACT: Final = 1e-9  # Tolerance where the integrator is exact: the rounding errors of a flight
 _TRUNCATION: Final = 1e-6
 """Tolerance for tumbling flight, where RK4 truncates: 4e-7 rad/s in ten seconds at 10 ms for the
 paper's vehicle. MuJoCo's Euler misses by 1 rad/s."""
@@ -86,8 +85,7 @@ def examine(vehicle: Vehicle, *, paper: bool | None = None) -> list[Check]:
         vehicle: Any.
         paper: Compare it with the paper's numbers too. None: if it is the vehicle of this package.
 
-    Raises:
-        InputError: MuJoCo warned during a flight, or the physics step is below 0.1 ms.
+    Raises `InputError`: MuJoCo warned during a flight, or the physics step is below 0.1 ms.
     """
     if vehicle.timestep < _LEAST_TIMESTEP:
         raise InputError(

@@ -26,8 +26,7 @@ def require(module: str, extra: str, purpose: str) -> ModuleType:
         extra: The extra of rotorgram that installs it.
         purpose: What it is needed for, as the subject of a sentence: "training".
 
-    Raises:
-        MissingPackage: It is not installed.
+    Raises `MissingPackage`: it is not installed.
     """
     try:
         return import_module(module)

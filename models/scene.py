@@ -21,10 +21,8 @@ World = Literal["plain", "airport"]
 
 AIRPORT_PREFIX: Final = "airport/"
 """Prefix of all names that `attach_airport` adds."""
-SCENE_PREFIX: Final = "scene/"
-"""Prefix of all names that `build_scene` adds."""
-MOST_HEIGHTS: Final = 4096
-"""Most rows and columns of a height field: 16.8 million points, 0.3 GB."""
+SCENE_PREFIX: Final = "scene/"  # Prefix of all names that `build_scene` adds
+MOST_HEIGHTS: Final = 4096  # Most rows and columns of a height field: 16.8 million points, 0.3 GB
 
 _GROUNDS: Final = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 _SKY: Final = mujoco.mjtTexture.mjTEXTURE_SKYBOX

@@ -26,8 +26,7 @@ __all__ = ["Rotor", "Vehicle"]
 
 LEAST_TIMESTEP: Final = 1e-5
 """Smallest physics step, s: a control step of 0.02 s then takes a hundredth of a second."""
-MOST_HEIGHT: Final = 1e4
-"""Height above which no craft may touch anything, m."""
+MOST_HEIGHT: Final = 1e4  # Height above which no craft may touch anything, m
 
 _RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves
 
@@ -96,8 +95,7 @@ class Vehicle:
             path: Of the file.
             linear_drag: 1/s, as Unity's `Rigidbody.drag`; 0 to 100.
 
-        Raises:
-            InputError: There is no such file, or it is no vehicle.
+        Raises `InputError`: there is no such file, or it is no vehicle.
         """
         file = Path(path if path is not None else QUAD_XML).resolve()
         number = isinstance(linear_drag, int | float | np.floating)

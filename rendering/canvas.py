@@ -55,8 +55,7 @@ class Canvas(AbstractContextManager["Canvas"]):
     def draw(self, camera: Camera = "chase", stage: Stage | None = None) -> np.ndarray:
         """The stage, or a twin of it, as it is now: a new array, uint8, shape (height, width, 3).
 
-        Raises:
-            NoOpenGL: The context was lost.
+        Raises `NoOpenGL`: the context was lost.
         """
         stage = stage or self.stage
         if stage.model is not self.stage.model:

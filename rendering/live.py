@@ -173,12 +173,7 @@ def lines_over(moments: tuple[Moment, ...], thrust_high: float, pace: str, drone
 def open_surface(
     kind: Literal["window", "web"], stage: Stage, pace: Pace, port: int = 8080
 ) -> Surface:
-    """A window on the display, or a page for browsers.
-
-    Raises:
-        NoDisplay: There is no display for a window.
-        InputError: The port is in use, or none.
-    """
+    """A window on the display, or a page for browsers. Raises `NoDisplay` or `InputError`."""
     if kind == "window":
         from .window import Window
 

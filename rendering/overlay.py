@@ -16,21 +16,16 @@ from .moment import Moment
 
 __all__ = ["Overlay", "graph_scale"]
 
-_GROUND: Final = (13, 18, 26, 150)
-"""Of panels: dark, and some of the picture shows through."""
+_GROUND: Final = (13, 18, 26, 150)  # Of panels: dark, and some of the picture shows through
 _EDGE: Final = (255, 255, 255, 36)
 _NAMES, _VALUES = (164, 176, 190), (238, 242, 246)
 _ZERO, _LIMIT = (150, 162, 176), (84, 96, 110)
 _ALARM: Final = (255, 107, 96)
 _BAR, _BAR_GROUND = (120, 190, 255), (70, 82, 98)
-_STEPS: Final = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
-"""Round numbers for the ends of a graph."""
-_LEAST: Final = 0.1
-"""Smallest end of a graph, in the metric's unit."""
-_STRIP_SIZE: Final = 160, 240
-"""Width and height of the smallest picture with a graph, pixels."""
-_NUMBERS_HEIGHT: Final = 160
-"""Of the smallest picture with numbers, pixels."""
+_STEPS: Final = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # Round numbers for the ends of a graph
+_LEAST: Final = 0.1  # Smallest end of a graph, in the metric's unit
+_STRIP_SIZE: Final = 160, 240  # Width and height of the smallest picture with a graph, pixels
+_NUMBERS_HEIGHT: Final = 160  # Of the smallest picture with numbers, pixels
 _NUMBERS_SHARE: Final = 0.4
 """Of the width or of the height: larger ones would hide the craft in the middle."""
 _TIMES: Final = 2

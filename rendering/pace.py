@@ -13,8 +13,7 @@ Press = Literal["pause", "step", "slower", "faster"]
 SPEEDS: Final = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
 """Steps of `slower` and `faster`; 1 is real time."""
 SLOWEST, FASTEST = SPEEDS[0], SPEEDS[-1]
-_CATCH_UP: Final = 0.1
-"""Longest delay that later steps make up for, s."""
+_CATCH_UP: Final = 0.1  # Longest delay that later steps make up for, s
 
 
 class Pace:

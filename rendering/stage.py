@@ -66,8 +66,7 @@ class Stage:
         model, data: With all visual elements; poses of the last moments.
         moments: The last moments.
 
-    Raises:
-        InputError: One of these is not what it should be.
+    Raises `InputError`: one of these is not what it should be.
     """
 
     def __init__(

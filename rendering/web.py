@@ -34,8 +34,7 @@ _KEYS: Final[tuple[tuple[Any, Press], ...]] = (
     (imgui.Key.Equal, "faster"),
     (imgui.Key.KeypadAdd, "faster"),
 )
-_COLUMN: Final = 90.0
-"""Left edge of values, in pixels of the panel."""
+_COLUMN: Final = 90.0  # Left edge of values, in pixels of the panel
 
 
 def refusal(host: str | None, origin: str | None) -> str | None:

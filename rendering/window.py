@@ -46,8 +46,7 @@ class Window:
         stage: The stage to show.
         pace: Changed by the keys.
 
-    Raises:
-        NoDisplay: There is no display, or none that OpenGL can draw on.
+    Raises `NoDisplay`: there is no display, or none that OpenGL can draw on.
     """
 
     where = "in the window"

@@ -22,8 +22,7 @@ _WORLDS: Final = {"mujoco": "MujocoWorld", "warp": "WarpWorld"}
 _PACKAGES: Final = {"mujoco": (), "warp": ("torch", "warp", "mujoco_warp")}
 _SETTINGS: Final = {"mujoco": "num_threads", "warp": "device"}
 
-MAX_WORLDS: Final = 1 << 16
-"""Most worlds of a batch."""
+MAX_WORLDS: Final = 1 << 16  # Most worlds of a batch
 CONTACT_CHECK: Final = 0.02
 """Longest time between two checks for contact, s. A bounce of the paper's craft at full thrust
 lasts longer, unless its skids dip less than half a millimetre."""

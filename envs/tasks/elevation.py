@@ -13,14 +13,11 @@ from .task import Outcome, Task, TaskOptions, check_choice, check_number, finite
 
 __all__ = ["Elevation", "ElevationOptions"]
 
-ERROR_SCALE: Final = 0.5
-"""|E| at which the reward crosses zero, m."""
+ERROR_SCALE: Final = 0.5  # |E| at which the reward crosses zero, m
 TERMINATION_REWARD: Final = -20.0
 """Added to the reward of the step that terminates an episode (crash, flip-over, out of band)."""
-MAX_TILT_COSINE: Final = 0.5
-"""Cosine of the tilt (60°) past which the craft counts as flipped over."""
-AIR: Final = 0.6
-"""Least room under a craft that starts, m."""
+MAX_TILT_COSINE: Final = 0.5  # Cosine of the tilt (60°) past which the craft counts as flipped over
+AIR: Final = 0.6  # Least room under a craft that starts, m
 FURTHEST: Final = 1e6
 """Highest target and widest flight band, m: far inside what MuJoCo and float32 can hold."""
 

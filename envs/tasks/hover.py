@@ -13,24 +13,16 @@ from .task import Outcome, Task, TaskOptions, check_number, finite
 
 __all__ = ["Hover", "HoverOptions"]
 
-ERROR_SCALE: Final = 0.5
-"""Distance at which the reward for nearness crosses zero, m."""
-HEADING_WEIGHT: Final = 0.2
-"""Cost of a heading half a turn off."""
-RATE_WEIGHT: Final = 0.02
-"""Cost of a body rate of 1 rad/s."""
-TERMINATION_REWARD: Final = -20.0
-"""Added to the reward of the step that terminates an episode."""
+ERROR_SCALE: Final = 0.5  # Distance at which the reward for nearness crosses zero, m
+HEADING_WEIGHT: Final = 0.2  # Cost of a heading half a turn off
+RATE_WEIGHT: Final = 0.02  # Cost of a body rate of 1 rad/s
+TERMINATION_REWARD: Final = -20.0  # Added to the reward of the step that terminates an episode
 LEAST_TILT_COSINE: Final = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
-AIR: Final = 0.6
-"""Least room under a craft that starts, m."""
-FURTHEST: Final = 1e4
-"""Furthest goal, m."""
-MOST_SPEED: Final = 100.0
-"""Speed past which an observation is clipped, m/s."""
-MOST_RATE: Final = 100.0
-"""Body rate past which an observation is clipped, rad/s."""
+AIR: Final = 0.6  # Least room under a craft that starts, m
+FURTHEST: Final = 1e4  # Furthest goal, m
+MOST_SPEED: Final = 100.0  # Speed past which an observation is clipped, m/s
+MOST_RATE: Final = 100.0  # Body rate past which an observation is clipped, rad/s
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,10 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Outcome", "Task", "TaskOptions", "check_choice", "check_number", "finite"]
 
-LONGEST_CONTROL_PERIOD: Final = 1.0
-"""Longest time between two actions, s."""
-LONGEST_EPISODE: Final = 1 << 31
-"""Most control steps of an episode."""
+LONGEST_CONTROL_PERIOD: Final = 1.0  # Longest time between two actions, s
+LONGEST_EPISODE: Final = 1 << 31  # Most control steps of an episode
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,8 +27,7 @@ FURTHEST: Final = 100.0
 """Largest coordinate of a start, m. float32 rounds 100 m to 8 µm; much further out a slow craft
 stands still, because what it flies in one physics step is rounded off."""
 
-CONTACTS_PER_GEOM: Final = 4
-"""Most contacts of a geom with the ground: so many have memory."""
+CONTACTS_PER_GEOM: Final = 4  # Most contacts of a geom with the ground: so many have memory
 
 
 class WarpWorld:
@@ -46,8 +45,7 @@ class WarpWorld:
         device: The `torch.device` of all tensors.
         qpos, qvel, ctrl: Live views of simulator memory, float32, shapes (W, 7), (W, 6), (W, R).
 
-    Raises:
-        InputError: There is no such device.
+    Raises `InputError`: there is no such device.
     """
 
     xp: Any = torch_api
