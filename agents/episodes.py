@@ -91,7 +91,6 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         keep_steps: Keep every step, for `steps`.
 
     Attributes:
-        spec: `EnvSpec` of the env.
         env_steps: Control steps of all drones together.
         episodes: Ended episodes, in the order of their ends.
     """
@@ -115,8 +114,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             if self.actions.discrete
             else spaces.Box(-1, 1, (self.actions.size,))
         )
-        self.run_seed = seed
-        self.env_steps = 0
+        self.run_seed, self.env_steps = seed, 0
         self.episodes: list[Episode] = []
         self._began: float | None = None
         self._numbers = np.arange(-count, 0)  # of the running episodes
@@ -126,8 +124,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._all, self._nothing = np.ones(count, bool), np.full(count, np.nan)
         self._flown: list[np.ndarray] = []  # actions; at least those of the running episodes
         self._steps: list[np.ndarray] | None = [] if keep_steps else None
-        still = np.zeros((count, self.actions.size), np.float32)
-        self._still = self.actions.to_envs(still)
+        self._still = self.actions.to_envs(np.zeros((count, self.actions.size), np.float32))
 
     def start_clock(self) -> None:
         """Training begins now; after `resume` it has begun before."""
@@ -156,21 +153,16 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         begins: np.ndarray | None = None,
         frozen: np.ndarray | None = None,
     ) -> None:
-        """Fly one step. A drone whose episode ends has to begin the next, or to be frozen.
+        """Fly one step with actions as a network draws them, shape (N, k), or (N, 1) if discrete.
 
-        Args:
-            actions: As a network draws them: shape (N, k), or (N, 1) if discrete.
-            begins: bool, shape (N,): drones that begin their next episode instead of flying.
-            frozen: bool, shape (N,): drones that stay as they are.
+        Drones may begin their next episode instead, or stay as they are: bool, shape (N,). One
+        whose episode has ended has to do either.
         """
-        env, sent = self.env, self.actions.to_envs(actions)
-        if begins is None:
-            env.advance(sent, None, None, frozen)
-            idle = frozen
-        else:
+        env, sent, seeds, idle = self.env, self.actions.to_envs(actions), None, frozen
+        if begins is not None:
             self._number(begins)
-            env.advance(sent, begins, self._seeds, frozen)
-            idle = begins if frozen is None else begins | frozen
+            seeds, idle = self._seeds, begins if frozen is None else begins | frozen
+        env.advance(sent, begins, seeds, frozen)
         self._flown.append(sent)
         self._keep_step(idle)
         self.env_steps += self.num_envs - (0 if idle is None else int(np.count_nonzero(idle)))

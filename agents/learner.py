@@ -38,10 +38,7 @@ class Agent(Protocol):
         """Take over a state."""
 
     def scalars(self) -> dict[str, float]:
-        """Numbers of the last update under SB3's names, `train/…`; none before the first.
-
-        `docs/algorithms/README.md` has the table. One that is not defined is NaN.
-        """
+        """Numbers of the last update, as in `docs/algorithms/README.md`; none before the first."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -72,10 +69,7 @@ class Terms:
 class Learner:
     """Base of our own algorithms: `collect` and `loss` are theirs; `loss` sets `terms` too.
 
-    Args:
-        log: Gives the sizes; it is not kept.
-        config: `VPGConfig` or `A2CConfig`.
-        seed: Seed of the run: weights and actions.
+    The log gives the sizes and is not kept; the seed is that of weights and actions.
     """
 
     def __init__(self, log: EpisodeLog, config: Any, seed: int) -> None:

@@ -34,21 +34,21 @@ def _layer(inputs: int, outputs: int, gain: float) -> nn.Linear:
 class Actor(nn.Module):
     """Policy: Gaussian for continuous actions, categorical for discrete ones.
 
-    The Gaussian's standard deviation does not depend on the state. An action is neither clipped
-    nor squashed here: the env gets the clipped action, the loss scores the drawn one.
-
-    Args:
-        inputs: Length of a flat observation, n.
-        outputs: Numbers of an action, or its choices, k.
-        discrete: Whether an action is a choice.
-        hidden: Units of the hidden layer.
-        log_std: Logarithm of the standard deviation to begin with.
+    The Gaussian's standard deviation does not depend on the state; `log_std` is its logarithm to
+    begin with. An action is neither clipped nor squashed here: the env gets the clipped action, the
+    loss scores the drawn one. Inputs are n, the length of a flat observation, outputs k, the
+    numbers of an action or its choices.
     """
 
     def __init__(
-        self, inputs: int, outputs: int, *, discrete: bool = False, hidden: int = 16,
+        self,
+        inputs: int,
+        outputs: int,
+        *,
+        discrete: bool = False,
+        hidden: int = 16,
         log_std: float = -0.5,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__()
         self.hidden = _layer(inputs, hidden, math.sqrt(2))
         # Near zero: the first policy gives the middle of the action space, whatever it sees.

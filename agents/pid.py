@@ -25,11 +25,7 @@ class PID:
     Needs the full observation and continuous actions. It derives the vehicle's numbers from the
     spec: the bounds of the rotors' thrust in the telemetry, N, over those in the observation,
     relative to hover, give the thrust at hover, and that over g the mass that a rotor carries.
-
-    Args:
-        spec: Of the env that it flies.
-
-    Raises `InputError`: it is another env, or its options or telemetry lack what the PID needs.
+    Raises `InputError` for another env, or where options or telemetry lack what it needs.
     """
 
     def __init__(self, spec: EnvSpec) -> None:

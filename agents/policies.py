@@ -43,9 +43,7 @@ class ActionMap:
 
     Of a continuous action the network's 0 is the middle between the bounds, -1 the lower and 1 the
     upper one; where there is no bound, it is the number itself. Of a discrete action the network
-    gives a number for each choice.
-
-    An array of whole numbers raises `InputError`.
+    gives a number for each choice. An array of whole numbers raises `InputError`.
 
     Attributes:
         outputs: Numbers that the network gives.
@@ -59,9 +57,8 @@ class ActionMap:
             self.outputs, self.size = action.n, 1
             return
         if not action.dtype.startswith("float"):
-            raise InputError(
-                f"action: expected a choice or numbers of type float, got {action.dtype}"
-            )
+            got = action.dtype
+            raise InputError(f"action: expected a choice or numbers of type float, got {got}")
         self.outputs = self.size = action.size
         # Two axes here and below: NumPy is slow where it has to add one to a batch of one.
         low, high = (bound.reshape(1, -1) for bound in action.bounds())
@@ -85,17 +82,13 @@ class ActionMap:
 class NetworkPolicy:
     """The actor of `networks.Actor`, from its weights.
 
-    Args:
-        weights: `hidden.weight` (h, n), `hidden.bias` (h,), `output.weight` (k, h),
-            `output.bias` (k,), all float32, and for continuous actions `log_std` (k,).
-        spec: Of the env that it flies.
-
-    Raises `InputError`: a weight is missing, or the shapes are not those that the env needs.
+    These are `hidden.weight` (h, n), `hidden.bias` (h,), `output.weight` (k, h), `output.bias`
+    (k,), all float32, and for continuous actions `log_std` (k,). Raises `InputError` if one is
+    missing, or the shapes are not those that the env needs.
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray], spec: EnvSpec) -> None:
-        self.spec = spec
-        self.actions = ActionMap(spec.action)
+        self.spec, self.actions = spec, ActionMap(spec.action)
         _check_shapes(weights, flat_size(spec), self.actions)
         self._w1, self._b1 = weights["hidden.weight"].T, weights["hidden.bias"][np.newaxis]
         self._w2, self._b2 = weights["output.weight"].T, weights["output.bias"][np.newaxis]

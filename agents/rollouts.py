@@ -42,15 +42,13 @@ class Rollout:
     @property
     def ends(self) -> np.ndarray:
         """After which rows another episode begins, or may: bool, shape (T, N)."""
-        ends: np.ndarray = self.terminated | self.truncated | ~self.kept
-        return ends
+        return np.asarray(self.terminated | self.truncated | ~self.kept)
 
     def rows(self, array: np.ndarray) -> np.ndarray:
         """The kept rows of an array of shape (T, N, ...): one for each transition."""
         if self.kept.all():
             return array.reshape(-1, *array.shape[2:])
-        chosen: np.ndarray = array[self.kept]
-        return chosen
+        return np.asarray(array[self.kept])
 
     def without_steps(self, lost: np.ndarray) -> "Rollout":
         """Without the steps whose simulator was lost: their rewards and observations are made up.
@@ -77,11 +75,10 @@ class Collector:
         self._log, self._rng = log, rng
 
     def steps(self, policy: NetworkPolicy, count: int) -> Rollout:
-        """Whole steps of all drones, as many as so many transitions need.
+        """Whole steps of all drones, as many as so many transitions need, less those with a loss.
 
         Running episodes go on in the next call. After an episode ends, that drone's next step
         begins the next episode and is no transition; if all have ended, no step is spent.
-        Steps with a lost simulator are left out.
         """
         rollout, lost, _ = self._fly(policy, -(-count // self._log.num_envs), None)
         return rollout.without_steps(lost)

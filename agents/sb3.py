@@ -96,12 +96,8 @@ class SB3A2C:
     """SB3's A2C behind the same interface as our own algorithms.
 
     Adam instead of SB3's RMSprop, no clipping of gradients, and every other setting from the same
-    `A2CConfig`: given the same experience, it makes the same updates as ours.
-
-    Args:
-        log: Log of the env to train on: SB3 wants it at construction.
-        config: Hyperparameters.
-        seed: Seed of the run: weights and actions.
+    `A2CConfig`: given the same experience, it makes the same updates as ours. SB3 wants the
+    env, the log, at construction.
     """
 
     def __init__(self, log: EpisodeLog, config: A2CConfig, seed: int) -> None:
@@ -109,9 +105,8 @@ class SB3A2C:
         # SB3 draws from the global generators: torch for actions, NumPy for the order of samples.
         torch.manual_seed(torch_seed)
         np.random.seed(torch_seed % 2**32)  # noqa: NPY002
-        self._config = config
+        self._config, self._ahead = config, 0.0
         self._rollout = config.rollout_size(log.num_envs)
-        self._ahead = 0.0
         self._model = _A2C(
             "MlpPolicy",
             SB3VecEnv(log),
@@ -138,7 +133,7 @@ class SB3A2C:
     def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
         """As `Agent.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
         model, rollout = self._model, self._rollout
-        done, whole = model.num_timesteps, env_steps // rollout * rollout
+        done, whole = model.num_timesteps, self.last_step(env_steps)
         if done >= whole:
             return
         self._ahead = rollout / whole

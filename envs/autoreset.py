@@ -54,13 +54,9 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         """Reset some drones, freeze some, and fly the others for one control period.
 
         Rewards and flags of a drone that is reset or frozen are 0, and its action is ignored. One
-        that is frozen is afterwards as it was before.
-
-        Args:
-            actions: Shape (N, k); of discrete actions (N,) or (N, 1).
-            resets: bool, shape (N,); None resets none.
-            seeds: Of those that are reset, shape (N,); None leaves their streams as they are.
-            frozen: bool, shape (N,); None freezes none.
+        that is frozen is afterwards as it was before. Actions have shape (N, k), discrete ones (N,)
+        or (N, 1); masks are bool, shape (N,), or None. Seeds, shape (N,), are of those that are
+        reset; None leaves their streams as they are.
         """
 
     def step(self, actions: Any) -> Step:
@@ -72,7 +68,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         info = self._info(~self._nobody)
         if mode == AutoresetMode.SAME_STEP and self.done.any():
             truncated, info = self._begin_next(truncated, info)
-        return self._observed(), rewards, terminated, truncated, info
+        return self.observations, rewards, terminated, truncated, info
 
     def _take_spec(self, spec: EnvSpec, num_envs: int, mode: AutoresetMode | str) -> None:
         """Set spaces and other attributes from a spec. Raises `InputError`.
@@ -107,15 +103,13 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         shape = (1,) if isinstance(action, Discrete) else action.shape
         return np.zeros((self.num_envs, *shape), np.float32)
 
-    def _begin_next(
-        self, truncated: np.ndarray, last_info: dict[str, Any]
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def _begin_next(self, truncated: Any, last_info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """SAME_STEP: reset those whose episode ended; the info, with that of their last step.
 
         A simulator that is lost meanwhile truncates the episodes of its frozen drones: they begin
         their next as well.
         """
-        last, ended = self._observed(), self._nobody
+        last, ended = self.observations, self._nobody
         while self.done.any():
             truncated = truncated | self.lost
             ended = ended | self.done
@@ -125,10 +119,6 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         info |= {"final_obs": last, "_final_obs": ended}
         info |= {"final_info": last_info | masks, "_final_info": ended | self._nobody}
         return truncated, info
-
-    def _observed(self) -> Any:
-        """Observations as the space has them."""
-        return self.observations
 
     def _info(self, mask: np.ndarray) -> dict[str, Any]:
         """The telemetry of the drones by its components, each name with its mask."""

@@ -131,16 +131,10 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
 class Loop:
     """N drones of one env, each in a world of its own.
 
-    Args:
-        env_id: Of a registered task.
-        num_envs: N.
-        vehicle: MJCF file; None is the paper's.
-        backend: `mujoco` or `warp`.
-        options: Of the task, by name.
-        settings: Of the backend: `num_threads`, or `device`.
+    The vehicle is an MJCF file, None the paper's; options are the task's, by name; settings the
+    backend's: `num_threads`, or `device`.
 
     Attributes:
-        spec: Its `EnvSpec`.
         task, world: Their arrays have the leading axes of the world; all others here have one axis
             of N drones, and are new after each `advance`.
         observations: By name, shape (N, *shape), of the declared dtypes.
@@ -170,8 +164,7 @@ class Loop:
         self._xp, lead = self.world.xp, self.world.shape
         self.task = type(draft)(draft.options, draft.vehicle, lead, self._xp)
         self.spec = spec_of(canonical_id(env_id), self.task)
-        self.num_envs = num_envs
-        self.vehicle = draft.vehicle
+        self.num_envs, self.vehicle = num_envs, draft.vehicle
         self._substeps = draft.vehicle.substeps(draft.options.control_period)
         self._length = draft.options.episode_length
         self._choices = self.task.controller.choices
@@ -183,8 +176,7 @@ class Loop:
         self.rewards: Array = 0.0 * self._nobody
         self.observations: dict[str, Array] = {}
         self._steps: Array = (0 * self._nobody).reshape(lead)[()]
-        self._waiting = ~self._nobody  # for a reset
-        self._anyone_waits = True
+        self._waiting, self._anyone_waits = ~self._nobody, True  # for a reset
         self._begun = False
         self._outcome: Outcome | None = None
         self.terms: dict[str, Array] = {}
@@ -213,18 +205,15 @@ class Loop:
         idle = resets if frozen is None else frozen if resets is None else resets | frozen
         flown = None if idle is None or not idle.any() else ~idle
         if self._anyone_waits:
-            self._check_begun(flown)
+            waiting = self._waiting if flown is None else self._waiting & flown
+            if waiting.any():
+                first = f"env {int(waiting.nonzero()[0][0])}"
+                raise gym.error.ResetNeeded(f"step: expected a call of reset() for {first} first")
         if flown is None or flown.any():
             self._fly(actions, flown)
         if resets is not None and resets.any():
             self._begin(resets, seeds, chosen or {})
         self._look(flown)
-
-    def _check_begun(self, flown: Array | None) -> None:
-        waiting = self._waiting if flown is None else self._waiting & flown
-        if waiting.any():
-            first = int(waiting.nonzero()[0][0])
-            raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
 
     def _fly(self, actions: Array, flown: Array | None) -> None:
         world, lead = self.world, self.world.shape

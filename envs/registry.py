@@ -22,11 +22,9 @@ _tasks: Final[dict[str, "str | type[Task]"]] = {}
 def register(env_id: str, task: "str | type[Task]") -> None:
     """Make a task known by an id, to rotorgram and to Gymnasium. Registering again replaces it.
 
-    Args:
-        env_id: As Gymnasium's: `name-v0` or `namespace/name-v0`.
-        task: A class derived from `Task`, or "module:Class", which is imported when needed.
-
-    Raises `InputError`: the id is not of that form, or belongs to another package's env.
+    The task is a class derived from `Task`, or "module:Class", which is imported when needed.
+    Raises `InputError` if the id is not as `name-v0` or `namespace/name-v0`, or belongs to another
+    package's env.
     """
     if not (isinstance(env_id, str) and _ID.fullmatch(env_id)):
         raise InputError(f"env id: expected name-v0 or namespace/name-v0, got {env_id!r}")
@@ -92,15 +90,7 @@ def options_type(env_id: str) -> "type[TaskOptions]":
 
 
 def env_spec(env_id: str, options: Any = None, vehicle: Any = None) -> EnvSpec:
-    """The spec of an env, without stepping anything.
-
-    Args:
-        env_id: Of a registered task.
-        options: By name; the others have their defaults.
-        vehicle: MJCF file; None is the paper's.
-
-    Raises `InputError`: an option or the vehicle is not what it should be.
-    """
+    """The spec of an env with these options and this MJCF file. Raises `InputError`."""
     from .loop import make_task, spec_of
 
     return spec_of(canonical_id(env_id), make_task(env_id, options or {}, vehicle))

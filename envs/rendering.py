@@ -20,14 +20,7 @@ RENDER_MODES: Final = ["human", "rgb_array"]
 
 
 class Renderer:
-    """`render` of an env: a picture of each drone, or a window that shows them in real time.
-
-    Args:
-        mode: None, `rgb_array` or `human`.
-        loop: What flies.
-
-    Raises `InputError`: there is no such mode.
-    """
+    """`render` of an env: a picture of each drone, or a window that shows them in real time."""
 
     def __init__(self, mode: str | None, loop: "Loop") -> None:
         if mode is not None and mode not in RENDER_MODES:
@@ -40,12 +33,7 @@ class Renderer:
     def render(self, episodes: Sequence[int]) -> tuple[np.ndarray, ...] | None:
         """Pictures, uint8, shape (height, width, 3); None in other modes than `rgb_array`.
 
-        Args:
-            episodes: How many each drone has begun.
-
-        Raises:
-            gymnasium.error.ResetNeeded: A drone has begun none.
-            NoOpenGL: No OpenGL works here, or there is no display.
+        `episodes` says how many each drone has begun; where that is none, it raises `ResetNeeded`.
         """
         if self._mode is None:
             gym.logger.warn("render: expected render_mode='rgb_array' or 'human', got None")
@@ -106,13 +94,7 @@ def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
 
 
 def moment(spec: EnvSpec, telemetry: Mapping[str, Any], **rest: Any) -> "Moment":
-    """The `Moment` of one drone.
-
-    Args:
-        spec: Of its env.
-        telemetry: Its arrays, by name.
-        rest: `reward`, `step` and `episode`, as `rendering.Moment` has them.
-    """
+    """The `Moment` of one drone, with `reward`, `step` and `episode` as `Moment` has them."""
     from ..rendering import Moment
 
     metrics = [(metric.name, metric.unit, metric.symbol) for metric in spec.metrics]

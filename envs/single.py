@@ -25,14 +25,9 @@ class SingleEnv(gym.Env[Any, Any]):
     Render modes: with `rgb_array`, `render()` gives a picture, uint8, shape (360, 480, 3); with
     `human` a window shows the flight in real time. The physics is the same with either.
 
-    Args:
-        env_id: Of a registered task.
-        render_mode: None, `rgb_array` or `human`.
-        vehicle: MJCF file; None is the paper's.
-        options: Of the task, by name.
+    The vehicle is an MJCF file, None the paper's; options are the task's, by name.
 
     Attributes:
-        env_spec: The `EnvSpec` of the env.
         control_period: Time of a step, s.
 
     Raises:
@@ -56,8 +51,7 @@ class SingleEnv(gym.Env[Any, Any]):
         self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
         self.env_spec = loop.spec
         self.control_period = loop.spec.control_period
-        fps = max(1, round(1 / self.control_period))
-        self.metadata = {"render_modes": RENDER_MODES, "render_fps": fps}
+        self.metadata = self.metadata | {"render_fps": max(1, round(1 / self.control_period))}
         self.observation_space = observation_space(loop.spec)
         self.action_space = action_space(loop.spec)
         self._names = telemetry_names(loop.spec)
@@ -100,15 +94,14 @@ class SingleEnv(gym.Env[Any, Any]):
         self._loop.close()
 
     def _checked(self, action: Any) -> np.ndarray:
-        if isinstance(action, np.ndarray) and action.dtype == np.float32:
-            if action.shape == self.action_space.shape:
-                return action
-        elif isinstance(self.action_space, gym.spaces.Discrete):
-            if not self.action_space.contains(action):
-                expected = f"a whole number 0 to {self.action_space.n - 1}"
+        space, shape = self.action_space, self.action_space.shape
+        if isinstance(action, np.ndarray) and (action.dtype, action.shape) == (np.float32, shape):
+            return action
+        if isinstance(space, gym.spaces.Discrete):
+            if not space.contains(action):
+                expected = f"a whole number 0 to {space.n - 1}"
                 raise InputError(f"action: expected {expected}, got {action!r}")
             return np.array((action,))
-        shape = self.action_space.shape
         try:
             array = np.asarray(action)
         except ValueError:

@@ -99,7 +99,7 @@ class LocalVectorEnv(AdvancingVectorEnv):
         chosen = {name: self._choice(name, value) for name, value in given.items()}
         seeds = checked_seeds(seed, self.num_envs)
         self.advance(self._no_actions(), mask, seeds, ~mask, chosen)
-        return self._observed(), self._info(mask)
+        return self.observations, self._info(mask)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """With `rgb_array` a picture of each drone, uint8, shape (180, 240, 3); otherwise None."""

@@ -81,11 +81,8 @@ class Check:
 def examine(vehicle: Vehicle, *, paper: bool | None = None) -> list[Check]:
     """Run the whole examination on a vehicle; its model does not change.
 
-    Args:
-        vehicle: Any.
-        paper: Compare it with the paper's numbers too. None: if it is the vehicle of this package.
-
-    Raises `InputError`: MuJoCo warned during a flight, or the physics step is below 0.1 ms.
+    With `paper` it is compared with the paper's numbers too; None: if it is the vehicle of this
+    package. Raises `InputError` if MuJoCo warns in flight, or the physics step is below 0.1 ms.
     """
     if vehicle.timestep < _LEAST_TIMESTEP:
         raise InputError(

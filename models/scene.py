@@ -40,17 +40,10 @@ _HAZE_COLOUR: Final = (0.80, 0.88, 0.96, 1.0)  # the sky's colour where it meets
 def build_scene(
     vehicle: Path | str | None = None, world: World = "plain", *, visual: bool = True
 ) -> mujoco.MjSpec:
-    """A vehicle with ground, sky and light, to be compiled.
+    """A vehicle, None for the paper's, with ground, sky and light, to be compiled.
 
-    Args:
-        vehicle: Its MJCF file; None is the paper's.
-        world: `plain` or `airport`.
-        visual: Keep visual elements. Without them the physics is faster and the same, bit for
-            bit.
-
-    Raises:
-        InputError: The world is not one of these, or a height field is too large.
-        ValueError: The file is no MJCF.
+    Without visual elements the physics is faster and the same, bit for bit. Raises `InputError` if
+    there is no such world, or a height field is too large; `ValueError` if the file is no MJCF.
     """
     if world not in ("plain", "airport"):
         raise InputError(f"world: expected 'plain' or 'airport', got {world!r}")
@@ -100,11 +93,10 @@ def _check_height_fields(path: Path, seen: set[Path]) -> None:
                     f"vehicle: expected a height field of at most {MOST_HEIGHTS} × {MOST_HEIGHTS} "
                     f"points, got {' × '.join(sides)}"
                 )
-        elif (
-            element.tag == "include"
-            and (inner := path.parent / element.get("file", "")) not in seen
-        ):
-            _check_height_fields(inner, seen)
+        elif element.tag == "include":
+            inner = path.parent / element.get("file", "")
+            if inner not in seen:
+                _check_height_fields(inner, seen)
 
 
 def switch_off_log_file() -> None:
@@ -136,11 +128,8 @@ def attach_airport(spec: mujoco.MjSpec) -> None:
 
     Horizontal planes of the world body at z = 0, the scene's floor, still carry what stands on
     them, but are not drawn unless geom group 3 is. The sky, haze, shadow map, and the near and far
-    end of drawing become the airport's. Lights and cameras stay.
-
-    Raises:
-        InputError: The scene has an airport already.
-        ValueError: It does not compile.
+    end of drawing become the airport's. Lights and cameras stay. Raises `InputError` if the scene
+    has an airport already, `ValueError` if it does not compile.
     """
     if any(geom.name.startswith(AIRPORT_PREFIX) for geom in spec.geoms):
         raise InputError("spec: expected a scene without an airport, got one that has it")

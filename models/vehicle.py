@@ -82,20 +82,15 @@ class Vehicle:
 
     @classmethod
     def load(cls, path: Path | str | None = None, *, linear_drag: float = 0.0) -> "Vehicle":
-        """The vehicle of an MJCF file; None is the paper's.
+        """The vehicle of an MJCF file; None is the paper's. Raises `InputError` if there is none.
 
-        The same path and drag give the same object until the file changes.
+        The same path and drag (1/s, as Unity's `Rigidbody.drag`, 0 to 100) give the same object
+        until the file changes.
 
         Its `hash` is BLAKE2b over the MJCF of vehicle and scene with includes resolved, as
         `MjSpec.to_xml()` writes it, the bytes of mesh and height field files, and the drag as a
         little-endian float64. Comments, layout and folder do not enter; numbers do, to the six
         digits that MuJoCo writes.
-
-        Args:
-            path: Of the file.
-            linear_drag: 1/s, as Unity's `Rigidbody.drag`; 0 to 100.
-
-        Raises `InputError`: there is no such file, or it is no vehicle.
         """
         file = Path(path if path is not None else QUAD_XML).resolve()
         number = isinstance(linear_drag, int | float | np.floating)
@@ -193,7 +188,12 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
         )
     center = data.subtree_com[body].copy()
     rotors = tuple(_rotor(model, data, i, body) for i in range(model.nu))
-    allocation = _allocation(rotors, center)
+    columns = []
+    for rotor in rotors:
+        axis = np.array(rotor.axis)
+        torque = np.cross(np.array(rotor.position) - center, axis) + rotor.reaction
+        columns.append((axis[2], *torque))
+    allocation = np.array(columns).T
     model.dof_damping[0:3] = drag * mass
     return Vehicle(
         path=path,
@@ -244,15 +244,6 @@ def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
         high=high,
         newtons=abs(newtons),
     )
-
-
-def _allocation(rotors: tuple[Rotor, ...], center: np.ndarray) -> np.ndarray:
-    columns = []
-    for rotor in rotors:
-        axis = np.array(rotor.axis)
-        torque = np.cross(np.array(rotor.position) - center, axis) + rotor.reaction
-        columns.append((axis[2], *torque))
-    return np.array(columns).T
 
 
 def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> np.ndarray:
@@ -306,10 +297,7 @@ def _rest_height(model: mujoco.MjModel, data: Any) -> float:
             )
     while high - low > 1e-10 * high:
         middle = (low + high) / 2
-        if _touches(model, data, middle):
-            low = middle
-        else:
-            high = middle
+        low, high = (middle, high) if _touches(model, data, middle) else (low, middle)
     return round(high, 9)
 
 

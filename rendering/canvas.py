@@ -17,16 +17,9 @@ _SAMPLES = 4  # of every pixel, for smooth edges; software has no more
 
 
 class Canvas(AbstractContextManager["Canvas"]):
-    """Pictures of a stage, all of one size.
+    """Pictures of a stage, all of one size in pixels. Raises `NoOpenGL` or `InputError`.
 
-    Args:
-        stage: The stage to draw.
-        width, height: Pixels.
-        fast: Without shadows and smooth edges, which take most of the time where software draws.
-
-    Raises:
-        NoOpenGL: No OpenGL works here.
-        InputError: Width or height is not 16 to 8192.
+    `fast` is without shadows and smooth edges, which take most of the time where software draws.
     """
 
     def __init__(
@@ -53,10 +46,7 @@ class Canvas(AbstractContextManager["Canvas"]):
         self._option, self._rect = mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
 
     def draw(self, camera: Camera = "chase", stage: Stage | None = None) -> np.ndarray:
-        """The stage, or a twin of it, as it is now: a new array, uint8, shape (height, width, 3).
-
-        Raises `NoOpenGL`: the context was lost.
-        """
+        """The stage, or a twin of it, as it is now: a new array, uint8, (height, width, 3)."""
         stage = stage or self.stage
         if stage.model is not self.stage.model:
             raise ValueError("stage: expected the canvas's own or a twin of it, got another")

@@ -153,15 +153,9 @@ def _write_mp4(
 
 
 def poster(path: Path, share: float = 0.3) -> bytes:
-    """A JPEG to show in place of an MP4 that does not play yet.
+    """A JPEG to show in place of an MP4 that does not play yet, from this share of its length.
 
-    Args:
-        path: An MP4.
-        share: Of the film's length, 0 to 1: where the picture is taken from.
-
-    Raises:
-        OSError: It cannot be read.
-        MissingPackage: Pillow or imageio-ffmpeg is not installed.
+    Raises `OSError` if it cannot be read, `MissingPackage` without Pillow or imageio-ffmpeg.
     """
     ffmpeg = require("imageio_ffmpeg", "render", "a film's poster")
     try:

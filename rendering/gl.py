@@ -53,7 +53,7 @@ def offscreen_context(width: int, height: int) -> Any:
 
     `MUJOCO_GL` decides if it is set (egl, osmesa, glfw; MuJoCo itself reads it once, when it is
     imported). Otherwise it is EGL on Linux, with a display or without; a window that is hidden
-    where there is a display and no EGL; elsewhere the system's own. Raises `NoOpenGL` if none works.
+    where there is a display and no EGL; elsewhere the system's own. Without any: `NoOpenGL`.
     """
     reasons = []
     for name in _candidates():

@@ -29,10 +29,7 @@ Lines = list[tuple[str, str]]
 
 
 class Aim:
-    """Turns a viewer's camera towards the goal once; afterwards moves it as the goal moves.
-
-    Without a goal it follows the craft.
-    """
+    """Turns a viewer's camera towards the goal, or the craft; afterwards moves it with that."""
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
@@ -70,20 +67,16 @@ class Surface(Protocol):
 
 
 class LiveView(AbstractContextManager["LiveView"]):
-    """Draws the latest moments in a thread of its own.
+    """Draws the latest moments on a surface, in a thread of its own.
 
-    Args:
-        stage: The stage to draw. The view alone shows moments on it.
-        surface: The window or page to draw on.
-        pace: Its speed is a line of the overlay.
-        of: Number of drones, if more than are shown.
+    The view alone shows moments on the stage. The pace's speed is a line of the overlay; `of` is
+    the number of drones, if more than are shown.
     """
 
     def __init__(self, stage: Stage, surface: Surface, pace: Pace, of: int | None = None) -> None:
         self.stage, self.surface, self.pace = stage, surface, pace
-        self._of = of or stage.drones
+        self._of, self._said = of or stage.drones, ""
         self._latest: tuple[Moment, ...] = ()
-        self._said = ""
         self._fresh, self._closing = Event(), Event()
         self._error: Exception | None = None
         self._thread = Thread(target=self._paint, name="live view", daemon=True)

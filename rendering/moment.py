@@ -61,13 +61,10 @@ class Moment:
     def of(
         cls, telemetry: Mapping[str, Any], metrics: Sequence[tuple[str, str, str]], **rest: Any
     ) -> Self:
-        """Read one drone's telemetry.
+        """From a drone's telemetry, and `reward`, `step` and `episode`, which it does not have.
 
-        Args:
-            telemetry: Arrays by name: `position` (3,), `attitude` (3,), `thrust` (R,), `metrics`
-                (M,) and, if the task has one, `goal` (3,). Others are ignored.
-            metrics: Name, unit and symbol of each of the M metrics.
-            rest: Fields that telemetry does not have: `reward`, `step`, `episode`.
+        Telemetry is arrays by name: `position` (3,), `attitude` (3,), `thrust` (R,), `metrics` (M,)
+        and, if the task has one, `goal` (3,). The M metrics are told by name, unit and symbol.
         """
 
         def told(name: str) -> tuple[Any, ...]:
@@ -97,11 +94,7 @@ class Moment:
         return None if self.goal is None else pose_in_mujoco_frame(self.goal, (0, 0, 0))[:3]
 
     def lines(self, thrust_high: float) -> list[tuple[str, str]]:
-        """Names and values for an overlay.
-
-        Args:
-            thrust_high: Largest thrust of a rotor, N: it sets the number of digits.
-        """
+        """Names and values for an overlay; a rotor's largest thrust, N, sets the digits."""
         lines = [(metric.label, metric.text) for metric in self.metrics[:_MOST_METRICS]]
         lines.append(("elevation", f"{self.position[1]:.2f} m"))
         if self.goal is not None:

@@ -137,13 +137,12 @@ class Overlay:
         _enlarged(image, self.panel, lambda draw: self._write_panel(draw, moment))
         if self.has_strip:
             _enlarged(image, self.strip, lambda draw: self._write_strip(draw, values))
-        if note:
-            box = self._note_box(note)
+        if note:  # below the panel, away from the craft
+            wide = self._large.getlength(note) / _TIMES + 3 * self._gap
+            left, upper = self.panel.left, self.panel.lower + self._gap
+            box = Box(left, upper, round(left + wide), round(upper + 1.9 * self._unit))
             _enlarged(image, box, lambda draw: self._write_note(draw, box, note))
         return np.asarray(image)
-
-    # Boxes are in pixels of the picture; what writes into them draws in enlarged pixels, from the
-    # box's own corner on.
 
     def _numbers_width(self) -> int:
         """Of a panel in which every name and its value fit beside each other."""
@@ -225,9 +224,9 @@ class Overlay:
         draw.text((2 * gap, gap), ", ".join(words), _NAMES, self._font)
         time = f"{max(len(values) - 1, 0) * self._period:.2f} s"
         draw.text((self.strip.size[0] - 2 * gap, gap), time, _VALUES, self._font, anchor="ra")
-        dx, dy = self.strip.left, self.strip.upper
+        corner = self.strip[:2] * 2
         left, upper, right, lower = (
-            (edge - (dx, dy)[number % 2]) * _TIMES for number, edge in enumerate(self.plot)
+            (edge - start) * _TIMES for edge, start in zip(self.plot, corner, strict=True)
         )
         for label, share in self._levels():
             y = lower - (lower - upper) * (1 + share) / 2
@@ -259,12 +258,6 @@ class Overlay:
         for x, y in ((x, height(y)) for x, y in points[-1:] if abs(y) <= 1):
             draw.ellipse((x - thick, y - thick, x + thick, y + thick), self._color)
 
-    def _note_box(self, note: str) -> Box:
-        """Below the panel, away from the craft."""
-        wide = self._large.getlength(note) / _TIMES + 3 * self._gap
-        left, upper = self.panel.left, self.panel.lower + self._gap
-        return Box(left, upper, round(left + wide), round(upper + 1.9 * self._unit))
-
     def _write_note(self, draw: ImageDraw.ImageDraw, box: Box, note: str) -> None:
         size = box.size[0] - 1, box.size[1] - 1
         thick = max(1, round(self._unit * _TIMES / 12))
@@ -273,7 +266,7 @@ class Overlay:
 
 
 def _enlarged(image: Image.Image, box: Box, write: Callable[[ImageDraw.ImageDraw], None]) -> None:
-    """Write on a part of the picture. All other pixels stay the same, bit for bit."""
+    """Write on a part of the picture, in enlarged pixels from its own corner on."""
     part = image.crop(box)
     part = part.resize((part.width * _TIMES, part.height * _TIMES), Image.Resampling.NEAREST)
     write(ImageDraw.Draw(part))

@@ -22,10 +22,6 @@ class Pace:
     Args:
         period: Time between two steps, s; 0 for as fast as possible.
         speed: 2 is twice as fast as real time. One beyond `SPEEDS` raises `InputError`.
-
-    Attributes:
-        speed: The present one.
-        paused: Whether each step waits for a press of `step`.
     """
 
     def __init__(self, period: float, speed: float = 1.0) -> None:

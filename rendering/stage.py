@@ -54,19 +54,14 @@ _FAR: Final = 10.0
 class Stage:
     """Craft over an airport or a plain floor. It simulates nothing: it shows moments.
 
-    Args:
-        world: `airport` or `plain`.
-        drones: Craft side by side, each with a goal and a path.
-        vehicle: MJCF file of the craft; None is the paper's.
-        trail: Whether paths are drawn.
+    The craft, of an MJCF file or the paper's, stand side by side, each with a goal and, with
+    `trail`, a path. What is wrong raises `InputError`.
 
     Attributes:
         radius: Of a sphere about the body's origin that holds the craft, m. Cameras, goals and
             paths scale with it.
         model, data: With all visual elements; poses of the last moments.
         moments: The last moments.
-
-    Raises `InputError`: one of these is not what it should be.
     """
 
     def __init__(

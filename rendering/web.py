@@ -74,15 +74,10 @@ web_server.serve = _guarded
 
 
 class WebPage:
-    """A stage in browsers, served on this machine's loopback alone. `Surface`.
+    """A stage in browsers, served on this machine's loopback alone: `Surface`.
 
-    Args:
-        stage: The stage to show.
-        pace: Changed by buttons and keys.
-        port: TCP port; 0 takes the first free one from 8080 on. One in use raises `InputError`.
-
-    Attributes:
-        port: The TCP port.
+    Buttons and keys change the pace. Port 0 takes the first free one from 8080 on; one in use
+    raises `InputError`.
     """
 
     def __init__(self, stage: Stage, pace: Pace, port: int) -> None:
@@ -141,13 +136,7 @@ class _LoopbackViewer(web_viewer.WebViewer):  # type: ignore[misc]
     It has no option for the address, only an attribute that it sets itself.
     """
 
-    @property
-    def _host(self) -> str:
-        return _HOST
-
-    @_host.setter
-    def _host(self, everywhere: str) -> None:
-        pass
+    _host = property(lambda _: _HOST, lambda _, everywhere: None)
 
     @property
     def address(self) -> tuple[str, int]:

@@ -40,14 +40,7 @@ class NoDisplay(NoOpenGL):
 
 
 class Window:
-    """A stage in a window. `Surface`.
-
-    Args:
-        stage: The stage to show.
-        pace: Changed by the keys.
-
-    Raises `NoDisplay`: there is no display, or none that OpenGL can draw on.
-    """
+    """A stage in a window, whose keys change the pace: `Surface`. Raises `NoDisplay`."""
 
     where = "in the window"
 

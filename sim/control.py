@@ -29,9 +29,7 @@ class Controller(Protocol):
     def thrust(self, action: Array, state: WorldState) -> Array:
         """Thrust of each rotor until the next action, N, shape (W, A, R).
 
-        Args:
-            action: float64, shape (W, A, k), finite. A number beyond a bound counts as the bound.
-            state: As the last step left it.
+        Actions are float64, shape (W, A, k), finite; one beyond a bound counts as the bound.
         """
 
 

@@ -5,7 +5,7 @@ use that is switched on later does not move the numbers of another.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 
@@ -17,8 +17,14 @@ START: Final = 0
 """Child of a world's seed that draws how its episodes begin."""
 
 
-class Draw(Protocol):
-    """Draws numbers for the worlds that begin an episode; for the others it gives zeros."""
+class Draw:
+    """Draws numbers for the worlds that begin an episode; for the others it gives zeros.
+
+    `chosen` has by name what a reset's options give in place of draws, shape (W, A, *size).
+    """
+
+    def __init__(self, chosen: Mapping[str, Any] | None) -> None:
+        self._chosen = chosen or {}
 
     def uniform(
         self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
@@ -28,12 +34,18 @@ class Draw(Protocol):
         Equal ends give that number, and a number is drawn all the same. Under `name` a reset's
         options may give values in place of the draw.
         """
+        return self._chosen.get(name, self._draw("uniform", (low, high), size))
 
     def normal(self, scale: float, size: tuple[int, ...] = (), *, name: str = "") -> Array:
         """Normal numbers with mean 0 and that standard deviation, shape (W, A, *size)."""
+        return self._chosen.get(name, self._draw("normal", (0.0, scale), size))
 
     def chosen(self, name: str) -> Array | None:
         """Values that a reset's options give under that name, shape (W, A); None if none."""
+        return self._chosen.get(name)
+
+    def _draw(self, kind: str, parameters: tuple[float, float], size: tuple[int, ...]) -> Array:
+        raise NotImplementedError
 
 
 class Streams:
@@ -61,12 +73,8 @@ class Streams:
         return generator
 
 
-class NumpyDraw:
-    """`Draw` from streams, for the worlds `ids` of W worlds of A drones.
-
-    `shape` is (W, A), or () for a single drone; `chosen` has by name what a reset's options give in
-    place of draws, shape (W, A, *size).
-    """
+class NumpyDraw(Draw):
+    """Draws from streams, for the worlds `ids` of (W, A), or of () for a single drone."""
 
     def __init__(
         self,
@@ -75,26 +83,13 @@ class NumpyDraw:
         shape: tuple[int, ...],
         chosen: Mapping[str, Any] | None = None,
     ) -> None:
-        self._streams, self._ids, self._shape, self._chosen = streams, ids, shape, chosen or {}
+        super().__init__(chosen)
+        self._streams, self._ids, self._shape = streams, ids, shape
 
-    def uniform(
-        self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
-    ) -> Array:
-        """As `Draw.uniform`."""
-        return self._draw("uniform", (low, high), size, name)
-
-    def normal(self, scale: float, size: tuple[int, ...] = (), *, name: str = "") -> Array:
-        """As `Draw.normal`."""
-        return self._draw("normal", (0.0, scale), size, name)
-
-    def chosen(self, name: str) -> Array | None:
-        """As `Draw.chosen`."""
-        return self._chosen.get(name)
-
-    def _draw(self, kind: str, parameters: Any, size: tuple[int, ...], name: str) -> Array:
+    def _draw(self, kind: str, parameters: tuple[float, float], size: tuple[int, ...]) -> Array:
         numbers = np.zeros((*self._shape, *size))
         one_world = (*self._shape[1:], *size)
         for world in self._ids:
             place = world if self._shape else ...
             numbers[place] = getattr(self._streams.of(world), kind)(*parameters, one_world)
-        return self._chosen.get(name, numbers[()])
+        return numbers[()]

@@ -56,12 +56,9 @@ class ElevationOptions(TaskOptions):
                 f"flight_band: expected more than start_band = {self.start_band:g} m, "
                 f"got {self.flight_band!r}"
             )
-        for name, kind in (
-            ("action_mode", ActionMode),
-            ("action_type", ActionType),
-            ("observation", Observed),
-        ):
-            check_choice(self, name, get_args(kind))
+        check_choice(self, "action_mode", get_args(ActionMode))
+        check_choice(self, "action_type", get_args(ActionType))
+        check_choice(self, "observation", get_args(Observed))
         if self.thrust_scale is not None:
             check_number(self, "thrust_scale", math.ulp(0.0), FURTHEST, "N")
         target: Any = self.target
@@ -217,10 +214,8 @@ class Elevation(Task):
         return float(self.options.flight_band + self.rate_bound * self.options.control_period)
 
     def _observation_spec(self) -> ArraySpec:
-        least, most = (
-            limit[0] / self._hover - 1
-            for limit in (self.vehicle.thrust_low, self.vehicle.thrust_high)
-        )
+        least = self.vehicle.thrust_low[0] / self._hover - 1
+        most = self.vehicle.thrust_high[0] / self._hover - 1
         low = np.array((-self.error_bound, -self.rate_bound, least))
         high = np.array((self.error_bound, self.rate_bound, most))
         size = 3 if self.options.observation == "full" else 1

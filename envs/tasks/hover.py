@@ -116,12 +116,13 @@ class Hover(Task):
         ratio = vehicle.thrust_high / vehicle.hover_thrust - 1
         self._hover_thrust = vehicle.hover_thrust
         most = (
-            (2 * options.flight_band,) * 3
-            + (MOST_SPEED,) * 3
-            + (1.001,) * 6
-            + (MOST_RATE,) * 3
-            + tuple(float(r) + 0.001 for r in ratio)
+            *[2 * options.flight_band] * 3,
+            *[MOST_SPEED] * 3,
+            *[1.001] * 6,
+            *[MOST_RATE] * 3,
+            *(ratio + 0.001).tolist(),
         )
+        vectors = ("goal - position", "velocity", "nose", "thrust axis", "body rate")
         self.observation = (
             ArraySpec(
                 name="observation",
@@ -131,11 +132,7 @@ class Hover(Task):
                 unit=("m",) * 3 + ("m/s",) * 3 + ("1",) * 6 + ("rad/s",) * 3 + ("1",) * rotors,
                 frame="world turned by the wanted heading; body rates: body",
                 components=(
-                    *(f"goal - position {axis}" for axis in "xyz"),
-                    *(f"velocity {axis}" for axis in "xyz"),
-                    *(f"nose {axis}" for axis in "xyz"),
-                    *(f"thrust axis {axis}" for axis in "xyz"),
-                    *(f"body rate {axis}" for axis in "xyz"),
+                    *(f"{vector} {axis}" for vector in vectors for axis in "xyz"),
                     *(f"thrust {i + 1} over hover" for i in range(rotors)),
                 ),
             ),

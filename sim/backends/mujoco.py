@@ -29,12 +29,7 @@ class MujocoWorld:
     the whole process; a log file of another name stays on.
 
     A single world has no leading axes: NumPy's scalars are ten times faster than its arrays of one.
-
-    Args:
-        vehicle: The vehicle of every world.
-        num_worlds: W.
-        num_threads: Threads that step the worlds; 0 takes one for each processor. A wrong number
-            raises `InputError`.
+    So many threads step the worlds; 0 takes one for each processor.
     """
 
     xp: Any = np

@@ -33,19 +33,10 @@ CONTACTS_PER_GEOM: Final = 4  # Most contacts of a geom with the ground: so many
 class WarpWorld:
     """W worlds of one drone over ground of its own: `World`, in float32 on one device.
 
-    Physics steps are CUDA graphs, launched on torch's current stream. Contact is looked for as
-    often as in the backend `mujoco`; a craft touches where there are constraints for a contact.
-
-    Args:
-        vehicle: The vehicle of every world.
-        num_worlds: W.
-        device: `cpu`, `cuda`, `cuda:1`...; None takes a CUDA device if there is one.
-
-    Attributes:
-        device: The `torch.device` of all tensors.
-        qpos, qvel, ctrl: Live views of simulator memory, float32, shapes (W, 7), (W, 6), (W, R).
-
-    Raises `InputError`: there is no such device.
+    `device` is `cpu`, `cuda`, `cuda:1`...; None takes a CUDA device if there is one. Physics steps
+    are CUDA graphs, launched on torch's current stream. Contact is looked for as often as in the
+    backend `mujoco`; a craft touches where there are constraints for a contact. `qpos`, `qvel` and
+    `ctrl` are live views of simulator memory, float32, shapes (W, 7), (W, 6), (W, R).
     """
 
     xp: Any = torch_api
@@ -206,35 +197,25 @@ class WarpWorld:
         wp.capture_launch(graph, stream=stream)
 
 
-class TorchDraw:
-    """`Draw` from one generator for all worlds, so that the host need not know which draw."""
+class TorchDraw(Draw):
+    """Float32, from one generator for all worlds, so that the host need not know which draw."""
 
     def __init__(
         self, generator: torch.Generator, mask: torch.Tensor, chosen: Mapping[str, Array]
     ) -> None:
-        self._generator, self._mask, self._chosen = generator, mask, chosen
+        super().__init__(chosen)
+        self._generator, self._mask = generator, mask
 
-    def uniform(
-        self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
-    ) -> Array:
-        """As `Draw.uniform`, float32."""
-        return self._drawn(torch.rand, low, high - low, size, name)
-
-    def normal(self, scale: float, size: tuple[int, ...] = (), *, name: str = "") -> Array:
-        """As `Draw.normal`, float32."""
-        return self._drawn(torch.randn, 0.0, scale, size, name)
-
-    def chosen(self, name: str) -> Array | None:
-        """As `Draw.chosen`."""
-        return self._chosen.get(name)
-
-    def _drawn(
-        self, kind: Any, offset: float, scale: float, size: tuple[int, ...], name: str
-    ) -> Array:
+    def _draw(self, kind: str, parameters: tuple[float, float], size: tuple[int, ...]) -> Array:
+        first, second = parameters
         shape, device = (*self._mask.shape, *size), self._mask.device
-        numbers = offset + scale * kind(shape, generator=self._generator, device=device)
+        if kind == "uniform":
+            numbers = torch.rand(shape, generator=self._generator, device=device)
+            numbers = first + (second - first) * numbers
+        else:
+            numbers = second * torch.randn(shape, generator=self._generator, device=device)
         mask = self._mask.reshape(*self._mask.shape, *[1] * len(size))
-        return self._chosen.get(name, torch.where(mask, numbers, 0.0))
+        return torch.where(mask, numbers, 0.0)
 
 
 def _device(name: str | None) -> tuple[torch.device, str]:
