@@ -14,7 +14,10 @@ from .policies import NetworkPolicy, Policy
 from .presets import PRESETS, A2CConfig, AlgorithmName, VPGConfig, preset
 
 if TYPE_CHECKING:
-    from .learner import Agent
+    from .learner import Learner
+    from .sb3 import SB3A2C
+
+    Agent = Learner | SB3A2C
 
 __all__ = [
     "PID", "PRESETS", "A2CConfig", "AlgorithmName", "Checkpoint", "CheckpointError", "Episode",

@@ -62,7 +62,6 @@ class Checkpoint:
     state: Mapping[str, np.ndarray]
     """State of the agent."""
     position: Position
-    """Position of the run, and its ended episodes."""
     versions: dict[str, str] = field(default_factory=lambda: software_versions())
 
     @property
@@ -155,12 +154,10 @@ def load(path: Path) -> Checkpoint:
 
 
 def _read(data: bytes, parse: Any) -> Checkpoint:
-    found = _CHECKSUM.search(data)
-    _expect(found is not None, "a checksum", "none")
-    assert found is not None
-    plain = _with_checksum(data, b"0" * 64)
-    _expect(hashlib.sha256(plain).hexdigest().encode() == found[1], "a file without damage",
-            "another checksum than it holds")  # fmt: skip
+    told = _CHECKSUM.findall(data)[:1]
+    _expect(bool(told), "a checksum", "none")
+    found = hashlib.sha256(_with_checksum(data, b"0" * 64)).hexdigest().encode()
+    _expect(told == [found], "a file without damage", "another checksum than it holds")
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     meta = json.loads(header["__metadata__"]["rotorgram"])
     _expect(meta["format"] == FORMAT, f"format {FORMAT}", meta["format"])
@@ -188,14 +185,10 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
         **arrays["position"],
     )
     _check_shapes(position, spec)
-    checkpoint = Checkpoint(
-        **{name: meta[name] for name in _PLAIN},
-        spec=spec,
-        actor=arrays["policy"],
-        state=arrays["state"],
-        position=position,
-    )
-    checkpoint.policy()
+    plain = {name: meta[name] for name in _PLAIN}
+    actor, state = arrays["policy"], arrays["state"]
+    checkpoint = Checkpoint(**plain, spec=spec, actor=actor, state=state, position=position)
+    checkpoint.policy()  # raises if it does not fit
     return checkpoint
 
 
@@ -213,7 +206,7 @@ def _check_shapes(position: Position, spec: EnvSpec) -> None:
     count, steps = len(position.numbers), len(position.actions)
     action = spec.action
     drawn, kind = ((), "i") if isinstance(action, Discrete) else ((action.size,), "f")
-    expected = dict.fromkeys(_POSITION, ((count,), "i"))
+    expected: dict[str, Any] = dict.fromkeys(_POSITION, ((count,), "i"))
     expected["actions"] = (steps, count, *drawn), kind
     expected["observations"] = (count, flat_size(spec)), "f"
     arrays = {name: getattr(position, name) for name in _POSITION}

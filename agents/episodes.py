@@ -294,14 +294,9 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _keep_step(self, idle: np.ndarray | None) -> None:
         telemetry = self.env.telemetry
         values = telemetry["metrics"][:, 0] if "metrics" in telemetry else self._nothing
-        if idle is None:
-            self._lengths += 1
-            self._rewards += self.env.rewards
-            self._sizes += np.abs(values)
-        else:
-            self._lengths += ~idle
-            self._rewards += np.where(idle, 0.0, self.env.rewards)
-            self._sizes += np.where(idle, 0.0, np.abs(values))
+        self._lengths += 1 if idle is None else ~idle
+        self._rewards += self.env.rewards  # 0 of those that did not fly
+        self._sizes += np.abs(values) if idle is None else np.where(idle, 0.0, np.abs(values))
         if self._steps is not None:
             thrust = telemetry["thrust"] if "thrust" in telemetry else self._nothing[:, np.newaxis]
             row = (self._numbers, values, self.env.rewards, thrust.mean(axis=1))

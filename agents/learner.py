@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -12,33 +12,11 @@ from .networks import Actor, arrays_of, load_arrays, nn, torch
 from .policies import ActionMap, NetworkPolicy, flat_size
 from .rollouts import Collector, Diverged, Rollout
 
-__all__ = ["Agent", "Diverged", "Learner", "OnUpdate", "Terms", "check_finite", "optimizer_arrays",
+__all__ = ["Diverged", "Learner", "OnUpdate", "Terms", "check_finite", "optimizer_arrays",
            "seeds_of", "set_optimizer_arrays", "updates_of"]  # fmt: skip
 
 OnUpdate = Callable[[], bool]
 """Called after every rollout and its update; training stops where it returns False."""
-
-
-class Agent(Protocol):
-    """An algorithm in training. Its state is plain arrays, whole at every update."""
-
-    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
-        """Train until the log counts `env_steps`, from the current state on. Raises `Diverged`."""
-
-    def last_step(self, env_steps: int) -> int:
-        """Env steps after which a training of so many ends: fewer where rollouts must be whole."""
-
-    def actor(self) -> dict[str, np.ndarray]:
-        """Weights for `NetworkPolicy`."""
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Everything that the next update depends on, but for the env's position."""
-
-    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Take over a state."""
-
-    def scalars(self) -> dict[str, float]:
-        """Numbers of the last update, as in `docs/algorithms/README.md`; none before the first."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -104,7 +82,7 @@ class Learner:
         raise NotImplementedError
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
-        """As `Agent.train`."""
+        """Train until the log counts `env_steps`, from the current state on. Raises `Diverged`."""
         collector = Collector(log, self._rng)
         while log.env_steps < env_steps:
             policy, before = NetworkPolicy(self.actor(), self.spec), log.env_steps
@@ -126,11 +104,11 @@ class Learner:
         return env_steps
 
     def actor(self) -> dict[str, np.ndarray]:
-        """Weights of the policy."""
+        """Weights for `NetworkPolicy`."""
         return arrays_of(self._actor)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Weights, Adam's moments and the generator, by name."""
+        """All that the next update depends on: weights, Adam's moments and the generator."""
         state = {
             f"{name}.{key}": value
             for name, network in self.networks.items()
@@ -138,8 +116,7 @@ class Learner:
         }
         state |= optimizer_arrays(self._optimizer)
         text = json.dumps(self._rng.bit_generator.state)
-        state["rng"] = np.frombuffer(text.encode(), np.uint8)
-        return state
+        return state | {"rng": np.frombuffer(text.encode(), np.uint8)}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over a state."""
@@ -150,7 +127,7 @@ class Learner:
         self.terms = None
 
     def scalars(self) -> dict[str, float]:
-        """Numbers of the last update under SB3's names; none before the first."""
+        """Numbers of the last update, as in `docs/algorithms/README.md`; none before the first."""
         if self.terms is None:
             return {}
         numbers = self.terms.numbers()

@@ -131,7 +131,7 @@ class SB3A2C:
         self._model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
-        """As `Agent.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
+        """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
         model, rollout = self._model, self._rollout
         done, whole = model.num_timesteps, self.last_step(env_steps)
         if done >= whole:

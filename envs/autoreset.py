@@ -44,6 +44,12 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
     telemetry: Mapping[str, np.ndarray]
 
     @abstractmethod
+    def reset(
+        self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode, for all drones or some."""
+
+    @abstractmethod
     def advance(
         self,
         actions: np.ndarray,
@@ -152,7 +158,7 @@ def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | 
             return most is None
         return isinstance(number, int | np.integer) and 0 <= int(number) <= (most or int(number))
 
-    numbers = seed
+    numbers: Seeds = seed
     if isinstance(seed, int | np.integer):
         numbers = range(int(seed), int(seed) + num_envs)
     several = isinstance(numbers, Sequence | np.ndarray) and len(numbers) == num_envs

@@ -263,11 +263,10 @@ class Loop:
         }
         self._outcome = outcome
         ended: Array = outcome.terminated
-        total: Array = 0.0
         late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b
-        for term in outcome.reward.values():
+        self.terms, total = outcome.reward, 0.0
+        for term in self.terms.values():
             total = total + term
-        self.terms = outcome.reward
         if not self.world.shape:  # a single drone's numbers
             self.rewards = np.array((total,))
             may_end = bool(ended or late)
@@ -309,8 +308,8 @@ class Loop:
         if actions.dtype.kind not in "iuf":
             raise InputError(f"actions: expected real numbers, got {actions.dtype}")
         if actions.size != self.num_envs * self._width:
-            expected = (self.num_envs, self._width)
-            raise InputError(f"actions: expected shape {expected}, got {actions.shape}")
+            shape = (self.num_envs, self._width)
+            raise InputError(f"actions: expected shape {shape}, got {actions.shape}")
         values = actions.reshape(self.num_envs, self._width)
         if values.dtype != np.float32 and not self._choices:
             with np.errstate(over="ignore"):  # an overflow is infinite, and refused as such

@@ -13,7 +13,7 @@ from .spec import EnvSpec, canonical_id
 if TYPE_CHECKING:
     from .tasks.task import Task, TaskOptions
 
-__all__ = ["env_spec", "is_known", "known_ids", "load", "options_type", "register", "task_type"]
+__all__ = ["env_spec", "is_known", "load", "options_type", "register", "task_type"]
 
 _ID: Final = re.compile(r"([\w.-]+/)?[\w.-]+-v\d+")
 _tasks: Final[dict[str, "str | type[Task]"]] = {}
@@ -65,11 +65,6 @@ def load(env_id: str) -> str:
 def is_known(env_id: str) -> bool:
     """Whether a task of ours or of the user's is registered under this id."""
     return canonical_id(env_id) in _tasks
-
-
-def known_ids() -> tuple[str, ...]:
-    """Ids of all registered tasks."""
-    return tuple(_tasks)
 
 
 def task_type(env_id: str) -> "type[Task]":

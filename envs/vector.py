@@ -63,14 +63,10 @@ class LocalVectorEnv(AdvancingVectorEnv):
         **options: Any,
     ) -> None:
         self.closed = True  # nothing is open yet
-        settings = {"num_threads": num_threads, "device": device}
+        settings: dict[str, Any] = {"num_threads": num_threads, "device": device}
+        given = {name: value for name, value in settings.items() if value is not None}
         self._loop = loop = Loop(
-            env_id,
-            num_envs,
-            vehicle=vehicle,
-            backend=backend,
-            options=options,
-            **{name: value for name, value in settings.items() if value is not None},
+            env_id, num_envs, vehicle=vehicle, backend=backend, options=options, **given
         )
         self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
         self._take_spec(loop.spec, num_envs, autoreset_mode)
@@ -158,10 +154,9 @@ class LocalVectorEnv(AdvancingVectorEnv):
             raise InputError(f"options: expected some of {expected}, got {name!r}")
         try:
             values = np.asarray(value, np.float64)
-            fits = values.shape in ((), (self.num_envs,)) and bool(np.isfinite(values).all())
         except (TypeError, ValueError):
-            fits = False
-        if not fits:
+            values = np.array(np.nan)
+        if values.shape not in ((), (self.num_envs,)) or not np.isfinite(values).all():
             raise InputError(
                 f"{name}: expected a finite number, or shape ({self.num_envs},), got {value!r}"
             )

@@ -76,11 +76,10 @@ def write_film(
     def counted() -> Iterator[np.ndarray]:
         nonlocal count
         for frame in chain((first,), taken):
-            if (frame.dtype, frame.shape) != (np.uint8, (*first.shape[:2], 3)):
-                raise ValueError(
-                    f"film: expected frames of uint8, shape {(*first.shape[:2], 3)}, "
-                    f"got {frame.dtype}, shape {frame.shape}"
-                )
+            shape = (*first.shape[:2], 3)
+            if frame.dtype != np.uint8 or frame.shape != shape:
+                got = f"got {frame.dtype}, shape {frame.shape}"
+                raise ValueError(f"film: expected frames of uint8, shape {shape}, {got}")
             count += 1
             yield frame
 

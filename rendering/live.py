@@ -7,7 +7,7 @@ pictures; the simulation goes on, slowed only by the processor that both share.
 import time
 from contextlib import AbstractContextManager
 from threading import Event, Thread
-from typing import Final, Literal, Protocol
+from typing import TYPE_CHECKING, Final, Literal
 
 import mujoco
 import numpy as np
@@ -17,7 +17,13 @@ from .moment import Moment
 from .pace import Pace
 from .stage import Stage
 
-__all__ = ["MOST_DRONES", "Aim", "Lines", "LiveView", "Surface", "lines_over", "open_surface"]
+if TYPE_CHECKING:
+    from .web import WebPage
+    from .window import Window
+
+    Surface = Window | WebPage
+
+__all__ = ["MOST_DRONES", "Aim", "Lines", "LiveView", "lines_over", "open_surface"]
 
 MOST_DRONES: Final = 16
 """Most craft side by side; of more, the first ones are shown."""
@@ -47,25 +53,6 @@ class Aim:
         self._focus = focus
 
 
-class Surface(Protocol):
-    """A window or a page on which a stage is drawn."""
-
-    where: str
-    """Place to look at, for a sentence."""
-
-    def show(self, lines: Lines) -> None:
-        """Draw the stage as it is now, with these lines over it."""
-
-    def is_running(self) -> bool:
-        """Whether it is still open."""
-
-    def is_watched(self) -> bool:
-        """Whether there is a viewer."""
-
-    def close(self) -> None:
-        """Close it."""
-
-
 class LiveView(AbstractContextManager["LiveView"]):
     """Draws the latest moments on a surface, in a thread of its own.
 
@@ -73,7 +60,7 @@ class LiveView(AbstractContextManager["LiveView"]):
     the number of drones, if more than are shown.
     """
 
-    def __init__(self, stage: Stage, surface: Surface, pace: Pace, of: int | None = None) -> None:
+    def __init__(self, stage: Stage, surface: "Surface", pace: Pace, of: int | None = None) -> None:
         self.stage, self.surface, self.pace = stage, surface, pace
         self._of, self._said = of or stage.drones, ""
         self._latest: tuple[Moment, ...] = ()
@@ -165,7 +152,7 @@ def lines_over(moments: tuple[Moment, ...], thrust_high: float, pace: str, drone
 
 def open_surface(
     kind: Literal["window", "web"], stage: Stage, pace: Pace, port: int = 8080
-) -> Surface:
+) -> "Surface":
     """A window on the display, or a page for browsers. Raises `NoDisplay` or `InputError`."""
     if kind == "window":
         from .window import Window

@@ -25,7 +25,7 @@ from rotorgram.agents import (
     store,
 )
 from rotorgram.agents.checkpoints import software_versions, write_whole
-from rotorgram.agents.learner import Agent
+from rotorgram.agents.learner import Learner
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.models.errors import InputError
 
@@ -45,7 +45,7 @@ def log_of(drones: int, seed: int = 5, **options: Any) -> EpisodeLog:
     return EpisodeLog(gym.make(ENV, **settings) if drones == 1 else env, seed)
 
 
-def checkpoint_of(algorithm: str, log: EpisodeLog, agent: Agent) -> Checkpoint:
+def checkpoint_of(algorithm: str, log: EpisodeLog, agent: Learner) -> Checkpoint:
     return Checkpoint(
         algorithm=algorithm,
         config=vars(preset(algorithm, "tuned", **SMALL[algorithm])),
@@ -58,7 +58,7 @@ def checkpoint_of(algorithm: str, log: EpisodeLog, agent: Agent) -> Checkpoint:
     )
 
 
-def trained(algorithm: str, log: EpisodeLog, updates: int = 10**9) -> Agent:
+def trained(algorithm: str, log: EpisodeLog, updates: int = 10**9) -> Learner:
     agent = make_agent(algorithm, log, preset(algorithm, "tuned", **SMALL[algorithm]), 5)
     calls = iter(range(updates - 1))
     agent.train(log, TOTAL, lambda: next(calls, None) is not None)
