@@ -14,7 +14,10 @@ from .policies import NetworkPolicy, Policy
 from .presets import PRESETS, A2CConfig, AlgorithmName, VPGConfig, preset
 
 if TYPE_CHECKING:
-    from .learner import Agent
+    from .learner import Learner
+    from .sb3 import SB3A2C
+
+    Agent = Learner | SB3A2C
 
 __all__ = [
     "PID", "PRESETS", "A2CConfig", "AlgorithmName", "Checkpoint", "CheckpointError", "Episode",
@@ -26,13 +29,7 @@ __all__ = [
 def make_agent(
     algorithm: str, log: EpisodeLog, config: VPGConfig | A2CConfig, seed: int
 ) -> "Agent":
-    """A new agent for the env of a log.
-
-    Args:
-        algorithm: `vpg`, `a2c` or `sb3-a2c`.
-        log: Log of the env to train on.
-        config: Hyperparameters of that algorithm.
-        seed: Seed of the run.
+    """A new agent, `vpg`, `a2c` or `sb3-a2c`, for the env of a log.
 
     Raises:
         InputError: No such algorithm, or a config of another one.
@@ -58,11 +55,7 @@ def make_agent(
 
 
 def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
-    """The agent of a checkpoint; the log resumes at the position of the run.
-
-    Args:
-        kept: The checkpoint.
-        log: New, with the same seed and number of drones.
+    """The agent of a checkpoint; the log, a new one of as many drones, resumes where it was.
 
     Raises:
         CheckpointError: The parts of the checkpoint do not fit together.
@@ -71,7 +64,7 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
     """
     for name in ("env_id", "options", "vehicle_hash", "observation", "action"):
         expected, got = getattr(kept.spec, name), getattr(log.spec, name)
-        if expected != got and not _is_untold(got):
+        if expected != got and got != "0" * 32:  # the hash of a peer that tells none
             raise ResumeError(f"resume: expected an env with {name} {expected}, got {got}")
     try:
         config = preset(kept.algorithm, "paper", **kept.config)
@@ -84,8 +77,3 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
         raise CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}") from None
     log.resume(kept.position)
     return agent
-
-
-def _is_untold(value: object) -> bool:
-    """Whether it is the hash of a peer that tells none."""
-    return value == "0" * 32

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from .episodes import EpisodeLog
 from .learner import Learner, Terms
 from .networks import Critic, nn, torch
 from .policies import NetworkPolicy, flat_size
@@ -21,13 +20,11 @@ class A2C(Learner):
     the target held still, which is step 5.
     """
 
-    def __init__(self, log: EpisodeLog, config: A2CConfig, seed: int) -> None:
-        super().__init__(log, config, seed)
-        self.config = config
+    config: A2CConfig
 
-    def others(self, config: A2CConfig) -> dict[str, nn.Module]:
+    def others(self) -> dict[str, nn.Module]:
         """The critic."""
-        self._critic = Critic(flat_size(self.spec), hidden=config.hidden)
+        self._critic = Critic(flat_size(self.spec), hidden=self.config.hidden)
         return {"critic": self._critic}
 
     def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
@@ -51,13 +48,8 @@ class A2C(Learner):
         gain = (log_probability * torch.from_numpy(advantage.astype(np.float32))).mean()
         value_loss = (targets - values).square().mean()
         loss: torch.Tensor = config.vf_coef * value_loss - gain - config.ent_coef * entropy.mean()
-        self.terms = Terms(
-            gain=gain.detach(),
-            entropy=entropy.detach(),
-            value_loss=value_loss.detach(),
-            values=held,
-            targets=targets,
-        )
+        critic = value_loss.detach(), held, targets
+        self.terms = Terms(gain=gain.detach(), entropy=entropy.detach(), critic=critic)
         return loss
 
     def advantages(self, rollout: Rollout, values: np.ndarray) -> np.ndarray:

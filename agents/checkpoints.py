@@ -29,6 +29,12 @@ __all__ = ["Checkpoint", "CheckpointError", "load", "software_versions", "store"
 
 FORMAT: Final = 2
 _GROUPS: Final = ("policy", "state", "position", "episodes")
+_PLAIN: Final = ("algorithm", "config", "seed", "env_steps", "versions")
+_POSITION: Final = ("actions", "observations", "numbers", "lengths", "first_steps")
+_COLUMNS: Final[dict[str, type[np.generic]]] = {
+    f.name: {int: np.int64, float: np.float64, bool: np.bool_}[f.type]  # type: ignore[index]
+    for f in fields(Episode)
+}
 _MOST: Final = 2**62
 _CHECKSUM: Final = re.compile(rb'"sha256":"([0-9a-f]{64})"')
 _MALFORMED: Final = (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError)
@@ -56,7 +62,6 @@ class Checkpoint:
     state: Mapping[str, np.ndarray]
     """State of the agent."""
     position: Position
-    """Position of the run, and its ended episodes."""
     versions: dict[str, str] = field(default_factory=lambda: software_versions())
 
     @property
@@ -70,24 +75,12 @@ class Checkpoint:
         return dict(self.spec.options)
 
     @property
-    def vehicle_hash(self) -> str:
-        """Hash of the vehicle; zeros if the env has none."""
-        return self.spec.vehicle_hash
-
-    @property
     def num_envs(self) -> int:
         """Drones that it trains with."""
         return len(self.position.numbers)
 
     def policy(self, spec: EnvSpec | None = None) -> NetworkPolicy:
-        """The policy, ready to fly.
-
-        Args:
-            spec: Of the env to fly; None: that of the training.
-
-        Raises:
-            InputError: The policy does not fit the env.
-        """
+        """The policy, ready to fly that env or its own. Raises `InputError` if it does not fit."""
         return NetworkPolicy(self.actor, spec or self.spec)
 
     def other_versions(self) -> dict[str, tuple[str, str]]:
@@ -112,15 +105,17 @@ def software_versions() -> dict[str, str]:
 def store(checkpoint: Checkpoint, path: Path) -> None:
     """Write a checkpoint: after a crash at any moment, `path` holds the old one or the new one.
 
-    Raises:
-        CheckpointError: A number is not finite: training diverged. The old file stays.
+    Raises `CheckpointError` where a number is not finite: training diverged. The old file stays.
     """
-    position = {k: v for k, v in vars(checkpoint.position).items() if k != "episodes"}
+    where = checkpoint.position
     parts: dict[str, Mapping[str, Any]] = {
         "policy": checkpoint.actor,
         "state": checkpoint.state,
-        "position": {k: v for k, v in position.items() if isinstance(v, np.ndarray)},
-        "episodes": _columns(checkpoint.position.episodes),
+        "position": {name: getattr(where, name) for name in _POSITION},
+        "episodes": {
+            name: np.array([getattr(episode, name) for episode in where.episodes], kind)
+            for name, kind in _COLUMNS.items()
+        },
     }
     arrays = {
         f"{group}/{name}": np.array(value, order="C")
@@ -134,7 +129,7 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
         "format": FORMAT,
         **{name: getattr(checkpoint, name) for name in _PLAIN},
         "spec": checkpoint.spec.to_json(),
-        "position": {k: v for k, v in position.items() if not isinstance(v, np.ndarray)},
+        "position": {"env_steps": where.env_steps, "seconds": where.seconds},
     }
     numpy = require("safetensors.numpy", "train", "writing checkpoints")
     text = {"rotorgram": json.dumps(meta), "sha256": "0" * 64}
@@ -142,17 +137,8 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
     write_whole(path, _with_checksum(data, hashlib.sha256(data).hexdigest().encode()))
 
 
-_PLAIN: Final = ("algorithm", "config", "seed", "env_steps", "versions")
-
-
 def load(path: Path) -> Checkpoint:
-    """Read a checkpoint.
-
-    Raises:
-        CheckpointError: There is no such file, it is damaged, or it is not a checkpoint of this
-            format.
-        MissingPackage: safetensors is not installed.
-    """
+    """Read a checkpoint. Raises `CheckpointError` or `MissingPackage`."""
     numpy = require("safetensors.numpy", "train", "reading checkpoints")
     if not path.is_file():
         raise CheckpointError(f"checkpoint: no file {path}")
@@ -168,12 +154,10 @@ def load(path: Path) -> Checkpoint:
 
 
 def _read(data: bytes, parse: Any) -> Checkpoint:
-    found = _CHECKSUM.search(data)
-    _expect(found is not None, "a checksum", "none")
-    assert found is not None
-    plain = _with_checksum(data, b"0" * 64)
-    _expect(hashlib.sha256(plain).hexdigest().encode() == found[1], "a file without damage",
-            "another checksum than it holds")  # fmt: skip
+    told = _CHECKSUM.findall(data)[:1]
+    _expect(bool(told), "a checksum", "none")
+    found = hashlib.sha256(_with_checksum(data, b"0" * 64)).hexdigest().encode()
+    _expect(told == [found], "a file without damage", "another checksum than it holds")
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     meta = json.loads(header["__metadata__"]["rotorgram"])
     _expect(meta["format"] == FORMAT, f"format {FORMAT}", meta["format"])
@@ -190,26 +174,25 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
         _expect(type(count) is int and 0 <= count < _MOST, "a whole number, 0 or more", count)
     seconds = where["seconds"]
     _expect(type(seconds) is float and 0 <= seconds < float("inf"), "seconds", seconds)
-    spec = EnvSpec.from_json(meta["spec"])
+    spec, columns = EnvSpec.from_json(meta["spec"]), arrays["episodes"]
+    kinds = {name: column.dtype.type for name, column in columns.items()}
+    _expect(kinds == _COLUMNS, f"columns {sorted(_COLUMNS)} of episodes", sorted(kinds))
+    rows = zip(*(columns[name].tolist() for name in _COLUMNS), strict=True)
     position = Position(
         env_steps=where["env_steps"],
         seconds=seconds,
-        episodes=_episodes(arrays["episodes"]),
+        episodes=tuple(Episode(**dict(zip(_COLUMNS, row, strict=True))) for row in rows),
         **arrays["position"],
     )
     _check_shapes(position, spec)
+    plain = {name: meta[name] for name in _PLAIN}
+    actor, state = arrays["policy"], arrays["state"]
     config = vars(preset(meta["algorithm"], "paper", **meta["config"]))
     _expect(config == meta["config"], f"a config of all of {sorted(config)}", meta["config"])
-    _check_steps(position, meta["env_steps"], arrays["state"].get("steps"))
-    _check_optimizer(arrays["state"])
-    checkpoint = Checkpoint(
-        **{name: meta[name] for name in _PLAIN},
-        spec=spec,
-        actor=arrays["policy"],
-        state=arrays["state"],
-        position=position,
-    )
-    checkpoint.policy()
+    _check_steps(position, meta["env_steps"], state.get("steps"))
+    _check_optimizer(state)
+    checkpoint = Checkpoint(**plain, spec=spec, actor=actor, state=state, position=position)
+    checkpoint.policy()  # raises if it does not fit
     return checkpoint
 
 
@@ -223,38 +206,14 @@ def _is_finite(name: str, array: np.ndarray) -> bool:
     return allowed or array.dtype.kind != "f" or bool(np.isfinite(array).all())
 
 
-def _columns(episodes: tuple[Episode, ...]) -> dict[str, np.ndarray]:
-    return {
-        name: np.array([getattr(episode, name) for episode in episodes], kind)
-        for name, kind in _KINDS.items()
-    }
-
-
-_KINDS: Final = {
-    f.name: {int: np.int64, float: np.float64, bool: np.bool_}[f.type]  # type: ignore[index]
-    for f in fields(Episode)
-}
-
-
-def _episodes(columns: Mapping[str, np.ndarray]) -> tuple[Episode, ...]:
-    kinds = {name: column.dtype.type for name, column in columns.items()}
-    _expect(kinds == _KINDS, f"columns {sorted(_KINDS)} of episodes", sorted(kinds))
-    rows = zip(*(columns[name].tolist() for name in _KINDS), strict=True)
-    return tuple(Episode(**dict(zip(_KINDS, row, strict=True))) for row in rows)
-
-
 def _check_shapes(position: Position, spec: EnvSpec) -> None:
     count, steps = len(position.numbers), len(position.actions)
     action = spec.action
-    drawn = () if isinstance(action, Discrete) else (action.size,)
-    expected = {
-        "actions": ((steps, count, *drawn), "i" if isinstance(action, Discrete) else "f"),
-        "observations": ((count, flat_size(spec)), "f"),
-        "numbers": ((count,), "i"),
-        "lengths": ((count,), "i"),
-        "first_steps": ((count,), "i"),
-    }
-    arrays = {name: getattr(position, name) for name in expected}
+    drawn, kind = ((), "i") if isinstance(action, Discrete) else ((action.size,), "f")
+    expected: dict[str, Any] = dict.fromkeys(_POSITION, ((count,), "i"))
+    expected["actions"] = (steps, count, *drawn), kind
+    expected["observations"] = (count, flat_size(spec)), "f"
+    arrays = {name: getattr(position, name) for name in _POSITION}
     got = {name: (array.shape, array.dtype.kind) for name, array in arrays.items()}
     _expect(got == expected and count > 0, f"a position of shapes {expected}", got)
     _expect(position.lengths.max() == steps, f"an episode of {steps} steps", position.lengths)
@@ -297,10 +256,7 @@ def _expect(ok: bool, expected: str, got: object) -> None:
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file: after a crash at any moment, `path` holds the old one or the new one.
 
-    Two processes may write it at the same time: one of them writes last.
-
-    Raises:
-        OSError: It cannot be written; the error names the file.
+    Two processes may write it at the same time: one of them writes last. `OSError` names the file.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
     try:

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.spec import EnvSpec, component_names
 from ..models.errors import InputError
-from .policies import ActionMap, flat, flat_size
+from .policies import ActionMap, flat
 
 __all__ = ["LOST", "Episode", "EpisodeLog", "Position", "ResumeError", "episode_seed"]
 
@@ -69,11 +69,10 @@ class Position:
     observations: np.ndarray
     """Observations after the last of them, flat: float32, shape (N, n)."""
     numbers: np.ndarray
-    """Number of the running episode of each: int64, shape (N,)."""
+    """Of the running episodes: int64, shape (N,), as their steps in `lengths`, and the env steps of
+    the run before each in `first_steps`."""
     lengths: np.ndarray
-    """Steps of the running episode of each: int64, shape (N,)."""
     first_steps: np.ndarray
-    """Env steps of the run before the running episode of each: int64, shape (N,)."""
     episodes: tuple[Episode, ...] = ()
     """Ended episodes, in the order of their ends."""
 
@@ -92,17 +91,12 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         keep_steps: Keep every step, for `steps`.
 
     Attributes:
-        spec: `EnvSpec` of the env.
         env_steps: Control steps of all drones together.
         episodes: Ended episodes, in the order of their ends.
     """
 
     def __init__(
-        self,
-        env: gym.Env[Any, Any] | AdvancingVectorEnv,
-        seed: int,
-        *,
-        keep_steps: bool = False,
+        self, env: gym.Env[Any, Any] | AdvancingVectorEnv, seed: int, *, keep_steps: bool = False
     ) -> None:
         told = ("metrics", "thrust") if keep_steps else ("metrics",)
         self.env = env if isinstance(env, AdvancingVectorEnv) else _OneDrone(env, told)
@@ -110,9 +104,17 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = count = self.env.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.actions = ActionMap(self.spec.action)
-        self._take_spaces()
-        self.run_seed = seed
-        self.env_steps = 0
+        low, high = (
+            np.concatenate([array.bounds()[i].ravel() for array in self.spec.observation])
+            for i in range(2)
+        )
+        self.single_observation_space = spaces.Box(low.astype("f"), high.astype("f"))
+        self.single_action_space = (
+            spaces.Discrete(self.actions.outputs)
+            if self.actions.discrete
+            else spaces.Box(-1, 1, (self.actions.size,))
+        )
+        self.run_seed, self.env_steps = seed, 0
         self.episodes: list[Episode] = []
         self._began: float | None = None
         self._numbers = np.arange(-count, 0)  # of the running episodes
@@ -122,23 +124,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._all, self._nothing = np.ones(count, bool), np.full(count, np.nan)
         self._flown: list[np.ndarray] = []  # actions; at least those of the running episodes
         self._steps: list[np.ndarray] | None = [] if keep_steps else None
-        still = np.zeros((count, self.actions.size), np.float32)
-        self._still = self.actions.to_envs(still)
-
-    def _take_spaces(self) -> None:
-        low, high = (
-            np.concatenate([array.bounds()[i].ravel() for array in self.spec.observation])
-            for i in range(2)
-        )
-        choices, size = self.actions.outputs, (self.actions.size,)
-        self.single_observation_space = spaces.Box(
-            low.astype(np.float32), high.astype(np.float32), (flat_size(self.spec),), np.float32
-        )
-        self.single_action_space = (
-            spaces.Discrete(choices) if self.actions.discrete else spaces.Box(-1, 1, size)
-        )
-
-    # ---- time
+        self._still = self.actions.to_envs(np.zeros((count, self.actions.size), np.float32))
 
     def start_clock(self) -> None:
         """Training begins now; after `resume` it has begun before."""
@@ -149,8 +135,6 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def seconds(self) -> float:
         """Wall time since training began, s."""
         return 0.0 if self._began is None else time.perf_counter() - self._began
-
-    # ---- flying
 
     @property
     def observations(self) -> np.ndarray:
@@ -169,21 +153,16 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         begins: np.ndarray | None = None,
         frozen: np.ndarray | None = None,
     ) -> None:
-        """Fly one step. A drone whose episode ends has to begin the next, or to be frozen.
+        """Fly one step with actions as a network draws them, shape (N, k), or (N, 1) if discrete.
 
-        Args:
-            actions: As a network draws them: shape (N, k), or (N, 1) if discrete.
-            begins: bool, shape (N,): drones that begin their next episode instead of flying.
-            frozen: bool, shape (N,): drones that stay as they are.
+        Drones may begin their next episode instead, or stay as they are: bool, shape (N,). One
+        whose episode has ended has to do either.
         """
-        env, sent = self.env, self.actions.to_envs(actions)
-        if begins is None:
-            env.advance(sent, None, None, frozen)
-            idle = frozen
-        else:
+        env, sent, seeds, idle = self.env, self.actions.to_envs(actions), None, frozen
+        if begins is not None:
             self._number(begins)
-            env.advance(sent, begins, self._seeds, frozen)
-            idle = begins if frozen is None else begins | frozen
+            seeds, idle = self._seeds, begins if frozen is None else begins | frozen
+        env.advance(sent, begins, seeds, frozen)
         self._flown.append(sent)
         self._keep_step(idle)
         self.env_steps += self.num_envs - (0 if idle is None else int(np.count_nonzero(idle)))
@@ -192,16 +171,10 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._keep_episodes(ended)
 
     def begin(self, drones: np.ndarray) -> np.ndarray:
-        """Begin the next episodes of some drones, while the others are frozen.
+        """Begin the next episodes of some drones, bool, shape (N,), while the others are frozen.
 
         If a simulator is lost meanwhile, the episodes of its frozen drones are truncated: these
-        begin their next as well.
-
-        Args:
-            drones: bool, shape (N,).
-
-        Returns:
-            Drones whose episode was truncated, bool, shape (N,).
+        begin their next as well, and are returned, bool, shape (N,).
         """
         env, broken = self.env, np.zeros(self.num_envs, bool)
         while drones.any():
@@ -212,8 +185,6 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             if drones.any():
                 self._keep_episodes(drones)
         return broken
-
-    # ---- Gymnasium's vector env
 
     def reset(self, **_: Any) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode of every drone, with its own seed; arguments are not used."""
@@ -234,8 +205,6 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             info = {"final_obs": last, "_final_obs": terminated | truncated}
         return self.observations, rewards, terminated, truncated, info
 
-    # ---- resuming
-
     def position(self) -> Position:
         """The current position of the run."""
         longest = int(self._lengths.max())
@@ -254,12 +223,10 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def resume(self, position: Position) -> None:
         """Bring the env to the position of another run, and continue there.
 
-        Every drone flies the actions of its running episode again. A drone whose episode is
-        shorter than the longest is frozen until its turn. `steps` begins with these steps.
-
-        Raises:
-            ResumeError: The env does not repeat what it did then: another model, another version
-                of MuJoCo, or other options.
+        Every drone flies the actions of its running episode again; one whose episode is shorter
+        than the longest is frozen until its turn. `steps` begins with these steps. Raises
+        `ResumeError` if the env does not repeat what it did then: another model, another version
+        of MuJoCo, or other options.
         """
         if len(position.numbers) != self.num_envs:
             raise ResumeError(
@@ -285,23 +252,18 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _repeat(self, position: Position) -> bool:
         """Fly the actions of a position; whether a simulator was lost."""
         self._forget(self._all)
-        self._flown = []
-        if self._steps is not None:
-            self._steps = []
+        self._flown, self._steps = [], None if self._steps is None else []
         self.env.reset(seed=self._seeds.tolist())
-        longest = len(position.actions)
         for step, actions in enumerate(position.actions):
-            frozen = position.lengths < longest - step
+            frozen = position.lengths < len(position.actions) - step
             self.env.advance(actions, None, None, frozen)
             if self.env.lost.any():
                 return True
             self._flown.append(actions)
             self._keep_step(frozen)
             if (self.env.terminated | self.env.truncated).any():
-                return False  # too early: the lengths differ
+                break  # too early: the lengths differ
         return False
-
-    # ---- keeping
 
     def steps(self) -> dict[str, np.ndarray]:
         """Every step that was flown, in the order of flight, those of one moment drone by drone.
@@ -334,14 +296,9 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _keep_step(self, idle: np.ndarray | None) -> None:
         telemetry = self.env.telemetry
         values = telemetry["metrics"][:, 0] if "metrics" in telemetry else self._nothing
-        if idle is None:
-            self._lengths += 1
-            self._rewards += self.env.rewards
-            self._sizes += np.abs(values)
-        else:
-            self._lengths += ~idle
-            self._rewards += np.where(idle, 0.0, self.env.rewards)
-            self._sizes += np.where(idle, 0.0, np.abs(values))
+        self._lengths += 1 if idle is None else ~idle
+        self._rewards += self.env.rewards  # 0 of those that did not fly
+        self._sizes += np.abs(values) if idle is None else np.where(idle, 0.0, np.abs(values))
         if self._steps is not None:
             thrust = telemetry["thrust"] if "thrust" in telemetry else self._nothing[:, np.newaxis]
             row = (self._numbers, values, self.env.rewards, thrust.mean(axis=1))
@@ -374,16 +331,12 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 _FLAGS: Final = (np.array((False,)), np.array((True,)))
 """A truth value as an array of one, never written to: to make another takes a microsecond."""
-for _flag in _FLAGS:
-    _flag.setflags(write=False)
 
 
 class _OneDrone:
     """An env of one drone as a batch of one: what the log needs of `AdvancingVectorEnv`.
 
-    Args:
-        env: The env.
-        told: Names of the arrays of the telemetry that are asked for.
+    `told` has the names of the arrays of the telemetry that are asked for.
     """
 
     num_envs = 1
@@ -391,8 +344,7 @@ class _OneDrone:
     def __init__(self, env: gym.Env[Any, Any], told: tuple[str, ...]) -> None:
         self._env = env
         self.env_spec: EnvSpec = env.get_wrapper_attr("env_spec")
-        action = self.env_spec.action
-        self._shape = getattr(action, "shape", None)
+        self._shape = getattr(self.env_spec.action, "shape", None)
         arrays = [array for array in self.env_spec.telemetry if array.name in told]
         self._told = [(array.name, component_names(array)) for array in arrays]
         self.telemetry: dict[str, np.ndarray] = {}
@@ -400,7 +352,6 @@ class _OneDrone:
         self._set(0.0, False, False, False)
 
     def reset(self, *, seed: list[int]) -> None:
-        """Begin an episode."""
         self._take(*self._env.reset(seed=seed[0]))
 
     def advance(
@@ -410,7 +361,6 @@ class _OneDrone:
         seeds: np.ndarray | None = None,
         frozen: np.ndarray | None = None,
     ) -> None:
-        """As `AdvancingVectorEnv.advance`."""
         if resets is not None and resets[0] and seeds is not None:
             self.reset(seed=[int(seeds[0])])
         elif frozen is not None and frozen[0]:

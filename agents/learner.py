@@ -3,69 +3,32 @@
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from .episodes import EpisodeLog
 from .networks import Actor, arrays_of, load_arrays, nn, torch
 from .policies import ActionMap, NetworkPolicy, flat_size
-from .presets import A2CConfig, VPGConfig
 from .rollouts import Collector, Diverged, Rollout
 
-__all__ = ["Agent", "Diverged", "Learner", "OnUpdate", "Terms", "check_finite", "optimizer_arrays",
+__all__ = ["Diverged", "Learner", "OnUpdate", "Terms", "check_finite", "optimizer_arrays",
            "seeds_of", "set_optimizer_arrays", "updates_of"]  # fmt: skip
 
 OnUpdate = Callable[[], bool]
 """Called after every rollout and its update; training stops where it returns False."""
 
 
-class Agent(Protocol):
-    """An algorithm in training. Its state is plain arrays, whole at every update."""
-
-    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
-        """Train until the log counts `env_steps`, from the current state on.
-
-        Raises:
-            Diverged: Weights are not finite after an update.
-        """
-
-    def last_step(self, env_steps: int) -> int:
-        """Env steps after which a training of so many ends: fewer where rollouts must be whole."""
-
-    def actor(self) -> dict[str, np.ndarray]:
-        """Weights for `NetworkPolicy`."""
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Everything that the next update depends on, but for the env's position."""
-
-    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Take over a state."""
-
-    def scalars(self) -> dict[str, float]:
-        """Numbers of the last update under SB3's names, `train/…`; none before the first.
-
-        `docs/algorithms/README.md` has the table. One that is not defined is NaN.
-        """
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Terms:
-    """Terms of the loss of an update, as tensors: few updates are logged.
-
-    Those of the critic are None where there is none.
-    """
+    """Terms of the loss of an update, as tensors: few updates are logged."""
 
     gain: torch.Tensor
     """Mean of weight · log P, which the actor climbs."""
     entropy: torch.Tensor
     """Of the policy at each step, nats: shape (T,)."""
-    value_loss: torch.Tensor | None = None
-    """Mean squared error of the values."""
-    values: torch.Tensor | None = None
-    """V(s_t) before the update, shape (T,)."""
-    targets: torch.Tensor | None = None
-    """Their targets, shape (T,)."""
+    critic: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
+    """Mean squared error of the values; V(s_t) before the update and its targets, shape (T,)."""
 
     def numbers(self) -> dict[str, float]:
         """By SB3's names and with its signs."""
@@ -73,11 +36,10 @@ class Terms:
             "train/policy_loss": -float(self.gain),
             "train/entropy_loss": -float(self.entropy.mean()),
         }
-        if self.value_loss is not None:
-            numbers["train/value_loss"] = float(self.value_loss)
-        if self.values is not None and self.targets is not None:
-            values, targets = self.values.numpy(), self.targets.numpy()
+        if self.critic is not None:
+            loss, values, targets = (tensor.numpy() for tensor in self.critic)
             spread, left = float(np.var(targets)), float(np.var(targets - values))
+            numbers["train/value_loss"] = float(loss)
             numbers["train/explained_variance"] = 1 - left / spread if spread else np.nan
         return numbers
 
@@ -85,16 +47,13 @@ class Terms:
 class Learner:
     """Base of our own algorithms: `collect` and `loss` are theirs; `loss` sets `terms` too.
 
-    Args:
-        log: Gives the sizes; it is not kept.
-        config: Hyperparameters.
-        seed: Seed of the run: weights and actions.
+    The log gives the sizes and is not kept; the seed is that of weights and actions.
     """
 
-    def __init__(self, log: EpisodeLog, config: VPGConfig | A2CConfig, seed: int) -> None:
+    def __init__(self, log: EpisodeLog, config: Any, seed: int) -> None:
         weights_seed, self._rng = seeds_of(seed)
         torch.manual_seed(weights_seed)
-        self.spec = log.spec
+        self.spec, self.config = log.spec, config
         actions = ActionMap(log.spec.action)
         self._actor = Actor(
             flat_size(log.spec),
@@ -103,15 +62,14 @@ class Learner:
             hidden=config.hidden,
             log_std=config.log_std,
         )
-        self.networks: dict[str, nn.Module] = {"actor": self._actor, **self.others(config)}
-        self._learning_rate, self._anneal = config.learning_rate, config.anneal
+        self.networks: dict[str, nn.Module] = {"actor": self._actor, **self.others()}
         parameters = [p for network in self.networks.values() for p in network.parameters()]
         # foreach: one call for all parameters instead of one for each; same arithmetic.
-        self._optimizer = torch.optim.Adam(parameters, lr=self._learning_rate, foreach=True)
+        self._optimizer = torch.optim.Adam(parameters, lr=config.learning_rate, foreach=True)
         self.terms: Terms | None = None
         """Of the last update."""
 
-    def others(self, config: Any) -> dict[str, nn.Module]:
+    def others(self) -> dict[str, nn.Module]:
         """Networks besides the actor, by name."""
         return {}
 
@@ -124,35 +82,33 @@ class Learner:
         raise NotImplementedError
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
-        """As `Agent.train`."""
+        """Train until the log counts `env_steps`, from the current state on. Raises `Diverged`."""
         collector = Collector(log, self._rng)
         while log.env_steps < env_steps:
             policy, before = NetworkPolicy(self.actor(), self.spec), log.env_steps
             rollout = self.collect(collector, policy, env_steps - before)
-            if self._anneal:
-                self._set_learning_rate(1 - before / env_steps)
+            if self.config.anneal:
+                for group in self._optimizer.param_groups:
+                    group["lr"] = self.config.learning_rate * (1 - before / env_steps)
             if len(rollout):
-                self._update(rollout)
+                self._optimizer.zero_grad()
+                self.loss(rollout).backward()  # type: ignore[no-untyped-call]
+                self._optimizer.step()
+                self._actor.clamp_()
+                check_finite(self._optimizer)
             if not on_update():
                 return
-
-    def _update(self, rollout: Rollout) -> None:
-        self._optimizer.zero_grad()
-        self.loss(rollout).backward()  # type: ignore[no-untyped-call]
-        self._optimizer.step()
-        self._actor.clamp_()
-        check_finite(self._optimizer)
 
     def last_step(self, env_steps: int) -> int:
         """Env steps after which a training of so many ends: all are flown."""
         return env_steps
 
     def actor(self) -> dict[str, np.ndarray]:
-        """Weights of the policy."""
+        """Weights for `NetworkPolicy`."""
         return arrays_of(self._actor)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Weights, Adam's moments and the generator, by name."""
+        """All that the next update depends on: weights, Adam's moments and the generator."""
         state = {
             f"{name}.{key}": value
             for name, network in self.networks.items()
@@ -160,8 +116,7 @@ class Learner:
         }
         state |= optimizer_arrays(self._optimizer)
         text = json.dumps(self._rng.bit_generator.state)
-        state["rng"] = np.frombuffer(text.encode(), np.uint8)
-        return state
+        return state | {"rng": np.frombuffer(text.encode(), np.uint8)}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over a state."""
@@ -172,7 +127,7 @@ class Learner:
         self.terms = None
 
     def scalars(self) -> dict[str, float]:
-        """Numbers of the last update under SB3's names; none before the first."""
+        """Numbers of the last update, as in `docs/algorithms/README.md`; none before the first."""
         if self.terms is None:
             return {}
         numbers = self.terms.numbers()
@@ -181,10 +136,6 @@ class Learner:
         if self._actor.log_std is not None:
             numbers["train/std"] = float(self._actor.log_std.detach().exp().mean())
         return numbers
-
-    def _set_learning_rate(self, share: float) -> None:
-        for group in self._optimizer.param_groups:
-            group["lr"] = self._learning_rate * share
 
 
 def check_finite(optimizer: torch.optim.Optimizer) -> None:

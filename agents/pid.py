@@ -11,14 +11,10 @@ from ..models.errors import InputError
 __all__ = ["PID"]
 
 ENV_ID: Final = "rotorgram/Elevation-v0"
-PROPORTIONAL: Final = 9.0
-"""1/s²: closed-loop natural frequency of 3 rad/s."""
-DERIVATIVE: Final = 5.4
-"""1/s: damping ratio 0.9."""
-INTEGRAL: Final = 1.0
-"""1/s³: there is no steady load to remove here; an unknown mass would be one."""
-INTEGRAL_BAND: Final = 0.02
-"""m: the integral grows only this near the target, against windup."""
+PROPORTIONAL: Final = 9.0  # 1/s²: closed-loop natural frequency of 3 rad/s
+DERIVATIVE: Final = 5.4  # 1/s: damping ratio 0.9
+INTEGRAL: Final = 1.0  # 1/s³: there is no steady load to remove here; an unknown mass would be one
+INTEGRAL_BAND: Final = 0.02  # m: the integral grows only this near the target, against windup
 SHARES: Final = {"increment": 0.05, "offset": 0.2}
 """Thrust per unit of action over the rotors' largest, where the option `thrust_scale` is None."""
 
@@ -29,12 +25,7 @@ class PID:
     Needs the full observation and continuous actions. It derives the vehicle's numbers from the
     spec: the bounds of the rotors' thrust in the telemetry, N, over those in the observation,
     relative to hover, give the thrust at hover, and that over g the mass that a rotor carries.
-
-    Args:
-        spec: Of the env that it flies.
-
-    Raises:
-        InputError: It is another env, or its options or telemetry lack what the PID needs.
+    Raises `InputError` for another env, or where options or telemetry lack what it needs.
     """
 
     def __init__(self, spec: EnvSpec) -> None:

@@ -24,11 +24,8 @@ class Policy(Protocol):
 def flat(observations: Any, spec: EnvSpec, *lead: int) -> np.ndarray:
     """Observations as networks take them: float32, shape (*lead, n).
 
-    Args:
-        observations: An array of shape (*lead, ...), or a mapping with one for each array of the
-            spec; these are joined in the order of the spec.
-        spec: Of the env.
-        lead: (N,) for N drones; nothing for a single one.
+    They are an array of shape (*lead, ...), or a mapping with one for each array of the spec, which
+    are joined in its order. `lead` is N for N drones, nothing for a single one.
     """
     if not isinstance(observations, Mapping):
         return np.asarray(observations, np.float32).reshape(*lead, -1)
@@ -46,31 +43,23 @@ class ActionMap:
 
     Of a continuous action the network's 0 is the middle between the bounds, -1 the lower and 1 the
     upper one; where there is no bound, it is the number itself. Of a discrete action the network
-    gives a number for each choice.
-
-    Args:
-        action: Of the env's spec.
+    gives a number for each choice. An array of whole numbers raises `InputError`.
 
     Attributes:
         outputs: Numbers that the network gives.
         size: Numbers of a drawn action, k: 1 if discrete.
         discrete: Whether an action is a choice.
-
-    Raises:
-        InputError: The action is an array of whole numbers.
     """
 
     def __init__(self, action: ArraySpec | Discrete) -> None:
         self.discrete = isinstance(action, Discrete)
-        self._shape: tuple[int, ...] = ()
         if isinstance(action, Discrete):
             self.outputs, self.size = action.n, 1
             return
         if not action.dtype.startswith("float"):
-            raise InputError(
-                f"action: expected a choice or numbers of type float, got {action.dtype}"
-            )
-        self._shape, self.outputs, self.size = action.shape, action.size, action.size
+            got = action.dtype
+            raise InputError(f"action: expected a choice or numbers of type float, got {got}")
+        self.outputs = self.size = action.size
         # Two axes here and below: NumPy is slow where it has to add one to a batch of one.
         low, high = (bound.reshape(1, -1) for bound in action.bounds())
         bounded = np.isfinite(low) & np.isfinite(high)
@@ -81,10 +70,7 @@ class ActionMap:
         self._plain = bool((self._middle == 0).all() and (self._half == 1).all())
 
     def to_envs(self, actions: np.ndarray) -> np.ndarray:
-        """Actions of an env for drawn actions, shape (N, k).
-
-        float32, shape (N, k), inside the bounds; or int64, shape (N,).
-        """
+        """Drawn actions (N, k) as the env's: float32, (N, k), inside the bounds; or int64, (N,)."""
         if self.discrete:
             return actions[:, 0].astype(np.int64)
         if not self._plain:
@@ -92,28 +78,17 @@ class ActionMap:
         clipped: np.ndarray = np.minimum(np.maximum(actions, self._low), self._high)
         return clipped
 
-    def to_env(self, action: np.ndarray) -> Any:
-        """Action of a single env for a drawn one, shape (k,): of the env's shape, or an int."""
-        if self.discrete:
-            return int(action[0])
-        return self.to_envs(action[np.newaxis])[0].reshape(self._shape)
-
 
 class NetworkPolicy:
     """The actor of `networks.Actor`, from its weights.
 
-    Args:
-        weights: `hidden.weight` (h, n), `hidden.bias` (h,), `output.weight` (k, h),
-            `output.bias` (k,), all float32, and for continuous actions `log_std` (k,).
-        spec: Of the env that it flies.
-
-    Raises:
-        InputError: A weight is missing, or the shapes are not those that the env needs.
+    These are `hidden.weight` (h, n), `hidden.bias` (h,), `output.weight` (k, h), `output.bias`
+    (k,), all float32, and for continuous actions `log_std` (k,). Raises `InputError` if one is
+    missing, or the shapes are not those that the env needs.
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray], spec: EnvSpec) -> None:
-        self.spec = spec
-        self.actions = ActionMap(spec.action)
+        self.spec, self.actions = spec, ActionMap(spec.action)
         _check_shapes(weights, flat_size(spec), self.actions)
         self._w1, self._b1 = weights["hidden.weight"].T, weights["hidden.bias"][np.newaxis]
         self._w2, self._b2 = weights["output.weight"].T, weights["output.bias"][np.newaxis]
@@ -134,8 +109,10 @@ class NetworkPolicy:
 
     def act(self, observation: Any) -> Any:
         """The most likely action, inside the bounds of the env."""
-        output = self.output(flat(observation, self.spec, 1))[0]
-        return int(output.argmax()) if self.actions.discrete else self.actions.to_env(output)
+        output = self.output(flat(observation, self.spec, 1))
+        if isinstance(self.spec.action, Discrete):
+            return int(output.argmax())
+        return self.actions.to_envs(output).reshape(self.spec.action.shape)
 
     def draw_noise(self, rng: np.random.Generator, steps: int) -> np.ndarray:
         """Randomness for so many rows of `sample`, drawn at once: shape (steps, k)."""
@@ -150,11 +127,8 @@ class NetworkPolicy:
     def sample(self, observations: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Actions drawn from the policy, float32, shape (N, k), not clipped.
 
-        Shape (N, 1), holding whole numbers, if they are discrete.
-
-        Args:
-            observations: Flat, shape (N, n).
-            noise: N rows of `draw_noise`.
+        Shape (N, 1), holding whole numbers, if they are discrete. Observations are flat, shape
+        (N, n); noise is N rows of `draw_noise`.
         """
         output = self.output(observations)
         output += noise

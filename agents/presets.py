@@ -4,6 +4,7 @@ A preset is named `paper` or `tuned`. `docs/algorithms/` lists where they differ
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
@@ -15,32 +16,64 @@ AlgorithmName = Literal["vpg", "a2c", "sb3-a2c"]
 PresetName = Literal["paper", "tuned"]
 
 
+_Rule = tuple[str, Callable[[Any], bool]]  # What is expected, and whether a value is that
+
+
+def _is_number(value: Any, low: float, high: float = math.inf) -> bool:
+    return type(value) in (int, float) and math.isfinite(value) and low <= value <= high
+
+
+def _rule(expected: str, is_right: Callable[[Any], bool], *names: str) -> dict[str, _Rule]:
+    return dict.fromkeys(names, (expected, is_right))
+
+
+_RULES: Final = {
+    **_rule("a whole number, 1 or more", lambda value: type(value) is int and value >= 1,
+            "hidden", "episodes_per_update", "steps_per_update"),
+    **_rule("a number from 0 to 1", lambda value: _is_number(value, 0, 1), "gamma", "gae_lambda"),
+    **_rule("a number, 0 or more", lambda value: _is_number(value, 0), "vf_coef", "ent_coef"),
+    **_rule("true or false", lambda value: type(value) is bool, "anneal", "normalize"),
+    **_rule("a number above 0", lambda value: _is_number(value, 5e-324, 1e30), "learning_rate"),
+    **_rule("a number from -4 to 1", lambda value: _is_number(value, -4, 1), "log_std"),
+    **_rule("'none' or 'time'", lambda value: value in ("none", "time"), "baseline"),
+}  # fmt: skip
+
+
 @dataclass(frozen=True, kw_only=True)
-class VPGConfig:
-    """Vanilla Policy Gradient (paper, section 2.3, Algorithm 1). Defaults: the paper's setting."""
+class _Config:
+    """What all algorithms have."""
 
     hidden: int = 16
-    """Units of the hidden layer (paper)."""
+    """Units of the hidden layer of each network (paper)."""
     learning_rate: float = 0.001
     """Of Adam (paper)."""
     anneal: bool = False
     """Lower the learning rate linearly to zero over the run."""
     gamma: float = 0.99
     """Discount. The paper names none."""
+    log_std: float = -0.5
+    """Initial logarithm of the policy's standard deviation, in units of the action."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            expected, is_right = _RULES[name]
+            if not is_right(value):
+                raise InputError(f"{name}: expected {expected}, got {value!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VPGConfig(_Config):
+    """Vanilla Policy Gradient (paper, section 2.3, Algorithm 1). Defaults: the paper's setting."""
+
     episodes_per_update: int = 1
     """Episodes flown with one policy ("a set of drone data"; the paper gives no number)."""
     baseline: Literal["none", "time"] = "none"
     """Taken off the returns: nothing (paper), or their mean at the same step of the episode."""
     normalize: bool = False
     """Divide the returns of an update by their standard deviation."""
-    log_std: float = -0.5
-    """Initial logarithm of the policy's standard deviation, in units of the action."""
 
     def __post_init__(self) -> None:
-        _check(self, counts=("hidden", "episodes_per_update"), shares=("gamma",),
-               flags=("anneal", "normalize"))  # fmt: skip
-        if self.baseline not in ("none", "time"):
-            raise InputError(f"baseline: expected 'none' or 'time', got {self.baseline!r}")
+        super().__post_init__()
         if self.baseline == "time" and self.episodes_per_update < 2:
             raise InputError(
                 "episodes_per_update: expected 2 or more with baseline 'time', where a single "
@@ -49,20 +82,12 @@ class VPGConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class A2CConfig:
+class A2CConfig(_Config):
     """Advantage Actor-Critic (paper, section 2.3, Algorithm 2). Defaults: the paper's setting.
 
     Serves our A2C and Stable-Baselines3's.
     """
 
-    hidden: int = 16
-    """Units of the hidden layer of each of the two networks (paper)."""
-    learning_rate: float = 0.001
-    """Of Adam (paper)."""
-    anneal: bool = False
-    """Lower the learning rate linearly to zero over the run."""
-    gamma: float = 0.99
-    """Discount. The paper names none."""
     steps_per_update: int = 1
     """Env steps between updates (paper: one), of all drones together."""
     gae_lambda: float = 0.0
@@ -73,66 +98,21 @@ class A2CConfig:
     """Weight of the squared error of the value."""
     ent_coef: float = 0.0
     """Weight of the policy's entropy."""
-    log_std: float = -0.5
-    """Initial logarithm of the policy's standard deviation, in units of the action."""
-
-    def __post_init__(self) -> None:
-        _check(self, counts=("hidden", "steps_per_update"), shares=("gamma", "gae_lambda"),
-               flags=("anneal", "normalize"))  # fmt: skip
-        for name in ("vf_coef", "ent_coef"):
-            _expect(self, name, "a number, 0 or more", _is_number(getattr(self, name), 0.0))
 
     def rollout_size(self, drones: int) -> int:
         """Env steps of a rollout: `steps_per_update`, rounded up to whole steps of all drones."""
         return -(-self.steps_per_update // drones) * drones
 
 
-def _check(
-    config: Any, *, counts: tuple[str, ...], shares: tuple[str, ...], flags: tuple[str, ...]
-) -> None:
-    for name in counts:
-        value = getattr(config, name)
-        _expect(config, name, "a whole number, 1 or more", type(value) is int and value >= 1)
-    for name in shares:
-        _expect(config, name, "a number from 0 to 1", _is_number(getattr(config, name), 0.0, 1.0))
-    for name in flags:
-        _expect(config, name, "true or false", type(getattr(config, name)) is bool)
-    rate = config.learning_rate
-    _expect(config, "learning_rate", "a number above 0", _is_number(rate, 0.0, 1e30) and rate > 0)
-    _expect(config, "log_std", "a number from -4 to 1", _is_number(config.log_std, -4.0, 1.0))
-
-
-def _is_number(value: Any, low: float, high: float = math.inf) -> bool:
-    return type(value) in (int, float) and math.isfinite(value) and low <= value <= high
-
-
-def _expect(config: Any, name: str, expected: str, ok: bool) -> None:
-    if not ok:
-        raise InputError(f"{name}: expected {expected}, got {getattr(config, name)!r}")
-
-
+_TUNED: Final[Any] = {"learning_rate": 0.01, "anneal": True, "gamma": 0.98, "normalize": True}
 PRESETS: Final[dict[str, dict[str, VPGConfig | A2CConfig]]] = {
     "vpg": {
         "paper": VPGConfig(),
-        "tuned": VPGConfig(
-            learning_rate=0.01,
-            anneal=True,
-            gamma=0.98,
-            episodes_per_update=4,
-            baseline="time",
-            normalize=True,
-        ),
+        "tuned": VPGConfig(**_TUNED, episodes_per_update=4, baseline="time"),
     },
     "a2c": {
         "paper": A2CConfig(),
-        "tuned": A2CConfig(
-            learning_rate=0.01,
-            anneal=True,
-            gamma=0.98,
-            steps_per_update=256,
-            gae_lambda=0.98,
-            normalize=True,
-        ),
+        "tuned": A2CConfig(**_TUNED, steps_per_update=256, gae_lambda=0.98),
     },
 }
 # The reference gets the very same settings: only the implementation differs.
@@ -140,11 +120,7 @@ PRESETS["sb3-a2c"] = PRESETS["a2c"]
 
 
 def preset(algorithm: str, name: str, **changes: Any) -> VPGConfig | A2CConfig:
-    """A preset, with some of its fields changed.
-
-    Raises:
-        InputError: No such algorithm, preset or field.
-    """
+    """A preset, with some of its fields changed. Raises `InputError` if there is no such one."""
     if algorithm not in PRESETS:
         raise InputError(f"algorithm: expected one of {sorted(PRESETS)}, got {algorithm!r}")
     if name not in PRESETS[algorithm]:

@@ -13,12 +13,8 @@ __all__ = ["advantages", "discounted_sums", "rewards_to_go", "step_of_episode"]
 def discounted_sums(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
     """S_t = v_t + f_t · S_t+1, where S is 0 after the last row: float64, shape of `values`.
 
-    The rows are combined in pairs, pairs of pairs and so on: log2(T) NumPy operations on all of
-    them take the place of T operations on one.
-
-    Args:
-        values: v.
-        factors: f, 0 where a sum stops.
+    A factor is 0 where a sum stops. The rows are combined in pairs, pairs of pairs and so on:
+    log2(T) NumPy operations on all of them take the place of T operations on one.
     """
     sums = values.astype(np.float64)
     factors = factors.astype(np.float64)
@@ -35,11 +31,6 @@ def rewards_to_go(rewards: np.ndarray, ends: np.ndarray, gamma: float) -> np.nda
     """Discounted return from each step to the end of its episode (paper, Algorithm 1, step 2).
 
     R_t = sum of gamma^(t' - t) · r_t' for t' = t ... the end.
-
-    Args:
-        rewards: Numbers.
-        ends: bool: terminated or truncated.
-        gamma: Discount.
     """
     return discounted_sums(rewards, gamma * ~ends)
 
@@ -56,16 +47,8 @@ def advantages(
 ) -> np.ndarray:
     """Generalised advantage estimates, float64; with `gae_lambda` = 0 the paper's Equation 3.
 
-    A_t = r_t + gamma · V(s_t+1) - V(s_t), where V after a termination is 0.
-
-    Args:
-        rewards: Numbers.
-        values: V(s_t).
-        next_values: V(s_t+1) of the state that the step led to, before any reset.
-        terminated: bool.
-        truncated: bool.
-        gamma: Discount.
-        gae_lambda: Decay of the sum over later errors, 0 to 1.
+    A_t = r_t + gamma · V(s_t+1) - V(s_t), where V after a termination is 0, and s_t+1 is the state
+    that the step led to, before any reset. `gae_lambda` is the decay of the sum over later errors.
     """
     errors: np.ndarray = rewards + gamma * np.where(terminated, 0.0, next_values) - values
     if gae_lambda == 0.0:

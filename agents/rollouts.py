@@ -1,6 +1,6 @@
 """Collecting experience: a policy flies, and every transition is kept."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -32,11 +32,9 @@ class Rollout:
     next_observations: np.ndarray
     """Observations after each step, before any reset: float32, shape (T, N, n)."""
     terminated: np.ndarray
-    """bool, shape (T, N)."""
+    """bool, shape (T, N), as the following."""
     truncated: np.ndarray
-    """bool, shape (T, N)."""
     kept: np.ndarray
-    """bool, shape (T, N)."""
 
     def __len__(self) -> int:
         return int(self.kept.sum())
@@ -44,23 +42,18 @@ class Rollout:
     @property
     def ends(self) -> np.ndarray:
         """After which rows another episode begins, or may: bool, shape (T, N)."""
-        ends: np.ndarray = self.terminated | self.truncated | ~self.kept
-        return ends
+        return np.asarray(self.terminated | self.truncated | ~self.kept)
 
     def rows(self, array: np.ndarray) -> np.ndarray:
         """The kept rows of an array of shape (T, N, ...): one for each transition."""
         if self.kept.all():
             return array.reshape(-1, *array.shape[2:])
-        chosen: np.ndarray = array[self.kept]
-        return chosen
+        return np.asarray(array[self.kept])
 
     def without_steps(self, lost: np.ndarray) -> "Rollout":
         """Without the steps whose simulator was lost: their rewards and observations are made up.
 
         The episode stops one step earlier: a value is carried over that, as over a truncation.
-
-        Args:
-            lost: bool, shape (T, N).
         """
         if not lost.any():
             return self
@@ -69,34 +62,23 @@ class Rollout:
         return replace(self, truncated=truncated, kept=self.kept & ~lost)
 
     def without_episodes(self, lost: np.ndarray) -> "Rollout":
-        """Without the episodes that end with such a step: the return of what was flown is unknown.
-
-        Args:
-            lost: bool, shape (T, N).
-        """
+        """Without the episodes that end with such a step: their returns are unknown."""
         if not lost.any():
             return self
         return replace(self, kept=self.kept & (rewards_to_go(lost, self.ends, 1.0) == 0))
 
 
 class Collector:
-    """Flies a policy, episode after episode, across calls.
-
-    Args:
-        log: Log of the env to fly.
-        rng: Draws the actions.
-    """
+    """Flies a policy, episode after episode, across calls; `rng` draws the actions."""
 
     def __init__(self, log: EpisodeLog, rng: np.random.Generator) -> None:
-        self._log = log
-        self._rng = rng
+        self._log, self._rng = log, rng
 
     def steps(self, policy: NetworkPolicy, count: int) -> Rollout:
-        """Whole steps of all drones, as many as so many transitions need.
+        """Whole steps of all drones, as many as so many transitions need, less those with a loss.
 
         Running episodes go on in the next call. After an episode ends, that drone's next step
         begins the next episode and is no transition; if all have ended, no step is spent.
-        Steps with a lost simulator are left out.
         """
         rollout, lost, _ = self._fly(policy, -(-count // self._log.num_envs), None)
         return rollout.without_steps(lost)
@@ -127,9 +109,8 @@ class Collector:
     ) -> tuple[Rollout, np.ndarray, bool]:
         """So many steps of all drones; or an episode of each, if it takes at most so many steps.
 
-        Returns:
-            The rollout; the steps in which a simulator was lost, bool, shape (T, N); and whether
-            all drones stand at the end of an episode.
+        Returns the rollout; the steps in which a simulator was lost, bool, shape (T, N); and
+        whether all drones stand at the end of an episode.
         """
         log, env, count = self._log, self._log.env, self._log.num_envs
         log.start()
@@ -147,10 +128,7 @@ class Collector:
                     "training diverged: actions are not finite; try a lower learning_rate"
                 )
             idle = done if waiting else None
-            if stop is None:
-                log.fly(actions, begins=idle)
-            else:
-                log.fly(actions, frozen=idle)
+            log.fly(actions, idle) if stop is None else log.fly(actions, None, idle)
             after, terminated, truncated = log.observations, env.terminated, env.truncated
             rows.append(
                 (observations, actions, env.rewards, after, terminated, truncated, ~done, env.lost)
@@ -165,7 +143,6 @@ class Collector:
                 observations, done, waiting = log.observations, np.zeros(count, bool), 0
         if waiting and (stop is None or waiting == count):
             log.begin(done)
-        *columns, kept, lost = (np.array(column) for column in zip(*rows, strict=True))
-        names = tuple(vars(Rollout)["__dataclass_fields__"])
-        rollout = Rollout(**dict(zip(names, (*columns, kept), strict=True)))
-        return rollout, lost, waiting == count
+        *columns, lost = (np.array(column) for column in zip(*rows, strict=True))
+        names = (field.name for field in fields(Rollout))
+        return Rollout(**dict(zip(names, columns, strict=True))), lost, waiting == count

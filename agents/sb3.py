@@ -1,6 +1,6 @@
 """Stable-Baselines3: its A2C as the reference, and vector envs as it wants them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from .learner import (
     set_optimizer_arrays,
     updates_of,
 )
-from .networks import load_arrays, torch
+from .networks import arrays_of, load_arrays, torch
 from .presets import A2CConfig
 
 if TYPE_CHECKING:
@@ -37,11 +37,7 @@ class SB3VecEnv(sb3_vec.VecEnv):
     Where an episode ended, `infos` has SB3's `terminal_observation` and `TimeLimit.truncated`; the
     rest of `info` is left out, for SB3 would want a dictionary for each env and step.
 
-    Args:
-        env: The vector env; it is closed by `close`.
-
-    Raises:
-        InputError: Its autoreset is another one.
+    `close` closes it. One of another autoreset raises `InputError`.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
@@ -85,33 +81,23 @@ class SB3VecEnv(sb3_vec.VecEnv):
         """An attribute of the vector env, which all envs share."""
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, *_: Any, **__: Any) -> None:
-        """Not possible: the envs are one."""
-        raise NotImplementedError("set_attr: the envs of a vector env have no attributes to set")
+    def env_method(self, *_: Any, **__: Any) -> Any:
+        """Not possible: the envs are one, without attributes to set and methods to call."""
+        raise NotImplementedError("the envs of a vector env are one")
 
-    def env_method(self, *_: Any, **__: Any) -> list[Any]:
-        """Not possible: the envs are one."""
-        raise NotImplementedError("env_method: the envs of a vector env have no methods to call")
+    set_attr = env_method
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """False: wrappers of single envs are not here."""
         return [False] * len(list(self._get_indices(indices)))
-
-    def get_images(self) -> Sequence[np.ndarray | None]:
-        """None: nothing is drawn."""
-        return [None] * self.num_envs
 
 
 class SB3A2C:
     """SB3's A2C behind the same interface as our own algorithms.
 
     Adam instead of SB3's RMSprop, no clipping of gradients, and every other setting from the same
-    `A2CConfig`: given the same experience, it makes the same updates as ours.
-
-    Args:
-        log: Log of the env to train on: SB3 wants it at construction.
-        config: Hyperparameters.
-        seed: Seed of the run: weights and actions.
+    `A2CConfig`: given the same experience, it makes the same updates as ours. SB3 wants the
+    env, the log, at construction.
     """
 
     def __init__(self, log: EpisodeLog, config: A2CConfig, seed: int) -> None:
@@ -119,9 +105,8 @@ class SB3A2C:
         # SB3 draws from the global generators: torch for actions, NumPy for the order of samples.
         torch.manual_seed(torch_seed)
         np.random.seed(torch_seed % 2**32)  # noqa: NPY002
-        self._config = config
+        self._config, self._ahead = config, 0.0
         self._rollout = config.rollout_size(log.num_envs)
-        self._ahead = 0.0
         self._model = _A2C(
             "MlpPolicy",
             SB3VecEnv(log),
@@ -146,9 +131,9 @@ class SB3A2C:
         self._model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
-        """As `Agent.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
+        """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
         model, rollout = self._model, self._rollout
-        done, whole = model.num_timesteps, env_steps // rollout * rollout
+        done, whole = model.num_timesteps, self.last_step(env_steps)
         if done >= whole:
             return
         self._ahead = rollout / whole
@@ -167,16 +152,13 @@ class SB3A2C:
 
     def actor(self) -> dict[str, np.ndarray]:
         """Weights of the policy, under our names."""
-        weights = {k: v.numpy().copy() for k, v in self._model.policy.state_dict().items()}
+        weights = arrays_of(self._model.policy)
         return {ours: weights[theirs] for ours, theirs in _NAMES.items() if theirs in weights}
 
     def state(self) -> dict[str, np.ndarray]:
         """Weights, optimizer, both generators and the state of SB3 between rollouts."""
         model = self._model
-        state = {
-            f"policy.{name}": value.numpy().copy()
-            for name, value in model.policy.state_dict().items()
-        }
+        state = {f"policy.{name}": array for name, array in arrays_of(model.policy).items()}
         state |= optimizer_arrays(model.policy.optimizer)
         state["rng.torch"] = torch.get_rng_state().numpy().copy()
         _, keys, place, *_ = np.random.get_state()  # noqa: NPY002
@@ -199,8 +181,7 @@ class SB3A2C:
         model.num_timesteps = int(state["steps"])
         if "observation" in state:
             shapes = state["observation"].shape, state["starts"].shape
-            sizes = model.observation_space.shape or ()
-            expected = (model.n_envs, *sizes), (model.n_envs,)
+            expected = (model.n_envs, *(model.observation_space.shape or ())), (model.n_envs,)
             if shapes != expected:
                 raise ValueError(f"observation, starts: expected shapes {expected}, got {shapes}")
             model._last_obs = state["observation"]

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from .episodes import EpisodeLog
 from .learner import Learner, Terms
 from .networks import torch
 from .policies import NetworkPolicy
@@ -20,9 +19,7 @@ class VPG(Learner):
     Algorithm 1 prints the update without R; Equation 2 has it, as we do.
     """
 
-    def __init__(self, log: EpisodeLog, config: VPGConfig, seed: int) -> None:
-        super().__init__(log, config, seed)
-        self.config = config
+    config: VPGConfig
 
     def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
         """Fly whole episodes with one policy."""

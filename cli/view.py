@@ -55,7 +55,7 @@ class View(EnvFlags):
         surface = open_surface("web" if self.web else "window", stage, pace, self.port)
         with LiveView(stage, surface, pace) as live:
             print(f"showing {self.what} {surface.where} (Ctrl-C ends)", flush=True)
-            while live.is_running and not live.is_watched:
+            while live.is_running and not live.surface.is_watched():
                 time.sleep(0.02)
             for trajectory in chain((first,), trajectories):
                 if not all(live.draw_in_time(moment) for moment in moments(trajectory)):

@@ -22,32 +22,12 @@ if TYPE_CHECKING:
     from .vector import LocalVectorEnv
 
 __all__ = [
-    "ArraySpec",
-    "Discrete",
-    "EnvSpec",
-    "LocalVectorEnv",
-    "Loop",
-    "Metric",
-    "Outcome",
-    "SingleEnv",
-    "Task",
-    "TaskOptions",
-    "check_choice",
-    "check_number",
-    "register",
+    "ArraySpec", "Discrete", "EnvSpec", "LocalVectorEnv", "Loop", "Metric", "Outcome",
+    "SingleEnv", "Task", "TaskOptions", "check_choice", "check_number", "register",
     "register_all",
-]
+]  # fmt: skip
 
-_HOMES: Final = {
-    "Loop": "loop",
-    "LocalVectorEnv": "vector",
-    "Outcome": "tasks.task",
-    "SingleEnv": "single",
-    "Task": "tasks.task",
-    "TaskOptions": "tasks.task",
-    "check_choice": "tasks.task",
-    "check_number": "tasks.task",
-}
+_HOMES: Final = {"Loop": "loop", "LocalVectorEnv": "vector", "SingleEnv": "single"}
 
 
 def register_all() -> None:
@@ -59,9 +39,9 @@ def register_all() -> None:
 
 def __getattr__(name: str) -> Any:
     """Import what needs MuJoCo on first use (PEP 562)."""
-    if name not in _HOMES:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f".{_HOMES[name]}", __name__), name)
+    return getattr(import_module(f".{_HOMES.get(name, 'tasks.task')}", __name__), name)
 
 
 register_all()

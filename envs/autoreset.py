@@ -21,11 +21,9 @@ Seeds = Sequence[int | None] | np.ndarray
 class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
     """A vector env that is stepped by `advance`, the step of the wire.
 
-    A derived class sets the attributes below in `advance` to new arrays; arrays of earlier steps
-    do not change.
+    `advance` sets the arrays below to new ones; those of earlier steps do not change.
 
     Attributes:
-        env_spec: The `EnvSpec` of the env.
         control_period: Time of a step, s.
         observations: float32, shape (N, n), where the spec has one array; else a dict of arrays.
         rewards: float64, shape (N,).
@@ -62,26 +60,21 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         """Reset some drones, freeze some, and fly the others for one control period.
 
         Rewards and flags of a drone that is reset or frozen are 0, and its action is ignored. One
-        that is frozen is afterwards as it was before.
-
-        Args:
-            actions: Shape (N, k); of discrete actions (N,) or (N, 1).
-            resets: bool, shape (N,); None resets none.
-            seeds: Of those that are reset, shape (N,); None leaves their streams as they are.
-            frozen: bool, shape (N,); None freezes none.
+        that is frozen is afterwards as it was before. Actions have shape (N, k), discrete ones (N,)
+        or (N, 1); masks are bool, shape (N,), or None. Seeds, shape (N,), are of those that are
+        reset; None leaves their streams as they are.
         """
 
     def step(self, actions: Any) -> Step:
         """Fly every drone for one control period; after an episode the autoreset mode decides."""
-        array = self._shaped(actions)
         mode = self.metadata["autoreset_mode"]
         resets = self.done if mode == AutoresetMode.NEXT_STEP and self.done.any() else None
-        self.advance(array, resets)
+        self.advance(self._shaped(actions), resets)
         rewards, terminated, truncated = self.rewards, self.terminated, self.truncated
         info = self._info(~self._nobody)
         if mode == AutoresetMode.SAME_STEP and self.done.any():
             truncated, info = self._begin_next(truncated, info)
-        return self._observed(), rewards, terminated, truncated, info
+        return self.observations, rewards, terminated, truncated, info
 
     def _take_spec(self, spec: EnvSpec, num_envs: int, mode: AutoresetMode | str) -> None:
         """Set spaces and other attributes from a spec. Raises `InputError`.
@@ -104,13 +97,11 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         fps = max(1, round(1 / spec.control_period))
         self.metadata = {"render_modes": [], "render_fps": fps, "autoreset_mode": mode}
 
-    def _shaped(self, actions: Any) -> np.ndarray:
-        array = np.asarray(actions)
-        if array.shape != self.action_space.shape:
-            raise InputError(
-                f"actions: expected an array of shape {self.action_space.shape}, "
-                f"got shape {array.shape}"
-            )
+    def _shaped(self, actions: Any) -> Any:
+        array, expected = np.asarray(actions), self.action_space.shape
+        if array.shape != expected:
+            got = f"got shape {array.shape}"
+            raise InputError(f"actions: expected an array of shape {expected}, {got}")
         return array
 
     def _no_actions(self) -> np.ndarray:
@@ -118,15 +109,13 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         shape = (1,) if isinstance(action, Discrete) else action.shape
         return np.zeros((self.num_envs, *shape), np.float32)
 
-    def _begin_next(
-        self, truncated: np.ndarray, last_info: dict[str, Any]
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def _begin_next(self, truncated: Any, last_info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """SAME_STEP: reset those whose episode ended; the info, with that of their last step.
 
         A simulator that is lost meanwhile truncates the episodes of its frozen drones: they begin
         their next as well.
         """
-        last, ended = self._observed(), self._nobody
+        last, ended = self.observations, self._nobody
         while self.done.any():
             truncated = truncated | self.lost
             ended = ended | self.done
@@ -137,16 +126,10 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         info |= {"final_info": last_info | masks, "_final_info": ended | self._nobody}
         return truncated, info
 
-    def _observed(self) -> Any:
-        """Observations as the space has them."""
-        return self.observations
-
     def _info(self, mask: np.ndarray) -> dict[str, Any]:
         """The telemetry of the drones by its components, each name with its mask."""
-        info: dict[str, Any] = {
-            name: column.copy()
-            for name, column in info_columns(self.env_spec, self.telemetry).items()
-        }
+        columns = info_columns(self.env_spec, self.telemetry)
+        info: dict[str, Any] = {name: column.copy() for name, column in columns.items()}
         return info | {f"_{name}": mask for name in info}
 
 
@@ -154,43 +137,34 @@ def checked_mask(mask: Any, num_envs: int) -> np.ndarray:
     """The `reset_mask` of a reset's options, bool, shape (N,); None is all. Raises `InputError`."""
     if mask is None:
         return np.ones(num_envs, bool)
-    if (
-        not isinstance(mask, np.ndarray)
-        or (mask.dtype, mask.shape) != (bool, (num_envs,))
-        or not mask.any()
-    ):
+    right = isinstance(mask, np.ndarray) and (mask.dtype, mask.shape) == (bool, (num_envs,))
+    if not (right and mask.any()):
         raise InputError(
             f"reset_mask: expected an array of {num_envs} bool, one of them True, got {mask!r}"
         )
-    return mask.copy()
+    return np.array(mask)
 
 
 def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | None:
     """One seed for each env, from one number, N of them, or None. Raises `InputError`.
 
-    Args:
-        seed: As Gymnasium's reset takes it.
-        num_envs: N.
-        most: Largest seed; where there is one, every env needs one.
+    Where there is a largest seed, `most`, every env needs one.
     """
     if seed is None:
         return None
-    numbers = seed
+
+    def is_seed(number: Any) -> bool:
+        if number is None:
+            return most is None
+        return isinstance(number, int | np.integer) and 0 <= int(number) <= (most or int(number))
+
+    numbers: Seeds = seed
     if isinstance(seed, int | np.integer):
         numbers = range(int(seed), int(seed) + num_envs)
-    if (
-        not isinstance(numbers, Sequence | np.ndarray)
-        or len(numbers) != num_envs
-        or not all(_is_seed(number, most) for number in numbers)
-    ):
+    several = isinstance(numbers, Sequence | np.ndarray) and len(numbers) == num_envs
+    if not (several and all(map(is_seed, numbers))):
         up_to = "from 0 on" if most is None else f"from 0 to 2^{most.bit_length()} - 1"
         raise InputError(
             f"seed: expected a whole number {up_to}, or {num_envs} of them, got {seed!r}"
         )
     return numbers
-
-
-def _is_seed(number: Any, most: int | None) -> bool:
-    if number is None:
-        return most is None
-    return isinstance(number, int | np.integer) and 0 <= int(number) <= (most or int(number))

@@ -23,8 +23,7 @@ from .tasks.task import Outcome, Task
 
 __all__ = ["Loop", "OnHost", "make_task", "spec_of"]
 
-_SMALL: Final = 64
-"""Up to this many numbers Python's loop is faster than NumPy's call."""
+_SMALL: Final = 64  # Up to this many numbers Python's loop is faster than NumPy's call
 
 
 def make_task(
@@ -46,57 +45,50 @@ def make_task(
     return task
 
 
-def _check_observed(spec: EnvSpec, observed: Any, num_envs: int) -> None:
-    """Tell the author of a task what `observe` has to return. Raises `InputError`."""
+def _check_returned(
+    spec: EnvSpec, observed: Any, outcome: Any, num_envs: int, *, alone: bool
+) -> None:
+    """Tell the author of a task what its methods have to return. Raises `InputError`."""
+
+    def expect(ok: bool, sentence: str) -> None:
+        if not ok:
+            raise InputError(f"{spec.env_id}: expected {sentence}")
+
     names = [array.name for array in spec.observation]
-    if not isinstance(observed, Mapping) or not observed.keys() >= set(names):
-        got = list(observed) if isinstance(observed, Mapping) else type(observed).__name__
-        raise InputError(
-            f"{spec.env_id}: expected observe() to return a dict of {names}, got {got}"
-        )
+    mapping = isinstance(observed, Mapping)
+    got = list(observed) if mapping else type(observed).__name__
+    right = mapping and observed.keys() >= set(names)
+    expect(right, f"observe() to return a dict of {names}, got {got}")
     for array in spec.observation:
         shape = tuple(getattr(observed[array.name], "shape", ()))
-        if prod(shape) != num_envs * prod(array.shape):
-            raise InputError(
-                f"{spec.env_id}: expected observe() to return {array.name} of shape "
-                f"{array.shape} for each of {num_envs} drones, got an array of shape {shape}"
-            )
-
-
-def _check_outcome(spec: EnvSpec, outcome: Any, many: bool) -> None:
-    """Tell the author of a task what `outcome` has to return. Raises `InputError`."""
-    if not isinstance(outcome, Outcome):
-        other = type(outcome).__name__
-        raise InputError(f"{spec.env_id}: expected outcome() to return an Outcome, got {other}")
-    for metric in spec.metrics:
-        if metric.name not in outcome.metrics:
-            got = list(outcome.metrics)
-            raise InputError(f"{spec.env_id}: expected the metric {metric.name!r}, got {got}")
-    if many and not any(hasattr(term, "shape") for term in outcome.reward.values()):
-        raise InputError(
-            f"{spec.env_id}: expected a reward for each drone, got {outcome.reward}: "
-            "make an array of it, as 1.0 + 0.0 * state.position[..., 2]"
+        expect(
+            prod(shape) == num_envs * array.size,
+            f"observe() to return {array.name} of shape {array.shape} for each of {num_envs} "
+            f"drones, got an array of shape {shape}",
         )
+    returned = type(outcome).__name__
+    expect(isinstance(outcome, Outcome), f"outcome() to return an Outcome, got {returned}")
+    for metric in spec.metrics:
+        told = list(outcome.metrics)
+        expect(metric.name in told, f"the metric {metric.name!r}, got {told}")
+    expect(
+        alone or any(hasattr(term, "shape") for term in outcome.reward.values()),
+        f"a reward for each drone, got {outcome.reward}: make an array of it, as "
+        "1.0 + 0.0 * state.position[..., 2]",
+    )
     kind = getattr(outcome.terminated, "dtype", type(outcome.terminated).__name__)
-    if "bool" not in str(kind):
-        raise InputError(f"{spec.env_id}: expected terminated as truth values, got {kind}")
+    expect("bool" in str(kind), f"terminated as truth values, got {kind}")
 
 
 def spec_of(env_id: str, task: Task) -> EnvSpec:
     """The `EnvSpec` of a task's env."""
     vehicle, controller = task.vehicle, task.controller
-    if controller.choices:
-        action: ArraySpec | Discrete = Discrete(
-            n=controller.choices, components=controller.components
-        )
-    else:
-        action = ArraySpec(
-            name="action",
-            shape=(len(controller.low),),
-            low=controller.low,
-            high=controller.high,
-            components=controller.components,
-        )
+    names, low, high = controller.components, controller.low, controller.high
+    action: ArraySpec | Discrete = (
+        Discrete(n=controller.choices, components=names)
+        if controller.choices
+        else ArraySpec(name="action", shape=(len(low),), low=low, high=high, components=names)
+    )
     return EnvSpec(
         env_id=env_id,
         options=asdict(task.options),
@@ -127,7 +119,7 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
             high=tuple(vehicle.thrust_high.tolist()),
         ),
     ]
-    if has_goal(task):
+    if type(task).goal is not Task.goal:
         names = ("X_goal", "Y_goal", "Z_goal")
         specs.append(numbers("goal", names, unit="m", frame="paper"))
     if task.metrics:
@@ -136,28 +128,16 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
     return tuple(specs)
 
 
-def has_goal(task: Task) -> bool:
-    """Whether a task has goals."""
-    return type(task).goal is not Task.goal
-
-
 class Loop(NotCopied):
     """N drones of one env, each in a world of its own.
 
-    Args:
-        env_id: Of a registered task.
-        num_envs: N.
-        vehicle: MJCF file; None is the paper's.
-        backend: `mujoco` or `warp`.
-        options: Of the task, by name.
-        settings: Of the backend: `num_threads`, or `device`.
+    The vehicle is an MJCF file, None the paper's; options are the task's, by name; settings the
+    backend's: `num_threads`, or `device`.
 
     Attributes:
-        spec: Its `EnvSpec`.
-        task, world: Its parts. Their arrays have the leading axes of the world; all
-            others here have one axis of N drones.
-        observations: By name, shape (N, *shape), of the declared dtypes. This and the following
-            are new arrays after each `advance`; arrays of earlier steps do not change.
+        task, world: Their arrays have the leading axes of the world; all others here have one axis
+            of N drones, and are new after each `advance`.
+        observations: By name, shape (N, *shape), of the declared dtypes.
         rewards: float64, shape (N,); 0 for a drone that did not fly.
         terminated, truncated: bool, shape (N,).
         done: bool, shape (N,): the episode has ended and the next has not begun.
@@ -184,13 +164,11 @@ class Loop(NotCopied):
         self._xp, lead = self.world.xp, self.world.shape
         self.task = type(draft)(draft.options, draft.vehicle, lead, self._xp)
         self.spec = spec_of(canonical_id(env_id), self.task)
-        self.num_envs = num_envs
-        self.vehicle = draft.vehicle
+        self.num_envs, self.vehicle = num_envs, draft.vehicle
         self._substeps = draft.vehicle.substeps(draft.options.control_period)
         self._length = draft.options.episode_length
         self._choices = self.task.controller.choices
         self._width = len(self.task.controller.low)
-        self._has_goal = has_goal(draft)
         self._dtypes = [(a.name, a.shape, getattr(self._xp, a.dtype)) for a in draft.observation]
         none = self.world.state.touching != self.world.state.touching  # all False, on its device
         self._none, self._nobody = none, none.reshape(num_envs)
@@ -198,15 +176,17 @@ class Loop(NotCopied):
         self.rewards: Array = 0.0 * self._nobody
         self.observations: dict[str, Array] = {}
         self._steps: Array = (0 * self._nobody).reshape(lead)[()]
-        self._waiting = ~self._nobody  # for a reset
-        self._anyone_waits = True
+        self._waiting, self._anyone_waits = ~self._nobody, True  # for a reset
         self._begun = False
         self._outcome: Outcome | None = None
         self.terms: dict[str, Array] = {}
         self._telemetry: np.ndarray | None = None
         self._goal: tuple[Any, Any] = (None, None)
-        self._columns = _columns(self.spec)
-        self._told = len(draft.metrics)
+        ends = np.cumsum([0, *(array.size for array in self.spec.telemetry)]).tolist()
+        self._columns = {  # where each array of the telemetry lies in the table of all
+            array.name: slice(*ends[i : i + 2]) for i, array in enumerate(self.spec.telemetry)
+        }
+        self._has_goal, self._told = "goal" in self._columns, len(draft.metrics)
 
     def advance(
         self,
@@ -218,32 +198,22 @@ class Loop(NotCopied):
     ) -> None:
         """Reset some drones, freeze some, and fly the others for one control period.
 
-        Rewards and flags of a drone that is reset or frozen are 0, and its action is ignored. One
-        that is frozen is afterwards as it was before.
-
-        Args:
-            actions: float32, shape (N, k), or whole numbers, shape (N,) or (N, 1).
-            resets: bool, shape (N,); None resets none.
-            seeds: Shape (N,), of those that are reset; None leaves their streams as they are.
-            frozen: bool, shape (N,); None freezes none.
-            chosen: By the names of `Task.choices`, what replaces a draw, shape (N,).
+        As `AdvancingVectorEnv.advance`; `chosen` has by the names of `Task.choices` what replaces
+        a draw, shape (N,).
         """
         resets, frozen = self.ours(resets), self.ours(frozen)
         idle = resets if frozen is None else frozen if resets is None else resets | frozen
         flown = None if idle is None or not idle.any() else ~idle
         if self._anyone_waits:
-            self._check_begun(flown)
+            waiting = self._waiting if flown is None else self._waiting & flown
+            if waiting.any():
+                first = f"env {int(waiting.nonzero()[0][0])}"
+                raise gym.error.ResetNeeded(f"step: expected a call of reset() for {first} first")
         if flown is None or flown.any():
             self._fly(actions, flown)
         if resets is not None and resets.any():
             self._begin(resets, seeds, chosen or {})
         self._look(flown)
-
-    def _check_begun(self, flown: Array | None) -> None:
-        waiting = self._waiting if flown is None else self._waiting & flown
-        if waiting.any():
-            first = int(waiting.nonzero()[0][0])
-            raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
 
     def _fly(self, actions: Array, flown: Array | None) -> None:
         world, lead = self.world, self.world.shape
@@ -262,16 +232,11 @@ class Loop(NotCopied):
             raise
         self._steps = self._steps + (1 if some is None else some)
 
-    def _begin(
-        self,
-        mask: Array,
-        seeds: Sequence[int | None] | np.ndarray | None,
-        chosen: Mapping[str, np.ndarray],
-    ) -> None:
+    def _begin(self, mask: Array, seeds: Any, chosen: Mapping[str, np.ndarray]) -> None:
         """Begin the episodes of the drones of a mask, bool, shape (N,)."""
-        world, lead, every = self.world, self.world.shape, ~self._nobody
+        world, lead = self.world, self.world.shape
         if not self._begun:  # the first time a task wants all of them
-            everybody = every.reshape(lead)[()]
+            everybody = (~self._nobody).reshape(lead)[()]
             if not mask.all():
                 world.reset(everybody, self._start(everybody, world.draw(everybody)))
             self._begun = True
@@ -303,23 +268,19 @@ class Loop(NotCopied):
         """Observations, rewards and ends after a step."""
         task, state, n = self.task, self.world.state, self.num_envs
         self._telemetry = None
-        observed = task.observe(state)
+        observed, outcome = task.observe(state), task.outcome(state)
         if self._outcome is None:
-            _check_observed(self.spec, observed, n)
+            _check_returned(self.spec, observed, outcome, n, alone=not self.world.shape)
         self.observations = {
             name: _as_type(observed[name].reshape((n, *shape)), dtype)
             for name, shape, dtype in self._dtypes
         }
-        outcome = task.outcome(state)
-        if self._outcome is None:
-            _check_outcome(self.spec, outcome, bool(self.world.shape))
         self._outcome = outcome
         ended: Array = outcome.terminated
-        total: Array = 0.0
         late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b
-        for term in outcome.reward.values():
+        self.terms, total = outcome.reward, 0.0
+        for term in self.terms.values():
             total = total + term
-        self.terms = outcome.reward
         if not self.world.shape:  # a single drone's numbers
             self.rewards = np.array((total,))
             may_end = bool(ended or late)
@@ -363,36 +324,26 @@ class Loop(NotCopied):
         if actions.dtype.kind not in "iuf":
             raise InputError(f"actions: expected real numbers, got {actions.dtype}")
         if actions.size != self.num_envs * self._width:
-            expected = (self.num_envs, self._width)
-            raise InputError(f"actions: expected shape {expected}, got {actions.shape}")
+            shape = (self.num_envs, self._width)
+            raise InputError(f"actions: expected shape {shape}, got {actions.shape}")
         values = actions.reshape(self.num_envs, self._width)
         if values.dtype != np.float32 and not self._choices:
             with np.errstate(over="ignore"):  # an overflow is infinite, and refused as such
                 values = values.astype(np.float32)
-        right = self._right(values)
-        if right is not None:
-            wrong = ~right if flown is None else ~right & flown
-            if wrong.any():
-                self._refuse(values, int(wrong.argmax()))
-            values = np.where(right[:, None], values, values.dtype.type(0))
-        return values.astype(np.float64)
-
-    def _right(self, values: np.ndarray) -> np.ndarray | None:
-        """Which actions are in the action space, bool, shape (N,); None if all are."""
+        if not self._choices and _is_finite(values):
+            return values.astype(np.float64)
+        right, expected = np.isfinite(values), "finite numbers"
         if self._choices:
-            right = ((values >= 0) & (values < self._choices) & (values % 1 == 0)).all(axis=1)
-        else:
-            if values.size <= _SMALL:
-                total = sum(values.ravel().tolist())
-                if total - total == 0.0:  # else one is NaN or infinite, or they add up to too much
-                    return None
-            right = np.isfinite(values).all(axis=1)
-        return None if right.all() else right
-
-    def _refuse(self, values: np.ndarray, first: int) -> None:
-        expected = f"a whole number 0 to {self._choices - 1}" if self._choices else "finite numbers"
-        got = values[first].tolist()
-        raise InputError(f"actions: expected {expected}, got {got} for env {first}")
+            right = (values >= 0) & (values < self._choices) & (values % 1 == 0)
+            expected = f"a whole number 0 to {self._choices - 1}"
+        wrong = ~right.all(axis=1)
+        if wrong.any():
+            if (refused := wrong if flown is None else wrong & flown).any():
+                first = int(refused.argmax())
+                got = values[first].tolist()
+                raise InputError(f"actions: expected {expected}, got {got} for env {first}")
+            values = np.where(wrong[:, None], values.dtype.type(0), values)
+        return values.astype(np.float64)
 
     @property
     def steps(self) -> Array:
@@ -479,24 +430,16 @@ class Loop(NotCopied):
 
 
 class OnHost:
-    """A loop whose results are NumPy arrays, wherever its world runs, for simulators.
-
-    Its attributes are those of the loop.
-    """
+    """A loop whose results are NumPy arrays, wherever its world runs, for simulators."""
 
     def __init__(self, loop: Loop) -> None:
         self.loop, self.spec, self.num_envs = loop, loop.spec, loop.num_envs
+        self.close = loop.close
         self._take()
 
-    def advance(
-        self,
-        actions: Array,
-        resets: Array | None = None,
-        seeds: Sequence[int | None] | np.ndarray | None = None,
-        frozen: Array | None = None,
-    ) -> None:
+    def advance(self, *command: Any, **named: Any) -> None:
         """As `Loop.advance`."""
-        self.loop.advance(actions, resets, seeds, frozen)
+        self.loop.advance(*command, **named)
         self._take()
 
     def _take(self) -> None:
@@ -514,10 +457,6 @@ class OnHost:
         """As of `Loop`."""
         return self.loop.telemetry
 
-    def close(self) -> None:
-        """As `Loop.close`."""
-        self.loop.close()
-
 
 def _is_finite(values: np.ndarray) -> bool:
     if values.size <= _SMALL:
@@ -525,15 +464,6 @@ def _is_finite(values: np.ndarray) -> bool:
         if total - total == 0.0:  # else one is NaN or infinite, or they add up to too much
             return True
     return values.dtype.kind != "f" or bool(np.isfinite(values).all())
-
-
-def _columns(spec: EnvSpec) -> dict[str, slice]:
-    """Where each array of the telemetry lies in the table of all."""
-    columns, start = {}, 0
-    for array in spec.telemetry:
-        columns[array.name] = slice(start, start + array.size)
-        start += array.size
-    return columns
 
 
 def _as_type(values: Array, dtype: Any) -> Array:

@@ -13,7 +13,7 @@ from .spec import EnvSpec, canonical_id
 if TYPE_CHECKING:
     from .tasks.task import Task, TaskOptions
 
-__all__ = ["env_spec", "is_known", "known_ids", "load", "options_type", "register", "task_type"]
+__all__ = ["env_spec", "is_known", "load", "options_type", "register", "task_type"]
 
 _ID: Final = re.compile(r"([\w.-]+/)?[\w.-]+-v\d+")
 _tasks: Final[dict[str, "str | type[Task]"]] = {}
@@ -22,12 +22,9 @@ _tasks: Final[dict[str, "str | type[Task]"]] = {}
 def register(env_id: str, task: "str | type[Task]") -> None:
     """Make a task known by an id, to rotorgram and to Gymnasium. Registering again replaces it.
 
-    Args:
-        env_id: As Gymnasium's: `name-v0` or `namespace/name-v0`.
-        task: A class derived from `Task`, or "module:Class", which is imported when needed.
-
-    Raises:
-        InputError: The id is not of that form, or belongs to another package's env.
+    The task is a class derived from `Task`, or "module:Class", which is imported when needed.
+    Raises `InputError` if the id is not as `name-v0` or `namespace/name-v0`, or belongs to another
+    package's env.
     """
     if not (isinstance(env_id, str) and _ID.fullmatch(env_id)):
         raise InputError(f"env id: expected name-v0 or namespace/name-v0, got {env_id!r}")
@@ -47,10 +44,8 @@ def register(env_id: str, task: "str | type[Task]") -> None:
 def load(env_id: str) -> str:
     """Import the module of an id and return the id without it. For ids that a user typed only.
 
-    The module of "module:Name-v0" is looked for in the working folder too.
-
-    Raises:
-        InputError: There is no such module, or it registers no such env.
+    The module of "module:Name-v0" is looked for in the working folder too. Raises `InputError`:
+    there is no such module, or it registers no such env.
     """
     module, colon, name = env_id.rpartition(":")
     if colon:
@@ -72,11 +67,6 @@ def is_known(env_id: str) -> bool:
     return canonical_id(env_id) in _tasks
 
 
-def known_ids() -> tuple[str, ...]:
-    """Ids of all registered tasks."""
-    return tuple(_tasks)
-
-
 def task_type(env_id: str) -> "type[Task]":
     """The class of a task. Raises `InputError` for an id that is not registered."""
     task = _tasks.get(canonical_id(env_id))
@@ -95,16 +85,7 @@ def options_type(env_id: str) -> "type[TaskOptions]":
 
 
 def env_spec(env_id: str, options: Any = None, vehicle: Any = None) -> EnvSpec:
-    """The spec of an env, without stepping anything.
-
-    Args:
-        env_id: Of a registered task.
-        options: By name; the others have their defaults.
-        vehicle: MJCF file; None is the paper's.
-
-    Raises:
-        InputError: An option or the vehicle is not what it should be.
-    """
+    """The spec of an env with these options and this MJCF file. Raises `InputError`."""
     from .loop import make_task, spec_of
 
     return spec_of(canonical_id(env_id), make_task(env_id, options or {}, vehicle))

@@ -3,40 +3,88 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+import gymnasium as gym
+import numpy as np
+
 from ..models.errors import InputError
 from .spec import EnvSpec
 
 if TYPE_CHECKING:
-    from ..rendering import Moment
-    from ..rendering.painter import Painter
+    from ..rendering import Canvas, Moment
+    from ..rendering.live import LiveView
     from .loop import Loop
 
-__all__ = ["RENDER_MODES", "checked_render_mode", "moment", "moments", "painter"]
+__all__ = ["RENDER_MODES", "Renderer", "moment", "moments"]
 
 RENDER_MODES: Final = ["human", "rgb_array"]
 
 
-def checked_render_mode(mode: str | None) -> str | None:
-    """The mode itself. Raises `InputError` for one that there is not."""
-    if mode is not None and mode not in RENDER_MODES:
-        raise InputError(f"render_mode: expected None, 'human' or 'rgb_array', got {mode!r}")
-    return mode
+class Renderer:
+    """`render` of an env: a picture of each drone, or a window that shows them in real time."""
 
+    def __init__(self, mode: str | None, loop: "Loop") -> None:
+        if mode is not None and mode not in RENDER_MODES:
+            raise InputError(f"render_mode: expected None, 'human' or 'rgb_array', got {mode!r}")
+        self._mode, self._loop = mode, loop
+        self._canvas: Canvas | None = None
+        self._view: LiveView | None = None
+        self._shown: list[Moment] = []
 
-def painter(mode: str, loop: "Loop") -> "Painter":
-    """A painter for the drones of a loop."""
-    from ..rendering.painter import Painter
+    def render(self, episodes: Sequence[int]) -> tuple[np.ndarray, ...] | None:
+        """Pictures, uint8, shape (height, width, 3); None in other modes than `rgb_array`.
 
-    return Painter(mode, loop.num_envs, loop.spec.control_period, loop.vehicle.path)
+        `episodes` says how many each drone has begun; where that is none, it raises `ResetNeeded`.
+        """
+        if self._mode is None:
+            gym.logger.warn("render: expected render_mode='rgb_array' or 'human', got None")
+            return None
+        if not all(episodes):
+            raise gym.error.ResetNeeded("render: expected a call of reset() first")
+        now = moments(self._loop, [number - 1 for number in episodes])
+        if self._mode == "human":
+            self._show(now)
+            return None
+        from ..rendering import Canvas, Stage
+
+        if self._canvas is None:
+            one = len(now) == 1
+            stage = Stage(vehicle=self._loop.vehicle.path, trail=one)
+            self._canvas = Canvas(stage, *((480, 360) if one else (240, 180)))
+        pictures = []
+        for one_drone in now:
+            self._canvas.stage.show(one_drone)
+            pictures.append(self._canvas.draw("chase"))
+        return tuple(pictures)
+
+    def _show(self, now: "list[Moment]") -> None:
+        from ..rendering import Stage, live
+        from ..rendering.pace import Pace
+
+        shown = now[: live.MOST_DRONES]
+        if self._view is None:
+            stage = Stage(drones=len(shown), vehicle=self._loop.vehicle.path)
+            pace = Pace(self._loop.spec.control_period)
+            surface = live.open_surface("window", stage, pace)
+            self._view = live.LiveView(stage, surface, pace, of=len(now))
+        if shown != self._shown:  # `step` shows by itself, and a script may ask once more
+            self._shown = shown
+            self._view.draw_in_time(*shown)
+
+    def close(self) -> None:
+        """Close the canvas or the window."""
+        for opened in (self._canvas, self._view):
+            if opened is not None:
+                opened.close()
+        self._canvas = self._view = None
 
 
 def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
     """The current `Moment` of every drone; `episodes` are the numbers of their episodes."""
-    steps, rewards = loop.steps, loop.rewards
+    telemetry, steps, rewards = loop.telemetry, loop.steps, loop.rewards
     return [
         moment(
             loop.spec,
-            {name: values[i] for name, values in loop.telemetry.items()},
+            {name: values[i] for name, values in telemetry.items()},
             reward=float(rewards[i]),
             step=int(steps[i]),
             episode=episode,
@@ -46,13 +94,7 @@ def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
 
 
 def moment(spec: EnvSpec, telemetry: Mapping[str, Any], **rest: Any) -> "Moment":
-    """The `Moment` of one drone.
-
-    Args:
-        spec: Of its env.
-        telemetry: Its arrays, by name.
-        rest: `reward`, `step` and `episode`, as `rendering.Moment` has them.
-    """
+    """The `Moment` of one drone, with `reward`, `step` and `episode` as `Moment` has them."""
     from ..rendering import Moment
 
     metrics = [(metric.name, metric.unit, metric.symbol) for metric in spec.metrics]

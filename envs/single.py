@@ -1,18 +1,15 @@
 """One drone behind Gymnasium's single signature: the loop with one world."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from ..models.errors import InputError, NotCopied
 from .loop import Loop
-from .rendering import RENDER_MODES, checked_render_mode, moments, painter
+from .rendering import RENDER_MODES, Renderer
 from .spaces import action_space, observation_space, telemetry_names
-
-if TYPE_CHECKING:
-    from ..rendering.painter import Painter
 
 __all__ = ["SingleEnv"]
 
@@ -28,14 +25,9 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
     Render modes: with `rgb_array`, `render()` gives a picture, uint8, shape (360, 480, 3); with
     `human` a window shows the flight in real time. The physics is the same with either.
 
-    Args:
-        env_id: Of a registered task.
-        render_mode: None, `rgb_array` or `human`.
-        vehicle: MJCF file; None is the paper's.
-        options: Of the task, by name.
+    The vehicle is an MJCF file, None the paper's; options are the task's, by name.
 
     Attributes:
-        env_spec: The `EnvSpec` of the env.
         control_period: Time of a step, s.
 
     Raises:
@@ -55,12 +47,11 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         vehicle: Path | str | None = None,
         **options: Any,
     ) -> None:
-        self.render_mode = checked_render_mode(render_mode)
         self._loop = loop = Loop(env_id, vehicle=vehicle, options=options)
+        self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
         self.env_spec = loop.spec
         self.control_period = loop.spec.control_period
-        fps = max(1, round(1 / self.control_period))
-        self.metadata = {"render_modes": RENDER_MODES, "render_fps": fps}
+        self.metadata = self.metadata | {"render_fps": max(1, round(1 / self.control_period))}
         self.observation_space = observation_space(loop.spec)
         self.action_space = action_space(loop.spec)
         self._names = telemetry_names(loop.spec)
@@ -69,7 +60,6 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         self._all = np.ones(1, bool)
         self._no_action = np.zeros((1, len(loop.task.controller.low)), np.float32)
         self._episodes = 0
-        self._painter: Painter | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -88,46 +78,30 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         """Fly for one control period. See the task for shapes, units and ends."""
         loop = self._loop
         loop.advance(self._checked(action))
-        result = (
-            self._observation(),
-            loop.rewards.item(),
-            loop.terminated.item(),
-            loop.truncated.item(),
-            self._info(),
-        )
         if self.render_mode == "human":
             self.render()
-        return result
+        ends = loop.terminated.item(), loop.truncated.item()
+        return self._observation(), loop.rewards.item(), *ends, self._info()
 
     def render(self) -> Any:
         """A picture of now, uint8, shape (360, 480, 3), with `rgb_array`; None otherwise."""
-        if self.render_mode is None:
-            gym.logger.warn("render: expected render_mode='rgb_array' or 'human', got None")
-            return None
-        if self._episodes == 0:
-            raise gym.error.ResetNeeded("render: expected a call of reset() first")
-        if self._painter is None:
-            self._painter = painter(self.render_mode, self._loop)
-        pictures = self._painter.pictures(moments(self._loop, [self._episodes - 1]))
+        pictures = self._renderer.render([self._episodes])
         return pictures[0] if pictures else None
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        if self._painter is not None:
-            self._painter.close()
-            self._painter = None
+        self._renderer.close()
         self._loop.close()
 
     def _checked(self, action: Any) -> np.ndarray:
-        if isinstance(action, np.ndarray) and action.dtype == np.float32:
-            if action.shape == self.action_space.shape:
-                return action
-        elif isinstance(self.action_space, gym.spaces.Discrete):
-            if not self.action_space.contains(action):
-                expected = f"a whole number 0 to {self.action_space.n - 1}"
+        space, shape = self.action_space, self.action_space.shape
+        if isinstance(action, np.ndarray) and (action.dtype, action.shape) == (np.float32, shape):
+            return action
+        if isinstance(space, gym.spaces.Discrete):
+            if not space.contains(action):
+                expected = f"a whole number 0 to {space.n - 1}"
                 raise InputError(f"action: expected {expected}, got {action!r}")
             return np.array((action,))
-        shape = self.action_space.shape
         try:
             array = np.asarray(action)
         except ValueError:

@@ -37,9 +37,7 @@ def action_space(spec: EnvSpec) -> spaces.Space[Any]:
 
 def joined(spec: EnvSpec, arrays: Mapping[str, Any]) -> Any:
     """Observation arrays as the space has them: the only one, or a dict."""
-    if len(spec.observation) == 1:
-        return arrays[spec.observation[0].name]
-    return dict(arrays)
+    return arrays[spec.observation[0].name] if len(spec.observation) == 1 else dict(arrays)
 
 
 def telemetry_names(spec: EnvSpec) -> tuple[str, ...]:

@@ -8,8 +8,8 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Final, Literal, Self
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 
@@ -17,23 +17,17 @@ from ..models.errors import InputError
 
 __all__ = ["ArraySpec", "Discrete", "EnvSpec", "Metric", "SpecError", "canonical_id"]
 
-MAX_ELEMENTS: Final = 1 << 22
-"""Most numbers of all observations of one drone."""
-MAX_TOLD: Final = 1 << 14
-"""Most numbers of all telemetry of one drone: each has a name in `info`."""
-MAX_DIMENSIONS: Final = 16
-"""Most axes of an array."""
-MAX_ARRAYS: Final = 64
-"""Most arrays of an observation or of the telemetry."""
-MAX_AGENTS: Final = 1024
-"""Most drones of one world."""
-MAX_NAME: Final = 200
-"""Longest name, unit or frame, characters."""
+MAX_ELEMENTS: Final = 1 << 22  # numbers of all observations of one drone
+MAX_TOLD: Final = 1 << 14  # numbers of all its telemetry: each has a name in `info`
+MAX_DIMENSIONS: Final = 16  # axes of an array
+MAX_ARRAYS: Final = 64  # arrays of an observation or of the telemetry
+MAX_AGENTS: Final = 1024  # drones of one world
+MAX_NAME: Final = 200  # characters of a name, unit or frame
 
 _DTYPES: Final = ("float32", "float64", "uint8", "int32", "int64")
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 _LARGEST: Final = float(np.finfo(np.float64).max)
-_HASH: Final = re.compile(r"[0-9a-f]{32}")
+_NO_BOUND: Final = {"low": -math.inf, "high": math.inf}
 
 Bound = float | tuple[float, ...]
 """One number for all elements, or one for each in C order. Infinite where there is no bound."""
@@ -43,9 +37,45 @@ class SpecError(InputError):
     """A spec is wrong: nothing of that kind can cross the wire."""
 
 
+class _Part:
+    """A dataclass that is a JSON object: tuples are lists, infinity is null."""
+
+    _optional: ClassVar[tuple[str, ...]] = ()
+    """Fields that are left out where they have their default."""
+
+    def _to_content(self) -> dict[str, Any]:
+        return {
+            f.metadata.get("json", f.name): _plain(value)
+            for f in fields(self)  # type: ignore[arg-type]
+            if (value := getattr(self, f.name)) != f.default or f.name not in self._optional
+        }
+
+    @classmethod
+    def _fields(cls, content: Any) -> dict[str, Any]:
+        """Keyword arguments from a JSON object; names that are not known are left out."""
+        if not isinstance(content, dict):
+            raise SpecError(f"spec: expected an object for {cls.__name__}, got {content!r:.80}")
+        given = {}
+        for f in fields(cls):  # type: ignore[arg-type]
+            name = f.metadata.get("json", f.name)
+            if name in content:
+                value = content[name]
+                given[f.name] = tuple(value) if isinstance(value, list) else value
+            elif f.default is f.default_factory is MISSING:
+                got = f"{sorted(content)!r:.80}"
+                raise SpecError(f"spec: expected {name} in {cls.__name__}, got {got}")
+        return given
+
+    @classmethod
+    def _from_content(cls, content: Any) -> Self:
+        return cls(**cls._fields(content))
+
+
 @dataclass(frozen=True, kw_only=True)
-class ArraySpec:
+class ArraySpec(_Part):
     """An array of one drone. Bounds of the same value are kept as one number."""
+
+    _optional = ("low", "high", "unit", "frame", "components")
 
     name: str
     shape: tuple[int, ...]
@@ -66,22 +96,14 @@ class ArraySpec:
             raise SpecError("name: expected a name for an array, got ''")
         shape = self.shape
         if not isinstance(shape, tuple) or not all(type(n) is int and n >= 1 for n in shape):
-            raise SpecError(
-                f"{self.name}: expected a shape of whole numbers >= 1, got {shape!r:.80}"
-            )
+            self._expect("a shape of whole numbers >= 1", shape)
         if len(shape) > MAX_DIMENSIONS:
-            raise SpecError(
-                f"{self.name}: expected at most {MAX_DIMENSIONS} axes, got {len(shape)}"
-            )
+            self._expect(f"at most {MAX_DIMENSIONS} axes", len(shape))
         if self.size > MAX_ELEMENTS:
-            raise SpecError(
-                f"{self.name}: expected at most {MAX_ELEMENTS} elements, got {shape!r:.80}"
-            )
+            self._expect(f"at most {MAX_ELEMENTS} elements", shape)
         if self.dtype not in _DTYPES:
-            raise SpecError(
-                f"{self.name}: expected a dtype of {', '.join(_DTYPES)}, got {self.dtype!r}"
-            )
-        for name in ("low", "high"):
+            self._expect(f"a dtype of {', '.join(_DTYPES)}", self.dtype)
+        for name in _NO_BOUND:
             object.__setattr__(self, name, self._bound(name))
         low, high = self.bounds()
         wrong = ~((low <= high) & (low < np.inf) & (high > -np.inf))
@@ -89,7 +111,31 @@ class ArraySpec:
             first = int(wrong.argmax())
             got = f"{low.flat[first]} and {high.flat[first]}"
             raise SpecError(f"{self.name}: expected low <= high, got {got} at element {first}")
-        self._check_words()
+        units, names = self.unit, self.components
+        if isinstance(units, str):
+            _check_text(f"{self.name}: unit", units)
+        else:
+            _check_words(f"{self.name}: unit", units)
+            if len(units) != self.size:
+                raise SpecError(f"{self.name}: expected {self.size} units, got {len(units)}")
+        _check_text(f"{self.name}: frame", self.frame)
+        _check_words(f"{self.name}: components", names)
+        if names and (len(names) != self.size or len(set(names)) < len(names) or "" in names):
+            self._expect(f"{self.size} different components", names)
+
+    def _expect(self, expected: str, got: Any) -> None:
+        raise SpecError(f"{self.name}: expected {expected}, got {got!r:.80}")
+
+    def _bound(self, name: str) -> Bound:
+        bound: Any = getattr(self, name)
+        try:
+            values = np.asarray(bound, np.float64)
+        except (TypeError, ValueError, OverflowError):
+            values = np.asarray(np.nan)
+        if values.shape not in ((), self.shape, (self.size,)) or np.isnan(values).any():
+            self._expect(f"one number for {name} or one for each element", bound)
+        flat = values.ravel()
+        return float(flat[0]) if (flat == flat[0]).all() else tuple(flat.tolist())
 
     @property
     def size(self) -> int:
@@ -98,78 +144,32 @@ class ArraySpec:
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """(low, high), float64, of the array's shape."""
-        pair = [np.asarray(b, np.float64) for b in (self.low, self.high)]
-        low, high = (np.broadcast_to(b.reshape(self.shape) if b.ndim else b, self.shape)
-                     for b in pair)  # fmt: skip
+        pair = [np.asarray(bound, np.float64) for bound in (self.low, self.high)]
+        low, high = (
+            np.broadcast_to(b.reshape(self.shape) if b.ndim else b, self.shape) for b in pair
+        )
         return low, high
 
-    def _bound(self, name: str) -> Bound:
-        bound: Any = getattr(self, name)
-        try:
-            values = np.asarray(bound, np.float64)
-        except (TypeError, ValueError, OverflowError):
-            raise SpecError(
-                f"{self.name}: expected numbers for {name}, got {bound!r:.80}"
-            ) from None
-        if values.shape not in ((), self.shape, (self.size,)) or np.isnan(values).any():
-            raise SpecError(
-                f"{self.name}: expected one number for {name} or one for each element, "
-                f"got {bound!r:.80}"
-            )
-        flat = values.ravel()
-        if not flat.size or (flat == flat[0]).all():
-            return float(flat[0])
-        return tuple(flat.tolist())
-
-    def _check_words(self) -> None:
-        units = (self.unit,) if isinstance(self.unit, str) else self.unit
-        for words, name in ((units, "unit"), ((self.frame,), "frame"),
-                            (self.components, "components")):  # fmt: skip
-            if not isinstance(words, tuple):
-                raise SpecError(f"{self.name}: expected a tuple for {name}, got {words!r:.80}")
-            for word in words:
-                _check_text(f"{self.name}: {name}", word)
-        if not isinstance(self.unit, str) and len(self.unit) != self.size:
-            raise SpecError(f"{self.name}: expected {self.size} units, got {len(self.unit)}")
-        names = self.components
-        if names and (len(names) != self.size or len(set(names)) < len(names) or "" in names):
-            raise SpecError(
-                f"{self.name}: expected {self.size} different components, got {names!r:.80}"
-            )
-
-    def to_json(self) -> dict[str, Any]:
-        """A JSON object; fields that have their default are left out, infinity is null."""
-        content: dict[str, Any] = {"name": self.name, "shape": list(self.shape)}
-        content["dtype"] = self.dtype
-        for name, none in (("low", -math.inf), ("high", math.inf)):
-            bound = getattr(self, name)
-            if bound != none:
-                content[name] = _finite_or_null(bound)
-        for name in ("unit", "frame", "components"):
-            if value := getattr(self, name):
-                content[name] = list(value) if isinstance(value, tuple) else value
-        return content
-
     @classmethod
-    def from_json(cls, content: Any) -> Self:
-        """The reverse of `to_json`. Raises `SpecError`."""
-        known = ("name", "shape", "dtype", "low", "high", "unit", "frame", "components")
-        fields = _fields(content, "an array", known, required=("name", "shape"))
-        for name, none in (("low", -math.inf), ("high", math.inf)):
-            if name in fields:
-                fields[name] = _from_null(fields[name], none)
-        for name in ("shape", "unit", "components"):
-            if isinstance(fields.get(name), list):
-                fields[name] = tuple(fields[name])
-        return cls(**fields)
+    def _from_content(cls, content: Any) -> Self:
+        given = cls._fields(content)
+        for name in _NO_BOUND.keys() & given:
+            values = given[name] if isinstance(given[name], tuple) else (given[name],)
+            if not all(value is None or _is_number(value) for value in values):
+                raise SpecError(f"bounds: expected numbers or null, got {given[name]!r:.80}")
+            values = tuple(_NO_BOUND[name] if value is None else value for value in values)
+            given[name] = values if isinstance(given[name], tuple) else values[0]
+        return cls(**given)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Discrete:
+class Discrete(_Part):
     """An action that is one choice out of 0 ... n - 1."""
 
-    n: int
+    _optional = ("components",)
+
     name: str = "action"
+    n: int = field(metadata={"json": "choices"})
     components: tuple[str, ...] = ()
     """A name for each choice, or none."""
 
@@ -177,33 +177,16 @@ class Discrete:
         if type(self.n) is not int or not 1 <= self.n <= 1 << 24:
             raise SpecError(f"action: expected 1 to 2^24 choices, got {self.n!r}")
         _check_text("action", self.name)
-        for word in self.components:
-            _check_text("action: components", word)
+        _check_words("action: components", self.components)
         if self.components and len(self.components) != self.n:
             raise SpecError(f"action: expected {self.n} components, got {self.components}")
 
-    def to_json(self) -> dict[str, Any]:
-        """A JSON object."""
-        content: dict[str, Any] = {"name": self.name, "choices": self.n}
-        if self.components:
-            content["components"] = list(self.components)
-        return content
-
-    @classmethod
-    def from_json(cls, content: Any) -> Self:
-        """The reverse of `to_json`. Raises `SpecError`."""
-        known = ("name", "choices", "components")
-        fields = _fields(content, "a discrete action", known, required=("choices",))
-        components = fields.get("components", [])
-        if not isinstance(components, list):
-            raise SpecError(f"action: expected a list of components, got {components!r:.80}")
-        return cls(n=fields["choices"], name=fields.get("name", "action"),
-                   components=tuple(components))  # fmt: skip
-
 
 @dataclass(frozen=True, kw_only=True)
-class Metric:
+class Metric(_Part):
     """A measure of how well a task is done. The first metric of a task is its headline."""
+
+    _optional = ("settled", "held", "symbol", "signed")
 
     name: str
     unit: str
@@ -234,22 +217,9 @@ class Metric:
             if value is not None and not (_is_number(value) and 0 < value <= _LARGEST):
                 raise SpecError(f"{self.name}: expected {name} > 0 or None, got {value!r:.80}")
 
-    def to_json(self) -> dict[str, Any]:
-        """A JSON object."""
-        content = {"name": self.name, "unit": self.unit, "goal": self.goal}
-        rest: dict[str, Any] = {"settled": self.settled, "held": self.held, "symbol": self.symbol}
-        rest["signed"] = self.signed
-        return content | {name: value for name, value in rest.items() if value}
-
-    @classmethod
-    def from_json(cls, content: Any) -> Self:
-        """The reverse of `to_json`. Raises `SpecError`."""
-        known = ("name", "unit", "goal", "settled", "held", "symbol", "signed")
-        return cls(**_fields(content, "a metric", known, required=("name", "unit")))
-
 
 @dataclass(frozen=True, kw_only=True)
-class EnvSpec:
+class EnvSpec(_Part):
     """Everything that an agent must know of an env. Arrays are those of one drone."""
 
     env_id: str
@@ -271,37 +241,33 @@ class EnvSpec:
 
     def __post_init__(self) -> None:
         _check_text("env_id", self.env_id)
-        object.__setattr__(self, "options", _plain(dict(self.options)))
+        object.__setattr__(self, "options", _json_values(self.options))
         period = self.control_period
         if not (_is_number(period) and 1e-6 <= period <= 1e3):
             raise SpecError(f"control_period: expected 1e-6 to 1e3 s, got {period!r:.80}")
         _check_text("vehicle", self.vehicle)
-        if not (isinstance(self.vehicle_hash, str) and _HASH.fullmatch(self.vehicle_hash)):
-            raise SpecError(f"vehicle_hash: expected 32 hex digits, got {self.vehicle_hash!r:.80}")
-        for name in self.agents:
-            _check_text("agents", name)
+        digits = self.vehicle_hash
+        if not (isinstance(digits, str) and re.fullmatch("[0-9a-f]{32}", digits)):
+            raise SpecError(f"vehicle_hash: expected 32 hex digits, got {digits!r:.80}")
+        _check_words("agents", self.agents)
         if not 1 <= len(self.agents) <= MAX_AGENTS or len(set(self.agents)) < len(self.agents):
             raise SpecError(
                 f"agents: expected 1 to {MAX_AGENTS} different names, got {self.agents!r:.80}"
             )
         if not self.observation:
             raise SpecError("observation: expected at least one array, got none")
-        for name, arrays in (("observation", self.observation), ("telemetry", self.telemetry)):
-            names = [array.name for array in arrays]
-            if len(arrays) > MAX_ARRAYS or len(set(names)) < len(names):
-                raise SpecError(f"{name}: expected at most {MAX_ARRAYS} different names")
-            most = MAX_ELEMENTS if name == "observation" else MAX_TOLD
+        for what, most in (("observation", MAX_ELEMENTS), ("telemetry", MAX_TOLD)):
+            arrays = getattr(self, what)
+            if len(arrays) > MAX_ARRAYS or len({array.name for array in arrays}) < len(arrays):
+                raise SpecError(f"{what}: expected at most {MAX_ARRAYS} different names")
             if (size := sum(array.size for array in arrays)) > most:
-                raise SpecError(f"{name}: expected at most {most} elements in all, got {size}")
-        self._check_metrics()
-
-    def _check_metrics(self) -> None:
+                raise SpecError(f"{what}: expected at most {most} elements in all, got {size}")
         names = tuple(metric.name for metric in self.metrics)
-        told = {a.name: a for a in self.telemetry}.get("metrics")
-        if (told.components if told else ()) != names:
+        told = next((a.components for a in self.telemetry if a.name == "metrics"), ())
+        if told != names:
             raise SpecError(
                 f"metrics: expected the components of the telemetry 'metrics' to be {names!r:.80}, "
-                f"got {told.components if told else ()!r:.80}"
+                f"got {told!r:.80}"
             )
         listed = [name for array in self.telemetry for name in component_names(array)]
         if len(set(listed)) < len(listed):
@@ -314,47 +280,28 @@ class EnvSpec:
 
     def to_json(self) -> str:
         """JSON text, the same for the same spec."""
-        content = {
-            "env_id": self.env_id,
-            "options": self.options,
-            "control_period": self.control_period,
-            "vehicle": self.vehicle,
-            "vehicle_hash": self.vehicle_hash,
-            "agents": list(self.agents),
-            "observation": [array.to_json() for array in self.observation],
-            "action": self.action.to_json(),
-            "telemetry": [array.to_json() for array in self.telemetry],
-            "metrics": [metric.to_json() for metric in self.metrics],
-        }
+        content = self._to_content()
         return json.dumps(content, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
         """The reverse of `to_json`. Raises `SpecError`, and nothing else, for any other text."""
         try:
-            content = json.loads(text, parse_constant=_no_constant)
+            content = json.loads(text)
         except (ValueError, RecursionError) as error:
             raise SpecError(f"spec: expected JSON, got {text[:80]!r}: {error}") from None
-        known = ("env_id", "options", "control_period", "vehicle", "vehicle_hash", "agents",
-                 "observation", "action", "telemetry", "metrics")  # fmt: skip
-        required = ("env_id", "control_period", "observation", "action")
-        fields = _fields(content, "a spec", known, required=required)
-        for name in ("agents", "observation", "telemetry", "metrics"):
-            if not isinstance(fields.get(name, []), list):
-                raise SpecError(f"{name}: expected a list, got {fields[name]!r:.80}")
-        if not isinstance(fields.get("options", {}), dict):
-            raise SpecError(f"options: expected an object, got {fields['options']!r:.80}")
-        for name in ("observation", "telemetry"):
-            if len(fields.get(name, [])) > MAX_ARRAYS:
-                raise SpecError(f"{name}: expected at most {MAX_ARRAYS} arrays")
-            fields[name] = tuple(map(ArraySpec.from_json, fields.get(name, [])))
-        fields["metrics"] = tuple(map(Metric.from_json, fields.get("metrics", [])))
-        if "agents" in fields:
-            fields["agents"] = tuple(fields["agents"])
-        action = fields["action"]
+        given = cls._fields(content)
+        kinds: dict[str, type[_Part]] = {
+            "observation": ArraySpec, "telemetry": ArraySpec, "metrics": Metric
+        }  # fmt: skip
+        for name in kinds.keys() & given:
+            if not isinstance(given[name], tuple):
+                raise SpecError(f"{name}: expected a list, got {given[name]!r:.80}")
+            given[name] = tuple(map(kinds[name]._from_content, given[name]))
+        action = given["action"]
         is_discrete = isinstance(action, dict) and "choices" in action
-        fields["action"] = (Discrete if is_discrete else ArraySpec).from_json(action)
-        return cls(**fields)
+        given["action"] = (Discrete if is_discrete else ArraySpec)._from_content(action)
+        return cls(**given)
 
 
 def canonical_id(env_id: str) -> str:
@@ -383,28 +330,30 @@ def _check_text(name: str, text: Any) -> None:
         raise SpecError(f"{name}: expected Unicode text, got {text!r:.80}") from None
 
 
+def _check_words(name: str, words: Any) -> None:
+    if not isinstance(words, tuple):
+        raise SpecError(f"{name}: expected a tuple of texts, got {words!r:.80}")
+    for word in words:
+        _check_text(name, word)
+
+
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float)
 
 
-def _finite_or_null(bound: Bound) -> Any:
-    if isinstance(bound, tuple):
-        return [value if math.isfinite(value) else None for value in bound]
-    return bound if math.isfinite(bound) else None
+def _plain(value: Any) -> Any:
+    """A field's value for JSON."""
+    if isinstance(value, _Part):
+        return value._to_content()
+    if isinstance(value, tuple):
+        return [_plain(one) for one in value]
+    return None if value in (math.inf, -math.inf) else value
 
 
-def _from_null(bound: Any, none: float) -> Any:
-    values = bound if isinstance(bound, list) else [bound]
-    if not all(value is None or _is_number(value) for value in values):
-        raise SpecError(f"bounds: expected numbers or null, got {bound!r:.80}")
-    numbers = tuple(none if value is None else value for value in values)
-    return numbers if isinstance(bound, list) else numbers[0]
-
-
-def _plain(options: dict[str, Any]) -> dict[str, Any]:
+def _json_values(options: Any) -> dict[str, Any]:
     """Options as JSON gives them back: tuples become lists. Raises `SpecError`."""
     try:
-        text = json.dumps(options, allow_nan=False, ensure_ascii=False)
+        text = json.dumps(dict(options), allow_nan=False, ensure_ascii=False)
         text.encode()  # half a surrogate pair cannot be sent
         plain: dict[str, Any] = json.loads(text)
     except (TypeError, ValueError, RecursionError) as error:
@@ -412,19 +361,3 @@ def _plain(options: dict[str, Any]) -> dict[str, Any]:
     for name in plain:
         _check_text("options", name)
     return plain
-
-
-def _fields(
-    content: Any, what: str, known: tuple[str, ...], required: tuple[str, ...]
-) -> dict[str, Any]:
-    """A JSON object as keyword arguments. Names that are not known are left out."""
-    if not isinstance(content, dict):
-        raise SpecError(f"spec: expected an object for {what}, got {content!r:.80}")
-    for name in required:
-        if name not in content:
-            raise SpecError(f"spec: expected {name} in {what}, got {sorted(content)!r:.80}")
-    return {name: content[name] for name in known if name in content}
-
-
-def _no_constant(word: str) -> Any:
-    raise ValueError(f"expected finite numbers, got {word}")

@@ -1,9 +1,9 @@
 """Many drones behind Gymnasium's vector signature: the loop with a world for each."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
@@ -11,11 +11,8 @@ from ..models.errors import InputError, NotCopied
 from ..sim import Backend, on_host
 from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
 from .loop import Loop
-from .rendering import RENDER_MODES, checked_render_mode, moments, painter
+from .rendering import RENDER_MODES, Renderer
 from .spaces import joined
-
-if TYPE_CHECKING:
-    from ..rendering.painter import Painter
 
 __all__ = ["LocalVectorEnv"]
 
@@ -66,29 +63,21 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         **options: Any,
     ) -> None:
         self.closed = True  # nothing is open yet
-        self.render_mode = checked_render_mode(render_mode)
-        settings = {"num_threads": num_threads, "device": device}
+        settings: dict[str, Any] = {"num_threads": num_threads, "device": device}
+        given = {name: value for name, value in settings.items() if value is not None}
         self._loop = loop = Loop(
-            env_id,
-            num_envs,
-            vehicle=vehicle,
-            backend=backend,
-            options=options,
-            **{name: value for name, value in settings.items() if value is not None},
+            env_id, num_envs, vehicle=vehicle, backend=backend, options=options, **given
         )
+        self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
         self._on_device = not isinstance(loop.done, np.ndarray)
         self._nobody = self.lost = self.done = loop.done
         self._episodes = np.zeros(num_envs, int)
-        self._painter: Painter | None = None
         self.closed = False
 
     def reset(
-        self,
-        *,
-        seed: int | Seeds | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode, for all drones or some.
 
@@ -98,15 +87,24 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
                 By the names of the task's `choices`: numbers, one or shape (N,), in place of those
                 that the seed gives.
         """
-        options, names = dict(options or {}), self._loop.task.choices
-        asked = options.pop("reset_mask", None)
-        mask = checked_mask(self._given(asked), self.num_envs)
-        chosen = {
-            name: self._choice(name, self._given(value), names) for name, value in options.items()
+        given = {
+            name: on_host(value) if hasattr(value, "detach") else value
+            for name, value in (options or {}).items()
         }
+        mask = checked_mask(given.pop("reset_mask", None), self.num_envs)
+        chosen = {name: self._choice(name, value) for name, value in given.items()}
         seeds = checked_seeds(seed, self.num_envs)
-        self._advance(self._no_actions(), mask, seeds, ~mask, chosen)
-        return self._observed(), self._info(mask)
+        self.advance(self._no_actions(), mask, seeds, ~mask, chosen)
+        return self.observations, self._info(mask)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """With `rgb_array` a picture of each drone, uint8, shape (180, 240, 3); otherwise None."""
+        return self._renderer.render(self._episodes.tolist())
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the window, if there is one."""
+        self._renderer.close()
+        self._loop.close()
 
     def advance(
         self,
@@ -114,36 +112,9 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         resets: np.ndarray | None = None,
         seeds: Seeds | None = None,
         frozen: np.ndarray | None = None,
+        chosen: Mapping[str, np.ndarray] | None = None,
     ) -> None:
-        """Reset some drones, freeze some, and fly the others: see `AdvancingVectorEnv`."""
-        self._advance(actions, resets, seeds, frozen, None)
-
-    def render(self) -> tuple[np.ndarray, ...] | None:
-        """With `rgb_array` a picture of each drone, uint8, shape (180, 240, 3); otherwise None."""
-        if self.render_mode is None:
-            gym.logger.warn("render: expected render_mode='rgb_array' or 'human', got None")
-            return None
-        if not self._episodes.all():
-            raise gym.error.ResetNeeded("render: expected a call of reset() first")
-        if self._painter is None:
-            self._painter = painter(self.render_mode, self._loop)
-        return self._painter.pictures(moments(self._loop, (self._episodes - 1).tolist()))
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Close the window, if there is one."""
-        if self._painter is not None:
-            self._painter.close()
-            self._painter = None
-        self._loop.close()
-
-    def _advance(
-        self,
-        actions: np.ndarray,
-        resets: np.ndarray | None,
-        seeds: Seeds | None,
-        frozen: np.ndarray | None,
-        chosen: Any,
-    ) -> None:
+        """As `AdvancingVectorEnv.advance`; `chosen` as of `Loop.advance`."""
         loop = self._loop
         loop.advance(actions, resets, seeds, frozen, chosen)
         self.observations = joined(loop.spec, loop.observations)
@@ -171,31 +142,21 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
 
     def _info(self, mask: Any) -> dict[str, Any]:
         loop = self._loop
-        if self._on_device:
-            which = loop.ours(mask)
-            info = {}
-            for name, values in loop.metrics.items():
-                info[name], info[f"_{name}"] = values, which
-        else:
-            which, info = mask, super()._info(mask)
-        for name, term in loop.reward_terms.items():
-            info[f"reward_{name}"], info[f"_reward_{name}"] = term, which
-        return info
+        told = {f"reward_{name}": term for name, term in loop.reward_terms.items()}
+        if not self._on_device:
+            return super()._info(mask) | told | {f"_{name}": mask for name in told}
+        told, which = loop.metrics | told, loop.ours(mask)
+        return told | {f"_{name}": which for name in told}
 
-    def _given(self, value: Any) -> Any:
-        """An argument of the caller; a tensor as a NumPy array."""
-        return on_host(value) if self._on_device and hasattr(value, "detach") else value
-
-    def _choice(self, name: str, value: Any, names: tuple[str, ...]) -> np.ndarray:
-        if name not in names:
-            expected = ", ".join(("reset_mask", *names))
+    def _choice(self, name: str, value: Any) -> np.ndarray:
+        if name not in self._loop.task.choices:
+            expected = ", ".join(("reset_mask", *self._loop.task.choices))
             raise InputError(f"options: expected some of {expected}, got {name!r}")
         try:
             values = np.asarray(value, np.float64)
-            fits = values.shape in ((), (self.num_envs,)) and bool(np.isfinite(values).all())
         except (TypeError, ValueError):
-            fits = False
-        if not fits:
+            values = np.array(np.nan)
+        if values.shape not in ((), (self.num_envs,)) or not np.isfinite(values).all():
             raise InputError(
                 f"{name}: expected a finite number, or shape ({self.num_envs},), got {value!r}"
             )

@@ -26,7 +26,7 @@ from .settings import Run
 if TYPE_CHECKING:
     import torch
 
-    from ..agents.learner import Agent
+    from ..agents import Agent
 else:
     torch = require("torch", "train", "training")
 

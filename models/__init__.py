@@ -15,40 +15,23 @@ if TYPE_CHECKING:
     from .vehicle import Rotor, Vehicle
 
 __all__ = [
-    "AIRPORT_XML",
-    "MOST_DRAG",
-    "QUAD_XML",
-    "SCENE_XML",
-    "InputError",
-    "MissingPackage",
-    "Rotor",
-    "Vehicle",
-    "attach_airport",
-    "build_scene",
-]
+    "AIRPORT_XML", "MOST_DRAG", "QUAD_XML", "SCENE_XML", "InputError", "MissingPackage",
+    "Rotor", "Vehicle", "attach_airport", "build_scene",
+]  # fmt: skip
 
 QUAD_XML: Final = Path(__file__).parent / "quad.xml"
 """The paper's vehicle."""
-
 SCENE_XML: Final = Path(__file__).parent / "scene.xml"
 """Ground, sky and light, which `build_scene` puts around a vehicle."""
-
 AIRPORT_XML: Final = Path(__file__).parent / "airport.xml"
 """The airport that `attach_airport` adds around a scene. It is visual only."""
-
 MOST_DRAG: Final = 100.0
 """Largest linear drag, 1/s. RK4 at 10 ms is within 0.1 % there, and unstable above 278 /s."""
-
-_HOMES: Final = {
-    "Rotor": "vehicle",
-    "Vehicle": "vehicle",
-    "attach_airport": "scene",
-    "build_scene": "scene",
-}
 
 
 def __getattr__(name: str) -> Any:
     """Import on first use the names that need MuJoCo (PEP 562)."""
-    if name not in _HOMES:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f".{_HOMES[name]}", __name__), name)
+    home = ".vehicle" if name in ("Rotor", "Vehicle") else ".scene"
+    return getattr(import_module(home, __name__), name)

@@ -10,14 +10,10 @@ __all__ = ["GRAVITY", "MASS", "MAX_THRUST", "NUM_ROTORS", "SIDE"]
 
 MASS: Final = 20.0
 """Mass, kg."""
-
 GRAVITY: Final = 9.8
 """Gravitational acceleration, m/s²: 9.8, not 9.81."""
-
 NUM_ROTORS: Final = 4
-
 MAX_THRUST: Final = 100.0
 """Largest thrust of one rotor, N."""
-
 SIDE: Final = 2.0
 """Side of the square at whose corners the rotors stand, m."""

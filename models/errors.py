@@ -10,8 +10,7 @@ __all__ = ["InputError", "MissingPackage", "NotCopied", "require"]
 class InputError(ValueError):
     """Wrong input from the user, a peer or a file. The message gives expected and actual value.
 
-    The command line prints it as one sentence. Any other `ValueError` is a bug of ours and keeps
-    its traceback.
+    The command line prints it. Any other `ValueError` is a bug of ours and keeps its traceback.
     """
 
 
@@ -28,15 +27,9 @@ class NotCopied:
 
 
 def require(module: str, extra: str, purpose: str) -> ModuleType:
-    """Import an optional package.
+    """Import an optional package, which an extra of rotorgram installs. Raises `MissingPackage`.
 
-    Args:
-        module: Its import name.
-        extra: The extra of rotorgram that installs it.
-        purpose: What it is needed for, as the subject of a sentence: "training".
-
-    Raises:
-        MissingPackage: It is not installed.
+    `purpose` is what it is needed for, as the subject of a sentence: "training".
     """
     try:
         return import_module(module)

@@ -28,9 +28,7 @@ _POLE: Final = 1 - 1e-12  # sine of phi past which (within 1e-4 degrees) the nos
 def positions_in_paper_frame(positions: ArrayLike, out: Array | None = None) -> Array:
     """(x, y, z) in MuJoCo's world -> (X, Y, Z) in the paper's, m; both (..., 3).
 
-    Args:
-        positions: Any leading axes.
-        out: Where to write, not `positions` itself; a new array without it.
+    Written to `out` if it is given, which is not `positions` itself.
     """
     positions = np.asarray(positions, np.float64)
     if out is None:
@@ -45,11 +43,7 @@ def attitudes_in_paper_frame(quaternions: ArrayLike, out: Array | None = None) -
 
     phi lies in [-90, 90], the others in [-180, 180]. With the nose straight up or down only a sum
     of theta and psi is defined: psi is then 0. Level craft that point forward, as all of the
-    elevation task, cost next to nothing.
-
-    Args:
-        quaternions: (..., 4), any leading axes.
-        out: (..., 3), where to write; a new array without it.
+    elevation task, cost next to nothing. Written to `out`, (..., 3), if it is given.
     """
     quaternions = np.asarray(quaternions, np.float64)
     if out is None:
@@ -80,12 +74,7 @@ def attitudes_in_paper_frame(quaternions: ArrayLike, out: Array | None = None) -
 
 
 def pose_in_mujoco_frame(positions: ArrayLike, attitudes: ArrayLike) -> Array:
-    """The reverse, for pictures: `qpos` of a free joint, (..., 7).
-
-    Args:
-        positions: (X, Y, Z), m, (..., 3).
-        attitudes: (phi, theta, psi), degrees, (..., 3).
-    """
+    """(X, Y, Z), m, and (phi, theta, psi), degrees, -> `qpos` of a free joint, (..., 7)."""
     right, up, forward = np.moveaxis(np.asarray(positions, np.float64), -1, 0)
     halves = np.radians(np.moveaxis(np.asarray(attitudes, np.float64), -1, 0)) / 2
     (a, b, c), (d, e, f) = np.cos(halves), np.sin(halves)

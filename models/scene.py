@@ -22,12 +22,8 @@ World = Literal["plain", "airport"]
 
 AIRPORT_PREFIX: Final = "airport/"
 """Prefix of all names that `attach_airport` adds."""
-
-SCENE_PREFIX: Final = "scene/"
-"""Prefix of all names that `build_scene` adds."""
-
-MOST_HEIGHTS: Final = 4096
-"""Most rows and columns of a height field: 16.8 million points, 0.3 GB."""
+SCENE_PREFIX: Final = "scene/"  # Prefix of all names that `build_scene` adds
+MOST_HEIGHTS: Final = 4096  # Most rows and columns of a height field: 16.8 million points, 0.3 GB
 
 MOST_ELEMENTS: Final = 10_000
 """Most elements of a file, each as often as it is repeated: seconds to compile."""
@@ -49,17 +45,10 @@ _HAZE_COLOUR: Final = (0.80, 0.88, 0.96, 1.0)  # the sky's colour where it meets
 def build_scene(
     vehicle: Path | str | None = None, world: World = "plain", *, visual: bool = True
 ) -> mujoco.MjSpec:
-    """A vehicle with ground, sky and light, to be compiled.
+    """A vehicle, None for the paper's, with ground, sky and light, to be compiled.
 
-    Args:
-        vehicle: Its MJCF file; None is the paper's.
-        world: `plain` or `airport`.
-        visual: Keep visual elements. Without them the physics is faster and the same, bit for
-            bit.
-
-    Raises:
-        InputError: The world is not one of these, or a part is too large.
-        ValueError: The file is no MJCF.
+    Without visual elements the physics is faster and the same, bit for bit. Raises `InputError` if
+    there is no such world, or a height field is too large; `ValueError` if the file is no MJCF.
     """
     if world not in ("plain", "airport"):
         raise InputError(f"world: expected 'plain' or 'airport', got {world!r}")
@@ -152,18 +141,13 @@ def attach_airport(spec: mujoco.MjSpec) -> None:
     """Put the airport of `AIRPORT_XML` around the scene `spec`, in place; compile `spec` yourself.
 
     The origin of the world becomes the centre of a pad on the apron; +x points along runway 09, z
-    up, metres. What is added is only looked at: geoms of the world body without mass that collide
-    with nothing, so that the scene moves bit for bit as without them. Only a rangefinder would see
-    them. `spec.compiler.discardvisual` drops them all.
+    up, metres. The scene moves bit for bit as without it: its geoms collide with nothing, and only
+    a rangefinder would see them. `spec.compiler.discardvisual` drops them all.
 
-    Horizontal planes of the world body at z = 0, the scene's floor, stay as they are and still
-    carry what stands on them, but move to the geom group 3, which is not drawn unless asked for:
-    the airport brings its own ground. It also brings its sky in place of the scene's, and sets
-    haze, shadow map, and the near and far end of drawing. Lights and cameras stay.
-
-    Raises:
-        InputError: The scene has an airport already.
-        ValueError: It does not compile.
+    Horizontal planes of the world body at z = 0, the scene's floor, still carry what stands on
+    them, but are not drawn unless geom group 3 is. The sky, haze, shadow map, and the near and far
+    end of drawing become the airport's. Lights and cameras stay. Raises `InputError` if the scene
+    has an airport already, `ValueError` if it does not compile.
     """
     if any(geom.name.startswith(AIRPORT_PREFIX) for geom in spec.geoms):
         raise InputError("spec: expected a scene without an airport, got one that has it")
@@ -176,7 +160,16 @@ def attach_airport(spec: mujoco.MjSpec) -> None:
     for texture in list(spec.textures):
         if texture.type == _SKY:
             spec.delete(texture)
-    _set_visuals(spec, model)
+    # See as far as the hills, and keep the scale that the scene has without them. MuJoCo measures
+    # the ends of drawing, shadows and the free camera's first distance in extents of the scene; an
+    # extent taken anew, with a runway in it, would spoil them.
+    stat, visual = model.stat, spec.visual
+    spec.stat.extent, spec.stat.center, spec.stat.meansize = stat.extent, stat.center, stat.meansize
+    visual.map.znear, visual.map.zfar = _NEAR / stat.extent, _FAR / stat.extent
+    visual.map.haze = _HAZE
+    visual.rgba.haze = _HAZE_COLOUR
+    visual.quality.shadowsize = min(visual.quality.shadowsize, _SHADOW_PIXELS)
+    visual.quality.numslices = max(visual.quality.numslices, _ROUNDNESS)
     airport = mujoco.MjSpec.from_file(str(AIRPORT_XML))
     spec.attach(airport, prefix=AIRPORT_PREFIX, frame=spec.worldbody.add_frame())
 
@@ -188,18 +181,3 @@ def _is_ground(model: mujoco.MjModel, geom: int) -> bool:
     rotation = np.empty(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
     return bool(np.isclose(rotation[8], 1.0) and model.geom_pos[geom, 2] == 0.0)
-
-
-def _set_visuals(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Make `spec` see as far as the hills, and keep the scale that the scene has without them.
-
-    MuJoCo measures the ends of drawing, shadows and the free camera's first distance in extents of
-    the scene; an extent taken anew, with a runway in it, would spoil them.
-    """
-    stat, visual = model.stat, spec.visual
-    spec.stat.extent, spec.stat.center, spec.stat.meansize = stat.extent, stat.center, stat.meansize
-    visual.map.znear, visual.map.zfar = _NEAR / stat.extent, _FAR / stat.extent
-    visual.map.haze = _HAZE
-    visual.rgba.haze = _HAZE_COLOUR
-    visual.quality.shadowsize = min(visual.quality.shadowsize, _SHADOW_PIXELS)
-    visual.quality.numslices = max(visual.quality.numslices, _ROUNDNESS)

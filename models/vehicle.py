@@ -10,7 +10,7 @@ Body frame: that of the free body, x forward, y left, z up; SI units.
 import math
 import struct
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Final, Self
@@ -31,7 +31,6 @@ MOST_TIMESTEP: Final = 1.0
 MOST_HEIGHT: Final = 1e4
 """Height above which no craft may touch anything, m."""
 
-_HASH_BYTES: Final = 16
 _RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves
 
 
@@ -86,29 +85,27 @@ class Vehicle:
 
     @classmethod
     def load(cls, path: Path | str | None = None, *, linear_drag: float = 0.0) -> "Vehicle":
-        """The vehicle of an MJCF file; None is the paper's.
+        """The vehicle of an MJCF file; None is the paper's. Raises `InputError` if there is none.
 
-        The same path and drag give the same object until the file changes.
+        The same path and drag (1/s, as Unity's `Rigidbody.drag`, 0 to 100) give the same object
+        until the file changes.
 
         Its `hash` is BLAKE2b over the MJCF of vehicle and scene with includes resolved, as
         `MjSpec.to_xml()` writes it, the bytes of mesh and height field files, and the drag as a
         little-endian float64. Comments, layout and folder do not enter; numbers do, to the six
         digits that MuJoCo writes.
-
-        Args:
-            path: Of the file.
-            linear_drag: 1/s, as Unity's `Rigidbody.drag`; 0 to 100.
-
-        Raises:
-            InputError: There is no such file, or it is no vehicle.
         """
         file = Path(path if path is not None else QUAD_XML).resolve()
-        drag = _checked_drag(linear_drag)
+        number = isinstance(linear_drag, int | float | np.floating)
+        if not (number and 0.0 <= linear_drag <= MOST_DRAG):
+            raise InputError(
+                f"linear_drag: expected a number from 0 to {MOST_DRAG:g} /s, got {linear_drag!r}"
+            )
         try:
             changed = file.stat().st_mtime_ns
         except OSError as error:
             raise InputError(f"vehicle: cannot read {path}: {error.strerror}") from None
-        return _load(file, drag, changed)
+        return _load(file, float(linear_drag) + 0.0, changed)  # no negative zero
 
     @property
     def num_rotors(self) -> int:
@@ -133,11 +130,9 @@ class Vehicle:
     @property
     def max_acceleration(self) -> float:
         """Largest vertical acceleration of the level craft, up or down, m/s²."""
-        vertical = self.allocation[0]
-        most = np.maximum(vertical * self.thrust_high, vertical * self.thrust_low).sum()
-        least = np.minimum(vertical * self.thrust_high, vertical * self.thrust_low).sum()
-        up, down = most / self.mass - self.gravity, self.gravity - least / self.mass
-        return float(max(up, down))
+        ends = self.allocation[0] * (self.thrust_low, self.thrust_high)
+        most, least = ends.max(axis=0).sum(), ends.min(axis=0).sum()
+        return float(max(most / self.mass - self.gravity, self.gravity - least / self.mass))
 
     def substeps(self, period: float) -> int:
         """Physics steps in a control period of so many seconds. Raises `InputError`."""
@@ -155,11 +150,7 @@ class Vehicle:
 
     def __reduce__(self) -> Any:
         """Loaded again from its file."""
-        return _again, (str(self.path), self.linear_drag)
-
-
-def _again(path: str, drag: float) -> Vehicle:
-    return Vehicle.load(path, linear_drag=drag)
+        return partial(Vehicle.load, linear_drag=self.linear_drag), (str(self.path),)
 
 
 @lru_cache(maxsize=32)
@@ -174,7 +165,17 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
             array = getattr(model, name)
             if getattr(array, "dtype", None) == np.float64 and not np.isfinite(array).all():
                 raise InputError(f"vehicle: expected finite numbers, got others in {name}")
-        body = _free_body(model)
+        free = int((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).sum())
+        if (free, model.njnt) != (1, 1):
+            raise InputError(
+                f"vehicle: expected one free body and no other joints, "
+                f"got {free} free of {model.njnt} joints"
+            )
+        if model.nu == 0:
+            raise InputError(
+                "vehicle: expected at least one rotor, an actuator at a site, got none"
+            )
+        body = int(model.jnt_bodyid[0])
         data = mujoco.MjData(model)
         data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
         mujoco.mj_forward(model, data)
@@ -196,7 +197,12 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
         )
     center = data.subtree_com[body].copy()
     rotors = tuple(_rotor(model, data, i, body) for i in range(model.nu))
-    allocation = _allocation(rotors, center)
+    columns = []
+    for rotor in rotors:
+        axis = np.array(rotor.axis)
+        torque = np.cross(np.array(rotor.position) - center, axis) + rotor.reaction
+        columns.append((axis[2], *torque))
+    allocation = np.array(columns).T
     model.dof_damping[0:3] = drag * mass
     return Vehicle(
         path=path,
@@ -215,19 +221,6 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
     )
 
 
-def _free_body(model: mujoco.MjModel) -> int:
-    """Number of the one free body. Raises `InputError` for any other kind of model."""
-    free = int((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).sum())
-    if (free, model.njnt) != (1, 1):
-        raise InputError(
-            f"vehicle: expected one free body and no other joints, "
-            f"got {free} free of {model.njnt} joints"
-        )
-    if model.nu == 0:
-        raise InputError("vehicle: expected at least one rotor, an actuator at a site, got none")
-    return int(model.jnt_bodyid[0])
-
-
 def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
     """The rotor of an actuator; `data` is at the origin and level. Raises `InputError`."""
     name = model.actuator(index).name or f"rotor{index + 1}"
@@ -237,12 +230,11 @@ def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
         raise InputError(f"vehicle: expected rotor {name} to be an actuator at a site of the body")
     if model.actuator_trnid[index, 1] >= 0:
         raise InputError(f"vehicle: expected rotor {name} to act without a reference site")
-    plain = (
-        model.actuator_gaintype[index] == mujoco.mjtGain.mjGAIN_FIXED
-        and model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
-        and model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_NONE
-    )
-    if not plain:
+    if (
+        model.actuator_gaintype[index] != mujoco.mjtGain.mjGAIN_FIXED
+        or model.actuator_biastype[index] != mujoco.mjtBias.mjBIAS_NONE
+        or model.actuator_dyntype[index] != mujoco.mjtDyn.mjDYN_NONE
+    ):
         raise InputError(f"vehicle: expected the thrust of rotor {name} to be gain times control")
     force, torque = model.actuator_gear[index, :3], model.actuator_gear[index, 3:]
     size = math.hypot(*force)
@@ -261,15 +253,6 @@ def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
         high=high,
         newtons=abs(newtons),
     )
-
-
-def _allocation(rotors: tuple[Rotor, ...], center: np.ndarray) -> np.ndarray:
-    columns = []
-    for rotor in rotors:
-        axis = np.array(rotor.axis)
-        torque = np.cross(np.array(rotor.position) - center, axis) + rotor.reaction
-        columns.append((axis[2], *torque))
-    return np.array(columns).T
 
 
 def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> np.ndarray:
@@ -323,10 +306,7 @@ def _rest_height(model: mujoco.MjModel, data: Any) -> float:
             )
     while high - low > 1e-10 * high:
         middle = (low + high) / 2
-        if _touches(model, data, middle):
-            low = middle
-        else:
-            high = middle
+        low, high = (middle, high) if _touches(model, data, middle) else (low, middle)
     return round(high, 9)
 
 
@@ -339,19 +319,9 @@ def _touches(model: mujoco.MjModel, data: Any, height: float) -> bool:
 
 
 def _hash(spec: mujoco.MjSpec, text: str, path: Path, drag: float) -> str:
-    digest = blake2b(text.encode() + b"\0" + struct.pack("<d", drag), digest_size=_HASH_BYTES)
-    for assets, folder in ((spec.meshes, spec.meshdir), (spec.hfields, spec.meshdir)):
-        for asset in assets:
-            file = path.parent / folder / asset.file
-            if asset.file and file.is_file():
-                digest.update(file.read_bytes())
+    digest = blake2b(text.encode() + b"\0" + struct.pack("<d", drag), digest_size=16)
+    for asset in (*spec.meshes, *spec.hfields):
+        file = path.parent / spec.meshdir / asset.file
+        if asset.file and file.is_file():
+            digest.update(file.read_bytes())
     return digest.hexdigest()
-
-
-def _checked_drag(linear_drag: Any) -> float:
-    number = isinstance(linear_drag, int | float | np.floating)
-    if not (number and 0.0 <= linear_drag <= MOST_DRAG):
-        raise InputError(
-            f"linear_drag: expected a number from 0 to {MOST_DRAG:g} /s, got {linear_drag!r}"
-        )
-    return float(linear_drag) + 0.0  # no negative zero

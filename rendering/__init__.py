@@ -13,23 +13,13 @@ if TYPE_CHECKING:
     from .stage import CAMERAS, WORLDS, Camera, Stage, World
 
 __all__ = [
-    "CAMERAS",
-    "WORLDS",
-    "Camera",
-    "Canvas",
-    "MetricValue",
-    "Moment",
-    "NoOpenGL",
-    "Stage",
+    "CAMERAS", "WORLDS", "Camera", "Canvas", "MetricValue", "Moment", "NoOpenGL", "Stage",
     "World",
-]
+]  # fmt: skip
 
 _MODULES: Final = {
-    "Canvas": "canvas",
-    "MetricValue": "moment",
-    "Moment": "moment",
-    "NoOpenGL": "gl",
-}
+    "Canvas": "canvas", "MetricValue": "moment", "Moment": "moment", "NoOpenGL": "gl"
+}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

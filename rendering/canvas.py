@@ -1,6 +1,7 @@
 """Draws a stage into arrays of pixels, without a window."""
 
-from typing import Any, Self
+from contextlib import AbstractContextManager
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -15,17 +16,10 @@ _ROOM = 10_000  # geoms
 _SAMPLES = 4  # of every pixel, for smooth edges; software has no more
 
 
-class Canvas:
-    """Pictures of a stage, all of one size.
+class Canvas(AbstractContextManager["Canvas"]):
+    """Pictures of a stage, all of one size in pixels. Raises `NoOpenGL` or `InputError`.
 
-    Args:
-        stage: The stage to draw.
-        width, height: Pixels.
-        fast: Without shadows and smooth edges, which take most of the time where software draws.
-
-    Raises:
-        NoOpenGL: No OpenGL works here.
-        InputError: Width or height is not 16 to 8192.
+    `fast` is without shadows and smooth edges, which take most of the time where software draws.
     """
 
     def __init__(
@@ -52,18 +46,7 @@ class Canvas:
         self._option, self._rect = mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
 
     def draw(self, camera: Camera = "chase", stage: Stage | None = None) -> np.ndarray:
-        """Draw the stage as it is now.
-
-        Args:
-            camera: Point of view.
-            stage: A twin of the canvas's stage, to be drawn in its place.
-
-        Returns:
-            A new array, uint8, shape (height, width, 3).
-
-        Raises:
-            NoOpenGL: The context was lost.
-        """
+        """The stage, or a twin of it, as it is now: a new array, uint8, (height, width, 3)."""
         stage = stage or self.stage
         if stage.model is not self.stage.model:
             raise ValueError("stage: expected the canvas's own or a twin of it, got another")
@@ -92,10 +75,5 @@ class Canvas:
             self._gl.free()
             self._gl = None
 
-    def __enter__(self) -> Self:
-        """Return the canvas, to be closed at the end of the block."""
-        return self
-
     def __exit__(self, *_: object) -> None:
-        """Close it."""
         self.close()

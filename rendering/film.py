@@ -4,11 +4,10 @@ import io
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import IO, Final
+from typing import Final
 
 import numpy as np
 
@@ -25,7 +24,8 @@ QUALITY: Final = 20
 
 def check_film(path: Path, width: int, height: int, fps: float) -> None:
     """Check the arguments of `write_film` before anything is drawn. Raises `InputError`."""
-    if path.suffix.lower() not in SUFFIXES:
+    kind = path.suffix.lower()
+    if kind not in SUFFIXES:
         raise InputError(
             f"film: expected a name that ends in .mp4, .gif or .png, or a folder's name without a "
             f"dot, got {path}"
@@ -34,11 +34,11 @@ def check_film(path: Path, width: int, height: int, fps: float) -> None:
         raise InputError(f"film: {path} is there already; choose another name")
     if not (0.01 <= fps <= 1000):
         raise InputError(f"fps: expected 0.01 to 1000 pictures per second, got {fps:g}")
-    if path.suffix.lower() == ".mp4" and (width % 2 or height % 2):
+    if kind == ".mp4" and (width % 2 or height % 2):
         raise InputError(
             f"film: expected an even width and an even height for MP4, got {width}x{height}"
         )
-    if path.suffix.lower() == ".gif" and abs(100 / fps - round(100 / fps)) > 1e-6:
+    if kind == ".gif" and abs(100 / fps - round(100 / fps)) > 1e-6:
         raise InputError(
             "fps: expected 100 divided by a whole number (50, 25, 20, 10) for GIF, which counts "
             f"hundredths of a second, got {fps:g}"
@@ -48,7 +48,7 @@ def check_film(path: Path, width: int, height: int, fps: float) -> None:
 def write_film(
     path: Path, frames: Iterable[np.ndarray], fps: float, *, quality: int = QUALITY
 ) -> int:
-    """Write a film. Its name says which kind.
+    """Write a film, and return how many frames were taken.
 
     `.mp4` is H.264 that every browser plays and that starts before it is loaded whole; `.gif`
     repeats for ever; `.png` is the last frame alone; a name without a dot becomes a folder of
@@ -61,9 +61,6 @@ def write_film(
         fps: Frames per second.
         quality: Of `.mp4`, x264's constant rate factor: 0 (every bit) to 51.
 
-    Returns:
-        How many frames were taken.
-
     Raises:
         InputError: The name, the size or the rate is not what it should be; there are no frames.
         OSError: It cannot be written, or the encoder failed.
@@ -74,50 +71,38 @@ def write_film(
     if first is None:
         raise InputError("film: expected at least one frame, got none")
     check_film(path, first.shape[1], first.shape[0], fps)
-    counted = _Counted(chain((first,), taken))
+    count = 0
+
+    def counted() -> Iterator[np.ndarray]:
+        nonlocal count
+        for frame in chain((first,), taken):
+            shape = (*first.shape[:2], 3)
+            if frame.dtype != np.uint8 or frame.shape != shape:
+                got = f"got {frame.dtype}, shape {frame.shape}"
+                raise ValueError(f"film: expected frames of uint8, shape {shape}, {got}")
+            count += 1
+            yield frame
+
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         unfinished = Path(folder) / path.name
         match path.suffix.lower():
             case ".mp4":
-                _write_mp4(unfinished, counted, fps, quality)
+                _write_mp4(unfinished, counted(), first.shape, fps, quality)
             case ".gif":
-                _write_gif(unfinished, counted, fps)
+                _write_gif(unfinished, counted(), fps)
             case ".png":
-                *_, last = counted
+                *_, last = counted()
                 Image.fromarray(last).save(unfinished)
             case _:
                 unfinished.mkdir()
-                for number, frame in enumerate(counted, 1):
+                for number, frame in enumerate(counted(), 1):
                     Image.fromarray(frame).save(unfinished / f"{number:04}.png")
         unfinished.rename(path)
-    return counted.count
+    return count
 
 
-class _Counted:
-    """Counts frames, and checks that all have the size of the first."""
-
-    def __init__(self, frames: Iterator[np.ndarray]) -> None:
-        self._frames = frames
-        self._shape: tuple[int, ...] = ()
-        self.count = 0
-
-    def __iter__(self) -> "_Counted":
-        return self
-
-    def __next__(self) -> np.ndarray:
-        frame = next(self._frames)
-        self._shape = self._shape or frame.shape
-        if frame.dtype != np.uint8 or frame.shape != self._shape or frame.shape[2:] != (3,):
-            raise ValueError(
-                f"film: expected frames of uint8, shape {(*self._shape[:2], 3)}, "
-                f"got {frame.dtype}, shape {frame.shape}"
-            )
-        self.count += 1
-        return frame
-
-
-def _write_gif(path: Path, frames: _Counted, fps: float) -> None:
+def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     # Without dithering: parts that stand still do not change, and cost nothing.
     pictures = (Image.fromarray(f).quantize(256, dither=Image.Dither.NONE) for f in frames)
     first = next(pictures)
@@ -128,30 +113,48 @@ def _write_gif(path: Path, frames: _Counted, fps: float) -> None:
         )
 
 
-def _write_mp4(path: Path, frames: _Counted, fps: float, quality: int) -> None:
-    first = next(frames)
-    height, width, _ = first.shape
-    rate = str(Fraction(fps).limit_denominator(1001))
+def _write_mp4(
+    path: Path, frames: Iterator[np.ndarray], shape: tuple[int, ...], fps: float, quality: int
+) -> None:
+    """Through FFmpeg. Raises `OSError` with its words if it fails."""
+    size, rate = f"{shape[1]}x{shape[0]}", str(Fraction(fps).limit_denominator(1001))
     words = [
-        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", rate, "-i", "-"),
+        *(_ffmpeg(), "-y", "-v", "error"),
+        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", rate, "-i", "-"),
         *("-an", "-c:v", "libx264", "-preset", "slow", "-crf", str(quality)),
         *("-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(path)),
     ]
-    with _encoder(words) as encoder:
-        for frame in chain((first,), frames):
-            encoder.write(np.ascontiguousarray(frame).data)
+    with tempfile.TemporaryFile() as said:
+        # In a session of its own: Ctrl-C is for us, who then end it.
+        with subprocess.Popen(
+            words,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+            start_new_session=True,
+        ) as process:
+            assert process.stdin is not None
+            broken = False
+            try:
+                for frame in frames:
+                    process.stdin.write(np.ascontiguousarray(frame).data)
+                process.stdin.close()
+            except BrokenPipeError:
+                broken = True
+            except BaseException:
+                process.kill()
+                raise
+            failed = process.wait() != 0 or broken
+        if failed:
+            said.seek(0)
+            why = " ".join(said.read().decode(errors="replace").split())
+            raise OSError(f"ffmpeg: the film could not be written: {why:.300}")
 
 
 def poster(path: Path, share: float = 0.3) -> bytes:
-    """A picture to show in place of a film that does not play yet: JPEG.
+    """A JPEG to show in place of an MP4 that does not play yet, from this share of its length.
 
-    Args:
-        path: An MP4.
-        share: Of the film's length, 0 to 1: where the picture is taken from.
-
-    Raises:
-        OSError: It cannot be read.
-        MissingPackage: Pillow or imageio-ffmpeg is not installed.
+    Raises `OSError` if it cannot be read, `MissingPackage` without Pillow or imageio-ffmpeg.
     """
     ffmpeg = require("imageio_ffmpeg", "render", "a film's poster")
     try:
@@ -171,36 +174,6 @@ def poster(path: Path, share: float = 0.3) -> bytes:
     jpeg = io.BytesIO()
     Image.open(io.BytesIO(done.stdout)).convert("RGB").save(jpeg, "JPEG", quality=80)
     return jpeg.getvalue()
-
-
-@contextmanager
-def _encoder(words: list[str]) -> Iterator[IO[bytes]]:
-    """FFmpeg, to which raw frames are written. Raises `OSError` with its words if it fails."""
-    program = _ffmpeg()
-    with tempfile.TemporaryFile() as said:
-        # In a session of its own: Ctrl-C is for us, who then end it.
-        with subprocess.Popen(
-            [program, "-y", "-v", "error", *words],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=said,
-            start_new_session=True,
-        ) as process:
-            assert process.stdin is not None
-            broken = False
-            try:
-                yield process.stdin
-                process.stdin.close()
-            except BrokenPipeError:
-                broken = True
-            except BaseException:
-                process.kill()
-                raise
-            failed = process.wait() != 0 or broken
-        if failed:
-            said.seek(0)
-            why = " ".join(said.read().decode(errors="replace").split())
-            raise OSError(f"ffmpeg: the film could not be written: {why:.300}")
 
 
 def _ffmpeg() -> str:

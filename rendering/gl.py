@@ -15,8 +15,8 @@ _ON: Final = ("enable", "enabled", "on", "true", "1", "glfw", "glx", "wgl")
 _LIBRARIES: Final = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "OpenGL"}
 
 _HIDDEN: Final = "ROTORGRAM_GL"
-"""`MUJOCO_GL` as the user set it, if `hidden_gl_setting` has hidden it from MuJoCo. An environment
-variable, so that the processes that this one starts know it too."""
+"""Keeps `MUJOCO_GL` as the user set it while `hidden_gl_setting` hides it from MuJoCo. An
+environment variable, so that the processes that this one starts know it too."""
 
 
 class NoOpenGL(RuntimeError):
@@ -53,10 +53,7 @@ def offscreen_context(width: int, height: int) -> Any:
 
     `MUJOCO_GL` decides if it is set (egl, osmesa, glfw; MuJoCo itself reads it once, when it is
     imported). Otherwise it is EGL on Linux, with a display or without; a window that is hidden
-    where there is a display and no EGL; elsewhere the system's own.
-
-    Raises:
-        NoOpenGL: None of them works.
+    where there is a display and no EGL; elsewhere the system's own. Without any: `NoOpenGL`.
     """
     reasons = []
     for name in _candidates():

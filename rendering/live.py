@@ -5,8 +5,9 @@ pictures; the simulation goes on, slowed only by the processor that both share.
 """
 
 import time
+from contextlib import AbstractContextManager
 from threading import Event, Thread
-from typing import Final, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Final, Literal
 
 import mujoco
 import numpy as np
@@ -16,25 +17,25 @@ from .moment import Moment
 from .pace import Pace
 from .stage import Stage
 
-__all__ = ["MOST_DRONES", "Aim", "Lines", "LiveView", "Surface", "lines_over", "open_surface"]
+if TYPE_CHECKING:
+    from .web import WebPage
+    from .window import Window
+
+    Surface = Window | WebPage
+
+__all__ = ["MOST_DRONES", "Aim", "Lines", "LiveView", "lines_over", "open_surface"]
 
 MOST_DRONES: Final = 16
 """Most craft side by side; of more, the first ones are shown."""
-DEFAULT_PORT: Final = 8080
-_PICTURES: Final = 30.0
-"""Most pictures a second."""
-_NAP: Final = 0.02
-"""Longest sleep before keys are looked at again, s."""
+_PICTURES: Final = 30.0  # a second, at most
+_NAP: Final = 0.02  # s, at most, before keys are looked at again
 
 Lines = list[tuple[str, str]]
 """Names and values."""
 
 
 class Aim:
-    """Turns a viewer's camera towards the goal once; afterwards moves it as the goal moves.
-
-    Without a goal it follows the craft.
-    """
+    """Turns a viewer's camera towards the goal, or the craft; afterwards moves it with that."""
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
@@ -52,40 +53,17 @@ class Aim:
         self._focus = focus
 
 
-class Surface(Protocol):
-    """A window or a page on which a stage is drawn."""
+class LiveView(AbstractContextManager["LiveView"]):
+    """Draws the latest moments on a surface, in a thread of its own.
 
-    where: str
-    """Place to look at, for a sentence."""
-
-    def show(self, lines: Lines) -> None:
-        """Draw the stage as it is now, with these lines over it."""
-
-    def is_running(self) -> bool:
-        """Whether it is still open."""
-
-    def is_watched(self) -> bool:
-        """Whether there is a viewer."""
-
-    def close(self) -> None:
-        """Close it."""
-
-
-class LiveView:
-    """Draws the latest moments in a thread of its own.
-
-    Args:
-        stage: The stage to draw. The view alone shows moments on it.
-        surface: The window or page to draw on.
-        pace: Its speed is a line of the overlay.
-        of: Number of drones, if more than are shown.
+    The view alone shows moments on the stage. The pace's speed is a line of the overlay; `of` is
+    the number of drones, if more than are shown.
     """
 
-    def __init__(self, stage: Stage, surface: Surface, pace: Pace, of: int | None = None) -> None:
+    def __init__(self, stage: Stage, surface: "Surface", pace: Pace, of: int | None = None) -> None:
         self.stage, self.surface, self.pace = stage, surface, pace
-        self._of = of or stage.drones
+        self._of, self._said = of or stage.drones, ""
         self._latest: tuple[Moment, ...] = ()
-        self._said = ""
         self._fresh, self._closing = Event(), Event()
         self._error: Exception | None = None
         self._thread = Thread(target=self._paint, name="live view", daemon=True)
@@ -98,11 +76,6 @@ class LiveView:
             error, self._error = self._error, None
             raise error
         return self._thread.is_alive() and not self._closing.is_set()
-
-    @property
-    def is_watched(self) -> bool:
-        """Whether there is a viewer: of a page, whether a browser has opened it."""
-        return self.surface.is_watched()
 
     @property
     def wants(self) -> bool:
@@ -135,12 +108,7 @@ class LiveView:
             finally:  # Ctrl-C twice too
                 self.surface.close()
 
-    def __enter__(self) -> Self:
-        """Return the view, to be closed at the end of the block."""
-        return self
-
     def __exit__(self, *_: object) -> None:
-        """Close it."""
         self.close()
 
     def _paint(self) -> None:
@@ -171,13 +139,9 @@ class LiveView:
 
 
 def lines_over(moments: tuple[Moment, ...], thrust_high: float, pace: str, drones: int) -> Lines:
-    """The lines of an overlay: those of the first craft, and the speed.
+    """The lines of an overlay: those of the first craft, and the speed in words.
 
-    Args:
-        moments: Of the craft that are shown.
-        thrust_high: Largest thrust of a rotor, N.
-        pace: The speed in words.
-        drones: Number of drones, shown or not.
+    `moments` are those of the craft that are shown, of so many drones; `thrust_high` in N.
     """
     lines = [*moments[0].lines(thrust_high), ("speed", pace)]
     if drones > 1:
@@ -187,14 +151,9 @@ def lines_over(moments: tuple[Moment, ...], thrust_high: float, pace: str, drone
 
 
 def open_surface(
-    kind: Literal["window", "web"], stage: Stage, pace: Pace, port: int = DEFAULT_PORT
-) -> Surface:
-    """A window on the display, or a page for browsers.
-
-    Raises:
-        NoDisplay: There is no display for a window.
-        InputError: The port is in use, or none.
-    """
+    kind: Literal["window", "web"], stage: Stage, pace: Pace, port: int = 8080
+) -> "Surface":
+    """A window on the display, or a page for browsers. Raises `NoDisplay` or `InputError`."""
     if kind == "window":
         from .window import Window
 

@@ -59,27 +59,25 @@ class Moment:
 
     @classmethod
     def of(
-        cls,
-        telemetry: Mapping[str, Any],
-        metrics: Sequence[tuple[str, str, str]] = (),
-        **rest: Any,
+        cls, telemetry: Mapping[str, Any], metrics: Sequence[tuple[str, str, str]], **rest: Any
     ) -> Self:
-        """Read one drone's telemetry.
+        """From a drone's telemetry, and `reward`, `step` and `episode`, which it does not have.
 
-        Args:
-            telemetry: Arrays by name: `position` (3,), `attitude` (3,), `thrust` (R,), `metrics`
-                (M,) and, if the task has one, `goal` (3,). Others are ignored.
-            metrics: Name, unit and symbol of each of the M metrics.
-            rest: Fields that telemetry does not have: `reward`, `step`, `episode`.
+        Telemetry is arrays by name: `position` (3,), `attitude` (3,), `thrust` (R,), `metrics` (M,)
+        and, if the task has one, `goal` (3,). The M metrics are told by name, unit and symbol.
         """
-        values = np.asarray(telemetry["metrics"]).tolist() if metrics else []
+
+        def told(name: str) -> tuple[Any, ...]:
+            return tuple(np.asarray(telemetry[name], float).tolist())
+
+        values = told("metrics") if metrics else ()
         return cls(
-            position=_vector(telemetry["position"]),
-            attitude=_vector(telemetry["attitude"]),
-            thrusts=tuple(np.asarray(telemetry["thrust"], float).tolist()),
-            goal=_vector(telemetry["goal"]) if "goal" in telemetry else None,
+            position=told("position"),
+            attitude=told("attitude"),
+            thrusts=told("thrust"),
+            goal=told("goal") if "goal" in telemetry else None,
             metrics=tuple(
-                MetricValue(name, float(value), unit, symbol)
+                MetricValue(name, value, unit, symbol)
                 for (name, unit, symbol), value in zip(metrics, values, strict=True)
             ),
             **rest,
@@ -96,11 +94,7 @@ class Moment:
         return None if self.goal is None else pose_in_mujoco_frame(self.goal, (0, 0, 0))[:3]
 
     def lines(self, thrust_high: float) -> list[tuple[str, str]]:
-        """Names and values for an overlay.
-
-        Args:
-            thrust_high: Largest thrust of a rotor, N: it sets the number of digits.
-        """
+        """Names and values for an overlay; a rotor's largest thrust, N, sets the digits."""
         lines = [(metric.label, metric.text) for metric in self.metrics[:_MOST_METRICS]]
         lines.append(("elevation", f"{self.position[1]:.2f} m"))
         if self.goal is not None:
@@ -113,21 +107,9 @@ class Moment:
         if rotors > _MOST_THRUSTS:
             name, shown = f"{name}, mean", (float(np.mean(shown)),)
         thrusts = " ".join(f"{scale * thrust:.{decimals}f}" for thrust in shown)
-        lines += [
-            (name, f"{thrusts} {unit}"),
-            ("reward", f"{self.reward:+.3f}"),
-            ("step", str(self.step)),
-            ("episode", str(self.episode)),
-        ]
-        return lines
+        lines += [(name, f"{thrusts} {unit}"), ("reward", f"{self.reward:+.3f}")]
+        return [*lines, ("step", str(self.step)), ("episode", str(self.episode))]
 
 
-_MOST_METRICS = 4
-"""Metrics with a line of their own."""
-_MOST_THRUSTS = 4
-"""Rotors with a number of their own."""
-
-
-def _vector(values: Any) -> Vector:
-    x, y, z = np.asarray(values, float).tolist()
-    return x, y, z
+_MOST_METRICS = 4  # with a line of their own
+_MOST_THRUSTS = 4  # rotors with a number of their own

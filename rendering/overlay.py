@@ -16,29 +16,20 @@ from .moment import Moment
 
 __all__ = ["Overlay", "graph_scale"]
 
-_GROUND: Final = (13, 18, 26, 150)
-"""Of panels: dark, and some of the picture shows through."""
+_GROUND: Final = (13, 18, 26, 150)  # Of panels: dark, and some of the picture shows through
 _EDGE: Final = (255, 255, 255, 36)
-_NAMES: Final = (164, 176, 190)
-_VALUES: Final = (238, 242, 246)
-_ZERO: Final = (150, 162, 176)
-_LIMIT: Final = (84, 96, 110)
+_NAMES, _VALUES = (164, 176, 190), (238, 242, 246)
+_ZERO, _LIMIT = (150, 162, 176), (84, 96, 110)
 _ALARM: Final = (255, 107, 96)
-_BAR: Final = (120, 190, 255)
-_BAR_GROUND: Final = (70, 82, 98)
-_STEPS: Final = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
-"""Round numbers for the ends of a graph."""
-_LEAST: Final = 0.1
-"""Smallest end of a graph, in the metric's unit."""
-_STRIP_SIZE: Final = 160, 240
-"""Width and height of the smallest picture with a graph, pixels."""
-_NUMBERS_HEIGHT: Final = 160
-"""Of the smallest picture with numbers, pixels."""
+_BAR, _BAR_GROUND = (120, 190, 255), (70, 82, 98)
+_STEPS: Final = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # Round numbers for the ends of a graph
+_LEAST: Final = 0.1  # Smallest end of a graph, in the metric's unit
+_STRIP_SIZE: Final = 160, 240  # Width and height of the smallest picture with a graph, pixels
+_NUMBERS_HEIGHT: Final = 160  # Of the smallest picture with numbers, pixels
 _NUMBERS_SHARE: Final = 0.4
 """Of the width or of the height: larger ones would hide the craft in the middle."""
 _TIMES: Final = 2
 """Everything is drawn so much larger, and reduced: smooth lines, letters where they belong."""
-
 
 Point = tuple[float, float]
 
@@ -50,6 +41,11 @@ class Box(NamedTuple):
     upper: int
     right: int
     lower: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of what is drawn into it, enlarged."""
+        return (self.right - self.left) * _TIMES, (self.lower - self.upper) * _TIMES
 
 
 def graph_scale(values: Iterable[float]) -> tuple[float, float]:
@@ -70,9 +66,8 @@ class Overlay:
         width, height: Of the pictures, pixels.
         title: Name of the flight.
         color: Of title and curve, "#RRGGBB"; light, the ground is dark.
-        like: A moment of the flight: its metrics, its goal and its rotors say which lines there
-            are.
-        vehicle: The vehicle: it gives the limits of the thrusts.
+        like: A moment of the flight: it says which metrics, goal and rotors there are.
+        vehicle: It gives the limits of the thrusts.
         period: Time between two values of the graph, s.
         seconds: Length of the graph's time axis, s.
         scale: Lower and upper end of the graph, in the metric's unit. Values beyond are not drawn:
@@ -82,9 +77,7 @@ class Overlay:
     Attributes:
         has_numbers: Whether the panel has numbers.
         has_strip: Whether there is a graph.
-        panel: Where title and numbers are.
-        strip: Where the graph is, if there is one.
-        plot: Where in it the curve is.
+        panel, strip, plot: Where title and numbers are, where the graph, and where in it its curve.
     """
 
     def __init__(
@@ -105,7 +98,16 @@ class Overlay:
         self._title, self._color = title, ImageColor.getrgb(color)[:3]
         self._period, self._seconds, self._scale = period, max(seconds, period), scale
         self._vehicle, self._high = vehicle, float(vehicle.thrust_high.max())
-        self._widest = _widest(like, self._high).lines(self._high)
+        self._widest = replace(  # its lines are as wide as any of the flight
+            like,
+            position=(0.0, -100.0, 0.0),
+            thrusts=(self._high,) * len(like.thrusts),
+            goal=like.goal and (0.0, -100.0, 0.0),
+            metrics=tuple(metric._replace(value=-1.001) for metric in like.metrics),
+            reward=-10.0,
+            step=100_000,
+            episode=100_000,
+        ).lines(self._high)
         self._metric = like.metrics[0] if like.metrics else None
         unit = max(7.0, min(height / 30, width / 34))
         self._unit, self._gap = unit, max(2, round(0.55 * unit))
@@ -122,13 +124,10 @@ class Overlay:
     def draw(
         self, picture: np.ndarray, moment: Moment, values: Sequence[float], note: str = ""
     ) -> np.ndarray:
-        """Return a copy of a picture with everything on it.
+        """A copy of a picture, uint8, shape (height, width, 3), with everything on it.
 
-        Args:
-            picture: uint8, shape (height, width, 3).
-            moment: For the panel.
-            values: The headline metric from the episode's start to this moment, one each period.
-            note: An event, such as "terminated".
+        `values` are those of the headline metric from the episode's start to this moment, one each
+        period; `note` is an event, such as "terminated".
         """
         image = Image.fromarray(picture)
         if image.size != self._size:
@@ -138,13 +137,12 @@ class Overlay:
         _enlarged(image, self.panel, lambda draw: self._write_panel(draw, moment))
         if self.has_strip:
             _enlarged(image, self.strip, lambda draw: self._write_strip(draw, values))
-        if note:
-            box = self._note_box(note)
+        if note:  # below the panel, away from the craft
+            wide = self._large.getlength(note) / _TIMES + 3 * self._gap
+            left, upper = self.panel.left, self.panel.lower + self._gap
+            box = Box(left, upper, round(left + wide), round(upper + 1.9 * self._unit))
             _enlarged(image, box, lambda draw: self._write_note(draw, box, note))
         return np.asarray(image)
-
-    # Boxes are in pixels of the picture; what writes into them draws in enlarged pixels, from the
-    # box's own corner on.
 
     def _numbers_width(self) -> int:
         """Of a panel in which every name and its value fit beside each other."""
@@ -172,7 +170,7 @@ class Overlay:
     def _write_panel(self, draw: ImageDraw.ImageDraw, moment: Moment) -> None:
         unit, gap, line = self._unit * _TIMES, self._gap * _TIMES, self._line * _TIMES
         left, y = 2 * gap, gap
-        right = (self.panel.right - self.panel.left) * _TIMES - 2 * gap
+        right = self.panel.size[0] - 2 * gap
         middle, radius = y + 0.8 * unit, 0.36 * unit
         draw.ellipse((left, middle - radius, left + 2 * radius, middle + radius), self._color)
         title = _fitted(self._title, self._large, right - left - 1.2 * unit)
@@ -225,11 +223,10 @@ class Overlay:
         words = [f"{self._metric.label} over time", *filter(None, [self._metric.unit])]
         draw.text((2 * gap, gap), ", ".join(words), _NAMES, self._font)
         time = f"{max(len(values) - 1, 0) * self._period:.2f} s"
-        end = (self.strip.right - self.strip.left) * _TIMES - 2 * gap
-        draw.text((end, gap), time, _VALUES, self._font, anchor="ra")
-        dx, dy = self.strip.left, self.strip.upper
+        draw.text((self.strip.size[0] - 2 * gap, gap), time, _VALUES, self._font, anchor="ra")
+        corner = self.strip[:2] * 2
         left, upper, right, lower = (
-            (edge - (dx, dy)[number % 2]) * _TIMES for number, edge in enumerate(self.plot)
+            (edge - start) * _TIMES for edge, start in zip(self.plot, corner, strict=True)
         )
         for label, share in self._levels():
             y = lower - (lower - upper) * (1 + share) / 2
@@ -261,21 +258,15 @@ class Overlay:
         for x, y in ((x, height(y)) for x, y in points[-1:] if abs(y) <= 1):
             draw.ellipse((x - thick, y - thick, x + thick, y + thick), self._color)
 
-    def _note_box(self, note: str) -> Box:
-        """Below the panel, away from the craft."""
-        wide = self._large.getlength(note) / _TIMES + 3 * self._gap
-        left, upper = self.panel.left, self.panel.lower + self._gap
-        return Box(left, upper, round(left + wide), round(upper + 1.9 * self._unit))
-
     def _write_note(self, draw: ImageDraw.ImageDraw, box: Box, note: str) -> None:
-        size = (box.right - box.left) * _TIMES - 1, (box.lower - box.upper) * _TIMES - 1
+        size = box.size[0] - 1, box.size[1] - 1
         thick = max(1, round(self._unit * _TIMES / 12))
         draw.rounded_rectangle((0, 0, *size), self._gap * _TIMES, _GROUND[:3], _ALARM, thick)
         draw.text((size[0] / 2, size[1] / 2), note, _ALARM, self._large, anchor="mm")
 
 
 def _enlarged(image: Image.Image, box: Box, write: Callable[[ImageDraw.ImageDraw], None]) -> None:
-    """Write on a part of the picture. All other pixels stay the same, bit for bit."""
+    """Write on a part of the picture, in enlarged pixels from its own corner on."""
     part = image.crop(box)
     part = part.resize((part.width * _TIMES, part.height * _TIMES), Image.Resampling.NEAREST)
     write(ImageDraw.Draw(part))
@@ -284,9 +275,8 @@ def _enlarged(image: Image.Image, box: Box, write: Callable[[ImageDraw.ImageDraw
 
 def _ground(box: Box, radius: int) -> Image.Image:
     """An empty panel, RGBA."""
-    size = (box.right - box.left) * _TIMES, (box.lower - box.upper) * _TIMES
-    image = Image.new("RGBA", size)
-    edges = (0, 0, size[0] - 1, size[1] - 1)
+    image = Image.new("RGBA", box.size)
+    edges = (0, 0, image.width - 1, image.height - 1)
     ImageDraw.Draw(image).rounded_rectangle(edges, radius * _TIMES, _GROUND, _EDGE, _TIMES)
     return image.reduce(_TIMES)
 
@@ -310,20 +300,6 @@ def _within(points: Sequence[Point]) -> tuple[list[list[Point]], list[Point]]:
         if first <= last < 1:
             exits.append((pieces[-1][-1][0], math.copysign(1.0, next_y)))
     return pieces, exits
-
-
-def _widest(like: Moment, thrust_high: float) -> Moment:
-    """A moment whose lines are as wide as any of the flight."""
-    return replace(
-        like,
-        position=(0.0, -100.0, 0.0),
-        thrusts=(thrust_high,) * len(like.thrusts),
-        goal=like.goal and (0.0, -100.0, 0.0),
-        metrics=tuple(metric._replace(value=-1.001) for metric in like.metrics),
-        reward=-10.0,
-        step=100_000,
-        episode=100_000,
-    )
 
 
 def _spaced(value: str) -> str:

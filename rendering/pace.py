@@ -1,6 +1,6 @@
 """The speed at which a flight is shown. Reads no clock: the time is passed in."""
 
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import Final, Literal
 
 from ..models.errors import InputError
@@ -13,8 +13,7 @@ Press = Literal["pause", "step", "slower", "faster"]
 SPEEDS: Final = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
 """Steps of `slower` and `faster`; 1 is real time."""
 SLOWEST, FASTEST = SPEEDS[0], SPEEDS[-1]
-_CATCH_UP: Final = 0.1
-"""Longest delay that later steps make up for, s."""
+_CATCH_UP: Final = 0.1  # Longest delay that later steps make up for, s
 
 
 class Pace:
@@ -22,14 +21,7 @@ class Pace:
 
     Args:
         period: Time between two steps, s; 0 for as fast as possible.
-        speed: 2 is twice as fast as real time.
-
-    Attributes:
-        speed: The present one.
-        paused: Whether each step waits for a press of `step`.
-
-    Raises:
-        InputError: The speed is beyond `SPEEDS`.
+        speed: 2 is twice as fast as real time. One beyond `SPEEDS` raises `InputError`.
     """
 
     def __init__(self, period: float, speed: float = 1.0) -> None:
@@ -49,12 +41,13 @@ class Pace:
         return f"{speed}, paused" if self.paused else speed
 
     def press(self, press: Press) -> None:
-        """Tell of a press, which `wait` then obeys. May be called from any thread."""
+        """Tell of a press, which `wait` then obeys; from any thread."""
         self._presses.put(press)
 
     def wait(self, now: float) -> float | None:
         """Seconds until the next step is due, 0 if it is; None while paused."""
-        self._obey()
+        while not self._presses.empty():
+            self._obey(self._presses.get())
         if self.paused:
             return 0.0 if self._asked else None
         if self._since is None:
@@ -70,18 +63,13 @@ class Pace:
         due = now if self._since is None else self._since + self.period / self.speed
         self._since = min(max(due, now - _CATCH_UP), now)
 
-    def _obey(self) -> None:
-        while True:
-            try:
-                press = self._presses.get_nowait()
-            except Empty:
-                return
-            if press == "pause":
-                self.paused, self._asked, self._since = not self.paused, 0, None
-            elif press == "step":
-                self._asked = self._asked + 1 if self.paused else 1
-                self.paused = True
-            elif press == "slower":
-                self.speed = max((s for s in SPEEDS if s < self.speed), default=SLOWEST)
-            else:
-                self.speed = min((s for s in SPEEDS if s > self.speed), default=FASTEST)
+    def _obey(self, press: Press) -> None:
+        if press == "pause":
+            self.paused, self._asked, self._since = not self.paused, 0, None
+        elif press == "step":
+            self._asked = self._asked + 1 if self.paused else 1
+            self.paused = True
+        elif press == "slower":
+            self.speed = max((s for s in SPEEDS if s < self.speed), default=SLOWEST)
+        else:
+            self.speed = min((s for s in SPEEDS if s > self.speed), default=FASTEST)

@@ -25,18 +25,14 @@ WORLDS: Final[tuple[World, ...]] = get_args(World)
 NextGeom = Callable[[], mujoco.MjvGeom | None]
 """Returns a geom to fill in, or None if the scene is full."""
 
-_TRAIL: Final = 150
-"""Length of a path, control steps."""
-_EVERY: Final = 3
-"""Control steps of one piece of a path."""
+_TRAIL, _EVERY = 150, 3  # control steps of a path, and of one piece of it
 _DISC = (0.13, 0.78, 0.52, 0.30)
 _PATH = (1.0, 0.85, 0.25)
+_ONBOARD: Final = "stage/onboard"
 
 # Lengths below are in radii of the craft.
-_SPACING: Final = 2.2
-"""Between craft that fly side by side."""
-_NEAR: Final = 0.14
-"""Largest distance at which drawing begins."""
+_SPACING: Final = 2.2  # between craft that fly side by side
+_NEAR: Final = 0.14  # at most: where drawing begins
 _LOWER: Final = 0.06
 """Front and side look this far below the goal, as a share of their distance: the graph covers the
 picture's lower end."""
@@ -49,10 +45,8 @@ _VIEWS: Final[dict[str, tuple[float, float, float, float]]] = {
 }
 """Azimuth and elevation in degrees, distance, and the distance between craft and goal that the
 picture holds: if they are further apart, the camera is further away."""
-_BACK: Final = 2.6
-"""Distance of a camera per distance between craft and goal."""
-_FOVY: Final = 50.0
-"""Vertical field of view of every camera but `onboard`, degrees."""
+_BACK: Final = 2.6  # distance of a camera per distance between craft and goal
+_FOVY: Final = 50.0  # vertical field of view of every camera but `onboard`, degrees
 _FAR: Final = 10.0
 """Cameras move back until craft and goal are so far apart, or as far as at the episode's start."""
 
@@ -60,22 +54,14 @@ _FAR: Final = 10.0
 class Stage:
     """Craft over an airport or a plain floor. It simulates nothing: it shows moments.
 
-    Args:
-        world: `airport` or `plain`.
-        drones: Craft side by side, each with a goal and a path.
-        vehicle: MJCF file of the craft; None is the paper's.
-        trail: Whether paths are drawn.
+    The craft, of an MJCF file or the paper's, stand side by side, each with a goal and, with
+    `trail`, a path. What is wrong raises `InputError`.
 
     Attributes:
-        vehicle: The vehicle of every craft.
         radius: Of a sphere about the body's origin that holds the craft, m. Cameras, goals and
             paths scale with it.
-        model: With all visual elements.
-        data: Poses of the last moments.
+        model, data: With all visual elements; poses of the last moments.
         moments: The last moments.
-
-    Raises:
-        InputError: One of these is not what it should be.
     """
 
     def __init__(
@@ -93,33 +79,36 @@ class Stage:
         self.radius, top = _size(spec.compile())
         self._offsets = _grid(drones, _SPACING * self.radius)
         self._spread = float(np.ptp(self._offsets, axis=0).max())
-        _add_onboard_camera(spec, self.radius, top)
+        _free_body(spec).add_camera(  # sees nose, front rotors and horizon
+            name=_ONBOARD,
+            pos=(0.03 * self.radius, 0.0, top + 0.154 * self.radius),
+            xyaxes=(0, -1, 0, 0.30, 0, 0.954),
+            fovy=70,
+        )
         for number, offset in enumerate(self._offsets[1:], 1):
-            _add_craft(spec, self.vehicle.path, offset, f"{number}/")
+            frame = spec.worldbody.add_frame(pos=offset)
+            craft = mujoco.MjSpec.from_file(str(self.vehicle.path))  # must outlive its body
+            frame.attach_body(_free_body(craft), f"{number}/", "")
         self.model = spec.compile()
         _scale_drawing(self.model, self.radius, self._spread)
+        self._length = _TRAIL // _EVERY if trail else 0
+        self._clear()
+
+    def _clear(self) -> None:
         self.data = mujoco.MjData(self.model)
         self.moments: tuple[Moment, ...] = ()
-        length = _TRAIL // _EVERY if trail else 0
-        self._paths: list[deque[np.ndarray]] = [deque(maxlen=length) for _ in range(drones)]
-        self._reach = np.zeros(drones)
+        self._paths: list[deque[np.ndarray]] = [deque(maxlen=self._length) for _ in self._offsets]
+        self._reach = np.zeros(self.drones)
         mujoco.mj_forward(self.model, self.data)
 
     def twin(self) -> "Stage":
         """A stage of the same model, with poses and paths of its own: one canvas draws both."""
         twin = copy.copy(self)
-        twin.data, twin.moments = mujoco.MjData(self.model), ()
-        twin._paths = [deque(maxlen=path.maxlen) for path in self._paths]
-        twin._reach = np.zeros(self.drones)
-        mujoco.mj_forward(twin.model, twin.data)
+        twin._clear()
         return twin
 
     def show(self, *moments: Moment) -> None:
-        """Put every craft where its moment has it, and extend its path.
-
-        Raises:
-            InputError: There are not as many moments as craft, or their craft is another vehicle.
-        """
+        """Put every craft where its moment has it, and extend its path. Raises `InputError`."""
         if len(moments) != self.drones:
             raise InputError(f"moments: expected {self.drones}, got {len(moments)}")
         if (rotors := len(moments[0].thrusts)) != self.vehicle.num_rotors:
@@ -148,9 +137,7 @@ class Stage:
 
         `chase` and `top` go with the craft; `front`, `side` and `free`, where a viewer's camera
         begins, look at the goal if there is one, and move back from a craft that is far from it.
-
-        Raises:
-            InputError: There is no such camera.
+        A name of none raises `InputError`.
         """
         camera = mujoco.MjvCamera()
         if name == "onboard":
@@ -186,12 +173,16 @@ class Stage:
                 _decoration(next_geom, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, _DISC)
             points = [*path, self._points()[i]]
             for number, (start, end) in enumerate(pairwise(points), 1):
-                _piece(next_geom, start, end, 0.019 * self.radius, number / len(path))
+                if np.array_equal(start, end):
+                    continue
+                kind, rgba = mujoco.mjtGeom.mjGEOM_CAPSULE, (*_PATH, 0.85 * number / len(path))
+                geom = _decoration(next_geom, kind, (1.0, 1.0, 1.0), start, rgba)
+                if geom is not None:
+                    mujoco.mjv_connector(geom, kind, 0.019 * self.radius, start, end)
 
     def _points(self) -> np.ndarray:
         """Positions of the craft, MuJoCo's frame, shape (drones, 3), m."""
-        points: np.ndarray = self.data.qpos.reshape(self.drones, 7)[:, :3]
-        return points
+        return np.asarray(self.data.qpos.reshape(self.drones, 7)[:, :3])
 
     def _goal(self, i: int) -> np.ndarray | None:
         goal = self.moments[i].goal_point if self.moments else None
@@ -218,9 +209,6 @@ def scene_geoms(scene: mujoco.MjvScene) -> NextGeom:
     return next_geom
 
 
-_ONBOARD: Final = "stage/onboard"
-
-
 def _free_body(spec: mujoco.MjSpec) -> Any:
     """The craft, `MjsBody`. `Vehicle.load` has checked that there is one."""
     free = mujoco.mjtJoint.mjJNT_FREE
@@ -238,29 +226,10 @@ def _size(model: mujoco.MjModel) -> tuple[float, float]:
     if not chosen.any():
         return 1.0, 0.0
     centres, bounds = data.geom_xpos[chosen], model.geom_rbound[chosen]
-    boxes, turns = model.geom_aabb[chosen], data.geom_xmat[chosen].reshape(-1, 3, 3)
-    tops = centres[:, 2] + (
-        np.einsum("ij,ij->i", turns[:, 2], boxes[:, :3])
-        + np.einsum("ij,ij->i", abs(turns[:, 2]), boxes[:, 3:])
-    )
+    boxes, rows = model.geom_aabb[chosen], data.geom_xmat[chosen, 6:]  # of z in body axes
+    tops = centres[:, 2] + (rows * boxes[:, :3] + abs(rows) * boxes[:, 3:]).sum(axis=1)
     radius = float((np.linalg.norm(centres, axis=1) + bounds).max())
     return max(radius, 1e-3), float(tops.max())
-
-
-def _add_onboard_camera(spec: mujoco.MjSpec, radius: float, top: float) -> None:
-    """Above the craft and a little downwards: nose, front rotors and horizon are seen."""
-    _free_body(spec).add_camera(
-        name=_ONBOARD,
-        pos=(0.03 * radius, 0.0, top + 0.154 * radius),
-        xyaxes=(0, -1, 0, 0.30, 0, 0.954),
-        fovy=70,
-    )
-
-
-def _add_craft(spec: mujoco.MjSpec, vehicle: Path, offset: np.ndarray, prefix: str) -> None:
-    frame = spec.worldbody.add_frame(pos=offset)
-    craft = mujoco.MjSpec.from_file(str(vehicle))  # must outlive its body
-    frame.attach_body(_free_body(craft), prefix, "")
 
 
 def _scale_drawing(model: mujoco.MjModel, radius: float, spread: float) -> None:
@@ -284,16 +253,6 @@ def _grid(drones: int, spacing: float) -> np.ndarray:
     """Places of the craft, shape (drones, 3), m: nearly a square, the first at the origin."""
     rows, columns = np.divmod(np.arange(drones), math.isqrt(drones - 1) + 1)
     return -spacing * np.stack((rows, columns, np.zeros(drones)), axis=1)
-
-
-def _piece(
-    next_geom: NextGeom, start: np.ndarray, end: np.ndarray, radius: float, freshness: float
-) -> None:
-    kind, rgba = mujoco.mjtGeom.mjGEOM_CAPSULE, (*_PATH, 0.85 * freshness)
-    if not np.array_equal(start, end):
-        geom = _decoration(next_geom, kind, (1.0, 1.0, 1.0), start, rgba)
-        if geom is not None:
-            mujoco.mjv_connector(geom, kind, radius, start, end)
 
 
 def _decoration(

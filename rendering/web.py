@@ -34,19 +34,15 @@ _KEYS: Final[tuple[tuple[Any, Press], ...]] = (
     (imgui.Key.Equal, "faster"),
     (imgui.Key.KeypadAdd, "faster"),
 )
-_COLUMN: Final = 90.0
-"""Left edge of values, in pixels of the panel."""
+_COLUMN: Final = 90.0  # Left edge of values, in pixels of the panel
 
 
 def refusal(host: str | None, origin: str | None) -> str | None:
     """The reason to refuse a request, by its headers; None if it is accepted.
 
     A page of another site may open a WebSocket to this machine, and its name server may name this
-    machine's address. `Host` and `Origin` then tell the other site's name.
-
-    Args:
-        host: Of the header `Host`: the address that the browser's user opened.
-        origin: Of the header `Origin`: the page that asks. Programs that are no browsers have none.
+    machine's address. `Host`, the address that was opened, and `Origin`, the page that asks, then
+    tell the other site's name. Programs that are no browsers have no `Origin`.
     """
     name, _, port = (host or "").lower().rpartition(":")
     if not port.isdecimal():
@@ -58,38 +54,30 @@ def refusal(host: str | None, origin: str | None) -> str | None:
     return None
 
 
-def _guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
-    """The server of MuJoCo's page, which takes every request, with `refusal` before it."""
-
-    def guarded(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
-        def checked(connection: Any, request: Any) -> Any:
-            hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-            reason = refusal(hosts[0] if len(hosts) == 1 else None, ", ".join(origins) or None)
-            if reason is not None:
-                return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
-            return process_request(connection, request)
-
-        return serve(*args, process_request=checked, **options)
-
-    return guarded
+_serve: Final[Callable[..., Any]] = web_server.serve
 
 
-web_server.serve = _guarded(web_server.serve)
+def _guarded(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+    """MuJoCo's server of the page, which takes every request, with `refusal` before it."""
+
+    def checked(connection: Any, request: Any) -> Any:
+        hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+        reason = refusal(hosts[0] if len(hosts) == 1 else None, ", ".join(origins) or None)
+        if reason is not None:
+            return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
+        return process_request(connection, request)
+
+    return _serve(*args, process_request=checked, **options)
+
+
+web_server.serve = _guarded
 
 
 class WebPage:
-    """A stage in browsers, served on this machine's loopback alone. `Surface`.
+    """A stage in browsers, served on this machine's loopback alone: `Surface`.
 
-    Args:
-        stage: The stage to show.
-        pace: Changed by buttons and keys.
-        port: TCP port; 0 takes the first free one from 8080 on.
-
-    Attributes:
-        port: The TCP port.
-
-    Raises:
-        InputError: The port is in use, or none.
+    Buttons and keys change the pace. Port 0 takes the first free one from 8080 on; one in use
+    raises `InputError`.
     """
 
     def __init__(self, stage: Stage, pace: Pace, port: int) -> None:
@@ -148,13 +136,7 @@ class _LoopbackViewer(web_viewer.WebViewer):  # type: ignore[misc]
     It has no option for the address, only an attribute that it sets itself.
     """
 
-    @property
-    def _host(self) -> str:
-        return _HOST
-
-    @_host.setter
-    def _host(self, everywhere: str) -> None:
-        pass
+    _host = property(lambda _: _HOST, lambda _, everywhere: None)
 
     @property
     def address(self) -> tuple[str, int]:
@@ -212,21 +194,15 @@ class _Panel(plugin.ViewerPlugin):  # type: ignore[misc]
             imgui.Text(name)
             imgui.SameLine(_COLUMN)
             imgui.Text(value)
-        self._buttons()
+        presses: list[Press] = ["pause", "step"]
+        presses += ["slower", "faster"] if self._pace.period else []
+        for press in presses:
+            if press != "pause":
+                imgui.SameLine()
+            label = "Go on" if press == "pause" and self._pace.paused else press.capitalize()
+            if imgui.Button(label):
+                self._pace.press(press)
         imgui.End()
         for key, press in _KEYS:
             if imgui.IsKeyPressed(key, False):
-                self._pace.press(press)
-
-    def _buttons(self) -> None:
-        buttons: list[tuple[str, Press]] = [
-            ("Go on" if self._pace.paused else "Pause", "pause"),
-            ("Step", "step"),
-        ]
-        if self._pace.period:
-            buttons += [("Slower", "slower"), ("Faster", "faster")]
-        for number, (label, press) in enumerate(buttons):
-            if number:
-                imgui.SameLine()
-            if imgui.Button(label):
                 self._pace.press(press)

@@ -32,9 +32,7 @@ _INSTEAD: Final = (
     "look from a browser instead (--web, or --view web with rotorgram sim) or make a film "
     "(rotorgram render)"
 )
-
-_NICENESS: Final = 10
-"""Of the threads that draw: the simulation comes first."""
+_NICENESS: Final = 10  # of the threads that draw: the simulation comes first
 
 
 class NoDisplay(NoOpenGL):
@@ -42,15 +40,7 @@ class NoDisplay(NoOpenGL):
 
 
 class Window:
-    """A stage in a window. `Surface`.
-
-    Args:
-        stage: The stage to show.
-        pace: Changed by the keys.
-
-    Raises:
-        NoDisplay: There is no display, or none that OpenGL can draw on.
-    """
+    """A stage in a window, whose keys change the pace: `Surface`. Raises `NoDisplay`."""
 
     where = "in the window"
 
@@ -119,8 +109,7 @@ def _text(place: mujoco.mjtGridPos, lines: Lines) -> tuple[Any, ...]:
 
 def _tasks() -> set[int]:
     """Numbers of this process's threads; empty on systems without /proc."""
-    folder = Path("/proc/self/task")
-    return {int(task.name) for task in folder.iterdir()} if folder.is_dir() else set()
+    return {int(task.name) for task in Path("/proc/self/task").glob("*")}
 
 
 def _viewer() -> Any:
@@ -134,21 +123,15 @@ def _viewer() -> Any:
             import glfw
             from mujoco import viewer
 
-            if on_x and not _draws(glfw):
-                raise RuntimeError("none that OpenGL can draw on")
+            if on_x:
+                if not glfw.init():
+                    raise RuntimeError("none that OpenGL can draw on")
+                glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
+                window = glfw.create_window(16, 16, "", None, None)
+                glfw.default_window_hints()
+                if not window:
+                    raise RuntimeError("none that OpenGL can draw on")
+                glfw.destroy_window(window)
     except (ImportError, RuntimeError) as error:
         raise NoDisplay(f"window: expected a display, got {error}: {_INSTEAD}") from None
     return viewer
-
-
-def _draws(glfw: Any) -> bool:
-    """Whether a window can be made."""
-    if not glfw.init():
-        return False
-    glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
-    window = glfw.create_window(16, 16, "", None, None)
-    glfw.default_window_hints()
-    if not window:
-        return False
-    glfw.destroy_window(window)
-    return True

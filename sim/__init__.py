@@ -9,22 +9,7 @@ from .state import Array, Pose, WorldState, clip, component, constant, on_host, 
 from .world import BACKENDS, Backend, PhysicsError, World, make_world
 
 __all__ = [
-    "BACKENDS",
-    "Array",
-    "Backend",
-    "CollectiveThrust",
-    "Controller",
-    "Draw",
-    "PhysicsError",
-    "Pose",
-    "RotorThrust",
-    "World",
-    "WorldState",
-    "clip",
-    "component",
-    "constant",
-    "make_world",
-    "on_host",
-    "plain",
-    "stack",
-]
+    "BACKENDS", "Array", "Backend", "CollectiveThrust", "Controller", "Draw", "PhysicsError",
+    "Pose", "RotorThrust", "World", "WorldState", "clip", "component", "constant", "make_world",
+    "on_host", "plain", "stack",
+]  # fmt: skip

@@ -29,9 +29,7 @@ class Controller(Protocol):
     def thrust(self, action: Array, state: WorldState) -> Array:
         """Thrust of each rotor until the next action, N, shape (W, A, R).
 
-        Args:
-            action: float64, shape (W, A, k), finite. A number beyond a bound counts as the bound.
-            state: As the last step left it.
+        Actions are float64, shape (W, A, k), finite; one beyond a bound counts as the bound.
         """
 
 
@@ -39,7 +37,7 @@ class CollectiveThrust:
     """One number for all rotors: they push alike, in proportion to their thrusts at hover.
 
     Args:
-        vehicle: The vehicle that it controls.
+        vehicle: What it controls.
         newtons: Thrust per unit of action, mean over the rotors.
         increment: Add to the present thrust; otherwise to that of a hover.
         discrete: Three choices, decrease, hold and increase, in place of a number in [-1, 1].
@@ -78,11 +76,7 @@ class CollectiveThrust:
 
 
 class RotorThrust:
-    """One number for each rotor: 0 is its thrust at hover, -1 its least and 1 its largest.
-
-    Args:
-        vehicle: The vehicle that it controls.
-    """
+    """One number for each rotor: 0 is its thrust at hover, -1 its least and 1 its largest."""
 
     def __init__(self, vehicle: "Vehicle") -> None:
         self.low, self.high = (-1.0,) * vehicle.num_rotors, (1.0,) * vehicle.num_rotors

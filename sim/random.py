@@ -5,7 +5,7 @@ use that is switched on later does not move the numbers of another.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 
@@ -17,33 +17,41 @@ START: Final = 0
 """Child of a world's seed that draws how its episodes begin."""
 
 
-class Draw(Protocol):
-    """Draws numbers for the worlds that begin an episode; for the others it gives zeros."""
+class Draw:
+    """Draws numbers for the worlds that begin an episode; for the others it gives zeros.
+
+    `chosen` has by name what a reset's options give in place of draws, shape (W, A, *size).
+    """
+
+    def __init__(self, chosen: Mapping[str, Any] | None) -> None:
+        self._chosen = chosen or {}
 
     def uniform(
         self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
     ) -> Array:
-        """Uniform numbers, float64, shape (W, A, *size).
+        """Uniform numbers, float64, shape (W, A, *size), with `size` that of one drone.
 
-        Args:
-            low, high: Range; equal ends give that number, and a number is drawn all the same.
-            size: Of one drone.
-            name: Under this name a reset's options may give values in place of the draw.
+        Equal ends give that number, and a number is drawn all the same. Under `name` a reset's
+        options may give values in place of the draw.
         """
+        return self._chosen.get(name, self._draw("uniform", (low, high), size))
 
     def normal(self, scale: float, size: tuple[int, ...] = (), *, name: str = "") -> Array:
         """Normal numbers with mean 0 and that standard deviation, shape (W, A, *size)."""
+        return self._chosen.get(name, self._draw("normal", (0.0, scale), size))
 
     def chosen(self, name: str) -> Array | None:
         """Values that a reset's options give under that name, shape (W, A); None if none."""
+        return self._chosen.get(name)
+
+    def _draw(self, kind: str, parameters: tuple[float, float], size: tuple[int, ...]) -> Array:
+        raise NotImplementedError
 
 
 class Streams:
     """A generator for each of W worlds, seeded by `seed`; unpredictable until it is.
 
-    Args:
-        num_worlds: W.
-        use: Which child of a world's seed.
+    `use` is the number of the child of a world's seed.
     """
 
     def __init__(self, num_worlds: int, use: int = START) -> None:
@@ -65,16 +73,8 @@ class Streams:
         return generator
 
 
-class NumpyDraw:
-    """`Draw` from streams, for some of W worlds of A drones.
-
-    Args:
-        streams: Of all worlds.
-        ids: Worlds that draw.
-        shape: (W, A), or () for a single drone.
-        chosen: Values that a reset's options give in place of draws, by name: shape
-            (W, A, *size).
-    """
+class NumpyDraw(Draw):
+    """Draws from streams, for the worlds `ids` of (W, A), or of () for a single drone."""
 
     def __init__(
         self,
@@ -83,29 +83,13 @@ class NumpyDraw:
         shape: tuple[int, ...],
         chosen: Mapping[str, Any] | None = None,
     ) -> None:
-        self._streams = streams
-        self._ids = ids
-        self._shape = shape
-        self._chosen = chosen or {}
+        super().__init__(chosen)
+        self._streams, self._ids, self._shape = streams, ids, shape
 
-    def uniform(
-        self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
-    ) -> Array:
-        """As `Draw.uniform`."""
-        return self._draw("uniform", (low, high), size, name)
-
-    def normal(self, scale: float, size: tuple[int, ...] = (), *, name: str = "") -> Array:
-        """As `Draw.normal`."""
-        return self._draw("normal", (0.0, scale), size, name)
-
-    def chosen(self, name: str) -> Array | None:
-        """As `Draw.chosen`."""
-        return self._chosen.get(name)
-
-    def _draw(self, kind: str, parameters: Any, size: tuple[int, ...], name: str) -> Array:
+    def _draw(self, kind: str, parameters: tuple[float, float], size: tuple[int, ...]) -> Array:
         numbers = np.zeros((*self._shape, *size))
         one_world = (*self._shape[1:], *size)
         for world in self._ids:
             place = world if self._shape else ...
             numbers[place] = getattr(self._streams.of(world), kind)(*parameters, one_world)
-        return self._chosen.get(name, numbers[()])
+        return numbers[()]

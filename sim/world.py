@@ -18,12 +18,11 @@ Backend = Literal["mujoco", "warp"]
 one."""
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
 
+_WORLDS: Final = {"mujoco": "MujocoWorld", "warp": "WarpWorld"}
 _PACKAGES: Final = {"mujoco": (), "warp": ("torch", "warp", "mujoco_warp")}
 _SETTINGS: Final = {"mujoco": "num_threads", "warp": "device"}
 
-MAX_WORLDS: Final = 1 << 16
-"""Most worlds of a batch."""
-
+MAX_WORLDS: Final = 1 << 16  # Most worlds of a batch
 CONTACT_CHECK: Final = 0.02
 """Longest time between two checks for contact, s. A bounce of the paper's craft at full thrust
 lasts longer, unless its skids dip less than half a millimetre."""
@@ -52,33 +51,20 @@ class World(Protocol):
         """Reset the worlds of the mask, bool, shape (W, A), to their rows of `pose`."""
 
     def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
-        """Fly for so many physics steps with constant thrusts.
+        """Fly the worlds of the mask, None for all, for so many physics steps with these thrusts.
 
-        Args:
-            thrust: N, shape (W, A, R).
-            substeps: Physics steps.
-            mask: Worlds that fly, bool, shape (W, A); the others stay as they are. None: all fly.
-
-        Raises:
-            PhysicsError: A state is bad; reset the worlds that the message names.
+        Thrusts in N, shape (W, A, R). A bad state raises `PhysicsError`, which names the worlds to
+        be reset.
         """
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
-        """Seed the random streams of the worlds of a mask; a seed of None leaves its stream.
-
-        Args:
-            mask: bool, shape (W, A).
-            seeds: Shape (W,).
-        """
+        """Seed the streams of the worlds of a mask, seeds (W,); None leaves its stream."""
 
     def checked(self, actions: Array, width: int, choices: int, flown: Array | None) -> Array:
-        """Actions as this backend's arrays, where those are not NumPy's. Raises `InputError`.
+        """Actions as this backend's arrays, shape (N, k), where those are not NumPy's.
 
-        Args:
-            actions: Of the caller: shape (N, k), or (N,) if they are choices.
-            width: k.
-            choices: 0, or how many.
-            flown: Drones that fly, bool, shape (N,); other actions are ignored. None: all.
+        They are out of so many choices, or numbers where `choices` is 0; those of drones that are
+        not `flown`, bool, shape (N,), are ignored. Raises `InputError`.
         """
 
     def draw(self, mask: Array, chosen: Any = None) -> Draw:
@@ -96,13 +82,7 @@ def contact_check(timestep: float) -> int:
 def make_world(
     vehicle: "Vehicle", num_worlds: int, backend: Backend = "mujoco", **settings: Any
 ) -> World:
-    """Worlds of one drone each.
-
-    Args:
-        vehicle: The vehicle of every world.
-        num_worlds: W.
-        backend: `mujoco` or `warp`.
-        settings: Of that backend: `num_threads`, or `device`.
+    """W worlds of one drone each; the backend's setting is `num_threads`, or `device`.
 
     Raises:
         InputError: The backend, the number or a setting is not what it should be.
@@ -121,5 +101,5 @@ def make_world(
     for package in _PACKAGES[backend]:
         require(package, "gpu", f"the backend {backend}")
     module = import_module(f".backends.{backend}", __package__)
-    world: World = module.make(vehicle, num_worlds, **settings)
+    world: World = getattr(module, _WORLDS[backend])(vehicle, num_worlds, **settings)
     return world

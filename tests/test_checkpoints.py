@@ -25,7 +25,7 @@ from rotorgram.agents import (
     store,
 )
 from rotorgram.agents.checkpoints import software_versions, write_whole
-from rotorgram.agents.learner import Agent
+from rotorgram.agents.learner import Learner
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.models.errors import InputError
 
@@ -45,7 +45,7 @@ def log_of(drones: int, seed: int = 5, **options: Any) -> EpisodeLog:
     return EpisodeLog(gym.make(ENV, **settings) if drones == 1 else env, seed)
 
 
-def checkpoint_of(algorithm: str, log: EpisodeLog, agent: Agent) -> Checkpoint:
+def checkpoint_of(algorithm: str, log: EpisodeLog, agent: Learner) -> Checkpoint:
     return Checkpoint(
         algorithm=algorithm,
         config=vars(preset(algorithm, "tuned", **SMALL[algorithm])),
@@ -58,7 +58,7 @@ def checkpoint_of(algorithm: str, log: EpisodeLog, agent: Agent) -> Checkpoint:
     )
 
 
-def trained(algorithm: str, log: EpisodeLog, updates: int = 10**9) -> Agent:
+def trained(algorithm: str, log: EpisodeLog, updates: int = 10**9) -> Learner:
     agent = make_agent(algorithm, log, preset(algorithm, "tuned", **SMALL[algorithm]), 5)
     calls = iter(range(updates - 1))
     agent.train(log, TOTAL, lambda: next(calls, None) is not None)
@@ -103,7 +103,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Checkpoint:
 
 def test_a_checkpoint_tells_where_it_comes_from(kept: Checkpoint) -> None:
     assert (kept.algorithm, kept.config["gae_lambda"], kept.seed) == ("a2c", 0.98, 5)
-    assert kept.vehicle_hash == kept.spec.vehicle_hash != "0" * 32
+    assert kept.spec.vehicle_hash != "0" * 32
     assert kept.versions == software_versions()
     assert kept.other_versions() == {}
     other = replace(kept, versions={**kept.versions, "torch": "0.1"})

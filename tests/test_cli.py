@@ -431,7 +431,7 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     kept = load(folder / "checkpoint.safetensors")
     assert (kept.algorithm, kept.config["steps_per_update"]) == ("a2c", 100)
     assert kept.options["episode_length"] == 60
-    assert len(kept.vehicle_hash) == 32
+    assert len(kept.spec.vehicle_hash) == 32
     assert json.loads((folder / "config.json").read_text())["seed"] == 0
     assert len(pd.read_csv(folder / "episodes.csv")) >= 20
     status, out, _ = run(capsys, "evaluate", folder / "checkpoint.safetensors", "--episodes", 3)

@@ -10,7 +10,7 @@ import pytest
 from pictures import HEXA, at
 from rotorgram.envs import LocalVectorEnv, SingleEnv
 from rotorgram.models import InputError
-from rotorgram.rendering import Moment, NoOpenGL, painter
+from rotorgram.rendering import Moment, NoOpenGL, live
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.rendering.stage import Stage
 
@@ -101,8 +101,8 @@ def test_a_window_shows_a_moment_once(monkeypatch: pytest.MonkeyPatch) -> None:
         def close(self) -> None:
             drawn.append(None)
 
-    monkeypatch.setattr(painter, "LiveView", View)
-    monkeypatch.setattr(painter, "open_surface", lambda *_: None)
+    monkeypatch.setattr(live, "LiveView", View)
+    monkeypatch.setattr(live, "open_surface", lambda *_: None)
     env = gym.make(ENV_ID, render_mode="human")
     env.reset(seed=0)
     for _ in range(3):

@@ -175,9 +175,9 @@ class Losing(LocalVectorEnv):
     armed = False
 
     def advance(
-        self, actions: Any, resets: Any = None, seeds: Any = None, frozen: Any = None
+        self, actions: Any, resets: Any = None, seeds: Any = None, frozen: Any = None, *rest: Any
     ) -> None:
-        super().advance(actions, resets, seeds, frozen)
+        super().advance(actions, resets, seeds, frozen, *rest)
         self.lost = np.zeros(self.num_envs, bool)
         if self.armed and frozen is not None and resets.any() and frozen[-1]:
             self.armed = False

@@ -29,7 +29,7 @@ for step in range(20):
 end = time.monotonic() + 60
 while not live.wants and time.monotonic() < end:
     time.sleep(0.05)
-assert live.is_running and live.is_watched
+assert live.is_running and live.surface.is_watched()
 handle = surface._handle
 assert abs(stage.data.qpos[2] - 5.95) < 1e-9, stage.data.qpos
 assert handle.cam.lookat[2] == 5.0
@@ -179,7 +179,7 @@ def look(stage, pace, page, live):
     wait_until(lambda: viewer.data.qpos[2] == 5.0)
     time.sleep(0.2)  # a few frames
     assert live.is_running
-    assert not live.is_watched  # no browser has come
+    assert not live.surface.is_watched()  # no browser has come
     try:
         web.WebPage(stage, pace, page.port)
     except ValueError as error:

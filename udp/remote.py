@@ -287,7 +287,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         if "reset_mask" in options and self._flying:
             mask = checked_mask(options["reset_mask"], self.num_envs)
             self.advance(self._nothing, mask, self._seeds(seed), ~mask)
-            return self._observed(), self._info(mask)
+            return self.observations, self._info(mask)
         self._flying = False
         self.connect()
         mask, seeds = checked_mask(options.get("reset_mask"), self.num_envs), self._seeds(seed)
@@ -295,7 +295,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         self.done, self._idle = np.zeros(self.num_envs, bool), ~mask
         self._flying = True
         self._take_states(np.ones(self.num_envs, bool))
-        return self._observed(), self._info(mask)
+        return self.observations, self._info(mask)
 
     def step(self, actions: Any) -> Any:
         """Fly every drone for one control period; what follows an episode, the autoreset says."""

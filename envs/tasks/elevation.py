@@ -13,14 +13,11 @@ from .task import Outcome, Task, TaskOptions, check_choice, check_number, finite
 
 __all__ = ["Elevation", "ElevationOptions"]
 
-ERROR_SCALE: Final = 0.5
-"""|E| at which the reward crosses zero, m."""
+ERROR_SCALE: Final = 0.5  # |E| at which the reward crosses zero, m
 TERMINATION_REWARD: Final = -20.0
 """Added to the reward of the step that terminates an episode (crash, flip-over, out of band)."""
-MAX_TILT_COSINE: Final = 0.5
-"""Cosine of the tilt (60°) past which the craft counts as flipped over."""
-AIR: Final = 0.6
-"""Least room under a craft that starts, m."""
+MAX_TILT_COSINE: Final = 0.5  # Cosine of the tilt (60°) past which the craft counts as flipped over
+AIR: Final = 0.6  # Least room under a craft that starts, m
 FURTHEST: Final = 1e6
 """Highest target and widest flight band, m: far inside what MuJoCo and float32 can hold."""
 
@@ -59,12 +56,9 @@ class ElevationOptions(TaskOptions):
                 f"flight_band: expected more than start_band = {self.start_band:g} m, "
                 f"got {self.flight_band!r}"
             )
-        for name, kind in (
-            ("action_mode", ActionMode),
-            ("action_type", ActionType),
-            ("observation", Observed),
-        ):
-            check_choice(self, name, get_args(kind))
+        check_choice(self, "action_mode", get_args(ActionMode))
+        check_choice(self, "action_type", get_args(ActionType))
+        check_choice(self, "observation", get_args(Observed))
         if self.thrust_scale is not None:
             check_number(self, "thrust_scale", math.ulp(0.0), FURTHEST, "N")
         target: Any = self.target
@@ -220,10 +214,8 @@ class Elevation(Task):
         return float(self.options.flight_band + self.rate_bound * self.options.control_period)
 
     def _observation_spec(self) -> ArraySpec:
-        least, most = (
-            limit[0] / self._hover - 1
-            for limit in (self.vehicle.thrust_low, self.vehicle.thrust_high)
-        )
+        least = self.vehicle.thrust_low[0] / self._hover - 1
+        most = self.vehicle.thrust_high[0] / self._hover - 1
         low = np.array((-self.error_bound, -self.rate_bound, least))
         high = np.array((self.error_bound, self.rate_bound, most))
         size = 3 if self.options.observation == "full" else 1

@@ -13,24 +13,16 @@ from .task import Outcome, Task, TaskOptions, check_number, finite
 
 __all__ = ["Hover", "HoverOptions"]
 
-ERROR_SCALE: Final = 0.5
-"""Distance at which the reward for nearness crosses zero, m."""
-HEADING_WEIGHT: Final = 0.2
-"""Cost of a heading half a turn off."""
-RATE_WEIGHT: Final = 0.02
-"""Cost of a body rate of 1 rad/s."""
-TERMINATION_REWARD: Final = -20.0
-"""Added to the reward of the step that terminates an episode."""
+ERROR_SCALE: Final = 0.5  # Distance at which the reward for nearness crosses zero, m
+HEADING_WEIGHT: Final = 0.2  # Cost of a heading half a turn off
+RATE_WEIGHT: Final = 0.02  # Cost of a body rate of 1 rad/s
+TERMINATION_REWARD: Final = -20.0  # Added to the reward of the step that terminates an episode
 LEAST_TILT_COSINE: Final = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
-AIR: Final = 0.6
-"""Least room under a craft that starts, m."""
-FURTHEST: Final = 1e4
-"""Furthest goal, m."""
-MOST_SPEED: Final = 100.0
-"""Speed past which an observation is clipped, m/s."""
-MOST_RATE: Final = 100.0
-"""Body rate past which an observation is clipped, rad/s."""
+AIR: Final = 0.6  # Least room under a craft that starts, m
+FURTHEST: Final = 1e4  # Furthest goal, m
+MOST_SPEED: Final = 100.0  # Speed past which an observation is clipped, m/s
+MOST_RATE: Final = 100.0  # Body rate past which an observation is clipped, rad/s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,12 +116,13 @@ class Hover(Task):
         ratio = vehicle.thrust_high / vehicle.hover_thrust - 1
         self._hover_thrust = vehicle.hover_thrust
         most = (
-            (2 * options.flight_band,) * 3
-            + (MOST_SPEED,) * 3
-            + (1.001,) * 6
-            + (MOST_RATE,) * 3
-            + tuple(float(r) + 0.001 for r in ratio)
+            *[2 * options.flight_band] * 3,
+            *[MOST_SPEED] * 3,
+            *[1.001] * 6,
+            *[MOST_RATE] * 3,
+            *(ratio + 0.001).tolist(),
         )
+        vectors = ("goal - position", "velocity", "nose", "thrust axis", "body rate")
         self.observation = (
             ArraySpec(
                 name="observation",
@@ -139,11 +132,7 @@ class Hover(Task):
                 unit=("m",) * 3 + ("m/s",) * 3 + ("1",) * 6 + ("rad/s",) * 3 + ("1",) * rotors,
                 frame="world turned by the wanted heading; body rates: body",
                 components=(
-                    *(f"goal - position {axis}" for axis in "xyz"),
-                    *(f"velocity {axis}" for axis in "xyz"),
-                    *(f"nose {axis}" for axis in "xyz"),
-                    *(f"thrust axis {axis}" for axis in "xyz"),
-                    *(f"body rate {axis}" for axis in "xyz"),
+                    *(f"{vector} {axis}" for vector in vectors for axis in "xyz"),
                     *(f"thrust {i + 1} over hover" for i in range(rotors)),
                 ),
             ),

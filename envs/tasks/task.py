@@ -8,6 +8,7 @@ array in place.
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
@@ -24,10 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Outcome", "Task", "TaskOptions", "check_choice", "check_number", "finite"]
 
-LONGEST_CONTROL_PERIOD: Final = 1.0
-"""Longest time between two actions, s."""
-LONGEST_EPISODE: Final = 1 << 31
-"""Most control steps of an episode."""
+LONGEST_CONTROL_PERIOD: Final = 1.0  # Longest time between two actions, s
+LONGEST_EPISODE: Final = 1 << 31  # Most control steps of an episode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +93,7 @@ class Task:
         choices: Names of draws that a reset's options may choose.
 
     Attributes:
-        options: An instance of `Options`.
-        vehicle: The vehicle of every drone.
+        options, vehicle: As given.
         shape: (W, A), or () for a single drone.
         xp: Namespace of the array API standard.
         controller: Turns actions into thrusts; set by `setup`.
@@ -112,10 +110,7 @@ class Task:
     def __init__(
         self, options: Any, vehicle: "Vehicle", shape: tuple[int, ...] = (), xp: Any = np
     ) -> None:
-        self.options = options
-        self.vehicle = vehicle
-        self.shape = shape
-        self.xp = xp
+        self.options, self.vehicle, self.shape, self.xp = options, vehicle, shape, xp
         self.setup()
 
     def setup(self) -> None:
@@ -127,12 +122,10 @@ class Task:
         raise NotImplementedError
 
     def begin(self, mask: Array, draw: Draw) -> Pose:
-        """Begin episodes: draw their numbers, and return the starts of the drones.
+        """Begin episodes: draw their numbers, shape (W, A, ...), and return the drones' starts.
 
-        Args:
-            mask: Worlds that begin one, bool, shape (W, A). The first call has all of them. Keep
-                the values of the others: `self.xp.where(mask, new, self.old)`.
-            draw: Draws numbers of shape (W, A, ...).
+        The mask, bool, shape (W, A), has the worlds that begin one, in the first call all of them.
+        Keep the values of the others: `self.xp.where(mask, new, self.old)`.
         """
         raise NotImplementedError
 
@@ -160,11 +153,9 @@ def finite(value: Any) -> float | None:
     """A finite real number as a float; None for everything else, truth values among them."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
         return None
-    try:
-        number = float(value)
-    except OverflowError:
-        return None
-    return number if math.isfinite(number) else None
+    with suppress(OverflowError):
+        return number if math.isfinite(number := float(value)) else None
+    return None
 
 
 def check_number(options: Any, name: str, low: float, high: float, unit: str = "") -> None:

@@ -5,7 +5,7 @@ of threads.
 """
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -18,14 +18,7 @@ from ..random import Draw, NumpyDraw, Streams
 from ..state import Array, Pose, WorldState
 from ..world import PhysicsError, contact_check
 
-__all__ = ["MujocoWorld", "make"]
-
-
-def make(vehicle: Vehicle, num_worlds: int, *, num_threads: int = 0) -> "MujocoWorld":
-    """Worlds of one drone each. Raises `InputError`."""
-    if type(num_threads) is not int or num_threads < 0:
-        raise InputError(f"num_threads: expected 0 or more, got {num_threads!r}")
-    return MujocoWorld(vehicle, num_worlds, num_threads)
+__all__ = ["MujocoWorld"]
 
 
 class MujocoWorld:
@@ -36,16 +29,14 @@ class MujocoWorld:
     the whole process; a log file of another name stays on.
 
     A single world has no leading axes: NumPy's scalars are ten times faster than its arrays of one.
-
-    Args:
-        vehicle: The vehicle of every world.
-        num_worlds: W.
-        num_threads: Threads that step the worlds; 0 takes one for each processor.
+    So many threads step the worlds; 0 takes one for each processor.
     """
 
     xp: Any = np
 
-    def __init__(self, vehicle: Vehicle, num_worlds: int, num_threads: int = 0) -> None:
+    def __init__(self, vehicle: Vehicle, num_worlds: int, *, num_threads: int = 0) -> None:
+        if type(num_threads) is not int or num_threads < 0:
+            raise InputError(f"num_threads: expected 0 or more, got {num_threads!r}")
         self.vehicle = vehicle
         self.shape: tuple[int, ...] = (num_worlds, 1) if num_worlds > 1 else ()
         self._streams = Streams(num_worlds)
@@ -79,7 +70,7 @@ class MujocoWorld:
     def reset(self, mask: Array, pose: Pose) -> None:
         """As `World.reset`."""
         self._check_process()
-        ids = self._ids(mask)
+        ids = np.flatnonzero(mask)
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         state, here = self.state, () if self.shape == () else ids
         state.position[here] = pose.position[here]
@@ -98,7 +89,7 @@ class MujocoWorld:
     def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
         """As `World.step`."""
         self._check_process()
-        ids = None if mask is None else self._ids(mask)
+        ids = None if mask is None else np.flatnonzero(mask)
         here = ... if ids is None or self.shape == () else ids
         self.state.thrust[here] = thrust[here]
         self._apply_thrust()
@@ -118,12 +109,12 @@ class MujocoWorld:
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """As `World.seed`."""
-        ids = self._ids(mask).tolist()
+        ids = np.flatnonzero(mask).tolist()
         self._streams.seed(ids, [seeds[i] for i in ids])
 
     def draw(self, mask: Array, chosen: Mapping[str, Any] | None = None) -> Draw:
         """As `World.draw`."""
-        return NumpyDraw(self._streams, self._ids(mask).tolist(), self.shape, chosen)
+        return NumpyDraw(self._streams, np.flatnonzero(mask).tolist(), self.shape, chosen)
 
     def close(self) -> None:
         """Nothing to release but memory."""
@@ -132,22 +123,13 @@ class MujocoWorld:
         if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
             raise RuntimeError("the threads of an env do not follow into a fork: make another env")
 
-    def _ids(self, mask: Array) -> np.ndarray:
-        """Numbers of the worlds of a mask of the leading shape, or of shape (W,)."""
-        return np.flatnonzero(mask)
-
     def _apply_thrust(self) -> None:
         if self._newtons is not None:
             np.divide(self._thrust, self._newtons, out=self._ctrl)
 
     def _describe_warnings(self) -> str:
-        # Clear the warnings, so that a reset gives usable worlds again.
         ids = np.flatnonzero(self._warnings.any(axis=1)).tolist()
-        names = ", ".join(_warning_names(self._warnings.sum(axis=0).tolist()))
-        self._warnings.fill(0)
+        kinds = np.flatnonzero(self._warnings.any(axis=0)).tolist()
+        names = ", ".join(mujoco.mjtWarning(kind).name for kind in kinds)
+        self._warnings.fill(0)  # so that a reset gives usable worlds again
         return f"MuJoCo warned of {names} in envs {ids[:5]}: reset the env"
-
-
-def _warning_names(counts: Iterable[int]) -> list[str]:
-    """MuJoCo's names of the warnings whose counts are not 0."""
-    return [mujoco.mjtWarning(i).name for i, count in enumerate(counts) if count]

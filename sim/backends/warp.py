@@ -18,7 +18,7 @@ from ..random import START, Draw
 from ..state import Array, Pose, WorldState, constant
 from ..world import PhysicsError, contact_check
 
-__all__ = ["FURTHEST", "WarpWorld", "make"]
+__all__ = ["FURTHEST", "WarpWorld"]
 
 wp: Any = warp  # its types have gaps
 mjw: Any = mujoco_warp
@@ -27,45 +27,22 @@ FURTHEST: Final = 100.0
 """Largest coordinate of a start, m. float32 rounds 100 m to 8 µm; much further out a slow craft
 stands still, because what it flies in one physics step is rounded off."""
 
-CONTACTS_PER_GEOM: Final = 4
-"""Most contacts of a geom with the ground: so many have memory."""
-
-
-def make(vehicle: Vehicle, num_worlds: int, *, device: str | None = None) -> "WarpWorld":
-    """Worlds of one drone each.
-
-    Args:
-        vehicle: The vehicle of every world.
-        num_worlds: W.
-        device: `cpu`, `cuda`, `cuda:1`...; None takes a CUDA device if there is one.
-
-    Raises:
-        InputError: There is no such device.
-    """
-    return WarpWorld(vehicle, num_worlds, device)
+CONTACTS_PER_GEOM: Final = 4  # Most contacts of a geom with the ground: so many have memory
 
 
 class WarpWorld:
     """W worlds of one drone over ground of its own: `World`, in float32 on one device.
 
-    Physics steps are CUDA graphs, launched on torch's current stream. Contact is looked for as
-    often as in the backend `mujoco`; a craft touches where there are constraints for a contact.
-
-    Args:
-        vehicle: The vehicle of every world.
-        num_worlds: W.
-        device: As of `make`.
-
-    Attributes:
-        device: The `torch.device` of all tensors.
-        qpos, qvel, ctrl: Live views of simulator memory, float32, shapes (W, 7), (W, 6), (W, R).
+    `device` is `cpu`, `cuda`, `cuda:1`...; None takes a CUDA device if there is one. Physics steps
+    are CUDA graphs, launched on torch's current stream. Contact is looked for as often as in the
+    backend `mujoco`; a craft touches where there are constraints for a contact. `qpos`, `qvel` and
+    `ctrl` are live views of simulator memory, float32, shapes (W, 7), (W, 6), (W, R).
     """
 
     xp: Any = torch_api
 
-    def __init__(self, vehicle: Vehicle, num_worlds: int, device: str | None = None) -> None:
-        self.vehicle = vehicle
-        self.shape = (num_worlds, 1)
+    def __init__(self, vehicle: Vehicle, num_worlds: int, *, device: str | None = None) -> None:
+        self.vehicle, self.shape = vehicle, (num_worlds, 1)
         self.device, self._name = _device(device)
         self._check = contact_check(vehicle.timestep)
         self._generator = torch.Generator(self.device)
@@ -136,7 +113,10 @@ class WarpWorld:
         self._apply_thrust()
         touching = torch.zeros_like(state.touching)
         while substeps > 0:
-            self._launch(self._graph(min(substeps, self._check)))
+            steps = min(substeps, self._check)
+            if steps not in self._steps:
+                self._steps[steps] = self._captured(mjw.step, steps)
+            self._launch(self._steps[steps])
             touching = touching | self._contact()
             substeps -= self._check
         for array, values in before:
@@ -203,11 +183,6 @@ class WarpWorld:
     def _contact(self) -> torch.Tensor:
         return (self._rows > self._rows_in_air)[:, None]
 
-    def _graph(self, steps: int) -> Any:
-        if steps not in self._steps:
-            self._steps[steps] = self._captured(mjw.step, steps)
-        return self._steps[steps]
-
     def _captured(self, function: Any, times: int) -> Any:
         """A CUDA graph that calls a function of model and data; on the CPU, the call itself."""
         with wp.ScopedDevice(self._name), wp.ScopedCapture() as capture:
@@ -222,38 +197,25 @@ class WarpWorld:
         wp.capture_launch(graph, stream=stream)
 
 
-class TorchDraw:
-    """`Draw` from one generator for all worlds, so that the host need not know which draw."""
+class TorchDraw(Draw):
+    """Float32, from one generator for all worlds, so that the host need not know which draw."""
 
     def __init__(
         self, generator: torch.Generator, mask: torch.Tensor, chosen: Mapping[str, Array]
     ) -> None:
-        self._generator = generator
-        self._mask = mask
-        self._chosen = chosen
+        super().__init__(chosen)
+        self._generator, self._mask = generator, mask
 
-    def uniform(
-        self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
-    ) -> Array:
-        """As `Draw.uniform`, float32."""
-        return self._drawn(low + (high - low) * self._random(torch.rand, size), name)
-
-    def normal(self, scale: float, size: tuple[int, ...] = (), *, name: str = "") -> Array:
-        """As `Draw.normal`, float32."""
-        return self._drawn(scale * self._random(torch.randn, size), name)
-
-    def chosen(self, name: str) -> Array | None:
-        """As `Draw.chosen`."""
-        return self._chosen.get(name)
-
-    def _random(self, kind: Any, size: tuple[int, ...]) -> torch.Tensor:
+    def _draw(self, kind: str, parameters: tuple[float, float], size: tuple[int, ...]) -> Array:
+        first, second = parameters
         shape, device = (*self._mask.shape, *size), self._mask.device
-        numbers: torch.Tensor = kind(shape, generator=self._generator, device=device)
-        return numbers
-
-    def _drawn(self, numbers: torch.Tensor, name: str) -> Array:
-        mask = self._mask.reshape(*self._mask.shape, *[1] * (numbers.ndim - 2))
-        return self._chosen.get(name, torch.where(mask, numbers, 0.0))
+        if kind == "uniform":
+            numbers = torch.rand(shape, generator=self._generator, device=device)
+            numbers = first + (second - first) * numbers
+        else:
+            numbers = second * torch.randn(shape, generator=self._generator, device=device)
+        mask = self._mask.reshape(*self._mask.shape, *[1] * len(size))
+        return torch.where(mask, numbers, 0.0)
 
 
 def _device(name: str | None) -> tuple[torch.device, str]:

@@ -1,6 +1,6 @@
 """Accuracy and cost of integrators and physics steps.
 
-`python -m rotorgram.models.checks.accuracy FILE.csv` writes the table that `docs/physics.md` shows.
+`python benchmarks/accuracy.py FILE.csv` writes the table that `docs/physics.md` shows.
 
 Two flights of the paper's vehicle. Tumbling: 5 s that begin with a spin about no axis of symmetry,
 with four thrusts that change every 20 ms; compared with RK4 at 0.25 ms. Drop: 1.5 s that begin at
@@ -19,10 +19,7 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-
-from ..vehicle import Vehicle
-
-__all__ = ["INTEGRATORS", "STEPS", "Accuracy", "accuracy", "markdown", "read", "write"]
+from rotorgram.models import Vehicle
 
 INTEGRATORS: Final = {
     "RK4": mujoco.mjtIntegrator.mjINT_RK4,
