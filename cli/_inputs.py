@@ -7,8 +7,6 @@ from pathlib import Path
 from ..models.errors import InputError
 from ._flags import Command
 
-__all__ = ["check_count", "folder_to_write", "parse_address", "refuse_settings"]
-
 
 def parse_address(text: str) -> tuple[str, int]:
     """HOST:PORT as a pair. Raises `InputError`."""
@@ -41,12 +39,8 @@ def folder_to_write(out: Path | None, name: str) -> Iterator[Path]:
 
 
 def refuse_settings(command: Command, folder: Path, *, free: tuple[str, ...]) -> None:
-    """Raises `InputError` if a setting was given, if only its default: a resumed run keeps its own.
-
-    Args:
-        command: The command that resumes.
-        folder: Of the run.
-        free: Names of the fields that may be set.
+    """Raises `InputError` if a setting but the free ones was given, if only its default: the run in
+    the folder that the command resumes keeps its own.
     """
     if changed := sorted(name for name in command.given if name not in free):
         flags = ", ".join("--" + name.replace("_", "-") for name in changed)

@@ -15,20 +15,7 @@ from ._flags import EnvFlags, PresetName
 from ._inputs import folder_to_write
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
-    from ..experiments.metrics import Headline
     from ..experiments.progress import OnProgress
-    from ..experiments.settings import SweepConfig
-
-__all__ = [
-    "RESUMED",
-    "RunsFlags",
-    "command_line",
-    "report_comparison",
-    "report_sweep",
-    "runs_folder",
-]
 
 _WORKERS: Final = ("jobs", "backend", "address")
 _SETTINGS: Final = ("preset", "seeds", "first_seed", "env_steps", "num_envs", "episodes", "env_id",
@@ -78,19 +65,13 @@ def command_line() -> str:
 
 @contextmanager
 def runs_folder(name: str, command: RunsFlags) -> "Iterator[tuple[Path, OnProgress]]":
-    """The folder to write to, and what shows the progress. If the runs fail, it says how to resume.
-
-    Args:
-        name: The command and its positional arguments.
-        command: Says where, and which workers run.
+    """The folder to write to, and what shows the progress. If the runs fail, it says how to resume:
+    `name` is the command with its positional arguments.
     """
     from ._progress import bars
 
-    with (
-        nullcontext(command.resume)
-        if command.resume
-        else folder_to_write(command.out, name.replace(" ", "-"))
-    ) as folder:
+    new = folder_to_write(command.out, name.replace(" ", "-"))
+    with nullcontext(command.resume) if command.resume else new as folder:
         try:
             with bars() as progress:
                 yield folder, progress
@@ -108,40 +89,31 @@ def report_comparison(folder: Path, *, film: bool = True) -> None:
     """Write figures, film and report from the folder's files, and print the table."""
     from rich.console import Console
 
+    from ..experiments.filming import film_comparison
     from ..experiments.report import VIDEO_FILE, table_of, terminal_table, write_report
     from ..experiments.results import read_results
+    from ..models.errors import InputError
+    from ._progress import frame_bar
 
     results = read_results(folder)
     page = write_report(folder, results)
     Console(width=100).print(terminal_table(table_of(results), results.headline))
     # Only now: if the film fails, there is a report.
-    if film and not (folder / VIDEO_FILE).exists() and _film(folder):
-        write_report(folder, results)
+    if film and not (folder / VIDEO_FILE).exists():
+        try:
+            with frame_bar(VIDEO_FILE) as on_frame:
+                if film_comparison(folder, folder / VIDEO_FILE, on_frame):
+                    write_report(folder, results)
+        except (OSError, InputError, ImportError) as error:
+            logging.getLogger(__name__).info("no film of the agents: %s", error)
     print(f"report: {page}")
-
-
-def _film(folder: Path) -> bool:
-    """Whether there is a film of the agents for the report."""
-    from ..experiments.filming import film_comparison
-    from ..experiments.report import VIDEO_FILE
-    from ..models.errors import InputError
-    from ._progress import bars
-
-    try:
-        with bars() as progress:
-
-            def on_frame(done: int, total: int) -> None:
-                progress(VIDEO_FILE, done, total, "done" if done == total else "film of the agents")
-
-            return film_comparison(folder, folder / VIDEO_FILE, on_frame)
-    except (OSError, InputError, ImportError) as error:
-        logging.getLogger(__name__).info("no film of the agents: %s", error)
-        return False
 
 
 def report_sweep(folder: Path) -> None:
     """Write `sweep.csv` from the folder's files, and print it."""
+    from rich import box
     from rich.console import Console
+    from rich.table import Table
 
     from ..experiments.metrics import Headline
     from ..experiments.results import read_config, read_spec
@@ -150,19 +122,10 @@ def report_sweep(folder: Path) -> None:
     config = read_sweep_config(folder)
     headline = Headline.of(read_spec(folder, read_config(folder)))
     results = write_sweep_table(config, folder)
-    Console(width=100).print(_sweep_table(results, config, headline))
-    print(f"{results['seeds'].sum()} of {len(config.runs())} runs done")
-    print(f"table: {folder / SWEEP_FILE}")
-
-
-def _sweep_table(results: Any, config: "SweepConfig", headline: "Headline") -> "Table":
-    from rich import box
-    from rich.table import Table
-
+    steady = headline.labelled(f"Steady {headline.size_symbol},\nworst")
     table = Table(box=box.SIMPLE_HEAD)
     for name in config.grid:
         table.add_column(name.replace("_", "\n"), overflow="fold")
-    steady = headline.labelled(f"Steady {headline.size_symbol},\nworst")
     for heading in (
         steady, "median", "Return,\nmedian", "Settled", "Crashed", "Seeds", "Training\n(s)",
         "Env\nsteps/s",
@@ -180,4 +143,6 @@ def _sweep_table(results: Any, config: "SweepConfig", headline: "Headline") -> "
             f"{row['seconds']:.1f}",
             f"{row['steps_per_second']:,.0f}",
         )
-    return table
+    Console(width=100).print(table)
+    print(f"{results['seeds'].sum()} of {len(config.runs())} runs done")
+    print(f"table: {folder / SWEEP_FILE}")

@@ -16,8 +16,6 @@ from ..rendering.stage import Stage, World
 from ..udp.protocol.messages import Command, Message, State
 from ..udp.transport.simulator import Observer, Simulator
 
-__all__ = ["Realtime", "Watcher", "watched"]
-
 _log = logging.getLogger(__name__)
 
 

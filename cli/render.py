@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from tyro.conf import Positional
 
@@ -67,21 +67,12 @@ class Render(EnvFlags):
         from ..experiments.filming import Film, film
         from ..rendering.film import check_film
         from ..rendering.gl import offscreen_context
-        from ._progress import bars
+        from ._progress import frame_bar
 
         width, height = parse_size(self.size)
-        config = Film(
-            width=width,
-            height=height,
-            camera=self.camera,
-            fps=self.fps,
-            speed=self.speed,
-            world=self.world,
-            vehicle=self.vehicle,
-            overlay=self.overlay,
-            at=self.at,
-            fast=self.fast,
-        )
+        alike = ("camera", "fps", "speed", "world", "vehicle", "overlay", "at", "fast")
+        settings: dict[str, Any] = {name: getattr(self, name) for name in alike}
+        config = Film(width=width, height=height, **settings)
         check_film(self.out, width, height, self.fps)
         if self.at is not None and self.out.suffix.lower() != ".png":
             raise InputError(f"at: expected it with a picture, --out NAME.png, got {self.out}")
@@ -90,11 +81,7 @@ class Render(EnvFlags):
         longest = max(shot.trajectories[0].seconds for shot in shots)
         if self.at is not None and self.at > longest:
             raise InputError(f"at: expected 0 to {longest:g} s, the flight's end, got {self.at:g}")
-        with bars() as progress:
-
-            def on_frame(done: int, total: int) -> None:
-                progress(self.out.name, done, total, "done" if done == total else "frames")
-
+        with frame_bar(self.out.name) as on_frame:
             frames = film(self.out, shots, config, on_frame)
         pictures = "1 picture" if frames == 1 else f"{frames} pictures"
         print(f"film: {self.out} ({pictures} of {width}x{height})")

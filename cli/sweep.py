@@ -37,9 +37,9 @@ class Sweep(RunsFlags):
 
     def run(self) -> int:
         """Sweep, and print the table."""
-        from ..experiments.errors import RunsFailed
         from ..experiments.settings import SweepConfig
         from ..experiments.sweep import sweep
+        from ..experiments.workers import RunsFailed
 
         if self.resume:
             config = self._resumed(self.resume)

@@ -1,5 +1,6 @@
 """`rotorgram train`: one run with a progress bar, checkpoints, and Ctrl-C that loses nothing."""
 
+import json
 import math
 import shlex
 import signal
@@ -27,7 +28,6 @@ _FREE: Final = ("resume", "listen", "num_simulators", "key_file", "insecure", "r
                 "store_every", "env", "vehicle")  # fmt: skip
 """Flags that a resumed training may be given."""
 _UPDATE_WITHIN: Final = 2.0  # s
-_SHOW_EVERY: Final = 0.2  # s
 _LEAST_STEPS: Final = 16  # of each drone for an update of A2C
 _LEAST_UPDATES: Final = 30  # of VPG
 
@@ -73,6 +73,7 @@ class Train(AgentFlags):
 
     def _begin(self) -> int:
         from ..agents import preset
+        from ..agents.checkpoints import software_versions, write_whole
         from ..experiments.folders import locked
         from ..experiments.settings import Run
         from ..experiments.training import Training
@@ -100,8 +101,11 @@ class Train(AgentFlags):
             locked(folder),
         ):  # fmt: skip
             spec = env.env_spec  # of the simulator that came
-            training = Training(replace(run, env_id=spec.env_id, options=spec.options), env)
-            _write_config(training, folder)
+            run = replace(run, env_id=spec.env_id, options=spec.options)
+            training = Training(run, env)
+            about = {"vehicle_hash": spec.vehicle_hash, "versions": software_versions()}
+            content = json.dumps({**asdict(run), **about}, indent=2) + "\n"
+            write_whole(folder / "config.json", content.encode())
             return self._train(training, folder)
 
     def _resume(self, folder: Path) -> int:
@@ -134,22 +138,23 @@ class Train(AgentFlags):
 
     def _train(self, training: "Training", folder: Path) -> int:
         from ._env import CHECKPOINT
+        from ._progress import bars
 
         before = training.log.env_steps
         go_on = f"go on with: {self._resuming(folder)}"
         keeper = _Keeper(training, folder, self.store_every)
         try:
-            with _stop_at_update() as stop, _showing(training) as show:
+            with _stop_at_update() as stop_is_asked, bars() as progress:
 
                 def on_update() -> bool:
-                    show()
-                    stopping = stop.reached()
+                    stopping = stop_is_asked()
                     keeper.keep(now=stopping)
                     return not stopping
 
-                finished = training.train(on_update)
+                name = f"{training.run.algorithm} seed {training.run.seed}"
+                finished = training.train(on_update, lambda *now: progress(name, *now))
                 if finished:
-                    stop.reached()
+                    stop_is_asked()
                     keeper.keep(now=True, last=True)
         except BaseException:  # a full disk and SIGTERM too
             with suppress(OSError):
@@ -259,74 +264,37 @@ class _Keeper:
         write_whole(self._folder / EPISODES, table.to_csv(index=False).encode())
 
 
-def _write_config(training: "Training", folder: Path) -> None:
-    import json
-
-    from ..agents.checkpoints import software_versions, write_whole
-
-    content = {
-        **asdict(training.run),
-        "vehicle_hash": training.log.spec.vehicle_hash,
-        "versions": software_versions(),
-    }
-    write_whole(folder / "config.json", (json.dumps(content, indent=2) + "\n").encode())
-
-
 @contextmanager
-def _showing(training: "Training") -> Iterator[Callable[[], None]]:
-    """A function that shows the progress, unless it was shown a moment ago."""
-    from ._progress import bars
+def _stop_at_update() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and termination ask to stop at an update: a function that tells there whether to.
 
-    name = f"{training.run.algorithm} seed {training.run.seed}"
-    due = 0.0
-    with bars() as progress:
-
-        def show() -> None:
-            nonlocal due
-            if time.monotonic() >= due:
-                state = training.progress()
-                progress(name, state.env_steps, state.total, state.words())
-                due = time.monotonic() + _SHOW_EVERY
-
-        yield show
-        due = 0.0
-        show()
-
-
-@contextmanager
-def _stop_at_update() -> "Iterator[_Stop]":
-    """Ctrl-C and termination ask to stop at the next update.
-
-    If none comes soon, since no simulator answers for example, or if asked again, it stops at once.
+    If no update comes soon, since no simulator answers for example, or if asked again, it stops at
+    once.
     """
-    stop = _Stop()
-    handlers = {signal.SIGINT: stop.ask, signal.SIGTERM: stop.ask}
-    if hasattr(signal, "setitimer"):
-        handlers[signal.SIGALRM] = stop.ask
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    asked, timers = False, hasattr(signal, "setitimer")
+
+    def set_timer(seconds: float) -> None:
+        if timers:
+            signal.setitimer(signal.ITIMER_REAL, seconds)
+
+    def ask(*_: object) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        print("stopping at the next update; Ctrl-C again stops now", flush=True)
+        set_timer(_UPDATE_WITHIN)
+
+    def reached() -> bool:
+        if asked:  # there is time to write now
+            set_timer(0)
+        return asked
+
+    numbers = [signal.SIGINT, signal.SIGTERM, *([signal.SIGALRM] if timers else [])]
+    before = {number: signal.signal(number, ask) for number in numbers}
     try:
-        yield stop
+        yield reached
     finally:
-        if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, 0)
+        set_timer(0)
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-class _Stop:
-    def __init__(self) -> None:
-        self.asked = False
-
-    def reached(self) -> bool:
-        """Whether to stop at this update. There is time to write then."""
-        if self.asked and hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, 0)
-        return self.asked
-
-    def ask(self, *_: object) -> None:
-        if self.asked:
-            raise KeyboardInterrupt
-        self.asked = True
-        print("stopping at the next update; Ctrl-C again stops now", flush=True)
-        if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, _UPDATE_WITHIN)

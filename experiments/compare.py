@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,17 +15,17 @@ from ..agents.pid import PID
 from ..agents.policies import NetworkPolicy
 from ..envs.loop import Loop
 from ..envs.registry import env_spec, options_type
-from ..envs.spec import EnvSpec, canonical_id
+from ..envs.spec import canonical_id
 from ..models.errors import InputError
 from ..models.vehicle import Vehicle
 from .bounds import elevation_bounds
-from .errors import ResultsError
 from .folders import locked
 from .metrics import Headline
 from .pairs import shared_pair
-from .progress import OnProgress, ProgressSender
+from .progress import OnProgress, Tell
 from .results import (
     CONFIG_FILE,
+    ResultsError,
     RunResults,
     episode_row,
     evaluation_row,
@@ -46,6 +46,7 @@ PARTS: Final = "parts"
 """Folder with the parts of an unfinished comparison, one for each run."""
 MAX_BATCH: Final = 64
 """Most evaluation episodes that are flown at a time."""
+_SETTINGS: Final = ("snapshots", "curve_episodes", "episodes")
 
 
 def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnProgress) -> None:
@@ -53,8 +54,7 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
 
     Each run leaves a part behind when it is done, so that a comparison that was interrupted, or of
     which a run failed, goes on where it was: call it again with the same folder (and the config of
-    `read_compare_config`). Figures, table and verdicts are drawn from the joined parts: see
-    `report.write_report`.
+    `read_compare_config`). `report.write_report` draws figures, table and verdicts.
 
     Args:
         config: Settings of the comparison.
@@ -72,22 +72,27 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
     parts = folder / PARTS
     with open_workers(config, on_progress) as workers, locked(folder):
         parts.mkdir(exist_ok=True)
-        _write_config(config, spec, folder, command)
+        if not (folder / CONFIG_FILE).exists():
+            content = config.content(*config.agents)
+            content["evaluation"] = {name: getattr(config, name) for name in _SETTINGS}
+            content["bounds"] = _bounds(config)
+            write_config(folder, command, spec, config.vehicle, content)
         for unfinished in parts.glob(".*"):
             shutil.rmtree(unfinished)
-        runs: list[Run | None] = [*config.runs(), *([None] if _can_fly(spec) else [])]
-        jobs = {_name(run): run for run in runs if not (parts / _part(run)).exists()}
+        runs: list[Run | None] = [*config.runs()]
+        with suppress(InputError):
+            PID(spec)  # if it can fly this env; it needs no training and has no seeds
+            runs.append(None)
+        jobs = {
+            f"{run.algorithm} seed {run.seed}" if run else "pid": run
+            for run in runs
+            if not (parts / _part(run)).exists()
+        }
         workers.fly_all(partial(_fly, config), jobs, partial(_keep, folder), config)
         join_parts(parts, folder, headline.name)
 
 
-def _name(run: Run | None) -> str:
-    """Name of a run; None: the PID, which needs no training and has no seeds."""
-    return f"{run.algorithm} seed {run.seed}" if run else "pid"
-
-
 def _part(run: Run | None) -> str:
-    """Name of its part."""
     return f"{run.algorithm}-seed{run.seed}" if run else "pid-seed0"
 
 
@@ -96,17 +101,17 @@ def _keep(folder: Path, run: Run | None, done: tuple[RunResults, Checkpoint | No
     results, checkpoint = done
     if checkpoint:
         store(checkpoint, folder / "checkpoints" / f"{_part(run)}.safetensors")
-    results.write(folder / PARTS)
+    results.write(folder / PARTS / _part(run))
 
 
 def _fly(
-    config: CompareConfig, run: Run | None, progress: ProgressSender
+    config: CompareConfig, run: Run | None, tell: Tell
 ) -> tuple[RunResults, Checkpoint | None]:
     """Train and evaluate (in a worker process)."""
     if run is None:
         return _evaluate("pid", 0, config), None
     with shared_pair(**run.env, num_envs=run.num_envs) as env:
-        training, row = train_run(run, env, progress, config.snapshots, keep_steps=True)
+        training, row = train_run(run, env, tell, config.snapshots, keep_steps=True)
         checkpoint, log = training.checkpoint(), training.log
     results = _evaluate(run.algorithm, run.seed, config, training.taken)
     steps = log.steps()
@@ -141,7 +146,7 @@ def _evaluate(
         snapshots: Sequence[Snapshot | None] = taken or [None]
         for snapshot in snapshots:
             policy = NetworkPolicy(snapshot.actor, spec) if snapshot else PID(spec)
-            if snapshot is None or snapshot is taken[-1]:
+            if snapshot is snapshots[-1]:
                 flown = fly_episodes(env, policy, config.episodes, "final")
             else:
                 flown = fly_episodes(env, policy, config.curve_episodes, "curve")
@@ -161,25 +166,14 @@ def _evaluate(
     )
 
 
-def _can_fly(spec: EnvSpec) -> bool:
-    """Whether the PID can fly the env."""
-    try:
-        PID(spec)
-    except InputError:
-        return False
-    return True
-
-
 def _bounds(config: CompareConfig) -> dict[str, float]:
     """Mean returns over the final evaluation's episodes, of the flights of `bounds`."""
     if canonical_id(config.env_id) != "rotorgram/Elevation-v0":
         return {}
     options: Any = options_type(config.env_id).from_options(config.options)
     loop = Loop(config.env_id, config.episodes, vehicle=config.vehicle, options=config.options)
-    everyone = np.ones(config.episodes, bool)
-    actions = np.zeros((config.episodes, 1), np.float32)
     seeds = [evaluation_seed(episode, "final") for episode in range(config.episodes)]
-    loop.advance(actions, everyone, seeds)
+    loop.advance(np.zeros((config.episodes, 1), np.float32), np.ones(config.episodes, bool), seeds)
     starts = np.array(loop.telemetry["metrics"][:, 0])
     loop.close()
     vehicle = Vehicle.load(config.vehicle, linear_drag=options.linear_drag)
@@ -194,12 +188,3 @@ def read_compare_config(folder: Path) -> CompareConfig:
         return CompareConfig(agents=tuple(content["agents"]), **common, **content["evaluation"])
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ResultsError(f"{folder / CONFIG_FILE}: expected a comparison's: {error!r}") from None
-
-
-def _write_config(config: CompareConfig, spec: EnvSpec, folder: Path, command: str) -> None:
-    if (folder / CONFIG_FILE).exists():
-        return
-    names = ("snapshots", "curve_episodes", "episodes")
-    content = config.content(*config.agents)
-    content["evaluation"] = {name: getattr(config, name) for name in names}
-    write_config(folder, command, spec, config.vehicle, {**content, "bounds": _bounds(config)})

@@ -171,7 +171,7 @@ def _flown_values(axis: Axes, flown: Flown | None, agent: str, headline: Headlin
     shown, total = flown
     for time, value in shown:
         axis.plot(time, value, color=agent_color(agent), lw=0.8, alpha=0.45)
-    if (held := headline.metric.held) is not None:
+    if (held := headline.held) is not None:
         low = axis.get_ylim()[1] if headline.high else -held if headline.signed else 0.0
         axis.axhspan(low, held, color="#333333", alpha=0.12, lw=0)
     count = f"{len(shown)} of {total}" if len(shown) < total else total
@@ -197,7 +197,7 @@ def _draw_learning_curve(evaluations: pd.DataFrame, curves: Curves, headline: He
             axis.axhline(level, color=agent_color(agent), ls="--", label=label)
         else:
             _plot(axis, curves.learning[agent], agent, marker="o")
-    if (held := headline.metric.held) is not None:
+    if (held := headline.held) is not None:
         label = headline.amount(f"{held:g}")
         axis.axhline(held, color="#333333", lw=0.9, ls=":", label=label)
     if not headline.high:

@@ -7,17 +7,18 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, get_args
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 import numpy as np
 
 from ..models.errors import require
 from .claims import MIN_SEEDS, OURS, Outcome, Verdict
-from .curves import AVERAGING_SHARE, Curves, Fan
+from .curves import AVERAGING_SHARE, Curves
 from .metrics import Headline, Spread
 from .palette import agent_color, agent_label, sort_agents
 from .results import Results
-from .tables import NOTHING, count_text, headings, number_text, result_rows, table_note
+from .tables import count_text, headings, number_text, result_rows, table_note
 
 if TYPE_CHECKING:
     import jinja2
@@ -27,7 +28,7 @@ else:
     jinja2 = require("jinja2", "report", "writing the report's page")
     from markupsafe import Markup
 
-__all__ = ["MAX_POINTS", "Chart", "FolderFile", "chart_data", "make_charts", "render_page"]
+__all__ = ["MAX_POINTS", "Chart", "chart_data", "make_charts", "render_page"]
 
 PAPER: Final = "https://doi.org/10.3390/drones7040225"
 
@@ -52,39 +53,30 @@ _ASSETS: Final = {
 }
 
 
-class FolderFile(NamedTuple):
-    """A file of the comparison's folder: its name and its contents."""
-
-    name: str
-    text: str
-
-
 def render_page(
     results: Results,
     table: "pd.DataFrame",
     verdicts: Sequence[Verdict],
     curves: Curves,
     video: bytes | None = None,
-    poster: bytes | None = None,
-    files: Sequence[FolderFile] = (),
+    files: Sequence[tuple[str, str]] = (),
 ) -> str:
     """Make the page.
 
     Args:
         results, table, verdicts, curves: As `report.write_report` makes them.
         video: An MP4 of the agents side by side, shown where there is one.
-        poster: A JPEG of it, shown before it is played.
-        files: Files beside the page.
+        files: Names and contents of the files beside the page.
     """
     config, headline = results.config, results.headline
     agents = sort_agents(table.index[table["seeds"] > 0])
     bounds = [name for name in table.index if name not in agents]
     charts = make_charts(curves, headline)
+    trained = sort_agents(config["agents"])
     return _template().render(
         **{name: _asset(path) for name, path in _ASSETS.items()},
         paper=PAPER,
         config=config,
-        env_id=results.spec.env_id,
         outcome=_outcome(table.loc[agents], verdicts, config["env_steps"], headline),
         extent=_extent(results),
         colors=[agent_color(agent) for agent in agents],
@@ -100,10 +92,8 @@ def render_page(
             "charts": chart_data(charts, agents),
         },
         video=base64.b64encode(video).decode("ascii") if video else None,
-        poster=base64.b64encode(poster).decode("ascii") if poster else None,
-        hyperparameters=_hyperparameters(config["agents"]),
-        settings=_settings(config),
-        surroundings=_surroundings(config),
+        trained=trained,
+        hyperparameters=dict.fromkeys(chain(*(config["agents"][agent] for agent in trained))),
         files=files,
     )
 
@@ -113,6 +103,7 @@ def _template() -> "jinja2.Template":
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     # NaN has no place in JSON: better an error here than a page without charts.
+    environment.filters |= {"written": _written, "label": agent_label}
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     return environment.from_string(_read("report.html"))
 
@@ -155,12 +146,8 @@ def _outcome(
 
 
 def _ends(table: "pd.DataFrame", headline: Headline) -> str:
-    return _listed(
-        [
-            f"{headline.amount(number_text(value))} ({agent_label(str(name))})"
-            for name, value in table["steady"].items()
-        ]
-    )
+    ends = table["steady"].map(number_text).map(headline.amount).items()
+    return _listed([f"{amount} ({agent_label(str(name))})" for name, amount in ends])
 
 
 def _listed(words: Sequence[str]) -> str:
@@ -187,47 +174,6 @@ def _schedule(agents: Mapping[str, Mapping[str, Any]]) -> str:
         f"Here the learning rate of {' and '.join(annealed)} falls to 0 over the run, which fixes "
         "roughly when a curve settles and damps its late fluctuation; the paper's rate is constant."
     )
-
-
-def _hyperparameters(
-    agents: Mapping[str, Mapping[str, Any]],
-) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    """The names of the agents, and for each hyperparameter its name and its value per agent."""
-    shown = sort_agents(agents)
-    names = list(dict.fromkeys(name for agent in shown for name in agents[agent]))
-    rows = [
-        (name, [_written(agents[agent][name]) if name in agents[agent] else NOTHING
-                for agent in shown])
-        for name in names
-    ]  # fmt: skip
-    return [agent_label(agent) for agent in shown], rows
-
-
-def _settings(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Settings without the hyperparameters: titled lists of names and values."""
-    general = {name: config[name] for name in ("preset", "seeds", "env_steps", "num_envs")
-               if name in config}  # fmt: skip
-    spec = config["spec"]
-    task = {"env": spec["env_id"], **spec["options"], "control_period": spec["control_period"]}
-    return [
-        ("Comparison", _pairs(general | config.get("evaluation", {}))),
-        ("Task", _pairs(task)),
-    ]
-
-
-def _surroundings(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Machine and software: titled lists of names and values."""
-    spec = config["spec"]
-    vehicle = {"name": spec.get("vehicle", ""), "hash": spec.get("vehicle_hash", "")}
-    return [
-        ("Versions", _pairs(config["versions"])),
-        ("Machine", _pairs(config["machine"])),
-        ("Vehicle", _pairs({**vehicle, "file": config["vehicle"] or "the paper's"})),
-    ]
-
-
-def _pairs(values: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [(name, _written(value)) for name, value in values.items()]
 
 
 def _written(value: Any) -> str:
@@ -259,7 +205,8 @@ class Chart:
 
 def make_charts(curves: Curves, headline: Headline) -> list[Chart]:
     """Make the charts in the order in which the page shows them; those without data too."""
-    size, held, log = headline.size_symbol, headline.metric.held, not headline.high
+    size, held, log = headline.size_symbol, headline.held, not headline.high
+    fans = curves.training_values.items()
     dotted = "" if held is None else f"Dotted: {headline.amount(f'{held:g}')}. "
     return [
         Chart(
@@ -303,7 +250,7 @@ def make_charts(curves: Curves, headline: Headline) -> list[Chart]:
             + ("" if headline.high else " Dotted: the target."),
             x_label="env steps",
             y_label=headline.labelled(headline.symbol),
-            spreads={name: _of_fan(fan) for name, fan in curves.training_values.items()},
+            spreads={a: Spread(fan.x, fan.middle, fan.lower, fan.upper) for a, fan in fans},
             mark=None if headline.high else 0.0,
         ),
         Chart(
@@ -326,16 +273,10 @@ def make_charts(curves: Curves, headline: Headline) -> list[Chart]:
     ]
 
 
-def _of_fan(fan: Fan) -> Spread:
-    return Spread(fan.x, fan.middle, fan.lower, fan.upper)
-
-
 def chart_data(charts: Sequence[Chart], agents: Sequence[str]) -> list[dict[str, Any]]:
     """Give the charts as what JSON can hold: rounded, thinned, missing values as None.
 
-    Args:
-        charts: As of `make_charts`.
-        agents: Every agent that may be in them; a series names its agent by the place in here.
+    A series names its agent by the place in `agents`.
     """
     return [
         {
@@ -344,21 +285,18 @@ def chart_data(charts: Sequence[Chart], agents: Sequence[str]) -> list[dict[str,
             "y": chart.y_label,
             "log": chart.log,
             "mark": chart.mark,
-            "series": _all_series(chart, agents),
+            "series": [
+                {"agent": agents.index(agent)}
+                | (
+                    {"level": _rounded(chart.levels[agent], _Y_DIGITS)}
+                    if agent in chart.levels
+                    else _series(chart.spreads[agent], chart.log)
+                )
+                for agent in sort_agents((*chart.spreads, *chart.levels))
+            ],
         }
         for chart in charts
     ]
-
-
-def _all_series(chart: Chart, agents: Sequence[str]) -> list[dict[str, Any]]:
-    series: list[dict[str, Any]] = []
-    for agent in sort_agents((*chart.spreads, *chart.levels)):
-        place = {"agent": agents.index(agent)}
-        if agent in chart.levels:
-            series.append(place | {"level": _rounded(chart.levels[agent], _Y_DIGITS)})
-        else:
-            series.append(place | _series(chart.spreads[agent], chart.log))
-    return series
 
 
 def _series(spread: Spread, log: bool) -> dict[str, list[float | None]]:

@@ -14,7 +14,7 @@ from .claims import Verdict, judge_claims, judge_no_worse
 from .curves import make_curves
 from .figures import FIGURE_FILES, draw_figures
 from .metrics import results_table
-from .page import FolderFile, render_page
+from .page import render_page
 from .results import (
     CONFIG_FILE,
     EPISODES_FILE,
@@ -29,8 +29,7 @@ from .tables import markdown_table, terminal_table
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["CLAIMS_FILE", "POSTER_FILE", "REPORT_FILE", "RESULTS_CSV", "RESULTS_MARKDOWN",
-           "VIDEO_FILE", "table_of", "terminal_table", "write_report"]  # fmt: skip
+__all__ = ["VIDEO_FILE", "table_of", "terminal_table", "write_report"]
 
 REPORT_FILE: Final = "report.html"
 RESULTS_CSV: Final = "results.csv"
@@ -38,10 +37,6 @@ RESULTS_MARKDOWN: Final = "results.md"
 CLAIMS_FILE: Final = "claims.json"
 VIDEO_FILE: Final = "video.mp4"
 """The agents side by side; the page has it in itself where it lies in the folder."""
-POSTER_FILE: Final = "video.jpg"
-"""Picture that the page shows before the film is played."""
-PAPERS_TASK: Final = "rotorgram/Elevation-v0"
-"""The paper's claims are about this task."""
 
 _FILES: Final = (
     (CONFIG_FILE, "every setting, the seeds, the versions and the machine"),
@@ -55,7 +50,6 @@ _FILES: Final = (
     (CLAIMS_FILE, "the verdicts with their definitions and evidence"),
     *((f"figures/{name}", "a figure, as a picture") for name in FIGURE_FILES),
     (VIDEO_FILE, "the agents side by side"),
-    (POSTER_FILE, "a picture of the film"),
 )
 
 
@@ -65,13 +59,13 @@ def table_of(results: Results) -> "pd.DataFrame":
     return results_table(results.evaluations, results.runs, results.headline, bounds)
 
 
-def verdicts_of(results: Results) -> list[Verdict]:
+def _verdicts(results: Results) -> list[Verdict]:
     """The paper's claims, for the paper's task; and whether our A2C is no worse than SB3's."""
     preset, headline = results.config["preset"], results.headline
     verdicts = []
-    if canonical_id(results.spec.env_id) == PAPERS_TASK:
+    if canonical_id(results.spec.env_id) == "rotorgram/Elevation-v0":  # of which the paper is
         verdicts = judge_claims(results.episodes, results.evaluations, preset, headline)
-    if headline.metric.held is not None:
+    if headline.held is not None:
         trained = set(results.runs["agent"])
         verdicts.append(judge_no_worse(results.evaluations, trained, preset, headline))
     return verdicts
@@ -88,7 +82,7 @@ def write_report(folder: Path | str, results: Results | None = None) -> Path:
     """
     folder = Path(folder)
     results = results or read_results(folder)
-    table, verdicts = table_of(results), verdicts_of(results)
+    table, verdicts = table_of(results), _verdicts(results)
     curves = make_curves(folder, results)
     draw_figures(folder, results, curves)
     table.to_csv(folder / RESULTS_CSV)
@@ -97,12 +91,14 @@ def write_report(folder: Path | str, results: Results | None = None) -> Path:
     )
     claims = json.dumps([asdict(verdict) for verdict in verdicts], indent=2, ensure_ascii=False)
     (folder / CLAIMS_FILE).write_text(claims + "\n", encoding="utf-8")
-    video, poster = (
-        path.read_bytes() if (path := folder / name).is_file() else None
-        for name in (VIDEO_FILE, POSTER_FILE)
+    video, report = folder / VIDEO_FILE, folder / REPORT_FILE
+    page = render_page(
+        results,
+        table,
+        verdicts,
+        curves,
+        video.read_bytes() if video.is_file() else None,
+        [(name, text) for name, text in _FILES if (folder / name).exists()],
     )
-    files = [FolderFile(name, text) for name, text in _FILES if (folder / name).exists()]
-    page = render_page(results, table, verdicts, curves, video, poster, files)
-    report = folder / REPORT_FILE
     report.write_text(page, encoding="utf-8")
     return report

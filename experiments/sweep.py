@@ -21,12 +21,19 @@ from ..agents.policies import NetworkPolicy
 from ..envs.registry import env_spec
 from ..models.errors import require
 from .compare import evaluation_pair
-from .errors import ResultsError
 from .folders import locked
 from .metrics import Headline, final_per_run
 from .pairs import shared_pair
-from .progress import OnProgress, ProgressSender
-from .results import CONFIG_FILE, RUNS_FILE, evaluation_row, read_config, read_spec, write_config
+from .progress import OnProgress, Tell
+from .results import (
+    CONFIG_FILE,
+    RUNS_FILE,
+    ResultsError,
+    evaluation_row,
+    read_config,
+    read_spec,
+    write_config,
+)
 from .settings import SweepConfig, SweepRun
 from .training import train_run
 from .trajectories import fly_episodes
@@ -89,33 +96,28 @@ def missing_runs(config: SweepConfig, rows: pd.DataFrame) -> list[SweepRun]:
     return [job for job in config.runs() if (job.point, job.run.seed) not in done]
 
 
-def _fly(config: SweepConfig, job: SweepRun, progress: ProgressSender) -> dict[str, Any]:
+def _fly(config: SweepConfig, job: SweepRun, tell: Tell) -> dict[str, Any]:
     """Train and evaluate (in a worker process); the row of the run."""
     run = job.run
     with shared_pair(**run.env, num_envs=run.num_envs) as env:
-        training, times = train_run(run, env, progress)
+        training, times = train_run(run, env, tell)
     policy = NetworkPolicy(training.agent.actor(), training.log.spec)
     with evaluation_pair(config, config.episodes) as env:
         trajectories = fly_episodes(env, policy, config.episodes, "tuning")
     headline = Headline.of(training.log.spec)
-    name = {"agent": run.algorithm, "seed": run.seed, "env_steps": times["env_steps"]}
-    episodes = [{**name, **evaluation_row(one, headline)} for one in trajectories]
-    (row,) = final_per_run(pd.DataFrame(episodes), headline).to_dict("records")
+    frame = pd.DataFrame([evaluation_row(one, headline) for one in trajectories])
+    frame = frame.assign(agent=run.algorithm, seed=run.seed, env_steps=times["env_steps"])
+    (row,) = final_per_run(frame, headline).to_dict("records")
     whole = {"point": job.point, **row, **times}
     return {column: whole[column] for column in RUN_COLUMNS}
 
 
 def sweep_table(config: SweepConfig, rows: pd.DataFrame, headline: Headline) -> pd.DataFrame:
-    """One row for each point of which a run is done, the best first.
+    """One row for each point of which a run is done, the best first: measures over its seeds.
 
     A point is as good as its worst seed: first by the crashed episodes of the seed that crashed
     most, then by the worst steady state. Points that lack a seed stand last, for the worst of fewer
     seeds flatters.
-
-    Returns:
-        `point` and its settings; `seeds` that are done; `worst` and `median` steady state over
-        seeds; medians over seeds of `return`, `seconds` and `steps_per_second`; sums over seeds of
-        `episodes`, `settled` and `crashed`, and `most_crashed` of one seed.
     """
     table = rows.groupby("point").agg(
         seeds=("seed", "size"),
@@ -141,7 +143,7 @@ def write_sweep_table(config: SweepConfig, folder: Path) -> pd.DataFrame:
 
 
 def read_sweep_runs(folder: Path, config: SweepConfig) -> pd.DataFrame:
-    """The runs that are done, columns `RUN_COLUMNS`; none where there is no file.
+    """The runs that are done, if any, columns `RUN_COLUMNS`.
 
     Raises:
         ResultsError: The file is not one of this sweep.
