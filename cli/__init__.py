@@ -108,14 +108,10 @@ def _run(words: list[str]) -> int:
     from ._flags import parse
 
     with hidden_gl_setting():  # importing OpenGL takes time, also for a command that draws nothing
+        kind: type[Command] = getattr(import_module(f".{_module(name)}", __name__), COMMANDS[name])
         with _wide_enough():
-            command = parse(_class_of(name), f"rotorgram {name}", words[1:])
+            command = parse(kind, f"rotorgram {name}", words[1:])
         return command.run()
-
-
-def _class_of(name: str) -> "type[Command]":
-    kind: type[Command] = getattr(import_module(f".{_module(name)}", __name__), COMMANDS[name])
-    return kind
 
 
 def _module(command: str) -> str:
@@ -138,15 +134,13 @@ def _wide_enough() -> Iterator[None]:
     from shutil import get_terminal_size
 
     before = os.environ.get("COLUMNS")
-    if get_terminal_size().columns < 40:
-        os.environ["COLUMNS"] = "40"
+    os.environ["COLUMNS"] = str(max(40, get_terminal_size().columns))
     try:
         yield
     finally:
+        del os.environ["COLUMNS"]
         if before is not None:
             os.environ["COLUMNS"] = before
-        else:
-            os.environ.pop("COLUMNS", None)
 
 
 def _prepare_streams() -> None:

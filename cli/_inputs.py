@@ -1,8 +1,10 @@
 """Checks of flags: addresses, counts, folders, and the settings that a resumed run keeps."""
 
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from ..models.errors import InputError
 from ._flags import Command
@@ -45,3 +47,13 @@ def refuse_settings(command: Command, folder: Path, *, free: tuple[str, ...]) ->
     if changed := sorted(name for name in command.given if name not in free):
         flags = ", ".join("--" + name.replace("_", "-") for name in changed)
         raise InputError(f"resume: expected the settings of {folder}, got others by {flags}")
+
+
+def go_on_with(command: Command, words: str, folder: Path, *flags: str) -> str:
+    """The line that tells how to resume: of the flags those that were given."""
+    line: list[Any] = ["rotorgram", *words.split(), "--resume", folder]
+    for flag in flags:
+        if flag in command.given:
+            value = getattr(command, flag)
+            line += [f"--{flag.replace('_', '-')}", *([] if value is True else [value])]
+    return f"go on with: {shlex.join(map(str, line))}"

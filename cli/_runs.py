@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from tyro.conf import arg
 
 from ._flags import EnvFlags, PresetName
-from ._inputs import folder_to_write
+from ._inputs import folder_to_write, go_on_with
 
 if TYPE_CHECKING:
     from ..experiments.progress import OnProgress
@@ -77,11 +77,7 @@ def runs_folder(name: str, command: RunsFlags) -> "Iterator[tuple[Path, OnProgre
                 yield folder, progress
         except BaseException:
             if any(folder.iterdir()):
-                words = ["rotorgram", *name.split(), "--resume", str(folder)]
-                for flag in ("env", "backend", "address"):
-                    if flag in command.given:
-                        words += [f"--{flag}", getattr(command, flag)]
-                print(f"go on with: {shlex.join(words)}")
+                print(go_on_with(command, name, folder, "env", "backend", "address"))
             raise
 
 

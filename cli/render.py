@@ -151,13 +151,11 @@ def _told_apart(names: Sequence[str], what: Sequence[str]) -> list[str]:
 
 def _colors(agents: Sequence[str]) -> list[str]:
     """Each agent's own; where that is taken, one that is free."""
-    from ..experiments.palette import agent_color
+    from ..experiments.palette import DARK_COLORS, agent_color
 
     colors: list[str] = []
-    spare = [agent_color(name, dark=True) for name in ("vpg", "a2c", "sb3-a2c", "pid")]
-    spare += ["#E29AC3", "#F0B840", "#7CC8F2", "#C9938A"]
     for agent in agents:
         own = agent_color(agent, dark=True)
-        free = [color for color in spare if color not in colors]
+        free = [color for color in DARK_COLORS.values() if color not in colors]
         colors.append(own if own not in colors or not free else free[-1])
     return colors

@@ -2,7 +2,6 @@
 
 import json
 import math
-import shlex
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -13,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..models.errors import InputError
+from ..models.errors import InputError, require
 from ._flags import AgentFlags, AlgorithmName, PresetName, parse_value
-from ._inputs import folder_to_write, refuse_settings
+from ._inputs import folder_to_write, go_on_with, refuse_settings
 
 if TYPE_CHECKING:
     from ..experiments.settings import Run
@@ -63,8 +62,6 @@ class Train(AgentFlags):
 
     def run(self) -> int:
         """Train by these settings, or by those of the folder to resume."""
-        from ..models.errors import require
-
         require("torch", "train", "training")
         require("tensorboard", "train", "training")
         if not (math.isfinite(self.store_every) and self.store_every > 0):
@@ -125,9 +122,8 @@ class Train(AgentFlags):
             if "env" in self.given and self.env_id != kept.env_id:
                 raise InputError(f"resume: expected --env {kept.env_id}, got {self.env}")
             if is_finished(kept):
-                print(
-                    f"already trained {kept.position.env_steps:,} of {kept.env_steps:,} env steps"
-                )
+                flown = kept.position.env_steps
+                print(f"already trained {flown:,} of {kept.env_steps:,} env steps")
                 print(f"checkpoint: {folder / CHECKPOINT}")
                 return 0
             for name, (then, now) in kept.other_versions().items():
@@ -141,7 +137,8 @@ class Train(AgentFlags):
         from ._progress import bars
 
         before = training.log.env_steps
-        go_on = f"go on with: {self._resuming(folder)}"
+        flags = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
+        go_on = go_on_with(self, f"train {self.algorithm}", folder, *flags)
         keeper = _Keeper(training, folder, self.store_every)
         try:
             with _stop_at_update() as stop_is_asked, bars() as progress:
@@ -170,15 +167,6 @@ class Train(AgentFlags):
             print(f"{training.log.env_steps / training.log.seconds:,.0f} env steps per second")
         print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)
         return 0 if finished else 128 + signal.SIGINT
-
-    def _resuming(self, folder: Path) -> str:
-        """The command that goes on."""
-        words: list[Any] = ["rotorgram", "train", self.algorithm, "--resume", folder]
-        for flag in ("env", "vehicle", "listen", "num_simulators", "key_file"):
-            if flag in self.given:
-                words += [f"--{flag.replace('_', '-')}", getattr(self, flag)]
-        words += ["--insecure"] if self.insecure else []
-        return shlex.join(map(str, words))
 
 
 def _change(word: str) -> tuple[str, Any]:
@@ -227,13 +215,10 @@ class _Keeper:
     def __init__(self, training: "Training", folder: Path, every: float) -> None:
         from ._scalars import ScalarWriter
 
-        self._training = training
-        self._folder = folder
-        self._every = every
+        self._training, self._folder, self._every = training, folder, every
         self._due = 0.0
-        self._scalars = ScalarWriter(
-            folder / "tensorboard", training.run.env_steps, behind=training.log.env_steps
-        )
+        total, behind = training.run.env_steps, training.log.env_steps
+        self._scalars = ScalarWriter(folder / "tensorboard", total, behind=behind)
 
     def keep(self, *, now: bool, last: bool = False) -> None:
         from ._env import CHECKPOINT
@@ -259,8 +244,8 @@ class _Keeper:
         from ..agents.checkpoints import write_whole
         from ..agents.episodes import Episode
 
-        rows = [asdict(episode) for episode in self._training.log.episodes]
-        table = pd.DataFrame(rows, columns=[f.name for f in fields(Episode)])
+        columns = [field.name for field in fields(Episode)]
+        table = pd.DataFrame(map(asdict, self._training.log.episodes), columns=columns)
         write_whole(self._folder / EPISODES, table.to_csv(index=False).encode())
 
 

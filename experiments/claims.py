@@ -15,12 +15,12 @@ on the good side of it.
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
-from ..models.errors import require
 from .metrics import (
     Headline,
     bootstrap_difference,
@@ -30,11 +30,6 @@ from .metrics import (
     iqm,
     training_runs,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = require("pandas", "train", "comparing agents")
 
 __all__ = ["MIN_SEEDS", "OURS", "Verdict", "convergence_step", "fluctuation", "judge_claims",
            "judge_no_worse", "long_run_return"]  # fmt: skip

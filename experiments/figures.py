@@ -4,28 +4,22 @@ What the lines and bands are is told where they are made, in `curves`. Drawn wit
 object interface, so that no display or global state is involved.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from ..models.errors import require
+import pandas as pd
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import EngFormatter
+
 from .curves import Curves, Fan, Flown, make_curves
 from .metrics import Headline, Spread, episode_ends, training_runs
 from .palette import agent_color, agent_label, sort_agents
 from .results import Results, read_results
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = require("pandas", "train", "comparing agents")
-require("matplotlib", "report", "drawing figures")
-
-from matplotlib import rc_context  # noqa: E402
-from matplotlib.axes import Axes  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
-from matplotlib.lines import Line2D  # noqa: E402
-from matplotlib.patches import Patch  # noqa: E402
-from matplotlib.ticker import EngFormatter  # noqa: E402
 
 __all__ = ["FIGURE_FILES", "draw_figures"]
 
@@ -62,29 +56,26 @@ _TIGHT: Final[dict[str, Any]] = {
 def draw_figures(
     folder: Path | str, results: Results | None = None, curves: Curves | None = None
 ) -> list[Path]:
-    """Draw all figures of a comparison into `figures/` inside its folder.
+    """Draw all figures of a comparison into `figures/` inside its folder, in the order of
+    `FIGURE_FILES`. Results and curves that are not given are made from the folder.
 
     Agents or runs that are missing are left out of the figures; a panel with nothing in it says so.
-
-    Results and curves that are not given are made from the folder. Returns the PNG files, in the
-    order of `FIGURE_FILES`.
     """
     results = results or read_results(folder)
     drawn = curves or make_curves(folder, results)
     headline = results.headline
     target = Path(folder) / "figures"
     target.mkdir(exist_ok=True)
-    draw: tuple[Callable[[], Figure], ...] = (
-        lambda: _draw_reward(results.episodes, drawn),
-        lambda: _draw_cumulative(drawn),
-        lambda: _draw_error(sort_agents(results.evaluations["agent"]), drawn, headline),
-        lambda: _draw_learning_curve(results.evaluations, drawn, headline),
-    )
-    paths = []
+    paths = [target / name for name in FIGURE_FILES]
     with rc_context(_STYLE):
-        for name, make in zip(FIGURE_FILES, draw, strict=True):
-            make().savefig(target / name, format="png")
-            paths.append(target / name)
+        figures = (
+            _draw_reward(results.episodes, drawn),
+            _draw_cumulative(drawn),
+            _draw_error(sort_agents(results.evaluations["agent"]), drawn, headline),
+            _draw_learning_curve(results.evaluations, drawn, headline),
+        )
+        for path, figure in zip(paths, figures, strict=True):
+            figure.savefig(path)
     return paths
 
 
@@ -99,7 +90,7 @@ def _draw_reward(episodes: pd.DataFrame, curves: Curves) -> Figure:
         spread = curves.average_return[agent]
         _scatter_episodes(axis, pd.concat(runs), agent)
         _plot(axis, spread, agent, label="average reward")
-        axis.set_title(f"{agent_label(agent)} ({_seeds(len(runs))})")
+        axis.set_title(f"{agent_label(agent)} ({len(runs)} seed{'s' * (len(runs) != 1)})")
         _legend_above(axis)
         if everything is not None:
             _plot(everything, spread, agent)
@@ -144,7 +135,12 @@ def _draw_error(agents: Sequence[str], curves: Curves, headline: Headline) -> Fi
         _flown_values(below, curves.flown.get(agent), agent, headline)
         above.set_title(agent_label(agent))
         below.set_xlabel("time in the episode (s)")
-    _explain_quantiles(figure, headline)
+    handles = [  # in grey, once for all agents' colours
+        Patch(color="#444444", alpha=_OUTER, lw=0, label="5–95 %"),
+        Patch(color="#444444", alpha=_INNER, lw=0, label="25–75 %"),
+        Line2D([], [], color="#444444", lw=1.2, label=f"median of {headline.symbol} in training"),
+    ]
+    figure.legend(handles=handles, loc="outside upper right", ncols=3, fontsize=8.5)
     axes[0, 0].set_ylabel(f"training: {headline.labelled(headline.symbol)}")
     axes[1, 0].set_ylabel(f"final evaluation: {headline.labelled(headline.symbol)}")
     return figure
@@ -176,16 +172,6 @@ def _flown_values(axis: Axes, flown: Flown | None, agent: str, headline: Headlin
         axis.axhspan(low, held, color="#333333", alpha=0.12, lw=0)
     count = f"{len(shown)} of {total}" if len(shown) < total else total
     axis.set_title(f"{count} trajectories", fontsize=8.5, color="#444444")
-
-
-def _explain_quantiles(figure: Figure, headline: Headline) -> None:
-    """Explain the bands in grey, once for all agents' colours."""
-    handles = [
-        Patch(color="#444444", alpha=_OUTER, lw=0, label="5–95 %"),
-        Patch(color="#444444", alpha=_INNER, lw=0, label="25–75 %"),
-        Line2D([], [], color="#444444", lw=1.2, label=f"median of {headline.symbol} in training"),
-    ]
-    figure.legend(handles=handles, loc="outside upper right", ncols=3, fontsize=8.5)
 
 
 def _draw_learning_curve(evaluations: pd.DataFrame, curves: Curves, headline: Headline) -> Figure:
@@ -269,7 +255,3 @@ def _say(axis: Axes, words: str) -> None:
     axis.tick_params(left=False, bottom=False, labelleft=False, labelbottom=False)
     axis.grid(False)
     axis.text(0.5, 0.5, words, transform=axis.transAxes, ha="center", color="#777777")
-
-
-def _seeds(count: int) -> str:
-    return f"{count} seed{'s' * (count != 1)}"

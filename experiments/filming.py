@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -104,7 +104,7 @@ class Film:
     """As of `write_film`."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.speed) and 0.001 <= self.speed <= 1000):
+        if not 0.001 <= self.speed <= 1000:
             raise InputError(f"speed: expected 0.001 to 1000, got {self.speed:g}")
         if self.at is not None and not (math.isfinite(self.at) and self.at >= 0):
             raise InputError(f"at: expected a time of 0 s or more, got {self.at:g}")
@@ -113,7 +113,7 @@ class Film:
 def film(
     path: Path, shots: Sequence[Shot], config: Film, on_frame: OnFrame = lambda *_: None
 ) -> int:
-    """Film trajectories side by side.
+    """Film trajectories side by side; the number of frames written.
 
     Args:
         path: As of `write_film`. A `.png` is the picture at `config.at`, or the last.
@@ -121,9 +121,6 @@ def film(
             trajectory of it has ended; one that ended before stays on its last picture.
         config: Settings.
         on_frame: Told how far it is.
-
-    Returns:
-        Frames written.
 
     Raises:
         NoOpenGL: No OpenGL works here.
@@ -168,18 +165,17 @@ def grid(count: int, width: int, height: int) -> tuple[int, int]:
     high, and few places empty.
     """
 
-    def badness(columns: int) -> float:
-        rows = -(-count // columns)
+    def badness(shape: tuple[int, int]) -> float:
+        columns, rows = shape
         aspect = (width / columns) / (height / rows)
         return abs(math.log(aspect / _ASPECT)) + (columns * rows - count) / count
 
-    columns = min(range(1, count + 1), key=badness)
-    return columns, -(-count // columns)
+    return min(((columns, -(-count // columns)) for columns in range(1, count + 1)), key=badness)
 
 
 def _frames(
     shots: Sequence[Shot], config: Film, times: Sequence[tuple[int, float]], on_frame: OnFrame
-) -> Iterator[np.ndarray]:
+) -> Generator[np.ndarray, None, None]:
     """Frames of uint8, shape (height, width, 3). One canvas of a pane's size serves every pane."""
     columns, rows = grid(len(shots), config.width, config.height)
     width = (config.width - _SPACE * (columns - 1)) // columns
@@ -268,8 +264,7 @@ def film_comparison(
 
     Of an agent's seeds the middle one flies, by the steady state in the final evaluation (of an
     even number the better of the two in the middle). Of the episodes of that evaluation they fly
-    the one that starts furthest from its goal. It is filmed without shadows: a few seconds where
-    software draws.
+    the one that starts furthest from its goal.
 
     Args:
         folder: Where `rotorgram compare` wrote.

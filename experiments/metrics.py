@@ -13,19 +13,15 @@ settled and how many crashed; a run with a crash in its evaluation does not hold
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
 from ..envs.spec import EnvSpec, Metric
-from ..models.errors import InputError, require
+from ..models.errors import InputError
 from .palette import sort_agents
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = require("pandas", "train", "comparing agents")
 
 __all__ = [
     "Curve", "Headline", "Spread", "average_return", "bootstrap_difference", "bootstrap_interval",
@@ -193,15 +189,12 @@ def bootstrap_interval(values: Values) -> tuple[float, float]:
 
 
 def bootstrap_difference(first: Values, second: Values) -> tuple[float, float, float]:
-    """Difference between two interquartile means over seeds, with its 95 % bootstrap interval.
+    """iqm(first) - iqm(second) over seeds, and the ends of its 95 % bootstrap interval, nan where
+    either side has fewer than two values.
 
     The runs of the two agents are resampled independently, although runs of one seed share their
     starting states, and VPG's and A2C's also the actor's first weights and the stream of noise. As
     far as this makes the runs of a seed alike, the interval is wider than it need be.
-
-    Returns:
-        (iqm(first) - iqm(second), low, high); the ends are nan where either side has fewer than
-        two values.
     """
     one, other = _finite(first), _finite(second)
     difference = iqm(one) - iqm(other)
@@ -228,14 +221,8 @@ def episode_ends(episodes: pd.DataFrame) -> Floats:
 
 
 def average_return(run: pd.DataFrame, share: float) -> Curve:
-    """Running mean of one run's return, over the episodes that ended in the last `share` of it.
-
-    Args:
-        run: The training episodes of one run, in order.
-        share: Of the run's env steps, 0 to 1.
-
-    Returns:
-        A point at the end of every episode; that episode is always in its mean.
+    """Running mean of one run's return, over the episodes that ended in the last `share` of it: a
+    point at the end of every episode, which is always in its mean.
     """
     ends = episode_ends(run)
     total = np.concatenate([[0.0], np.cumsum(run["return"].to_numpy())])
@@ -332,8 +319,7 @@ def results_table(
         `_high` of its 95 % interval. `held`: seeds that hold the goal; `worst`: the worst seed's
         steady state. Counts: seeds, episodes, settled, crashed. For agents that were trained:
         env_steps_to_reach and seconds_to_reach (interquartile mean over the `reached` of `seeds`
-        seeds that hold the goal for good) and steps_per_second; nan for the others. A bound has
-        a return and nothing else; its counts are 0.
+        seeds that hold the goal for good) and steps_per_second. A bound has a return alone.
     """
     final = final_per_run(evaluations, headline)
     rows: dict[str, dict[str, float]] = {}

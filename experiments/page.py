@@ -5,14 +5,15 @@ import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from importlib import resources
 from itertools import chain
-from typing import TYPE_CHECKING, Any, Final, get_args
+from typing import Any, Final, NamedTuple, get_args
 
+import jinja2
 import numpy as np
+import pandas as pd
+from markupsafe import Markup
 
-from ..models.errors import require
 from .claims import MIN_SEEDS, OURS, Outcome, Verdict
 from .curves import AVERAGING_SHARE, Curves
 from .metrics import Headline, Spread
@@ -20,29 +21,13 @@ from .palette import agent_color, agent_label, sort_agents
 from .results import Results
 from .tables import count_text, headings, number_text, result_rows, table_note
 
-if TYPE_CHECKING:
-    import jinja2
-    import pandas as pd
-    from markupsafe import Markup
-else:
-    jinja2 = require("jinja2", "report", "writing the report's page")
-    from markupsafe import Markup
-
 __all__ = ["MAX_POINTS", "Chart", "chart_data", "make_charts", "render_page"]
-
-PAPER: Final = "https://doi.org/10.3390/drones7040225"
 
 MAX_POINTS: Final = 500
 """Points of a series above which it is thinned."""
 
 _X_DIGITS: Final = 7
 _Y_DIGITS: Final = 4
-
-_SEEDS: Final = (
-    "Lines: interquartile mean over seeds. Bands: quartiles over seeds, or the whole range below "
-    "four seeds."
-)
-
 
 _ASSETS: Final = {
     "style": "report.css",
@@ -55,7 +40,7 @@ _ASSETS: Final = {
 
 def render_page(
     results: Results,
-    table: "pd.DataFrame",
+    table: pd.DataFrame,
     verdicts: Sequence[Verdict],
     curves: Curves,
     video: bytes | None = None,
@@ -75,18 +60,22 @@ def render_page(
     trained = sort_agents(config["agents"])
     return _template().render(
         **{name: _asset(path) for name, path in _ASSETS.items()},
-        paper=PAPER,
         config=config,
+        headline=headline,
         outcome=_outcome(table.loc[agents], verdicts, config["env_steps"], headline),
-        extent=_extent(results),
         colors=[agent_color(agent) for agent in agents],
         dark_colors=[agent_color(agent, dark=True) for agent in agents],
         headings=headings(headline),
         rows=result_rows(table.loc[[*agents, *bounds]]),
         note=table_note(headline),
         verdicts=verdicts,
-        schedule=_schedule(config["agents"]),
+        annealed=[
+            agent_label(name)
+            for name in ("vpg", "a2c")
+            if config["agents"].get(name, {}).get("anneal")
+        ],
         charts=charts,
+        averaging_share=AVERAGING_SHARE,
         data={
             "agents": [agent_label(agent) for agent in agents],
             "charts": chart_data(charts, agents),
@@ -98,7 +87,7 @@ def render_page(
     )
 
 
-def _template() -> "jinja2.Template":
+def _template() -> jinja2.Template:
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -112,13 +101,13 @@ def _read(path: str) -> str:
     return resources.files(__package__).joinpath(path).read_text(encoding="utf-8")
 
 
-def _asset(path: str) -> "Markup":
+def _asset(path: str) -> Markup:
     """Ours or uPlot's, and so not to be escaped."""
     return Markup(_read(f"assets/{path}"))
 
 
 def _outcome(
-    table: "pd.DataFrame", verdicts: Sequence[Verdict], env_steps: int, headline: Headline
+    table: pd.DataFrame, verdicts: Sequence[Verdict], env_steps: int, headline: Headline
 ) -> str:
     """The result in one sentence."""
     seen = table[table["steady"].notna()]
@@ -145,35 +134,13 @@ def _outcome(
     return text[0].upper() + text[1:]
 
 
-def _ends(table: "pd.DataFrame", headline: Headline) -> str:
+def _ends(table: pd.DataFrame, headline: Headline) -> str:
     ends = table["steady"].map(number_text).map(headline.amount).items()
     return _listed([f"{amount} ({agent_label(str(name))})" for name, amount in ends])
 
 
 def _listed(words: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
-
-
-def _extent(results: Results) -> str:
-    config, period = results.config, results.spec.control_period
-    seeds = config["seeds"]
-    text = (
-        f"{len(seeds)} seed{'s' * (len(seeds) != 1)}, {count_text(config['env_steps'])} env steps"
-    )
-    if length := results.spec.options.get("episode_length"):
-        text += f" per run, episodes of {length * period:g} s at {period:g} s per step"
-    return text
-
-
-def _schedule(agents: Mapping[str, Mapping[str, Any]]) -> str:
-    """Effect of an annealed learning rate on the claims; "" if the judged agents have none."""
-    annealed = [agent_label(name) for name in ("vpg", "a2c") if agents.get(name, {}).get("anneal")]
-    if not annealed:
-        return ""
-    return (
-        f"Here the learning rate of {' and '.join(annealed)} falls to 0 over the run, which fixes "
-        "roughly when a curve settles and damps its late fluctuation; the paper's rate is constant."
-    )
 
 
 def _written(value: Any) -> str:
@@ -183,19 +150,16 @@ def _written(value: Any) -> str:
 # ---- charts
 
 
-@dataclass(frozen=True, kw_only=True)
-class Chart:
-    """One chart: its description and its series."""
+class Chart(NamedTuple):
+    """One chart; the page has its title and caption."""
 
     key: str
     """Names it in the page."""
-    title: str
-    caption: str
     x_label: str
     y_label: str
     spreads: Mapping[str, Spread]
     """By agent; never without a point."""
-    levels: Mapping[str, float] = field(default_factory=dict)
+    levels: Mapping[str, float] = {}
     """By agent; drawn as a dashed line."""
     log: bool = False
     """Whether y is drawn on a logarithmic scale."""
@@ -206,70 +170,20 @@ class Chart:
 def make_charts(curves: Curves, headline: Headline) -> list[Chart]:
     """Make the charts in the order in which the page shows them; those without data too."""
     size, held, log = headline.size_symbol, headline.held, not headline.high
-    fans = curves.training_values.items()
-    dotted = "" if held is None else f"Dotted: {headline.amount(f'{held:g}')}. "
+    steps, steady = "env steps", headline.labelled(f"steady-state {size}")
+    training = {
+        agent: Spread(fan.x, fan.middle, fan.lower, fan.upper)
+        for agent, fan in curves.training_values.items()
+    }
+    value, target = headline.labelled(headline.symbol), None if headline.high else 0.0
+    total = "cumulative reward"
     return [
-        Chart(
-            key="learning",
-            title=f"{size} at the end of an episode over training",
-            caption=f"Steady-state {size} of deterministic evaluations of snapshots taken during "
-            f"training. Dashed: agents that are not trained. {dotted}{_SEEDS}",
-            x_label="env steps",
-            y_label=headline.labelled(f"steady-state {size}"),
-            spreads=curves.learning,
-            levels=curves.levels,
-            log=log,
-            mark=held,
-        ),
-        Chart(
-            key="flown",
-            title=f"{size} during an episode",
-            caption=f"{size} over the time in an episode of the final evaluation. Lines: "
-            "interquartile mean over the episodes of all seeds. Bands: their quartiles. An episode "
-            "that crashed counts as long as it lasted.",
-            x_label="time (s)",
-            y_label=headline.labelled(size),
-            spreads=curves.flown_sizes,
-            log=log,
-            mark=held,
-        ),
-        Chart(
-            key="reward",
-            title="Reward per episode (the paper's Figure 6)",
-            caption="Average reward with exploration: a running mean over "
-            f"{AVERAGING_SHARE * 100:g} % of training. {_SEEDS}",
-            x_label="env steps",
-            y_label="reward per episode",
-            spreads=curves.average_return,
-        ),
-        Chart(
-            key="training-error",
-            title=f"{headline.symbol} in training (the paper's Figure 8)",
-            caption=f"{headline.symbol} with exploration, in windows of training, all seeds "
-            "together. Lines: median. Bands: 25 to 75 % of the steps."
-            + ("" if headline.high else " Dotted: the target."),
-            x_label="env steps",
-            y_label=headline.labelled(headline.symbol),
-            spreads={a: Spread(fan.x, fan.middle, fan.lower, fan.upper) for a, fan in fans},
-            mark=None if headline.high else 0.0,
-        ),
-        Chart(
-            key="total-by-step",
-            title="Cumulative reward (the paper's Figure 7)",
-            caption=f"The sum of all rewards since training began, over env steps. {_SEEDS}",
-            x_label="env steps",
-            y_label="cumulative reward",
-            spreads=curves.return_by_step,
-        ),
-        Chart(
-            key="total-by-episode",
-            title="Cumulative reward over episodes",
-            caption="The same over episodes, as in the paper: an agent that crashes often has more "
-            "episodes in as many env steps.",
-            x_label="episodes",
-            y_label="cumulative reward",
-            spreads=curves.return_by_episode,
-        ),
+        Chart("learning", steps, steady, curves.learning, curves.levels, log=log, mark=held),
+        Chart("flown", "time (s)", headline.labelled(size), curves.flown_sizes, log=log, mark=held),
+        Chart("reward", steps, "reward per episode", curves.average_return),
+        Chart("training-error", steps, value, training, mark=target),
+        Chart("total-by-step", steps, total, curves.return_by_step),
+        Chart("total-by-episode", "episodes", total, curves.return_by_episode),
     ]
 
 

@@ -7,7 +7,9 @@ nothing outside itself.
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import pandas as pd
 
 from ..envs.spec import canonical_id
 from .claims import Verdict, judge_claims, judge_no_worse
@@ -25,9 +27,6 @@ from .results import (
     read_results,
 )
 from .tables import markdown_table, terminal_table
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 __all__ = ["VIDEO_FILE", "table_of", "terminal_table", "write_report"]
 
@@ -53,7 +52,7 @@ _FILES: Final = (
 )
 
 
-def table_of(results: Results) -> "pd.DataFrame":
+def table_of(results: Results) -> pd.DataFrame:
     """The table of results, with the bounds of the task behind the agents."""
     bounds = results.config.get("bounds")
     return results_table(results.evaluations, results.runs, results.headline, bounds)

@@ -25,9 +25,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.dataset as pads
+import pyarrow.parquet as pq
 
 from ..agents.checkpoints import software_versions, write_whole
 from ..agents.episodes import Episode
@@ -35,17 +39,6 @@ from ..envs.spec import EnvSpec, SpecError
 from ..models.errors import InputError, require
 from .metrics import Headline, overshoot, settling_time, steady_state
 from .trajectories import Trajectory
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import pyarrow as pa
-    import pyarrow.dataset as pads
-    import pyarrow.parquet as pq
-else:
-    pd = require("pandas", "train", "comparing agents")
-    pa = require("pyarrow", "train", "comparing agents")
-    pads = require("pyarrow.dataset", "train", "comparing agents")
-    pq = require("pyarrow.parquet", "train", "comparing agents")
 
 __all__ = [
     "CONFIG_FILE", "CONFIG_KEYS", "EPISODES_FILE", "EPISODE_COLUMNS", "EVALUATIONS_FILE",
@@ -117,7 +110,7 @@ def _in_file(column: str, metric: str) -> str:
     return metric if column in _OWN_NAMES else column
 
 
-def step_schema(metric: str) -> "pa.Schema":
+def step_schema(metric: str) -> pa.Schema:
     """Columns of `steps.parquet`, the headline metric by its name."""
     return pa.schema(
         [
@@ -201,7 +194,7 @@ class RunResults:
     evaluations: list[dict[str, Any]]
     runs: list[dict[str, Any]]
     """Rows of these tables, without agent and seed."""
-    steps: "list[pa.Table]"
+    steps: list[pa.Table]
     """Tables of `steps.parquet`."""
 
     def write(self, part: Path) -> None:
@@ -260,7 +253,7 @@ def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]
 
 def evaluation_steps(
     agent: str, seed: int, headline: Headline, trajectories: Sequence[Trajectory]
-) -> "list[pa.Table]":
+) -> list[pa.Table]:
     """Every env step of evaluation trajectories."""
     return [
         step_table(
@@ -278,7 +271,7 @@ def evaluation_steps(
     ]
 
 
-def step_table(metric: str, **columns: Any) -> "pa.Table":
+def step_table(metric: str, **columns: Any) -> pa.Table:
     """Rows of `steps.parquet`: its columns, the metric's as `value`; one value or (T,) each."""
     frame = pd.DataFrame({_in_file(name, metric): column for name, column in columns.items()})
     table = pa.Table.from_pandas(frame, step_schema(metric), preserve_index=False)
@@ -296,11 +289,11 @@ class Results:
     """`config.json`."""
     spec: EnvSpec
     headline: Headline
-    episodes: "pd.DataFrame"
+    episodes: pd.DataFrame
     """Training episodes, `EPISODE_COLUMNS`; one that the end of training cut is not there."""
-    evaluations: "pd.DataFrame"
+    evaluations: pd.DataFrame
     """Evaluation episodes, `EVALUATION_COLUMNS`."""
-    runs: "pd.DataFrame"
+    runs: pd.DataFrame
     """Training runs, `RUN_COLUMNS`."""
 
 
@@ -319,7 +312,7 @@ def read_steps(
     phase: str,
     columns: Iterable[str] = ("agent", "seed", "episode", "step", "value"),
     max_rows: int | None = None,
-) -> "pd.DataFrame":
+) -> pd.DataFrame:
     """Read some columns of one phase of `steps.parquet`.
 
     Args:
@@ -361,7 +354,7 @@ def _check_names(path: Path, kind: str, wanted: Iterable[str], present: Iterable
         )
 
 
-def _read_csv(folder: Path | str, name: str, metric: str) -> "pd.DataFrame":
+def _read_csv(folder: Path | str, name: str, metric: str) -> pd.DataFrame:
     path = _existing(folder, name)
     columns = _TABLES[name]
     types = {_in_file(column, metric): kind for column, kind in columns.items()}

@@ -12,14 +12,14 @@ A folder holds three files, all of them whole at any moment:
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 
 from ..agents.checkpoints import write_whole
 from ..agents.policies import NetworkPolicy
 from ..envs.registry import env_spec
-from ..models.errors import require
 from .compare import evaluation_pair
 from .folders import locked
 from .metrics import Headline, final_per_run
@@ -38,11 +38,6 @@ from .settings import SweepConfig, SweepRun
 from .training import train_run
 from .trajectories import fly_episodes
 from .workers import open_workers
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = require("pandas", "train", "a sweep")
 
 __all__ = ["SWEEP_FILE", "is_sweep", "missing_runs", "read_sweep_config", "read_sweep_runs",
            "sweep", "sweep_table", "write_sweep_table"]  # fmt: skip

@@ -3,17 +3,15 @@
 import math
 import re
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
+import pandas as pd
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
 from .metrics import Headline
 from .palette import agent_label
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 __all__ = ["NOTHING", "Cell", "count_text", "headings", "markdown_table", "number_text",
            "result_rows", "table_note", "terminal_table"]  # fmt: skip
@@ -70,7 +68,7 @@ class Cell(NamedTuple):
     details: tuple[str, ...] = ()
 
 
-def terminal_table(table: "pd.DataFrame", headline: Headline) -> Table:
+def terminal_table(table: pd.DataFrame, headline: Headline) -> Table:
     """Make a table of at most 100 columns for the terminal from `metrics.results_table`."""
     shown = Table(
         box=box.SIMPLE_HEAD,
@@ -102,7 +100,7 @@ def _terminal_cell(cell: Cell) -> Text:
     return Text("\n".join((cell.value, *details)))
 
 
-def result_rows(table: "pd.DataFrame") -> list[tuple[Cell, ...]]:
+def result_rows(table: pd.DataFrame) -> list[tuple[Cell, ...]]:
     """Put the results into words: a cell for each of `headings`, a row per agent."""
     return [_row(str(agent), row) for agent, row in table.iterrows()]
 
@@ -169,7 +167,7 @@ def count_text(value: float) -> str:
     return NOTHING if math.isnan(value) else f"{value:,.0f}"
 
 
-def markdown_table(table: "pd.DataFrame", headline: Headline) -> str:
+def markdown_table(table: pd.DataFrame, headline: Headline) -> str:
     """Make a Markdown table from `metrics.results_table`, with its note below."""
     titles = headings(headline)
     lines = [titles, ("---", *["---:"] * (len(titles) - 1))]

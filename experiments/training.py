@@ -4,10 +4,11 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
+import torch
 
 from ..agents import (
     A2CConfig,
@@ -19,17 +20,11 @@ from ..agents import (
     resume_agent,
     store,
 )
+from ..agents.learner import Agent
 from ..envs.autoreset import AdvancingVectorEnv
-from ..models.errors import InputError, require
+from ..models.errors import InputError
 from .progress import Tell
 from .settings import Run
-
-if TYPE_CHECKING:
-    import torch
-
-    from ..agents.learner import Agent
-else:
-    torch = require("torch", "train", "training")
 
 __all__ = ["AnyEnv", "Run", "Snapshot", "Training", "is_finished", "train_run"]
 

@@ -31,10 +31,8 @@ Ending = Literal["terminated", "truncated", "cut off"]
 
 
 def evaluation_seed(episode: int, of: EpisodeSet = "curve") -> int:
-    """Seed of an evaluation episode: the same for every agent.
-
-    Training seeds are spawned by another key from another number, so that no run's seed meets one
-    of these.
+    """Seed of an evaluation episode: the same for every agent, and of no training, whose seeds are
+    spawned by another key from another number.
     """
     sequence = np.random.SeedSequence(_EVALUATION, spawn_key=(_SETS.index(of), episode))
     return int(sequence.generate_state(1, np.uint64)[0])
@@ -75,24 +73,22 @@ class Trajectory:
 
     def values(self, metric: str) -> np.ndarray:
         """A metric by name, float64, shape (T + 1,)."""
-        names = [one.name for one in self.spec.metrics]
-        column: np.ndarray = self.telemetry["metrics"].reshape(len(self) + 1, -1)
-        return column[:, names.index(metric)]
+        return self._rows("metrics")[:, [one.name for one in self.spec.metrics].index(metric)]
 
     @property
     def headline(self) -> np.ndarray:
         """The headline metric, shape (T + 1,); nan where the env names none."""
-        if self.spec.headline is None:
-            return np.full(len(self) + 1, np.nan)
-        return self.values(self.spec.headline.name)
+        return self._rows("metrics" if self.spec.headline else "")[:, 0]
 
     @property
     def mean_thrust(self) -> np.ndarray:
         """Mean over the rotors, N, shape (T + 1,); nan where the env does not tell it."""
-        if "thrust" not in self.telemetry:
-            return np.full(len(self) + 1, np.nan)
-        thrust: np.ndarray = self.telemetry["thrust"].reshape(len(self) + 1, -1).mean(axis=1)
-        return thrust
+        return np.asarray(self._rows("thrust").mean(axis=1))
+
+    def _rows(self, name: str) -> np.ndarray:
+        """Telemetry, shape (T + 1, n); a column of nan where there is none of that name."""
+        array = self.telemetry.get(name, np.full(len(self) + 1, np.nan))
+        return np.asarray(array).reshape(len(self) + 1, -1)
 
     def step_at(self, seconds: float) -> int:
         """Number of the row that is seen at that time; the last, from its end on."""
@@ -157,8 +153,7 @@ def fly_episodes(
     Args:
         env: Of one drone, or a vector env without autoreset.
         policy: Chooses the actions. Every drone of a vector env gets a copy.
-        episodes: How many.
-        of: Which.
+        episodes, of: How many, of which set.
     """
     seeds = [evaluation_seed(episode, of) for episode in range(episodes)]
     if not isinstance(env, AdvancingVectorEnv):
@@ -178,19 +173,20 @@ def _fly_batch(
     policies = [copy.deepcopy(policy) for _ in seeds]
     for one in policies:
         one.reset()
-    actions = (
-        np.zeros(count, np.int64)
-        if isinstance(spec.action, Discrete)
-        else np.zeros((count, *spec.action.shape), np.float32)
-    )
+    if isinstance(spec.action, Discrete):
+        actions: np.ndarray = np.zeros(count, np.int64)
+    else:
+        actions = np.zeros((count, *spec.action.shape), np.float32)
     env.reset(seed=[*seeds.values(), *[0] * (count - len(seeds))])
     rows, rewards = [_copied(env.telemetry)], []
     lengths, terminated = np.zeros(count, int), np.zeros(count, bool)
     done, lost = np.arange(count) >= len(seeds), env.lost.copy()
     done |= lost
     while not done.all():
+        told: Any = env.observations
         for drone in np.flatnonzero(~done).tolist():
-            actions[drone] = policies[drone].act(_observation(env, drone))
+            own = {k: v[drone] for k, v in told.items()} if isinstance(told, dict) else told[drone]
+            actions[drone] = policies[drone].act(own)
         env.advance(actions, np.zeros(count, bool), None, done)
         rows.append(_copied(env.telemetry))
         rewards.append(env.rewards.copy())
@@ -221,12 +217,6 @@ def _copied(telemetry: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: np.array(array, np.float64) for name, array in telemetry.items()}
 
 
-def _observation(env: AdvancingVectorEnv, drone: int) -> Any:
-    if isinstance(env.observations, dict):
-        return {name: array[drone] for name, array in env.observations.items()}
-    return env.observations[drone]
-
-
 def flown_trajectories(
     policy: Policy | None,
     env_id: str,
@@ -239,12 +229,10 @@ def flown_trajectories(
     """Evaluation episodes by number, flown in process without exploration.
 
     Args:
-        policy: Chooses the actions; None draws actions at random, the same for the same episode.
-        env_id: A registered env.
-        options: Of the env.
-        episodes: Their numbers.
+        policy: As of `fly`.
+        env_id, options: A registered env.
+        episodes, of: Their numbers, in which set.
         vehicle: MJCF file; None: the paper's.
-        of: Which evaluation episodes.
     """
     made = gym.make(env_id, disable_env_checker=True, vehicle=vehicle, **options)
     with closing(made.unwrapped) as env:
