@@ -62,8 +62,7 @@ class Ratio:
     name: str
     of: Callable[[Rates], float]
     target: float | None = None
-    at_most: bool = False
-    """Whether less is better."""
+    at_most: bool = False  # whether less is better
 
     def value(self, layers: Sequence["Layer"]) -> float:
         """Median over the rounds."""
@@ -84,12 +83,8 @@ class Ratio:
         return value <= self.target if self.at_most else value >= self.target
 
 
-def _over(numerator: str, denominator: str, target: float | None = None) -> Ratio:
-    return Ratio(
-        name=f"{numerator} ÷ {denominator}",
-        of=lambda rates: rates[numerator] / rates[denominator],
-        target=target,
-    )
+def _over(above: str, below: str, target: float | None = None) -> Ratio:
+    return Ratio(name=f"{above} ÷ {below}", of=lambda r: r[above] / r[below], target=target)
 
 
 RATIOS: Final = (
@@ -166,10 +161,7 @@ def bench(
 ) -> list[Layer]:
     """Measure every layer, and write `bench.json` into `folder`.
 
-    Args:
-        config: Duration of the measurement.
-        folder: Made if it is not there.
-        on_layer: Told before each turn: name of the layer, turns done, turns in all.
+    Told before each turn: name of the layer, turns done, turns in all.
     """
     rates: dict[str, list[float]] = {name: [] for name, *_ in _LAYERS}
     with ExitStack() as stack:
@@ -177,17 +169,15 @@ def bench(
         for name, _, _, open_ in _LAYERS:
             on_layer(f"opening {name}", 0, 1)
             opened.append((name, stack.enter_context(open_())))
-        total, turn = (config.rounds + 1) * len(opened), 0
+        turns = (config.rounds + 1) * len(opened)
         for number in range(config.rounds + 1):
             first = number % len(opened)
-            for name, run in opened[first:] + opened[:first]:
-                on_layer(name, turn, total)
+            for place, (name, run) in enumerate(opened[first:] + opened[:first]):
+                on_layer(name, number * len(opened) + place, turns)
                 start = time.perf_counter()
-                steps = run(config.seconds)
-                rate = steps / (time.perf_counter() - start)
+                rate = run(config.seconds) / (time.perf_counter() - start)
                 if number:  # the first round warms up
                     rates[name].append(round(rate, 1))
-                turn += 1
     layers = [
         Layer(name=name, about=about, drones=drones, rates=tuple(rates[name]))
         for name, about, drones, _ in _LAYERS

@@ -79,15 +79,14 @@ class Verdict:
     """The verdict on one claim of the paper."""
 
     claim: str
-    """The claim, with the paper's words."""
+    """With the paper's words."""
     source: str
-    """Place of the claim in the paper."""
+    """Place in the paper."""
     preset: str
     """Hyperparameters with which the agents were trained."""
     verdict: Outcome
-    """The outcome."""
     definition: str
-    """Definition of its measure and of the decision."""
+    """Of its measure and of the decision."""
     evidence: str
     """The numbers."""
 
@@ -108,7 +107,7 @@ def convergence_step(run: pd.DataFrame) -> float:
     episodes, has nan.
     """
     if len(run) < MIN_EPISODES:
-        return float("nan")
+        return np.nan
     ends = episode_ends(run)
     total = np.concatenate([[0.0], np.cumsum(run["return"].to_numpy())])
     grid = ends[-1] * np.arange(1, _GRID + 1) / _GRID
@@ -120,7 +119,7 @@ def convergence_step(run: pd.DataFrame) -> float:
     steps = grid[filled]
     begin = int(np.searchsorted(steps, grid[round(SMOOTHING_SHARE * _GRID) - 1]))
     if level[-1] - level[begin] <= LEARNING_RISE * level[steps > 0.75 * ends[-1]].std():
-        return float("nan")
+        return np.nan
     away = np.abs(level - level[-1]) > CONVERGENCE_BAND * np.ptp(level)
     start = int(away.nonzero()[0][-1]) + 1 if away.any() else 0
     return float(steps[start])
@@ -128,9 +127,7 @@ def convergence_step(run: pd.DataFrame) -> float:
 
 def long_run_return(run: pd.DataFrame) -> float:
     """Mean return of one run's episodes in the last quarter of training; nan if too few."""
-    if len(run) < MIN_EPISODES:
-        return float("nan")
-    return float(run["return"].to_numpy()[_late(run)].mean())
+    return float(run["return"][_late(run)].mean()) if len(run) >= MIN_EPISODES else np.nan
 
 
 def fluctuation(run: pd.DataFrame) -> float:
@@ -139,7 +136,7 @@ def fluctuation(run: pd.DataFrame) -> float:
     """
     late = _late(run)
     if len(run) < MIN_EPISODES or late.sum() < 2:
-        return float("nan")
+        return np.nan
     moving = run["return"].rolling(FLUCTUATION_WINDOW, center=True, min_periods=1).mean()
     return float((run["return"] - moving).to_numpy()[late].std(ddof=1))
 
@@ -263,10 +260,9 @@ def judge_no_worse(
     """Judge whether our A2C is no worse than SB3's after as many env steps.
 
     Args:
-        evaluations: As of `results.Results`.
+        evaluations, headline: As of `results.Results`; the metric has a bound of its goal.
         agents: Those that were trained.
         preset: Hyperparameters with which they were trained.
-        headline: The metric that decides; it needs a bound below which its goal is held.
     """
     margin = MARGIN_SHARE * (headline.held or np.nan)
     outcome, evidence = _no_worse(final_per_run(evaluations, headline), agents, margin, headline)

@@ -58,7 +58,7 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
 
     Args:
         config: Settings of the comparison.
-        folder: One that exists, and no other process writes to: see `folders.new_folder`.
+        folder: One that exists: see `folders.new_folder`.
         command: The user's command, for `config.json`.
         on_progress: Told how far it is.
 
@@ -150,10 +150,8 @@ def _evaluate(
                 flown = fly_episodes(env, policy, config.episodes, "final")
             else:
                 flown = fly_episodes(env, policy, config.curve_episodes, "curve")
-            behind = {
-                "env_steps": snapshot.env_steps if snapshot else 0,
-                "seconds": snapshot.seconds if snapshot else 0.0,
-            }
+            steps, seconds = (snapshot.env_steps, snapshot.seconds) if snapshot else (0, 0.0)
+            behind = {"env_steps": steps, "seconds": seconds}
             rows += [{**behind, **evaluation_row(one, headline)} for one in flown]
     return RunResults(
         agent=agent,

@@ -14,11 +14,10 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from threading import Thread
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 from ..agents.checkpoints import software_versions
 from ..envs.registry import load
@@ -41,16 +40,12 @@ class RunsFailed(RuntimeError):
     """Some runs failed; the message names each with its reason. The others are kept."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Result:
-    """The end of a job."""
+class Result(NamedTuple):
+    """The end of a job, by its name: a sentence about its failure, or the value of its function."""
 
     name: str
-    """Of the job."""
-    failure: str = ""
-    """A sentence; empty if the job is done."""
-    value: Any = None
-    """Result of its function, if it is done."""
+    failure: str
+    value: Any
 
 
 _Do = Callable[[Mapping[str, Any], Mapping[str, Any]], Generator[Result, None, None]]
@@ -72,7 +67,7 @@ class Workers:
         Args:
             function: Called in a worker, with a job and what tells its progress.
             jobs: By name.
-            env: Env of the jobs: a worker imports the module of the user's task.
+            env: Of the jobs: a worker imports the module of the user's task.
         """
         shared = {
             "function": function,
@@ -92,8 +87,7 @@ class Workers:
     ) -> None:
         """Do all jobs, and hand each with its result to `keep` (in this process).
 
-        Raises:
-            RunsFailed: Some failed; the others were kept.
+        Raises `RunsFailed` if some failed; the others were kept.
         """
         failures = []
         # Of jobs on other machines this is all the progress told.
@@ -113,15 +107,8 @@ class Workers:
 
 @contextmanager
 def open_workers(config: WorkersConfig, on_progress: OnProgress) -> Iterator[Workers]:
-    """Workers, to the end of the block.
-
-    Args:
-        config: Which, and how many.
-        on_progress: Told how far the jobs on this machine are, and which are done.
-
-    Raises:
-        InputError: There is no such Ray cluster.
-        MissingPackage: There is no joblib, or no Ray.
+    """Workers, to the end of the block; told is how far the jobs of this machine are, and which are
+    done. Raises `InputError` if there is no such Ray cluster.
     """
     here = config.backend == "loky"
     opened = _loky(config) if here else _ray(config)
@@ -209,7 +196,7 @@ def _do_by_ray(
                 result = ray.get(landed)
             except ray.exceptions.RayError as error:  # its machine is lost, or has no rotorgram
                 reason = str(error).strip().splitlines()[-1]
-                result = Result(name=name, failure=f"{name}: {reason}")
+                result = Result(name, f"{name}: {reason}", None)
             yield result
     finally:
         for reference in flying:  # their simulators end with them
@@ -237,9 +224,9 @@ def _done(
         if task:
             load(task)
         with telling(name, home) as tell:
-            return Result(name=name, value=function(job, tell))
+            return Result(name, "", function(job, tell))
     except Exception as error:
-        return Result(name=name, failure=f"{name}: {type(error).__name__}: {error}")
+        return Result(name, f"{name}: {type(error).__name__}: {error}", None)
 
 
 _watched: set[int] = set()
