@@ -115,7 +115,7 @@ def _for_tyro(kind: type[Any], **namespace: Any) -> Any:
         extras = getattr(hint, "__metadata__", ())  # of Annotated
         hint = hint.__origin__ if extras else hint
         if isinstance(hint, UnionType):
-            union = Union[get_args(hint)]  # noqa: UP007
+            union: Any = Union[get_args(hint)]  # noqa: UP007
             changed[one.name] = Annotated[union, *extras] if extras else union
     namespace = {"__annotations__": changed, "__doc__": kind.__doc__, **namespace}
     return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), namespace))

@@ -381,7 +381,7 @@ def _echo() -> Iterator[Slice]:
 @contextmanager
 def _policy(drones: int) -> Iterator[Slice]:
     dice = np.random.default_rng(0)
-    shapes = {
+    shapes: dict[str, Any] = {
         "hidden.weight": (16, 3), "hidden.bias": 16, "output.weight": (1, 16), "output.bias": 1,
         "log_std": 1,
     }  # fmt: skip

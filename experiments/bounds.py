@@ -92,7 +92,7 @@ def bang_bang(
         """The second moment for a first one: so that the speed is 0 at the end."""
         return _bisected(lambda two: _flown(first, two, horizon, *limits)[1] > 0, first, longest)
 
-    def falls_short(first: Floats) -> Floats:
+    def falls_short(first: Floats) -> npt.NDArray[np.bool_]:
         return _flown(first, braked(first), horizon, *limits)[0][:, -1] < distance
 
     first = _bisected(falls_short, np.zeros(len(distance)), longest)

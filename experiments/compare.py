@@ -3,10 +3,9 @@
 import shutil
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -25,8 +24,11 @@ from .pairs import shared_pair
 from .progress import OnProgress, Tell
 from .results import (
     CONFIG_FILE,
+    EPISODES_FILE,
+    EVALUATIONS_FILE,
+    RUNS_FILE,
     ResultsError,
-    RunResults,
+    Rows,
     episode_row,
     evaluation_row,
     evaluation_steps,
@@ -34,6 +36,7 @@ from .results import (
     read_config,
     step_table,
     write_config,
+    write_part,
 )
 from .settings import CompareConfig, EnvConfig, Run
 from .training import Snapshot, train_run
@@ -68,7 +71,7 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
             such Ray cluster; nothing is written.
     """
     spec = env_spec(**config.env)
-    headline = Headline.of(spec)
+    metric = Headline.of(spec).name
     parts = folder / PARTS
     with open_workers(config, on_progress) as workers, locked(folder):
         parts.mkdir(exist_ok=True)
@@ -88,44 +91,48 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
             for run in runs
             if not (parts / _part(run)).exists()
         }
-        workers.fly_all(partial(_fly, config), jobs, partial(_keep, folder), config)
-        join_parts(parts, folder, headline.name)
+        workers.fly_all(partial(_fly, config), jobs, partial(_keep, folder, metric), config)
+        join_parts(parts, folder, metric)
 
 
 def _part(run: Run | None) -> str:
     return f"{run.algorithm}-seed{run.seed}" if run else "pid-seed0"
 
 
-def _keep(folder: Path, run: Run | None, done: tuple[RunResults, Checkpoint | None]) -> None:
+class _Done(NamedTuple):
+    """What a run gives."""
+
+    rows: Rows
+    steps: list[Any]  # tables of `steps.parquet`
+    checkpoint: Checkpoint | None = None
+
+
+def _keep(folder: Path, metric: str, run: Run | None, done: _Done) -> None:
     """Write checkpoint and part; the part last, for with it the run is done."""
-    results, checkpoint = done
-    if checkpoint:
-        store(checkpoint, folder / "checkpoints" / f"{_part(run)}.safetensors")
-    results.write(folder / PARTS / _part(run))
+    if done.checkpoint:
+        store(done.checkpoint, folder / "checkpoints" / f"{_part(run)}.safetensors")
+    write_part(folder / PARTS / _part(run), metric, done.rows, done.steps)
 
 
-def _fly(
-    config: CompareConfig, run: Run | None, tell: Tell
-) -> tuple[RunResults, Checkpoint | None]:
+def _fly(config: CompareConfig, run: Run | None, tell: Tell) -> _Done:
     """Train and evaluate (in a worker process)."""
     if run is None:
-        return _evaluate("pid", 0, config), None
+        return _evaluate("pid", 0, config)
     with shared_pair(**run.env, num_envs=run.num_envs) as env:
-        training, row = train_run(run, env, tell, config.snapshots, keep_steps=True)
+        training, times = train_run(run, env, tell, config.snapshots, keep_steps=True)
         checkpoint, log = training.checkpoint(), training.log
-    results = _evaluate(run.algorithm, run.seed, config, training.taken)
+    evaluated = _evaluate(run.algorithm, run.seed, config, training.taken)
+    label = {"agent": run.algorithm, "seed": run.seed}
+    episodes = [episode_row(one, run.num_envs, log.env_steps) for one in log.episodes]
+    rows = {
+        **evaluated.rows,
+        EPISODES_FILE: [label | episode for episode in episodes],
+        RUNS_FILE: [label | times],
+    }
     steps = log.steps()
     steps["step"] = np.arange(1, len(steps["episode"]) + 1)
-    trained_steps = step_table(
-        results.metric, agent=run.algorithm, seed=run.seed, phase="train", **steps
-    )
-    trained = replace(
-        results,
-        episodes=[episode_row(one, run.num_envs, log.env_steps) for one in log.episodes],
-        runs=[row],
-        steps=[trained_steps, *results.steps],
-    )
-    return trained, checkpoint
+    trained = step_table(Headline.of(log.spec).name, **label, phase="train", **steps)
+    return _Done(rows, [trained, *evaluated.steps], checkpoint)
 
 
 def evaluation_pair(config: EnvConfig, episodes: int) -> AbstractContextManager[Any]:
@@ -135,7 +142,7 @@ def evaluation_pair(config: EnvConfig, episodes: int) -> AbstractContextManager[
 
 def _evaluate(
     agent: str, seed: int, config: CompareConfig, taken: Sequence[Snapshot] = ()
-) -> RunResults:
+) -> _Done:
     """Evaluate the snapshots of a training, or the PID."""
     rows: list[dict[str, Any]] = []
     flown: list[Trajectory] = []
@@ -151,17 +158,9 @@ def _evaluate(
             else:
                 flown = fly_episodes(env, policy, config.curve_episodes, "curve")
             steps, seconds = (snapshot.env_steps, snapshot.seconds) if snapshot else (0, 0.0)
-            behind = {"env_steps": steps, "seconds": seconds}
-            rows += [{**behind, **evaluation_row(one, headline)} for one in flown]
-    return RunResults(
-        agent=agent,
-        seed=seed,
-        metric=headline.name,
-        episodes=[],
-        evaluations=rows,
-        runs=[],
-        steps=evaluation_steps(agent, seed, headline, flown),
-    )
+            label = {"agent": agent, "seed": seed, "env_steps": steps, "seconds": seconds}
+            rows += [label | evaluation_row(one, headline) for one in flown]
+    return _Done({EVALUATIONS_FILE: rows}, evaluation_steps(agent, seed, headline, flown))
 
 
 def _bounds(config: CompareConfig) -> dict[str, float]:

@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
-from matplotlib import rc_context
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter
 
-from .curves import Curves, Fan, Flown, make_curves
+from .curves import Curves, Fan, Flown
 from .metrics import Headline, Spread, episode_ends, training_runs
 from .palette import agent_color, agent_label, sort_agents
-from .results import Results, read_results
+from .results import Results
 
 __all__ = ["FIGURE_FILES", "draw_figures"]
 
@@ -29,54 +29,30 @@ FIGURE_FILES: Final = ("fig6_reward.png", "fig7_cumulative_reward.png", "fig8_er
 _MAX_POINTS: Final = 2000
 _OUTER: Final = 0.18  # opacity of the 5–95 % band
 _INNER: Final = 0.38  # and of the 25–75 % band
-_STYLE: Final[dict[Any, Any]] = {
-    "font.size": 9.5,
-    "axes.titlesize": 10.5,
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#E4E4E4",
-    "grid.linewidth": 0.7,
-    "axes.edgecolor": "#777777",
-    "xtick.color": "#444444",
-    "ytick.color": "#444444",
-    "legend.frameon": False,
-    "lines.linewidth": 1.7,
-    "figure.constrained_layout.use": True,
-}
-
+_STYLE: Final = Path(__file__).parent / "assets" / "figures.mplstyle"
 _TIGHT: Final[dict[str, Any]] = {
     "borderaxespad": 0.0, "columnspacing": 1.0, "handlelength": 1.2, "handletextpad": 0.5,
     "fontsize": 8.5,
 }  # fmt: skip
 
 
-def draw_figures(
-    folder: Path | str, results: Results | None = None, curves: Curves | None = None
-) -> list[Path]:
-    """Draw all figures of a comparison into `figures/` inside its folder, in the order of
-    `FIGURE_FILES`. Results and curves that are not given are made from the folder.
+def draw_figures(folder: Path, results: Results, curves: Curves) -> None:
+    """Draw all figures of a comparison, `FIGURE_FILES`, into `figures/` inside its folder.
 
     Agents or runs that are missing are left out of the figures; a panel with nothing in it says so.
     """
-    results = results or read_results(folder)
-    drawn = curves or make_curves(folder, results)
     headline = results.headline
-    target = Path(folder) / "figures"
+    target = folder / "figures"
     target.mkdir(exist_ok=True)
-    paths = [target / name for name in FIGURE_FILES]
-    with rc_context(_STYLE):
+    with style.context(_STYLE):
         figures = (
-            _draw_reward(results.episodes, drawn),
-            _draw_cumulative(drawn),
-            _draw_error(sort_agents(results.evaluations["agent"]), drawn, headline),
-            _draw_learning_curve(results.evaluations, drawn, headline),
+            _draw_reward(results.episodes, curves),
+            _draw_cumulative(curves),
+            _draw_error(sort_agents(results.evaluations["agent"]), curves, headline),
+            _draw_learning_curve(results.evaluations, curves, headline),
         )
-        for path, figure in zip(paths, figures, strict=True):
-            figure.savefig(path)
-    return paths
+        for name, figure in zip(FIGURE_FILES, figures, strict=True):
+            figure.savefig(target / name)
 
 
 def _draw_reward(episodes: pd.DataFrame, curves: Curves) -> Figure:

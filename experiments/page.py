@@ -4,7 +4,7 @@ import base64
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import resources
 from itertools import chain
 from typing import Any, Final, NamedTuple, get_args
@@ -44,14 +44,14 @@ def render_page(
     verdicts: Sequence[Verdict],
     curves: Curves,
     video: bytes | None = None,
-    files: Sequence[tuple[str, str]] = (),
+    files: Collection[str] = (),
 ) -> str:
     """Make the page.
 
     Args:
         results, table, verdicts, curves: As `report.write_report` makes them.
         video: An MP4 of the agents side by side, shown where there is one.
-        files: Names and contents of the files beside the page.
+        files: Names of the files beside the page.
     """
     config, headline = results.config, results.headline
     agents = sort_agents(table.index[table["seeds"] > 0])

@@ -14,42 +14,16 @@ import pandas as pd
 from ..envs.spec import canonical_id
 from .claims import Verdict, judge_claims, judge_no_worse
 from .curves import make_curves
-from .figures import FIGURE_FILES, draw_figures
+from .figures import draw_figures
 from .metrics import results_table
 from .page import render_page
-from .results import (
-    CONFIG_FILE,
-    EPISODES_FILE,
-    EVALUATIONS_FILE,
-    RUNS_FILE,
-    STEPS_FILE,
-    Results,
-    read_results,
-)
+from .results import Results, read_results
 from .tables import markdown_table, terminal_table
 
 __all__ = ["VIDEO_FILE", "table_of", "terminal_table", "write_report"]
 
-REPORT_FILE: Final = "report.html"
-RESULTS_CSV: Final = "results.csv"
-RESULTS_MARKDOWN: Final = "results.md"
-CLAIMS_FILE: Final = "claims.json"
 VIDEO_FILE: Final = "video.mp4"
 """The agents side by side; the page has it in itself where it lies in the folder."""
-
-_FILES: Final = (
-    (CONFIG_FILE, "every setting, the seeds, the versions and the machine"),
-    (EPISODES_FILE, "a row per training episode"),
-    (EVALUATIONS_FILE, "a row per evaluation episode of every snapshot"),
-    (RUNS_FILE, "a row per training run, with its times"),
-    (STEPS_FILE, "a row per env step of training and of the final evaluation"),
-    ("checkpoints", "the trained policies; fly one with rotorgram serve or rotorgram evaluate"),
-    (RESULTS_CSV, "the table of results, all digits"),
-    (RESULTS_MARKDOWN, "the table of results, for reading"),
-    (CLAIMS_FILE, "the verdicts with their definitions and evidence"),
-    *((f"figures/{name}", "a figure, as a picture") for name in FIGURE_FILES),
-    (VIDEO_FILE, "the agents side by side"),
-)
 
 
 def table_of(results: Results) -> pd.DataFrame:
@@ -71,33 +45,21 @@ def _verdicts(results: Results) -> list[Verdict]:
 
 
 def write_report(folder: Path | str, results: Results | None = None) -> Path:
-    """Draw the figures and write the page, the table and the verdicts into the folder.
-
-    Returns:
-        The path of the page.
-
-    Raises:
-        ResultsError: A file or a column is missing.
+    """Draw the figures and write the page, the table and the verdicts into the folder; the path of
+    the page. Raises `ResultsError` if a file or a column is missing.
     """
     folder = Path(folder)
     results = results or read_results(folder)
     table, verdicts = table_of(results), _verdicts(results)
     curves = make_curves(folder, results)
     draw_figures(folder, results, curves)
-    table.to_csv(folder / RESULTS_CSV)
-    (folder / RESULTS_MARKDOWN).write_text(
-        markdown_table(table, results.headline), encoding="utf-8"
-    )
+    table.to_csv(folder / "results.csv")
+    markdown = markdown_table(table, results.headline)
+    (folder / "results.md").write_text(markdown, encoding="utf-8")
     claims = json.dumps([asdict(verdict) for verdict in verdicts], indent=2, ensure_ascii=False)
-    (folder / CLAIMS_FILE).write_text(claims + "\n", encoding="utf-8")
-    video, report = folder / VIDEO_FILE, folder / REPORT_FILE
-    page = render_page(
-        results,
-        table,
-        verdicts,
-        curves,
-        video.read_bytes() if video.is_file() else None,
-        [(name, text) for name, text in _FILES if (folder / name).exists()],
-    )
-    report.write_text(page, encoding="utf-8")
+    (folder / "claims.json").write_text(claims + "\n", encoding="utf-8")
+    video, report = folder / VIDEO_FILE, folder / "report.html"
+    film = video.read_bytes() if video.is_file() else None
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+    report.write_text(render_page(results, table, verdicts, curves, film, files), encoding="utf-8")
     return report

@@ -43,8 +43,9 @@ from .trajectories import Trajectory
 __all__ = [
     "CONFIG_FILE", "CONFIG_KEYS", "EPISODES_FILE", "EPISODE_COLUMNS", "EVALUATIONS_FILE",
     "EVALUATION_COLUMNS", "RUNS_FILE", "RUN_COLUMNS", "STEPS_FILE", "Results", "ResultsError",
-    "RunResults", "episode_row", "evaluation_row", "evaluation_steps", "join_parts", "machine",
+    "Rows", "episode_row", "evaluation_row", "evaluation_steps", "join_parts", "machine",
     "read_config", "read_results", "read_spec", "read_steps", "step_table", "write_config",
+    "write_part",
 ]  # fmt: skip
 
 CONFIG_FILE: Final = "config.json"
@@ -182,33 +183,20 @@ def read_spec(folder: Path | str, config: Mapping[str, Any]) -> EnvSpec:
 # ---- writing
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunResults:
-    """Results of one run."""
+Rows = Mapping[str, list[dict[str, Any]]]
+"""Rows by the name of their file."""
 
-    agent: str
-    seed: int
-    metric: str
-    """Name of the headline metric."""
-    episodes: list[dict[str, Any]]
-    evaluations: list[dict[str, Any]]
-    runs: list[dict[str, Any]]
-    """Rows of these tables, without agent and seed."""
-    steps: list[pa.Table]
-    """Tables of `steps.parquet`."""
 
-    def write(self, part: Path) -> None:
-        """Write a part: a folder that is there whole or not at all."""
-        unfinished = part.with_name(f".{part.name}")
-        unfinished.mkdir(parents=True)
-        label = {"agent": self.agent, "seed": self.seed}
-        for name, columns in _TABLES.items():
-            rows = [{**label, **row} for row in getattr(self, name.removesuffix(".csv"))]
-            table = pd.DataFrame(rows, columns=list(columns))
-            table.columns = [_in_file(column, self.metric) for column in columns]
-            table.to_csv(unfinished / name, index=False)
-        pq.write_table(pa.concat_tables(self.steps), unfinished / STEPS_FILE, compression="zstd")
-        unfinished.rename(part)
+def write_part(part: Path, metric: str, rows: Rows, steps: list[pa.Table]) -> None:
+    """Write what one run gave: a folder that is there whole or not at all."""
+    unfinished = part.with_name(f".{part.name}")
+    unfinished.mkdir(parents=True)
+    for name, columns in _TABLES.items():
+        table = pd.DataFrame(rows.get(name, []), columns=list(columns))
+        table.columns = [_in_file(column, metric) for column in columns]
+        table.to_csv(unfinished / name, index=False)
+    pq.write_table(pa.concat_tables(steps), unfinished / STEPS_FILE, compression="zstd")
+    unfinished.rename(part)
 
 
 def join_parts(parts: Path, folder: Path, metric: str) -> None:

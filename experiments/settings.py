@@ -86,8 +86,6 @@ class WorkersConfig:
     def __post_init__(self) -> None:
         if self.jobs is not None and self.jobs < 1:
             raise InputError(f"jobs: expected at least 1, got {self.jobs}")
-        if self.backend not in ("loky", "ray"):
-            raise InputError(f"backend: expected loky or ray, got {self.backend}")
         if self.address is not None and self.backend != "ray":
             raise InputError(f"address: expected it with backend ray, got it with {self.backend}")
 
@@ -137,9 +135,9 @@ class _ManyRuns(WorkersConfig, EnvConfig):
     @staticmethod
     def read_content(content: Mapping[str, Any]) -> dict[str, Any]:
         """The settings that all have, from the content of a `config.json`."""
-        kept = {name: content[name] for name in ("preset", "env_steps", "num_envs", "vehicle")}
         seeds, spec = content["seeds"], content["spec"]
-        kept |= {"env_id": spec["env_id"], "options": spec["options"]}
+        kept = {name: content[name] for name in ("preset", "env_steps", "num_envs", "vehicle")}
+        kept |= {name: spec[name] for name in ("env_id", "options")}
         return kept | {"seeds": len(seeds), "first_seed": seeds[0]}
 
     def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:
@@ -194,7 +192,7 @@ class SweepRun:
 
     @property
     def name(self) -> str:
-        """Name of the run."""
+        """For progress and errors."""
         words = " ".join(f"{name}={value}" for name, value in self.settings.items())
         return f"{words} seed {self.run.seed}"
 
@@ -214,20 +212,18 @@ class SweepConfig(_ManyRuns):
         super().__post_init__()
         if not self.grid:
             raise InputError("grid: expected at least one hyperparameter, got none")
+        self.runs()  # wrong names and numbers are told before anything is trained
         for name, values in self.grid.items():
             if not values:
                 raise InputError(f"grid: expected at least one value of {name}, got none")
-        self.runs()  # wrong names and numbers are told before anything is trained
-        for name, values in self.grid.items():
             for place, value in enumerate(values):
                 if value in values[:place]:
                     raise InputError(f"grid: expected each {name} once, got {value!r} twice")
 
     def points(self) -> list[dict[str, Any]]:
         """Settings of every point; the value that is named last changes fastest."""
-        return [
-            dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())
-        ]
+        names, values = self.grid.keys(), product(*self.grid.values())
+        return [dict(zip(names, chosen, strict=True)) for chosen in values]
 
     def runs(self) -> list[SweepRun]:
         """Every training, in the order in which they start.

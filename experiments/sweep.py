@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import pandas as pd
 
 from ..agents.checkpoints import write_whole
@@ -122,10 +121,8 @@ def sweep_table(config: SweepConfig, rows: pd.DataFrame, headline: Headline) -> 
         **{name: (name, "sum") for name in ("episodes", "settled", "crashed")},
         most_crashed=("crashed", "max"),
     ).reset_index()  # fmt: skip
-    table = table.sort_values(
-        ["seeds", "most_crashed", "worst"], ascending=[False, True, not headline.high],
-        kind="stable",
-    )  # fmt: skip
+    order = {"seeds": False, "most_crashed": True, "worst": not headline.high}
+    table = table.sort_values(list(order), ascending=list(order.values()), kind="stable")
     return _with_settings(table, config).reset_index(drop=True)
 
 
@@ -138,11 +135,7 @@ def write_sweep_table(config: SweepConfig, folder: Path) -> pd.DataFrame:
 
 
 def read_sweep_runs(folder: Path, config: SweepConfig) -> pd.DataFrame:
-    """The runs that are done, if any, columns `RUN_COLUMNS`.
-
-    Raises:
-        ResultsError: The file is not one of this sweep.
-    """
+    """The runs that are done, columns `RUN_COLUMNS`. Raises `ResultsError` if others are there."""
     path = folder / RUNS_FILE
     if not path.exists():
         return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in RUN_COLUMNS.items()})
@@ -181,9 +174,6 @@ def read_sweep_config(folder: Path) -> SweepConfig:
 
 def _with_settings(table: pd.DataFrame, config: SweepConfig) -> pd.DataFrame:
     """A table by points, with the settings of each after its number."""
-    points = config.points()
-    wide = table.copy()
-    for place, name in enumerate(config.grid, 1):
-        values = [points[point][name] for point in table["point"]]
-        wide.insert(place, name, np.array(values, dtype=object))
-    return wide
+    settings = pd.DataFrame(config.points(), dtype=object).iloc[table["point"]]
+    settings.index = table.index
+    return pd.concat([table[["point"]], settings, table.drop(columns="point")], axis=1)
