@@ -13,11 +13,11 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from errno import ENOSPC, EPIPE
 from importlib import import_module
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Final, TypeGuard, cast
 
 if TYPE_CHECKING:
@@ -66,6 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
     _show_log()
+    if get_terminal_size().columns < 40:  # tyro does not end on narrower terminals
+        os.environ["COLUMNS"] = "40"
     # A terminated command says Close to the other side before it ends.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     # At exit Python collects garbage: with torch half a second for nothing.
@@ -109,9 +111,7 @@ def _run(words: list[str]) -> int:
 
     with hidden_gl_setting():  # importing OpenGL takes time, also for a command that draws nothing
         kind: type[Command] = getattr(import_module(f".{_module(name)}", __name__), COMMANDS[name])
-        with _wide_enough():
-            command = parse(kind, f"rotorgram {name}", words[1:])
-        return command.run()
+        return parse(kind, f"rotorgram {name}", words[1:]).run()
 
 
 def _module(command: str) -> str:
@@ -126,21 +126,6 @@ def _help() -> str:
         summary = ast.get_docstring(cast(ast.ClassDef, node)) or ""
         lines.append(f"  {name:12} {summary.partition(chr(10))[0]}")
     return "\n".join([*lines, "", "rotorgram COMMAND --help lists the flags of a command."])
-
-
-@contextmanager
-def _wide_enough() -> Iterator[None]:
-    """Flags are told to a terminal of 40 columns at least: tyro does not end on narrower ones."""
-    from shutil import get_terminal_size
-
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = str(max(40, get_terminal_size().columns))
-    try:
-        yield
-    finally:
-        del os.environ["COLUMNS"]
-        if before is not None:
-            os.environ["COLUMNS"] = before
 
 
 def _prepare_streams() -> None:

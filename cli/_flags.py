@@ -1,9 +1,9 @@
 """Base of all commands, and the parser of their flags: tyro, plus the options of any task."""
 
 import json
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
-from itertools import zip_longest
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Final, Literal, TypeVar, Union, cast, get_args, get_type_hints
@@ -78,7 +78,9 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
         return cast(C, replace(tyro.cli(plain, prog=prog, args=words), given=given))
     from ..envs import registry
 
-    env_id = _value(words, "--env") or DEFAULT_ENV
+    parser = ArgumentParser(prog, add_help=False, allow_abbrev=False)
+    parser.add_argument("--env", default=DEFAULT_ENV)
+    env_id = parser.parse_known_args(words)[0].env
     listens = "listen" in given or getattr(kind, "listen", None) is not None
     if listens and ":" not in env_id and not registry.is_known(env_id):
         words, required = _without_requirements(words)
@@ -136,16 +138,6 @@ def _given(words: Sequence[str]) -> frozenset[str]:
         prefix + dot + name.removeprefix("no_")
         for prefix, dot, name in (flag.rpartition(".") for flag in flags)
     )
-
-
-def _value(words: Sequence[str], flag: str) -> str | None:
-    """The last value of a flag, `--flag VALUE` or `--flag=VALUE`; None where it is not set."""
-    found = None
-    for word, following in zip_longest(words, words[1:], fillvalue=""):
-        name, equals, value = word.partition("=")
-        if name == flag:
-            found = value if equals else following
-    return found
 
 
 def _without_requirements(words: Sequence[str]) -> tuple[list[str], dict[str, Any]]:

@@ -221,7 +221,9 @@ def _for_a_while(fly: Callable[[], int], prepare: Callable[[], None] = lambda: N
     return run
 
 
-def _again(call: Callable[[], Any], drones: int = 1) -> Slice:
+def _again(
+    call: Callable[[], Any], drones: int = 1, prepare: Callable[[], None] = lambda: None
+) -> Slice:
     """Calls it, a step of so many drones, `_STEPS_AT_ONCE` times between two looks at the clock."""
 
     def fly() -> int:
@@ -229,7 +231,7 @@ def _again(call: Callable[[], Any], drones: int = 1) -> Slice:
             call()
         return drones * _STEPS_AT_ONCE
 
-    return _for_a_while(fly)
+    return _for_a_while(fly, prepare)
 
 
 @contextmanager
@@ -238,17 +240,12 @@ def _mj_step() -> Iterator[Slice]:
     model, substeps = vehicle.model, vehicle.substeps(_PERIOD)
     data = mujoco.MjData(model)
 
-    def fly() -> int:
-        for _ in range(_STEPS_AT_ONCE):
-            mujoco.mj_step(model, data, substeps)
-        return _STEPS_AT_ONCE
-
     def prepare() -> None:
         # Every turn begins in the air: how long it lasts must not matter.
         mujoco.mj_resetData(model, data)
         data.qpos[2], data.ctrl[:] = 5.0, vehicle.hover_thrust
 
-    yield _for_a_while(fly, prepare)
+    yield _again(lambda: mujoco.mj_step(model, data, substeps), prepare=prepare)
 
 
 @contextmanager

@@ -254,11 +254,7 @@ def _scale(flown: Sequence[Trajectory]) -> tuple[float, float]:
 
 
 def film_comparison(
-    folder: Path,
-    out: Path,
-    on_frame: OnFrame = lambda *_: None,
-    *,
-    world: World = "airport",
+    folder: Path, out: Path, on_frame: OnFrame = lambda *_: None, *, world: World = "airport"
 ) -> bool:
     """Film the agents of a comparison: each agent and the PID, the same episode side by side.
 

@@ -87,15 +87,9 @@ class Training:
     def resume(cls, kept: Checkpoint, env: AnyEnv) -> "Training":
         """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
         try:
-            run = Run(
-                algorithm=kept.algorithm,
-                config=preset(kept.algorithm, "paper", **kept.config),
-                env_id=kept.env_id,
-                options=kept.options,
-                seed=kept.seed,
-                env_steps=kept.env_steps,
-                num_envs=kept.num_envs,
-            )
+            names = ("algorithm", "env_id", "options", "seed", "env_steps", "num_envs")
+            config = preset(kept.algorithm, "paper", **kept.config)
+            run = Run(config=config, **{name: getattr(kept, name) for name in names})
         except (InputError, TypeError, ValueError) as error:
             raise CheckpointError(f"checkpoint: its parts do not fit together: {error}") from None
         return cls(run, env, kept=kept)

@@ -243,11 +243,7 @@ def flown_trajectories(
 
 
 def recorded_trajectories(
-    path: Path,
-    episodes: Sequence[int] | None = None,
-    *,
-    session: int | None = None,
-    drone: int = 0,
+    path: Path, episodes: Sequence[int] | None = None, *, session: int | None = None, drone: int = 0
 ) -> list[Trajectory]:
     """Episodes of one drone of one session of a journal.
 
