@@ -34,16 +34,18 @@ class Bench(Command):
         """Measure, print and draw."""
         from rich.console import Console
 
-        from ..experiments.bench import RATIOS, BenchConfig, bench, parts_of
+        from ..experiments.bench import RATIOS, bench, parts_of
         from ._progress import bars
 
         require("matplotlib", "report", "drawing")  # before anything is measured
-        config = BenchConfig(rounds=self.rounds, seconds=self.seconds)
         logging.getLogger("rotorgram").setLevel(logging.WARNING)  # no counters of every wire
         with folder_to_write(self.out, "bench") as folder, bars() as progress:
-            layers = bench(config, folder, lambda name, at, of: progress("bench", at, of, name))
-            turns = (config.rounds + 1) * len(layers)
-            progress("bench", turns, turns, "done")
+
+            def on_layer(name: str, turn: int, turns: int) -> None:
+                progress("bench", turn, turns, name)
+
+            layers = bench(self.rounds, self.seconds, folder, on_layer)
+            progress("bench", 1, 1, "done")
         show = Console().print
         show(_table("layer", "what", "env steps/s", "µs per env step", rows=[
             (one.name, one.about, f"{one.rate:,.0f}", f"{1e6 / one.rate:.2f}") for one in layers

@@ -42,7 +42,7 @@ from .results import machine
 from .settings import Run
 from .training import Training
 
-__all__ = ["PARTS", "RATIOS", "BenchConfig", "Layer", "Ratio", "bench", "parts_of"]
+__all__ = ["PARTS", "RATIOS", "Layer", "Ratio", "bench", "parts_of"]
 
 ENV_ID: Final = "rotorgram/Elevation-v0"
 _PERIOD: Final = 0.02  # s, of a control step
@@ -125,22 +125,6 @@ _STEPS_AT_ONCE: Final = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchConfig:
-    """Duration of a measurement."""
-
-    rounds: int = 7
-    """Turns of every layer."""
-    seconds: float = 0.5
-    """Length of a turn, s."""
-
-    def __post_init__(self) -> None:
-        if self.rounds < 1:
-            raise InputError(f"rounds: expected at least 1, got {self.rounds}")
-        if not 0 < self.seconds <= 60:
-            raise InputError(f"seconds: expected more than 0 and at most 60, got {self.seconds}")
-
-
-@dataclass(frozen=True, kw_only=True)
 class Layer:
     """One measured layer."""
 
@@ -157,25 +141,29 @@ class Layer:
 
 
 def bench(
-    config: BenchConfig, folder: Path, on_layer: Callable[[str, int, int], None]
+    rounds: int, seconds: float, folder: Path, on_layer: Callable[[str, int, int], None]
 ) -> list[Layer]:
-    """Measure every layer, and write `bench.json` into `folder`.
+    """Measure every layer in turns of so many seconds, and write `bench.json` into `folder`.
 
-    Told before each turn: name of the layer, turns done, turns in all.
+    Told before each turn: name of the layer, turns done, turns in all. Raises `InputError`.
     """
+    if rounds < 1:
+        raise InputError(f"rounds: expected at least 1, got {rounds}")
+    if not 0 < seconds <= 60:
+        raise InputError(f"seconds: expected more than 0 and at most 60, got {seconds}")
     rates: dict[str, list[float]] = {name: [] for name, *_ in _LAYERS}
     with ExitStack() as stack:
         opened: list[tuple[str, Slice]] = []
         for name, _, _, open_ in _LAYERS:
             on_layer(f"opening {name}", 0, 1)
             opened.append((name, stack.enter_context(open_())))
-        turns = (config.rounds + 1) * len(opened)
-        for number in range(config.rounds + 1):
+        turns = (rounds + 1) * len(opened)
+        for number in range(rounds + 1):
             first = number % len(opened)
             for place, (name, run) in enumerate(opened[first:] + opened[:first]):
                 on_layer(name, number * len(opened) + place, turns)
                 start = time.perf_counter()
-                rate = run(config.seconds) / (time.perf_counter() - start)
+                rate = run(seconds) / (time.perf_counter() - start)
                 if number:  # the first round warms up
                     rates[name].append(round(rate, 1))
     layers = [
@@ -183,7 +171,8 @@ def bench(
         for name, about, drones, _ in _LAYERS
     ]
     content = {
-        **asdict(config),
+        "rounds": rounds,
+        "seconds": seconds,
         "layers": [asdict(layer) for layer in layers],
         "medians": {layer.name: layer.rate for layer in layers},
         "ratios": {

@@ -90,6 +90,11 @@ class Verdict:
     evidence: str
     """The numbers."""
 
+    @classmethod
+    def of(cls, found: tuple[Outcome, str], preset: str, **texts: str) -> "Verdict":
+        """From an outcome and its evidence."""
+        return cls(verdict=found[0], evidence=found[1], preset=preset, **texts)
+
 
 def _late(run: pd.DataFrame) -> npt.NDArray[np.bool_]:
     """Which episodes of a run ended in the last quarter of its training, shape (episodes,)."""
@@ -150,47 +155,6 @@ def judge_claims(
         episodes, evaluations, headline: As of `results.Results`.
         preset: Hyperparameters with which the agents were trained; stated in every verdict.
     """
-    outcome, evidence = _compare(
-        episodes, convergence_step, larger=True, unit=" env steps", without="did not converge"
-    )
-    convergence = Verdict(
-        claim="A2C converges later than VPG: it “takes much more episodes to converge”.",
-        source="Section 3, Figure 6 (“A2C converge slower than VPG”)",
-        preset=preset,
-        verdict=outcome,
-        definition=(
-            "Convergence: the env step from which the training return, averaged over "
-            f"{100 * SMOOTHING_SHARE:.0f} % of training, stays within "
-            f"{100 * CONVERGENCE_BAND:.0f} % of its own range around its final level. A run that "
-            "does not raise this average, from the first tenth of training to the last, by more "
-            f"than {LEARNING_RISE:g} times its standard deviation in the last quarter did not "
-            "converge and is left out. Env steps are compared, not episodes, because crashes make "
-            "episodes of unequal length."
-        ),
-        evidence=evidence,
-    )
-    outcome, evidence = _compare(episodes, long_run_return, larger=True)
-    average = Verdict(
-        claim="A2C's long-run average reward is higher: it “can reach to higher average reward”.",
-        source="Section 3, Figures 6 and 7 (“A2C outperform the VPG on the long run”)",
-        preset=preset,
-        verdict=outcome,
-        definition="Long run: the mean return of the episodes in the last quarter of training.",
-        evidence=evidence,
-    )
-    outcome, evidence = _compare(episodes, fluctuation, larger=False)
-    stability = Verdict(
-        claim="A2C fluctuates less than VPG: “with much more stability”, “with minimum "
-        "fluctuation”.",
-        source="Section 3, Figures 6 and 8",
-        preset=preset,
-        verdict=outcome,
-        definition=(
-            "Fluctuation: the standard deviation of the episode return around its centred moving "
-            f"average over {FLUCTUATION_WINDOW} episodes, in the last quarter of training."
-        ),
-        evidence=evidence,
-    )
     trained = set(episodes["agent"])
     final = final_per_run(evaluations, headline)
     holds = {
@@ -199,23 +163,58 @@ def judge_claims(
     }
     # One agent that fails, fails the claim about both, whatever the other does.
     order: tuple[Outcome, ...] = ("not borne out", "not tested", "undecided", "borne out")
-    hold = Verdict(
-        claim=(
-            "Both agents hold the target: “both implemented algorithms achieve high stability, "
-            "by achieving convergence to the required performance”."
+    both = min((outcome for outcome, _ in holds.values()), key=order.index)
+    texts = (f"{name.upper()} {text}" for name, (_, text) in holds.items())
+    return [
+        Verdict.of(
+            _compare(
+                episodes,
+                convergence_step,
+                larger=True,
+                unit=" env steps",
+                without="did not converge",
+            ),
+            preset,
+            claim="A2C converges later than VPG: it “takes much more episodes to converge”.",
+            source="Section 3, Figure 6 (“A2C converge slower than VPG”)",
+            definition="Convergence: the env step from which the training return, averaged over "
+            f"{100 * SMOOTHING_SHARE:.0f} % of training, stays within "
+            f"{100 * CONVERGENCE_BAND:.0f} % of its own range around its final level. A run that "
+            "does not raise this average, from the first tenth of training to the last, by more "
+            f"than {LEARNING_RISE:g} times its standard deviation in the last quarter did not "
+            "converge and is left out. Env steps are compared, not episodes, because crashes make "
+            "episodes of unequal length.",
         ),
-        source="Abstract; section 3, Figure 8",
-        preset=preset,
-        verdict=min((outcome for outcome, _ in holds.values()), key=order.index),
-        definition=(
-            f"Holding: the steady state (mean {headline.size_symbol} over the last quarter of each "
-            f"episode) of the final deterministic evaluation fulfils {headline.held_text} with the "
-            "far end of its 95 % interval, and no episode of it crashes. Fewer than "
-            f"{MIN_SEEDS} seeds decide nothing."
+        Verdict.of(
+            _compare(episodes, long_run_return, larger=True),
+            preset,
+            claim="A2C's long-run average reward is higher: it “can reach to higher average "
+            "reward”.",
+            source="Section 3, Figures 6 and 7 (“A2C outperform the VPG on the long run”)",
+            definition="Long run: the mean return of the episodes in the last quarter of training.",
         ),
-        evidence="; ".join(f"{name.upper()} {text}" for name, (_, text) in holds.items()) + ".",
-    )
-    return [convergence, average, stability, hold]
+        Verdict.of(
+            _compare(episodes, fluctuation, larger=False),
+            preset,
+            claim="A2C fluctuates less than VPG: “with much more stability”, “with minimum "
+            "fluctuation”.",
+            source="Section 3, Figures 6 and 8",
+            definition="Fluctuation: the standard deviation of the episode return around its "
+            f"centred moving average over {FLUCTUATION_WINDOW} episodes, in the last quarter of "
+            "training.",
+        ),
+        Verdict.of(
+            (both, "; ".join(texts) + "."),
+            preset,
+            claim="Both agents hold the target: “both implemented algorithms achieve high "
+            "stability, by achieving convergence to the required performance”.",
+            source="Abstract; section 3, Figure 8",
+            definition=f"Holding: the steady state (mean {headline.size_symbol} over the last "
+            "quarter of each episode) of the final deterministic evaluation fulfils "
+            f"{headline.held_text} with the far end of its 95 % interval, and no episode of it "
+            f"crashes. Fewer than {MIN_SEEDS} seeds decide nothing.",
+        ),
+    ]
 
 
 def _compare(
@@ -265,19 +264,15 @@ def judge_no_worse(
         preset: Hyperparameters with which they were trained.
     """
     margin = MARGIN_SHARE * (headline.held or np.nan)
-    outcome, evidence = _no_worse(final_per_run(evaluations, headline), agents, margin, headline)
-    return Verdict(
+    return Verdict.of(
+        _no_worse(final_per_run(evaluations, headline), agents, margin, headline),
+        preset,
         claim="Our A2C is no worse than Stable-Baselines3's after as many env steps.",
         source=OURS,
-        preset=preset,
-        verdict=outcome,
-        definition=(
-            f"No worse: the steady {headline.size_symbol} of our A2C minus that of SB3's, in the "
-            "final deterministic evaluation, lies on the better side of a margin of "
-            f"{headline.amount(_number(margin))} with its whole 95 % interval. The margin is "
-            f"ours: {MARGIN_SHARE:.0%} of the bound for holding the goal."
-        ),
-        evidence=evidence,
+        definition=f"No worse: the steady {headline.size_symbol} of our A2C minus that of SB3's, "
+        "in the final deterministic evaluation, lies on the better side of a margin of "
+        f"{headline.amount(_number(margin))} with its whole 95 % interval. The margin is ours: "
+        f"{MARGIN_SHARE:.0%} of the bound for holding the goal.",
     )
 
 

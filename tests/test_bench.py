@@ -8,9 +8,9 @@ from rotorgram.cli import main
 from rotorgram.experiments.bench import (
     PARTS,
     RATIOS,
-    BenchConfig,
     Layer,
     Ratio,
+    bench,
     parts_of,
 )
 
@@ -61,8 +61,10 @@ def test_every_layer_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert all(one.name in said for one in layers)
 
 
-def test_wrong_times() -> None:
-    with pytest.raises(ValueError, match="rounds: expected at least 1, got 0"):
-        BenchConfig(rounds=0)
-    with pytest.raises(ValueError, match="seconds: expected more than 0 and at most 60, got 0"):
-        BenchConfig(seconds=0)
+def test_wrong_times(tmp_path: Path) -> None:
+    for rounds, seconds, sentence in (
+        (0, 1.0, "rounds: expected at least 1, got 0"),
+        (1, 0.0, "seconds: expected more than 0 and at most 60, got 0"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            bench(rounds, seconds, tmp_path, lambda *_: None)
