@@ -32,6 +32,10 @@ class Command:
         """Do it; the exit status."""
         raise NotImplementedError
 
+    def settings(self, kind: type[Any]) -> dict[str, Any]:
+        """Values of the flags that are fields of a class of settings."""
+        return {f.name: getattr(self, f.name) for f in fields(kind) if hasattr(self, f.name)}
+
 
 @dataclass(frozen=True, kw_only=True)
 class EnvFlags(Command):

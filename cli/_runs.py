@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from tyro.conf import arg
 
@@ -17,10 +17,7 @@ from ._inputs import folder_to_write, go_on_with
 if TYPE_CHECKING:
     from ..experiments.progress import OnProgress
 
-_WORKERS: Final = ("jobs", "backend", "address")
-_SETTINGS: Final = ("preset", "seeds", "first_seed", "env_steps", "num_envs", "episodes", "env_id",
-                    "options", "vehicle")  # fmt: skip
-RESUMED: Final = (*_WORKERS, "resume", "env")
+RESUMED: Final = ("jobs", "backend", "address", "resume", "env")
 """Flags that a resumed command may be given: they change no number. `--env` imports the module of a
 task."""
 
@@ -48,14 +45,6 @@ class RunsFlags(EnvFlags):
     """loky: processes of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
     address: Annotated[str | None, arg(metavar="ray://HOST:PORT")] = None
     """The Ray cluster. Default: the one that this machine is part of."""
-
-    def workers(self) -> dict[str, Any]:
-        """Fields of `WorkersConfig`."""
-        return {name: getattr(self, name) for name in _WORKERS}
-
-    def settings(self) -> dict[str, Any]:
-        """Fields that `CompareConfig` and `SweepConfig` share."""
-        return {name: getattr(self, name) for name in (*_WORKERS, *_SETTINGS)}
 
 
 def command_line() -> str:
@@ -85,7 +74,6 @@ def report_comparison(folder: Path, *, film: bool = True) -> None:
     """Write figures, film and report from the folder's files, and print the table."""
     from rich.console import Console
 
-    from ..experiments.filming import film_comparison
     from ..experiments.report import VIDEO_FILE, table_of, terminal_table, write_report
     from ..experiments.results import read_results
     from ..models.errors import InputError
@@ -97,6 +85,8 @@ def report_comparison(folder: Path, *, film: bool = True) -> None:
     # Only now: if the film fails, there is a report.
     if film and not (folder / VIDEO_FILE).exists():
         try:
+            from ..experiments.filming import film_comparison
+
             with frame_bar(VIDEO_FILE) as on_frame:
                 if film_comparison(folder, folder / VIDEO_FILE, on_frame):
                     write_report(folder, results)

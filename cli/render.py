@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from tyro.conf import Positional
 
@@ -70,9 +70,7 @@ class Render(EnvFlags):
         from ._progress import frame_bar
 
         width, height = parse_size(self.size)
-        alike = ("camera", "fps", "speed", "world", "vehicle", "overlay", "at", "fast")
-        settings: dict[str, Any] = {name: getattr(self, name) for name in alike}
-        config = Film(width=width, height=height, **settings)
+        config = Film(width=width, height=height, **self.settings(Film))
         check_film(self.out, width, height, self.fps)
         if self.at is not None and self.out.suffix.lower() != ".png":
             raise InputError(f"at: expected it with a picture, --out NAME.png, got {self.out}")

@@ -44,11 +44,8 @@ class Sweep(RunsFlags):
         if self.resume:
             config = self._resumed(self.resume)
         else:
-            config = SweepConfig(
-                algorithm=self.algorithm,
-                grid=parse_grid(word for words in self.grid for word in words),
-                **self.settings(),
-            )
+            grid = parse_grid(word for words in self.grid for word in words)
+            config = SweepConfig(**self.settings(SweepConfig) | {"grid": grid})
         name = f"sweep {config.algorithm}"
         try:
             with runs_folder(name, self) as (folder, progress):
@@ -60,9 +57,10 @@ class Sweep(RunsFlags):
         return 0
 
     def _resumed(self, folder: Path) -> Any:
+        from ..experiments.settings import WorkersConfig
         from ..experiments.sweep import missing_runs, read_sweep_config, read_sweep_runs
 
-        config = replace(read_sweep_config(folder), **self.workers())
+        config = replace(read_sweep_config(folder), **self.settings(WorkersConfig))
         if config.algorithm != self.algorithm:
             raise InputError(
                 f"resume: expected a sweep of {self.algorithm}, "

@@ -74,26 +74,17 @@ class Train(AgentFlags):
         from ..experiments.folders import locked
         from ..experiments.settings import Run
         from ..experiments.training import Training
-        from ._env import chosen_env, remote_env
+        from ._env import remote_env
 
         changes = dict(_change(word) for words in self.set for word in words)
-        env_id, options = chosen_env(self)
-        run = Run(
-            algorithm=self.algorithm,
-            config=preset(self.algorithm, self.preset, **changes),
-            env_id=env_id,
-            options=options,
-            vehicle=self.vehicle,
-            seed=self.seed,
-            env_steps=self.env_steps,
-            num_envs=self.num_envs,
-        )
+        config = preset(self.algorithm, self.preset, **changes)
+        run = Run(config=config, **self.settings(Run))
         if advice := _advice(run):
             print(f"note: {advice}", flush=True)
-        required = bool(options) or "env" in self.given
+        required = bool(self.options) or "env" in self.given
         with (
             folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
-            remote_env(self, env_id, options, required=required, num_envs=run.num_envs,
+            remote_env(self, self.env_id, self.options, required=required, num_envs=run.num_envs,
                        num_simulators=self.num_simulators) as env,
             locked(folder),
         ):  # fmt: skip
