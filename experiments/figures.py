@@ -60,19 +60,17 @@ def _draw_reward(episodes: pd.DataFrame, curves: Curves) -> Figure:
     agents = sort_agents(episodes["agent"])
     panels = max(1, len(agents) + (len(agents) > 1))
     figure, axes = _panels(panels)
-    everything = axes[-1] if len(agents) > 1 else None
     for axis, agent in zip(axes, agents, strict=False):
         runs = training_runs(episodes, agent)
-        spread = curves.average_return[agent]
         _scatter_episodes(axis, pd.concat(runs), agent)
-        _plot(axis, spread, agent, label="average reward")
+        _plot(axis, curves.average_return[agent], agent, label="average reward")
         axis.set_title(f"{agent_label(agent)} ({len(runs)} seed{'s' * (len(runs) != 1)})")
         _legend_above(axis)
-        if everything is not None:
-            _plot(everything, spread, agent)
-    if everything is not None:
-        everything.set_title("Average reward")
-        _legend_above(everything)
+    if len(agents) > 1:
+        for agent in agents:
+            _plot(axes[-1], curves.average_return[agent], agent)
+        axes[-1].set_title("Average reward")
+        _legend_above(axes[-1])
     for axis in axes:
         _env_steps_axis(axis)
     for axis in axes[:: _columns(panels)]:
