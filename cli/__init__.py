@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from errno import ENOSPC, EPIPE
 from importlib import import_module
 from pathlib import Path
-from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Final, TypeGuard, cast
 
 if TYPE_CHECKING:
@@ -66,8 +65,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
     _show_log()
-    if get_terminal_size().columns < 40:  # tyro does not end on narrower terminals
-        os.environ["COLUMNS"] = "40"
     # A terminated command says Close to the other side before it ends.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     # At exit Python collects garbage: with torch half a second for nothing.
@@ -106,9 +103,13 @@ def _run(words: list[str]) -> int:
         known = ", ".join(COMMANDS)
         print(f"rotorgram: expected a command of {known}, got {name}", file=sys.stderr)
         return 2
+    from shutil import get_terminal_size
+
     from ..rendering.gl import hidden_gl_setting
     from ._flags import parse
 
+    if get_terminal_size().columns < 40:  # tyro does not end on narrower terminals
+        os.environ["COLUMNS"] = "40"
     with hidden_gl_setting():  # importing OpenGL takes time, also for a command that draws nothing
         kind: type[Command] = getattr(import_module(f".{_module(name)}", __name__), COMMANDS[name])
         return parse(kind, f"rotorgram {name}", words[1:]).run()
