@@ -13,8 +13,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from errno import ENOSPC, EPIPE
 from importlib import import_module
 from pathlib import Path
@@ -104,18 +103,16 @@ def _run(words: list[str]) -> int:
         known = ", ".join(COMMANDS)
         print(f"rotorgram: expected a command of {known}, got {name}", file=sys.stderr)
         return 2
+    from shutil import get_terminal_size
+
     from ..rendering.gl import hidden_gl_setting
     from ._flags import parse
 
+    if get_terminal_size().columns < 40:  # tyro does not end on narrower terminals
+        os.environ["COLUMNS"] = "40"
     with hidden_gl_setting():  # importing OpenGL takes time, also for a command that draws nothing
-        with _wide_enough():
-            command = parse(_class_of(name), f"rotorgram {name}", words[1:])
-        return command.run()
-
-
-def _class_of(name: str) -> "type[Command]":
-    kind: type[Command] = getattr(import_module(f".{_module(name)}", __name__), COMMANDS[name])
-    return kind
+        kind: type[Command] = getattr(import_module(f".{_module(name)}", __name__), COMMANDS[name])
+        return parse(kind, f"rotorgram {name}", words[1:]).run()
 
 
 def _module(command: str) -> str:
@@ -130,23 +127,6 @@ def _help() -> str:
         summary = ast.get_docstring(cast(ast.ClassDef, node)) or ""
         lines.append(f"  {name:12} {summary.partition(chr(10))[0]}")
     return "\n".join([*lines, "", "rotorgram COMMAND --help lists the flags of a command."])
-
-
-@contextmanager
-def _wide_enough() -> Iterator[None]:
-    """Flags are told to a terminal of 40 columns at least: tyro does not end on narrower ones."""
-    from shutil import get_terminal_size
-
-    before = os.environ.get("COLUMNS")
-    if get_terminal_size().columns < 40:
-        os.environ["COLUMNS"] = "40"
-    try:
-        yield
-    finally:
-        if before is not None:
-            os.environ["COLUMNS"] = before
-        else:
-            os.environ.pop("COLUMNS", None)
 
 
 def _prepare_streams() -> None:

@@ -16,17 +16,6 @@ if TYPE_CHECKING:
     from ..experiments.trajectories import Trajectory
     from ..udp import RemoteEnv, RemoteVectorEnv
 
-__all__ = [
-    "CHECKPOINT",
-    "chosen_env",
-    "load_checkpoint",
-    "local_spec",
-    "pilot_of",
-    "policy_for",
-    "remote_env",
-    "words_of",
-]
-
 CHECKPOINT: Final = "checkpoint.safetensors"
 _CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
 
@@ -34,8 +23,7 @@ _CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simu
 def load_checkpoint(name: str) -> "Checkpoint | None":
     """The checkpoint of a policy by its file or its training's folder; None for `pid`.
 
-    Raises:
-        InputError: There is none.
+    Raises `InputError` if there is none.
     """
     if name == "pid":
         return None
@@ -57,10 +45,8 @@ def chosen_env(
 ) -> tuple[str, dict[str, Any]]:
     """Id of the task, and its options that are not the default.
 
-    A checkpoint brings those that it was trained with; options that the user set win.
-
-    Raises:
-        InputError: The options are of another task than the checkpoint's.
+    A checkpoint brings those that it was trained with; options that the user set win. Raises
+    `InputError` if they are of another task than the checkpoint's.
     """
     if checkpoint is None or ("env" in command.given and command.env_id != checkpoint.env_id):
         return command.env_id, command.options
@@ -70,13 +56,6 @@ def chosen_env(
             f"was trained on, got options of {command.env_id}"
         )
     return checkpoint.env_id, {**checkpoint.options, **command.options}
-
-
-def local_spec(command: EnvFlags, checkpoint: "Checkpoint | None") -> "EnvSpec":
-    """The chosen env as it is flown here. Raises `InputError`."""
-    from ..envs import registry
-
-    return registry.env_spec(*chosen_env(command, checkpoint), vehicle=command.vehicle)
 
 
 def policy_for(command: EnvFlags, checkpoint: "Checkpoint | None", spec: "EnvSpec") -> "Policy":
@@ -108,11 +87,14 @@ def pilot_of(
     """Checkpoint, policy and chosen env of what flies here; `random` has no policy, `pid` no
     checkpoint. Raises `InputError`.
     """
-    checkpoint = policy = None
-    if what != "random":
-        checkpoint = load_checkpoint(what)
-        policy = policy_for(command, checkpoint, local_spec(command, checkpoint))
-    return checkpoint, policy, chosen_env(command, checkpoint)
+    if what == "random":
+        return None, None, chosen_env(command)
+    from ..envs import registry
+
+    checkpoint = load_checkpoint(what)
+    env = chosen_env(command, checkpoint)
+    spec = registry.env_spec(*env, vehicle=command.vehicle)
+    return checkpoint, policy_for(command, checkpoint, spec), env
 
 
 def words_of(trajectory: "Trajectory") -> str:
@@ -141,8 +123,7 @@ def remote_env(
 
     Args:
         command: Says where, and with which key.
-        env_id: Task.
-        options: Its options that are not the default.
+        env_id, options: Of the task; only options that are not the default.
         required: Whether simulators that come must fly this task, with these options if there are
             any; otherwise the first that comes decides.
         num_envs: Drones. None: as many as the first simulator has, in a `RemoteVectorEnv`.
@@ -151,20 +132,20 @@ def remote_env(
     Raises:
         InputError: Flags that contradict each other.
     """
-    if num_simulators > 1 and command.listen is None:
-        raise InputError(f"num-simulators: expected 1 without --listen, got {num_simulators}")
     if command.listen is not None:
-        required_env = (env_id if required else None, options or None if required else None)
-        opened = _waiting(command, required_env, num_envs, num_simulators)
+        settings = {"env_id": env_id, "options": options or None} if required else {}
+        opened = _waiting(command, command.listen, num_envs, num_simulators, **settings)
     else:
+        from ..envs.registry import is_known
+        from ..experiments.pairs import socket_pair
+
+        if num_simulators > 1:
+            raise InputError(f"num-simulators: expected 1 without --listen, got {num_simulators}")
         if command.key_file or command.insecure:
             raise InputError(
                 "key-file, insecure: expected them with --listen, got them for a simulator of "
                 "our own on this machine"
             )
-        from ..envs.registry import is_known
-        from ..experiments.pairs import socket_pair
-
         if not is_known(env_id):
             raise InputError(
                 f"env: expected --env MODULE:{env_id}, for the task is not known here without the "
@@ -182,41 +163,25 @@ def remote_env(
 
 @contextmanager
 def _waiting(
-    command: AgentFlags,
-    required: tuple[str | None, dict[str, Any] | None],
-    num_envs: int | None,
-    num_simulators: int,
+    command: AgentFlags, listen: str, num_envs: int | None, num_simulators: int, **settings: Any
 ) -> "Iterator[RemoteEnv | RemoteVectorEnv]":
     from ..udp import RemoteEnv, RemoteVectorEnv
 
-    vehicle_hash = None
     if command.vehicle is not None:
-        from ..models.vehicle import Vehicle
+        from ..models.vehicle import Vehicle  # an agent needs no MuJoCo otherwise
 
-        vehicle_hash = Vehicle.load(command.vehicle).hash
-    assert command.listen is not None
-    address = parse_address(command.listen)
-    settings: dict[str, Any] = {
-        "env_id": required[0],
-        "options": required[1],
-        "vehicle_hash": vehicle_hash,
-        "connect": False,
-        "connect_timeout": _CONNECT_TIMEOUT,
-        "key_file": command.key_file,
-        "insecure": command.insecure,
-        "record": command.record,
-    }
+        settings["vehicle_hash"] = Vehicle.load(command.vehicle).hash
+    settings |= {
+        "connect": False, "connect_timeout": _CONNECT_TIMEOUT, "key_file": command.key_file,
+        "insecure": command.insecure, "record": command.record,
+    }  # fmt: skip
+    address = parse_address(listen)
     remote: RemoteEnv | RemoteVectorEnv
     if num_envs == num_simulators == 1:
         remote = RemoteEnv(address, **settings)
     else:
-        remote = RemoteVectorEnv(
-            address,
-            num_envs=num_envs,
-            num_simulators=num_simulators,
-            autoreset_mode="Disabled",
-            **settings,
-        )
+        settings |= {"num_simulators": num_simulators, "autoreset_mode": "Disabled"}
+        remote = RemoteVectorEnv(address, num_envs=num_envs, **settings)
     with closing(remote):
         waited = "a simulator" if num_simulators == 1 else f"{num_simulators} simulators"
         share = (num_envs or 0) // num_simulators

@@ -1,39 +1,17 @@
 """Base of all commands, and the parser of their flags: tyro, plus the options of any task."""
 
 import json
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
-from itertools import zip_longest
 from pathlib import Path
 from types import UnionType
-from typing import (
-    Annotated,
-    Any,
-    Final,
-    Literal,
-    TypeVar,
-    Union,
-    cast,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, Final, Literal, TypeVar, Union, cast, get_args, get_type_hints
 
 import tyro
 from tyro.conf import Fixed, Suppress, arg
 
 from ..models.errors import InputError
-
-__all__ = [
-    "DEFAULT_ENV",
-    "AgentFlags",
-    "AlgorithmName",
-    "Command",
-    "EnvFlags",
-    "PresetName",
-    "parse",
-    "parse_value",
-]
 
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
 
@@ -53,6 +31,10 @@ class Command:
     def run(self) -> int:
         """Do it; the exit status."""
         raise NotImplementedError
+
+    def settings(self, kind: type[Any]) -> dict[str, Any]:
+        """Values of the flags that are fields of a class of settings."""
+        return {f.name: getattr(self, f.name) for f in fields(kind) if hasattr(self, f.name)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,19 +75,20 @@ C = TypeVar("C", bound=Command)
 def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     """A command from its words. A wrong flag exits with status 2, `--help` with 0.
 
-    Raises:
-        InputError: The task or one of its options is not what it should be.
+    Raises `InputError` if the task or one of its options is not what it should be.
     """
-    given = _given(words)
+    given, plain = _given(words), _for_tyro(kind)
     if not issubclass(kind, EnvFlags):
-        plain: C = tyro.cli(_for_tyro(kind), prog=prog, args=words)
-        return replace(plain, given=given)
-    env_id = _value(words, "--env") or DEFAULT_ENV
+        return cast(C, replace(tyro.cli(plain, prog=prog, args=words), given=given))
     from ..envs import registry
 
-    if _listens(kind, given) and ":" not in env_id and not registry.is_known(env_id):
+    parser = ArgumentParser(prog, add_help=False, allow_abbrev=False)
+    parser.add_argument("--env", default=DEFAULT_ENV)
+    env_id = parser.parse_known_args(words)[0].env
+    listens = "listen" in given or getattr(kind, "listen", None) is not None
+    if listens and ":" not in env_id and not registry.is_known(env_id):
         words, required = _without_requirements(words)
-        command = tyro.cli(_for_tyro(kind), prog=prog, args=words)
+        command = tyro.cli(plain, prog=prog, args=words)
         return cast(C, replace(command, given=given, options=required))
     env_id = registry.load(env_id)
     options_type = registry.options_type(env_id)
@@ -114,7 +97,7 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     typed = make_dataclass(
         kind.__name__,
         [("options", Annotated[raw, arg(name="env")], field(default_factory=raw))],
-        bases=(_for_tyro(kind),),
+        bases=(plain,),
         namespace={"__doc__": kind.__doc__},
         frozen=True,
         kw_only=True,
@@ -127,32 +110,21 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     return cast(C, replace(command, given=given, options=chosen))
 
 
-def _for_tyro(kind: type[Any], **namespace: Any) -> type[Any]:
+def _for_tyro(kind: type[Any], **namespace: Any) -> Any:
     """A dataclass with `Union[X, Y]` in place of `X | Y`: for the latter, and Python before 3.14,
     tyro imports typeguard, which takes as long as all else.
     """
     hints = get_type_hints(kind, include_extras=True)
-    changed = {
-        one.name: hint
-        for one in fields(kind)
-        if (hint := _with_union(hints[one.name])) is not hints[one.name]
-    }
-    made = type(kind.__name__, (kind,), {"__annotations__": changed, "__doc__": kind.__doc__,
-                                         **namespace})  # fmt: skip
-    return dataclass(frozen=True, kw_only=True)(made)
-
-
-def _with_union(hint: Any) -> Any:
-    if isinstance(hint, UnionType):
-        return Union[get_args(hint)]  # noqa: UP007
-    if get_origin(hint) is Annotated and isinstance(get_args(hint)[0], UnionType):
-        first, *rest = get_args(hint)
-        return Annotated[_with_union(first), *rest]
-    return hint
-
-
-def _listens(kind: type[Command], given: frozenset[str]) -> bool:
-    return "listen" in given or any(f.name == "listen" and f.default for f in fields(kind))
+    changed = {}
+    for one in fields(kind):
+        hint = hints[one.name]
+        extras = getattr(hint, "__metadata__", ())  # of Annotated
+        hint = hint.__origin__ if extras else hint
+        if isinstance(hint, UnionType):
+            union: Any = Union[get_args(hint)]  # noqa: UP007
+            changed[one.name] = Annotated[union, *extras] if extras else union
+    namespace = {"__annotations__": changed, "__doc__": kind.__doc__, **namespace}
+    return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), namespace))
 
 
 def parse_value(text: str) -> Any:
@@ -170,16 +142,6 @@ def _given(words: Sequence[str]) -> frozenset[str]:
         prefix + dot + name.removeprefix("no_")
         for prefix, dot, name in (flag.rpartition(".") for flag in flags)
     )
-
-
-def _value(words: Sequence[str], flag: str) -> str | None:
-    """The last value of a flag, `--flag VALUE` or `--flag=VALUE`; None where it is not set."""
-    found = None
-    for word, following in zip_longest(words, words[1:], fillvalue=""):
-        name, equals, value = word.partition("=")
-        if name == flag:
-            found = value if equals else following
-    return found
 
 
 def _without_requirements(words: Sequence[str]) -> tuple[list[str], dict[str, Any]]:

@@ -1,13 +1,13 @@
 """Checks of flags: addresses, counts, folders, and the settings that a resumed run keeps."""
 
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from ..models.errors import InputError
 from ._flags import Command
-
-__all__ = ["check_count", "folder_to_write", "parse_address", "refuse_settings"]
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -41,13 +41,19 @@ def folder_to_write(out: Path | None, name: str) -> Iterator[Path]:
 
 
 def refuse_settings(command: Command, folder: Path, *, free: tuple[str, ...]) -> None:
-    """Raises `InputError` if a setting was given, if only its default: a resumed run keeps its own.
-
-    Args:
-        command: The command that resumes.
-        folder: Of the run.
-        free: Names of the fields that may be set.
+    """Raises `InputError` if a setting but the free ones was given, if only its default: the run in
+    the folder that the command resumes keeps its own.
     """
     if changed := sorted(name for name in command.given if name not in free):
         flags = ", ".join("--" + name.replace("_", "-") for name in changed)
         raise InputError(f"resume: expected the settings of {folder}, got others by {flags}")
+
+
+def go_on_with(command: Command, words: str, folder: Path, *flags: str) -> str:
+    """The line that tells how to resume: of the flags those that were given."""
+    line: list[Any] = ["rotorgram", *words.split(), "--resume", folder]
+    for flag in flags:
+        if flag in command.given:
+            value = getattr(command, flag)
+            line += [f"--{flag.replace('_', '-')}", *([] if value is True else [value])]
+    return f"go on with: {shlex.join(map(str, line))}"

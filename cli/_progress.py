@@ -18,8 +18,6 @@ from rich.text import Text
 
 from ..experiments.progress import OnProgress
 
-__all__ = ["Bars", "Lines", "bars"]
-
 _LINE_EVERY: Final = 10.0  # s
 _RATE_OVER: Final = 10.0  # s: the rate is that of so long a time up to now
 
@@ -36,7 +34,37 @@ def bars() -> Iterator[OnProgress]:
         yield shown
 
 
-class Bars:
+@contextmanager
+def frame_bar(name: str) -> Iterator[Callable[[int, int], None]]:
+    """A function that shows how many frames of a film are drawn: (done, total)."""
+    with bars() as show:
+        yield lambda done, total: show(name, done, total, "done" if done == total else "frames")
+
+
+class _Runs:
+    """Base: the task of each run, by name, with its recent amounts done and their times."""
+
+    def __init__(self, progress: Progress) -> None:
+        self.progress = progress
+        self._tasks: dict[str, Task] = {}
+
+    def update(self, name: str, done: int, total: int, words: str) -> Task:
+        now = self.progress.get_time()
+        if name not in self._tasks:
+            # There is always a point: a bar may be drawn, by a thread of rich's, at any time.
+            points = deque([(now, done)])
+            number = self.progress.add_task(name, total=total, words=words, points=points)
+            self._tasks[name] = next(t for t in self.progress.tasks if t.id == number)
+        task = self._tasks[name]
+        points = task.fields["points"]
+        points.append((now, done))
+        while len(points) > 2 and points[1][0] <= now - _RATE_OVER:
+            points.popleft()
+        self.progress.update(task.id, completed=done, total=total, words=words)
+        return task
+
+
+class Bars(_Runs):
     """Shows runs by a bar each, with done and total, rate, elapsed and remaining time, and words.
 
     Args:
@@ -45,27 +73,25 @@ class Bars:
     """
 
     def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
-        self.progress = Progress(
+        columns = (
             TextColumn("{task.description}"),
             BarColumn(bar_width=None),
             _Figures(_count),
             _Figures(_rate),
             _Figures(_times),
             TextColumn("{task.fields[words]}"),
-            console=console,
-            get_time=clock,
         )
-        self._runs = _Runs(self.progress)
+        super().__init__(Progress(*columns, console=console, get_time=clock))
 
     def __call__(self, name: str, done: int, total: int, words: str) -> None:
         """Show it."""
-        task = self._runs.update(name, done, total, words)
+        task = self.update(name, done, total, words)
         if words == "done":  # more runs than lines: what is done makes room
             self.progress.update(task.id, visible=False)
             self.progress.print(f"{name:14} done", highlight=False)
 
 
-class Lines:
+class Lines(_Runs):
     """Prints a run at most every ten seconds, and when it is done.
 
     Args:
@@ -73,59 +99,17 @@ class Lines:
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+        super().__init__(Progress(get_time=clock))  # never started: it shows nothing
         self._last: dict[str, float] = {}
-        self._runs = _Runs(Progress(get_time=clock))  # never started: it shows nothing
 
     def __call__(self, name: str, done: int, total: int, words: str) -> None:
         """Print it, unless that was done a moment ago."""
-        task, now = self._runs.update(name, done, total, words), self._clock()
+        task, now = self.update(name, done, total, words), self.progress.get_time()
         if words == "done" or now - self._last.get(name, now - _LINE_EVERY) >= _LINE_EVERY:
             self._last[name] = now
             figures = (_count(task), _rate(task), _times(task), words)
             with suppress(OSError):  # no line is worth a run
                 print(f"{name:14} {'  '.join(filter(None, figures))}", flush=True)
-
-
-class _Pace:
-    """Recent speed of a run: amounts done and their times, over the last seconds.
-
-    There is always a point: a bar may be drawn, by a thread of rich's, at any time.
-    """
-
-    def __init__(self, now: float, done: int) -> None:
-        self._points = deque([(now, done)])
-
-    def add(self, now: float, done: int) -> None:
-        points = self._points
-        points.append((now, done))
-        while len(points) > 2 and points[1][0] <= now - _RATE_OVER:
-            points.popleft()
-
-    @property
-    def rate(self) -> float:
-        """Per second; 0 where it is not known."""
-        (began, before), (now, done) = self._points[0], self._points[-1]
-        return max(done - before, 0) / (now - began) if now > began else 0.0
-
-
-class _Runs:
-    """The task of each run, by name."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-        self._tasks: dict[str, Task] = {}
-
-    def update(self, name: str, done: int, total: int, words: str) -> Task:
-        now = self._progress.get_time()
-        if name not in self._tasks:
-            pace = _Pace(now, done)
-            number = self._progress.add_task(name, total=total, words=words, pace=pace)
-            self._tasks[name] = next(t for t in self._progress.tasks if t.id == number)
-        task = self._tasks[name]
-        task.fields["pace"].add(now, done)
-        self._progress.update(task.id, completed=done, total=total, words=words)
-        return task
 
 
 class _Figures(TextColumn):
@@ -143,14 +127,21 @@ def _count(task: Task) -> str:
     return f"{_short(task.completed)}/{_short(task.total or 0)}"
 
 
+def _per_second(task: Task) -> float:
+    """0 where it is not known."""
+    points = task.fields["points"]
+    (began, before), (now, done) = points[0], points[-1]
+    return max(done - before, 0) / (now - began) if now > began else 0.0
+
+
 def _rate(task: Task) -> str:
-    rate = task.fields["pace"].rate
+    rate = _per_second(task)
     return f"{_short(rate)}/s" if rate else ""
 
 
 def _times(task: Task) -> str:
     elapsed = task.finished_time if task.finished else task.elapsed
-    rate, remaining = task.fields["pace"].rate, task.remaining
+    rate, remaining = _per_second(task), task.remaining
     left = f", {_duration(math.ceil(remaining / rate))} left" if rate and remaining else ""
     return f"{_duration(elapsed or 0.0)}{left}"
 

@@ -7,33 +7,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from tyro.conf import arg
 
 from ._flags import EnvFlags, PresetName
-from ._inputs import folder_to_write
+from ._inputs import folder_to_write, go_on_with
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
-    from ..experiments.metrics import Headline
     from ..experiments.progress import OnProgress
-    from ..experiments.settings import SweepConfig
 
-__all__ = [
-    "RESUMED",
-    "RunsFlags",
-    "command_line",
-    "report_comparison",
-    "report_sweep",
-    "runs_folder",
-]
-
-_WORKERS: Final = ("jobs", "backend", "address")
-_SETTINGS: Final = ("preset", "seeds", "first_seed", "env_steps", "num_envs", "episodes", "env_id",
-                    "options", "vehicle")  # fmt: skip
-RESUMED: Final = (*_WORKERS, "resume", "env")
+RESUMED: Final = ("jobs", "backend", "address", "resume", "env")
 """Flags that a resumed command may be given: they change no number. `--env` imports the module of a
 task."""
 
@@ -62,14 +46,6 @@ class RunsFlags(EnvFlags):
     address: Annotated[str | None, arg(metavar="ray://HOST:PORT")] = None
     """The Ray cluster. Default: the one that this machine is part of."""
 
-    def workers(self) -> dict[str, Any]:
-        """Fields of `WorkersConfig`."""
-        return {name: getattr(self, name) for name in _WORKERS}
-
-    def settings(self) -> dict[str, Any]:
-        """Fields that `CompareConfig` and `SweepConfig` share."""
-        return {name: getattr(self, name) for name in (*_WORKERS, *_SETTINGS)}
-
 
 def command_line() -> str:
     """The command as the user typed it."""
@@ -78,29 +54,19 @@ def command_line() -> str:
 
 @contextmanager
 def runs_folder(name: str, command: RunsFlags) -> "Iterator[tuple[Path, OnProgress]]":
-    """The folder to write to, and what shows the progress. If the runs fail, it says how to resume.
-
-    Args:
-        name: The command and its positional arguments.
-        command: Says where, and which workers run.
+    """The folder to write to, and what shows the progress. If the runs fail, it says how to resume:
+    `name` is the command with its positional arguments.
     """
     from ._progress import bars
 
-    with (
-        nullcontext(command.resume)
-        if command.resume
-        else folder_to_write(command.out, name.replace(" ", "-"))
-    ) as folder:
+    new = folder_to_write(command.out, name.replace(" ", "-"))
+    with nullcontext(command.resume) if command.resume else new as folder:
         try:
             with bars() as progress:
                 yield folder, progress
         except BaseException:
             if any(folder.iterdir()):
-                words = ["rotorgram", *name.split(), "--resume", str(folder)]
-                for flag in ("env", "backend", "address"):
-                    if flag in command.given:
-                        words += [f"--{flag}", getattr(command, flag)]
-                print(f"go on with: {shlex.join(words)}")
+                print(go_on_with(command, name, folder, "env", "backend", "address"))
             raise
 
 
@@ -110,38 +76,30 @@ def report_comparison(folder: Path, *, film: bool = True) -> None:
 
     from ..experiments.report import VIDEO_FILE, table_of, terminal_table, write_report
     from ..experiments.results import read_results
+    from ..models.errors import InputError
+    from ._progress import frame_bar
 
     results = read_results(folder)
     page = write_report(folder, results)
     Console(width=100).print(terminal_table(table_of(results), results.headline))
     # Only now: if the film fails, there is a report.
-    if film and not (folder / VIDEO_FILE).exists() and _film(folder):
-        write_report(folder, results)
+    if film and not (folder / VIDEO_FILE).exists():
+        try:
+            from ..experiments.filming import film_comparison
+
+            with frame_bar(VIDEO_FILE) as on_frame:
+                if film_comparison(folder, folder / VIDEO_FILE, on_frame):
+                    write_report(folder, results)
+        except (OSError, InputError, ImportError) as error:
+            logging.getLogger(__name__).info("no film of the agents: %s", error)
     print(f"report: {page}")
-
-
-def _film(folder: Path) -> bool:
-    """Whether there is a film of the agents for the report."""
-    from ..experiments.filming import film_comparison
-    from ..experiments.report import VIDEO_FILE
-    from ..models.errors import InputError
-    from ._progress import bars
-
-    try:
-        with bars() as progress:
-
-            def on_frame(done: int, total: int) -> None:
-                progress(VIDEO_FILE, done, total, "done" if done == total else "film of the agents")
-
-            return film_comparison(folder, folder / VIDEO_FILE, on_frame)
-    except (OSError, InputError, ImportError) as error:
-        logging.getLogger(__name__).info("no film of the agents: %s", error)
-        return False
 
 
 def report_sweep(folder: Path) -> None:
     """Write `sweep.csv` from the folder's files, and print it."""
+    from rich import box
     from rich.console import Console
+    from rich.table import Table
 
     from ..experiments.metrics import Headline
     from ..experiments.results import read_config, read_spec
@@ -150,19 +108,10 @@ def report_sweep(folder: Path) -> None:
     config = read_sweep_config(folder)
     headline = Headline.of(read_spec(folder, read_config(folder)))
     results = write_sweep_table(config, folder)
-    Console(width=100).print(_sweep_table(results, config, headline))
-    print(f"{results['seeds'].sum()} of {len(config.runs())} runs done")
-    print(f"table: {folder / SWEEP_FILE}")
-
-
-def _sweep_table(results: Any, config: "SweepConfig", headline: "Headline") -> "Table":
-    from rich import box
-    from rich.table import Table
-
+    steady = headline.labelled(f"Steady {headline.size_symbol},\nworst")
     table = Table(box=box.SIMPLE_HEAD)
     for name in config.grid:
         table.add_column(name.replace("_", "\n"), overflow="fold")
-    steady = headline.labelled(f"Steady {headline.size_symbol},\nworst")
     for heading in (
         steady, "median", "Return,\nmedian", "Settled", "Crashed", "Seeds", "Training\n(s)",
         "Env\nsteps/s",
@@ -180,4 +129,6 @@ def _sweep_table(results: Any, config: "SweepConfig", headline: "Headline") -> "
             f"{row['seconds']:.1f}",
             f"{row['steps_per_second']:,.0f}",
         )
-    return table
+    Console(width=100).print(table)
+    print(f"{results['seeds'].sum()} of {len(config.runs())} runs done")
+    print(f"table: {folder / SWEEP_FILE}")

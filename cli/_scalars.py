@@ -9,8 +9,6 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 
-__all__ = ["ScalarWriter"]
-
 _POINTS: Final = 200  # of each curve: the width of a chart, and less than 1 MB for all
 _LEAST: Final = 100  # env steps between two points: in short runs more would cost time
 _PREFIX: Final = "events.out.tfevents."

@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,24 +12,21 @@ from ..envs.rendering import moment
 from ..rendering.live import MOST_DRONES, LiveView, open_surface
 from ..rendering.moment import Moment
 from ..rendering.pace import Pace
-from ..rendering.stage import Stage, World
+from ..rendering.stage import Stage
 from ..udp.protocol.messages import Command, Message, State
 from ..udp.transport.simulator import Observer, Simulator
 
-__all__ = ["Realtime", "Watcher", "watched"]
+if TYPE_CHECKING:
+    from .sim import Sim
 
 _log = logging.getLogger(__name__)
 
 
 class Watcher:
-    """Passes States of a simulator to a live view, as often as it draws: an observer.
+    """Passes States of a simulator to a live view of its first drones, as often as it draws.
 
     Lock-step never waits for it. A pause freezes the picture alone: an agent that got no answer
     would take the simulator for lost. If the view is closed or fails, the simulator goes on.
-
-    Args:
-        live: Shows the first so many drones.
-        simulator: The simulator to show.
     """
 
     def __init__(self, live: LiveView, simulator: Simulator) -> None:
@@ -95,26 +92,18 @@ class Realtime:
 
 
 @contextmanager
-def watched(
-    simulator: Simulator,
-    kind: Literal["window", "web"] | None,
-    port: int,
-    world: World,
-    vehicle: str | None,
-    *,
-    realtime: bool,
-) -> Iterator[None]:
-    """Show a simulator, or hold it to real time, during the block."""
+def watched(simulator: Simulator, command: "Sim") -> Iterator[None]:
+    """Show a simulator, or hold it to real time, during the block, as the command says."""
     observers: list[Observer] = []
     with ExitStack() as opened:
-        if kind is not None:
+        if command.view is not None:
             pace, drones = Pace(0.0), simulator.stepped.num_envs
-            stage = Stage(world, min(drones, MOST_DRONES), vehicle=vehicle)
-            surface = open_surface(kind, stage, pace, port)
+            stage = Stage(command.world, min(drones, MOST_DRONES), vehicle=command.vehicle)
+            surface = open_surface(command.view, stage, pace, command.view_port)
             live = opened.enter_context(LiveView(stage, surface, pace, of=drones))
             print(f"shown {surface.where}", flush=True)
             observers.append(Watcher(live, simulator))
-        if realtime:
+        if command.realtime:
             observers.append(Realtime(simulator.spec.control_period))
 
         def observe(cause: Message | None, state: State) -> None:

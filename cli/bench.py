@@ -1,6 +1,7 @@
 """`rotorgram bench`: the speed of each layer of a training on this machine."""
 
 import logging
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,54 +34,42 @@ class Bench(Command):
         """Measure, print and draw."""
         from rich.console import Console
 
-        from ..experiments.bench import BenchConfig, bench
+        from ..experiments.bench import RATIOS, bench, parts_of
         from ._progress import bars
 
         require("matplotlib", "report", "drawing")  # before anything is measured
-        config = BenchConfig(rounds=self.rounds, seconds=self.seconds)
         logging.getLogger("rotorgram").setLevel(logging.WARNING)  # no counters of every wire
         with folder_to_write(self.out, "bench") as folder, bars() as progress:
-            layers = bench(config, folder, lambda name, at, of: progress("bench", at, of, name))
-            turns = (config.rounds + 1) * len(layers)
-            progress("bench", turns, turns, "done")
-        console = Console()
-        console.print(_rates(layers))
-        console.print(_parts(layers))
-        console.print(_ratios(layers))
+
+            def on_layer(name: str, turn: int, turns: int) -> None:
+                progress("bench", turn, turns, name)
+
+            layers = bench(self.rounds, self.seconds, folder, on_layer)
+            progress("bench", 1, 1, "done")
+        show = Console().print
+        show(_table("layer", "what", "env steps/s", "µs per env step", rows=[
+            (one.name, one.about, f"{one.rate:,.0f}", f"{1e6 / one.rate:.2f}") for one in layers
+        ]))  # fmt: skip
+        show(_table("part of a lock-step step of one drone", "µs", rows=[
+            (name, f"{1e6 * seconds:.1f}") for name, seconds in parts_of(layers)
+        ]))  # fmt: skip
+        values = [(ratio, ratio.value(layers)) for ratio in RATIOS]
+        show(_table("ratio", "median", "target", rows=[
+            (ratio.name, f"{'' if ratio.reached(value) else '[red]'}{value:.2f}", ratio.target_text)
+            for ratio, value in values
+        ]))  # fmt: skip
         _draw(layers, folder / "bench.png")
         print(f"written: {folder / 'bench.json'}, {folder / 'bench.png'}")
         return 0
 
 
-def _rates(layers: "list[Layer]") -> Table:
-    table = Table("layer", "what", box=box.SIMPLE_HEAD)
-    for name in ("env steps/s", "µs per env step"):
-        table.add_column(name, justify="right")
-    for layer in layers:
-        table.add_row(layer.name, layer.about, f"{layer.rate:,.0f}", f"{1e6 / layer.rate:.2f}")
-    return table
-
-
-def _ratios(layers: "list[Layer]") -> Table:
-    from ..experiments.bench import RATIOS
-
-    table = Table("ratio", box=box.SIMPLE_HEAD)
-    for name in ("median", "target"):
-        table.add_column(name, justify="right")
-    for ratio in RATIOS:
-        value = ratio.value(layers)
-        mark = "" if ratio.reached(value) else "[red]"
-        table.add_row(ratio.name, f"{mark}{value:.2f}", ratio.target_text)
-    return table
-
-
-def _parts(layers: "list[Layer]") -> Table:
-    from ..experiments.bench import parts_of
-
-    table = Table("part of a lock-step step of one drone", box=box.SIMPLE_HEAD)
-    table.add_column("µs", justify="right")
-    for name, seconds in parts_of(layers):
-        table.add_row(name, f"{1e6 * seconds:.1f}")
+def _table(*headings: str, rows: Iterable[tuple[str, ...]]) -> Table:
+    """A table of words, then numbers: only layers have a second column of words."""
+    table = Table(box=box.SIMPLE_HEAD)
+    for place, heading in enumerate(headings):
+        table.add_column(heading, justify="left" if place == 0 or heading == "what" else "right")
+    for row in rows:
+        table.add_row(*row)
     return table
 
 

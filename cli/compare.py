@@ -34,18 +34,19 @@ class Compare(RunsFlags):
         for module in ("matplotlib", "jinja2"):  # before hours of training
             require(module, "report", "a comparison's report")
         from ..experiments.compare import PARTS, compare, read_compare_config
-        from ..experiments.settings import CompareConfig
+        from ..experiments.settings import CompareConfig, WorkersConfig
 
         if self.resume:
             refuse_settings(self, self.resume, free=("film", *RESUMED))
-            config = replace(read_compare_config(self.resume), **self.workers())
+            config = read_compare_config(self.resume)
+            config = replace(config, **self.settings(WorkersConfig))
             if not (self.resume / PARTS).is_dir():
                 raise InputError(
                     f"resume: expected an interrupted comparison, {self.resume} is finished; "
                     f"draw its report with: rotorgram report {self.resume}"
                 )
         else:
-            config = CompareConfig(agents=self.agents, snapshots=self.snapshots, **self.settings())
+            config = CompareConfig(**self.settings(CompareConfig))
         with runs_folder("compare", self) as (folder, progress):
             compare(config, folder, command_line(), progress)
         report_comparison(folder, film=self.film)

@@ -47,7 +47,7 @@ class Evaluate(AgentFlags):
         print(f"episodes   {len(rows)}, {sum(row['terminated'] for row in rows)} terminated")
         print(f"return     {mean('return'):.1f}")
         print(f"steady     {headline.size_symbol} {amount('steady')}")
-        if (bound := headline.metric.settled) is not None and not headline.high:
+        if (bound := headline.settled) is not None and not headline.high:
             count = sum(not np.isnan(row["settling_time"]) for row in rows)
             when = f"{mean('settling_time'):.2f} s" if count else "never"
             bound_text = headline.amount(f"{bound:g}")

@@ -67,21 +67,10 @@ class Render(EnvFlags):
         from ..experiments.filming import Film, film
         from ..rendering.film import check_film
         from ..rendering.gl import offscreen_context
-        from ._progress import bars
+        from ._progress import frame_bar
 
         width, height = parse_size(self.size)
-        config = Film(
-            width=width,
-            height=height,
-            camera=self.camera,
-            fps=self.fps,
-            speed=self.speed,
-            world=self.world,
-            vehicle=self.vehicle,
-            overlay=self.overlay,
-            at=self.at,
-            fast=self.fast,
-        )
+        config = Film(width=width, height=height, **self.settings(Film))
         check_film(self.out, width, height, self.fps)
         if self.at is not None and self.out.suffix.lower() != ".png":
             raise InputError(f"at: expected it with a picture, --out NAME.png, got {self.out}")
@@ -90,11 +79,7 @@ class Render(EnvFlags):
         longest = max(shot.trajectories[0].seconds for shot in shots)
         if self.at is not None and self.at > longest:
             raise InputError(f"at: expected 0 to {longest:g} s, the flight's end, got {self.at:g}")
-        with bars() as progress:
-
-            def on_frame(done: int, total: int) -> None:
-                progress(self.out.name, done, total, "done" if done == total else "frames")
-
+        with frame_bar(self.out.name) as on_frame:
             frames = film(self.out, shots, config, on_frame)
         pictures = "1 picture" if frames == 1 else f"{frames} pictures"
         print(f"film: {self.out} ({pictures} of {width}x{height})")
@@ -164,13 +149,11 @@ def _told_apart(names: Sequence[str], what: Sequence[str]) -> list[str]:
 
 def _colors(agents: Sequence[str]) -> list[str]:
     """Each agent's own; where that is taken, one that is free."""
-    from ..experiments.palette import agent_color
+    from ..experiments.palette import DARK_COLORS, agent_color
 
     colors: list[str] = []
-    spare = [agent_color(name, dark=True) for name in ("vpg", "a2c", "sb3-a2c", "pid")]
-    spare += ["#E29AC3", "#F0B840", "#7CC8F2", "#C9938A"]
     for agent in agents:
         own = agent_color(agent, dark=True)
-        free = [color for color in spare if color not in colors]
+        free = [color for color in DARK_COLORS.values() if color not in colors]
         colors.append(own if own not in colors or not free else free[-1])
     return colors

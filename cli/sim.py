@@ -3,13 +3,10 @@
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from ._flags import EnvFlags
 from ._inputs import parse_address
-
-if TYPE_CHECKING:
-    from ..udp import Simulator
 
 __all__ = ["Sim"]
 
@@ -65,7 +62,12 @@ class Sim(EnvFlags):
             record=self.record,
             **self.options,
         )
-        with simulator, self._watched(simulator):
+        shown: AbstractContextManager[None] = nullcontext()
+        if self.view is not None or self.realtime:  # otherwise nothing that draws is imported
+            from ._watch import watched
+
+            shown = watched(simulator, self)
+        with simulator, shown:
             here = "{}:{}".format(*simulator.address)
             print(f"simulating at {here} for the agent at {self.server} (Ctrl-C ends)", flush=True)
             try:
@@ -73,13 +75,3 @@ class Sim(EnvFlags):
             finally:
                 print(f"wire: {simulator.link.statistics}", flush=True)
         return 0
-
-    def _watched(self, simulator: "Simulator") -> AbstractContextManager[None]:
-        """Viewers; without any, nothing that draws is imported."""
-        if self.view is None and not self.realtime:
-            return nullcontext()
-        from ._watch import watched
-
-        return watched(
-            simulator, self.view, self.view_port, self.world, self.vehicle, realtime=self.realtime
-        )

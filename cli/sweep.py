@@ -37,18 +37,15 @@ class Sweep(RunsFlags):
 
     def run(self) -> int:
         """Sweep, and print the table."""
-        from ..experiments.errors import RunsFailed
         from ..experiments.settings import SweepConfig
         from ..experiments.sweep import sweep
+        from ..experiments.workers import RunsFailed
 
         if self.resume:
             config = self._resumed(self.resume)
         else:
-            config = SweepConfig(
-                algorithm=self.algorithm,
-                grid=parse_grid(word for words in self.grid for word in words),
-                **self.settings(),
-            )
+            grid = parse_grid(word for words in self.grid for word in words)
+            config = SweepConfig(**self.settings(SweepConfig) | {"grid": grid})
         name = f"sweep {config.algorithm}"
         try:
             with runs_folder(name, self) as (folder, progress):
@@ -60,9 +57,10 @@ class Sweep(RunsFlags):
         return 0
 
     def _resumed(self, folder: Path) -> Any:
+        from ..experiments.settings import WorkersConfig
         from ..experiments.sweep import missing_runs, read_sweep_config, read_sweep_runs
 
-        config = replace(read_sweep_config(folder), **self.workers())
+        config = replace(read_sweep_config(folder), **self.settings(WorkersConfig))
         if config.algorithm != self.algorithm:
             raise InputError(
                 f"resume: expected a sweep of {self.algorithm}, "

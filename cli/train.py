@@ -1,7 +1,7 @@
 """`rotorgram train`: one run with a progress bar, checkpoints, and Ctrl-C that loses nothing."""
 
+import json
 import math
-import shlex
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..models.errors import InputError
+from ..models.errors import InputError, require
 from ._flags import AgentFlags, AlgorithmName, PresetName, parse_value
-from ._inputs import folder_to_write, refuse_settings
+from ._inputs import folder_to_write, go_on_with, refuse_settings
 
 if TYPE_CHECKING:
     from ..experiments.settings import Run
@@ -27,7 +27,6 @@ _FREE: Final = ("resume", "listen", "num_simulators", "key_file", "insecure", "r
                 "store_every", "env", "vehicle")  # fmt: skip
 """Flags that a resumed training may be given."""
 _UPDATE_WITHIN: Final = 2.0  # s
-_SHOW_EVERY: Final = 0.2  # s
 _LEAST_STEPS: Final = 16  # of each drone for an update of A2C
 _LEAST_UPDATES: Final = 30  # of VPG
 
@@ -63,8 +62,6 @@ class Train(AgentFlags):
 
     def run(self) -> int:
         """Train by these settings, or by those of the folder to resume."""
-        from ..models.errors import require
-
         require("torch", "train", "training")
         require("tensorboard", "train", "training")
         if not (math.isfinite(self.store_every) and self.store_every > 0):
@@ -73,35 +70,30 @@ class Train(AgentFlags):
 
     def _begin(self) -> int:
         from ..agents import preset
+        from ..agents.checkpoints import software_versions, write_whole
         from ..experiments.folders import locked
         from ..experiments.settings import Run
         from ..experiments.training import Training
-        from ._env import chosen_env, remote_env
+        from ._env import remote_env
 
         changes = dict(_change(word) for words in self.set for word in words)
-        env_id, options = chosen_env(self)
-        run = Run(
-            algorithm=self.algorithm,
-            config=preset(self.algorithm, self.preset, **changes),
-            env_id=env_id,
-            options=options,
-            vehicle=self.vehicle,
-            seed=self.seed,
-            env_steps=self.env_steps,
-            num_envs=self.num_envs,
-        )
+        config = preset(self.algorithm, self.preset, **changes)
+        run = Run(config=config, **self.settings(Run))
         if advice := _advice(run):
             print(f"note: {advice}", flush=True)
-        required = bool(options) or "env" in self.given
+        required = bool(self.options) or "env" in self.given
         with (
             folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
-            remote_env(self, env_id, options, required=required, num_envs=run.num_envs,
+            remote_env(self, self.env_id, self.options, required=required, num_envs=run.num_envs,
                        num_simulators=self.num_simulators) as env,
             locked(folder),
         ):  # fmt: skip
             spec = env.env_spec  # of the simulator that came
-            training = Training(replace(run, env_id=spec.env_id, options=spec.options), env)
-            _write_config(training, folder)
+            run = replace(run, env_id=spec.env_id, options=spec.options)
+            training = Training(run, env)
+            about = {"vehicle_hash": spec.vehicle_hash, "versions": software_versions()}
+            content = json.dumps({**asdict(run), **about}, indent=2) + "\n"
+            write_whole(folder / "config.json", content.encode())
             return self._train(training, folder)
 
     def _resume(self, folder: Path) -> int:
@@ -121,9 +113,8 @@ class Train(AgentFlags):
             if "env" in self.given and self.env_id != kept.env_id:
                 raise InputError(f"resume: expected --env {kept.env_id}, got {self.env}")
             if is_finished(kept):
-                print(
-                    f"already trained {kept.position.env_steps:,} of {kept.env_steps:,} env steps"
-                )
+                flown = kept.position.env_steps
+                print(f"already trained {flown:,} of {kept.env_steps:,} env steps")
                 print(f"checkpoint: {folder / CHECKPOINT}")
                 return 0
             for name, (then, now) in kept.other_versions().items():
@@ -134,22 +125,24 @@ class Train(AgentFlags):
 
     def _train(self, training: "Training", folder: Path) -> int:
         from ._env import CHECKPOINT
+        from ._progress import bars
 
         before = training.log.env_steps
-        go_on = f"go on with: {self._resuming(folder)}"
+        flags = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
+        go_on = go_on_with(self, f"train {self.algorithm}", folder, *flags)
         keeper = _Keeper(training, folder, self.store_every)
         try:
-            with _stop_at_update() as stop, _showing(training) as show:
+            with _stop_at_update() as stop_is_asked, bars() as progress:
 
                 def on_update() -> bool:
-                    show()
-                    stopping = stop.reached()
+                    stopping = stop_is_asked()
                     keeper.keep(now=stopping)
                     return not stopping
 
-                finished = training.train(on_update)
+                name = f"{training.run.algorithm} seed {training.run.seed}"
+                finished = training.train(on_update, lambda *now: progress(name, *now))
                 if finished:
-                    stop.reached()
+                    stop_is_asked()
                     keeper.keep(now=True, last=True)
         except BaseException:  # a full disk and SIGTERM too
             with suppress(OSError):
@@ -165,15 +158,6 @@ class Train(AgentFlags):
             print(f"{training.log.env_steps / training.log.seconds:,.0f} env steps per second")
         print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)
         return 0 if finished else 128 + signal.SIGINT
-
-    def _resuming(self, folder: Path) -> str:
-        """The command that goes on."""
-        words: list[Any] = ["rotorgram", "train", self.algorithm, "--resume", folder]
-        for flag in ("env", "vehicle", "listen", "num_simulators", "key_file"):
-            if flag in self.given:
-                words += [f"--{flag.replace('_', '-')}", getattr(self, flag)]
-        words += ["--insecure"] if self.insecure else []
-        return shlex.join(map(str, words))
 
 
 def _change(word: str) -> tuple[str, Any]:
@@ -222,13 +206,10 @@ class _Keeper:
     def __init__(self, training: "Training", folder: Path, every: float) -> None:
         from ._scalars import ScalarWriter
 
-        self._training = training
-        self._folder = folder
-        self._every = every
+        self._training, self._folder, self._every = training, folder, every
         self._due = 0.0
-        self._scalars = ScalarWriter(
-            folder / "tensorboard", training.run.env_steps, behind=training.log.env_steps
-        )
+        total, behind = training.run.env_steps, training.log.env_steps
+        self._scalars = ScalarWriter(folder / "tensorboard", total, behind=behind)
 
     def keep(self, *, now: bool, last: bool = False) -> None:
         from ._env import CHECKPOINT
@@ -254,80 +235,43 @@ class _Keeper:
         from ..agents.checkpoints import write_whole
         from ..agents.episodes import Episode
 
-        rows = [asdict(episode) for episode in self._training.log.episodes]
-        table = pd.DataFrame(rows, columns=[f.name for f in fields(Episode)])
+        columns = [field.name for field in fields(Episode)]
+        table = pd.DataFrame(map(asdict, self._training.log.episodes), columns=columns)
         write_whole(self._folder / EPISODES, table.to_csv(index=False).encode())
 
 
-def _write_config(training: "Training", folder: Path) -> None:
-    import json
-
-    from ..agents.checkpoints import software_versions, write_whole
-
-    content = {
-        **asdict(training.run),
-        "vehicle_hash": training.log.spec.vehicle_hash,
-        "versions": software_versions(),
-    }
-    write_whole(folder / "config.json", (json.dumps(content, indent=2) + "\n").encode())
-
-
 @contextmanager
-def _showing(training: "Training") -> Iterator[Callable[[], None]]:
-    """A function that shows the progress, unless it was shown a moment ago."""
-    from ._progress import bars
+def _stop_at_update() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and termination ask to stop at an update: a function that tells there whether to.
 
-    name = f"{training.run.algorithm} seed {training.run.seed}"
-    due = 0.0
-    with bars() as progress:
-
-        def show() -> None:
-            nonlocal due
-            if time.monotonic() >= due:
-                state = training.progress()
-                progress(name, state.env_steps, state.total, state.words())
-                due = time.monotonic() + _SHOW_EVERY
-
-        yield show
-        due = 0.0
-        show()
-
-
-@contextmanager
-def _stop_at_update() -> "Iterator[_Stop]":
-    """Ctrl-C and termination ask to stop at the next update.
-
-    If none comes soon, since no simulator answers for example, or if asked again, it stops at once.
+    If no update comes soon, since no simulator answers for example, or if asked again, it stops at
+    once.
     """
-    stop = _Stop()
-    handlers = {signal.SIGINT: stop.ask, signal.SIGTERM: stop.ask}
-    if hasattr(signal, "setitimer"):
-        handlers[signal.SIGALRM] = stop.ask
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    try:
-        yield stop
-    finally:
-        if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, 0)
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    asked, timers = False, hasattr(signal, "setitimer")
 
+    def set_timer(seconds: float) -> None:
+        if timers:
+            signal.setitimer(signal.ITIMER_REAL, seconds)
 
-class _Stop:
-    def __init__(self) -> None:
-        self.asked = False
-
-    def reached(self) -> bool:
-        """Whether to stop at this update. There is time to write then."""
-        if self.asked and hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, 0)
-        return self.asked
-
-    def ask(self, *_: object) -> None:
-        if self.asked:
+    def ask(*_: object) -> None:
+        nonlocal asked
+        if asked:
             raise KeyboardInterrupt
-        self.asked = True
+        asked = True
         with suppress(OSError):  # standard output may take no more
             print("stopping at the next update; Ctrl-C again stops now", flush=True)
-        if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, _UPDATE_WITHIN)
+        set_timer(_UPDATE_WITHIN)
+
+    def reached() -> bool:
+        if asked:  # there is time to write now
+            set_timer(0)
+        return asked
+
+    numbers = [signal.SIGINT, signal.SIGTERM, *([signal.SIGALRM] if timers else [])]
+    before = {number: signal.signal(number, ask) for number in numbers}
+    try:
+        yield reached
+    finally:
+        set_timer(0)
+        for number, handler in before.items():
+            signal.signal(number, handler)

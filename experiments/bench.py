@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
 
@@ -41,7 +42,7 @@ from .results import machine
 from .settings import Run
 from .training import Training
 
-__all__ = ["PARTS", "RATIOS", "BenchConfig", "Layer", "Ratio", "bench", "layers_of", "parts_of"]
+__all__ = ["PARTS", "RATIOS", "Layer", "Ratio", "bench", "parts_of"]
 
 ENV_ID: Final = "rotorgram/Elevation-v0"
 _PERIOD: Final = 0.02  # s, of a control step
@@ -61,8 +62,7 @@ class Ratio:
     name: str
     of: Callable[[Rates], float]
     target: float | None = None
-    at_most: bool = False
-    """Whether less is better."""
+    at_most: bool = False  # whether less is better
 
     def value(self, layers: Sequence["Layer"]) -> float:
         """Median over the rounds."""
@@ -72,10 +72,9 @@ class Ratio:
 
     @property
     def target_text(self) -> str:
-        """The target, with its sign."""
-        if self.target is None:
-            return ""
-        return f"{'≤' if self.at_most else '≥'} {self.target:g}"
+        """The target, with its sign; empty without one."""
+        sign = "≤" if self.at_most else "≥"
+        return f"{sign} {self.target:g}" if self.target is not None else ""
 
     def reached(self, value: float) -> bool:
         """Whether a value is on the right side of the target."""
@@ -84,12 +83,8 @@ class Ratio:
         return value <= self.target if self.at_most else value >= self.target
 
 
-def _over(numerator: str, denominator: str, target: float | None = None) -> Ratio:
-    return Ratio(
-        name=f"{numerator} ÷ {denominator}",
-        of=lambda rates: rates[numerator] / rates[denominator],
-        target=target,
-    )
+def _over(above: str, below: str, target: float | None = None) -> Ratio:
+    return Ratio(name=f"{above} ÷ {below}", of=lambda r: r[above] / r[below], target=target)
 
 
 RATIOS: Final = (
@@ -130,22 +125,6 @@ _STEPS_AT_ONCE: Final = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchConfig:
-    """Duration of a measurement."""
-
-    rounds: int = 7
-    """Turns of every layer."""
-    seconds: float = 0.5
-    """Length of a turn, s."""
-
-    def __post_init__(self) -> None:
-        if self.rounds < 1:
-            raise InputError(f"rounds: expected at least 1, got {self.rounds}")
-        if not 0 < self.seconds <= 60:
-            raise InputError(f"seconds: expected more than 0 and at most 60, got {self.seconds}")
-
-
-@dataclass(frozen=True, kw_only=True)
 class Layer:
     """One measured layer."""
 
@@ -162,37 +141,49 @@ class Layer:
 
 
 def bench(
-    config: BenchConfig, folder: Path, on_layer: Callable[[str, int, int], None]
+    rounds: int, seconds: float, folder: Path, on_layer: Callable[[str, int, int], None]
 ) -> list[Layer]:
-    """Measure every layer, and write `bench.json` into `folder`.
+    """Measure every layer in turns of so many seconds, and write `bench.json` into `folder`.
 
-    Args:
-        config: Duration of the measurement.
-        folder: Made if it is not there.
-        on_layer: Told before each turn: name of the layer, turns done, turns in all.
+    Told before each turn: name of the layer, turns done, turns in all. Raises `InputError`.
     """
+    if rounds < 1:
+        raise InputError(f"rounds: expected at least 1, got {rounds}")
+    if not 0 < seconds <= 60:
+        raise InputError(f"seconds: expected more than 0 and at most 60, got {seconds}")
     rates: dict[str, list[float]] = {name: [] for name, *_ in _LAYERS}
     with ExitStack() as stack:
         opened: list[tuple[str, Slice]] = []
         for name, _, _, open_ in _LAYERS:
             on_layer(f"opening {name}", 0, 1)
             opened.append((name, stack.enter_context(open_())))
-        total, turn = (config.rounds + 1) * len(opened), 0
-        for number in range(config.rounds + 1):
+        turns = (rounds + 1) * len(opened)
+        for number in range(rounds + 1):
             first = number % len(opened)
-            for name, run in opened[first:] + opened[:first]:
-                on_layer(name, turn, total)
+            for place, (name, run) in enumerate(opened[first:] + opened[:first]):
+                on_layer(name, number * len(opened) + place, turns)
                 start = time.perf_counter()
-                steps = run(config.seconds)
-                rate = steps / (time.perf_counter() - start)
+                rate = run(seconds) / (time.perf_counter() - start)
                 if number:  # the first round warms up
                     rates[name].append(round(rate, 1))
-                turn += 1
     layers = [
         Layer(name=name, about=about, drones=drones, rates=tuple(rates[name]))
         for name, about, drones, _ in _LAYERS
     ]
-    _write(layers, config, folder)
+    content = {
+        "rounds": rounds,
+        "seconds": seconds,
+        "layers": [asdict(layer) for layer in layers],
+        "medians": {layer.name: layer.rate for layer in layers},
+        "ratios": {
+            ratio.name: {"value": round(ratio.value(layers), 3), "target": ratio.target_text}
+            for ratio in RATIOS
+        },
+        "microseconds": {name: round(1e6 * seconds, 2) for name, seconds in parts_of(layers)},
+        "machine": machine(),
+        "versions": software_versions(),
+    }
+    write_whole(folder / "bench.json", (json.dumps(content, indent=2) + "\n").encode())
     return layers
 
 
@@ -205,33 +196,31 @@ def parts_of(layers: Sequence[Layer]) -> list[tuple[str, float]]:
     return [*parts, ("links", whole - sum(seconds for _, seconds in parts)), ("step", whole)]
 
 
-def layers_of(folder: Path) -> list[Layer]:
-    """Read the results of `bench`. Raises `InputError` if there are none."""
-    path = folder / "bench.json"
-    try:
-        content = json.loads(path.read_text())
-        return [Layer(**{**layer, "rates": tuple(layer["rates"])}) for layer in content["layers"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: expected what rotorgram bench writes: {error!r}") from None
-
-
-def _write(layers: list[Layer], config: BenchConfig, folder: Path) -> None:
-    content = {
-        **asdict(config),
-        "layers": [asdict(layer) for layer in layers],
-        "medians": {layer.name: layer.rate for layer in layers},
-        "ratios": {
-            ratio.name: {"value": round(ratio.value(layers), 3), "target": ratio.target_text}
-            for ratio in RATIOS
-        },
-        "microseconds": {name: round(1e6 * seconds, 2) for name, seconds in parts_of(layers)},
-        "machine": machine(),
-        "versions": software_versions(),
-    }
-    write_whole(folder / "bench.json", (json.dumps(content, indent=2) + "\n").encode())
-
-
 # ---- the layers, each a context that gives a `Slice`
+
+
+def _for_a_while(fly: Callable[[], int], prepare: Callable[[], None] = lambda: None) -> Slice:
+    def run(seconds: float) -> int:
+        prepare()
+        until, steps = time.perf_counter() + seconds, 0
+        while time.perf_counter() < until:
+            steps += fly()
+        return steps
+
+    return run
+
+
+def _again(
+    call: Callable[[], Any], drones: int = 1, prepare: Callable[[], None] = lambda: None
+) -> Slice:
+    """Calls it, a step of so many drones, `_STEPS_AT_ONCE` times between two looks at the clock."""
+
+    def fly() -> int:
+        for _ in range(_STEPS_AT_ONCE):
+            call()
+        return drones * _STEPS_AT_ONCE
+
+    return _for_a_while(fly, prepare)
 
 
 @contextmanager
@@ -240,26 +229,19 @@ def _mj_step() -> Iterator[Slice]:
     model, substeps = vehicle.model, vehicle.substeps(_PERIOD)
     data = mujoco.MjData(model)
 
-    def fly() -> int:
-        # Every turn begins in the air: how long it lasts must not matter.
-        for _ in range(_STEPS_AT_ONCE):
-            mujoco.mj_step(model, data, substeps)
-        return _STEPS_AT_ONCE
-
     def prepare() -> None:
+        # Every turn begins in the air: how long it lasts must not matter.
         mujoco.mj_resetData(model, data)
         data.qpos[2], data.ctrl[:] = 5.0, vehicle.hover_thrust
 
-    yield _for_a_while(fly, prepare)
+    yield _again(lambda: mujoco.mj_step(model, data, substeps), prepare=prepare)
 
 
 @contextmanager
 def _batch_step(drones: int, timestep: float | None = None) -> Iterator[Slice]:
     vehicle = Vehicle.load()
-    model = vehicle.model
-    if timestep is not None:
-        model = copy.deepcopy(model)
-        model.opt.timestep = timestep
+    model = copy.deepcopy(vehicle.model)
+    model.opt.timestep = timestep or model.opt.timestep
     batch, substeps = Batch(model, drones), round(_PERIOD / model.opt.timestep)
 
     def prepare() -> None:
@@ -287,86 +269,97 @@ def _remote(drones: int) -> Iterator[Slice]:
         yield _single(env) if drones == 1 else _vector(env)
 
 
+def _single(env: Any) -> Slice:
+    actions = cycle(np.random.default_rng(0).uniform(-0.1, 0.1, (4096, 1)).astype(np.float32))
+    env.reset(seed=0)
+
+    def step() -> None:
+        _, _, terminated, truncated, _ = env.step(next(actions))
+        if terminated or truncated:
+            env.reset()
+
+    return _again(step)
+
+
+def _vector(env: Any) -> Slice:
+    """Random actions; drones whose episode ended are reset by the next step, as in NEXT_STEP."""
+    dice = np.random.default_rng(0)
+    actions = cycle(dice.uniform(-0.1, 0.1, (16, env.num_envs, 1)).astype(np.float32))
+    env.reset(seed=0)
+
+    def fly() -> int:
+        resets = env.done
+        env.advance(next(actions), resets if resets.any() else None)
+        return int((~resets).sum())
+
+    return _for_a_while(fly)
+
+
 @contextmanager
 def _simulate() -> Iterator[Slice]:
     """The simulator's part between a Command and a State."""
-    loop = Loop(ENV_ID)
     dice = np.random.default_rng(0)
-    actions = dice.uniform(-0.1, 0.1, (_STEPS_AT_ONCE, 1, 1)).astype(np.float32)
+    actions = cycle(dice.uniform(-0.1, 0.1, (_STEPS_AT_ONCE, 1, 1)).astype(np.float32))
     everyone = np.ones(1, bool)
-    loop.advance(actions[0], everyone)
+    with closing(Loop(ENV_ID)) as loop:
+        loop.advance(next(actions), everyone)
 
-    def fly() -> int:
-        for action in actions:
-            loop.advance(action, everyone if loop.done[0] else None)
+        def step() -> None:
+            loop.advance(next(actions), everyone if loop.done[0] else None)
             loop.telemetry  # noqa: B018  # made when it is asked for
-        return _STEPS_AT_ONCE
 
-    with closing(loop):
-        yield _for_a_while(fly)
+        yield _again(step)
 
 
-def _messages() -> tuple[Any, State, Command]:
-    """A State and a Command of one drone, and their layout."""
-    loop = Loop(ENV_ID)
-    loop.advance(np.zeros((1, 1), np.float32), np.ones(1, bool))
-    state = State(
-        session=1,
-        sequence=2,
-        time=0.02,
-        observations=tuple(loop.observations.values()),
-        rewards=loop.rewards,
-        terminated=loop.terminated,
-        truncated=loop.truncated,
-        telemetry=tuple(loop.telemetry.values()),
-    )
-    command = Command(
-        session=1, sequence=2, actions=np.zeros((1, 1), np.float32), orders=np.zeros(1, np.uint8)
-    )
-    loop.close()
-    return layout_of(loop.spec, 1), state, command
+def _messages() -> tuple[Any, dict[str, State | Command]]:
+    """The layout of one drone, and a State and a Command of it by name."""
+    action = np.zeros((1, 1), np.float32)
+    with closing(Loop(ENV_ID)) as loop:
+        loop.advance(action, np.ones(1, bool))
+        state = State(
+            session=1,
+            sequence=2,
+            time=0.02,
+            observations=tuple(loop.observations.values()),
+            rewards=loop.rewards,
+            terminated=loop.terminated,
+            truncated=loop.truncated,
+            telemetry=tuple(loop.telemetry.values()),
+        )
+        command = Command(session=1, sequence=2, actions=action, orders=np.zeros(1, np.uint8))
+        return layout_of(loop.spec, 1), {"State": state, "Command": command}
 
 
 @contextmanager
 def _codec(name: str) -> Iterator[Slice]:
-    layout, state, command = _messages()
+    layout, messages = _messages()
     what, kind = name.split()
-    messages: dict[str, State | Command] = {"State": state, "Command": command}
-    message: State | Command = messages[kind]
+    message = messages[kind]
     datagram = binary.encode(message, layout)
-
-    def fly() -> int:
-        for _ in range(_STEPS_AT_ONCE):
-            if what == "encode":
-                binary.encode(message, layout)
-            else:
-                binary.decode(datagram, layout)
-        return _STEPS_AT_ONCE
-
-    yield _for_a_while(fly)
+    if what == "encode":
+        yield _again(lambda: binary.encode(message, layout))
+    else:
+        yield _again(lambda: binary.decode(datagram, layout))
 
 
 @contextmanager
 def _echo() -> Iterator[Slice]:
     """A blocking Python client and server; datagrams of the sizes of a State and a Command."""
-    layout, *both = _messages()
-    messages: tuple[State | Command, ...] = tuple(both)  # type: ignore[arg-type]
-    state, command = (len(binary.encode(message, layout)) for message in messages)
-    words = [sys.executable, "-c", _ECHO, str(command)]
+    layout, messages = _messages()
+    sizes = {kind: len(binary.encode(one, layout)) for kind, one in messages.items()}
+    words = [sys.executable, "-c", _ECHO, str(sizes["Command"])]
     with subprocess.Popen(words, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
-        address, message = ("127.0.0.1", int(process.stdout.readline())), bytes(state)
+        address, message = ("127.0.0.1", int(process.stdout.readline())), bytes(sizes["State"])
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.settimeout(1.0)
 
-            def fly() -> int:
-                for _ in range(_STEPS_AT_ONCE):
-                    sock.sendto(message, address)
-                    sock.recvfrom(65536)
-                return _STEPS_AT_ONCE
+            def exchange() -> None:
+                sock.sendto(message, address)
+                sock.recvfrom(65536)
 
             try:
-                yield _for_a_while(fly)
+                yield _again(exchange)
             finally:
                 sock.sendto(b"", address)
 
@@ -374,32 +367,24 @@ def _echo() -> Iterator[Slice]:
 @contextmanager
 def _policy(drones: int) -> Iterator[Slice]:
     dice = np.random.default_rng(0)
-    weights = {
-        "hidden.weight": dice.normal(size=(16, 3)),
-        "hidden.bias": np.zeros(16),
-        "output.weight": dice.normal(size=(1, 16)),
-        "output.bias": np.zeros(1),
-        "log_std": np.zeros(1),
-    }
-    policy = NetworkPolicy(
-        {name: array.astype(np.float32) for name, array in weights.items()}, env_spec(ENV_ID)
-    )
+    shapes: dict[str, Any] = {
+        "hidden.weight": (16, 3), "hidden.bias": 16, "output.weight": (1, 16), "output.bias": 1,
+        "log_std": 1,
+    }  # fmt: skip
+    weights = {name: dice.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+    policy = NetworkPolicy(weights, env_spec(ENV_ID))
     observations = dice.normal(size=(drones, 3)).astype(np.float32)
     noise = policy.draw_noise(dice, drones)
-
-    def fly() -> int:
-        for _ in range(_STEPS_AT_ONCE):
-            policy.actions.to_envs(policy.sample(observations, noise))
-        return drones * _STEPS_AT_ONCE
-
-    yield _for_a_while(fly)
+    yield _again(lambda: policy.actions.to_envs(policy.sample(observations, noise)), drones)
 
 
 @contextmanager
 def _training(algorithm: str, drones: int) -> Iterator[Slice]:
+    # With 64 drones: five steps of each for an update, as SB3's default has it; VPG an episode.
+    batch = {"episodes_per_update": 64} if algorithm == "vpg" else {"steps_per_update": 64 * 5}
     run = Run(
         algorithm=algorithm,
-        config=preset(algorithm, "tuned", **({} if drones == 1 else _BATCH[algorithm])),
+        config=preset(algorithm, "tuned", **({} if drones == 1 else batch)),
         seed=0,
         env_steps=10**9,
         num_envs=drones,
@@ -413,60 +398,6 @@ def _training(algorithm: str, drones: int) -> Iterator[Slice]:
             return training.log.env_steps - before
 
         yield fly
-
-
-_BATCH: Final[dict[str, dict[str, Any]]] = {
-    "vpg": {"episodes_per_update": 64},
-    "a2c": {"steps_per_update": 64 * 5},
-    "sb3-a2c": {"steps_per_update": 64 * 5},
-}
-"""With 64 drones: five steps of each for an update, as SB3's default has it; VPG an episode."""
-
-
-def _single(env: Any) -> Slice:
-    actions = np.random.default_rng(0).uniform(-0.1, 0.1, (4096, 1)).astype(np.float32)
-    env.reset(seed=0)
-    number = 0
-
-    def fly() -> int:
-        nonlocal number
-        for _ in range(_STEPS_AT_ONCE):
-            _, _, terminated, truncated, _ = env.step(actions[number % 4096])
-            number += 1
-            if terminated or truncated:
-                env.reset()
-        return _STEPS_AT_ONCE
-
-    return _for_a_while(fly)
-
-
-def _vector(env: Any) -> Slice:
-    """Random actions; drones whose episode ended are reset by the next step, as in NEXT_STEP."""
-    shape = env.num_envs, 1
-    dice = np.random.default_rng(0)
-    actions = [dice.uniform(-0.1, 0.1, shape).astype(np.float32) for _ in range(16)]
-    env.reset(seed=0)
-    number = 0
-
-    def fly() -> int:
-        nonlocal number
-        resets = env.done
-        env.advance(actions[number % 16], resets if resets.any() else None)
-        number += 1
-        return int((~resets).sum())
-
-    return _for_a_while(fly)
-
-
-def _for_a_while(fly: Callable[[], int], prepare: Callable[[], None] = lambda: None) -> Slice:
-    def run(seconds: float) -> int:
-        prepare()
-        until, steps = time.perf_counter() + seconds, 0
-        while time.perf_counter() < until:
-            steps += fly()
-        return steps
-
-    return run
 
 
 _MANY: Final = (64, 1024, 4096)

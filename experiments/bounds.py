@@ -31,22 +31,16 @@ Floats = npt.NDArray[np.float64]
 def elevation_bounds(
     options: ElevationOptions, vehicle: Vehicle, starts: Floats
 ) -> dict[str, float]:
-    """Mean returns of the two flights over episodes, by name.
-
-    Args:
-        options, vehicle: Of `rotorgram/Elevation-v0`.
-        starts: E at the start of each episode, m, shape (n,).
-    """
+    """Mean returns of the two flights by name, over episodes that start at E in m, shape (n,)."""
     steps, period = options.episode_length, options.control_period
     up, down, change = _limits(options, vehicle)
     rising = starts > 0
     towards, against = np.where(rising, up, down), np.where(rising, down, up)
     drag = options.linear_drag
     left = bang_bang(np.abs(starts), steps, period, towards, against, change, drag)
-    fastest = elevation_reward(left).sum(axis=1)
     return {
-        "time-optimal": float(fastest.mean()),
-        "hover": float((steps * elevation_reward(starts)).mean()),
+        "time-optimal": float(elevation_reward(left).sum(axis=1).mean()),
+        "hover": float(steps * elevation_reward(starts).mean()),
     }
 
 
@@ -86,8 +80,7 @@ def bang_bang(
         m, shape (n, steps).
     """
     limits = towards, against, change, drag, period
-    # More than enough: without and with limited changes of the acceleration, and at a speed that
-    # drag limits.
+    # More than enough, also for limited changes of the acceleration, and a speed that drag limits.
     weakest = float(np.minimum(towards, against).min())
     furthest = float(distance.max(initial=0.0))
     seconds = 3 * np.sqrt(furthest / weakest) + 2 * furthest * drag / weakest
@@ -97,15 +90,12 @@ def bang_bang(
 
     def braked(first: Floats) -> Floats:
         """The second moment for a first one: so that the speed is 0 at the end."""
-        return _bisected(
-            lambda second: _flown(first, second, horizon, *limits)[1] > 0, first, longest
-        )
+        return _bisected(lambda two: _flown(first, two, horizon, *limits)[1] > 0, first, longest)
 
-    first = _bisected(
-        lambda moment: _flown(moment, braked(moment), horizon, *limits)[0][:, -1] < distance,
-        np.zeros(len(distance)),
-        longest,
-    )
+    def falls_short(first: Floats) -> npt.NDArray[np.bool_]:
+        return _flown(first, braked(first), horizon, *limits)[0][:, -1] < distance
+
+    first = _bisected(falls_short, np.zeros(len(distance)), longest)
     way, _ = _flown(first, braked(first), max(horizon, steps), *limits)
     return np.asarray(distance[:, None] - way[:, :steps])
 

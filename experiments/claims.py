@@ -15,12 +15,12 @@ on the good side of it.
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
-from ..models.errors import require
 from .metrics import (
     Headline,
     bootstrap_difference,
@@ -30,11 +30,6 @@ from .metrics import (
     iqm,
     training_runs,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = require("pandas", "train", "comparing agents")
 
 __all__ = ["MIN_SEEDS", "OURS", "Verdict", "convergence_step", "fluctuation", "judge_claims",
            "judge_no_worse", "long_run_return"]  # fmt: skip
@@ -84,37 +79,27 @@ class Verdict:
     """The verdict on one claim of the paper."""
 
     claim: str
-    """The claim, with the paper's words."""
+    """With the paper's words."""
     source: str
-    """Place of the claim in the paper."""
+    """Place in the paper."""
     preset: str
     """Hyperparameters with which the agents were trained."""
     verdict: Outcome
-    """The outcome."""
     definition: str
-    """Definition of its measure and of the decision."""
+    """Of its measure and of the decision."""
     evidence: str
     """The numbers."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class _Comparison:
-    """A claim that A2C's number is larger (or smaller) than VPG's."""
-
-    measure: Callable[[pd.DataFrame], float]
-    claim: str
-    source: str
-    definition: str
-    unit: str
-    larger: bool
-    without: str = ""
-    """Words for a run that is long enough and yet has no number."""
+    @classmethod
+    def of(cls, found: tuple[Outcome, str], preset: str, **texts: str) -> "Verdict":
+        """From an outcome and its evidence."""
+        return cls(verdict=found[0], evidence=found[1], preset=preset, **texts)
 
 
 def _late(run: pd.DataFrame) -> npt.NDArray[np.bool_]:
     """Which episodes of a run ended in the last quarter of its training, shape (episodes,)."""
     ends = episode_ends(run)
-    return np.asarray(ends > 0.75 * ends.max())
+    return np.asarray(ends > 0.75 * ends.max(initial=0.0))
 
 
 def convergence_step(run: pd.DataFrame) -> float:
@@ -123,16 +108,11 @@ def convergence_step(run: pd.DataFrame) -> float:
     The band around the final level is a share of the curve's own range, so a curve that only
     fluctuates would "converge" too, and late. It counts only if training raised the level: from
     the first tenth of training to the last by more than `LEARNING_RISE` standard deviations of
-    the level in the last quarter.
-
-    Args:
-        run: The training episodes of one run, in order.
-
-    Returns:
-        nan for a run that did not converge, or of fewer than `MIN_EPISODES` episodes.
+    the level in the last quarter. A run that did not converge, or of fewer than `MIN_EPISODES`
+    episodes, has nan.
     """
     if len(run) < MIN_EPISODES:
-        return float("nan")
+        return np.nan
     ends = episode_ends(run)
     total = np.concatenate([[0.0], np.cumsum(run["return"].to_numpy())])
     grid = ends[-1] * np.arange(1, _GRID + 1) / _GRID
@@ -144,7 +124,7 @@ def convergence_step(run: pd.DataFrame) -> float:
     steps = grid[filled]
     begin = int(np.searchsorted(steps, grid[round(SMOOTHING_SHARE * _GRID) - 1]))
     if level[-1] - level[begin] <= LEARNING_RISE * level[steps > 0.75 * ends[-1]].std():
-        return float("nan")
+        return np.nan
     away = np.abs(level - level[-1]) > CONVERGENCE_BAND * np.ptp(level)
     start = int(away.nonzero()[0][-1]) + 1 if away.any() else 0
     return float(steps[start])
@@ -152,60 +132,18 @@ def convergence_step(run: pd.DataFrame) -> float:
 
 def long_run_return(run: pd.DataFrame) -> float:
     """Mean return of one run's episodes in the last quarter of training; nan if too few."""
-    if len(run) < MIN_EPISODES:
-        return float("nan")
-    return float(run["return"].to_numpy()[_late(run)].mean())
+    return float(run["return"][_late(run)].mean()) if len(run) >= MIN_EPISODES else np.nan
 
 
 def fluctuation(run: pd.DataFrame) -> float:
-    """Spread of one run's episode returns around their moving average, late in training.
-
-    The standard deviation over the episodes of the last quarter of training; nan if the run has
-    fewer than `MIN_EPISODES` episodes or fewer than two in that quarter.
+    """Standard deviation of one run's episode returns around their moving average, over the last
+    quarter of training; nan if it has fewer than `MIN_EPISODES` episodes, or two in that quarter.
     """
-    late = _late(run) if len(run) else np.zeros(0, dtype=bool)
+    late = _late(run)
     if len(run) < MIN_EPISODES or late.sum() < 2:
-        return float("nan")
+        return np.nan
     moving = run["return"].rolling(FLUCTUATION_WINDOW, center=True, min_periods=1).mean()
     return float((run["return"] - moving).to_numpy()[late].std(ddof=1))
-
-
-_CONVERGENCE: Final = _Comparison(
-    measure=convergence_step,
-    claim="A2C converges later than VPG: it “takes much more episodes to converge”.",
-    source="Section 3, Figure 6 (“A2C converge slower than VPG”)",
-    definition=(
-        "Convergence: the env step from which the training return, averaged over "
-        f"{100 * SMOOTHING_SHARE:.0f} % of training, stays within "
-        f"{100 * CONVERGENCE_BAND:.0f} % of its own range around its final level. A run "
-        "that does not raise this average, from the first tenth of training to the last, by more "
-        f"than {LEARNING_RISE:g} times its standard deviation in the last quarter did not converge "
-        "and is left out. Env steps are compared, not episodes, because crashes make episodes of "
-        "unequal length."
-    ),
-    unit=" env steps",
-    larger=True,
-    without="did not converge",
-)
-_RETURN: Final = _Comparison(
-    measure=long_run_return,
-    claim="A2C's long-run average reward is higher: it “can reach to higher average reward”.",
-    source="Section 3, Figures 6 and 7 (“A2C outperform the VPG on the long run”)",
-    definition="Long run: the mean return of the episodes in the last quarter of training.",
-    unit="",
-    larger=True,
-)
-_FLUCTUATION: Final = _Comparison(
-    measure=fluctuation,
-    claim="A2C fluctuates less than VPG: “with much more stability”, “with minimum fluctuation”.",
-    source="Section 3, Figures 6 and 8",
-    definition=(
-        "Fluctuation: the standard deviation of the episode return around its centred moving "
-        f"average over {FLUCTUATION_WINDOW} episodes, in the last quarter of training."
-    ),
-    unit="",
-    larger=False,
-)
 
 
 def judge_claims(
@@ -214,92 +152,105 @@ def judge_claims(
     """Judge the paper's four claims from the training episodes and the evaluations.
 
     Args:
-        episodes: As of `results.Results`.
-        evaluations: As of `results.Results`.
+        episodes, evaluations, headline: As of `results.Results`.
         preset: Hyperparameters with which the agents were trained; stated in every verdict.
-        headline: The metric that decides whether a goal is held.
     """
-    verdicts = []
-    for comparison in (_CONVERGENCE, _RETURN, _FLUCTUATION):
-        outcome, evidence = _compare(episodes, comparison)
-        verdicts.append(
-            Verdict(
-                claim=comparison.claim,
-                source=comparison.source,
-                preset=preset,
-                verdict=outcome,
-                definition=comparison.definition,
-                evidence=evidence,
-            )
-        )
-    trained = sorted(set(episodes["agent"]) & {"vpg", "a2c"})
-    return [*verdicts, _judge_hold(evaluations, trained, preset, headline)]
+    trained = set(episodes["agent"])
+    final = final_per_run(evaluations, headline)
+    holds = {
+        name: _holds(final[(final["agent"] == name) & (name in trained)], headline)
+        for name in ("a2c", "vpg")
+    }
+    # One agent that fails, fails the claim about both, whatever the other does.
+    order: tuple[Outcome, ...] = ("not borne out", "not tested", "undecided", "borne out")
+    both = min((outcome for outcome, _ in holds.values()), key=order.index)
+    texts = (f"{name.upper()} {text}" for name, (_, text) in holds.items())
+    return [
+        Verdict.of(
+            _compare(
+                episodes,
+                convergence_step,
+                larger=True,
+                unit=" env steps",
+                without="did not converge",
+            ),
+            preset,
+            claim="A2C converges later than VPG: it “takes much more episodes to converge”.",
+            source="Section 3, Figure 6 (“A2C converge slower than VPG”)",
+            definition="Convergence: the env step from which the training return, averaged over "
+            f"{100 * SMOOTHING_SHARE:.0f} % of training, stays within "
+            f"{100 * CONVERGENCE_BAND:.0f} % of its own range around its final level. A run that "
+            "does not raise this average, from the first tenth of training to the last, by more "
+            f"than {LEARNING_RISE:g} times its standard deviation in the last quarter did not "
+            "converge and is left out. Env steps are compared, not episodes, because crashes make "
+            "episodes of unequal length.",
+        ),
+        Verdict.of(
+            _compare(episodes, long_run_return, larger=True),
+            preset,
+            claim="A2C's long-run average reward is higher: it “can reach to higher average "
+            "reward”.",
+            source="Section 3, Figures 6 and 7 (“A2C outperform the VPG on the long run”)",
+            definition="Long run: the mean return of the episodes in the last quarter of training.",
+        ),
+        Verdict.of(
+            _compare(episodes, fluctuation, larger=False),
+            preset,
+            claim="A2C fluctuates less than VPG: “with much more stability”, “with minimum "
+            "fluctuation”.",
+            source="Section 3, Figures 6 and 8",
+            definition="Fluctuation: the standard deviation of the episode return around its "
+            f"centred moving average over {FLUCTUATION_WINDOW} episodes, in the last quarter of "
+            "training.",
+        ),
+        Verdict.of(
+            (both, "; ".join(texts) + "."),
+            preset,
+            claim="Both agents hold the target: “both implemented algorithms achieve high "
+            "stability, by achieving convergence to the required performance”.",
+            source="Abstract; section 3, Figure 8",
+            definition=f"Holding: the steady state (mean {headline.size_symbol} over the last "
+            "quarter of each episode) of the final deterministic evaluation fulfils "
+            f"{headline.held_text} with the far end of its 95 % interval, and no episode of it "
+            f"crashes. Fewer than {MIN_SEEDS} seeds decide nothing.",
+        ),
+    ]
 
 
-def _compare(episodes: pd.DataFrame, comparison: _Comparison) -> tuple[Outcome, str]:
-    """The outcome for a claim that compares the two agents, and the numbers."""
+def _compare(
+    episodes: pd.DataFrame, measure: Callable[[pd.DataFrame], float], *, larger: bool,
+    unit: str = "", without: str = "",
+) -> tuple[Outcome, str]:  # fmt: skip
+    """Judge a claim that A2C's number is larger (or smaller) than VPG's: outcome and the numbers.
+
+    Args:
+        episodes: Of training.
+        measure: The number of one run.
+        larger: Whether the claim is that A2C's is larger.
+        unit: Of the number, behind a space.
+        without: Words for a run that is long enough and yet has no number.
+    """
     runs = {name: training_runs(episodes, name.lower()) for name in ("A2C", "VPG")}
     if missing := [name for name, own in runs.items() if not own]:
         return "not tested", f"{_join(missing)} not trained."
-    a2c, vpg = ([comparison.measure(run) for run in own] for own in runs.values())
-    evidence = (
-        f"A2C {_measured(a2c, runs['A2C'], comparison)}, "
-        f"VPG {_measured(vpg, runs['VPG'], comparison)}; "
-    )
-    if min(np.isfinite(a2c).sum(), np.isfinite(vpg).sum()) < MIN_SEEDS:
+    values = {name: [measure(run) for run in own] for name, own in runs.items()}
+    counts, parts = [], []
+    for name, numbers in values.items():
+        finite = np.isfinite(numbers)
+        counts.append(int(finite.sum()))
+        text, value = _seeds(counts[-1], len(numbers)), iqm(numbers)
+        long = np.array([len(run) >= MIN_EPISODES for run in runs[name]])
+        if without and (count := int((long & ~finite).sum())):
+            text += f", {count} {without}"
+        parts.append(f"{name} {_number(value)}{unit if counts[-1] else ''} ({text})")
+    evidence = ", ".join(parts) + "; "
+    if min(counts) < MIN_SEEDS:
         return "undecided", f"{evidence}{_TOO_FEW}."
-    difference, low, high = bootstrap_difference(a2c, vpg)
+    difference, low, high = bootstrap_difference(values["A2C"], values["VPG"])
     evidence += f"difference {_number(difference)}, 95 % interval {_range(low, high)}."
     if low <= 0.0 <= high:
         return "undecided", evidence
-    as_claimed = (low > 0.0) == comparison.larger
-    return ("borne out" if as_claimed else "not borne out"), evidence
-
-
-def _measured(values: list[float], runs: list[pd.DataFrame], comparison: _Comparison) -> str:
-    """One agent's number, and how many of its runs have one."""
-    text = _seeds(int(np.isfinite(values).sum()), len(values))
-    without = sum(
-        not np.isfinite(value) and len(run) >= MIN_EPISODES
-        for value, run in zip(values, runs, strict=True)
-    )
-    if comparison.without and without:
-        text += f", {without} {comparison.without}"
-    value = iqm(values)
-    return f"{_number(value)}{comparison.unit if np.isfinite(value) else ''} ({text})"
-
-
-def _judge_hold(
-    evaluations: pd.DataFrame, trained: list[str], preset: str, headline: Headline
-) -> Verdict:
-    final = final_per_run(evaluations, headline)
-    parts: list[str] = []
-    outcomes: list[Outcome] = []
-    for agent in ("a2c", "vpg"):
-        runs = final[final["agent"] == agent]
-        if agent not in trained or runs.empty:
-            outcomes.append("not tested")
-            parts.append(f"{agent.upper()} not trained")
-        else:
-            outcome, part = _holds(runs, headline)
-            outcomes.append(outcome)
-            parts.append(f"{agent.upper()} {part}")
-    return Verdict(
-        claim=(
-            "Both agents hold the target: “both implemented algorithms achieve high stability, "
-            "by achieving convergence to the required performance”."
-        ),
-        source="Abstract; section 3, Figure 8",
-        preset=preset,
-        verdict=_together(outcomes),
-        definition=(
-            f"Holding: the steady state (mean {headline.size_symbol} over the last quarter of each "
-            f"episode) of the final deterministic evaluation fulfils {headline.held_text} with the "
-            "far end of its 95 % interval, and no episode of it crashes. Fewer than "
-            f"{MIN_SEEDS} seeds decide nothing."
-        ),
-        evidence="; ".join(parts) + ".",
-    )
+    return ("borne out" if (low > 0.0) == larger else "not borne out"), evidence
 
 
 def judge_no_worse(
@@ -308,36 +259,30 @@ def judge_no_worse(
     """Judge whether our A2C is no worse than SB3's after as many env steps.
 
     Args:
-        evaluations: As of `results.Results`.
+        evaluations, headline: As of `results.Results`; the metric has a bound of its goal.
         agents: Those that were trained.
         preset: Hyperparameters with which they were trained.
-        headline: The metric that decides; it needs a bound below which its goal is held.
     """
-    margin = MARGIN_SHARE * (headline.metric.held or np.nan)
-    outcome, evidence = _no_worse(final_per_run(evaluations, headline), agents, margin, headline)
-    return Verdict(
+    margin = MARGIN_SHARE * (headline.held or np.nan)
+    return Verdict.of(
+        _no_worse(final_per_run(evaluations, headline), agents, margin, headline),
+        preset,
         claim="Our A2C is no worse than Stable-Baselines3's after as many env steps.",
         source=OURS,
-        preset=preset,
-        verdict=outcome,
-        definition=(
-            f"No worse: the steady {headline.size_symbol} of our A2C minus that of SB3's, in the "
-            "final deterministic evaluation, lies on the better side of a margin of "
-            f"{headline.amount(_number(margin))} with its whole 95 % interval. The margin is "
-            f"ours: {MARGIN_SHARE:.0%} of the bound for holding the goal."
-        ),
-        evidence=evidence,
+        definition=f"No worse: the steady {headline.size_symbol} of our A2C minus that of SB3's, "
+        "in the final deterministic evaluation, lies on the better side of a margin of "
+        f"{headline.amount(_number(margin))} with its whole 95 % interval. The margin is ours: "
+        f"{MARGIN_SHARE:.0%} of the bound for holding the goal.",
     )
 
 
 def _no_worse(
     final: pd.DataFrame, agents: Collection[str], margin: float, headline: Headline
 ) -> tuple[Outcome, str]:
-    if missing := [name for name in ("a2c", "sb3-a2c") if name not in agents]:
+    names = ("a2c", "sb3-a2c")
+    if missing := [name for name in names if name not in agents]:
         return "not tested", f"{_join(missing)} not trained."
-    ours, theirs = (
-        final.loc[final["agent"] == name, "steady"].to_numpy() for name in ("a2c", "sb3-a2c")
-    )
+    ours, theirs = (final.loc[final["agent"] == name, "steady"].to_numpy() for name in names)
     difference, low, high = bootstrap_difference(ours, theirs)
     evidence = (
         f"A2C {_number(iqm(ours))}, SB3 A2C {_number(iqm(theirs))}; difference "
@@ -352,14 +297,10 @@ def _no_worse(
     return ("not borne out" if best > margin else "undecided"), evidence
 
 
-def _together(outcomes: list[Outcome]) -> Outcome:
-    """The verdict on a claim about both agents: one that fails, fails it, whatever the other."""
-    order: tuple[Outcome, ...] = ("not borne out", "not tested", "undecided", "borne out")
-    return min(outcomes, key=order.index)
-
-
 def _holds(runs: pd.DataFrame, headline: Headline) -> tuple[Outcome, str]:
-    """Whether one agent holds its goal in its final evaluation, and the numbers."""
+    """Whether one agent holds its goal in its final evaluations, and the numbers."""
+    if runs.empty:
+        return "not tested", "not trained"
     values = runs["steady"].to_numpy()
     low, high = bootstrap_interval(values)
     count, crashed = int(np.isfinite(values).sum()), int(runs["crashed"].sum())

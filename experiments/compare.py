@@ -2,11 +2,10 @@
 
 import shutil
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
-from dataclasses import replace
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -15,18 +14,21 @@ from ..agents.pid import PID
 from ..agents.policies import NetworkPolicy
 from ..envs.loop import Loop
 from ..envs.registry import env_spec, options_type
-from ..envs.spec import EnvSpec, canonical_id
+from ..envs.spec import canonical_id
 from ..models.errors import InputError
 from ..models.vehicle import Vehicle
 from .bounds import elevation_bounds
-from .errors import ResultsError
 from .folders import locked
 from .metrics import Headline
 from .pairs import shared_pair
-from .progress import OnProgress, ProgressSender
+from .progress import OnProgress, Tell
 from .results import (
     CONFIG_FILE,
-    RunResults,
+    EPISODES_FILE,
+    EVALUATIONS_FILE,
+    RUNS_FILE,
+    ResultsError,
+    Rows,
     episode_row,
     evaluation_row,
     evaluation_steps,
@@ -34,6 +36,7 @@ from .results import (
     read_config,
     step_table,
     write_config,
+    write_part,
 )
 from .settings import CompareConfig, EnvConfig, Run
 from .training import Snapshot, train_run
@@ -46,6 +49,7 @@ PARTS: Final = "parts"
 """Folder with the parts of an unfinished comparison, one for each run."""
 MAX_BATCH: Final = 64
 """Most evaluation episodes that are flown at a time."""
+_SETTINGS: Final = ("snapshots", "curve_episodes", "episodes")
 
 
 def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnProgress) -> None:
@@ -53,12 +57,11 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
 
     Each run leaves a part behind when it is done, so that a comparison that was interrupted, or of
     which a run failed, goes on where it was: call it again with the same folder (and the config of
-    `read_compare_config`). Figures, table and verdicts are drawn from the joined parts: see
-    `report.write_report`.
+    `read_compare_config`). `report.write_report` draws figures, table and verdicts.
 
     Args:
         config: Settings of the comparison.
-        folder: One that exists, and no other process writes to: see `folders.new_folder`.
+        folder: One that exists: see `folders.new_folder`.
         command: The user's command, for `config.json`.
         on_progress: Told how far it is.
 
@@ -68,59 +71,68 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
             such Ray cluster; nothing is written.
     """
     spec = env_spec(**config.env)
-    headline = Headline.of(spec)
+    metric = Headline.of(spec).name
     parts = folder / PARTS
     with open_workers(config, on_progress) as workers, locked(folder):
         parts.mkdir(exist_ok=True)
-        _write_config(config, spec, folder, command)
+        if not (folder / CONFIG_FILE).exists():
+            content = config.content(*config.agents)
+            content["evaluation"] = {name: getattr(config, name) for name in _SETTINGS}
+            content["bounds"] = _bounds(config)
+            write_config(folder, command, spec, config.vehicle, content)
         for unfinished in parts.glob(".*"):
             shutil.rmtree(unfinished)
-        runs: list[Run | None] = [*config.runs(), *([None] if _can_fly(spec) else [])]
-        jobs = {_name(run): run for run in runs if not (parts / _part(run)).exists()}
-        workers.fly_all(partial(_fly, config), jobs, partial(_keep, folder), config)
-        join_parts(parts, folder, headline.name)
-
-
-def _name(run: Run | None) -> str:
-    """Name of a run; None: the PID, which needs no training and has no seeds."""
-    return f"{run.algorithm} seed {run.seed}" if run else "pid"
+        runs: list[Run | None] = [*config.runs()]
+        with suppress(InputError):
+            PID(spec)  # if it can fly this env; it needs no training and has no seeds
+            runs.append(None)
+        jobs = {
+            f"{run.algorithm} seed {run.seed}" if run else "pid": run
+            for run in runs
+            if not (parts / _part(run)).exists()
+        }
+        workers.fly_all(partial(_fly, config), jobs, partial(_keep, folder, metric), config)
+        join_parts(parts, folder, metric)
 
 
 def _part(run: Run | None) -> str:
-    """Name of its part."""
     return f"{run.algorithm}-seed{run.seed}" if run else "pid-seed0"
 
 
-def _keep(folder: Path, run: Run | None, done: tuple[RunResults, Checkpoint | None]) -> None:
+class _Done(NamedTuple):
+    """What a run gives."""
+
+    rows: Rows
+    steps: list[Any]  # tables of `steps.parquet`
+    checkpoint: Checkpoint | None = None
+
+
+def _keep(folder: Path, metric: str, run: Run | None, done: _Done) -> None:
     """Write checkpoint and part; the part last, for with it the run is done."""
-    results, checkpoint = done
-    if checkpoint:
-        store(checkpoint, folder / "checkpoints" / f"{_part(run)}.safetensors")
-    results.write(folder / PARTS)
+    if done.checkpoint:
+        store(done.checkpoint, folder / "checkpoints" / f"{_part(run)}.safetensors")
+    write_part(folder / PARTS / _part(run), metric, done.rows, done.steps)
 
 
-def _fly(
-    config: CompareConfig, run: Run | None, progress: ProgressSender
-) -> tuple[RunResults, Checkpoint | None]:
+def _fly(config: CompareConfig, run: Run | None, tell: Tell) -> _Done:
     """Train and evaluate (in a worker process)."""
     if run is None:
-        return _evaluate("pid", 0, config), None
+        return _evaluate("pid", 0, config)
     with shared_pair(**run.env, num_envs=run.num_envs) as env:
-        training, row = train_run(run, env, progress, config.snapshots, keep_steps=True)
+        training, times = train_run(run, env, tell, config.snapshots, keep_steps=True)
         checkpoint, log = training.checkpoint(), training.log
-    results = _evaluate(run.algorithm, run.seed, config, training.taken)
+    evaluated = _evaluate(run.algorithm, run.seed, config, training.taken)
+    label = {"agent": run.algorithm, "seed": run.seed}
+    episodes = [episode_row(one, run.num_envs, log.env_steps) for one in log.episodes]
+    rows = {
+        **evaluated.rows,
+        EPISODES_FILE: [label | episode for episode in episodes],
+        RUNS_FILE: [label | times],
+    }
     steps = log.steps()
     steps["step"] = np.arange(1, len(steps["episode"]) + 1)
-    trained_steps = step_table(
-        results.metric, agent=run.algorithm, seed=run.seed, phase="train", **steps
-    )
-    trained = replace(
-        results,
-        episodes=[episode_row(one, run.num_envs, log.env_steps) for one in log.episodes],
-        runs=[row],
-        steps=[trained_steps, *results.steps],
-    )
-    return trained, checkpoint
+    trained = step_table(Headline.of(log.spec).name, **label, phase="train", **steps)
+    return _Done(rows, [trained, *evaluated.steps], checkpoint)
 
 
 def evaluation_pair(config: EnvConfig, episodes: int) -> AbstractContextManager[Any]:
@@ -130,7 +142,7 @@ def evaluation_pair(config: EnvConfig, episodes: int) -> AbstractContextManager[
 
 def _evaluate(
     agent: str, seed: int, config: CompareConfig, taken: Sequence[Snapshot] = ()
-) -> RunResults:
+) -> _Done:
     """Evaluate the snapshots of a training, or the PID."""
     rows: list[dict[str, Any]] = []
     flown: list[Trajectory] = []
@@ -141,33 +153,14 @@ def _evaluate(
         snapshots: Sequence[Snapshot | None] = taken or [None]
         for snapshot in snapshots:
             policy = NetworkPolicy(snapshot.actor, spec) if snapshot else PID(spec)
-            if snapshot is None or snapshot is taken[-1]:
+            if snapshot is snapshots[-1]:
                 flown = fly_episodes(env, policy, config.episodes, "final")
             else:
                 flown = fly_episodes(env, policy, config.curve_episodes, "curve")
-            behind = {
-                "env_steps": snapshot.env_steps if snapshot else 0,
-                "seconds": snapshot.seconds if snapshot else 0.0,
-            }
-            rows += [{**behind, **evaluation_row(one, headline)} for one in flown]
-    return RunResults(
-        agent=agent,
-        seed=seed,
-        metric=headline.name,
-        episodes=[],
-        evaluations=rows,
-        runs=[],
-        steps=evaluation_steps(agent, seed, headline, flown),
-    )
-
-
-def _can_fly(spec: EnvSpec) -> bool:
-    """Whether the PID can fly the env."""
-    try:
-        PID(spec)
-    except InputError:
-        return False
-    return True
+            steps, seconds = (snapshot.env_steps, snapshot.seconds) if snapshot else (0, 0.0)
+            label = {"agent": agent, "seed": seed, "env_steps": steps, "seconds": seconds}
+            rows += [label | evaluation_row(one, headline) for one in flown]
+    return _Done({EVALUATIONS_FILE: rows}, evaluation_steps(agent, seed, headline, flown))
 
 
 def _bounds(config: CompareConfig) -> dict[str, float]:
@@ -176,10 +169,8 @@ def _bounds(config: CompareConfig) -> dict[str, float]:
         return {}
     options: Any = options_type(config.env_id).from_options(config.options)
     loop = Loop(config.env_id, config.episodes, vehicle=config.vehicle, options=config.options)
-    everyone = np.ones(config.episodes, bool)
-    actions = np.zeros((config.episodes, 1), np.float32)
     seeds = [evaluation_seed(episode, "final") for episode in range(config.episodes)]
-    loop.advance(actions, everyone, seeds)
+    loop.advance(np.zeros((config.episodes, 1), np.float32), np.ones(config.episodes, bool), seeds)
     starts = np.array(loop.telemetry["metrics"][:, 0])
     loop.close()
     vehicle = Vehicle.load(config.vehicle, linear_drag=options.linear_drag)
@@ -194,12 +185,3 @@ def read_compare_config(folder: Path) -> CompareConfig:
         return CompareConfig(agents=tuple(content["agents"]), **common, **content["evaluation"])
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ResultsError(f"{folder / CONFIG_FILE}: expected a comparison's: {error!r}") from None
-
-
-def _write_config(config: CompareConfig, spec: EnvSpec, folder: Path, command: str) -> None:
-    if (folder / CONFIG_FILE).exists():
-        return
-    names = ("snapshots", "curve_episodes", "episodes")
-    content = config.content(*config.agents)
-    content["evaluation"] = {name: getattr(config, name) for name in names}
-    write_config(folder, command, spec, config.vehicle, {**content, "bounds": _bounds(config)})

@@ -7,12 +7,12 @@ them ends. An agent without any data for a curve is not in that curve's dictiona
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
-from ..models.errors import require
 from .metrics import (
     Curve,
     Headline,
@@ -26,11 +26,6 @@ from .metrics import (
 )
 from .palette import sort_agents
 from .results import Results, read_steps
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = require("pandas", "train", "comparing agents")
 
 __all__ = [
     "AVERAGING_SHARE", "Curves", "Fan", "Flown", "cumulative_returns", "flown_sizes",
@@ -62,40 +57,26 @@ class Fan(NamedTuple):
 class Flown(NamedTuple):
     """Some trajectories of an agent's final evaluations."""
 
-    shown: list[Curve]
-    """The metric over the time in the episode (s)."""
-    total: int
-    """Number of all trajectories."""
+    shown: list[Curve]  # the metric over the time in the episode (s)
+    total: int  # number of all trajectories
 
 
 @dataclass(frozen=True, kw_only=True)
 class Curves:
-    """All curves of a comparison, by agent."""
+    """All curves of a comparison, by agent; over env steps where nothing else is said."""
 
-    average_return: dict[str, Spread]
-    """Running mean of the training episodes' return over env steps."""
-    return_by_step: dict[str, Spread]
-    """Sum of all rewards since training began, over env steps."""
-    return_by_episode: dict[str, Spread]
-    """The same over training episodes."""
-    training_values: dict[str, Fan]
-    """The metric in training, all seeds together."""
-    flown: dict[str, Flown]
-    """The metric over time in the final evaluation."""
-    flown_sizes: dict[str, Spread]
-    """Its size over time (s) in the final evaluation, all trajectories of all seeds together."""
-    learning: dict[str, Spread]
-    """Steady-state size of the snapshots over env steps."""
-    levels: dict[str, float]
-    """Steady-state size of the agents that were not trained."""
+    average_return: dict[str, Spread]  # running mean of the training episodes' return
+    return_by_step: dict[str, Spread]  # sum of all rewards since training began
+    return_by_episode: dict[str, Spread]  # the same over training episodes
+    training_values: dict[str, Fan]  # the metric in training, all seeds together
+    flown: dict[str, Flown]  # the metric over time (s) in the final evaluation
+    flown_sizes: dict[str, Spread]  # its size there, all trajectories of all seeds together
+    learning: dict[str, Spread]  # steady-state size of the snapshots
+    levels: dict[str, float]  # steady-state size of the agents that were not trained
 
 
 def make_curves(folder: Path | str, results: Results) -> Curves:
-    """Make all curves of a comparison.
-
-    Raises:
-        ResultsError: The step rows are missing or are not what they should be.
-    """
+    """Make all curves of a comparison. Raises `ResultsError` if the step rows are not right."""
     by_step, by_episode = cumulative_returns(results.episodes)
     learning, levels = learning_curves(results.evaluations)
     metric, period = results.headline.name, results.spec.control_period
@@ -146,11 +127,7 @@ def _runs(episodes: pd.DataFrame) -> list[tuple[str, list[pd.DataFrame]]]:
 
 
 def value_fan(steps: pd.DataFrame) -> Fan:
-    """Quantiles of the metric over at most 100 windows of env steps.
-
-    Args:
-        steps: Training steps of one agent, columns `step` and `value`; at least one row.
-    """
+    """Quantiles of the metric over at most 100 windows of an agent's training steps."""
     step = steps["step"].to_numpy()
     windows = min(100, max(1, len(steps) // 50))
     width = (float(step.max()) + 1) / windows
@@ -160,12 +137,7 @@ def value_fan(steps: pd.DataFrame) -> Fan:
 
 
 def pick_trajectories(steps: pd.DataFrame, control_period: float) -> Flown:
-    """Pick at most 40 trajectories, at random but always the same ones.
-
-    Args:
-        steps: Evaluation steps of one agent, columns `seed`, `episode`, `step` and `value`.
-        control_period: Time between two control steps, s.
-    """
+    """Pick at most 40 trajectories of an agent's evaluation, at random but always the same ones."""
     found = [one for _, one in steps.groupby(["seed", "episode"], sort=True)]
     # At random: every n-th would be the same few start positions for every seed.
     order = np.random.default_rng(0).permutation(len(found))[:_MAX_TRAJECTORIES]
@@ -175,13 +147,8 @@ def pick_trajectories(steps: pd.DataFrame, control_period: float) -> Flown:
 
 
 def flown_sizes(steps: pd.DataFrame, control_period: float, headline: Headline) -> Spread:
-    """Interquartile mean and spread of the size over trajectories, at most at 500 moments.
-
-    A trajectory that crashed counts as long as it lasted.
-
-    Args:
-        steps: Evaluation steps of one agent, columns `step` and `value`; at least one row.
-        control_period: Time between two control steps, s.
+    """Interquartile mean and spread of the size over an agent's trajectories of the evaluation, at
+    most at 500 moments. One that crashed counts as long as it lasted.
     """
     last = int(steps["step"].max())
     moments = np.unique(np.linspace(0, last, min(last + 1, _MAX_MOMENTS)).round().astype(np.int64))
@@ -193,11 +160,8 @@ def flown_sizes(steps: pd.DataFrame, control_period: float, headline: Headline) 
 
 
 def learning_curves(evaluations: pd.DataFrame) -> tuple[dict[str, Spread], dict[str, float]]:
-    """Steady-state size of the snapshots of each agent over env steps.
-
-    Returns:
-        The curves of the agents that were trained, and the interquartile means over seeds of those
-        that were not (all of whose evaluations are at 0 env steps).
+    """Steady-state size of the snapshots of each agent over env steps; interquartile means over
+    seeds of the agents that were not trained, all of whose evaluations are at 0 env steps.
     """
     curves: dict[str, Spread] = {}
     levels: dict[str, float] = {}
@@ -209,9 +173,7 @@ def learning_curves(evaluations: pd.DataFrame) -> tuple[dict[str, Spread], dict[
         if means["env_steps"].max() == 0:
             levels[agent] = iqm(means["steady"].to_numpy())
             continue
-        runs = [
-            Curve(run["env_steps"].to_numpy(float), run["steady"].to_numpy(float))
-            for _, run in means.groupby("seed")
-        ]
+        columns = ["env_steps", "steady"]
+        runs = [Curve(*run[columns].to_numpy(float).T) for _, run in means.groupby("seed")]
         curves[agent] = spread_over_seeds(runs, np.unique(means["env_steps"]))
     return curves, levels

@@ -4,28 +4,22 @@ What the lines and bands are is told where they are made, in `curves`. Drawn wit
 object interface, so that no display or global state is involved.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from ..models.errors import require
-from .curves import Curves, Fan, Flown, make_curves
+import pandas as pd
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import EngFormatter
+
+from .curves import Curves, Fan, Flown
 from .metrics import Headline, Spread, episode_ends, training_runs
 from .palette import agent_color, agent_label, sort_agents
-from .results import Results, read_results
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = require("pandas", "train", "comparing agents")
-require("matplotlib", "report", "drawing figures")
-
-from matplotlib import rc_context  # noqa: E402
-from matplotlib.axes import Axes  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
-from matplotlib.lines import Line2D  # noqa: E402
-from matplotlib.patches import Patch  # noqa: E402
-from matplotlib.ticker import EngFormatter  # noqa: E402
+from .results import Results
 
 __all__ = ["FIGURE_FILES", "draw_figures"]
 
@@ -35,57 +29,30 @@ FIGURE_FILES: Final = ("fig6_reward.png", "fig7_cumulative_reward.png", "fig8_er
 _MAX_POINTS: Final = 2000
 _OUTER: Final = 0.18  # opacity of the 5–95 % band
 _INNER: Final = 0.38  # and of the 25–75 % band
-_STYLE: Final[dict[Any, Any]] = {
-    "font.size": 9.5,
-    "axes.titlesize": 10.5,
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#E4E4E4",
-    "grid.linewidth": 0.7,
-    "axes.edgecolor": "#777777",
-    "xtick.color": "#444444",
-    "ytick.color": "#444444",
-    "legend.frameon": False,
-    "lines.linewidth": 1.7,
-    "figure.constrained_layout.use": True,
-}
-
+_STYLE: Final = Path(__file__).parent / "assets" / "figures.mplstyle"
 _TIGHT: Final[dict[str, Any]] = {
     "borderaxespad": 0.0, "columnspacing": 1.0, "handlelength": 1.2, "handletextpad": 0.5,
     "fontsize": 8.5,
 }  # fmt: skip
 
 
-def draw_figures(
-    folder: Path | str, results: Results | None = None, curves: Curves | None = None
-) -> list[Path]:
-    """Draw all figures of a comparison into `figures/` inside its folder.
+def draw_figures(folder: Path, results: Results, curves: Curves) -> None:
+    """Draw all figures of a comparison, `FIGURE_FILES`, into `figures/` inside its folder.
 
     Agents or runs that are missing are left out of the figures; a panel with nothing in it says so.
-
-    Results and curves that are not given are made from the folder. Returns the PNG files, in the
-    order of `FIGURE_FILES`.
     """
-    results = results or read_results(folder)
-    drawn = curves or make_curves(folder, results)
     headline = results.headline
-    target = Path(folder) / "figures"
+    target = folder / "figures"
     target.mkdir(exist_ok=True)
-    draw: tuple[Callable[[], Figure], ...] = (
-        lambda: _draw_reward(results.episodes, drawn),
-        lambda: _draw_cumulative(drawn),
-        lambda: _draw_error(sort_agents(results.evaluations["agent"]), drawn, headline),
-        lambda: _draw_learning_curve(results.evaluations, drawn, headline),
-    )
-    paths = []
-    with rc_context(_STYLE):
-        for name, make in zip(FIGURE_FILES, draw, strict=True):
-            make().savefig(target / name, format="png")
-            paths.append(target / name)
-    return paths
+    with style.context(_STYLE):
+        figures = (
+            _draw_reward(results.episodes, curves),
+            _draw_cumulative(curves),
+            _draw_error(sort_agents(results.evaluations["agent"]), curves, headline),
+            _draw_learning_curve(results.evaluations, curves, headline),
+        )
+        for name, figure in zip(FIGURE_FILES, figures, strict=True):
+            figure.savefig(target / name)
 
 
 def _draw_reward(episodes: pd.DataFrame, curves: Curves) -> Figure:
@@ -93,19 +60,17 @@ def _draw_reward(episodes: pd.DataFrame, curves: Curves) -> Figure:
     agents = sort_agents(episodes["agent"])
     panels = max(1, len(agents) + (len(agents) > 1))
     figure, axes = _panels(panels)
-    everything = axes[-1] if len(agents) > 1 else None
     for axis, agent in zip(axes, agents, strict=False):
         runs = training_runs(episodes, agent)
-        spread = curves.average_return[agent]
         _scatter_episodes(axis, pd.concat(runs), agent)
-        _plot(axis, spread, agent, label="average reward")
-        axis.set_title(f"{agent_label(agent)} ({_seeds(len(runs))})")
+        _plot(axis, curves.average_return[agent], agent, label="average reward")
+        axis.set_title(f"{agent_label(agent)} ({len(runs)} seed{'s' * (len(runs) != 1)})")
         _legend_above(axis)
-        if everything is not None:
-            _plot(everything, spread, agent)
-    if everything is not None:
-        everything.set_title("Average reward")
-        _legend_above(everything)
+    if len(agents) > 1:
+        for agent in agents:
+            _plot(axes[-1], curves.average_return[agent], agent)
+        axes[-1].set_title("Average reward")
+        _legend_above(axes[-1])
     for axis in axes:
         _env_steps_axis(axis)
     for axis in axes[:: _columns(panels)]:
@@ -144,7 +109,12 @@ def _draw_error(agents: Sequence[str], curves: Curves, headline: Headline) -> Fi
         _flown_values(below, curves.flown.get(agent), agent, headline)
         above.set_title(agent_label(agent))
         below.set_xlabel("time in the episode (s)")
-    _explain_quantiles(figure, headline)
+    handles = [  # in grey, once for all agents' colours
+        Patch(color="#444444", alpha=_OUTER, lw=0, label="5–95 %"),
+        Patch(color="#444444", alpha=_INNER, lw=0, label="25–75 %"),
+        Line2D([], [], color="#444444", lw=1.2, label=f"median of {headline.symbol} in training"),
+    ]
+    figure.legend(handles=handles, loc="outside upper right", ncols=3, fontsize=8.5)
     axes[0, 0].set_ylabel(f"training: {headline.labelled(headline.symbol)}")
     axes[1, 0].set_ylabel(f"final evaluation: {headline.labelled(headline.symbol)}")
     return figure
@@ -171,21 +141,11 @@ def _flown_values(axis: Axes, flown: Flown | None, agent: str, headline: Headlin
     shown, total = flown
     for time, value in shown:
         axis.plot(time, value, color=agent_color(agent), lw=0.8, alpha=0.45)
-    if (held := headline.metric.held) is not None:
+    if (held := headline.held) is not None:
         low = axis.get_ylim()[1] if headline.high else -held if headline.signed else 0.0
         axis.axhspan(low, held, color="#333333", alpha=0.12, lw=0)
     count = f"{len(shown)} of {total}" if len(shown) < total else total
     axis.set_title(f"{count} trajectories", fontsize=8.5, color="#444444")
-
-
-def _explain_quantiles(figure: Figure, headline: Headline) -> None:
-    """Explain the bands in grey, once for all agents' colours."""
-    handles = [
-        Patch(color="#444444", alpha=_OUTER, lw=0, label="5–95 %"),
-        Patch(color="#444444", alpha=_INNER, lw=0, label="25–75 %"),
-        Line2D([], [], color="#444444", lw=1.2, label=f"median of {headline.symbol} in training"),
-    ]
-    figure.legend(handles=handles, loc="outside upper right", ncols=3, fontsize=8.5)
 
 
 def _draw_learning_curve(evaluations: pd.DataFrame, curves: Curves, headline: Headline) -> Figure:
@@ -197,7 +157,7 @@ def _draw_learning_curve(evaluations: pd.DataFrame, curves: Curves, headline: He
             axis.axhline(level, color=agent_color(agent), ls="--", label=label)
         else:
             _plot(axis, curves.learning[agent], agent, marker="o")
-    if (held := headline.metric.held) is not None:
+    if (held := headline.held) is not None:
         label = headline.amount(f"{held:g}")
         axis.axhline(held, color="#333333", lw=0.9, ls=":", label=label)
     if not headline.high:
@@ -269,7 +229,3 @@ def _say(axis: Axes, words: str) -> None:
     axis.tick_params(left=False, bottom=False, labelleft=False, labelbottom=False)
     axis.grid(False)
     axis.text(0.5, 0.5, words, transform=axis.transAxes, ha="center", color="#777777")
-
-
-def _seeds(count: int) -> str:
-    return f"{count} seed{'s' * (count != 1)}"

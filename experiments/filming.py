@@ -3,6 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +17,7 @@ from ..agents.policies import Policy
 from ..envs.rendering import moment
 from ..models.errors import InputError
 from ..rendering import Camera, Canvas, Moment, NoOpenGL, Stage, World
-from ..rendering.film import QUALITY, check_film, poster, write_film
+from ..rendering.film import QUALITY, check_film, write_film
 from ..rendering.overlay import Overlay, graph_scale
 from .palette import agent_color, agent_label, sort_agents
 from .trajectories import Trajectory, flown_trajectories
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Film", "OnFrame", "Shot", "film", "film_comparison", "grid", "moments"]
 
-OnFrame = Callable[[int, int], None]
+OnFrame = Callable[[int, int], object]
 """Called with frames drawn, and frames in all."""
 
 MOST_FRAMES: Final = 1_000_000
@@ -43,8 +44,7 @@ _COMPARISON: Final[dict[str, Any]] = {
 def moments(trajectory: Trajectory) -> list[Moment]:
     """The moments of a trajectory: its start, and after each control step.
 
-    Raises:
-        InputError: Its telemetry does not tell where the craft is.
+    Raises `InputError` if its telemetry does not tell where the craft is.
     """
     told = trajectory.telemetry
     if missing := {"position", "attitude", "thrust"} - set(told):
@@ -104,14 +104,16 @@ class Film:
     """As of `write_film`."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.speed) and 0.001 <= self.speed <= 1000):
+        if not 0.001 <= self.speed <= 1000:
             raise InputError(f"speed: expected 0.001 to 1000, got {self.speed:g}")
         if self.at is not None and not (math.isfinite(self.at) and self.at >= 0):
             raise InputError(f"at: expected a time of 0 s or more, got {self.at:g}")
 
 
-def film(path: Path, shots: Sequence[Shot], config: Film, on_frame: OnFrame | None = None) -> int:
-    """Film trajectories side by side.
+def film(
+    path: Path, shots: Sequence[Shot], config: Film, on_frame: OnFrame = lambda *_: None
+) -> int:
+    """Film trajectories side by side; the number of frames written.
 
     Args:
         path: As of `write_film`. A `.png` is the picture at `config.at`, or the last.
@@ -119,9 +121,6 @@ def film(path: Path, shots: Sequence[Shot], config: Film, on_frame: OnFrame | No
             trajectory of it has ended; one that ended before stays on its last picture.
         config: Settings.
         on_frame: Told how far it is.
-
-    Returns:
-        Frames written.
 
     Raises:
         NoOpenGL: No OpenGL works here.
@@ -131,19 +130,9 @@ def film(path: Path, shots: Sequence[Shot], config: Film, on_frame: OnFrame | No
     """
     check_film(path, config.width, config.height, config.fps)
     times = _times(shots, config, still=path.suffix.lower() == ".png")
-
-    def told() -> Generator[np.ndarray, None, None]:
-        with _Studio(shots, config) as studio:
-            for number, (episode, seconds) in enumerate(times, 1):
-                yield studio.frame(episode, seconds)
-                if on_frame:
-                    on_frame(number, len(times))
-
-    frames = told()
-    try:
+    # Whatever goes wrong, the OpenGL context is given back here.
+    with closing(_frames(shots, config, times, on_frame)) as frames:
         return write_film(path, frames, config.fps, quality=config.quality)
-    finally:
-        frames.close()  # whatever went wrong, the context is given back here
 
 
 def _times(shots: Sequence[Shot], config: Film, *, still: bool) -> list[tuple[int, float]]:
@@ -172,66 +161,44 @@ def _times(shots: Sequence[Shot], config: Film, *, still: bool) -> list[tuple[in
 
 
 def grid(count: int, width: int, height: int) -> tuple[int, int]:
-    """Columns and rows of so many panes in a picture of so many pixels.
-
-    Panes come out a little wider than high, with few places empty.
+    """Columns and rows of so many panes in a picture of so many pixels: panes a little wider than
+    high, and few places empty.
     """
 
-    def badness(columns: int) -> float:
-        rows = -(-count // columns)
+    def badness(shape: tuple[int, int]) -> float:
+        columns, rows = shape
         aspect = (width / columns) / (height / rows)
         return abs(math.log(aspect / _ASPECT)) + (columns * rows - count) / count
 
-    columns = min(range(1, count + 1), key=badness)
-    return columns, -(-count // columns)
+    return min(((columns, -(-count // columns)) for columns in range(1, count + 1)), key=badness)
 
 
-class _Studio:
-    """Draws frames. One canvas of a pane's size serves every pane."""
-
-    def __init__(self, shots: Sequence[Shot], config: Film) -> None:
-        self._config = config
-        columns, rows = grid(len(shots), config.width, config.height)
-        width = (config.width - _SPACE * (columns - 1)) // columns
-        height = (config.height - _SPACE * (rows - 1)) // rows
-        self._corners = [
-            ((width + _SPACE) * (i % columns), (height + _SPACE) * (i // columns))
-            for i in range(len(shots))
-        ]
-        stage = Stage(config.world, vehicle=config.vehicle)
-        self._canvas = Canvas(stage, width, height, fast=config.fast)
-        flown = [one for shot in shots for one in shot.trajectories]
-        seconds, scale = max(one.seconds for one in flown), _scale(flown)
-        try:
-            self._panes = [
-                _Pane(shot, config, self._canvas, stage.twin(), seconds, scale, len(shots) > 1)
-                for shot in shots
-            ]
-        except BaseException:
-            self._canvas.close()
-            raise
-
-    def frame(self, episode: int, seconds: float) -> np.ndarray:
-        """The picture at that time of flight: uint8, shape (height, width, 3)."""
-        frame = np.full((self._config.height, self._config.width, 3), _DARK, np.uint8)
-        for pane, (x, y) in zip(self._panes, self._corners, strict=True):
-            picture = pane.picture(episode, seconds)
-            frame[y : y + picture.shape[0], x : x + picture.shape[1]] = picture
-        return frame
-
-    def __enter__(self) -> "_Studio":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._canvas.close()
+def _frames(
+    shots: Sequence[Shot], config: Film, times: Sequence[tuple[int, float]], on_frame: OnFrame
+) -> Generator[np.ndarray, None, None]:
+    """Frames of uint8, shape (height, width, 3). One canvas of a pane's size serves every pane."""
+    columns, rows = grid(len(shots), config.width, config.height)
+    width = (config.width - _SPACE * (columns - 1)) // columns
+    height = (config.height - _SPACE * (rows - 1)) // rows
+    stage = Stage(config.world, vehicle=config.vehicle)
+    flown = [one for shot in shots for one in shot.trajectories]
+    with Canvas(stage, width, height, fast=config.fast) as canvas:
+        panes = [_Pane(shot, config, canvas, stage.twin(), flown, len(shots) > 1) for shot in shots]
+        for number, (episode, seconds) in enumerate(times, 1):
+            frame = np.full((config.height, config.width, 3), _DARK, np.uint8)
+            for place, pane in enumerate(panes):
+                x, y = (width + _SPACE) * (place % columns), (height + _SPACE) * (place // columns)
+                frame[y : y + height, x : x + width] = pane.picture(episode, seconds)
+            yield frame
+            on_frame(number, len(times))
 
 
 class _Pane:
     """The picture of one flight, drawn again only where it changes."""
 
     def __init__(
-        self, shot: Shot, config: Film, canvas: Canvas, stage: Stage, seconds: float,
-        scale: tuple[float, float], named: bool,
+        self, shot: Shot, config: Film, canvas: Canvas, stage: Stage, flown: Sequence[Trajectory],
+        named: bool,
     ) -> None:  # fmt: skip
         self._shot, self._config = shot, config
         self._canvas, self._stage = canvas, stage
@@ -246,31 +213,28 @@ class _Pane:
             like=shot.moments[0][0],
             vehicle=stage.vehicle,
             period=shot.trajectories[0].control_period,
-            seconds=seconds,
-            scale=scale,
+            seconds=max(one.seconds for one in flown),
+            scale=_scale(flown),
             numbers=config.overlay,
         )
 
     def picture(self, episode: int, seconds: float) -> np.ndarray:
         trajectory = self._shot.trajectories[episode]
         step = trajectory.step_at(seconds)
-        if (episode, step) != self._shown:
-            begin = self._shown[1] + 1 if episode == self._shown[0] else 0
-            for one in self._shot.moments[episode][begin : step + 1]:  # its path has no gaps
-                self._stage.show(one)
-            self._shown = episode, step
-            self._picture = self._draw(episode, step)
+        if (episode, step) == self._shown:
+            return self._picture
+        begin = self._shown[1] + 1 if episode == self._shown[0] else 0
+        told = self._shot.moments[episode]
+        for one in told[begin : step + 1]:  # its path has no gaps
+            self._stage.show(one)
+        self._shown = episode, step
+        self._picture = self._canvas.draw(self._config.camera, self._stage)
+        if not self._bare:
+            ended = self._config.overlay and step == len(trajectory)
+            note = trajectory.ending if ended and trajectory.ending != "truncated" else ""
+            values = trajectory.headline[: step + 1].tolist()
+            self._picture = self._overlay.draw(self._picture, told[step], values, note)
         return self._picture
-
-    def _draw(self, episode: int, step: int) -> np.ndarray:
-        picture = self._canvas.draw(self._config.camera, self._stage)
-        if self._bare:
-            return picture
-        trajectory = self._shot.trajectories[episode]
-        ended = self._config.overlay and step == len(trajectory)
-        note = trajectory.ending if ended and trajectory.ending != "truncated" else ""
-        values = trajectory.headline[: step + 1].tolist()
-        return self._overlay.draw(picture, self._shot.moments[episode][step], values, note)
 
 
 def _scale(flown: Sequence[Trajectory]) -> tuple[float, float]:
@@ -290,25 +254,18 @@ def _scale(flown: Sequence[Trajectory]) -> tuple[float, float]:
 
 
 def film_comparison(
-    folder: Path,
-    out: Path,
-    on_frame: OnFrame | None = None,
-    *,
-    picture: Path | None = None,
-    world: World = "airport",
+    folder: Path, out: Path, on_frame: OnFrame = lambda *_: None, *, world: World = "airport"
 ) -> bool:
     """Film the agents of a comparison: each agent and the PID, the same episode side by side.
 
     Of an agent's seeds the middle one flies, by the steady state in the final evaluation (of an
     even number the better of the two in the middle). Of the episodes of that evaluation they fly
-    the one that starts furthest from its goal. It is filmed without shadows: a few seconds where
-    software draws.
+    the one that starts furthest from its goal.
 
     Args:
         folder: Where `rotorgram compare` wrote.
         out: The film; one that exists is replaced.
         on_frame: Told how far it is.
-        picture: JPEG of a moment of the film, written beside it; what a page shows before it plays.
         world: Surroundings.
 
     Returns:
@@ -329,8 +286,6 @@ def film_comparison(
     except NoOpenGL as error:
         logging.getLogger(__name__).info("no film of the agents: %s", error)
         return False
-    if picture is not None:
-        picture.write_bytes(poster(fresh))
     fresh.replace(out)
     return True
 
@@ -346,16 +301,12 @@ def _comparison_shots(folder: Path, results: "Results") -> list[Shot]:
     episode = int(shown["episode"].iloc[int(np.argmax(starts))])
     shots = []
     for agent in sort_agents(final["agent"]):
-        order = not results.headline.high
-        runs = final[final["agent"] == agent].sort_values("steady", ascending=order, kind="stable")
+        runs = final[final["agent"] == agent]
+        runs = runs.sort_values("steady", ascending=not results.headline.high, kind="stable")
         seed = int(runs["seed"].iloc[(len(runs) - 1) // 2])
-        name = agent_label(agent)
-        policy: Policy
-        if agent == "pid":
-            policy = PID(spec)
-        else:
-            policy = load(folder / "checkpoints" / f"{agent}-seed{seed}.safetensors").policy()
-            name += f", seed {seed}" if len(runs) > 1 else ""
+        name = agent_label(agent) + (f", seed {seed}" if len(runs) > 1 else "")
+        file = folder / "checkpoints" / f"{agent}-seed{seed}.safetensors"
+        policy: Policy = PID(spec) if agent == "pid" else load(file).policy()
         flown = flown_trajectories(
             policy, spec.env_id, spec.options, [episode], vehicle=vehicle, of="final"
         )

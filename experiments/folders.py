@@ -4,71 +4,51 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
+from itertools import count
 from pathlib import Path
-from typing import Final
 
 from ..models.errors import InputError
 
-__all__ = ["LOCK_FILE", "locked", "new_folder"]
-
-LOCK_FILE: Final = ".lock"
-"""Its holder writes to the folder. The file stays; the lock ends with its process."""
+__all__ = ["locked", "new_folder"]
 
 
 def new_folder(out: Path | None, name: str, runs: Path = Path("runs")) -> Path:
     """Make the folder to write to.
 
     Args:
-        out: Where; None: a folder named by the time. Of two processes that ask for one of the same
-            second, the second gets a number behind it.
-        name: Of the command; part of the folder's name.
+        out: Where; None: a folder in `runs`, named by the command and the time. Of two processes
+            that ask for one of the same second, the second gets a number behind it.
+        name: Of the command.
         runs: Where folders named by the time are made.
 
     Raises:
         InputError: `out` exists, or the place allows no folder.
     """
-    if out is not None:
-        _make(out)
-        return out
-    stem, number = f"{name}-{datetime.now():%Y%m%d-%H%M%S}", 1
-    while True:
-        folder = runs / (stem if number == 1 else f"{stem}-{number}")
-        if not folder.exists():
-            try:
-                _make(folder)
-            except _Exists:
-                pass
-            else:
-                return folder
-        number += 1
-
-
-class _Exists(InputError):
-    pass
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"out: cannot make {folder.parent}: {error.strerror}") from None
-    try:
-        folder.mkdir()  # atomic: of two processes one succeeds
-    except FileExistsError:
-        raise _Exists(f"out: expected a new folder, {folder} exists already") from None
-    except OSError as error:
-        raise InputError(f"out: cannot make {folder}: {error.strerror}") from None
+    stem = f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    for number in count(1):
+        folder = out or runs / (stem if number == 1 else f"{stem}-{number}")
+        try:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            folder.mkdir()  # atomic: of two processes one succeeds
+            break
+        except OSError as error:
+            if not (isinstance(error, FileExistsError) and Path(error.filename) == folder):
+                words = f"out: cannot make {error.filename}: {error.strerror}"
+                raise InputError(words) from None
+            if out:
+                raise InputError(f"out: expected a new folder, {out} exists already") from None
+    return folder
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold a folder's lock; a crash releases it.
+    """Hold a folder's lock, a file in it that stays; the lock ends with its process.
 
     Raises:
         InputError: Another process holds it, or the folder cannot be written.
     """
     try:
-        file = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        file = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except FileNotFoundError:
         raise InputError(f"{folder}: expected a folder, there is none") from None
     except OSError as error:

@@ -13,19 +13,15 @@ settled and how many crashed; a run with a crash in its evaluation does not hold
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
 from ..envs.spec import EnvSpec, Metric
-from ..models.errors import InputError, require
+from ..models.errors import InputError
 from .palette import sort_agents
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = require("pandas", "train", "comparing agents")
 
 __all__ = [
     "Curve", "Headline", "Spread", "average_return", "bootstrap_difference", "bootstrap_interval",
@@ -58,36 +54,19 @@ class Spread(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Headline:
+class Headline(Metric):
     """The metric that decides, and how its numbers are read.
 
     The *size* of an error (goal `zero`) is its magnitude; of a metric that is to be high, its
     value.
     """
 
-    metric: Metric
-
     @classmethod
     def of(cls, spec: EnvSpec) -> "Headline":
         """The headline metric of an env. Raises `InputError` where the env names none."""
-        if spec.headline is None:
+        if (metric := spec.headline) is None:
             raise InputError(f"env: expected one that names a metric, got {spec.env_id}")
-        return cls(metric=spec.headline)
-
-    @property
-    def signed(self) -> bool:
-        """Whether it changes sign; only then an overshoot is defined."""
-        return self.metric.signed
-
-    @property
-    def name(self) -> str:
-        """Column of files, key of `info`."""
-        return self.metric.name
-
-    @property
-    def symbol(self) -> str:
-        """Of the value, as E."""
-        return self.metric.symbol or self.metric.name
+        return cls(**(vars(metric) | {"symbol": metric.symbol or metric.name}))
 
     @property
     def size_symbol(self) -> str:
@@ -95,14 +74,14 @@ class Headline:
         return f"|{self.symbol}|" if self.signed else self.symbol
 
     @property
-    def unit(self) -> str:
-        """Empty where it has none."""
-        return self.metric.unit
-
-    @property
     def high(self) -> bool:
         """Whether more is better."""
-        return self.metric.goal == "high"
+        return self.goal == "high"
+
+    @property
+    def settles(self) -> bool:
+        """Whether a settling time is defined."""
+        return self.settled is not None and not self.high
 
     def labelled(self, text: str) -> str:
         """A heading with the unit: "steady |E| (m)"."""
@@ -115,10 +94,10 @@ class Headline:
     @property
     def held_text(self) -> str:
         """The condition of a held goal: "|E| < 0.1 m"; empty if undefined."""
-        if self.metric.held is None:
+        if self.held is None:
             return ""
         sign = "≥" if self.high else "<"
-        return f"{self.size_symbol} {sign} {self.amount(f'{self.metric.held:g}')}"
+        return f"{self.size_symbol} {sign} {self.amount(f'{self.held:g}')}"
 
     def size(self, values: Values) -> Floats:
         """Magnitude of an error, value of a metric with goal `high`; same shape, float64."""
@@ -126,42 +105,31 @@ class Headline:
 
     def holds(self, sizes: Values) -> npt.NDArray[np.bool_]:
         """Whether each mean size counts as holding the goal; false for nan, or without a bound."""
-        array, held = np.asarray(sizes, float), self.metric.held
-        # None as nan: no number is above or below it.
-        bound = np.nan if held is None else held
+        array = np.asarray(sizes, float)
+        bound = np.nan if self.held is None else self.held  # no number is above or below nan
         return np.asarray(array >= bound if self.high else array < bound)
 
     def worst(self, sizes: Values) -> float:
         """The worst of the values that are not missing; nan if there is none."""
         finite = _finite(sizes)
-        worst = np.min if self.high else np.max
-        return float(worst(finite)) if finite.size else math.nan
+        if not finite.size:
+            return math.nan
+        return float(finite.min() if self.high else finite.max())
 
 
 def steady_state(sizes: Values) -> float:
-    """Mean size in the last quarter of an episode (at least its last step), in the metric's unit.
-
-    Args:
-        sizes: `Headline.size` after every control step, shape (T,).
-
-    Returns:
-        nan for an episode without steps.
-    """
+    """Mean of the last quarter of an episode's sizes, (T,), at least of the last; nan if T = 0."""
     values = np.asarray(sizes, float)
     return float(values[-max(1, values.size // 4) :].mean()) if values.size else math.nan
 
 
 def settling_time(errors: Values, control_period: float, tolerance: float) -> float:
-    """Time from which the error stays inside the tolerance until the episode ends, s.
+    """Time from which the error stays inside the tolerance until the episode ends, s; nan if never.
 
     Args:
         errors: The metric at every control step, shape (T,); `errors[0]` is at time 0.
         control_period: Time between two control steps, s.
         tolerance: Half width of the band around zero, in the metric's unit.
-
-    Returns:
-        nan if the last error lies outside the band, or if there is none. An episode that crashes
-        has not settled whatever its errors say; the caller knows, this function does not.
     """
     outside = ~(np.abs(np.asarray(errors, float)) < tolerance)
     if outside.size == 0 or outside[-1]:
@@ -170,15 +138,10 @@ def settling_time(errors: Values, control_period: float, tolerance: float) -> fl
 
 
 def overshoot(errors: Values) -> float:
-    """How far the craft passed its target: the largest -sign(E_0)·E, at least 0.
+    """How far the craft passed its target: the largest -sign(E_0)·E of shape (T,), at least 0.
 
-    An episode that begins exactly on its target has no side to pass to: its largest |E| counts.
-
-    Args:
-        errors: A signed error at every control step, shape (T,).
-
-    Returns:
-        In the metric's unit; nan for an episode without steps.
+    An episode that begins exactly on its target has no side to pass to: its largest |E| counts. An
+    episode without steps has nan.
     """
     values = np.asarray(errors, float)
     if not values.size:
@@ -189,9 +152,8 @@ def overshoot(errors: Values) -> float:
 
 
 def _finite(values: Values) -> Floats:
-    array: Floats = np.asarray(values, float)
-    finite: Floats = array[np.isfinite(array)]
-    return finite
+    array = np.asarray(values, float)
+    return np.asarray(array[np.isfinite(array)])
 
 
 def trimmed_mean(values: Values, axis: int = -1) -> Floats:
@@ -215,16 +177,10 @@ def _resampled_iqms(values: Floats, rng: np.random.Generator) -> Floats:
 
 
 def bootstrap_interval(values: Values) -> tuple[float, float]:
-    """95 % percentile-bootstrap interval of the interquartile mean over seeds.
+    """95 % percentile-bootstrap interval of the interquartile mean over seeds, always the same.
 
-    It is the same each time that a report is written.
-
-    Args:
-        values: One value per seed; missing ones are left out.
-
-    Returns:
-        (low, high). (nan, nan) for fewer than two values: one seed shows no spread, which is not
-        the same as a spread of zero. With few seeds the interval is narrower than it should be.
+    Missing values are left out. Fewer than two give (nan, nan): one seed shows no spread, which is
+    not the same as a spread of zero. With few seeds the interval is narrower than it should be.
     """
     finite = _finite(values)
     if finite.size < 2:
@@ -233,15 +189,12 @@ def bootstrap_interval(values: Values) -> tuple[float, float]:
 
 
 def bootstrap_difference(first: Values, second: Values) -> tuple[float, float, float]:
-    """Difference between two interquartile means over seeds, with its 95 % bootstrap interval.
+    """iqm(first) - iqm(second) over seeds, and the ends of its 95 % bootstrap interval, nan where
+    either side has fewer than two values.
 
     The runs of the two agents are resampled independently, although runs of one seed share their
     starting states, and VPG's and A2C's also the actor's first weights and the stream of noise. As
     far as this makes the runs of a seed alike, the interval is wider than it need be.
-
-    Returns:
-        (iqm(first) - iqm(second), low, high); the ends are nan where either side has fewer than
-        two values.
     """
     one, other = _finite(first), _finite(second)
     difference = iqm(one) - iqm(other)
@@ -257,10 +210,7 @@ def _ends(means: Floats) -> tuple[float, float]:
 
 
 def training_runs(episodes: pd.DataFrame, agent: str) -> list[pd.DataFrame]:
-    """Split an agent's training episodes into one frame per seed, in the order of their ends.
-
-    Episodes of several drones overlap: their env steps count from the run's when they began.
-    """
+    """Split an agent's training episodes into one frame per seed, in the order of their ends."""
     own = episodes[episodes["agent"] == agent].sort_values(["seed", "last_step"], kind="stable")
     return [run for _, run in own.groupby("seed")]
 
@@ -271,14 +221,8 @@ def episode_ends(episodes: pd.DataFrame) -> Floats:
 
 
 def average_return(run: pd.DataFrame, share: float) -> Curve:
-    """Running mean of one run's return, over the episodes that ended in the last `share` of it.
-
-    Args:
-        run: The training episodes of one run, in order.
-        share: Of the run's env steps, 0 to 1.
-
-    Returns:
-        A point at the end of every episode; that episode is always in its mean.
+    """Running mean of one run's return, over the episodes that ended in the last `share` of it: a
+    point at the end of every episode, which is always in its mean.
     """
     ends = episode_ends(run)
     total = np.concatenate([[0.0], np.cumsum(run["return"].to_numpy())])
@@ -288,15 +232,12 @@ def average_return(run: pd.DataFrame, share: float) -> Curve:
 
 
 def spread_over_seeds(curves: Sequence[Curve], grid: Floats | None = None) -> Spread:
-    """Put several seeds' curves on one grid: interquartile mean and spread.
+    """Put several seeds' curves on one grid: interquartile mean and `extent`.
 
     Args:
         curves: One per seed, at least one, of at least one point each.
-        grid: Ascending, shape (m,); 300 even points if not given.
-
-    Returns:
-        The grid's points that all curves reach. `low` and `high` are the quartiles over seeds, or
-        the extremes below four seeds, where quartiles would be made up.
+        grid: Ascending, shape (m,), of which points that all curves reach are kept; 300 even points
+            if not given.
     """
     start = max(curve.x[0] for curve in curves)
     end = min(curve.x[-1] for curve in curves)
@@ -314,13 +255,10 @@ def extent(count: int) -> tuple[float, float]:
 
 
 def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tuple[float, float]:
-    """Training after which one run holds its goal for good.
+    """Training after which one run holds its goal for good, by its evaluation episodes.
 
     A snapshot is judged by few episodes, in which even an untrained network can pass by luck:
     hence a snapshot counts only if none after it fails.
-
-    Args:
-        evaluations: The evaluation episodes of one run (one agent, one seed).
 
     Returns:
         Env steps and seconds of training of the first snapshot from which on every snapshot holds
@@ -329,18 +267,10 @@ def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tup
     # A crash, or a value that is missing, must not vanish in a mean that skips it.
     never = -np.inf if headline.high else np.inf
     steady = evaluations["steady"].fillna(never).mask(evaluations["terminated"], never)
-    snapshots = (
-        evaluations.assign(steady=steady)
-        .groupby("env_steps", sort=True)
-        .agg(steady=("steady", "mean"), seconds=("seconds", "max"))
-        .reset_index()
-    )
-    misses = (~headline.holds(snapshots["steady"].to_numpy())).nonzero()[0]
-    first = int(misses[-1]) + 1 if misses.size else 0
-    if first >= len(snapshots):
-        return math.nan, math.nan
-    row = snapshots.iloc[first]
-    return float(row["env_steps"]), float(row["seconds"])
+    snapshots = evaluations.assign(steady=steady).groupby("env_steps")
+    misses = ~headline.holds(snapshots["steady"].mean().to_numpy())
+    lasting = snapshots["seconds"].max()[~np.logical_or.accumulate(misses[::-1])[::-1]]
+    return next(((float(s), float(t)) for s, t in lasting.items()), (math.nan, math.nan))
 
 
 def final_evaluations(evaluations: pd.DataFrame) -> pd.DataFrame:
@@ -357,14 +287,11 @@ def final_per_run(evaluations: pd.DataFrame, headline: Headline) -> pd.DataFrame
     a value in every episode and without a crash.
     """
     final = final_evaluations(evaluations)
-    final = final.assign(
-        # Files leave a crash's settling time empty; a value there would be a mistake.
-        settling_time=final["settling_time"].mask(final["terminated"]),
-        missing=final["steady"].isna(),
-    )
+    # Files leave a crash's settling time empty; a value there would be a mistake.
+    settling_time = final["settling_time"].mask(final["terminated"])
+    final = final.assign(settling_time=settling_time, missing=final["steady"].isna())
     rows = final.groupby(["agent", "seed"], sort=True).agg(
-        **{name: (name, "mean") for name in ("steady", "settling_time", "overshoot")},
-        **{"return": ("return", "mean")},
+        **{name: (name, "mean") for name in ("steady", "settling_time", "overshoot", "return")},
         episodes=("episode", "size"),
         settled=("settling_time", "count"),
         crashed=("terminated", "sum"),
@@ -392,8 +319,7 @@ def results_table(
         `_high` of its 95 % interval. `held`: seeds that hold the goal; `worst`: the worst seed's
         steady state. Counts: seeds, episodes, settled, crashed. For agents that were trained:
         env_steps_to_reach and seconds_to_reach (interquartile mean over the `reached` of `seeds`
-        seeds that hold the goal for good) and steps_per_second; nan for the others. A bound has
-        a return and nothing else; its counts are 0.
+        seeds that hold the goal for good) and steps_per_second. A bound has a return alone.
     """
     final = final_per_run(evaluations, headline)
     rows: dict[str, dict[str, float]] = {}
@@ -403,13 +329,9 @@ def results_table(
         rows[agent] = _final_row(final[final["agent"] == agent], headline)
         rows[agent] |= _training_row(own, trained, headline)
     for name, value in (bounds or {}).items():
-        counts = dict.fromkeys(_COUNTS, 0)
-        nothing = dict.fromkeys(next(iter(rows.values())), math.nan)
-        rows[name] = {**nothing, **counts, "return": value}
-    table = pd.DataFrame.from_dict(rows, orient="index")
-    table = table.astype(dict.fromkeys(_COUNTS, "int64"))
-    table.index.name = "agent"
-    return table
+        rows[name] = {**dict.fromkeys(_COUNTS, 0), "return": value}
+    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("agent")
+    return table.astype(dict.fromkeys(_COUNTS, "int64"))
 
 
 def _final_row(final: pd.DataFrame, headline: Headline) -> dict[str, float]:
@@ -418,7 +340,7 @@ def _final_row(final: pd.DataFrame, headline: Headline) -> dict[str, float]:
         values = final[name].to_numpy()
         row[name] = iqm(values)
         row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(values)
-    row["held"] = math.nan if headline.metric.held is None else int(final["held"].sum())
+    row["held"] = math.nan if headline.held is None else int(final["held"].sum())
     row["worst"] = headline.worst(final["steady"].to_numpy())
     return row | {name: int(final[name].sum()) for name in _COUNTS[1:]}
 
@@ -427,7 +349,7 @@ def _training_row(
     evaluations: pd.DataFrame, runs: pd.DataFrame, headline: Headline
 ) -> dict[str, float]:
     reached, steps, seconds = math.nan, np.empty(0), np.empty(0)
-    if len(runs) and headline.metric.held is not None:
+    if len(runs) and headline.held is not None:
         first = [first_lasting_snapshot(run, headline) for _, run in evaluations.groupby("seed")]
         steps, seconds = np.array(first).T
         reached = int(np.isfinite(steps).sum())

@@ -46,17 +46,12 @@ def socket_pair(
         PeerClosed: The simulator did not start, or ended: its own sentence, or its last words.
         PeerSilent: The simulator runs and does not answer.
     """
-    config = EnvConfig(
-        env_id=env_id, options=options or {}, vehicle=None if vehicle is None else str(vehicle)
-    )
+    file = None if vehicle is None else str(vehicle)
+    config = EnvConfig(env_id=env_id, options=options or {}, vehicle=file)
     settings: dict[str, Any] = {
-        "env_id": env_id,
-        "options": config.options,
-        "connect": False,
-        "connect_timeout": _POLL,
-        "timeout": _ANSWER_TIMEOUT,
-        "record": record,
-    }
+        "env_id": env_id, "options": config.options, "connect": False, "connect_timeout": _POLL,
+        "timeout": _ANSWER_TIMEOUT, "record": record,
+    }  # fmt: skip
     here = ("127.0.0.1", 0)
     env: RemoteEnv | RemoteVectorEnv
     if num_envs == 1:
@@ -64,7 +59,7 @@ def socket_pair(
     else:
         env = RemoteVectorEnv(here, num_envs=num_envs, autoreset_mode="Disabled", **settings)
     arguments = {"server": env.address, "bind": here, "num_envs": num_envs, "env": env_id}
-    arguments |= {"vehicle": config.vehicle, "options": config.options}
+    arguments |= {"vehicle": file, "options": config.options}
     arguments |= {"module": config.module} if config.module else {}
     # -P: no folder of the working directory stands for the package.
     command = [sys.executable, "-P", "-m", "rotorgram.udp", json.dumps(arguments)]
@@ -100,7 +95,7 @@ def _connect(env: RemoteEnv | RemoteVectorEnv, process: subprocess.Popen[bytes])
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """It was told to end; close the way back and take its exit status."""
+    """The simulator was told to end: wait for it."""
     assert process.stdin is not None
     process.stdin.close()
     try:
@@ -114,19 +109,16 @@ _shared: dict[str, tuple[Any, ExitStack]] = {}
 
 
 @contextmanager
-def shared_pair(
-    env_id: str, options: Mapping[str, Any], *, num_envs: int = 1, vehicle: str | None = None
-) -> Iterator[Any]:
-    """As `socket_pair`, but the pair stays open for the next run of this process.
+def shared_pair(**settings: Any) -> Iterator[Any]:
+    """As `socket_pair` by keyword, but the pair stays open for the next run of this process.
 
     To start a simulator takes as long as a short training. A pair whose block fails is closed. The
     others are closed by `close_shared_pairs`, or with the process.
     """
-    key = json.dumps([env_id, options, num_envs, vehicle], sort_keys=True)
+    key = json.dumps(settings, sort_keys=True)
     if key not in _shared:
         stack = ExitStack()
-        pair = socket_pair(env_id, options, num_envs=num_envs, vehicle=vehicle)
-        _shared[key] = stack.enter_context(pair), stack
+        _shared[key] = stack.enter_context(socket_pair(**settings)), stack
     env, stack = _shared[key]
     try:
         yield env

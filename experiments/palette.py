@@ -3,14 +3,13 @@
 from collections.abc import Iterable
 from typing import Final
 
-__all__ = ["agent_color", "agent_label", "sort_agents"]
+__all__ = ["DARK_COLORS", "agent_color", "agent_label", "sort_agents"]
 
 _LABELS: Final = {"vpg": "VPG", "a2c": "A2C", "sb3-a2c": "SB3 A2C", "pid": "PID"}
 # Okabe and Ito's palette: told apart by readers with colour-blindness.
 _COLORS: Final = {"vpg": "#D55E00", "a2c": "#0072B2", "sb3-a2c": "#009E73", "pid": "#555555"}
 _SPARE_COLORS: Final = ("#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
-# The same hues, lighter, for a dark ground.
-_DARK_COLORS: Final = {
+DARK_COLORS: Final = {
     "#D55E00": "#F58A3C",
     "#0072B2": "#55B0F0",
     "#009E73": "#2CC998",
@@ -20,6 +19,7 @@ _DARK_COLORS: Final = {
     "#56B4E9": "#7CC8F2",
     "#8C564B": "#C9938A",
 }
+"""The same hues, lighter, for a dark ground."""
 
 
 def agent_label(agent: str) -> str:
@@ -28,15 +28,10 @@ def agent_label(agent: str) -> str:
 
 
 def agent_color(agent: str, dark: bool = False) -> str:
-    """Give an agent's colour, the same in every figure and every report.
-
-    Args:
-        agent: Its name.
-        dark: Whether it is drawn on a dark ground.
-    """
+    """Give an agent's colour, the same in every figure and report; lighter for a dark ground."""
     spare = _SPARE_COLORS[sum(agent.encode()) % len(_SPARE_COLORS)]
     color = _COLORS.get(agent, spare)
-    return _DARK_COLORS[color] if dark else color
+    return DARK_COLORS[color] if dark else color
 
 
 def sort_agents(names: Iterable[str]) -> list[str]:

@@ -7,102 +7,59 @@ nothing outside itself.
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import pandas as pd
 
 from ..envs.spec import canonical_id
 from .claims import Verdict, judge_claims, judge_no_worse
 from .curves import make_curves
-from .figures import FIGURE_FILES, draw_figures
+from .figures import draw_figures
 from .metrics import results_table
-from .page import FolderFile, render_page
-from .results import (
-    CONFIG_FILE,
-    EPISODES_FILE,
-    EVALUATIONS_FILE,
-    RUNS_FILE,
-    STEPS_FILE,
-    Results,
-    read_results,
-)
+from .page import render_page
+from .results import Results, read_results
 from .tables import markdown_table, terminal_table
 
-if TYPE_CHECKING:
-    import pandas as pd
+__all__ = ["VIDEO_FILE", "table_of", "terminal_table", "write_report"]
 
-__all__ = ["CLAIMS_FILE", "POSTER_FILE", "REPORT_FILE", "RESULTS_CSV", "RESULTS_MARKDOWN",
-           "VIDEO_FILE", "table_of", "terminal_table", "write_report"]  # fmt: skip
-
-REPORT_FILE: Final = "report.html"
-RESULTS_CSV: Final = "results.csv"
-RESULTS_MARKDOWN: Final = "results.md"
-CLAIMS_FILE: Final = "claims.json"
 VIDEO_FILE: Final = "video.mp4"
 """The agents side by side; the page has it in itself where it lies in the folder."""
-POSTER_FILE: Final = "video.jpg"
-"""Picture that the page shows before the film is played."""
-PAPERS_TASK: Final = "rotorgram/Elevation-v0"
-"""The paper's claims are about this task."""
-
-_FILES: Final = (
-    (CONFIG_FILE, "every setting, the seeds, the versions and the machine"),
-    (EPISODES_FILE, "a row per training episode"),
-    (EVALUATIONS_FILE, "a row per evaluation episode of every snapshot"),
-    (RUNS_FILE, "a row per training run, with its times"),
-    (STEPS_FILE, "a row per env step of training and of the final evaluation"),
-    ("checkpoints", "the trained policies; fly one with rotorgram serve or rotorgram evaluate"),
-    (RESULTS_CSV, "the table of results, all digits"),
-    (RESULTS_MARKDOWN, "the table of results, for reading"),
-    (CLAIMS_FILE, "the verdicts with their definitions and evidence"),
-    *((f"figures/{name}", "a figure, as a picture") for name in FIGURE_FILES),
-    (VIDEO_FILE, "the agents side by side"),
-    (POSTER_FILE, "a picture of the film"),
-)
 
 
-def table_of(results: Results) -> "pd.DataFrame":
+def table_of(results: Results) -> pd.DataFrame:
     """The table of results, with the bounds of the task behind the agents."""
     bounds = results.config.get("bounds")
     return results_table(results.evaluations, results.runs, results.headline, bounds)
 
 
-def verdicts_of(results: Results) -> list[Verdict]:
+def _verdicts(results: Results) -> list[Verdict]:
     """The paper's claims, for the paper's task; and whether our A2C is no worse than SB3's."""
     preset, headline = results.config["preset"], results.headline
     verdicts = []
-    if canonical_id(results.spec.env_id) == PAPERS_TASK:
+    if canonical_id(results.spec.env_id) == "rotorgram/Elevation-v0":  # of which the paper is
         verdicts = judge_claims(results.episodes, results.evaluations, preset, headline)
-    if headline.metric.held is not None:
+    if headline.held is not None:
         trained = set(results.runs["agent"])
         verdicts.append(judge_no_worse(results.evaluations, trained, preset, headline))
     return verdicts
 
 
 def write_report(folder: Path | str, results: Results | None = None) -> Path:
-    """Draw the figures and write the page, the table and the verdicts into the folder.
-
-    Returns:
-        The path of the page.
-
-    Raises:
-        ResultsError: A file or a column is missing.
+    """Draw the figures and write the page, the table and the verdicts into the folder; the path of
+    the page. Raises `ResultsError` if a file or a column is missing.
     """
     folder = Path(folder)
     results = results or read_results(folder)
-    table, verdicts = table_of(results), verdicts_of(results)
+    table, verdicts = table_of(results), _verdicts(results)
     curves = make_curves(folder, results)
     draw_figures(folder, results, curves)
-    table.to_csv(folder / RESULTS_CSV)
-    (folder / RESULTS_MARKDOWN).write_text(
-        markdown_table(table, results.headline), encoding="utf-8"
-    )
+    table.to_csv(folder / "results.csv")
+    markdown = markdown_table(table, results.headline)
+    (folder / "results.md").write_text(markdown, encoding="utf-8")
     claims = json.dumps([asdict(verdict) for verdict in verdicts], indent=2, ensure_ascii=False)
-    (folder / CLAIMS_FILE).write_text(claims + "\n", encoding="utf-8")
-    video, poster = (
-        path.read_bytes() if (path := folder / name).is_file() else None
-        for name in (VIDEO_FILE, POSTER_FILE)
-    )
-    files = [FolderFile(name, text) for name, text in _FILES if (folder / name).exists()]
-    page = render_page(results, table, verdicts, curves, video, poster, files)
-    report = folder / REPORT_FILE
-    report.write_text(page, encoding="utf-8")
+    (folder / "claims.json").write_text(claims + "\n", encoding="utf-8")
+    video, report = folder / VIDEO_FILE, folder / "report.html"
+    film = video.read_bytes() if video.is_file() else None
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+    report.write_text(render_page(results, table, verdicts, curves, film, files), encoding="utf-8")
     return report

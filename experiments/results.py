@@ -25,34 +25,27 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.dataset as pads
+import pyarrow.parquet as pq
 
 from ..agents.checkpoints import software_versions, write_whole
 from ..agents.episodes import Episode
 from ..envs.spec import EnvSpec, SpecError
-from ..models.errors import require
-from .errors import ResultsError
+from ..models.errors import InputError, require
 from .metrics import Headline, overshoot, settling_time, steady_state
 from .trajectories import Trajectory
 
-if TYPE_CHECKING:
-    import pandas as pd
-    import pyarrow as pa
-    import pyarrow.dataset as pads
-    import pyarrow.parquet as pq
-else:
-    pd = require("pandas", "train", "comparing agents")
-    pa = require("pyarrow", "train", "comparing agents")
-    pads = require("pyarrow.dataset", "train", "comparing agents")
-    pq = require("pyarrow.parquet", "train", "comparing agents")
-
 __all__ = [
     "CONFIG_FILE", "CONFIG_KEYS", "EPISODES_FILE", "EPISODE_COLUMNS", "EVALUATIONS_FILE",
-    "EVALUATION_COLUMNS", "RUNS_FILE", "RUN_COLUMNS", "STEPS_FILE", "Results", "RunResults",
-    "episode_row", "evaluation_row", "evaluation_steps", "join_parts", "machine", "read_config",
-    "read_results", "read_spec", "read_steps", "step_table", "write_config",
+    "EVALUATION_COLUMNS", "RUNS_FILE", "RUN_COLUMNS", "STEPS_FILE", "Results", "ResultsError",
+    "Rows", "episode_row", "evaluation_row", "evaluation_steps", "join_parts", "machine",
+    "read_config", "read_results", "read_spec", "read_steps", "step_table", "write_config",
+    "write_part",
 ]  # fmt: skip
 
 CONFIG_FILE: Final = "config.json"
@@ -110,11 +103,15 @@ _OWN_NAMES: Final = ("mean_size", "steady", "value")
 """Columns that have the headline metric's name in the files."""
 
 
+class ResultsError(InputError):
+    """A file of results is missing or is not what it should be."""
+
+
 def _in_file(column: str, metric: str) -> str:
     return metric if column in _OWN_NAMES else column
 
 
-def step_schema(metric: str) -> "pa.Schema":
+def step_schema(metric: str) -> pa.Schema:
     """Columns of `steps.parquet`, the headline metric by its name."""
     return pa.schema(
         [
@@ -136,10 +133,10 @@ def step_schema(metric: str) -> "pa.Schema":
 def write_config(
     folder: Path, command: str, spec: EnvSpec, vehicle: str | None, content: Mapping[str, Any]
 ) -> None:
-    """Write `config.json`: the content, and versions and machine, on which the numbers depend too.
+    """Write `config.json`; one that exists stays: a resumed run keeps its settings.
 
     Args:
-        folder: Where to; a file that exists stays: a resumed run keeps its settings.
+        folder: Where to.
         command, spec, vehicle: The user's command; of the env; path of its file or None.
         content: Settings of the comparison or the sweep; with them all of `CONFIG_KEYS` are there.
     """
@@ -168,11 +165,9 @@ def read_config(folder: Path | str) -> dict[str, Any]:
     """Read `config.json` and check that the keys of `CONFIG_KEYS` are there."""
     path = _existing(folder, CONFIG_FILE)
     try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ResultsError(f"{path} is not JSON: {error}") from error
-    if not isinstance(config, dict):
-        raise ResultsError(f"{path} should hold an object, not a {type(config).__name__}")
+        config = dict(json.loads(path.read_text(encoding="utf-8")))
+    except (TypeError, ValueError) as error:
+        raise ResultsError(f"{path} is not JSON, or no object: {error}") from error
     _check_names(path, "key", CONFIG_KEYS, config)
     return config
 
@@ -188,36 +183,20 @@ def read_spec(folder: Path | str, config: Mapping[str, Any]) -> EnvSpec:
 # ---- writing
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunResults:
-    """Results of one run."""
+Rows = Mapping[str, list[dict[str, Any]]]
+"""Rows by the name of their file."""
 
-    agent: str
-    seed: int
-    metric: str
-    """Name of the headline metric."""
-    episodes: list[dict[str, Any]]
-    """Rows of `episodes.csv`, without agent and seed."""
-    evaluations: list[dict[str, Any]]
-    """Rows of `evaluations.csv`, without agent and seed."""
-    runs: list[dict[str, Any]]
-    """Its row of `runs.csv`, without agent and seed; none if nothing was trained."""
-    steps: "list[pa.Table]"
-    """Tables of `steps.parquet`."""
 
-    def write(self, parts: Path) -> None:
-        """Write a part: a folder that is there whole or not at all."""
-        part = parts / f"{self.agent}-seed{self.seed}"
-        unfinished = part.with_name(f".{part.name}")
-        unfinished.mkdir(parents=True)
-        label = {"agent": self.agent, "seed": self.seed}
-        for name, columns in _TABLES.items():
-            rows = [{**label, **row} for row in getattr(self, name.removesuffix(".csv"))]
-            table = pd.DataFrame(rows, columns=list(columns))
-            table.columns = [_in_file(column, self.metric) for column in columns]
-            table.to_csv(unfinished / name, index=False)
-        pq.write_table(pa.concat_tables(self.steps), unfinished / STEPS_FILE, compression="zstd")
-        unfinished.rename(part)
+def write_part(part: Path, metric: str, rows: Rows, steps: list[pa.Table]) -> None:
+    """Write what one run gave: a folder that is there whole or not at all."""
+    unfinished = part.with_name(f".{part.name}")
+    unfinished.mkdir(parents=True)
+    for name, columns in _TABLES.items():
+        table = pd.DataFrame(rows.get(name, []), columns=list(columns))
+        table.columns = [_in_file(column, metric) for column in columns]
+        table.to_csv(unfinished / name, index=False)
+    pq.write_table(pa.concat_tables(steps), unfinished / STEPS_FILE, compression="zstd")
+    unfinished.rename(part)
 
 
 def join_parts(parts: Path, folder: Path, metric: str) -> None:
@@ -236,25 +215,18 @@ def join_parts(parts: Path, folder: Path, metric: str) -> None:
 
 
 def episode_row(episode: Episode, num_envs: int, env_steps: int) -> dict[str, Any]:
-    """A training episode as a row of `episodes.csv`, without agent and seed.
-
-    Args:
-        episode: The episode.
-        num_envs: Drones of the run. While one flies a step, each of the others does.
-        env_steps: Of the run.
-    """
+    """A training episode as a row of `episodes.csv`, without agent and seed."""
+    # While one drone flies a step, each of the others does.
     last = min(episode.first_step + episode.length * num_envs, env_steps)
     return {**asdict(episode), "return": episode.total_reward, "last_step": last}
 
 
 def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]:
     """A trajectory as a row of `evaluations.csv`, but for the columns that name the run."""
-    values = trajectory.values(headline.name)
-    settled = over = np.nan
-    if headline.metric.settled is not None and not headline.high and not trajectory.terminated:
-        settled = settling_time(values, trajectory.control_period, headline.metric.settled)
-    if headline.signed:
-        over = overshoot(values)
+    values = trajectory.headline
+    settled = np.nan
+    if headline.settles and not trajectory.terminated:  # what crashes has not settled
+        settled = settling_time(values, trajectory.control_period, headline.settled or 0.0)
     return {
         "episode": trajectory.episode,
         "length": len(trajectory),
@@ -262,14 +234,14 @@ def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]
         "start": float(values[0]),
         "steady": steady_state(headline.size(values[1:])),
         "settling_time": settled,
-        "overshoot": over,
+        "overshoot": overshoot(values) if headline.signed else np.nan,
         "terminated": trajectory.terminated,
     }
 
 
 def evaluation_steps(
     agent: str, seed: int, headline: Headline, trajectories: Sequence[Trajectory]
-) -> "list[pa.Table]":
+) -> list[pa.Table]:
     """Every env step of evaluation trajectories."""
     return [
         step_table(
@@ -277,9 +249,9 @@ def evaluation_steps(
             agent=agent,
             seed=seed,
             phase="evaluation",
-            episode=np.full(len(one), one.episode),
+            episode=one.episode,
             step=np.arange(1, len(one) + 1),
-            value=one.values(headline.name)[1:],
+            value=one.headline[1:],
             reward=one.rewards,
             thrust=one.mean_thrust[1:],
         )
@@ -287,20 +259,11 @@ def evaluation_steps(
     ]
 
 
-def step_table(
-    metric: str, *, agent: str, seed: int, phase: str, **columns: np.ndarray
-) -> "pa.Table":
-    """Rows of `steps.parquet` from `episode`, `step`, `value`, `reward` and `thrust`, (T,) each."""
-    count = len(columns["step"])
-    named: dict[str, Any] = {_in_file(name, metric): x for name, x in columns.items()}
-    named |= {"agent": [agent] * count, "seed": np.full(count, seed), "phase": [phase] * count}
-    schema = step_schema(metric)
-    arrays = [
-        pa.array(np.asarray(named[f.name], np.float32) if f.type == pa.float32() else named[f.name])
-        .cast(f.type)
-        for f in schema
-    ]  # fmt: skip
-    return pa.Table.from_arrays(arrays, schema=schema)
+def step_table(metric: str, **columns: Any) -> pa.Table:
+    """Rows of `steps.parquet`: its columns, the metric's as `value`; one value or (T,) each."""
+    frame = pd.DataFrame({_in_file(name, metric): column for name, column in columns.items()})
+    table = pa.Table.from_pandas(frame, step_schema(metric), preserve_index=False)
+    return table.replace_schema_metadata()
 
 
 # ---- reading
@@ -314,11 +277,11 @@ class Results:
     """`config.json`."""
     spec: EnvSpec
     headline: Headline
-    episodes: "pd.DataFrame"
+    episodes: pd.DataFrame
     """Training episodes, `EPISODE_COLUMNS`; one that the end of training cut is not there."""
-    evaluations: "pd.DataFrame"
+    evaluations: pd.DataFrame
     """Evaluation episodes, `EVALUATION_COLUMNS`."""
-    runs: "pd.DataFrame"
+    runs: pd.DataFrame
     """Training runs, `RUN_COLUMNS`."""
 
 
@@ -337,7 +300,7 @@ def read_steps(
     phase: str,
     columns: Iterable[str] = ("agent", "seed", "episode", "step", "value"),
     max_rows: int | None = None,
-) -> "pd.DataFrame":
+) -> pd.DataFrame:
     """Read some columns of one phase of `steps.parquet`.
 
     Args:
@@ -345,12 +308,8 @@ def read_steps(
         metric: Name of the headline metric; its column is `value` in the frame.
         phase: "train" or "evaluation".
         columns: Others are not read from the disk.
-        max_rows: Keep about this many rows. The rows are picked at random (always the same ones),
-            not by a stride: a stride that divides the episode length would show the same moments
-            of every episode.
-
-    Returns:
-        The rows, in the order of the file; `agent` is a category.
+        max_rows: Keep about so many, picked at random but always the same ones: a stride that
+            divides the episode length would show the same moments of every episode.
     """
     path = _existing(folder, STEPS_FILE)
     try:
@@ -383,7 +342,7 @@ def _check_names(path: Path, kind: str, wanted: Iterable[str], present: Iterable
         )
 
 
-def _read_csv(folder: Path | str, name: str, metric: str) -> "pd.DataFrame":
+def _read_csv(folder: Path | str, name: str, metric: str) -> pd.DataFrame:
     path = _existing(folder, name)
     columns = _TABLES[name]
     types = {_in_file(column, metric): kind for column, kind in columns.items()}

@@ -7,19 +7,13 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from itertools import product
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 from ..agents.presets import A2CConfig, VPGConfig, preset
 from ..envs.registry import env_spec, is_known, options_type, task_type
 from ..models.errors import InputError
 
-__all__ = ["AGENTS", "Backend", "CompareConfig", "EnvConfig", "Run", "SweepConfig", "SweepRun",
-           "WorkersConfig"]  # fmt: skip
-
-AGENTS: Final = ("vpg", "a2c", "sb3-a2c")
-
-Backend = Literal["loky", "ray"]
-"""Workers of the jobs: the cores of this machine, or a Ray cluster."""
+__all__ = ["CompareConfig", "EnvConfig", "Run", "SweepConfig", "SweepRun", "WorkersConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,9 +41,7 @@ class EnvConfig:
     @property
     def module(self) -> str | None:
         """Module that another process must import to know the task; None for ours."""
-        if not is_known(self.env_id):
-            return None
-        name = task_type(self.env_id).__module__
+        name = task_type(self.env_id).__module__ if is_known(self.env_id) else "__main__"
         return None if name.startswith("rotorgram.") or name == "__main__" else name
 
 
@@ -67,10 +59,9 @@ class Run(EnvConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.seed < 0:
-            raise InputError(f"seed: expected 0 or more, got {self.seed}")
-        if self.num_envs < 1:
-            raise InputError(f"num_envs: expected 1 or more, got {self.num_envs}")
+        for name, least in (("seed", 0), ("num_envs", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
         least = 1
         if isinstance(self.config, A2CConfig):
             least = self.config.rollout_size(self.num_envs)
@@ -86,7 +77,7 @@ class WorkersConfig:
 
     jobs: int | None = None
     """Jobs at a time; None: one for each core of the machine or of the cluster."""
-    backend: Backend = "loky"
+    backend: Literal["loky", "ray"] = "loky"
     """`loky`: processes of this machine. `ray`: a Ray cluster."""
     address: str | None = None
     """The cluster's: `ray://HOST:PORT` of its client server from anywhere, `HOST:PORT` or None on
@@ -95,8 +86,6 @@ class WorkersConfig:
     def __post_init__(self) -> None:
         if self.jobs is not None and self.jobs < 1:
             raise InputError(f"jobs: expected at least 1, got {self.jobs}")
-        if self.backend not in ("loky", "ray"):
-            raise InputError(f"backend: expected loky or ray, got {self.backend}")
         if self.address is not None and self.backend != "ray":
             raise InputError(f"address: expected it with backend ray, got it with {self.backend}")
 
@@ -139,20 +128,16 @@ class _ManyRuns(WorkersConfig, EnvConfig):
 
     def content(self, *algorithms: str) -> dict[str, Any]:
         """What `config.json` has of it, but for the env; `read_content` reads it."""
-        return {
-            "preset": self.preset,
-            "seeds": list(self.all_seeds),
-            "env_steps": self.env_steps,
-            "num_envs": self.num_envs,
-            "agents": {name: asdict(preset(name, self.preset)) for name in algorithms},
-        }
+        content = {name: getattr(self, name) for name in ("preset", "env_steps", "num_envs")}
+        agents = {name: asdict(preset(name, self.preset)) for name in algorithms}
+        return {**content, "seeds": list(self.all_seeds), "agents": agents}
 
     @staticmethod
     def read_content(content: Mapping[str, Any]) -> dict[str, Any]:
         """The settings that all have, from the content of a `config.json`."""
-        kept = {name: content[name] for name in ("preset", "env_steps", "num_envs", "vehicle")}
         seeds, spec = content["seeds"], content["spec"]
-        kept |= {"env_id": spec["env_id"], "options": spec["options"]}
+        kept = {name: content[name] for name in ("preset", "env_steps", "num_envs", "vehicle")}
+        kept |= {name: spec[name] for name in ("env_id", "options")}
         return kept | {"seeds": len(seeds), "first_seed": seeds[0]}
 
     def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:
@@ -170,7 +155,7 @@ class _ManyRuns(WorkersConfig, EnvConfig):
 class CompareConfig(_ManyRuns):
     """Settings of a comparison and its workers."""
 
-    agents: tuple[str, ...] = AGENTS
+    agents: tuple[str, ...] = ("vpg", "a2c", "sb3-a2c")
     """Agents to train. The PID is always evaluated beside them, where it can fly the env."""
     snapshots: int = 10
     """Policies kept during each training, for the learning curves."""
@@ -207,7 +192,7 @@ class SweepRun:
 
     @property
     def name(self) -> str:
-        """Name of the run."""
+        """For progress and errors."""
         words = " ".join(f"{name}={value}" for name, value in self.settings.items())
         return f"{words} seed {self.run.seed}"
 
@@ -227,20 +212,18 @@ class SweepConfig(_ManyRuns):
         super().__post_init__()
         if not self.grid:
             raise InputError("grid: expected at least one hyperparameter, got none")
+        self.runs()  # wrong names and numbers are told before anything is trained
         for name, values in self.grid.items():
             if not values:
                 raise InputError(f"grid: expected at least one value of {name}, got none")
-        self.runs()  # wrong names and numbers are told before anything is trained
-        for name, values in self.grid.items():
             for place, value in enumerate(values):
                 if value in values[:place]:
                     raise InputError(f"grid: expected each {name} once, got {value!r} twice")
 
     def points(self) -> list[dict[str, Any]]:
         """Settings of every point; the value that is named last changes fastest."""
-        return [
-            dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())
-        ]
+        names, values = self.grid.keys(), product(*self.grid.values())
+        return [dict(zip(names, chosen, strict=True)) for chosen in values]
 
     def runs(self) -> list[SweepRun]:
         """Every training, in the order in which they start.
@@ -249,9 +232,7 @@ class SweepConfig(_ManyRuns):
         every point.
         """
         return [
-            SweepRun(
-                point=point, settings=settings, run=self._run(self.algorithm, seed, **settings)
-            )
+            SweepRun(point=point, settings=chosen, run=self._run(self.algorithm, seed, **chosen))
             for seed in self.all_seeds
-            for point, settings in enumerate(self.points())
+            for point, chosen in enumerate(self.points())
         ]

@@ -12,30 +12,31 @@ A folder holds three files, all of them whole at any moment:
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-import numpy as np
+import pandas as pd
 
 from ..agents.checkpoints import write_whole
 from ..agents.policies import NetworkPolicy
 from ..envs.registry import env_spec
-from ..models.errors import require
 from .compare import evaluation_pair
-from .errors import ResultsError
 from .folders import locked
 from .metrics import Headline, final_per_run
 from .pairs import shared_pair
-from .progress import OnProgress, ProgressSender
-from .results import CONFIG_FILE, RUNS_FILE, evaluation_row, read_config, read_spec, write_config
+from .progress import OnProgress, Tell
+from .results import (
+    CONFIG_FILE,
+    RUNS_FILE,
+    ResultsError,
+    evaluation_row,
+    read_config,
+    read_spec,
+    write_config,
+)
 from .settings import SweepConfig, SweepRun
 from .training import train_run
 from .trajectories import fly_episodes
 from .workers import open_workers
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = require("pandas", "train", "a sweep")
 
 __all__ = ["SWEEP_FILE", "is_sweep", "missing_runs", "read_sweep_config", "read_sweep_runs",
            "sweep", "sweep_table", "write_sweep_table"]  # fmt: skip
@@ -89,33 +90,28 @@ def missing_runs(config: SweepConfig, rows: pd.DataFrame) -> list[SweepRun]:
     return [job for job in config.runs() if (job.point, job.run.seed) not in done]
 
 
-def _fly(config: SweepConfig, job: SweepRun, progress: ProgressSender) -> dict[str, Any]:
+def _fly(config: SweepConfig, job: SweepRun, tell: Tell) -> dict[str, Any]:
     """Train and evaluate (in a worker process); the row of the run."""
     run = job.run
     with shared_pair(**run.env, num_envs=run.num_envs) as env:
-        training, times = train_run(run, env, progress)
+        training, times = train_run(run, env, tell)
     policy = NetworkPolicy(training.agent.actor(), training.log.spec)
     with evaluation_pair(config, config.episodes) as env:
         trajectories = fly_episodes(env, policy, config.episodes, "tuning")
     headline = Headline.of(training.log.spec)
-    name = {"agent": run.algorithm, "seed": run.seed, "env_steps": times["env_steps"]}
-    episodes = [{**name, **evaluation_row(one, headline)} for one in trajectories]
-    (row,) = final_per_run(pd.DataFrame(episodes), headline).to_dict("records")
+    frame = pd.DataFrame([evaluation_row(one, headline) for one in trajectories])
+    frame = frame.assign(agent=run.algorithm, seed=run.seed, env_steps=times["env_steps"])
+    (row,) = final_per_run(frame, headline).to_dict("records")
     whole = {"point": job.point, **row, **times}
     return {column: whole[column] for column in RUN_COLUMNS}
 
 
 def sweep_table(config: SweepConfig, rows: pd.DataFrame, headline: Headline) -> pd.DataFrame:
-    """One row for each point of which a run is done, the best first.
+    """One row for each point of which a run is done, the best first: measures over its seeds.
 
     A point is as good as its worst seed: first by the crashed episodes of the seed that crashed
     most, then by the worst steady state. Points that lack a seed stand last, for the worst of fewer
     seeds flatters.
-
-    Returns:
-        `point` and its settings; `seeds` that are done; `worst` and `median` steady state over
-        seeds; medians over seeds of `return`, `seconds` and `steps_per_second`; sums over seeds of
-        `episodes`, `settled` and `crashed`, and `most_crashed` of one seed.
     """
     table = rows.groupby("point").agg(
         seeds=("seed", "size"),
@@ -125,10 +121,8 @@ def sweep_table(config: SweepConfig, rows: pd.DataFrame, headline: Headline) -> 
         **{name: (name, "sum") for name in ("episodes", "settled", "crashed")},
         most_crashed=("crashed", "max"),
     ).reset_index()  # fmt: skip
-    table = table.sort_values(
-        ["seeds", "most_crashed", "worst"], ascending=[False, True, not headline.high],
-        kind="stable",
-    )  # fmt: skip
+    order = {"seeds": False, "most_crashed": True, "worst": not headline.high}
+    table = table.sort_values(list(order), ascending=list(order.values()), kind="stable")
     return _with_settings(table, config).reset_index(drop=True)
 
 
@@ -141,11 +135,7 @@ def write_sweep_table(config: SweepConfig, folder: Path) -> pd.DataFrame:
 
 
 def read_sweep_runs(folder: Path, config: SweepConfig) -> pd.DataFrame:
-    """The runs that are done, columns `RUN_COLUMNS`; none where there is no file.
-
-    Raises:
-        ResultsError: The file is not one of this sweep.
-    """
+    """The runs that are done, columns `RUN_COLUMNS`. Raises `ResultsError` if others are there."""
     path = folder / RUNS_FILE
     if not path.exists():
         return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in RUN_COLUMNS.items()})
@@ -184,9 +174,6 @@ def read_sweep_config(folder: Path) -> SweepConfig:
 
 def _with_settings(table: pd.DataFrame, config: SweepConfig) -> pd.DataFrame:
     """A table by points, with the settings of each after its number."""
-    points = config.points()
-    wide = table.copy()
-    for place, name in enumerate(config.grid, 1):
-        values = [points[point][name] for point in table["point"]]
-        wide.insert(place, name, np.array(values, dtype=object))
-    return wide
+    settings = pd.DataFrame(config.points(), dtype=object).iloc[table["point"]]
+    settings.index = table.index
+    return pd.concat([table[["point"]], settings, table.drop(columns="point")], axis=1)

@@ -3,17 +3,15 @@
 import math
 import re
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
+import pandas as pd
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
 from .metrics import Headline
 from .palette import agent_label
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 __all__ = ["NOTHING", "Cell", "count_text", "headings", "markdown_table", "number_text",
            "result_rows", "table_note", "terminal_table"]  # fmt: skip
@@ -22,37 +20,25 @@ NOTHING: Final = "–"
 """Shown where there is no value."""
 
 
-def headings(headline: Headline, short: bool = False) -> tuple[str, ...]:
-    """Headings of the columns; short ones, in lines, for the terminal."""
-    size, goal = headline.size_symbol, headline.held_text
-    settled = headline.metric.settled
-    if short:
-        return (
-            "Agent",
-            headline.labelled(f"Steady\n{size}"),
-            "Hold\nit",
-            "Settling\n(s)",
-            headline.labelled("Overshoot\n").replace("\n ", "\n").rstrip(),
-            "Return",
-            f"Env steps to\n{goal}",
-            "Env\nsteps/s",
-        )
+def headings(headline: Headline) -> tuple[str, ...]:
+    """Headings of the columns."""
+    size, goal, settled = headline.size_symbol, headline.held_text, headline.settled
     band = f" to {headline.amount(f'{settled:.2g}')}" if settled is not None else ""
     return (
         "Agent",
         headline.labelled(f"Steady {size}"),
-        f"Seeds that hold {goal}" if goal else "Seeds that hold",
+        f"Seeds that hold {goal}".rstrip(),
         f"Settling{band} (s)",
         headline.labelled("Overshoot"),
         "Return",
-        f"Env steps to {goal}" if goal else "Env steps to hold",
+        f"Env steps to {goal or 'hold'}",
         "Env steps per s",
     )
 
 
 def table_note(headline: Headline) -> str:
     """Explanation of the columns."""
-    size, goal, settled = headline.size_symbol, headline.held_text, headline.metric.settled
+    size, goal, settled = headline.size_symbol, headline.held_text, headline.settled
     parts = [
         "Interquartile means over seeds with 95 % bootstrap intervals, from the deterministic "
         "evaluation after training, on episodes of its own. "
@@ -65,7 +51,7 @@ def table_note(headline: Headline) -> str:
             f"time: up to the first snapshot from which on all hold {goal}, over the seeds that "
             "get there."
         )
-    if settled is not None and not headline.high:
+    if headline.settles:
         band = headline.amount(f"{settled:.2g}")
         parts.append(f"Settling: until {size} stays below {band}, over the episodes that settle.")
     parts.append(
@@ -82,7 +68,7 @@ class Cell(NamedTuple):
     details: tuple[str, ...] = ()
 
 
-def terminal_table(table: "pd.DataFrame", headline: Headline) -> Table:
+def terminal_table(table: pd.DataFrame, headline: Headline) -> Table:
     """Make a table of at most 100 columns for the terminal from `metrics.results_table`."""
     shown = Table(
         box=box.SIMPLE_HEAD,
@@ -92,9 +78,16 @@ def terminal_table(table: "pd.DataFrame", headline: Headline) -> Table:
         caption="Below a value: its 95 % interval, and how many episodes (or seeds) got there.",
         caption_justify="left",
     )
-    first, *others = headings(headline, short=True)
-    shown.add_column(first, no_wrap=True)
-    for heading in others:
+    shown.add_column("Agent", no_wrap=True)
+    for heading in (
+        headline.labelled(f"Steady\n{headline.size_symbol}"),
+        "Hold\nit",
+        "Settling\n(s)",
+        f"Overshoot\n({headline.unit})" if headline.unit else "Overshoot",
+        "Return",
+        f"Env steps to\n{headline.held_text}",
+        "Env\nsteps/s",
+    ):
         shown.add_column(heading, justify="right", overflow="fold")
     for row in result_rows(table):
         shown.add_row(*(_terminal_cell(cell) for cell in row), end_section=True)
@@ -107,7 +100,7 @@ def _terminal_cell(cell: Cell) -> Text:
     return Text("\n".join((cell.value, *details)))
 
 
-def result_rows(table: "pd.DataFrame") -> list[tuple[Cell, ...]]:
+def result_rows(table: pd.DataFrame) -> list[tuple[Cell, ...]]:
     """Put the results into words: a cell for each of `headings`, a row per agent."""
     return [_row(str(agent), row) for agent, row in table.iterrows()]
 
@@ -174,7 +167,7 @@ def count_text(value: float) -> str:
     return NOTHING if math.isnan(value) else f"{value:,.0f}"
 
 
-def markdown_table(table: "pd.DataFrame", headline: Headline) -> str:
+def markdown_table(table: pd.DataFrame, headline: Headline) -> str:
     """Make a Markdown table from `metrics.results_table`, with its note below."""
     titles = headings(headline)
     lines = [titles, ("---", *["---:"] * (len(titles) - 1))]

@@ -1,12 +1,14 @@
 """One training run: an agent, an env, a seed; with snapshots, checkpoints and a way to stop."""
 
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
+import torch
 
 from ..agents import (
     A2CConfig,
@@ -19,25 +21,15 @@ from ..agents import (
     store,
 )
 from ..envs.autoreset import AdvancingVectorEnv
-from ..models.errors import InputError, require
-from .progress import Progress, ProgressSender
+from ..models.errors import InputError
+from .progress import Tell
 from .settings import Run
-
-if TYPE_CHECKING:
-    import torch
-
-    from ..agents import Agent
-else:
-    torch = require("torch", "train", "training")
 
 __all__ = ["AnyEnv", "Run", "Snapshot", "Training", "is_finished", "train_run"]
 
 AnyEnv = gym.Env[Any, Any] | AdvancingVectorEnv
 
-# Episodes to average over, or as many as there are drones, if that is more: of those that began
-# together the shortest end first, so that the last few to end are those that flew longest.
-_RECENT = 20  # in a progress report: it tells how it goes now
-_WINDOW = 100  # in a point of a curve: SB3's `stats_window_size`
+_TELL_EVERY: Final = 0.2  # s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,16 +59,15 @@ class Training:
         snapshots: How many times, evenly spread, the policy is kept for later evaluation, besides
             the untrained one.
         keep_steps: Keep every step, for `log.steps()`.
+        kept: What to go on from; its run is `run`.
     """
 
     run: Run
     env: AnyEnv
     snapshots: int = 0
     keep_steps: bool = False
-    taken: list[Snapshot] = field(default_factory=list)
-
     kept: Checkpoint | None = None
-    """What to go on from; its run is `run`."""
+    taken: list[Snapshot] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
         # Networks of 16 units: a second thread costs more than it brings.
@@ -95,48 +86,49 @@ class Training:
     def resume(cls, kept: Checkpoint, env: AnyEnv) -> "Training":
         """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
         try:
-            run = Run(
-                algorithm=kept.algorithm,
-                config=preset(kept.algorithm, "paper", **kept.config),
-                env_id=kept.env_id,
-                options=kept.options,
-                seed=kept.seed,
-                env_steps=kept.env_steps,
-                num_envs=kept.num_envs,
-            )
+            names = ("algorithm", "env_id", "options", "seed", "env_steps", "num_envs")
+            config = preset(kept.algorithm, "paper", **kept.config)
+            run = Run(config=config, **{name: getattr(kept, name) for name in names})
         except (InputError, TypeError, ValueError) as error:
             raise CheckpointError(f"checkpoint: its parts do not fit together: {error}") from None
         return cls(run, env, kept=kept)
 
-    def train(self, on_update: Callable[[], bool] = lambda: True) -> bool:
-        """Train to the end, or until `on_update` returns False. Whether the end was reached."""
-        self.log.start_clock()
-        if self.snapshots:
-            self._take()
+    def train(
+        self, on_update: Callable[[], bool] = lambda: True, tell: Tell = lambda *_: None
+    ) -> bool:
+        """Train to the end, or until `on_update` returns False. Whether the end was reached.
+
+        Progress is told at updates, five times a second at most, and at the end.
+        """
+        log, total, told = self.log, self.run.env_steps, 0.0
+        log.start_clock()
 
         def after_update() -> bool:
-            if self.snapshots and self._due():
+            nonlocal told
+            if log.env_steps * self.snapshots >= len(self.taken) * total:
                 self._take()
+            if time.monotonic() >= told + _TELL_EVERY:
+                told = time.monotonic()
+                tell(log.env_steps, total, self.words())
             return on_update()
 
-        self.agent.train(self.log, self.run.env_steps, after_update)
-        if self.snapshots and self.taken[-1].env_steps < self.log.env_steps:
+        self._take()
+        self.agent.train(log, total, after_update)
+        if self.taken and self.taken[-1].env_steps < log.env_steps:
             self._take()
-        return self.log.env_steps >= self.agent.last_step(self.run.env_steps)
+        tell(log.env_steps, total, self.words())
+        return log.env_steps >= self.agent.last_step(total)
 
-    def progress(self) -> Progress:
-        """Progress of the training."""
-        recent = self.log.episodes[-max(_RECENT, self.run.num_envs) :]
-        headline = self.log.spec.headline
-        return Progress(
-            env_steps=self.log.env_steps,
-            total=self.run.env_steps,
-            seconds=self.log.seconds,
-            mean_return=_mean(e.total_reward for e in recent),
-            mean_size=_mean(e.mean_size for e in recent),
-            symbol=(headline.symbol or headline.name) if headline else "",
-            unit=headline.unit if headline else "",
-        )
+    def words(self) -> str:
+        """Recent return and size of the headline metric, for a progress bar."""
+        recent = self._recent_means(20)  # it tells how it goes now
+        if not recent:
+            return ""
+        text, headline = f"return {recent['rew']:.0f}", self.log.spec.headline
+        if headline is None:
+            return text
+        symbol = headline.symbol or headline.name
+        return f"{text}, |{symbol}| {recent['error']:.2f} {headline.unit}".rstrip()
 
     def scalars(self) -> dict[str, float]:
         """Progress of the training, in numbers for TensorBoard, under SB3's names.
@@ -150,10 +142,8 @@ class Training:
             "time/fps": log.env_steps / log.seconds if log.seconds else np.nan,
             **self.agent.scalars(),
         }
-        recent = log.episodes[-max(_WINDOW, self.run.num_envs) :]
-        numbers["rollout/ep_rew_mean"] = _mean(e.total_reward for e in recent)
-        numbers["rollout/ep_len_mean"] = _mean(e.length for e in recent)
-        numbers["rollout/ep_error_mean"] = _mean(e.mean_size for e in recent)
+        recent = self._recent_means(100)  # SB3's `stats_window_size`
+        numbers |= {f"rollout/ep_{name}_mean": value for name, value in recent.items()}
         if (statistics := getattr(self.env, "statistics", None)) is not None:
             numbers |= {f"wire/{name}": value for name, value in statistics.numbers().items()}
         return {name: value for name, value in numbers.items() if np.isfinite(value)}
@@ -175,23 +165,25 @@ class Training:
         """Write a checkpoint."""
         store(self.checkpoint(), path)
 
-    def _due(self) -> bool:
-        return self.log.env_steps * self.snapshots >= len(self.taken) * self.run.env_steps
+    def _recent_means(self, count: int) -> dict[str, float]:
+        """Over so many episodes, or as many as there are drones, if that is more: of those that
+        began together the shortest end first, and the last few to end are those that flew longest.
+        """
+        recent = self.log.episodes[-max(count, self.run.num_envs) :]
+        if not recent:
+            return {}
+        rows = [(episode.total_reward, episode.length, episode.mean_size) for episode in recent]
+        return dict(zip(("rew", "len", "error"), np.mean(rows, axis=0).tolist(), strict=True))
 
     def _take(self) -> None:
         log = self.log
-        taken = Snapshot(env_steps=log.env_steps, seconds=log.seconds, actor=self.agent.actor())
-        self.taken.append(taken)
-
-
-def _mean(numbers: Iterable[float]) -> float:
-    """NaN of none."""
-    kept = list(numbers)
-    return float(np.mean(kept)) if kept else np.nan
+        if self.snapshots:
+            seconds, actor = log.seconds, self.agent.actor()
+            self.taken.append(Snapshot(env_steps=log.env_steps, seconds=seconds, actor=actor))
 
 
 def train_run(
-    run: Run, env: AnyEnv, progress: ProgressSender, snapshots: int = 0, keep_steps: bool = False
+    run: Run, env: AnyEnv, tell: Tell, snapshots: int = 0, keep_steps: bool = False
 ) -> tuple[Training, dict[str, Any]]:
     """Train to the end, and tell the progress, as comparisons and sweeps do.
 
@@ -199,13 +191,8 @@ def train_run(
         The training, and how long it took: `env_steps`, `seconds` and `steps_per_second`.
     """
     training = Training(run, env, snapshots=snapshots, keep_steps=keep_steps)
-
-    def on_update() -> bool:
-        progress.rarely(training.progress)
-        return True
-
-    training.train(on_update)
+    training.train(tell=tell)
     steps, seconds = training.log.env_steps, training.log.seconds
-    progress(run.env_steps, run.env_steps, "evaluating")
+    tell(run.env_steps, run.env_steps, "evaluating")
     times = {"env_steps": steps, "seconds": seconds, "steps_per_second": steps / seconds}
     return training, times

@@ -31,10 +31,8 @@ Ending = Literal["terminated", "truncated", "cut off"]
 
 
 def evaluation_seed(episode: int, of: EpisodeSet = "curve") -> int:
-    """Seed of an evaluation episode: the same for every agent.
-
-    Training seeds are spawned by another key from another number, so that no run's seed meets one
-    of these.
+    """Seed of an evaluation episode: the same for every agent, and of no training, whose seeds are
+    spawned by another key from another number.
     """
     sequence = np.random.SeedSequence(_EVALUATION, spawn_key=(_SETS.index(of), episode))
     return int(sequence.generate_state(1, np.uint64)[0])
@@ -75,24 +73,22 @@ class Trajectory:
 
     def values(self, metric: str) -> np.ndarray:
         """A metric by name, float64, shape (T + 1,)."""
-        names = [one.name for one in self.spec.metrics]
-        column: np.ndarray = self.telemetry["metrics"].reshape(len(self) + 1, -1)
-        return column[:, names.index(metric)]
+        return self._rows("metrics")[:, [one.name for one in self.spec.metrics].index(metric)]
 
     @property
     def headline(self) -> np.ndarray:
         """The headline metric, shape (T + 1,); nan where the env names none."""
-        if self.spec.headline is None:
-            return np.full(len(self) + 1, np.nan)
-        return self.values(self.spec.headline.name)
+        return self._rows("metrics" if self.spec.headline else "")[:, 0]
 
     @property
     def mean_thrust(self) -> np.ndarray:
         """Mean over the rotors, N, shape (T + 1,); nan where the env does not tell it."""
-        if "thrust" not in self.telemetry:
-            return np.full(len(self) + 1, np.nan)
-        thrust: np.ndarray = self.telemetry["thrust"].reshape(len(self) + 1, -1).mean(axis=1)
-        return thrust
+        return np.asarray(self._rows("thrust").mean(axis=1))
+
+    def _rows(self, name: str) -> np.ndarray:
+        """Telemetry, shape (T + 1, n); a column of nan where there is none of that name."""
+        array = self.telemetry.get(name, np.full(len(self) + 1, np.nan))
+        return np.asarray(array).reshape(len(self) + 1, -1)
 
     def step_at(self, seconds: float) -> int:
         """Number of the row that is seen at that time; the last, from its end on."""
@@ -112,32 +108,25 @@ def fly(env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int =
         seed: Of the episode.
         episode: Its number, for the trajectory.
     """
-    while (flown := _fly(env, policy, seed, episode)) is None:
-        pass
-    return flown
-
-
-def _fly(
-    env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int
-) -> Trajectory | None:
     from ..udp import LOST
 
-    observation, info = env.reset(seed=seed)
-    if policy is None:
-        env.action_space.seed(seed)
-    else:
-        policy.reset()
-    spec: EnvSpec = env.get_wrapper_attr("env_spec")
-    names = [name for array in spec.telemetry for name in component_names(array)]
-    rows, rewards = [[info[name] for name in names]], []
-    terminated = truncated = False
-    while not (terminated or truncated):
-        action = env.action_space.sample() if policy is None else policy.act(observation)
-        observation, reward, terminated, truncated, info = env.step(action)
-        if LOST in info:
-            return None
-        rows.append([info[name] for name in names])
-        rewards.append(float(reward))
+    lost = True
+    while lost:
+        observation, info = env.reset(seed=seed)
+        spec: EnvSpec = env.get_wrapper_attr("env_spec")  # of the simulator that came
+        names = [name for array in spec.telemetry for name in component_names(array)]
+        if policy is None:
+            env.action_space.seed(seed)
+        else:
+            policy.reset()
+        rows, rewards = [[info[name] for name in names]], []
+        terminated = truncated = lost = False
+        while not (terminated or truncated or lost):
+            action = env.action_space.sample() if policy is None else policy.act(observation)
+            observation, reward, terminated, truncated, info = env.step(action)
+            rows.append([info[name] for name in names])
+            rewards.append(float(reward))
+            lost = LOST in info
     table = np.array(rows, np.float64)
     ends = np.cumsum([array.size for array in spec.telemetry])[:-1]
     columns = np.split(table, ends, axis=1) if spec.telemetry else []
@@ -164,9 +153,7 @@ def fly_episodes(
     Args:
         env: Of one drone, or a vector env without autoreset.
         policy: Chooses the actions. Every drone of a vector env gets a copy.
-        episodes: How many.
-        of: Which.
-        first: Number of the first.
+        episodes, first, of: How many, the number of the first, and of which set.
     """
     seeds = {first + i: evaluation_seed(first + i, of) for i in range(episodes)}
     if not isinstance(env, AdvancingVectorEnv):
@@ -186,19 +173,20 @@ def _fly_batch(
     policies = [copy.deepcopy(policy) for _ in seeds]
     for one in policies:
         one.reset()
-    actions = (
-        np.zeros(count, np.int64)
-        if isinstance(spec.action, Discrete)
-        else np.zeros((count, *spec.action.shape), np.float32)
-    )
+    if isinstance(spec.action, Discrete):
+        actions: np.ndarray = np.zeros(count, np.int64)
+    else:
+        actions = np.zeros((count, *spec.action.shape), np.float32)
     env.reset(seed=[*seeds.values(), *[0] * (count - len(seeds))])
     rows, rewards = [_copied(env.telemetry)], []
     lengths, terminated = np.zeros(count, int), np.zeros(count, bool)
     done, lost = np.arange(count) >= len(seeds), env.lost.copy()
     done |= lost
     while not done.all():
+        told: Any = env.observations
         for drone in np.flatnonzero(~done).tolist():
-            actions[drone] = policies[drone].act(_observation(env, drone))
+            own = {k: v[drone] for k, v in told.items()} if isinstance(told, dict) else told[drone]
+            actions[drone] = policies[drone].act(own)
         env.advance(actions, np.zeros(count, bool), None, done)
         rows.append(_copied(env.telemetry))
         rewards.append(env.rewards.copy())
@@ -206,7 +194,7 @@ def _fly_batch(
         terminated |= env.terminated & ~done
         lost |= env.lost & ~done
         done = done | env.terminated | env.truncated
-    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    arrays = _stacked(rows)
     totals = np.array(rewards, np.float64).reshape(len(rewards), count)
     return {
         episode: Trajectory(
@@ -221,14 +209,12 @@ def _fly_batch(
     }
 
 
+def _stacked(rows: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+
 def _copied(telemetry: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: np.array(array, np.float64) for name, array in telemetry.items()}
-
-
-def _observation(env: AdvancingVectorEnv, drone: int) -> Any:
-    if isinstance(env.observations, dict):
-        return {name: array[drone] for name, array in env.observations.items()}
-    return env.observations[drone]
 
 
 def flown_trajectories(
@@ -243,12 +229,10 @@ def flown_trajectories(
     """Evaluation episodes by number, flown in process without exploration.
 
     Args:
-        policy: Chooses the actions; None draws actions at random, the same for the same episode.
-        env_id: A registered env.
-        options: Of the env.
-        episodes: Their numbers.
+        policy: As of `fly`.
+        env_id, options: A registered env.
+        episodes, of: Their numbers, in which set.
         vehicle: MJCF file; None: the paper's.
-        of: Which evaluation episodes.
     """
     made = gym.make(env_id, disable_env_checker=True, vehicle=vehicle, **options)
     with closing(made.unwrapped) as env:
@@ -259,11 +243,7 @@ def flown_trajectories(
 
 
 def recorded_trajectories(
-    path: Path,
-    episodes: Sequence[int] | None = None,
-    *,
-    session: int | None = None,
-    drone: int = 0,
+    path: Path, episodes: Sequence[int] | None = None, *, session: int | None = None, drone: int = 0
 ) -> list[Trajectory]:
     """Episodes of one drone of one session of a journal.
 
@@ -291,23 +271,34 @@ def recorded_trajectories(
     if session is not None and session not in readers:
         known = f"1 to {len(readers)}" if readers else "a journal with sessions"
         raise InputError(f"session: expected {known}, got {session} for {path}")
-    flown = [readers[index] for index in sorted(readers) if readers[index].steps]
-    if not flown:
+    flown = next((readers[index] for index in sorted(readers) if readers[index].has_steps), None)
+    if flown is None:
         raise InputError(f"{path}: expected an episode with a step in it, got none")
-    return flown[0].chosen(episodes, path)
+    if not 0 <= drone < flown.num_envs:
+        last = flown.num_envs - 1
+        raise InputError(f"drone: expected 0 to {last} in {path}, got {drone}")
+    flown.keep("cut off")
+    if not flown.found:
+        raise InputError(f"{path}: expected an episode of drone {drone}, got none")
+    last = len(flown.found) - 1
+    for episode in episodes or ():
+        if not 0 <= episode <= last:
+            raise InputError(f"episode: expected 0 to {last} in {path}, got {episode}")
+    return flown.found if episodes is None else [flown.found[episode] for episode in episodes]
 
 
 class _Reader:
     """Makes trajectories of what a journal has of one session. It keeps one drone's numbers."""
 
     def __init__(self, spec: EnvSpec, num_envs: int, drone: int) -> None:
-        self._spec, self._num_envs, self._drone = spec, num_envs, drone
+        self.num_envs = num_envs
+        self.found: list[Trajectory] = []
+        self.has_steps = False
+        """Of any drone."""
+        self._spec, self._drone = spec, drone
         self._command: Any = None
         self._rows: list[dict[str, np.ndarray]] = []
         self._rewards: list[float] = []
-        self._found: list[Trajectory] = []
-        self.steps = 0
-        """Of any drone."""
 
     def take(self, message: Any) -> None:
         """The next message of the session."""
@@ -316,26 +307,9 @@ class _Reader:
         if isinstance(message, Command):
             self._command = message
         elif isinstance(message, State):
-            self.steps += self._command is not None and not bool(self._command.resets.all())
-            if 0 <= self._drone < self._num_envs:
+            self.has_steps |= self._command is not None and not self._command.resets.all()
+            if 0 <= self._drone < self.num_envs:
                 self._take_state(message, self._command)
-
-    def chosen(self, episodes: Sequence[int] | None, path: Path) -> list[Trajectory]:
-        """Episodes by number, or all, once all is read. Raises `InputError`."""
-        if not 0 <= self._drone < self._num_envs:
-            last = self._num_envs - 1
-            raise InputError(f"drone: expected 0 to {last} in {path}, got {self._drone}")
-        self._keep("cut off")
-        found = self._found
-        if not found:
-            raise InputError(f"{path}: expected an episode of drone {self._drone}, got none")
-        if episodes is None:
-            return found
-        for episode in episodes:
-            if not 0 <= episode < len(found):
-                last = len(found) - 1
-                raise InputError(f"episode: expected 0 to {last} in {path}, got {episode}")
-        return [found[episode] for episode in episodes]
 
     def _take_state(self, state: Any, command: Any) -> None:
         drone = self._drone
@@ -343,7 +317,7 @@ class _Reader:
         if command is not None and command.frozen[drone]:
             return
         if begins:
-            self._keep("cut off")
+            self.keep("cut off")
         elif not self._rows:  # stepped after its end: no episode
             return
         named = zip(self._spec.telemetry, state.telemetry, strict=True)
@@ -351,20 +325,17 @@ class _Reader:
         if not begins:
             self._rewards.append(float(state.rewards[drone]))
             if state.terminated[drone] or state.truncated[drone]:
-                self._keep("terminated" if state.terminated[drone] else "truncated")
+                self.keep("terminated" if state.terminated[drone] else "truncated")
 
-    def _keep(self, ending: Ending) -> None:
+    def keep(self, ending: Ending) -> None:
         """The episode has ended; it counts if it has a step."""
         if self._rewards:
-            self._found.append(
-                Trajectory(
-                    spec=self._spec,
-                    telemetry={
-                        name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]
-                    },
-                    rewards=np.array(self._rewards),
-                    ending=ending,
-                    episode=len(self._found),
-                )
+            flown = Trajectory(
+                spec=self._spec,
+                telemetry=_stacked(self._rows),
+                rewards=np.array(self._rewards),
+                ending=ending,
+                episode=len(self.found),
             )
+            self.found.append(flown)
         self._rows, self._rewards = [], []

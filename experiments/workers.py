@@ -14,70 +14,50 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from threading import Thread
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 from ..agents.checkpoints import software_versions
 from ..envs.registry import load
 from ..models.errors import InputError, require
-from .errors import RunsFailed
 from .pairs import close_shared_pairs
-from .progress import OnProgress, ProgressListener, ProgressSender
+from .progress import Home, OnProgress, Tell, listening, telling
 from .settings import EnvConfig, WorkersConfig
 
-__all__ = ["Result", "Workers", "WorkersConfig", "open_workers"]
+__all__ = ["Result", "RunsFailed", "Workers", "WorkersConfig", "open_workers"]
 
 _LISTENING_TIMEOUT: Final = 5.0  # s
 _WATCH_EVERY: Final = 0.5  # s
 
 _Job = TypeVar("_Job")
 _Value = TypeVar("_Value")
-_Function = Callable[[_Job, ProgressSender], _Value]
+_Function = Callable[[_Job, Tell], _Value]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Result:
-    """The end of a job."""
-
-    name: str
-    """Of the job."""
-    failure: str = ""
-    """A sentence; empty if the job is done."""
-    value: Any = None
-    """Result of its function, if it is done."""
+class RunsFailed(RuntimeError):
+    """Some runs failed; the message names each with its reason. The others are kept."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Order:
-    """A job with all that a worker needs, on this machine or another."""
+class Result(NamedTuple):
+    """The end of a job, by its name: a sentence about its failure, or the value of its function."""
 
     name: str
-    job: Any
-    function: _Function[Any, Any]
-    task: str | None
-    """`module:id` of a task of the user's own, which the worker has to import."""
-    home: tuple[str, int]
-    """Of the `ProgressListener`."""
-    versions: dict[str, str]
-    """Software of the main process."""
-    parent: int | None
-    """Process that the worker ends with; None: another machine's."""
+    failure: str
+    value: Any
 
 
-_Do = Callable[[list[_Order]], Generator[Result, None, None]]
-"""Does jobs, as many at a time as there are workers."""
+_Do = Callable[[Mapping[str, Any], Mapping[str, Any]], Generator[Result, None, None]]
+"""Does jobs, as many at a time as there are workers: `_done` with the name and the job of each, and
+with keywords that all have."""
 
 
 class Workers:
     """Do jobs: made by `open_workers`."""
 
-    def __init__(self, do: _Do, listener: ProgressListener, parent: int | None) -> None:
-        self._do = do
-        self._listener = listener
-        self._parent = parent
+    def __init__(self, do: _Do, home: Home, tell: OnProgress, parent: int | None) -> None:
+        self._do, self._home, self._tell, self._parent = do, home, tell, parent
 
     def fly(
         self, function: _Function[_Job, Any], jobs: Mapping[str, _Job], env: EnvConfig | None = None
@@ -85,20 +65,18 @@ class Workers:
         """Give results as they come. To be closed: what still flies then is ended.
 
         Args:
-            function: Called in a worker, with a job and its progress sender.
+            function: Called in a worker, with a job and what tells its progress.
             jobs: By name.
-            env: Env of the jobs: a worker imports the module of the user's task.
+            env: Of the jobs: a worker imports the module of the user's task.
         """
-        task = f"{env.module}:{env.env_id}" if env and env.module else None
-        order = partial(
-            _Order,
-            function=function,
-            task=task,
-            home=self._listener.home,
-            versions=software_versions(),
-            parent=self._parent,
-        )
-        return self._do([order(name=name, job=job) for name, job in jobs.items()])
+        shared = {
+            "function": function,
+            "task": f"{env.module}:{env.env_id}" if env and env.module else None,
+            "home": self._home,
+            "versions": software_versions(),
+            "parent": self._parent,
+        }
+        return self._do(jobs, shared)
 
     def fly_all(
         self,
@@ -109,45 +87,33 @@ class Workers:
     ) -> None:
         """Do all jobs, and hand each with its result to `keep` (in this process).
 
-        Raises:
-            RunsFailed: Some failed; the others were kept.
+        Raises `RunsFailed` if some failed; the others were kept.
         """
         failures = []
+        # Of jobs on other machines this is all the progress told.
+        self._tell("all runs", 0, len(jobs), "")
         with closing(self.fly(function, jobs, env)) as results:
-            for result in self._telling(results, len(jobs)):
+            for number, result in enumerate(results, 1):
                 if result.failure:
                     failures.append(result.failure)
+                    self._tell(result.name, 0, 1, "failed")
                 else:
                     keep(jobs[result.name], result.value)
+                    self._tell(result.name, 1, 1, "done")
+                self._tell("all runs", number, len(jobs), "")
         if failures:
             raise RunsFailed(f"{len(failures)} of {len(jobs)} runs failed: {'; '.join(failures)}")
-
-    def _telling(self, results: Iterator[Result], count: int) -> Iterator[Result]:
-        """Tell what has come. Of jobs on other machines this is all the progress told."""
-        tell = self._listener.tell
-        tell("all runs", 0, count, "")
-        for done, result in enumerate(results, 1):
-            yield result
-            kept = not result.failure
-            tell(result.name, int(kept), 1, "done" if kept else "failed")
-            tell("all runs", done, count, "")
 
 
 @contextmanager
 def open_workers(config: WorkersConfig, on_progress: OnProgress) -> Iterator[Workers]:
-    """Workers, to the end of the block.
-
-    Args:
-        config: Which, and how many.
-        on_progress: Told how far the jobs on this machine are, and which are done.
-
-    Raises:
-        InputError: There is no such Ray cluster.
-        MissingPackage: There is no joblib, or no Ray.
+    """Workers, to the end of the block; told is how far the jobs of this machine are, and which are
+    done. Raises `InputError` if there is no such Ray cluster.
     """
     here = config.backend == "loky"
-    with _loky(config) if here else _ray(config) as do, ProgressListener(on_progress) as listener:
-        yield Workers(do, listener, os.getpid() if here else None)
+    opened = _loky(config) if here else _ray(config)
+    with opened as do, listening(on_progress) as (home, tell):
+        yield Workers(do, home, tell, os.getpid() if here else None)
 
 
 @contextmanager
@@ -159,12 +125,14 @@ def _loky(config: WorkersConfig) -> Iterator[_Do]:
         close_shared_pairs()  # of a single worker, which is this process
 
 
-def _do_by_loky(orders: list[_Order], joblib: Any, workers: int) -> Generator[Result, None, None]:
+def _do_by_loky(
+    jobs: Mapping[str, Any], shared: Mapping[str, Any], joblib: Any, workers: int
+) -> Generator[Result, None, None]:
     from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     parallel = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")
-    results = parallel(joblib.delayed(_done)(order) for order in orders)
+    results = parallel(joblib.delayed(_done)(name, job, **shared) for name, job in jobs.items())
     try:
         # `yield from` would close it without the care below.
         for result in results:  # noqa: UP028
@@ -208,16 +176,18 @@ def _check_listening(address: str) -> None:
         socket.create_connection((host, int(port)), _LISTENING_TIMEOUT).close()
 
 
-def _do_by_ray(orders: list[_Order], workers: int, ray: Any) -> Generator[Result, None, None]:
+def _do_by_ray(
+    jobs: Mapping[str, Any], shared: Mapping[str, Any], ray: Any, workers: int
+) -> Generator[Result, None, None]:
     # Ray's own backend for joblib gives results when all are there, so that an interrupt
     # would lose every run; and it deals runs out in turn, to workers that are busy.
     remote = ray.remote(num_cpus=1)(_done)
-    waiting = iter(orders)
+    waiting = iter(jobs.items())
     flying: dict[Any, str] = {}
     try:
         while True:
             more = islice(waiting, workers - len(flying))
-            flying |= {remote.remote(order): order.name for order in more}
+            flying |= {remote.remote(name, job, **shared): name for name, job in more}
             if not flying:
                 return
             (landed,), _ = ray.wait(list(flying))
@@ -226,26 +196,37 @@ def _do_by_ray(orders: list[_Order], workers: int, ray: Any) -> Generator[Result
                 result = ray.get(landed)
             except ray.exceptions.RayError as error:  # its machine is lost, or has no rotorgram
                 reason = str(error).strip().splitlines()[-1]
-                result = Result(name=name, failure=f"{name}: {reason}")
+                result = Result(name, f"{name}: {reason}", None)
             yield result
     finally:
         for reference in flying:  # their simulators end with them
             ray.cancel(reference, force=True)
 
 
-def _done(order: _Order) -> Result:
-    """Do a job (in a worker process)."""
-    if order.parent is not None and os.getpid() != order.parent:  # one of loky's
+def _done(
+    name: str, job: Any, *, function: _Function[Any, Any], task: str | None, home: Home,
+    versions: dict[str, str], parent: int | None,
+) -> Result:  # fmt: skip
+    """Do a job (in a worker process).
+
+    Args:
+        name, job, function: As of `Workers.fly`.
+        task: `module:id` of a task of the user's own, which the worker has to import.
+        home: Where progress is told.
+        versions: Software of the main process.
+        parent: Process that the worker ends with; None: another machine's.
+    """
+    if parent is not None and os.getpid() != parent:  # one of loky's
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's affair
-        _watch(order.parent)
+        _watch(parent)
     try:
-        _check_software(order.versions)
-        if order.task:
-            load(order.task)
-        with ProgressSender(order.name, order.home) as progress:
-            return Result(name=order.name, value=order.function(order.job, progress))
+        _check_software(versions)
+        if task:
+            load(task)
+        with telling(name, home) as tell:
+            return Result(name, "", function(job, tell))
     except Exception as error:
-        return Result(name=order.name, failure=f"{order.name}: {type(error).__name__}: {error}")
+        return Result(name, f"{name}: {type(error).__name__}: {error}", None)
 
 
 _watched: set[int] = set()

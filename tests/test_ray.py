@@ -16,12 +16,11 @@ import pytest
 from rotorgram.agents.checkpoints import load, software_versions
 from rotorgram.experiments import workers as module
 from rotorgram.experiments.compare import compare
-from rotorgram.experiments.errors import RunsFailed
 from rotorgram.experiments.folders import new_folder
 from rotorgram.experiments.results import read_results, read_steps
 from rotorgram.experiments.settings import CompareConfig, SweepConfig, WorkersConfig
 from rotorgram.experiments.sweep import read_sweep_runs, sweep
-from rotorgram.experiments.workers import open_workers
+from rotorgram.experiments.workers import RunsFailed, open_workers
 
 # Ray listens beyond this machine. It reads these when it is imported.
 os.environ |= {

@@ -330,17 +330,14 @@ def comparison(training: Path, tmp_path: Path) -> Path:
 def test_the_film_of_a_comparison_shows_its_agents(comparison: Path, opengl: None) -> None:
     out = comparison / "video.mp4"
     out.write_text("an old one")
-    picture = comparison / "video.jpg"
-    assert film_comparison(comparison, out, picture=picture, world="plain")
-    assert pixels(picture).shape == (400, 1280, 3)
-    assert pixels(picture).mean() > 60
+    assert film_comparison(comparison, out, world="plain")
     frames = decoded(out, 1280, 400)
     assert len(frames) == 13
     left, right = frames[0][:, :639].astype(int), frames[0][:, 641:].astype(int)
     assert abs(left[100:300] - right[100:300]).mean() < 8  # they start alike
     assert sorted(path.name for path in comparison.iterdir()) == [
         "checkpoints", "config.json", "episodes.csv", "evaluations.csv", "runs.csv",
-        "video.jpg", "video.mp4",
+        "video.mp4",
     ]  # fmt: skip
 
 

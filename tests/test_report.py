@@ -11,13 +11,14 @@ import pyarrow.parquet as pq
 import pytest
 from comparisons import GATES, HEADLINE, spec_of, synthetic_folder
 from rich.console import Console
-from rotorgram.experiments.errors import ResultsError
+from rotorgram.experiments.curves import make_curves
 from rotorgram.experiments.figures import FIGURE_FILES, draw_figures
 from rotorgram.experiments.metrics import Headline
 from rotorgram.experiments.palette import agent_color, agent_label, sort_agents
-from rotorgram.experiments.report import POSTER_FILE, VIDEO_FILE, table_of, write_report
+from rotorgram.experiments.report import VIDEO_FILE, table_of, write_report
 from rotorgram.experiments.results import (
     EVALUATION_COLUMNS,
+    ResultsError,
     read_config,
     read_results,
     read_steps,
@@ -107,9 +108,9 @@ def test_what_is_wrong_in_a_file_is_named(tmp_path):
 
 def test_figures_are_pictures_of_modest_size(comparison):
     paths = [comparison / "figures" / name for name in FIGURE_FILES]
-    assert draw_figures(comparison) == paths
     written = [path.read_bytes() for path in paths]
-    assert draw_figures(comparison, read_results(comparison)) == paths
+    results = read_results(comparison)
+    draw_figures(comparison, results, make_curves(comparison, results))
     assert [path.read_bytes() for path in paths] == written
     for path in paths:
         assert path.read_bytes().startswith(b"\x89PNG")
@@ -148,13 +149,11 @@ def test_a_report_from_results_at_hand_is_the_same(comparison):
     assert page.read_bytes() == before
 
 
-def test_the_film_of_a_page_has_a_poster(tmp_path):
+def test_the_page_shows_the_film_where_there_is_one(tmp_path):
     folder = synthetic_folder(tmp_path, agents=("a2c",), seeds=1, env_steps=300)
     assert "<video" not in write_report(folder).read_text(encoding="utf-8")
     (folder / VIDEO_FILE).write_bytes(b"film")
-    (folder / POSTER_FILE).write_bytes(b"picture")
     page = write_report(folder).read_text(encoding="utf-8")
-    assert 'poster="data:image/jpeg;base64,cGljdHVyZQ=="' in page
     assert 'src="data:video/mp4;base64,ZmlsbQ=="' in page
 
 

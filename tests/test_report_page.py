@@ -125,7 +125,7 @@ def test_trajectories_are_picked_once_and_for_all() -> None:
 
 
 def chart(spread: Spread, **changes: Any) -> dict[str, Any]:
-    texts = dict.fromkeys(("key", "title", "caption", "x_label", "y_label"), "")
+    texts = dict.fromkeys(("key", "x_label", "y_label"), "")
     charts = [Chart(**texts, spreads={"a2c": spread}, **changes)]
     (data,) = chart_data(charts, ["vpg", "a2c", "pid"])
     return data

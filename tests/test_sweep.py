@@ -20,10 +20,9 @@ from rotorgram.agents.policies import NetworkPolicy
 from rotorgram.cli import main
 from rotorgram.cli.sweep import parse_grid
 from rotorgram.experiments.compare import read_compare_config
-from rotorgram.experiments.errors import ResultsError, RunsFailed
 from rotorgram.experiments.folders import locked
 from rotorgram.experiments.metrics import Headline
-from rotorgram.experiments.results import CONFIG_KEYS
+from rotorgram.experiments.results import CONFIG_KEYS, ResultsError
 from rotorgram.experiments.settings import CompareConfig, SweepConfig
 from rotorgram.experiments.sweep import (
     RUN_COLUMNS,
@@ -36,7 +35,7 @@ from rotorgram.experiments.sweep import (
 )
 from rotorgram.experiments.training import Run, Training
 from rotorgram.experiments.trajectories import evaluation_seed
-from rotorgram.experiments.workers import WorkersConfig, open_workers
+from rotorgram.experiments.workers import RunsFailed, WorkersConfig, open_workers
 
 OPTIONS: dict[str, Any] = {"episode_length": 40, "flight_band": 1.2}
 CONFIG = SweepConfig(

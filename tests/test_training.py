@@ -105,8 +105,7 @@ def test_progress_tells_of_every_drone() -> None:
     lengths = [episode.length for episode in last]
     assert np.mean(lengths[-20:]) > np.mean(lengths)
     mean = np.mean([episode.total_reward for episode in last])
-    assert training.progress().mean_return == pytest.approx(mean)
-    assert training.progress().words().startswith(f"return {mean:.0f}, |E| 0.")
+    assert training.words().startswith(f"return {mean:.0f}, |E| 0.")
     assert training.scalars()["rollout/ep_rew_mean"] == pytest.approx(mean)
     assert training.scalars()["rollout/ep_len_mean"] == pytest.approx(np.mean(lengths))
 

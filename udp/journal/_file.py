@@ -157,6 +157,9 @@ class McapFile:
         self._broken = False
 
 
+_OPCODE_AND_LENGTH: Final = 9  # bytes, of every record
+
+
 def read_records(file: BinaryIO) -> Iterator[McapRecord]:
     """The records of an MCAP file, those in chunks too, in order.
 
