@@ -12,6 +12,7 @@ import torch
 
 from ..agents import (
     A2CConfig,
+    Agent,
     Checkpoint,
     CheckpointError,
     EpisodeLog,
