@@ -289,7 +289,7 @@ class Loop(NotCopied):
             if may_end:
                 self.terminated[0], self.truncated[0] = ended, late
         else:
-            self.rewards = total.reshape(n)
+            self.rewards = self._xp.reshape(total, (n,))
             # New arrays, whatever the task gave: arrays of earlier steps must not change.
             self.terminated = (ended | self._none).reshape(n)
             self.truncated = late.reshape(n)

@@ -7,7 +7,7 @@ pictures; the simulation goes on, slowed only by the processor that both share.
 import time
 from contextlib import AbstractContextManager
 from threading import Event, Thread
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 import mujoco
 import numpy as np
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .web import WebPage
     from .window import Window
 
-    Surface = Window | WebPage
+    Surface: TypeAlias = Window | WebPage
 
 __all__ = ["MOST_DRONES", "Aim", "Lines", "LiveView", "lines_over", "open_surface"]
 

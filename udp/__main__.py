@@ -15,9 +15,11 @@ from threading import Thread
 from typing import Any, Final
 
 from ..models.errors import InputError
+from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
 from .transport.simulator import Simulator
 
+_FOR_EVER: Final = 30 * 86_400.0  # s
 _KINDS: Final[dict[str, tuple[type | tuple[type, ...], str]]] = {
     "env": (str, "an id"),
     "module": (str, "the name of a module"),
@@ -41,7 +43,10 @@ def main() -> int:
     words = sys.argv[1:]
     ends_with_stdin = words[1:] == ["--until-stdin-closes"]
     try:
-        with Simulator(**parse_arguments(words[:1] if ends_with_stdin else words)) as simulator:
+        arguments = parse_arguments(words[:1] if ends_with_stdin else words)
+        if ends_with_stdin:  # an agent that is busy for long still holds it
+            arguments["config"] = LinkConfig(timeout=_FOR_EVER)
+        with Simulator(**arguments) as simulator:
             ended: list[int] = []
 
             def end(number: int, _: object) -> None:
