@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +12,6 @@ import torch
 
 from ..agents import (
     A2CConfig,
-    Agent,
     Checkpoint,
     CheckpointError,
     EpisodeLog,
@@ -25,6 +24,9 @@ from ..envs.autoreset import AdvancingVectorEnv
 from ..models.errors import InputError
 from .progress import Tell
 from .settings import Run
+
+if TYPE_CHECKING:
+    from ..agents import Agent
 
 __all__ = ["AnyEnv", "Run", "Snapshot", "Training", "is_finished", "train_run"]
 
