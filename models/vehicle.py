@@ -153,48 +153,58 @@ class Vehicle:
         return partial(Vehicle.load, linear_drag=self.linear_drag), (str(self.path),)
 
 
-@lru_cache(maxsize=32)
-def _load(path: Path, drag: float, changed: int) -> Vehicle:
-    del changed  # a file that was written anew is another key
+def _compiled(path: Path) -> tuple[mujoco.MjSpec, str, mujoco.MjModel, mujoco.MjData]:
+    """A file's spec, its text, its model, and the vehicle level at the origin."""
     try:
         spec = build_scene(path, visual=False)
         spec.comment = ""
         text = spec.to_xml()
         model = spec.compile()
-        for name in dir(model):
-            array = getattr(model, name)
-            if getattr(array, "dtype", None) == np.float64 and not np.isfinite(array).all():
-                raise InputError(f"vehicle: expected finite numbers, got others in {name}")
-        free = int((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).sum())
-        if (free, model.njnt) != (1, 1):
-            raise InputError(
-                f"vehicle: expected one free body and no other joints, "
-                f"got {free} free of {model.njnt} joints"
-            )
-        if model.nu == 0:
-            raise InputError(
-                "vehicle: expected at least one rotor, an actuator at a site, got none"
-            )
-        body = int(model.jnt_bodyid[0])
+        _check(model)
         data = mujoco.MjData(model)
         data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
         mujoco.mj_forward(model, data)
+    except InputError:
+        raise
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
-        if isinstance(error, InputError):
-            raise
         reason = " ".join(str(error).split())
         raise InputError(f"vehicle: expected an MJCF file, got {path.name}: {reason}") from None
-    mass, gravity = float(model.body_subtreemass[body]), -float(model.opt.gravity[2])
-    if not (mass > 0 and gravity > 0 and not model.opt.gravity[:2].any()):
+    return spec, text, model, data
+
+
+def _check(model: mujoco.MjModel) -> None:
+    """Raise `InputError` for a model that is no multirotor, or that cannot be stepped."""
+    for name in dir(model):
+        array = getattr(model, name)
+        if getattr(array, "dtype", None) == np.float64 and not np.isfinite(array).all():
+            raise InputError(f"vehicle: expected finite numbers, got others in {name}")
+    free = int((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).sum())
+    if (free, model.njnt) != (1, 1):
+        raise InputError(
+            f"vehicle: expected one free body and no other joints, "
+            f"got {free} free of {model.njnt} joints"
+        )
+    if model.nu == 0:
+        raise InputError("vehicle: expected at least one rotor, an actuator at a site, got none")
+    mass, gravity = float(model.body_subtreemass[model.jnt_bodyid[0]]), model.opt.gravity
+    if not (mass > 0 and gravity[2] < 0 and not gravity[:2].any()):
         raise InputError(
             f"vehicle: expected a mass > 0 and gravity along -z, got {mass:g} kg and "
-            f"{model.opt.gravity.tolist()} m/s²"
+            f"{gravity.tolist()} m/s²"
         )
     if not LEAST_TIMESTEP <= model.opt.timestep <= MOST_TIMESTEP:
         raise InputError(
             f"vehicle: expected a physics step of at least {LEAST_TIMESTEP:g} s and at most "
             f"{MOST_TIMESTEP:g} s, got {model.opt.timestep:g}"
         )
+
+
+@lru_cache(maxsize=32)
+def _load(path: Path, drag: float, changed: int) -> Vehicle:
+    del changed  # a file that was written anew is another key
+    spec, text, model, data = _compiled(path)
+    body = int(model.jnt_bodyid[0])
+    mass, gravity = float(model.body_subtreemass[body]), -float(model.opt.gravity[2])
     center = data.subtree_com[body].copy()
     rotors = tuple(_rotor(model, data, i, body) for i in range(model.nu))
     columns = []

@@ -70,9 +70,9 @@ def test_the_reliability_page_tells_what_the_benchmarks_wrote() -> None:
 
 def test_the_performance_page_tells_what_the_benchmarks_wrote() -> None:
     page = (ROOT / "docs" / "performance.md").read_text()
-    bench, hover, peers = (
+    bench, hover, peers, waiting = (
         json.loads((RESULTS / "performance" / f"{name}.json").read_text())
-        for name in ("bench", "time_to_hover", "peers")
+        for name in ("bench", "time_to_hover", "peers", "waiting")
     )
     told = [f"| {rate:,.0f} | {1e6 / rate:.2f} |" for rate in bench["medians"].values()]
     for name, ratio in bench["ratios"].items():
@@ -84,6 +84,12 @@ def test_the_performance_page_tells_what_the_benchmarks_wrote() -> None:
             word = "reached" if reached else "missed"
         told.append(f"| {name} | {ratio['target'] or '–'} | {value:.2f} | {word} |")
     told += [f"| {name} | {time:.1f} |" for name, time in bench["microseconds"].items()]
+    told += [
+        f"| {row['neighbours']} | {row['medians']['looks']:.0f} | {row['medians']['sleeps']:.0f} |"
+        for row in waiting["rows"]
+    ]
+    codec = sum(time for name, time in bench["microseconds"].items() if name[2:5] == "cod")
+    told.append(f"takes {codec:.1f} of the {bench['microseconds']['step']:.1f} µs")
     told += [f"| {one['wall_seconds']:.1f} | {one['worst_error']:.3f} |"
              for one in hover["settings"]]  # fmt: skip
     told += [f"| {rate:,.0f} |" for rate in peers["env_steps_per_second"].values()]

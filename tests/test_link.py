@@ -277,6 +277,16 @@ def test_only_answers_that_come_twice_in_a_row_lengthen_the_wait() -> None:
     assert longer == [False, False, False, True, True, False, False]
 
 
+def test_an_agent_that_waits_for_others_is_not_silent() -> None:
+    wire = Wire("agent", False)
+    link = to(simulator(), SimulatorState.WAITING, wire)
+    number = link.sequence
+    link.receive(wire(Alive(session=link.hello.session, sequence=number)), 9.0)
+    assert link.handle_timer(18.0)
+    assert link.state is SimulatorState.WAITING
+    assert not link.handle_timer(19.0)
+
+
 def test_silence_ends_a_simulator_and_a_pause_of_its_own_does_not() -> None:  # fault 25
     link = to(simulator(), SimulatorState.WAITING, Wire("agent", False))
     link.pardon(100.0)

@@ -666,3 +666,4 @@ def test_unity_script_compiles(tmp_path: Path) -> None:
     stub.write_text(UNITY)
     out, sources = f"-out:{tmp_path / 'unity.dll'}", sorted(PEERS.glob("*.cs"))
     compiled(tool("mcs"), "-t:library", "-d:UNITY_5_3_OR_NEWER", out, *sources, stub)
+    assert (tmp_path / "unity.dll").is_file()

@@ -3,6 +3,7 @@
 import errno
 import gc
 import json
+import os
 import re
 import signal
 import socket
@@ -26,6 +27,7 @@ from rotorgram.udp import (
     RemoteEnv,
     Simulator,
 )
+from rotorgram.udp import __main__ as udp_main
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.messages import Close, Hello, Welcome
 from rotorgram.udp.transport import sockets
@@ -365,3 +367,25 @@ def test_an_env_that_fails(value: float | None, sentence: str) -> None:
         remote.step(np.zeros(1))
     assert isinstance(running.join(), RuntimeError if value is None else ValueError)
     remote.close()
+
+
+def test_a_simulator_of_our_own_waits_as_long_as_its_agent_lives(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An agent may train or evaluate something else for minutes, and holds its standard input."""
+    made: list[Any] = []
+
+    class Made(Simulator):
+        def run(self) -> str:
+            made.append(self.config.timeout)
+            return ""
+
+    monkeypatch.setattr(udp_main, "Simulator", Made)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(os, "read", lambda *_: b"")
+    arguments = json.dumps({"server": ["127.0.0.1", 9], "bind": ["127.0.0.1", 0]})
+    for words in ([arguments], [arguments, "--until-stdin-closes"]):
+        monkeypatch.setattr(sys, "argv", ["simulator", *words])
+        assert udp_main.main() == 0
+    assert made[0] == LinkConfig().timeout
+    assert made[1] >= 86_400

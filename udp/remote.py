@@ -67,9 +67,20 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
     Args:
         address: Address (host, port) to listen on; port 0 takes a free one (see `address`).
         connect: Wait for the simulator now. Otherwise `connect` or the first `reset` waits.
-        settings: Those of `AgentSettings`: `env_id`, `options` and `vehicle_hash` of the simulators
-            that are taken, `connect_timeout`, `timeout`, `max_datagram`, `key_file`, `insecure`,
-            `record`.
+        env_id: A simulator of another env is refused; None flies any.
+        options: A simulator of other options is refused; None takes any. Those that are not given
+            have their defaults if the env is registered here, and any value otherwise.
+        vehicle_hash: A simulator of another vehicle is refused; None takes any.
+        connect_timeout: Longest wait for a simulator, s, the first or one that replaces another;
+            60.
+        timeout: Longest wait for an answer from it, s, before another may take its slot; 30. While
+            it computes, it says so.
+        max_datagram: Largest datagram, bytes, a seal not counted. None: 65,483 on loopback, 1,200
+            elsewhere.
+        key_file: File with the key that the simulators have too (`rotorgram key`). With it any
+            address is allowed, because only holders of the key can take part.
+        insecure: Allow an address that is not loopback without a key.
+        record: MCAP file to write every message to; it must not exist.
 
     Attributes:
         env_spec: The `EnvSpec` of the env, once a simulator has come.
@@ -94,13 +105,9 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
     ) -> None:
         self.render_mode = None
         self._flying = False
-        self._agent = Agent(address, AgentConfig(worlds=1, **settings))
+        self._agent = Agent(address, AgentConfig(worlds=1, slots=1, **settings))
         if connect:
-            try:
-                self.connect()
-            except BaseException:
-                self.close()
-                raise
+            _connect(self)
 
     def connect(self) -> None:
         """Wait until it is the agent's turn: for the simulator's first State, if none has come."""
@@ -210,7 +217,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
             is that of the first simulator that comes.
         autoreset_mode: `AutoresetMode`, or its value.
         connect: Wait for the simulators now. Otherwise `connect` or the first `reset` waits.
-        settings: As `RemoteEnv`.
+        Others: As `RemoteEnv`.
 
     Raises:
         PeerSilent: A slot stayed free for `connect_timeout`.
@@ -250,11 +257,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         self._agent = Agent(address, AgentConfig(worlds=worlds, slots=num_simulators, **settings))
         self.closed = False
         if connect:
-            try:
-                self.connect()
-            except BaseException:
-                self.close()
-                raise
+            _connect(self)
 
     def connect(self) -> None:
         """Wait until every slot is taken."""
@@ -438,6 +441,15 @@ def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
     except ValueError:
         expected = " or ".join(repr(m.value) for m in AutoresetMode)
         raise InputError(f"autoreset_mode: expected {expected}, got {mode!r}") from None
+
+
+def _connect(env: RemoteEnv | RemoteVectorEnv) -> None:
+    """Connect; without success nothing stays open."""
+    try:
+        env.connect()
+    except BaseException:
+        env.close()
+        raise
 
 
 def _checked_actions(action: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:

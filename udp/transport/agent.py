@@ -44,29 +44,17 @@ Order = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 
 
 class AgentSettings(TypedDict, total=False):
-    """Settings of an env over UDP."""
+    """Settings of an env over UDP: see `RemoteEnv`."""
 
     env_id: str | None
-    """A simulator of another env is refused; None flies any."""
     options: Mapping[str, Any] | None
-    """A simulator of other options is refused; None takes any. Those that are not here have their
-    defaults if the env is registered here, and any value otherwise."""
     vehicle_hash: str | None
-    """A simulator of another vehicle is refused; None takes any."""
     connect_timeout: float
-    """Longest wait for a simulator, s, the first or one that replaces another; 60."""
     timeout: float
-    """Longest wait for an answer from it, s, before another may take its slot; 30. While it
-    computes, it says so."""
     max_datagram: int | None
-    """Largest datagram, bytes, a seal not counted. None: 65,483 on loopback, 1,200 elsewhere."""
     key_file: Path | str | None
-    """File with the key that the simulators have too (`rotorgram key`). With it any address is
-    allowed, because only holders of the key can take part."""
     insecure: bool
-    """Allow an address that is not loopback without a key."""
     record: Path | str | None
-    """MCAP file to write every message to; it must not exist."""
 
 
 @dataclass(frozen=True, kw_only=True)
