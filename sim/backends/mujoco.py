@@ -6,7 +6,7 @@ of threads.
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -19,6 +19,8 @@ from ..state import Array, Pose, WorldState
 from ..world import PhysicsError, contact_check
 
 __all__ = ["MujocoWorld"]
+
+_FEW: Final = 8
 
 
 class MujocoWorld:
@@ -44,6 +46,7 @@ class MujocoWorld:
         threads = 1 if num_worlds == 1 else num_threads
         self._batch = batch = Batch(vehicle.model, num_worlds, threads)
         self._owner = None if threads == 1 else os.getpid()
+        self._initial = batch.state[0].copy()
         # Live views of simulator memory, made once.
         qpos: np.ndarray = batch.bind("qpos")
         qvel: np.ndarray = batch.bind("qvel")
@@ -71,7 +74,7 @@ class MujocoWorld:
         """As `World.reset`."""
         self._check_process()
         ids = np.flatnonzero(mask)
-        self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self._batch.state[ids] = self._initial
         state, here = self.state, () if self.shape == () else ids
         state.position[here] = pose.position[here]
         for name, plain in (
@@ -83,7 +86,9 @@ class MujocoWorld:
             given = getattr(pose, name)
             getattr(state, name)[here] = plain if given is None else given[here]
         self._apply_thrust()
-        self._batch.forward(ids)
+        # To wake the threads takes longer than a few worlds.
+        for some in (ids,) if len(ids) > _FEW else ids[:, None]:
+            self._batch.forward(some)
         self._touching[ids] = self._contacts[ids] > 0
 
     def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
