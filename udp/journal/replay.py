@@ -60,8 +60,7 @@ class SessionVerdict:
     _loop: Loop | None = None
     _sequence: int | None = None
     _command: Command | None = None
-    _known: bool = False
-    """Whether the simulated drones are where the recorded ones were."""
+    _known: bool = False  # whether the simulated drones are where the recorded ones were
 
     @property
     def identical(self) -> bool:

@@ -17,7 +17,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
-from ...envs.spec import EnvSpec
+from ...envs.spec import ArraySpec, EnvSpec
 from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.layout import COMMAND_ARRAYS_AT, STATE_ARRAYS_AT, Layout, Slot
@@ -25,20 +25,15 @@ from ..protocol.messages import Command, Hello, Message, State
 from ..protocol.statistics import Statistics
 from ._file import McapFile
 
-__all__ = ["ABOUT", "FORMAT", "MODEL", "Journal", "model_of", "software"]
+__all__ = ["ABOUT", "FORMAT", "Journal", "model_of", "software"]
 
-ABOUT: Final = "rotorgram"
-"""Name of the metadata about the whole file; those of each session are named `session`."""
-FORMAT: Final = "2"
-"""Version of the content of the file, beside the protocol's version in each datagram."""
-MODEL: Final = "model.xml"
-"""Name of the attachment that is the whole vehicle of the simulator, as MJCF."""
+ABOUT: Final = "rotorgram"  # name of the metadata about the whole file
+FORMAT: Final = "2"  # version of the file's content, beside the protocol's in each datagram
 
 _CHUNK: Final = 1 << 16  # bytes; 2 ms to write
 _SECOND: Final = 10**9
 _STATISTICS: Final = 10 * _SECOND
-_SEEDED: Final = binary.COMMAND | 0x100
-"""Kind of a Command with seeds: its ROS 1 message has one more array."""
+_SEEDED: Final = binary.COMMAND | 0x100  # a Command whose ROS 1 message has one more array
 _ONE: Final = object()
 _PACKAGES: Final = ("rotorgram", "mujoco", "gymnasium", "numpy", "mcap")
 
@@ -52,10 +47,8 @@ uint64 session
 uint64 sequence
 """
 _EVENT: Final = "rotorgram.Event", '{"type": "object"}'
-_NUMBERS: Final = (
-    "rotorgram.Statistics",
-    '{"type": "object", "additionalProperties": {"type": "number"}}',
-)
+_NUMBER: Final = '{"type": "object", "additionalProperties": {"type": "number"}}'
+_NUMBERS: Final = "rotorgram.Statistics", _NUMBER
 
 
 class Journal:
@@ -75,16 +68,11 @@ class Journal:
     def __init__(
         self, path: Path | str, *, side: str, text_hello: Hello | None = None, model: str = ""
     ) -> None:
-        self._path = Path(path)
-        self._side = side
-        self._model = model
+        self._path, self._side, self._model = Path(path), side, model
         self._text_hello = text_hello
         self._slots: Sequence[object] = ()
         self._holders: dict[int, object] = {}
-        self._schemas: dict[str, dict[str, int]] = {}
-        self._topics: dict[tuple[str, int], int] = {}
-        self._channels: dict[tuple[int, int], int] = {}
-        """Channel by slot and kind: State, Command, or Command with seeds."""
+        self._channels: dict[tuple[int, int], int] = {}  # by slot and kind: binary's or _SEEDED
         self._size = self._sessions = 0
         self._open = False
 
@@ -112,7 +100,7 @@ class Journal:
         try:
             file.add_metadata(ABOUT, {"format": FORMAT, "side": self._side, **about})
             if self._model:
-                file.add_attachment(MODEL, "application/xml", self._model.encode(), now)
+                file.add_attachment("model.xml", "application/xml", self._model.encode(), now)
         except BaseException:
             file.abandon()
             self._path.unlink()
@@ -212,8 +200,9 @@ class Journal:
             (binary.COMMAND, "command", "Command", _command_schema(layout, seeded=False)),
             (_SEEDED, "command", "SeededCommand", _command_schema(layout, seeded=True)),
         ):
-            schema = self._schema(f"rotorgram/{name}", "ros1msg", text)
-            self._channels[slot, kind] = self._topic(f"/slot{slot}/{topic}", "ros1", schema)
+            self._channels[slot, kind] = self._file.channel(
+                f"/slot{slot}/{topic}", "ros1", f"rotorgram/{name}", text
+            )
         words = _words(hello, datagram) | {"codec": codec}
         self._add_json(f"/slot{slot}/events", _EVENT, words, now)
 
@@ -224,22 +213,8 @@ class Journal:
     def _add_json(
         self, topic: str, schema: tuple[str, str], words: Mapping[str, Any], now: int
     ) -> None:
-        name, text = schema
-        channel = self._topic(topic, "json", self._schema(name, "jsonschema", text))
+        channel = self._file.channel(topic, "json", *schema)
         self._pending.append((channel, now, 0, json.dumps(words).encode()))
-
-    def _schema(self, name: str, encoding: str, text: str) -> int:
-        """Id of a schema. A second one of the same name, of another layout, is numbered."""
-        known = self._schemas.setdefault(name, {})
-        if text not in known:
-            number = f"{len(known) + 1}" if known else ""
-            known[text] = self._file.add_schema(name + number, encoding, text)
-        return known[text]
-
-    def _topic(self, topic: str, encoding: str, schema: int) -> int:
-        if (topic, schema) not in self._topics:
-            self._topics[topic, schema] = self._file.add_channel(topic, encoding, schema)
-        return self._topics[topic, schema]
 
 
 def software() -> dict[str, str]:
@@ -266,8 +241,8 @@ def model_of(stepped: Any) -> str:
 
 def _state_schema(spec: EnvSpec, layout: Layout) -> str:
     """A State of this layout as a ROS 1 message."""
-    observation = _field_names("observation", (array.name for array in spec.observation))
-    telemetry = _field_names("telemetry", (array.name for array in spec.telemetry))
+    observation = _field_names("observation", spec.observation)
+    telemetry = _field_names("telemetry", spec.telemetry)
     slots = (*layout.observation_slots, layout.rewards, *layout.flags, *layout.telemetry_slots)
     names = (*observation, "rewards", "terminated", "truncated", *telemetry)
     fixed = "float64 time\nuint64 nonce\n"
@@ -292,11 +267,11 @@ def _schema_text(fixed: str, at: int, arrays: Iterable[tuple[str, Slot]]) -> str
     return text
 
 
-def _field_names(prefix: str, names: Iterable[str]) -> list[str]:
-    """Names made into different ones that ROS 1 allows."""
+def _field_names(prefix: str, arrays: Iterable[ArraySpec]) -> list[str]:
+    """Names of arrays, made into different ones that ROS 1 allows."""
     fields: list[str] = []
-    for name in names:
-        field = f"{prefix}_{re.sub(r'[^a-zA-Z0-9_]', '_', name)}"
+    for array in arrays:
+        field = f"{prefix}_{re.sub(r'[^a-zA-Z0-9_]', '_', array.name)}"
         while field in fields:
             field += "_"
         fields.append(field)

@@ -23,17 +23,14 @@ from .errors import Forged
 
 __all__ = ["OVERHEAD", "Key", "is_sealed", "key_id", "message_of", "read_keys", "write_key"]
 
-KEY_SIZE: Final = 32
-"""Bytes of a shared key."""
-OVERHEAD: Final = 24
-"""Bytes that sealing adds to a datagram."""
+KEY_SIZE: Final = 32  # bytes of a shared key
+OVERHEAD: Final = 24  # bytes that sealing adds to a datagram
 
 _MAGIC: Final = b"\xa7S"
 _ID_SIZE: Final = 6
 _TAG_AT: Final = 2 + _ID_SIZE
 _TAG_SIZE: Final = 16
-_LONGEST_FILE: Final = 1 << 12
-"""Bytes."""
+_LONGEST_FILE: Final = 1 << 12  # bytes
 
 Side = Literal["simulator", "agent"]
 

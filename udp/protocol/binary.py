@@ -32,31 +32,7 @@ from .messages import (
     Welcome,
 )
 
-__all__ = [
-    "ALIVE",
-    "CLOSE",
-    "COMMAND",
-    "FRAGMENT",
-    "HEADER_SIZE",
-    "HELLO",
-    "MAGIC",
-    "MISSING",
-    "OF_SESSION",
-    "REFUSE",
-    "STATE",
-    "UNKNOWN",
-    "VERSION",
-    "check",
-    "decode",
-    "decode_due",
-    "encode",
-    "frame",
-    "numbers_of",
-    "peek",
-]
-
-MAGIC: Final = b"\xa7R"
-"""Not UTF-8, so that no text datagram begins with it."""
+MAGIC: Final = b"\xa7R"  # not UTF-8, so that no text datagram begins with it
 VERSION: Final = 2
 HEADER_SIZE: Final = 24
 
@@ -71,13 +47,11 @@ UNKNOWN: Final = 8
 ALIVE: Final = 9
 MISSING: Final = 10
 
-FRAGMENT: Final = 0x80
-"""Set in the type of a fragment of a message."""
+FRAGMENT: Final = 0x80  # set in the type of a fragment of a message
 OF_SESSION: Final = frozenset({STATE, COMMAND, CLOSE, ALIVE})
 """Types that belong to an open session, as Missing does but for that of a Hello."""
 
-_NUMBERED: Final = OF_SESSION | {UNKNOWN, MISSING}
-"""Types that have a sequence number."""
+_NUMBERED: Final = OF_SESSION | {UNKNOWN, MISSING}  # types that have a sequence number
 
 _HEADER: Final = struct.Struct("<2sBBIQQ")
 _NUMBERS: Final = struct.Struct("<QQ")  # session, sequence: the end of the header

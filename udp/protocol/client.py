@@ -37,20 +37,7 @@ from .messages import (
 from .statistics import Statistics
 from .transitions import SIMULATOR, SimulatorState, Way
 
-__all__ = [
-    "CLOSE_INTERVAL",
-    "CLOSE_LINGER",
-    "Address",
-    "Client",
-    "LinkConfig",
-    "RoundTrips",
-    "Tap",
-    "largest_datagram",
-    "new_session",
-]
-
-Address = tuple[str, int]
-"""IPv4 host and port."""
+Address = tuple[str, int]  # IPv4 host and port
 
 Tap = Callable[[int, Message, bytes], None]
 """Sees every message once, when it is first sent or taken: the number of its slot (0 at the
@@ -58,23 +45,18 @@ simulator), the message, and its bytes in the binary codec, whole and not sealed
 
 CLOSE_INTERVAL: Final = 0.025
 """A Close is repeated after so long, s, until the other side has answered it with its own."""
-CLOSE_LINGER: Final = 0.25
-"""Longest wait for that answer, s: the other side may be gone."""
+CLOSE_LINGER: Final = 0.25  # longest wait for that answer, s: the other side may be gone
 
-_FIRST_RESEND: Final = 0.2
-"""Wait before a resend while no round trip has been measured, s."""
+_FIRST_RESEND: Final = 0.2  # wait before a resend while no round trip has been measured, s
 _GRANULARITY: Final = 0.005
 """A system may let a process wait for so long, s: the least that is added to a round trip."""
-_LONGEST_RESEND: Final = 1.0
-"""Longest wait before a resend, s."""
-_PATIENCE: Final = 8
-"""Resends before the waits double: most that was lost was lost by chance."""
+_LONGEST_RESEND: Final = 1.0  # longest wait before a resend, s
+_PATIENCE: Final = 8  # resends before the waits double: most that was lost was lost by chance
 
 
 _LATER: Final = 1.25
 """By so much each Alive for a State lengthens the wait before the next is asked for."""
-_TOO_EARLY: Final = 1.5
-"""By so much round trips are taken for longer when answers come twice."""
+_TOO_EARLY: Final = 1.5  # by so much round trips are taken for longer when answers come twice
 _AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING, Way.RECEIVED, Command]
 
 
@@ -123,8 +105,7 @@ class RoundTrips:
         self._variation = 0.0
         self._sent_at = 0.0
         self._is_repeat = self._was_repeated = self._came_twice = self._says_alive = False
-        self._in_a_row = 0
-        """Messages in a row that were repeated, and then answered twice."""
+        self._in_a_row = 0  # messages in a row that were repeated, and then answered twice
 
     def sent(self, now: float, *, first: bool = False) -> None:
         """Something was sent that wants an answer, for the first time or again."""

@@ -32,11 +32,9 @@ MAX_FRAGMENTS: Final = 1 << 14
 _FRAGMENT: Final = struct.Struct("<HHB3x")
 _OVERHEAD: Final = HEADER_SIZE + _FRAGMENT.size
 _ASKS_AT: Final = 28
-_FIRST_BURST: Final = 3 << 16
-"""Bytes: what the smallest buffer that systems give a socket holds."""
+_FIRST_BURST: Final = 3 << 16  # bytes: what the smallest buffer that systems give a socket holds
 _LARGEST_BURST: Final = 1 << 20
-_MOST_LOST: Final = 0.25
-"""A burst of which more was lost was too large for a buffer on its way."""
+_MOST_LOST: Final = 0.25  # A burst of which more was lost was too large for a buffer on its way
 _LARGEST_BITMAP: Final = 128
 """Bytes of the bitmap of a Missing: it says what 1,024 fragments are about."""
 
@@ -45,8 +43,7 @@ class Window:
     """Size of a burst. It grows while bursts arrive, and halves if much is lost."""
 
     def __init__(self) -> None:
-        self.size = _FIRST_BURST
-        """Bytes."""
+        self.size = _FIRST_BURST  # bytes
 
     def report(self, sent: int, lost: int) -> None:
         """Take into account that so many fragments of a burst were lost."""

@@ -16,17 +16,14 @@ from ...models.errors import InputError
 
 __all__ = ["MAX_DRONES", "MAX_MESSAGE", "ArrayLayout", "Layout", "Slot"]
 
-MAX_DRONES: Final = 1 << 16
-"""Most drones of one simulator."""
-MAX_MESSAGE: Final = 1 << 24
-"""Largest message in all its fragments, bytes."""
+MAX_DRONES: Final = 1 << 16  # most drones of one simulator
+MAX_MESSAGE: Final = 1 << 24  # largest message in all its fragments, bytes
 STATE_ARRAYS_AT: Final = 40
 COMMAND_ARRAYS_AT: Final = 32
 
 _LETTERS: Final = {"float32": "f", "float64": "d", "uint8": "B", "int32": "i", "int64": "q"}
 """The dtypes that may cross the wire, and how `struct` calls them."""
-_SMALL: Final = 256
-"""Up to this many numbers Python's loop is faster than NumPy's calls."""
+_SMALL: Final = 256  # up to this many numbers Python's loop is faster than NumPy's calls
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,14 +42,10 @@ class ArrayLayout:
 class Slot(NamedTuple):
     """An array of all drones, at its place in a message."""
 
-    at: int
-    """First byte."""
-    end: int
-    """First byte after it."""
-    shape: tuple[int, ...]
-    """(N, *shape)."""
-    dtype: np.dtype
-    """Little-endian."""
+    at: int  # first byte
+    end: int  # first byte after it
+    shape: tuple[int, ...]  # (N, *shape)
+    dtype: np.dtype  # little-endian
 
     def view(self, data: bytes) -> np.ndarray:
         """The array in a message, not copied, read-only."""

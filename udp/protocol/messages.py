@@ -14,39 +14,13 @@ import numpy as np
 from ...models.errors import InputError
 from .layout import MAX_DRONES
 
-__all__ = [
-    "FLY",
-    "FREEZE",
-    "MAX_SPEC",
-    "MAX_TEXT",
-    "MAX_UINT64",
-    "RESET",
-    "Alive",
-    "Close",
-    "Command",
-    "Extension",
-    "Hello",
-    "Message",
-    "Missing",
-    "Refuse",
-    "State",
-    "Unknown",
-    "Wait",
-    "Welcome",
-    "one_line",
-]
-
-MAX_UINT64: Final = (1 << 64) - 1
-"""Largest session, sequence number, nonce and seed."""
-MAX_TEXT: Final = 512
-"""Longest reason, bytes of UTF-8."""
-MAX_SPEC: Final = 1 << 22
-"""Longest spec, bytes of UTF-8."""
+MAX_UINT64: Final = (1 << 64) - 1  # largest session, sequence number, nonce and seed
+MAX_TEXT: Final = 512  # longest reason, bytes of UTF-8
+MAX_SPEC: Final = 1 << 22  # longest spec, bytes of UTF-8
 
 FLY: Final = 0
 RESET: Final = 1
-FREEZE: Final = 2
-"""Order to a drone: fly its action, reset instead of it, or do nothing."""
+FREEZE: Final = 2  # order to a drone: fly its action, reset instead of it, or do nothing
 
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 

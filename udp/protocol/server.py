@@ -49,8 +49,7 @@ may come at the same moment."""
 _TEXT_REMEMBERED: Final = 2.0
 """Time in which a copy of the last line of a closed text simulator is recognized, s."""
 _AFTER_STATE: Final = AGENT[AgentState.EXPECTING, Way.RECEIVED, State]
-_REASON_AT: Final = binary.HEADER_SIZE + 2
-"""Bytes of a Refuse or a Close before its reason."""
+_REASON_AT: Final = binary.HEADER_SIZE + 2  # bytes of a Refuse or a Close before its reason
 
 
 class KeyMismatch(Forged):
@@ -75,30 +74,23 @@ class Session:
     """An exchange with one simulator, pinned to its address and codec."""
 
     peer: Address
-    number: int
-    """Session number; 0 with the text codec."""
+    number: int  # session number; 0 with the text codec
     layout: Layout
     hello: Hello | None  # none if it speaks text
     state: AgentState = AgentState.NEW
-    sequence: int = 0
-    """Number of the State that came last."""
+    sequence: int = 0  # number of the State that came last
     key: Key | None = None
     welcome: Welcome | None = None
-    reply: Transfer | None = None
-    """The answer to the last State, or the Welcome."""
-    assembler: Assembler | None = None
-    """Of the State that is coming in fragments."""
+    reply: Transfer | None = None  # the answer to the last State, or the Welcome
+    assembler: Assembler | None = None  # of the State that is coming in fragments
     window: Window = field(default_factory=Window)
     largest: int = 0
     """Bytes of the largest datagram to it, a seal not counted; 0 before the first message."""
     due: bytes = b""
     """Bytes 8 to 23 of the State that is expected; empty where it is sealed, or a line of text."""
-    asked_at: float = 0.0
-    """When the Command was sent whose State is expected."""
-    heard_at: float = 0.0
-    """When it last said that it lives, or brought a fragment that was missing."""
-    room: int = 0
-    """Bytes that a Refuse may have, while it waits for a slot."""
+    asked_at: float = 0.0  # when the Command was sent whose State is expected
+    heard_at: float = 0.0  # when it last said that it lives, or brought a fragment that was missing
+    room: int = 0  # bytes that a Refuse may have, while it waits for a slot
     last: bytes = b""  # line, by text
 
     @property

@@ -64,10 +64,8 @@ class AgentConfig:
     env_id: str | None = None
     options: Mapping[str, Any] | None = None
     vehicle_hash: str | None = None
-    worlds: int | None = None
-    """Worlds of each simulator; None: as many as the first has."""
-    slots: int = 1
-    """Simulators to fly at the same time."""
+    worlds: int | None = None  # worlds of each simulator; None: as many as the first has
+    slots: int = 1  # simulators to fly at the same time
     connect_timeout: float = 60.0
     timeout: float = 30.0
     max_datagram: int | None = None
@@ -311,8 +309,7 @@ class _Required:
 
     def __init__(self, config: AgentConfig) -> None:
         self.config = config
-        self.spec: EnvSpec | None = None
-        """Of the simulator that has flown."""
+        self.spec: EnvSpec | None = None  # of the simulator that has flown
         self.worlds = config.worlds
         self.text_spec = cache(self._text_spec)
         self.text_layout = cache(self._text_layout)

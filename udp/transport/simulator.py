@@ -29,10 +29,8 @@ __all__ = ["DEFAULT_AGENT", "DEFAULT_SIMULATOR", "Observer", "Simulator"]
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
 
-_ALIVE_EVERY: Final = 0.5
-"""Period of the message Alive while a long step is computed, s."""
-_COMPLAIN_AFTER: Final = 1.0
-"""A wait for the agent that is told, once, s."""
+_ALIVE_EVERY: Final = 0.5  # period of the message Alive while a long step is computed, s
+_COMPLAIN_AFTER: Final = 1.0  # A wait for the agent that is told, once, s
 _PAUSE: Final = 1.0
 """A wait that took so much longer than it should, s: this process was stopped meanwhile."""
 

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import gymnasium as gym
 import numpy as np
@@ -16,35 +16,14 @@ from ...models.errors import InputError
 from ..protocol.layout import MAX_DRONES, Layout
 from ..protocol.messages import MAX_UINT64
 
+if TYPE_CHECKING:
+    from ...envs.loop import Loop, OnHost
+
 __all__ = ["Stepped", "make_stepped", "reset_all", "spec_of_gymnasium"]
 
-
+Stepped: TypeAlias = "Loop | OnHost | _Singles"
+"""N drones that take a step of the wire together, with the results of `rotorgram.envs.Loop`."""
 _Some = np.ndarray | None
-
-
-class Stepped(Protocol):
-    """N drones that take a step of the wire together: see `rotorgram.envs.Loop`."""
-
-    spec: EnvSpec
-    num_envs: int
-    observations: dict[str, np.ndarray]
-    """By name, shape (N, *shape)."""
-    rewards: np.ndarray
-    """float64, shape (N,)."""
-    terminated: np.ndarray
-    """bool, shape (N,)."""
-    truncated: np.ndarray
-    """bool, shape (N,)."""
-
-    @property
-    def telemetry(self) -> dict[str, np.ndarray]:
-        """By name, float64, shape (N, *shape)."""
-
-    def advance(self, actions: np.ndarray, resets: _Some, seeds: _Some, frozen: _Some) -> None:
-        """Reset some drones, freeze some, and fly the others for one control period."""
-
-    def close(self) -> None:
-        """Release threads, windows and memory."""
 
 
 def make_stepped(
@@ -74,9 +53,14 @@ def make_stepped(
             from ...envs.loop import Loop, OnHost
 
             name, chosen = canonical_id(env), cast(Any, backend)
-            loop: Any = Loop(name, num_envs, vehicle=vehicle, backend=chosen, options=options)
+            loop = Loop(name, num_envs, vehicle=vehicle, backend=chosen, options=options)
             return loop if backend == "mujoco" else OnHost(loop)
-        envs = [_make(env, options) for _ in range(num_envs)]
+        try:
+            envs = [gym.make(env, disable_env_checker=True, **options) for _ in range(num_envs)]
+        except (gym.error.Error, ImportError) as error:
+            raise InputError(f"env: expected a registered id, got {env!r}: {error}") from None
+        except TypeError as error:
+            raise InputError(f"options of {env}: {error}") from None
     else:
         if options:
             raise InputError(f"options {sorted(options)}: expected none with an env already made")
@@ -95,17 +79,8 @@ def reset_all(stepped: Stepped, layout: Layout, seed: int) -> None:
     stepped.advance(np.zeros(actions.shape, actions.dtype), np.ones(count, bool), seeds, None)
 
 
-def _make(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
-    try:
-        return gym.make(env_id, disable_env_checker=True, **options)
-    except (gym.error.Error, ImportError) as error:
-        raise InputError(f"env: expected a registered id, got {env_id!r}: {error}") from None
-    except TypeError as error:
-        raise InputError(f"options of {env_id}: {error}") from None
-
-
 class _Singles:
-    """Gymnasium envs, one after the other: `Stepped`."""
+    """Gymnasium envs, one after the other."""
 
     def __init__(self, envs: Sequence[gym.Env[Any, Any]], options: Mapping[str, Any]) -> None:
         self.envs, self.num_envs = envs, len(envs)
@@ -141,10 +116,9 @@ class _Singles:
             env.close()
 
     def _keep(self, i: int, observation: Any, info: Mapping[str, Any]) -> None:
-        arrays = self.spec.observation
-        named = observation if isinstance(observation, dict) else {arrays[0].name: observation}
-        for array in arrays:
-            value = np.asarray(named[array.name])
+        named = isinstance(observation, dict)
+        for array in self.spec.observation:
+            value = np.asarray(observation[array.name] if named else observation)
             if value.shape != array.shape or value.dtype != array.dtype:
                 raise InputError(
                     f"observation {array.name}: expected {array.dtype} of shape {array.shape}, "
@@ -170,11 +144,8 @@ def spec_of_gymnasium(env: gym.Env[Any, Any], options: Mapping[str, Any]) -> Env
         action = Discrete(n=int(env.action_space.n))
     else:
         action = _array("action", env.action_space)
-    spec = getattr(base, "env_spec", None)
-    if isinstance(spec, EnvSpec) and (env.observation_space, env.action_space) == (
-        observation_space(spec),
-        action_space(spec),
-    ):
+    spec, ours = getattr(base, "env_spec", None), (env.observation_space, env.action_space)
+    if isinstance(spec, EnvSpec) and ours == (observation_space(spec), action_space(spec)):
         return spec
     try:
         json.dumps(dict(options))
