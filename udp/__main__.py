@@ -14,7 +14,7 @@ from importlib import import_module
 from threading import Thread
 from typing import Any, Final
 
-from ..models.errors import InputError
+from ..models.errors import InputError, expect
 from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
 from .transport.simulator import Simulator
@@ -80,11 +80,9 @@ def parse_arguments(words: list[str]) -> dict[str, Any]:
     if not isinstance(arguments, dict):
         raise InputError(f"expected a JSON object, got {words[0][:80]}")
     for name, value in arguments.items():
-        if name not in _KINDS:
-            raise InputError(f"{name}: expected one of {', '.join(_KINDS)}")
+        expect(name in _KINDS, name, f"one of {', '.join(_KINDS)}")
         kind, expected = _KINDS[name]
-        if not isinstance(value, kind):
-            raise InputError(f"{name}: expected {expected}, got {value!r}")
+        expect(isinstance(value, kind), name, expected, f"{value!r}")
     if module := arguments.pop("module", None):
         sys.path.append(os.getcwd())  # last, and with -P not there: it shadows no other module
         import_module(module)

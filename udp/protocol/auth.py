@@ -18,7 +18,7 @@ from hmac import compare_digest
 from pathlib import Path
 from typing import Final, Literal
 
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from .errors import Forged
 
 __all__ = ["OVERHEAD", "Key", "is_sealed", "key_id", "message_of", "read_keys", "write_key"]
@@ -43,11 +43,9 @@ class Key:
     """
 
     def __init__(self, secret: bytes, side: Side, *, id_: bytes = b"") -> None:
-        if len(secret) != KEY_SIZE:
-            raise InputError(f"key: expected {KEY_SIZE} bytes, got {len(secret)}")
+        expect(len(secret) == KEY_SIZE, "key", f"{KEY_SIZE} bytes", f"{len(secret)}")
         self._secret = secret
         self.id = id_ or blake2b(key=secret, digest_size=_ID_SIZE, person=b"key id").digest()
-        """6 bytes."""
         self._envelope = _MAGIC + self.id
         self._side = side
         there = "agent" if side == "simulator" else "simulator"
@@ -110,17 +108,15 @@ def read_keys(path: Path | str) -> tuple[bytes, ...]:
             text = file.read(_LONGEST_FILE) if stat.S_ISREG(mode) else b""
     except OSError as error:
         raise InputError(f"key file: cannot read {path}: {error.strerror}") from None
-    if os.name == "posix" and stat.S_ISREG(mode) and mode & 0o077:
-        raise InputError(
-            f"key file: expected {path} to be readable by its owner alone (chmod 600), "
-            f"got mode {mode & 0o777:o}"
-        )
+    private = os.name != "posix" or not stat.S_ISREG(mode) or not mode & 0o077
+    expected = f"{path} to be readable by its owner alone (chmod 600)"
+    expect(private, "key file", expected, f"mode {mode & 0o777:o}")
     try:
         keys = tuple(bytes.fromhex(line) for line in text.decode("ascii").split())
     except ValueError:
         keys = ()
-    if not keys or any(len(key) != KEY_SIZE for key in keys):
-        raise InputError(f"key file: expected {2 * KEY_SIZE} hexadecimal digits in {path}")
+    right = keys and all(len(key) == KEY_SIZE for key in keys)
+    expect(right, "key file", f"{2 * KEY_SIZE} hexadecimal digits in {path}")
     return keys
 
 

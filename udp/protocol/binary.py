@@ -13,24 +13,10 @@ from typing import Any, Final
 import numpy as np
 
 from ...models.errors import InputError
+from . import messages
 from .errors import DecodeError, VersionMismatch
 from .layout import COMMAND_ARRAYS_AT, MAX_MESSAGE, Layout, Slot
-from .messages import (
-    MAX_SPEC,
-    MAX_TEXT,
-    Alive,
-    Close,
-    Command,
-    Extension,
-    Hello,
-    Message,
-    Missing,
-    Refuse,
-    State,
-    Unknown,
-    Wait,
-    Welcome,
-)
+from .messages import MAX_SPEC, MAX_TEXT, Command, Extension, Message, State
 
 MAGIC: Final = b"\xa7R"  # not UTF-8, so that no text datagram begins with it
 VERSION: Final = 2
@@ -315,7 +301,7 @@ _HEADERLESS: Final = bytes(HEADER_SIZE)
 # ---- all others: the body of a message, and its fields
 
 
-def _encode_hello(m: Hello) -> bytes:
+def _encode_hello(m: messages.Hello) -> bytes:
     spec = m.spec.encode()
     return _HELLO_BODY.pack(*m.versions, m.worlds, len(spec)) + spec + _extensions(m.extensions)
 
@@ -330,7 +316,7 @@ def _decode_hello(body: bytes) -> dict[str, Any]:
     return {"spec": spec, "worlds": worlds, "versions": (low, high), "extensions": extensions}
 
 
-def _encode_welcome(m: Welcome) -> bytes:
+def _encode_welcome(m: messages.Welcome) -> bytes:
     body = _WELCOME_BODY.pack(m.nonce, m.seed or 0, m.seed is not None, m.version)
     return body + _extensions(m.extensions)
 
@@ -344,7 +330,7 @@ def _decode_welcome(body: bytes) -> dict[str, Any]:
     return {"nonce": nonce, "version": version, "seed": seed, "extensions": extensions}
 
 
-def _encode_nothing(m: Wait | Unknown | Alive) -> bytes:
+def _encode_nothing(m: messages.Wait | messages.Unknown | messages.Alive) -> bytes:
     return b""
 
 
@@ -353,7 +339,7 @@ def _decode_nothing(body: bytes) -> dict[str, Any]:
     return {}
 
 
-def _encode_missing(m: Missing) -> bytes:
+def _encode_missing(m: messages.Missing) -> bytes:
     return _MISSING_BODY.pack(m.kind, m.count, m.first) + m.bitmap
 
 
@@ -363,7 +349,7 @@ def _decode_missing(body: bytes) -> dict[str, Any]:
     return {"kind": kind, "count": count, "first": first, "bitmap": bitmap}
 
 
-def _encode_reason(m: Refuse | Close) -> bytes:
+def _encode_reason(m: messages.Refuse | messages.Close) -> bytes:
     raw = m.reason.encode()
     return _LENGTH.pack(len(raw)) + raw
 
@@ -403,16 +389,16 @@ _LAID_OUT: Final = (State, Command)
 """Messages that mean something with a layout only: their codecs take it, and whole datagrams."""
 
 _MESSAGES: Final[dict[int, tuple[Callable[..., Any], Callable[..., bytes], Callable[..., Any]]]] = {
-    HELLO: (Hello, _encode_hello, _decode_hello),
-    _WELCOME: (Welcome, _encode_welcome, _decode_welcome),
-    REFUSE: (Refuse, _encode_reason, _decode_reason),
+    HELLO: (messages.Hello, _encode_hello, _decode_hello),
+    _WELCOME: (messages.Welcome, _encode_welcome, _decode_welcome),
+    REFUSE: (messages.Refuse, _encode_reason, _decode_reason),
     STATE: (State, _encode_state, _decode_state),
     COMMAND: (Command, _encode_command, _decode_command),
-    CLOSE: (Close, _encode_reason, _decode_reason),
-    _WAIT: (Wait, _encode_nothing, _decode_nothing),
-    UNKNOWN: (Unknown, _encode_nothing, _decode_nothing),
-    ALIVE: (Alive, _encode_nothing, _decode_nothing),
-    MISSING: (Missing, _encode_missing, _decode_missing),
+    CLOSE: (messages.Close, _encode_reason, _decode_reason),
+    _WAIT: (messages.Wait, _encode_nothing, _decode_nothing),
+    UNKNOWN: (messages.Unknown, _encode_nothing, _decode_nothing),
+    ALIVE: (messages.Alive, _encode_nothing, _decode_nothing),
+    MISSING: (messages.Missing, _encode_missing, _decode_missing),
 }
 
 _STARTS: Final = {kind: MAGIC + bytes((VERSION, kind)) for kind in _MESSAGES}

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 
 __all__ = ["MAX_DRONES", "MAX_MESSAGE", "ArrayLayout", "Layout", "Slot"]
 
@@ -35,8 +35,8 @@ class ArrayLayout:
     """`float32`, `float64`, `uint8`, `int32` or `int64`."""
 
     def __post_init__(self) -> None:
-        if self.dtype not in _LETTERS:
-            raise InputError(f"dtype: expected one of {', '.join(_LETTERS)}, got {self.dtype!r}")
+        known = f"one of {', '.join(_LETTERS)}"
+        expect(self.dtype in _LETTERS, "dtype", known, f"{self.dtype!r}")
 
 
 class Slot(NamedTuple):
@@ -91,10 +91,9 @@ class Layout:
         choices: int = 0,
         telemetry: tuple[tuple[int, ...], ...] = (),
     ) -> None:
-        if not 1 <= drones <= MAX_DRONES:
-            raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {drones}")
-        if (action is None) != (choices >= 1):
-            raise InputError("action: expected an array or a number of choices, not both")
+        expect(1 <= drones <= MAX_DRONES, "drones", f"1 to {MAX_DRONES}", f"{drones}")
+        either = (action is None) == (choices >= 1)
+        expect(either, "action", "an array or a number of choices, not both")
         self.drones, self.observation, self.action = drones, observation, action
         self.choices, self.telemetry = choices, telemetry
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from ...envs import registry
 from ...envs.spec import EnvSpec, canonical_id
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from ..layouts import layout_of
 from ..protocol import text
 from ..protocol.auth import Key, read_keys
@@ -76,8 +76,7 @@ class AgentConfig:
     def __post_init__(self) -> None:
         for name in ("connect_timeout", "timeout"):
             seconds = getattr(self, name)
-            if not (math.isfinite(seconds) and seconds > 0):
-                raise InputError(f"{name}: expected seconds > 0, got {seconds}")
+            expect(math.isfinite(seconds) and seconds > 0, name, "seconds > 0", f"{seconds}")
         if self.env_id is not None:
             object.__setattr__(self, "env_id", canonical_id(self.env_id))
             self.expected_options(self.env_id)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Final
 
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from ..protocol.client import Address
 from .sockets import is_loopback, open_socket, resolve
 
@@ -59,20 +59,19 @@ class FaultConfig:
     """The same seed gives each client's datagrams the same fates, by their order."""
 
     def __post_init__(self) -> None:
-        if type(self.seed) is not int:
-            raise InputError(f"seed: expected a whole number, got {self.seed!r}")
-        if type(self.mtu) is not int or not (self.mtu == 0 or 68 <= self.mtu <= _LARGEST):
-            raise InputError(f"mtu: expected 0 or 68 to {_LARGEST} bytes, got {self.mtu!r}")
-        if self.black_hole and not self.mtu:
-            raise InputError("black_hole: expected an mtu with it, got none")
+        seed, mtu = self.seed, self.mtu
+        expect(type(seed) is int, "seed", "a whole number", f"{seed!r}")
+        right = type(mtu) is int and (mtu == 0 or 68 <= mtu <= _LARGEST)
+        expect(right, "mtu", f"0 or 68 to {_LARGEST} bytes", f"{mtu!r}")
+        expect(mtu or not self.black_hole, "black_hole", "an mtu with it", "none")
         for names, most, expected in (
             ("drop duplicate reorder truncate corrupt", 1, "a probability from 0 to 1"),
             ("delay jitter reorder_by", 3600, "seconds from 0 to 3600"),
         ):
             for name in names.split():
                 value = getattr(self, name)
-                if not (isinstance(value, int | float) and 0 <= value <= most):
-                    raise InputError(f"{name}: expected {expected}, got {value!r}")
+                right = isinstance(value, int | float) and 0 <= value <= most
+                expect(right, name, expected, f"{value!r}")
 
 
 class Faults:
@@ -190,10 +189,9 @@ class Relay:
         self.config = config or FaultConfig()
         self.counters: Counter[str] = Counter()
         self.server = _reachable(server, insecure)
-        if self.server[1] == 0:
-            raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
-        if self.server == _reachable(listen, insecure):
-            raise InputError(f"listen: expected another address than the server's, got {listen}")
+        expect(self.server[1], "server", "the port of the agent, 1 to 65535", "0")
+        differs = self.server != _reachable(listen, insecure)
+        expect(differs, "listen", "another address than the server's", f"{listen}")
         self._any = ("0.0.0.0" if insecure else "127.0.0.1", 0)
         self._clients: OrderedDict[Address, _Client] = OrderedDict()
         self._last_number = 0

@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import gymnasium as gym
 import numpy as np
 
-from ...models.errors import InputError, NotCopied
+from ...models.errors import NotCopied, expect
 from ..layouts import layout_of
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
@@ -20,9 +20,6 @@ from ..protocol.messages import Close, Command, Hello, Message, Refuse, State, W
 from ..protocol.transitions import SimulatorState
 from .sockets import LONGEST_WAIT, address_text, log_notices, open_socket, resolve
 from .stepped import Stepped, make_stepped, reset_all
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["DEFAULT_AGENT", "DEFAULT_SIMULATOR", "Observer", "Simulator"]
 
@@ -81,14 +78,12 @@ class Simulator(NotCopied):
         record: Path | str | None = None,
         **options: Any,
     ) -> None:
-        if codec not in ("binary", "text"):
-            raise InputError(f"codec: expected 'binary' or 'text', got {codec!r}")
+        expect(codec in ("binary", "text"), "codec", "'binary' or 'text'", f"{codec!r}")
         self._text = codec == "text"
         key = Key(read_keys(key_file)[0], "simulator") if key_file else None
         anywhere = insecure or key is not None
         self.server = resolve(server, insecure=anywhere)
-        if self.server[1] == 0:
-            raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
+        expect(self.server[1], "server", "the port of the agent, 1 to 65535", "0")
         self.config = config or LinkConfig()
         self.observer: Observer | None = None
         self._keyed = key is not None

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from ...envs import registry
 from ...envs.spaces import action_space, observation_space
 from ...envs.spec import ArraySpec, Discrete, EnvSpec, canonical_id, component_names
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from ..protocol.layout import MAX_DRONES, Layout
 from ..protocol.messages import MAX_UINT64
 
@@ -46,8 +46,8 @@ def make_stepped(
     Raises:
         InputError: An argument or the env's spaces are not what they should be.
     """
-    if type(num_envs) is not int or not 1 <= num_envs <= MAX_DRONES:
-        raise InputError(f"num_envs: expected 1 to {MAX_DRONES}, got {num_envs!r}")
+    right = type(num_envs) is int and 1 <= num_envs <= MAX_DRONES
+    expect(right, "num_envs", f"1 to {MAX_DRONES}", f"{num_envs!r}")
     if isinstance(env, str):
         if registry.is_known(env):
             from ...envs.loop import Loop, OnHost
@@ -62,13 +62,11 @@ def make_stepped(
         except TypeError as error:
             raise InputError(f"options of {env}: {error}") from None
     else:
-        if options:
-            raise InputError(f"options {sorted(options)}: expected none with an env already made")
-        if num_envs > 1:
-            raise InputError(f"num_envs: expected 1 with an env already made, got {num_envs}")
+        expect(not options, f"options {sorted(options)}", "none with an env already made")
+        expect(num_envs == 1, "num_envs", "1 with an env already made", f"{num_envs}")
         envs = [env]
-    if vehicle is not None or backend != "mujoco":
-        raise InputError(f"vehicle, backend: expected none for {env!r}, which is no task of ours")
+    ours = vehicle is not None or backend != "mujoco"
+    expect(not ours, "vehicle, backend", f"none for {env!r}, which is no task of ours")
     return _Singles(envs, options)
 
 
@@ -120,10 +118,9 @@ class _Singles:
         for array in self.spec.observation:
             value = np.asarray(observation[array.name] if named else observation)
             if value.shape != array.shape or value.dtype != array.dtype:
-                raise InputError(
-                    f"observation {array.name}: expected {array.dtype} of shape {array.shape}, "
-                    f"got {value.dtype} of shape {value.shape}"
-                )
+                expected = f"{array.dtype} of shape {array.shape}"
+                got = f"{value.dtype} of shape {value.shape}"
+                raise InputError(f"observation {array.name}: expected {expected}, got {got}")
             self.observations[array.name][i] = value
         for array in self.spec.telemetry:
             numbers = [info[name] for name in component_names(array)]
