@@ -20,19 +20,15 @@ from .protocol.errors import LinkError
 from .transport.simulator import Simulator
 
 _FOR_EVER: Final = 30 * 86_400.0  # s
-_KINDS: Final[dict[str, tuple[type | tuple[type, ...], str]]] = {
+_KINDS: Final[dict[str, tuple[Any, str]]] = {
     "env": (str, "an id"),
     "module": (str, "the name of a module"),
     "options": (dict, "an object"),
-    "vehicle": ((str, type(None)), "a path"),
     "num_envs": (int, "a number"),
-    "backend": (str, "a name"),
-    "codec": (str, "a name"),
-    "server": (list, "[host, port]"),
-    "bind": (list, "[host, port]"),
-    "key_file": ((str, type(None)), "a path"),
+    **dict.fromkeys(("backend", "codec"), (str, "a name")),
+    **dict.fromkeys(("server", "bind"), (list, "[host, port]")),
+    **dict.fromkeys(("vehicle", "key_file", "record"), (str | None, "a path")),
     "insecure": (bool, "true or false"),
-    "record": ((str, type(None)), "a path"),
 }
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from ..envs.autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
-from ..envs.spaces import action_space, joined, observation_space
-from ..envs.spec import Discrete, EnvSpec, component_names
+from ..envs.spaces import action_space, joined, observation_space, telemetry_names
+from ..envs.spec import Discrete, EnvSpec
 from ..models.errors import InputError, NotCopied, expect
 from .protocol.client import Address
 from .protocol.layout import MAX_DRONES
@@ -177,7 +177,7 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         fps = max(1, round(1 / spec.control_period))
         self.metadata = {"render_modes": [], "render_fps": fps}
         self._arrays = tuple(array.name for array in spec.observation)
-        self._names = tuple(n for array in spec.telemetry for n in component_names(array))
+        self._names = telemetry_names(spec)
         self._take_actions(spec.action, 1)
 
     def _observation(self, state: State) -> Any:

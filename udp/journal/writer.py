@@ -11,7 +11,7 @@ import platform
 import re
 import time
 import weakref
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -195,11 +195,7 @@ class Journal:
             "spec": hello.spec,
         }
         self._file.add_metadata("session", words)
-        for kind, topic, name, text in (
-            (binary.STATE, "state", "State", _state_schema(spec, layout)),
-            (binary.COMMAND, "command", "Command", _command_schema(layout, seeded=False)),
-            (_SEEDED, "command", "SeededCommand", _command_schema(layout, seeded=True)),
-        ):
+        for kind, topic, name, text in _schemas(spec, layout):
             self._channels[slot, kind] = self._file.channel(
                 f"/slot{slot}/{topic}", "ros1", f"rotorgram/{name}", text
             )
@@ -239,21 +235,20 @@ def model_of(stepped: Any) -> str:
 # ---- ROS 1 messages
 
 
-def _state_schema(spec: EnvSpec, layout: Layout) -> str:
-    """A State of this layout as a ROS 1 message."""
+def _schemas(spec: EnvSpec, layout: Layout) -> Iterator[tuple[int, str, str, str]]:
+    """Kind, topic, name and text of each ROS 1 message of this layout."""
     observation = _field_names("observation", spec.observation)
     telemetry = _field_names("telemetry", spec.telemetry)
     slots = (*layout.observation_slots, layout.rewards, *layout.flags, *layout.telemetry_slots)
-    names = (*observation, "rewards", "terminated", "truncated", *telemetry)
-    fixed = "float64 time\nuint64 nonce\n"
-    return _schema_text(fixed, STATE_ARRAYS_AT, zip(names, slots, strict=True))
-
-
-def _command_schema(layout: Layout, *, seeded: bool) -> str:
-    """A Command of this layout as a ROS 1 message."""
+    named = zip(
+        (*observation, "rewards", "terminated", "truncated", *telemetry), slots, strict=True
+    )
+    text = _schema_text("float64 time\nuint64 nonce\n", STATE_ARRAYS_AT, named)
+    yield binary.STATE, "state", "State", text
     arrays = [("actions", layout.actions), ("orders", layout.orders), ("seeds", layout.seeds)]
-    fixed = "uint32 seed_count\nuint8[4] reserved\n"
-    return _schema_text(fixed, COMMAND_ARRAYS_AT, arrays if seeded else arrays[:2])
+    for kind, name, count in (binary.COMMAND, "Command", 2), (_SEEDED, "SeededCommand", 3):
+        fixed = "uint32 seed_count\nuint8[4] reserved\n"
+        yield kind, "command", name, _schema_text(fixed, COMMAND_ARRAYS_AT, arrays[:count])
 
 
 def _schema_text(fixed: str, at: int, arrays: Iterable[tuple[str, Slot]]) -> str:

@@ -100,6 +100,7 @@ class Agent:
     """Exchanges Commands for States with all simulators at the same time.
 
     Attributes:
+        address: Address that this side listens on.
         spec: Of the simulator that joined last; None before the first.
         states: The last State of each slot; None before the first.
         lost: For each slot why its simulator was lost during the last exchange; "" if it was not.
@@ -134,6 +135,7 @@ class Agent:
         self.lost = [""] * config.slots
         self._deadlines = [0.0] * config.slots
         self._port = Port(address, insecure=config.insecure or bool(keys))
+        self.address = self._port.address
         if journal:
             try:
                 journal.start(self.server.statistics, self.server.slots)
@@ -142,11 +144,6 @@ class Agent:
                 raise
         # Runs once: in close(), with the garbage, or when the program ends.
         self.close = weakref.finalize(self, _leave, os.getpid(), self.server, self._port, journal)
-
-    @property
-    def address(self) -> Address:
-        """Address that this side listens on."""
-        return self._port.address
 
     @property
     def worlds(self) -> int:
@@ -186,7 +183,7 @@ class Agent:
     def _gather(self) -> None:
         """Send what is due and answer what comes, until it is the agent's turn everywhere."""
         server, config, slots = self.server, self.config, self.server.slots
-        self._flush()  # before anything else: a simulator waits
+        _flush(server, self._port)  # before anything else: a simulator waits
         now = time.monotonic()
         self._deadlines = [
             now + (config.timeout if session else config.connect_timeout) for session in slots
@@ -217,7 +214,7 @@ class Agent:
                     self._handle(event, address)
                     pending = self._pending()
                 if pending:
-                    self._flush()
+                    _flush(server, self._port)
 
     def _pending(self) -> list[int]:
         """Slots at which it is not the agent's turn."""
@@ -233,7 +230,7 @@ class Agent:
             self._lose(slot, f"the simulator at {address_text(address)} closed: {message.reason}")
             self._keep_sockets()
             if not any(self.server.slots):
-                self._flush()
+                _flush(self.server, self._port)
                 raise PeerClosed(self.lost[slot])
             self._say_waiting(slot)
             return
@@ -296,9 +293,6 @@ class Agent:
     def _last_dropped(self) -> str:
         last = self.server.statistics.last_error
         return f"; last datagram dropped: {last}" if last else ""
-
-    def _flush(self) -> None:
-        _flush(self.server, self._port)
 
 
 class _Required:
