@@ -41,26 +41,17 @@ class _Waiting(BytesIO):
 
 
 class McapFile:
-    """Appends to a new file, in whole records.
+    """Appends to a new file, in whole records. Every method raises `OSError` where that fails.
 
     A write that an exception interrupts (a full device, Ctrl-C) may leave half a record. Then
     nothing more can be written, and `abandon` closes the file after the last whole record.
-
-    Attributes:
-        pending: Messages of the next chunk: channel, nanoseconds since 1970, sequence number,
-            data. Append to it; `flush` takes them.
-
-    Args:
-        path: The file; it must not exist. Nothing is written before the first flush.
-        library: Name and version of the program that writes.
-
-    Raises:
-        FileExistsError: The file exists.
-        OSError: It cannot be written: from every method.
+    Nothing is written before the first flush. `library` is name and version of the program.
     """
 
     def __init__(self, path: Path, library: str) -> None:
         self.pending: list[tuple[int, int, int, bytes]] = []
+        """Messages of the next chunk: channel, nanoseconds since 1970, sequence number, data.
+        Append to it; `flush` takes them."""
         self._schemas: dict[str, dict[str, int]] = {}  # ids by name and text
         self._channels: dict[tuple[str, int], int] = {}  # ids by topic and schema
         self._file = path.open("xb")

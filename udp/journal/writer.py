@@ -77,16 +77,12 @@ class Journal:
         self._open = False
 
     def start(self, statistics: Statistics, slots: Sequence[object] = ()) -> None:
-        """Make the file. Nothing is written before.
+        """Make the file. Raises `FileExistsError`, or `OSError` if it cannot be written.
 
         Args:
             statistics: Those of the link. They are written every 10 s, and at the end.
             slots: Sessions in the slots of an agent; another one in a slot is another session.
                 Only the text codec needs them: there all sessions have the same number.
-
-        Raises:
-            FileExistsError: The file exists.
-            OSError: It cannot be written.
         """
         now = self._flushed = self._counted = time.time_ns()
         versions = software()

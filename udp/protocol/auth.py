@@ -97,8 +97,7 @@ def read_keys(path: Path | str) -> tuple[bytes, ...]:
     A simulator seals with the first. An agent takes what is sealed with any of them: to change a
     key, add the new one to the agent's file, give it to the simulators, then remove the old one.
 
-    Raises:
-        InputError: The file cannot be read, holds something else, or is readable by others.
+    Raises `InputError` if the file cannot be read, holds something else, or others can read it.
     """
     try:
         # A FIFO would block for ever.
@@ -123,9 +122,7 @@ def read_keys(path: Path | str) -> tuple[bytes, ...]:
 def write_key(path: Path) -> None:
     """Write a new random key to a new file, readable by its owner alone.
 
-    Raises:
-        FileExistsError: There is such a file; a key is never replaced.
-        OSError: It cannot be written; then there is no file.
+    Raises `FileExistsError`, for a key is never replaced, or `OSError`; then there is no file.
     """
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)

@@ -54,14 +54,9 @@ _PADS: Final = tuple(bytes(size) for size in range(8))
 
 
 def encode(message: Message, layout: Layout | None = None) -> bytes:
-    """The bytes of a message, whole.
+    """The bytes of a message, whole; a State or a Command needs the layout of its Hello.
 
-    Args:
-        message: Any message.
-        layout: That of the Hello; a State or a Command needs it.
-
-    Raises:
-        InputError: A number, an array or the whole does not fit.
+    Raises `InputError` if a number, an array or the whole does not fit.
     """
     kind = type(message)
     start, crc, encoder, laid_out = _ENCODERS[kind]
@@ -85,10 +80,7 @@ def frame(kind: int, session: int, sequence: int, body: bytes) -> bytes:
 
 
 def check(datagram: bytes) -> tuple[int, int, int]:
-    """Type, session and sequence of a datagram whose header is as it should be.
-
-    Raises `DecodeError` otherwise.
-    """
+    """Type, session and sequence of a datagram. Raises `DecodeError` for a wrong header."""
     if len(datagram) < HEADER_SIZE:
         raise DecodeError(f"header: expected {HEADER_SIZE} bytes, got {len(datagram)}")
     magic, version, kind, crc, session, sequence = _HEADER.unpack_from(datagram)
@@ -104,11 +96,9 @@ def check(datagram: bytes) -> tuple[int, int, int]:
 
 
 def decode(datagram: bytes, layout: Layout | None = None) -> Message:
-    """The message in these bytes. Raises `DecodeError`, and nothing else, for any other bytes.
+    """The message in these bytes, its fragments put together. A State or a Command needs a layout.
 
-    Args:
-        datagram: A whole message, its fragments put together.
-        layout: That of the Hello; without it no State and no Command can be read.
+    Raises `DecodeError`, and nothing else, for any other bytes.
     """
     kind, session, sequence = check(datagram)
     if kind not in _MESSAGES:
@@ -152,10 +142,7 @@ def numbers_of(session: int, sequence: int) -> bytes:
 
 
 def peek(datagram: bytes) -> tuple[int, int, int]:
-    """Type, session and sequence that a datagram claims, nothing verified; zeros if it has none.
-
-    The type of a fragment is that of its message.
-    """
+    """Type (of a fragment its message's), session and sequence that a datagram claims, or zeros."""
     if len(datagram) < HEADER_SIZE or datagram[:2] != MAGIC:
         return 0, 0, 0
     _, _, kind, _, session, sequence = _HEADER.unpack_from(datagram)

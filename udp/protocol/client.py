@@ -236,10 +236,7 @@ class Client:
         return state
 
     def alive(self) -> list[bytes]:
-        """Datagrams that say that the Command of this number is being computed; maybe none.
-
-        May be called from another thread, while this one computes.
-        """
+        """Datagrams of an Alive, maybe none. May be called from another thread than the others."""
         if self._text or self.state is not SimulatorState.READY or not self.sequence:
             return []
         alive = binary.encode(m.Alive(session=self.hello.session, sequence=self.sequence))

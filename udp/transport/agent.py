@@ -104,10 +104,6 @@ class Agent:
         spec: Of the simulator that joined last; None before the first.
         states: The last State of each slot; None before the first.
         lost: For each slot why its simulator was lost during the last exchange; "" if it was not.
-
-    Raises:
-        InputError: An address, a time, an option or the key file is not what it should be.
-        OSError: The port is in use.
     """
 
     def __init__(self, address: Address, config: AgentConfig) -> None:
@@ -153,9 +149,8 @@ class Agent:
     def connect(self) -> None:
         """Wait until it is the agent's turn at every slot.
 
-        Raises:
-            PeerSilent: A slot stayed free, or its simulator fell silent and no other came.
-            PeerClosed: The last simulator ended the exchange.
+        Raises `PeerSilent` if a slot stayed free, or its simulator fell silent and no other came;
+        `PeerClosed` if the last simulator ended the exchange.
         """
         if not self.close.alive:
             raise gym.error.ClosedEnvironmentError("expected an open env, got a closed one")
@@ -166,11 +161,8 @@ class Agent:
         """Send each of these slots its Command, and wait for the States of all.
 
         A simulator that is lost meanwhile is replaced by another that comes; then `lost` says why
-        and `states` has the first State of that one.
-
-        Raises:
-            InputError: The first order is not of the layout, or not finite; nothing was sent.
-            PeerSilent, PeerClosed: As `connect`.
+        and `states` has the first State of that one. Raises `InputError` if the first order is not
+        of the layout, or not finite, and nothing was sent; otherwise as `connect`.
         """
         now = time.monotonic()
         for slot, (actions, what, seeds) in orders.items():
@@ -305,7 +297,7 @@ class _Required:
         self.spec: EnvSpec | None = None  # of the simulator that has flown
         self.worlds = config.worlds
         self.text_spec = cache(self._text_spec)
-        self.text_layout = cache(self._text_layout)
+        self.text_layout = cache(lambda: layout_of(s) if (s := self.text_spec()) else None)
 
     def accept(self, hello: Hello) -> Layout | str:
         """The layout of a simulator, or why it is refused."""
@@ -323,10 +315,8 @@ class _Required:
             drones = "one drone" if self.worlds == 1 else f"{self.worlds} drones"
             return f"expected a simulator of {drones}, got one of {worlds}"
         if config.vehicle_hash is not None and spec.vehicle_hash != config.vehicle_hash:
-            return (
-                f"expected a vehicle of hash {config.vehicle_hash}, "
-                f"got {spec.vehicle} of {spec.vehicle_hash}"
-            )
+            got = f"{spec.vehicle} of {spec.vehicle_hash}"
+            return f"expected a vehicle of hash {config.vehicle_hash}, got {got}"
         if config.options is not None:
             expected = config.expected_options(env_id)
             both_ways = registry.is_known(env_id)
@@ -336,21 +326,15 @@ class _Required:
 
     def _text_spec(self) -> EnvSpec | None:
         """Of a simulator that speaks text, for it tells none; None if text is not flown."""
-        config = self.config
-        if config.env_id is None or not registry.is_known(config.env_id):
+        config, env_id = self.config, self.config.env_id
+        if env_id is None or not registry.is_known(env_id) or config.worlds not in (None, 1):
             return None
-        if config.worlds not in (None, 1):
-            return None
-        spec = registry.env_spec(config.env_id, dict(config.options or {}))
+        spec = registry.env_spec(env_id, dict(config.options or {}))
         try:
             text.check_layout(layout_of(spec))
         except InputError:
             return None
         return spec
-
-    def _text_layout(self) -> Layout | None:
-        spec = self.text_spec()
-        return layout_of(spec) if spec else None
 
 
 @lru_cache(maxsize=4)
@@ -363,17 +347,16 @@ def _options_difference(
     ours: Mapping[str, Any], theirs: Mapping[str, Any], *, both_ways: bool
 ) -> str:
     """In which options two envs differ, in a sentence; "" if in none."""
-    names = [*ours, *(name for name in theirs if name not in ours)] if both_ways else ours
+
+    def told(options: Mapping[str, Any], name: str) -> str:
+        return repr(options[name]) if name in options else "not to be there"
+
     differing = [
-        f"{name} {_told(ours, name)}, got {_told(theirs, name)}"
-        for name in names
+        f"{name} {told(ours, name)}, got {told(theirs, name)}"
+        for name in ({**ours, **theirs} if both_ways else ours)
         if (name in ours, ours.get(name)) != (name in theirs, theirs.get(name))
     ]
     return f"options: expected {'; expected '.join(differing)}" if differing else ""
-
-
-def _told(options: Mapping[str, Any], name: str) -> str:
-    return repr(options[name]) if name in options else "not to be there"
 
 
 def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:

@@ -52,6 +52,7 @@ class Simulator(NotCopied):
         options: Options of the env, by name.
 
     Attributes:
+        address: Address of this side.
         spec: Spec of the env.
         stepped: The loop or the envs.
         observer: Called for every State once it is sent, while the agent thinks; None at first.
@@ -115,15 +116,10 @@ class Simulator(NotCopied):
             )
             self._socket = open_socket(bind, insecure=anywhere, peer=self.server)
             failing.callback(self._socket.close)
+            self.address: Address = self._socket.getsockname()
             if self._journal:
                 self._journal.start(self.link.statistics)
             failing.pop_all()
-
-    @property
-    def address(self) -> Address:
-        """Address of this side."""
-        host, port = self._socket.getsockname()
-        return host, port
 
     def run(self) -> str:
         """Fly until the agent closes; the reason that it gave. A simulator runs once.

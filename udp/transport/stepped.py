@@ -34,7 +34,7 @@ def make_stepped(
     backend: str = "mujoco",
     options: Mapping[str, Any],
 ) -> Stepped:
-    """N drones of an env.
+    """N drones of an env. Raises `InputError` if its spaces or an argument are not right.
 
     Args:
         env: Id of a registered task, of an env of Gymnasium, or one env itself.
@@ -42,9 +42,6 @@ def make_stepped(
         vehicle: MJCF file, for a registered task; None is the paper's.
         backend: `mujoco` or `warp`, for a registered task.
         options: Of the env, by name.
-
-    Raises:
-        InputError: An argument or the env's spaces are not what they should be.
     """
     right = type(num_envs) is int and 1 <= num_envs <= MAX_DRONES
     expect(right, "num_envs", f"1 to {MAX_DRONES}", f"{num_envs!r}")
@@ -128,10 +125,7 @@ class _Singles:
 
 
 def spec_of_gymnasium(env: gym.Env[Any, Any], options: Mapping[str, Any]) -> EnvSpec:
-    """The spec of any Gymnasium env: its own if it has one, else from its spaces.
-
-    Raises `InputError` if a space cannot cross the wire.
-    """
+    """The env's own spec, or one from its spaces. `InputError`: one cannot cross the wire."""
     base: Any = env.unwrapped
     observation = env.observation_space
     boxes = observation.spaces if isinstance(observation, spaces.Dict) else {"": observation}
