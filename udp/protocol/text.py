@@ -54,7 +54,8 @@ def encode(message: State | Command | Close) -> bytes:
         case Close():
             fields = ["close"]
     line = ",".join([str(message.sequence), *fields]).encode()
-    expect(len(line) <= MAX_LINE, "text line", f"at most {MAX_LINE} bytes", f"{len(line)}")
+    if len(line) > MAX_LINE:
+        raise InputError(f"text line: expected at most {MAX_LINE} bytes, got {len(line)}")
     return line
 
 
@@ -167,13 +168,14 @@ def split(datagram: bytes) -> tuple[int, list[str]]:
 
 def _whole(name: str, field: str) -> int:
     number = int(field) if _WHOLE.fullmatch(field) else -1
-    right = 0 <= number <= MAX_UINT64
-    expect(right, name, "a whole number below 2^64", f"{field[:80]!r}")
+    if not 0 <= number <= MAX_UINT64:
+        raise InputError(f"{name}: expected a whole number below 2^64, got {field[:80]!r}")
     return number
 
 
 def _flag(name: str, field: str) -> bool:
-    expect(field in ("0", "1"), name, "0 or 1", f"{field[:80]!r}")
+    if field not in ("0", "1"):
+        raise InputError(f"{name}: expected 0 or 1, got {field[:80]!r}")
     return field == "1"
 
 
