@@ -892,7 +892,7 @@ def test_a_device_that_is_full_from_the_beginning(
 def test_an_interrupted_write_costs_its_chunk_alone(tmp_path: Path) -> None:
     path = tmp_path / "i.mcap"
     file = McapFile(path, "test")
-    channel = file.add_channel("/t", "json", file.add_schema("s", "jsonschema", "{}"))
+    channel = file.channel("/t", "json", "s", "{}")
     for number in range(100):
         file.pending.append((channel, number, number, b"%d" % number))
         if number == 59:

@@ -14,25 +14,21 @@ from importlib import import_module
 from threading import Thread
 from typing import Any, Final
 
-from ..models.errors import InputError
+from ..models.errors import InputError, expect
 from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
 from .transport.simulator import Simulator
 
 _FOR_EVER: Final = 30 * 86_400.0  # s
-_KINDS: Final[dict[str, tuple[type | tuple[type, ...], str]]] = {
+_KINDS: Final[dict[str, tuple[Any, str]]] = {
     "env": (str, "an id"),
     "module": (str, "the name of a module"),
     "options": (dict, "an object"),
-    "vehicle": ((str, type(None)), "a path"),
     "num_envs": (int, "a number"),
-    "backend": (str, "a name"),
-    "codec": (str, "a name"),
-    "server": (list, "[host, port]"),
-    "bind": (list, "[host, port]"),
-    "key_file": ((str, type(None)), "a path"),
+    **dict.fromkeys(("backend", "codec"), (str, "a name")),
+    **dict.fromkeys(("server", "bind"), (list, "[host, port]")),
+    **dict.fromkeys(("vehicle", "key_file", "record"), (str | None, "a path")),
     "insecure": (bool, "true or false"),
-    "record": ((str, type(None)), "a path"),
 }
 
 
@@ -80,11 +76,9 @@ def parse_arguments(words: list[str]) -> dict[str, Any]:
     if not isinstance(arguments, dict):
         raise InputError(f"expected a JSON object, got {words[0][:80]}")
     for name, value in arguments.items():
-        if name not in _KINDS:
-            raise InputError(f"{name}: expected one of {', '.join(_KINDS)}")
+        expect(name in _KINDS, name, f"one of {', '.join(_KINDS)}")
         kind, expected = _KINDS[name]
-        if not isinstance(value, kind):
-            raise InputError(f"{name}: expected {expected}, got {value!r}")
+        expect(isinstance(value, kind), name, expected, f"{value!r}")
     if module := arguments.pop("module", None):
         sys.path.append(os.getcwd())  # last, and with -P not there: it shadows no other module
         import_module(module)

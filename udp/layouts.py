@@ -7,11 +7,7 @@ __all__ = ["layout_of"]
 
 
 def layout_of(spec: EnvSpec, worlds: int = 1) -> Layout:
-    """The layout of so many worlds, each with every drone of the spec.
-
-    Raises:
-        InputError: There are too many drones, or their messages would be too large.
-    """
+    """The layout of so many worlds, each with every drone of the spec. Raises as `Layout`."""
     action = spec.action
     return Layout(
         drones=worlds * len(spec.agents),

@@ -8,9 +8,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from ..envs.autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
-from ..envs.spaces import action_space, joined, observation_space
-from ..envs.spec import Discrete, EnvSpec, component_names
-from ..models.errors import InputError, NotCopied
+from ..envs.spaces import action_space, joined, observation_space, telemetry_names
+from ..envs.spec import Discrete, EnvSpec
+from ..models.errors import InputError, NotCopied, expect
 from .protocol.client import Address
 from .protocol.layout import MAX_DRONES
 from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET, State
@@ -118,10 +118,8 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode in the simulator, with its generator seeded where a seed is given."""
-        if seed is not None and not 0 <= seed <= MAX_UINT64:
-            raise InputError(f"seed: expected 0 to 2^64 - 1, got {seed}")
-        if options:
-            raise InputError(f"options: expected none over UDP, got {options}")
+        expect(seed is None or 0 <= seed <= MAX_UINT64, "seed", "0 to 2^64 - 1", f"{seed}")
+        expect(not options, "options", "none over UDP", f"{options}")
         super().reset(seed=seed)
         self._flying = False
         self.connect()
@@ -179,7 +177,7 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         fps = max(1, round(1 / spec.control_period))
         self.metadata = {"render_modes": [], "render_fps": fps}
         self._arrays = tuple(array.name for array in spec.observation)
-        self._names = tuple(n for array in spec.telemetry for n in component_names(array))
+        self._names = telemetry_names(spec)
         self._take_actions(spec.action, 1)
 
     def _observation(self, state: State) -> Any:
@@ -238,16 +236,13 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         **settings: Unpack[AgentSettings],
     ) -> None:
         self.closed = True  # nothing is open yet
-        if type(num_simulators) is not int or not 1 <= num_simulators <= MAX_DRONES:
-            raise InputError(f"num_simulators: expected 1 to {MAX_DRONES}, got {num_simulators!r}")
+        right = type(num_simulators) is int and 1 <= num_simulators <= MAX_DRONES
+        expect(right, "num_simulators", f"1 to {MAX_DRONES}", f"{num_simulators!r}")
         most = num_simulators * MAX_DRONES
-        if num_envs is not None and (
-            type(num_envs) is not int or not 1 <= num_envs <= most or num_envs % num_simulators
-        ):
-            raise InputError(
-                f"num_envs: expected a multiple of num_simulators = {num_simulators}, at most "
-                f"{most}, got {num_envs!r}"
-            )
+        if num_envs is not None:
+            right = type(num_envs) is int and 1 <= num_envs <= most
+            expected = f"a multiple of num_simulators = {num_simulators}, at most {most}"
+            expect(right and not num_envs % num_simulators, "num_envs", expected, f"{num_envs!r}")
         self.num_simulators, self.num_envs = num_simulators, num_envs or 0
         self._broken: tuple[np.ndarray, np.ndarray] | None = None
         self._mode = autoreset_mode

@@ -21,74 +21,64 @@ from mcap.writer import Writer
 
 from ..protocol.layout import MAX_MESSAGE
 
-__all__ = ["MAGIC", "MAX_CHUNK", "Entry", "McapFile", "read_records"]
+__all__ = ["MAGIC", "MAX_CHUNK", "McapFile", "read_records"]
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_CHUNK: Final = 2 * MAX_MESSAGE
 """Most bytes of a record or of a decompressed chunk that is read. Ours are of 64 KiB, or of one
 message and 256 KiB where that is longer."""
 _MAX_CHANNELS: Final = 0xFFFF
-
-Entry = tuple[int, int, int, bytes]
-"""A message that waits to be written: channel, nanoseconds since 1970, sequence number, data."""
+_SCHEMA_ENCODING: Final = {"ros1": "ros1msg", "json": "jsonschema"}
 
 
 class _Waiting(BytesIO):
     """Whole records that are not in the file yet."""
 
-    begin = 0
-    """Where they will begin in the file."""
+    begin = 0  # of them, in the file
 
     def tell(self) -> int:
         return self.begin + super().tell()
 
 
 class McapFile:
-    """Appends to a new file, in whole records.
+    """Appends to a new file, in whole records. Every method raises `OSError` where that fails.
 
     A write that an exception interrupts (a full device, Ctrl-C) may leave half a record. Then
     nothing more can be written, and `abandon` closes the file after the last whole record.
-
-    Attributes:
-        pending: Messages of the next chunk. Append to it; `flush` takes them.
-
-    Args:
-        path: The file; it must not exist.
-        library: Name and version of the program that writes.
-
-    Raises:
-        FileExistsError: The file exists.
-        OSError: It cannot be written. All other methods raise this too.
+    Nothing is written before the first flush. `library` is name and version of the program.
     """
 
     def __init__(self, path: Path, library: str) -> None:
-        self.pending: list[Entry] = []
+        self.pending: list[tuple[int, int, int, bytes]] = []
+        """Messages of the next chunk: channel, nanoseconds since 1970, sequence number, data.
+        Append to it; `flush` takes them."""
+        self._schemas: dict[str, dict[str, int]] = {}  # ids by name and text
+        self._channels: dict[tuple[str, int], int] = {}  # ids by topic and schema
         self._file = path.open("xb")
         self._waiting = _Waiting()
         self._writer: Any = Writer(self._waiting, chunk_size=sys.maxsize, use_summary_offsets=False)
         self._lock = RLock()
         self._broken = self._busy = False
-        try:
-            with self._whole():
-                self._writer.start("", library)
-        except BaseException:
-            self.abandon()
-            path.unlink()
-            raise
+        self._writer.start("", library)
 
-    def add_schema(self, name: str, encoding: str, text: str) -> int:
-        """Its id."""
-        with self._lock:
-            number: int = self._writer.register_schema(name, encoding, text.encode())
-            return number
+    def channel(self, topic: str, encoding: str, name: str, text: str) -> int:
+        """Id of the channel with this schema: `ros1` or `json`. A file has at most 65,535.
 
-    def add_channel(self, topic: str, encoding: str, schema: int) -> int:
-        """Its id. A file has at most 65,535 channels."""
+        A second schema of the same name, with another text, is numbered.
+        """
         with self._lock:
-            number: int = self._writer.register_channel(topic, encoding, schema)
-            if number > _MAX_CHANNELS:
-                raise OSError(EFBIG, f"more than {_MAX_CHANNELS} channels")
-            return number
+            schemas = self._schemas.setdefault(name, {})
+            if text not in schemas:
+                name += f"{len(schemas) + 1}" if schemas else ""
+                schemas[text] = self._writer.register_schema(
+                    name, _SCHEMA_ENCODING[encoding], text.encode()
+                )
+            key = topic, schemas[text]
+            if key not in self._channels:
+                if len(self._channels) == _MAX_CHANNELS:
+                    raise OSError(EFBIG, f"more than {_MAX_CHANNELS} channels")
+                self._channels[key] = self._writer.register_channel(topic, encoding, key[1])
+            return self._channels[key]
 
     def add_metadata(self, name: str, words: Mapping[str, str]) -> None:
         """Names and values, after all messages before."""
@@ -158,9 +148,6 @@ class McapFile:
         self._broken = False
 
 
-_OPCODE_AND_LENGTH: Final = 9  # bytes, of every record
-
-
 def read_records(file: BinaryIO) -> Iterator[McapRecord]:
     """The records of an MCAP file, those in chunks too, in order.
 
@@ -176,10 +163,9 @@ def read_records(file: BinaryIO) -> Iterator[McapRecord]:
             chunk = _decompressed(record)
             at = count = 0
             while at < len(chunk.data):  # before all of them are made
-                at += _OPCODE_AND_LENGTH + int.from_bytes(chunk.data[at + 1 : at + 9], "little")
+                at += 9 + int.from_bytes(chunk.data[at + 1 : at + 9], "little")  # opcode, length
                 count += 1
-                if count > len(record.data):
-                    most = len(record.data)
+                if count > (most := len(record.data)):
                     raise ValueError(f"expected at most {most} records in so many bytes, got more")
             yield from breakup_chunk(chunk, validate_crc=True)
         else:
@@ -192,14 +178,10 @@ def _decompressed(chunk: Chunk) -> Chunk:
         return chunk
     if chunk.compression != "zstd":
         raise ValueError(f"expected a chunk compressed by zstd, got {chunk.compression!r:.80}")
-    if chunk.uncompressed_size > MAX_CHUNK:
-        size = chunk.uncompressed_size
+    if (size := chunk.uncompressed_size) > MAX_CHUNK:
         raise ValueError(f"expected chunks of at most {MAX_CHUNK} bytes, got one of {size}")
-    stream = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK).stream_reader(
-        BytesIO(chunk.data)
-    )
-    data = stream.read(chunk.uncompressed_size + 1)
-    if len(data) != chunk.uncompressed_size:
-        size = chunk.uncompressed_size
+    decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK)
+    data = decompressor.stream_reader(BytesIO(chunk.data)).read(size + 1)
+    if len(data) != size:
         raise ValueError(f"expected a chunk of {size} bytes, got one of another size")
     return replace(chunk, compression="", data=data)

@@ -22,18 +22,6 @@ from ..protocol.messages import FLY, Close, Command, Hello, Message, Refuse, Sta
 from ._file import MAGIC, read_records
 from .writer import ABOUT, FORMAT
 
-__all__ = [
-    "Item",
-    "Recording",
-    "Session",
-    "SessionSummary",
-    "Summary",
-    "count_of",
-    "printable",
-    "read_journal",
-    "summarize",
-]
-
 _TOPIC: Final = re.compile(r"/slot([0-9]{1,9})/(state|command|events)")
 
 

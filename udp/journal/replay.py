@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -19,8 +19,7 @@ from .writer import software
 __all__ = ["Difference", "SessionVerdict", "Verification", "verify"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Difference:
+class Difference(NamedTuple):
     """The first number of a State that differs."""
 
     sequence: int
@@ -32,10 +31,8 @@ class Difference:
     replayed: str
 
     def __str__(self) -> str:
-        return (
-            f"State {self.sequence}, drone {self.drone}, {self.field}: "
-            f"recorded {self.recorded}, replayed {self.replayed}"
-        )
+        where = f"State {self.sequence}, drone {self.drone}, {self.field}"
+        return f"{where}: recorded {self.recorded}, replayed {self.replayed}"
 
 
 @dataclass(kw_only=True)
@@ -60,8 +57,7 @@ class SessionVerdict:
     _loop: Loop | None = None
     _sequence: int | None = None
     _command: Command | None = None
-    _known: bool = False
-    """Whether the simulated drones are where the recorded ones were."""
+    _known: bool = False  # whether the simulated drones are where the recorded ones were
 
     @property
     def identical(self) -> bool:
@@ -70,10 +66,9 @@ class SessionVerdict:
 
     def lines(self) -> list[str]:
         """The verdict in words."""
-        counts = f"{self.same} States the same in every bit"
-        counts += f", {self.differing} not" if self.differing else ""
-        counts += f", {self.unchecked} before the first seed not compared" if self.unchecked else ""
-        lines = [f"{self.session}: {counts}"]
+        differing = f", {self.differing} not" if self.differing else ""
+        blind = f", {self.unchecked} before the first seed not compared" if self.unchecked else ""
+        lines = [f"{self.session}: {self.same} States the same in every bit{differing}{blind}"]
         lines += [f"  first difference: {self.difference}"] if self.difference else []
         lines += [f"  {self.problem}"] if self.problem else []
         return lines + [f"  note: {note}" for note in self.notes]
@@ -156,10 +151,6 @@ class Verification(Recording):
     Attributes:
         notes: Versions that have changed.
         sessions: The verdict on each.
-
-    Raises:
-        InputError: It is not a journal.
-        OSError: It cannot be read.
     """
 
     def __init__(self, path: Path | str, *, vehicle: Path | str | None = None) -> None:
@@ -212,34 +203,27 @@ def _difference(recorded: State, loop: Loop) -> Difference | None:
     pairs = list(_arrays(recorded, loop))
     if all(was.tobytes() == now.tobytes() for _, was, now in pairs):
         return None
-    return next(
-        Difference(
-            sequence=recorded.sequence,
-            drone=drone,
-            field=name,
-            recorded=_digits(old),
-            replayed=_digits(new),
-        )
+    drone, name, old, new = next(
+        (drone, name, old, new)
         for drone in range(loop.num_envs)
         for names, was, now in pairs
         for name, old, new in zip(names, was[drone].flat, now[drone].flat, strict=True)
         if old.tobytes() != new.tobytes()
     )
+    return Difference(recorded.sequence, drone, name, _digits(old), _digits(new))
 
 
-def _arrays(
-    recorded: State, loop: Loop
-) -> Iterator[tuple[tuple[str, ...], np.ndarray, np.ndarray]]:
+def _arrays(recorded: State, loop: Loop) -> Iterator[tuple[list[str], np.ndarray, np.ndarray]]:
     """Names of the numbers of one drone, the recorded array and the replayed one."""
-    yield ("reward",), recorded.rewards, loop.rewards
-    yield ("terminated",), recorded.terminated, loop.terminated
-    yield ("truncated",), recorded.truncated, loop.truncated
+    yield ["reward"], recorded.rewards, loop.rewards
+    yield ["terminated"], recorded.terminated, loop.terminated
+    yield ["truncated"], recorded.truncated, loop.truncated
     for what, specs, arrays, here in (
         ("telemetry", loop.spec.telemetry, recorded.telemetry, loop.telemetry),
         ("observation", loop.spec.observation, recorded.observations, loop.observations),
     ):
         for spec, was in zip(specs, arrays, strict=True):
-            names = tuple(f"{what} {name}" for name in component_names(spec))
+            names = [f"{what} {name}" for name in component_names(spec)]
             yield names, was, np.ascontiguousarray(here[spec.name], was.dtype)
 
 

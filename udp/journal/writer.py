@@ -11,13 +11,13 @@ import platform
 import re
 import time
 import weakref
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
-from ...envs.spec import EnvSpec
+from ...envs.spec import ArraySpec, EnvSpec
 from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.layout import COMMAND_ARRAYS_AT, STATE_ARRAYS_AT, Layout, Slot
@@ -25,20 +25,15 @@ from ..protocol.messages import Command, Hello, Message, State
 from ..protocol.statistics import Statistics
 from ._file import McapFile
 
-__all__ = ["ABOUT", "FORMAT", "MODEL", "Journal", "model_of", "software"]
+__all__ = ["ABOUT", "FORMAT", "Journal", "model_of", "software"]
 
-ABOUT: Final = "rotorgram"
-"""Name of the metadata about the whole file; those of each session are named `session`."""
-FORMAT: Final = "2"
-"""Version of the content of the file, beside the protocol's version in each datagram."""
-MODEL: Final = "model.xml"
-"""Name of the attachment that is the whole vehicle of the simulator, as MJCF."""
+ABOUT: Final = "rotorgram"  # name of the metadata about the whole file
+FORMAT: Final = "2"  # version of the file's content, beside the protocol's in each datagram
 
 _CHUNK: Final = 1 << 16  # bytes; 2 ms to write
 _SECOND: Final = 10**9
 _STATISTICS: Final = 10 * _SECOND
-_SEEDED: Final = binary.COMMAND | 0x100
-"""Kind of a Command with seeds: its ROS 1 message has one more array."""
+_SEEDED: Final = binary.COMMAND | 0x100  # a Command whose ROS 1 message has one more array
 _ONE: Final = object()
 _PACKAGES: Final = ("rotorgram", "mujoco", "gymnasium", "numpy", "mcap")
 
@@ -52,10 +47,8 @@ uint64 session
 uint64 sequence
 """
 _EVENT: Final = "rotorgram.Event", '{"type": "object"}'
-_NUMBERS: Final = (
-    "rotorgram.Statistics",
-    '{"type": "object", "additionalProperties": {"type": "number"}}',
-)
+_NUMBER: Final = '{"type": "object", "additionalProperties": {"type": "number"}}'
+_NUMBERS: Final = "rotorgram.Statistics", _NUMBER
 
 
 class Journal:
@@ -75,30 +68,21 @@ class Journal:
     def __init__(
         self, path: Path | str, *, side: str, text_hello: Hello | None = None, model: str = ""
     ) -> None:
-        self._path = Path(path)
-        self._side = side
-        self._model = model
+        self._path, self._side, self._model = Path(path), side, model
         self._text_hello = text_hello
         self._slots: Sequence[object] = ()
         self._holders: dict[int, object] = {}
-        self._schemas: dict[str, dict[str, int]] = {}
-        self._topics: dict[tuple[str, int], int] = {}
-        self._channels: dict[tuple[int, int], int] = {}
-        """Channel by slot and kind: State, Command, or Command with seeds."""
+        self._channels: dict[tuple[int, int], int] = {}  # by slot and kind: binary's or _SEEDED
         self._size = self._sessions = 0
         self._open = False
 
     def start(self, statistics: Statistics, slots: Sequence[object] = ()) -> None:
-        """Make the file. Nothing is written before.
+        """Make the file. Raises `FileExistsError`, or `OSError` if it cannot be written.
 
         Args:
             statistics: Those of the link. They are written every 10 s, and at the end.
             slots: Sessions in the slots of an agent; another one in a slot is another session.
                 Only the text codec needs them: there all sessions have the same number.
-
-        Raises:
-            FileExistsError: The file exists.
-            OSError: It cannot be written.
         """
         now = self._flushed = self._counted = time.time_ns()
         versions = software()
@@ -112,7 +96,7 @@ class Journal:
         try:
             file.add_metadata(ABOUT, {"format": FORMAT, "side": self._side, **about})
             if self._model:
-                file.add_attachment(MODEL, "application/xml", self._model.encode(), now)
+                file.add_attachment("model.xml", "application/xml", self._model.encode(), now)
         except BaseException:
             file.abandon()
             self._path.unlink()
@@ -207,13 +191,10 @@ class Journal:
             "spec": hello.spec,
         }
         self._file.add_metadata("session", words)
-        for kind, topic, name, text in (
-            (binary.STATE, "state", "State", _state_schema(spec, layout)),
-            (binary.COMMAND, "command", "Command", _command_schema(layout, seeded=False)),
-            (_SEEDED, "command", "SeededCommand", _command_schema(layout, seeded=True)),
-        ):
-            schema = self._schema(f"rotorgram/{name}", "ros1msg", text)
-            self._channels[slot, kind] = self._topic(f"/slot{slot}/{topic}", "ros1", schema)
+        for kind, topic, name, text in _schemas(spec, layout):
+            self._channels[slot, kind] = self._file.channel(
+                f"/slot{slot}/{topic}", "ros1", f"rotorgram/{name}", text
+            )
         words = _words(hello, datagram) | {"codec": codec}
         self._add_json(f"/slot{slot}/events", _EVENT, words, now)
 
@@ -224,22 +205,8 @@ class Journal:
     def _add_json(
         self, topic: str, schema: tuple[str, str], words: Mapping[str, Any], now: int
     ) -> None:
-        name, text = schema
-        channel = self._topic(topic, "json", self._schema(name, "jsonschema", text))
+        channel = self._file.channel(topic, "json", *schema)
         self._pending.append((channel, now, 0, json.dumps(words).encode()))
-
-    def _schema(self, name: str, encoding: str, text: str) -> int:
-        """Id of a schema. A second one of the same name, of another layout, is numbered."""
-        known = self._schemas.setdefault(name, {})
-        if text not in known:
-            number = f"{len(known) + 1}" if known else ""
-            known[text] = self._file.add_schema(name + number, encoding, text)
-        return known[text]
-
-    def _topic(self, topic: str, encoding: str, schema: int) -> int:
-        if (topic, schema) not in self._topics:
-            self._topics[topic, schema] = self._file.add_channel(topic, encoding, schema)
-        return self._topics[topic, schema]
 
 
 def software() -> dict[str, str]:
@@ -264,21 +231,20 @@ def model_of(stepped: Any) -> str:
 # ---- ROS 1 messages
 
 
-def _state_schema(spec: EnvSpec, layout: Layout) -> str:
-    """A State of this layout as a ROS 1 message."""
-    observation = _field_names("observation", (array.name for array in spec.observation))
-    telemetry = _field_names("telemetry", (array.name for array in spec.telemetry))
+def _schemas(spec: EnvSpec, layout: Layout) -> Iterator[tuple[int, str, str, str]]:
+    """Kind, topic, name and text of each ROS 1 message of this layout."""
+    observation = _field_names("observation", spec.observation)
+    telemetry = _field_names("telemetry", spec.telemetry)
     slots = (*layout.observation_slots, layout.rewards, *layout.flags, *layout.telemetry_slots)
-    names = (*observation, "rewards", "terminated", "truncated", *telemetry)
-    fixed = "float64 time\nuint64 nonce\n"
-    return _schema_text(fixed, STATE_ARRAYS_AT, zip(names, slots, strict=True))
-
-
-def _command_schema(layout: Layout, *, seeded: bool) -> str:
-    """A Command of this layout as a ROS 1 message."""
+    named = zip(
+        (*observation, "rewards", "terminated", "truncated", *telemetry), slots, strict=True
+    )
+    text = _schema_text("float64 time\nuint64 nonce\n", STATE_ARRAYS_AT, named)
+    yield binary.STATE, "state", "State", text
     arrays = [("actions", layout.actions), ("orders", layout.orders), ("seeds", layout.seeds)]
-    fixed = "uint32 seed_count\nuint8[4] reserved\n"
-    return _schema_text(fixed, COMMAND_ARRAYS_AT, arrays if seeded else arrays[:2])
+    for kind, name, count in (binary.COMMAND, "Command", 2), (_SEEDED, "SeededCommand", 3):
+        fixed = "uint32 seed_count\nuint8[4] reserved\n"
+        yield kind, "command", name, _schema_text(fixed, COMMAND_ARRAYS_AT, arrays[:count])
 
 
 def _schema_text(fixed: str, at: int, arrays: Iterable[tuple[str, Slot]]) -> str:
@@ -292,11 +258,11 @@ def _schema_text(fixed: str, at: int, arrays: Iterable[tuple[str, Slot]]) -> str
     return text
 
 
-def _field_names(prefix: str, names: Iterable[str]) -> list[str]:
-    """Names made into different ones that ROS 1 allows."""
+def _field_names(prefix: str, arrays: Iterable[ArraySpec]) -> list[str]:
+    """Names of arrays, made into different ones that ROS 1 allows."""
     fields: list[str] = []
-    for name in names:
-        field = f"{prefix}_{re.sub(r'[^a-zA-Z0-9_]', '_', name)}"
+    for array in arrays:
+        field = f"{prefix}_{re.sub(r'[^a-zA-Z0-9_]', '_', array.name)}"
         while field in fields:
             field += "_"
         fields.append(field)

@@ -18,22 +18,19 @@ from hmac import compare_digest
 from pathlib import Path
 from typing import Final, Literal
 
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from .errors import Forged
 
 __all__ = ["OVERHEAD", "Key", "is_sealed", "key_id", "message_of", "read_keys", "write_key"]
 
-KEY_SIZE: Final = 32
-"""Bytes of a shared key."""
-OVERHEAD: Final = 24
-"""Bytes that sealing adds to a datagram."""
+KEY_SIZE: Final = 32  # bytes of a shared key
+OVERHEAD: Final = 24  # bytes that sealing adds to a datagram
 
 _MAGIC: Final = b"\xa7S"
 _ID_SIZE: Final = 6
 _TAG_AT: Final = 2 + _ID_SIZE
 _TAG_SIZE: Final = 16
-_LONGEST_FILE: Final = 1 << 12
-"""Bytes."""
+_LONGEST_FILE: Final = 1 << 12  # bytes
 
 Side = Literal["simulator", "agent"]
 
@@ -46,11 +43,9 @@ class Key:
     """
 
     def __init__(self, secret: bytes, side: Side, *, id_: bytes = b"") -> None:
-        if len(secret) != KEY_SIZE:
-            raise InputError(f"key: expected {KEY_SIZE} bytes, got {len(secret)}")
+        expect(len(secret) == KEY_SIZE, "key", f"{KEY_SIZE} bytes", f"{len(secret)}")
         self._secret = secret
         self.id = id_ or blake2b(key=secret, digest_size=_ID_SIZE, person=b"key id").digest()
-        """6 bytes."""
         self._envelope = _MAGIC + self.id
         self._side = side
         there = "agent" if side == "simulator" else "simulator"
@@ -102,8 +97,7 @@ def read_keys(path: Path | str) -> tuple[bytes, ...]:
     A simulator seals with the first. An agent takes what is sealed with any of them: to change a
     key, add the new one to the agent's file, give it to the simulators, then remove the old one.
 
-    Raises:
-        InputError: The file cannot be read, holds something else, or is readable by others.
+    Raises `InputError` if the file cannot be read, holds something else, or others can read it.
     """
     try:
         # A FIFO would block for ever.
@@ -113,26 +107,22 @@ def read_keys(path: Path | str) -> tuple[bytes, ...]:
             text = file.read(_LONGEST_FILE) if stat.S_ISREG(mode) else b""
     except OSError as error:
         raise InputError(f"key file: cannot read {path}: {error.strerror}") from None
-    if os.name == "posix" and stat.S_ISREG(mode) and mode & 0o077:
-        raise InputError(
-            f"key file: expected {path} to be readable by its owner alone (chmod 600), "
-            f"got mode {mode & 0o777:o}"
-        )
+    private = os.name != "posix" or not stat.S_ISREG(mode) or not mode & 0o077
+    expected = f"{path} to be readable by its owner alone (chmod 600)"
+    expect(private, "key file", expected, f"mode {mode & 0o777:o}")
     try:
         keys = tuple(bytes.fromhex(line) for line in text.decode("ascii").split())
     except ValueError:
         keys = ()
-    if not keys or any(len(key) != KEY_SIZE for key in keys):
-        raise InputError(f"key file: expected {2 * KEY_SIZE} hexadecimal digits in {path}")
+    right = keys and all(len(key) == KEY_SIZE for key in keys)
+    expect(right, "key file", f"{2 * KEY_SIZE} hexadecimal digits in {path}")
     return keys
 
 
 def write_key(path: Path) -> None:
     """Write a new random key to a new file, readable by its owner alone.
 
-    Raises:
-        FileExistsError: There is such a file; a key is never replaced.
-        OSError: It cannot be written; then there is no file.
+    Raises `FileExistsError`, for a key is never replaced, or `OSError`; then there is no file.
     """
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)

@@ -13,50 +13,12 @@ from typing import Any, Final
 import numpy as np
 
 from ...models.errors import InputError
+from . import messages
 from .errors import DecodeError, VersionMismatch
 from .layout import COMMAND_ARRAYS_AT, MAX_MESSAGE, Layout, Slot
-from .messages import (
-    MAX_SPEC,
-    MAX_TEXT,
-    Alive,
-    Close,
-    Command,
-    Extension,
-    Hello,
-    Message,
-    Missing,
-    Refuse,
-    State,
-    Unknown,
-    Wait,
-    Welcome,
-)
+from .messages import MAX_SPEC, MAX_TEXT, Command, Extension, Message, State
 
-__all__ = [
-    "ALIVE",
-    "CLOSE",
-    "COMMAND",
-    "FRAGMENT",
-    "HEADER_SIZE",
-    "HELLO",
-    "MAGIC",
-    "MISSING",
-    "OF_SESSION",
-    "REFUSE",
-    "STATE",
-    "UNKNOWN",
-    "VERSION",
-    "check",
-    "decode",
-    "decode_due",
-    "encode",
-    "frame",
-    "numbers_of",
-    "peek",
-]
-
-MAGIC: Final = b"\xa7R"
-"""Not UTF-8, so that no text datagram begins with it."""
+MAGIC: Final = b"\xa7R"  # not UTF-8, so that no text datagram begins with it
 VERSION: Final = 2
 HEADER_SIZE: Final = 24
 
@@ -71,13 +33,11 @@ UNKNOWN: Final = 8
 ALIVE: Final = 9
 MISSING: Final = 10
 
-FRAGMENT: Final = 0x80
-"""Set in the type of a fragment of a message."""
+FRAGMENT: Final = 0x80  # set in the type of a fragment of a message
 OF_SESSION: Final = frozenset({STATE, COMMAND, CLOSE, ALIVE})
 """Types that belong to an open session, as Missing does but for that of a Hello."""
 
-_NUMBERED: Final = OF_SESSION | {UNKNOWN, MISSING}
-"""Types that have a sequence number."""
+_NUMBERED: Final = OF_SESSION | {UNKNOWN, MISSING}  # types that have a sequence number
 
 _HEADER: Final = struct.Struct("<2sBBIQQ")
 _NUMBERS: Final = struct.Struct("<QQ")  # session, sequence: the end of the header
@@ -94,14 +54,9 @@ _PADS: Final = tuple(bytes(size) for size in range(8))
 
 
 def encode(message: Message, layout: Layout | None = None) -> bytes:
-    """The bytes of a message, whole.
+    """The bytes of a message, whole; a State or a Command needs the layout of its Hello.
 
-    Args:
-        message: Any message.
-        layout: That of the Hello; a State or a Command needs it.
-
-    Raises:
-        InputError: A number, an array or the whole does not fit.
+    Raises `InputError` if a number, an array or the whole does not fit.
     """
     kind = type(message)
     start, crc, encoder, laid_out = _ENCODERS[kind]
@@ -125,10 +80,7 @@ def frame(kind: int, session: int, sequence: int, body: bytes) -> bytes:
 
 
 def check(datagram: bytes) -> tuple[int, int, int]:
-    """Type, session and sequence of a datagram whose header is as it should be.
-
-    Raises `DecodeError` otherwise.
-    """
+    """Type, session and sequence of a datagram. Raises `DecodeError` for a wrong header."""
     if len(datagram) < HEADER_SIZE:
         raise DecodeError(f"header: expected {HEADER_SIZE} bytes, got {len(datagram)}")
     magic, version, kind, crc, session, sequence = _HEADER.unpack_from(datagram)
@@ -144,11 +96,9 @@ def check(datagram: bytes) -> tuple[int, int, int]:
 
 
 def decode(datagram: bytes, layout: Layout | None = None) -> Message:
-    """The message in these bytes. Raises `DecodeError`, and nothing else, for any other bytes.
+    """The message in these bytes, its fragments put together. A State or a Command needs a layout.
 
-    Args:
-        datagram: A whole message, its fragments put together.
-        layout: That of the Hello; without it no State and no Command can be read.
+    Raises `DecodeError`, and nothing else, for any other bytes.
     """
     kind, session, sequence = check(datagram)
     if kind not in _MESSAGES:
@@ -192,10 +142,7 @@ def numbers_of(session: int, sequence: int) -> bytes:
 
 
 def peek(datagram: bytes) -> tuple[int, int, int]:
-    """Type, session and sequence that a datagram claims, nothing verified; zeros if it has none.
-
-    The type of a fragment is that of its message.
-    """
+    """Type (of a fragment its message's), session and sequence that a datagram claims, or zeros."""
     if len(datagram) < HEADER_SIZE or datagram[:2] != MAGIC:
         return 0, 0, 0
     _, _, kind, _, session, sequence = _HEADER.unpack_from(datagram)
@@ -341,7 +288,7 @@ _HEADERLESS: Final = bytes(HEADER_SIZE)
 # ---- all others: the body of a message, and its fields
 
 
-def _encode_hello(m: Hello) -> bytes:
+def _encode_hello(m: messages.Hello) -> bytes:
     spec = m.spec.encode()
     return _HELLO_BODY.pack(*m.versions, m.worlds, len(spec)) + spec + _extensions(m.extensions)
 
@@ -356,7 +303,7 @@ def _decode_hello(body: bytes) -> dict[str, Any]:
     return {"spec": spec, "worlds": worlds, "versions": (low, high), "extensions": extensions}
 
 
-def _encode_welcome(m: Welcome) -> bytes:
+def _encode_welcome(m: messages.Welcome) -> bytes:
     body = _WELCOME_BODY.pack(m.nonce, m.seed or 0, m.seed is not None, m.version)
     return body + _extensions(m.extensions)
 
@@ -370,7 +317,7 @@ def _decode_welcome(body: bytes) -> dict[str, Any]:
     return {"nonce": nonce, "version": version, "seed": seed, "extensions": extensions}
 
 
-def _encode_nothing(m: Wait | Unknown | Alive) -> bytes:
+def _encode_nothing(m: messages.Wait | messages.Unknown | messages.Alive) -> bytes:
     return b""
 
 
@@ -379,7 +326,7 @@ def _decode_nothing(body: bytes) -> dict[str, Any]:
     return {}
 
 
-def _encode_missing(m: Missing) -> bytes:
+def _encode_missing(m: messages.Missing) -> bytes:
     return _MISSING_BODY.pack(m.kind, m.count, m.first) + m.bitmap
 
 
@@ -389,7 +336,7 @@ def _decode_missing(body: bytes) -> dict[str, Any]:
     return {"kind": kind, "count": count, "first": first, "bitmap": bitmap}
 
 
-def _encode_reason(m: Refuse | Close) -> bytes:
+def _encode_reason(m: messages.Refuse | messages.Close) -> bytes:
     raw = m.reason.encode()
     return _LENGTH.pack(len(raw)) + raw
 
@@ -429,16 +376,16 @@ _LAID_OUT: Final = (State, Command)
 """Messages that mean something with a layout only: their codecs take it, and whole datagrams."""
 
 _MESSAGES: Final[dict[int, tuple[Callable[..., Any], Callable[..., bytes], Callable[..., Any]]]] = {
-    HELLO: (Hello, _encode_hello, _decode_hello),
-    _WELCOME: (Welcome, _encode_welcome, _decode_welcome),
-    REFUSE: (Refuse, _encode_reason, _decode_reason),
+    HELLO: (messages.Hello, _encode_hello, _decode_hello),
+    _WELCOME: (messages.Welcome, _encode_welcome, _decode_welcome),
+    REFUSE: (messages.Refuse, _encode_reason, _decode_reason),
     STATE: (State, _encode_state, _decode_state),
     COMMAND: (Command, _encode_command, _decode_command),
-    CLOSE: (Close, _encode_reason, _decode_reason),
-    _WAIT: (Wait, _encode_nothing, _decode_nothing),
-    UNKNOWN: (Unknown, _encode_nothing, _decode_nothing),
-    ALIVE: (Alive, _encode_nothing, _decode_nothing),
-    MISSING: (Missing, _encode_missing, _decode_missing),
+    CLOSE: (messages.Close, _encode_reason, _decode_reason),
+    _WAIT: (messages.Wait, _encode_nothing, _decode_nothing),
+    UNKNOWN: (messages.Unknown, _encode_nothing, _decode_nothing),
+    ALIVE: (messages.Alive, _encode_nothing, _decode_nothing),
+    MISSING: (messages.Missing, _encode_missing, _decode_missing),
 }
 
 _STARTS: Final = {kind: MAGIC + bytes((VERSION, kind)) for kind in _MESSAGES}

@@ -14,67 +14,37 @@ from typing import Final
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import expect
 from . import binary, text
+from . import messages as m
 from .auth import Key, is_sealed, message_of
 from .errors import DecodeError, Forged
 from .fragments import FAR, NEAR, Assembler, Transfer, Window, asks, is_fragment
 from .layout import Layout
-from .messages import (
-    Alive,
-    Close,
-    Command,
-    Hello,
-    Message,
-    Missing,
-    Refuse,
-    State,
-    Unknown,
-    Wait,
-    Welcome,
-    one_line,
-)
+from .messages import Command, Message, State, one_line
 from .statistics import Statistics
 from .transitions import SIMULATOR, SimulatorState, Way
 
-__all__ = [
-    "CLOSE_INTERVAL",
-    "CLOSE_LINGER",
-    "Address",
-    "Client",
-    "LinkConfig",
-    "RoundTrips",
-    "Tap",
-    "largest_datagram",
-    "new_session",
-]
-
-Address = tuple[str, int]
-"""IPv4 host and port."""
+Address = tuple[str, int]  # IPv4 host and port
 
 Tap = Callable[[int, Message, bytes], None]
 """Sees every message once, when it is first sent or taken: the number of its slot (0 at the
 simulator), the message, and its bytes in the binary codec, whole and not sealed."""
 
+_Moving = m.Welcome | m.Refuse | Command | m.Close
+
 CLOSE_INTERVAL: Final = 0.025
 """A Close is repeated after so long, s, until the other side has answered it with its own."""
-CLOSE_LINGER: Final = 0.25
-"""Longest wait for that answer, s: the other side may be gone."""
+CLOSE_LINGER: Final = 0.25  # longest wait for that answer, s: the other side may be gone
 
-_FIRST_RESEND: Final = 0.2
-"""Wait before a resend while no round trip has been measured, s."""
+_FIRST_RESEND: Final = 0.2  # wait before a resend while no round trip has been measured, s
 _GRANULARITY: Final = 0.005
 """A system may let a process wait for so long, s: the least that is added to a round trip."""
-_LONGEST_RESEND: Final = 1.0
-"""Longest wait before a resend, s."""
-_PATIENCE: Final = 8
-"""Resends before the waits double: most that was lost was lost by chance."""
-
-
+_LONGEST_RESEND: Final = 1.0  # longest wait before a resend, s
+_PATIENCE: Final = 8  # resends before the waits double: most that was lost was lost by chance
 _LATER: Final = 1.25
 """By so much each Alive for a State lengthens the wait before the next is asked for."""
-_TOO_EARLY: Final = 1.5
-"""By so much round trips are taken for longer when answers come twice."""
+_TOO_EARLY: Final = 1.5  # by so much round trips are taken for longer when answers come twice
 _AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING, Way.RECEIVED, Command]
 
 
@@ -102,10 +72,10 @@ class LinkConfig:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if value is not None and not (isfinite(value) and value > 0):
-                raise InputError(f"{field.name}: expected a number > 0, got {value}")
-        if self.max_datagram is not None and self.max_datagram < 256:
-            raise InputError(f"max_datagram: expected at least 256, got {self.max_datagram}")
+            right = value is None or (isfinite(value) and value > 0)
+            expect(right, field.name, "a number > 0", f"{value}")
+        most = self.max_datagram
+        expect(most is None or most >= 256, "max_datagram", "at least 256", f"{most}")
 
 
 class RoundTrips:
@@ -123,8 +93,7 @@ class RoundTrips:
         self._variation = 0.0
         self._sent_at = 0.0
         self._is_repeat = self._was_repeated = self._came_twice = self._says_alive = False
-        self._in_a_row = 0
-        """Messages in a row that were repeated, and then answered twice."""
+        self._in_a_row = 0  # messages in a row that were repeated, and then answered twice
 
     def sent(self, now: float, *, first: bool = False) -> None:
         """Something was sent that wants an answer, for the first time or again."""
@@ -192,7 +161,7 @@ class Client:
 
     def __init__(
         self,
-        hello: Hello,
+        hello: m.Hello,
         layout: Layout,
         config: LinkConfig,
         *,
@@ -203,8 +172,7 @@ class Client:
         draw_session: Callable[[], int] = new_session,
     ) -> None:
         if by_text:
-            if key:
-                raise InputError("text codec: expected no key, got one: only binary can be sealed")
+            expect(not key, "text codec", "no key", "one: only binary can be sealed")
             text.check_layout(layout)
         self.hello = hello
         self.layout = layout
@@ -268,24 +236,21 @@ class Client:
         return state
 
     def alive(self) -> list[bytes]:
-        """Datagrams that say that the Command of this number is being computed; maybe none.
-
-        May be called from another thread, while this one computes.
-        """
+        """Datagrams of an Alive, maybe none. May be called from another thread than the others."""
         if self._text or self.state is not SimulatorState.READY or not self.sequence:
             return []
-        alive = binary.encode(Alive(session=self.hello.session, sequence=self.sequence))
+        alive = binary.encode(m.Alive(session=self.hello.session, sequence=self.sequence))
         return [self._session_key.seal(alive) if self._session_key else alive]
 
     def close(self, reason: str, now: float) -> None:
         """End the exchange. An agent that has welcomed this simulator is told, until it answers."""
-        if (self.state, Way.SENT, Close) in SIMULATOR:
+        if (self.state, Way.SENT, m.Close) in SIMULATOR:
             session, number = self.hello.session, self.sequence
-            self._send(Close(session=session, sequence=number, reason=one_line(reason)), now)
+            self._send(m.Close(session=session, sequence=number, reason=one_line(reason)), now)
         elif self.state is not SimulatorState.CLOSING:
             self._end()  # a Hello that was not answered is not repeated
 
-    def receive(self, datagram: bytes, now: float) -> Welcome | Refuse | Command | Close | None:
+    def receive(self, datagram: bytes, now: float) -> _Moving | None:
         """Take a datagram from the agent; the message, if it moves the exchange on."""
         self.statistics.counters["received"] += 1
         if self.state is SimulatorState.WAITING and self._is_plain:
@@ -297,9 +262,7 @@ class Client:
                 return self._take(message, _AFTER_COMMAND, datagram, now)
         return self._receive_any(datagram, now)
 
-    def _receive_any(
-        self, datagram: bytes, now: float
-    ) -> Welcome | Refuse | Command | Close | None:
+    def _receive_any(self, datagram: bytes, now: float) -> _Moving | None:
         """Whatever comes: `receive` knows only the Command that is waited for."""
         try:
             plain = datagram if self._key is None else self._open(datagram)
@@ -325,7 +288,7 @@ class Client:
         state = SIMULATOR.get((self.state, Way.RECEIVED, type(message)))
         number = getattr(message, "sequence", self.sequence)
         # There is one Close in a session, so its number does not matter.
-        if state is None or (number != self.sequence and not isinstance(message, Close)):
+        if state is None or (number != self.sequence and not isinstance(message, m.Close)):
             if isinstance(message, Command) and self.sequence - message.sequence <= 1:
                 self._round_trips.answered_again()
             self._drop("stale", "", now)
@@ -376,7 +339,7 @@ class Client:
 
     def _take(
         self, message: Message, state: SimulatorState, plain: bytes, now: float
-    ) -> Welcome | Refuse | Command | Close | None:
+    ) -> _Moving | None:
         """A message that may come now."""
         if isinstance(message, Command):
             self.state, self._transfer = state, None
@@ -386,11 +349,11 @@ class Client:
             self._round_trips.answered(now)
             return message
         was_closing = self.state is SimulatorState.CLOSING
-        if isinstance(message, Missing | Wait | Alive):  # the agent is there: this is no silence
-            self._deadline = now + self._config.timeout
-            if isinstance(message, Missing):
+        if isinstance(message, m.Missing | m.Wait | m.Alive):
+            self._deadline = now + self._config.timeout  # the agent is there: this is no silence
+            if isinstance(message, m.Missing):
                 self._resend_missing(message, now)
-            elif isinstance(message, Alive):  # others are late
+            elif isinstance(message, m.Alive):  # others are late
                 self._round_trips.answered(now, alive=True)
                 self._progress(now)
                 self._alives += 1
@@ -399,27 +362,27 @@ class Client:
                 self._is_queued = True
                 self.statistics.notice("every slot of the agent is taken; waiting for a free one")
             return None
-        if isinstance(message, Welcome) and (reason := self._unfit(message)):
+        if isinstance(message, m.Welcome) and (reason := self._unfit(message)):
             self._drop("malformed", reason, now)
             return None
         self.state = state
         self._record(message, plain)
-        if isinstance(message, Unknown):
+        if isinstance(message, m.Unknown):
             self._begin_again(now)
             return None
         self._transfer = None
-        if isinstance(message, Welcome):
+        if isinstance(message, m.Welcome):
             self.statistics.counters["sessions"] += 1
             self._nonce = message.nonce
             if self._key:
                 self._session_key = self._key.for_session(message.session, message.nonce)
-        elif isinstance(message, Close) and not was_closing:
-            close = Close(session=message.session, sequence=self.sequence, reason="")
+        elif isinstance(message, m.Close) and not was_closing:
+            close = m.Close(session=message.session, sequence=self.sequence, reason="")
             data = self._encode(close)
             self._put([data], self._session_key)
             self.statistics.counters["sent"] += 1
             self._record(close, data)
-        assert isinstance(message, Welcome | Refuse | Close)
+        assert isinstance(message, _Moving)
         return message
 
     def _open(self, datagram: bytes) -> bytes:
@@ -428,7 +391,7 @@ class Client:
         assert key is not None
         if not is_sealed(datagram):
             message = binary.decode(datagram, self.layout)
-            words = f" that says: {message.reason}" if isinstance(message, Refuse) else ""
+            words = f" that says: {message.reason}" if isinstance(message, m.Refuse) else ""
             raise Forged(f"not sealed, a {type(message).__name__}{words}")
         kind, _, sequence = binary.peek(message_of(datagram))
         if kind == binary.UNKNOWN:  # answers this very State, not a forged one
@@ -461,7 +424,7 @@ class Client:
         self._tries = 1
         self._resend_at = now + self._round_trips.wait(1)
 
-    def _resend_missing(self, missing: Missing, now: float) -> None:
+    def _resend_missing(self, missing: m.Missing, now: float) -> None:
         """Send again what the agent lacks of the outstanding message."""
         if self._transfer is None or missing.kind != binary.peek(self._transfer.message)[0]:
             self._drop("stale", "", now)
@@ -471,7 +434,7 @@ class Client:
         self._put(self._transfer.resend(missing), self._transfer_key)
         self._progress(now)
 
-    def _unfit(self, welcome: Welcome) -> str:
+    def _unfit(self, welcome: m.Welcome) -> str:
         """The reason to refuse a Welcome, or ""."""
         low, high = self.hello.versions
         if not low <= welcome.version <= high:
@@ -491,7 +454,7 @@ class Client:
 
     # ---- what is sent
 
-    def _send(self, message: Hello | State | Close, now: float) -> None:
+    def _send(self, message: m.Hello | State | m.Close, now: float) -> None:
         """Send a message and repeat it until it is answered."""
         data = self._encode(message)
         if self._tap:
@@ -499,14 +462,14 @@ class Client:
         self._transfer = transfer = Transfer(data, self._largest, self._window)
         self._due = data[8:24]
         kind = type(message)
-        self._transfer_key = self._key if kind is Hello else self._session_key
+        self._transfer_key = self._key if kind is m.Hello else self._session_key
         self.state = SIMULATOR[self.state, Way.SENT, kind]
-        self.sequence = 0 if isinstance(message, Hello) else message.sequence
+        self.sequence = 0 if isinstance(message, m.Hello) else message.sequence
         self.sends = self._tries = 1
         self._alives = 0
         self._round_trips.sent(now, first=True)
         self._put(transfer.start(), self._transfer_key)
-        closing = kind is Close
+        closing = kind is m.Close
         self._sent_at = now
         self._resend_at = now + (CLOSE_INTERVAL if closing else self._round_trips.wait(1))
         self._deadline = now + (CLOSE_LINGER if closing else self._config.timeout)
@@ -518,8 +481,8 @@ class Client:
         if sealed:
             self._asking = sealed[-1]
 
-    def _encode(self, message: Hello | State | Close) -> bytes:
-        if self._text and isinstance(message, State | Close):
+    def _encode(self, message: m.Hello | State | m.Close) -> bytes:
+        if self._text and isinstance(message, State | m.Close):
             return text.encode(message)
         return binary.encode(message, self.layout)
 

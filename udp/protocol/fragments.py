@@ -32,11 +32,9 @@ MAX_FRAGMENTS: Final = 1 << 14
 _FRAGMENT: Final = struct.Struct("<HHB3x")
 _OVERHEAD: Final = HEADER_SIZE + _FRAGMENT.size
 _ASKS_AT: Final = 28
-_FIRST_BURST: Final = 3 << 16
-"""Bytes: what the smallest buffer that systems give a socket holds."""
+_FIRST_BURST: Final = 3 << 16  # bytes: what the smallest buffer that systems give a socket holds
 _LARGEST_BURST: Final = 1 << 20
-_MOST_LOST: Final = 0.25
-"""A burst of which more was lost was too large for a buffer on its way."""
+_MOST_LOST: Final = 0.25  # A burst of which more was lost was too large for a buffer on its way
 _LARGEST_BITMAP: Final = 128
 """Bytes of the bitmap of a Missing: it says what 1,024 fragments are about."""
 
@@ -45,8 +43,7 @@ class Window:
     """Size of a burst. It grows while bursts arrive, and halves if much is lost."""
 
     def __init__(self) -> None:
-        self.size = _FIRST_BURST
-        """Bytes."""
+        self.size = _FIRST_BURST  # bytes
 
     def report(self, sent: int, lost: int) -> None:
         """Take into account that so many fragments of a burst were lost."""
@@ -59,10 +56,8 @@ class Window:
 class Transfer:
     """One message on its way, or a line of text: in one datagram, or in fragments.
 
-    Args:
-        message: Its bytes.
-        largest: Bytes of the largest datagram, a seal not counted.
-        window: Size of the bursts, of this side and peer.
+    `largest` are the bytes of the largest datagram, a seal not counted. `window` is kept for the
+    next message to the same peer.
     """
 
     __slots__ = ("_burst", "_crc", "_next", "_slice", "_start", "_window", "count", "message")
@@ -134,10 +129,8 @@ class Assembler:
     """Puts one message after the other together, from fragments in any order, repeated ones too.
 
     Fragments of a message that is older than the one at hand change nothing. Repeats of a message
-    have the same bytes and cuts, so fragments of several repeats make one.
-
-    Args:
-        largest: Bytes of the largest message that can come: more are never kept.
+    have the same bytes and cuts, so fragments of several repeats make one. More bytes than
+    `largest`, those of the largest message that can come, are never kept.
     """
 
     def __init__(self, largest: int) -> None:
@@ -147,8 +140,7 @@ class Assembler:
     def take(self, fragment: bytes) -> bytes | None:
         """Take a fragment with a checked header; the message, if it is whole now.
 
-        Raises:
-            DecodeError: The fragment's numbers make no sense, or it is too much.
+        Raises `DecodeError` if the fragment's numbers make no sense, or it is too much.
         """
         if len(fragment) <= _OVERHEAD:
             raise DecodeError(f"fragment: expected a slice of a message, got {len(fragment)} bytes")
@@ -187,10 +179,8 @@ class Assembler:
         lacking = np.array([first + i not in self._slices for i in range(span)])
         kind, session, sequence = self._header
         bitmap = np.packbits(lacking, bitorder="little").tobytes()
-        count = self._count
-        return Missing(
-            session=session, sequence=sequence, kind=kind, count=count, first=first, bitmap=bitmap
-        )
+        numbers = {"session": session, "sequence": sequence, "kind": kind, "count": self._count}
+        return Missing(**numbers, first=first, bitmap=bitmap)
 
     def _begin(self, header: tuple[int, int, int], count: int) -> None:
         self._header, self._count = header, count

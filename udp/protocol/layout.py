@@ -12,21 +12,18 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 
 __all__ = ["MAX_DRONES", "MAX_MESSAGE", "ArrayLayout", "Layout", "Slot"]
 
-MAX_DRONES: Final = 1 << 16
-"""Most drones of one simulator."""
-MAX_MESSAGE: Final = 1 << 24
-"""Largest message in all its fragments, bytes."""
+MAX_DRONES: Final = 1 << 16  # most drones of one simulator
+MAX_MESSAGE: Final = 1 << 24  # largest message in all its fragments, bytes
 STATE_ARRAYS_AT: Final = 40
 COMMAND_ARRAYS_AT: Final = 32
 
 _LETTERS: Final = {"float32": "f", "float64": "d", "uint8": "B", "int32": "i", "int64": "q"}
 """The dtypes that may cross the wire, and how `struct` calls them."""
-_SMALL: Final = 256
-"""Up to this many numbers Python's loop is faster than NumPy's calls."""
+_SMALL: Final = 256  # up to this many numbers Python's loop is faster than NumPy's calls
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,21 +35,17 @@ class ArrayLayout:
     """`float32`, `float64`, `uint8`, `int32` or `int64`."""
 
     def __post_init__(self) -> None:
-        if self.dtype not in _LETTERS:
-            raise InputError(f"dtype: expected one of {', '.join(_LETTERS)}, got {self.dtype!r}")
+        known = f"one of {', '.join(_LETTERS)}"
+        expect(self.dtype in _LETTERS, "dtype", known, f"{self.dtype!r}")
 
 
 class Slot(NamedTuple):
     """An array of all drones, at its place in a message."""
 
-    at: int
-    """First byte."""
-    end: int
-    """First byte after it."""
-    shape: tuple[int, ...]
-    """(N, *shape)."""
-    dtype: np.dtype
-    """Little-endian."""
+    at: int  # first byte
+    end: int  # first byte after it
+    shape: tuple[int, ...]  # (N, *shape)
+    dtype: np.dtype  # little-endian
 
     def view(self, data: bytes) -> np.ndarray:
         """The array in a message, not copied, read-only."""
@@ -98,10 +91,9 @@ class Layout:
         choices: int = 0,
         telemetry: tuple[tuple[int, ...], ...] = (),
     ) -> None:
-        if not 1 <= drones <= MAX_DRONES:
-            raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {drones}")
-        if (action is None) != (choices >= 1):
-            raise InputError("action: expected an array or a number of choices, not both")
+        expect(1 <= drones <= MAX_DRONES, "drones", f"1 to {MAX_DRONES}", f"{drones}")
+        either = (action is None) == (choices >= 1)
+        expect(either, "action", "an array or a number of choices, not both")
         self.drones, self.observation, self.action = drones, observation, action
         self.choices, self.telemetry = choices, telemetry
 

@@ -11,42 +11,16 @@ from typing import Final
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from .layout import MAX_DRONES
 
-__all__ = [
-    "FLY",
-    "FREEZE",
-    "MAX_SPEC",
-    "MAX_TEXT",
-    "MAX_UINT64",
-    "RESET",
-    "Alive",
-    "Close",
-    "Command",
-    "Extension",
-    "Hello",
-    "Message",
-    "Missing",
-    "Refuse",
-    "State",
-    "Unknown",
-    "Wait",
-    "Welcome",
-    "one_line",
-]
-
-MAX_UINT64: Final = (1 << 64) - 1
-"""Largest session, sequence number, nonce and seed."""
-MAX_TEXT: Final = 512
-"""Longest reason, bytes of UTF-8."""
-MAX_SPEC: Final = 1 << 22
-"""Longest spec, bytes of UTF-8."""
+MAX_UINT64: Final = (1 << 64) - 1  # largest session, sequence number, nonce and seed
+MAX_TEXT: Final = 512  # longest reason, bytes of UTF-8
+MAX_SPEC: Final = 1 << 22  # longest spec, bytes of UTF-8
 
 FLY: Final = 0
 RESET: Final = 1
-FREEZE: Final = 2
-"""Order to a drone: fly its action, reset instead of it, or do nothing."""
+FREEZE: Final = 2  # order to a drone: fly its action, reset instead of it, or do nothing
 
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
@@ -59,15 +33,12 @@ def one_line(text: str) -> str:
 
 def _check_text(name: str, text: str) -> None:
     size = len(text.encode())
-    if size > MAX_TEXT:
-        raise InputError(f"{name}: expected at most {MAX_TEXT} bytes of UTF-8, got {size}")
-    if _CONTROL.search(text):
-        raise InputError(f"{name}: expected no control characters, got {text!r}")
+    expect(size <= MAX_TEXT, name, f"at most {MAX_TEXT} bytes of UTF-8", f"{size}")
+    expect(not _CONTROL.search(text), name, "no control characters", f"{text!r}")
 
 
 def _check_uint64(name: str, number: int) -> None:
-    if not 0 <= number <= MAX_UINT64:
-        raise InputError(f"{name}: expected 0 to 2^64 - 1, got {number}")
+    expect(0 <= number <= MAX_UINT64, name, "0 to 2^64 - 1", f"{number}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -80,10 +51,9 @@ class Extension:
     """Whether a side that does not know it must not go on."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.number < 1 << 15:
-            raise InputError(f"extension: expected a number 0 to 32767, got {self.number}")
-        if (size := len(self.value)) > MAX_TEXT:
-            raise InputError(f"extension: expected at most {MAX_TEXT} bytes, got {size}")
+        number, size = self.number, len(self.value)
+        expect(0 <= number < 1 << 15, "extension", "a number 0 to 32767", f"{number}")
+        expect(size <= MAX_TEXT, "extension", f"at most {MAX_TEXT} bytes", f"{size}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -101,14 +71,11 @@ class Hello:
     extensions: tuple[Extension, ...] = ()
 
     def __post_init__(self) -> None:
-        if not 1 <= self.worlds <= MAX_DRONES:
-            raise InputError(f"worlds: expected 1 to {MAX_DRONES}, got {self.worlds}")
-        low, high = self.versions
-        if not 1 <= low <= high <= 255:
-            raise InputError(f"versions: expected 1 <= lowest <= highest, got {self.versions}")
-        size = len(self.spec.encode())
-        if not 2 <= size <= MAX_SPEC:
-            raise InputError(f"spec: expected 2 to {MAX_SPEC} bytes of UTF-8, got {size}")
+        worlds, (low, high), size = self.worlds, self.versions, len(self.spec.encode())
+        expect(1 <= worlds <= MAX_DRONES, "worlds", f"1 to {MAX_DRONES}", f"{worlds}")
+        right = 1 <= low <= high <= 255
+        expect(right, "versions", "1 <= lowest <= highest", f"{self.versions}")
+        expect(2 <= size <= MAX_SPEC, "spec", f"2 to {MAX_SPEC} bytes of UTF-8", f"{size}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

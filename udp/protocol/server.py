@@ -16,26 +16,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from . import binary, text
+from . import messages as m
 from .auth import OVERHEAD, Key, is_sealed, key_id, message_of
 from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address, Tap, largest_datagram
 from .errors import DecodeError, Forged, VersionMismatch
 from .fragments import Assembler, Transfer, Window, asks, is_fragment
 from .layout import Layout
-from .messages import (
-    MAX_SPEC,
-    Alive,
-    Close,
-    Command,
-    Hello,
-    Message,
-    Missing,
-    Refuse,
-    State,
-    Unknown,
-    Wait,
-    Welcome,
-    one_line,
-)
+from .messages import MAX_SPEC, Command, Message, State, one_line
 from .statistics import Statistics
 from .transitions import AGENT, AgentState, Way
 
@@ -49,8 +36,7 @@ may come at the same moment."""
 _TEXT_REMEMBERED: Final = 2.0
 """Time in which a copy of the last line of a closed text simulator is recognized, s."""
 _AFTER_STATE: Final = AGENT[AgentState.EXPECTING, Way.RECEIVED, State]
-_REASON_AT: Final = binary.HEADER_SIZE + 2
-"""Bytes of a Refuse or a Close before its reason."""
+_REASON_AT: Final = binary.HEADER_SIZE + 2  # bytes of a Refuse or a Close before its reason
 
 
 class KeyMismatch(Forged):
@@ -65,7 +51,7 @@ class Event(NamedTuple):
     """The effect of a datagram."""
 
     slot: int
-    message: State | Close
+    message: State | m.Close
     joined: bool = False
     """The State is the first of a new session, which may have taken the slot of another."""
 
@@ -75,30 +61,23 @@ class Session:
     """An exchange with one simulator, pinned to its address and codec."""
 
     peer: Address
-    number: int
-    """Session number; 0 with the text codec."""
+    number: int  # session number; 0 with the text codec
     layout: Layout
-    hello: Hello | None  # none if it speaks text
+    hello: m.Hello | None  # none if it speaks text
     state: AgentState = AgentState.NEW
-    sequence: int = 0
-    """Number of the State that came last."""
+    sequence: int = 0  # number of the State that came last
     key: Key | None = None
-    welcome: Welcome | None = None
-    reply: Transfer | None = None
-    """The answer to the last State, or the Welcome."""
-    assembler: Assembler | None = None
-    """Of the State that is coming in fragments."""
+    welcome: m.Welcome | None = None
+    reply: Transfer | None = None  # the answer to the last State, or the Welcome
+    assembler: Assembler | None = None  # of the State that is coming in fragments
     window: Window = field(default_factory=Window)
     largest: int = 0
     """Bytes of the largest datagram to it, a seal not counted; 0 before the first message."""
     due: bytes = b""
     """Bytes 8 to 23 of the State that is expected; empty where it is sealed, or a line of text."""
-    asked_at: float = 0.0
-    """When the Command was sent whose State is expected."""
-    heard_at: float = 0.0
-    """When it last said that it lives, or brought a fragment that was missing."""
-    room: int = 0
-    """Bytes that a Refuse may have, while it waits for a slot."""
+    asked_at: float = 0.0  # when the Command was sent whose State is expected
+    heard_at: float = 0.0  # when it last said that it lives, or brought a fragment that was missing
+    room: int = 0  # bytes that a Refuse may have, while it waits for a slot
     last: bytes = b""  # line, by text
 
     @property
@@ -138,7 +117,7 @@ class Server:
 
     def __init__(
         self,
-        accept: Callable[[Hello], Layout | str],
+        accept: Callable[[m.Hello], Layout | str],
         text_layout: Callable[[], Layout | None] | None = None,
         *,
         slots: int = 1,
@@ -206,7 +185,7 @@ class Server:
         except DecodeError as error:
             self._refuse_undecoded(error, arrival)
             return None
-        if isinstance(message, Hello):
+        if isinstance(message, m.Hello):
             self._receive_hello(message, arrival, key)
             return None
         assert holder is not None
@@ -261,7 +240,7 @@ class Server:
                 self._answer(slot, session, _goodbye(session, reason))
         for queued in self._queue.values():
             self._refuse(queued.number, reason, queued.peer, queued.room, queued.key)
-            queued.move(Way.SENT, Refuse)
+            queued.move(Way.SENT, m.Refuse)
         self._resend_at, self._deadline = now + CLOSE_INTERVAL, now + CLOSE_LINGER
 
     def next_timer(self) -> float | None:
@@ -301,7 +280,7 @@ class Server:
             # It went on with another agent: what opened it here came late, from before a restart.
             self._disown(plain, arrival)
             return None
-        is_due = number == session.sequence + is_state or isinstance(message, Close)
+        is_due = number == session.sequence + is_state or isinstance(message, m.Close)
         state = AGENT.get((session.state, Way.RECEIVED, type(message))) if is_due else None
         if state is None:
             self._drop("stale", "", arrival)
@@ -309,13 +288,13 @@ class Server:
         match message:
             case State():
                 return self._take_state(slot, session, message, plain, arrival.now)
-            case Alive():
+            case m.Alive():
                 session.heard_at = arrival.now
-            case Missing() if session.reply and message.kind == binary.COMMAND:
+            case m.Missing() if session.reply and message.kind == binary.COMMAND:
                 self._put(session.reply.resend(message), session.peer, session.key, "resent")
-            case Missing():
+            case m.Missing():
                 self._drop("stale", "", arrival)
-            case Close():
+            case m.Close():
                 self._record(slot, message, plain, session)
                 if session.state is not AgentState.CLOSING:
                     self._answer(slot, session, _goodbye(session, ""))
@@ -328,7 +307,7 @@ class Server:
 
     # ---- a simulator that comes
 
-    def _receive_hello(self, hello: Hello, arrival: _Arrival, key: Key | None) -> None:
+    def _receive_hello(self, hello: m.Hello, arrival: _Arrival, key: Key | None) -> None:
         address, size = arrival.address, len(arrival.datagram)
         opening = self._openings.get((address, hello.session))
         if hello.session in self._ended or self._seated(hello.session):
@@ -344,7 +323,7 @@ class Server:
         else:
             self._let_wait(Session(address, hello.session, layout, hello, key=key), size)
 
-    def _fit(self, hello: Hello) -> Layout | str:
+    def _fit(self, hello: m.Hello) -> Layout | str:
         """The layout of a simulator that is accepted, or the reason to refuse it."""
         if self.closed:
             return "the agent has closed"
@@ -355,19 +334,19 @@ class Server:
             return f"expected no critical extension of type {unknown[0]}"
         return self._accept(hello)
 
-    def _welcome(self, hello: Hello, layout: Layout, address: Address, key: Key | None) -> None:
+    def _welcome(self, hello: m.Hello, layout: Layout, address: Address, key: Key | None) -> None:
         self._queue.pop(address, None)
-        welcome = Welcome(session=hello.session, nonce=self._draw_nonce())
+        welcome = m.Welcome(session=hello.session, nonce=self._draw_nonce())
         opening = Session(address, hello.session, layout, hello, key=key, welcome=welcome)
-        opening.move(Way.SENT, Welcome)
+        opening.move(Way.SENT, m.Welcome)
         opening.reply = self._transfer(binary.encode(welcome), opening)
         self._put(opening.reply.start(), address, key)
         _keep(self._openings, (address, hello.session), opening)
 
     def _let_wait(self, session: Session, size: int) -> None:
-        wait = binary.encode(Wait(session=session.number))
+        wait = binary.encode(m.Wait(session=session.number))
         self._put([wait], session.peer, session.key)
-        session.move(Way.SENT, Wait)
+        session.move(Way.SENT, m.Wait)
         session.room = size - len(wait)
         _keep(self._queue, session.peer, session)
 
@@ -403,9 +382,9 @@ class Server:
         layout = self._fit(opening.hello)  # another one may have come since its Hello
         if isinstance(layout, str):
             words = _cut(layout, len(plain) - _REASON_AT)
-            close = Close(session=opening.number, sequence=1, reason=words)
+            close = m.Close(session=opening.number, sequence=1, reason=words)
             self._put([binary.encode(close)], opening.peer, self._session_key(opening))
-            opening.move(Way.SENT, Close)
+            opening.move(Way.SENT, m.Close)
             self._drop("refused", layout, arrival)
             return None
         if None not in self.slots and opening.peer not in self._slot_of:  # another was quicker
@@ -453,7 +432,7 @@ class Server:
             self._drop("foreign", f"session {number:016x}", arrival)
             return
         self.statistics.counters["foreign"] += 1  # after a restart of ours, mostly: no word of it
-        reply = binary.encode(Unknown(session=number, sequence=sequence))
+        reply = binary.encode(m.Unknown(session=number, sequence=sequence))
         if self._keys:  # of use only to the one that has sent this State
             key = self._keys.get(key_id(datagram))
             if key is None:
@@ -490,7 +469,7 @@ class Server:
             if event and isinstance(message, State):
                 session.last = datagram
             return event
-        if isinstance(message, Close):
+        if isinstance(message, m.Close):
             self.statistics.counters["foreign"] += 1
             return None
         last, number, until = self._ended_text.get(address, (b"", 0, 0.0))
@@ -511,7 +490,7 @@ class Server:
 
     def _turn_text_away(self, sequence: int, cause: str, reason: str, arrival: _Arrival) -> None:
         """Answer a line that is not flown, with no more bytes than it has."""
-        line = text.encode(Close(session=0, sequence=sequence, reason=""))
+        line = text.encode(m.Close(session=0, sequence=sequence, reason=""))
         if len(line) <= len(arrival.datagram):
             self._put([line], arrival.address, None)
         self._drop(cause, reason, arrival)
@@ -617,7 +596,7 @@ class Server:
 
     # ---- what is sent
 
-    def _answer(self, slot: int, session: Session, message: Command | Close) -> None:
+    def _answer(self, slot: int, session: Session, message: Command | m.Close) -> None:
         """Send a message to a simulator that has a slot. Its bytes are kept for a repeated State.
 
         Raises `InputError` if it cannot be encoded; then nothing has changed.
@@ -639,7 +618,7 @@ class Server:
         if session.state is not AgentState.DECIDING:
             self._repeat(session)
         elif not session.is_text:
-            alive = Alive(session=session.number, sequence=session.sequence)
+            alive = m.Alive(session=session.number, sequence=session.sequence)
             self._put([binary.encode(alive)], session.peer, session.key)
             self.statistics.counters["sent"] += 1
 
@@ -649,7 +628,7 @@ class Server:
         """Refuse a Hello that came in so many bytes, with no more than those."""
         room = size - _REASON_AT - (OVERHEAD if key else 0)
         if room >= 0:
-            refuse = Refuse(session=number, reason=_cut(reason, room))
+            refuse = m.Refuse(session=number, reason=_cut(reason, room))
             self._put([binary.encode(refuse)], address, key)
 
     def _transfer(self, data: bytes, session: Session) -> Transfer:
@@ -674,8 +653,8 @@ class Server:
         self.statistics.drop(cause, f"from {host}:{port}: {reason}", arrival.now)
 
 
-def _goodbye(session: Session, reason: str) -> Close:
-    return Close(session=session.number, sequence=session.sequence, reason=one_line(reason))
+def _goodbye(session: Session, reason: str) -> m.Close:
+    return m.Close(session=session.number, sequence=session.sequence, reason=one_line(reason))
 
 
 def _cut(reason: str, room: int) -> str:

@@ -8,13 +8,10 @@ from .messages import one_line
 
 __all__ = ["Durations", "Statistics"]
 
-NOTICE_INTERVAL: Final = 10.0
-"""Shortest time between two notices of the same cause, s."""
-REPORT_INTERVAL: Final = 60.0
-"""Time between two reports of all numbers, s."""
+NOTICE_INTERVAL: Final = 10.0  # shortest time between two notices of the same cause, s
+REPORT_INTERVAL: Final = 60.0  # time between two reports of all numbers, s
 
-_STEPS: Final = 32
-"""Buckets for each doubling: a quantile is right to 3 %."""
+_STEPS: Final = 32  # buckets for each doubling: a quantile is right to 3 %
 _QUIET: Final = frozenset({"duplicate", "stale"})
 """Events of every network that loses datagrams: counted, without a notice."""
 
@@ -24,8 +21,7 @@ class Durations:
 
     def __init__(self) -> None:
         self.count = 0
-        self.longest = 0.0
-        """s; 0 while there is none."""
+        self.longest = 0.0  # s; 0 while there is none
         self._buckets: Counter[int] = Counter()
 
     def add(self, seconds: float) -> None:
@@ -59,8 +55,7 @@ class Statistics:
         `malformed`, `forged`, `foreign`, `refused`, `duplicate`, `stale`."""
         self.round_trips = Durations()
         """From the first sending of a message to the answer that counts."""
-        self.last_error = ""
-        """Why the last unexpected datagram was dropped; "" if none was."""
+        self.last_error = ""  # why the last unexpected datagram was dropped; "" if none was
         self._notices: list[str] = []
         self._next_notice: dict[str, float] = {}
         self._unsaid: Counter[str] = Counter()

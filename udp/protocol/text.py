@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from .errors import DecodeError
 from .layout import Layout
 from .messages import FLY, MAX_UINT64, RESET, Close, Command, State
@@ -34,16 +34,14 @@ def is_text(datagram: bytes) -> bool:
 
 def check_layout(layout: Layout) -> None:
     """Raise `InputError` if the messages of a layout cannot be written as text."""
-    observation, action = layout.observation, layout.action
-    if layout.drones != 1:
-        raise InputError(f"text codec: expected one drone, got {layout.drones}: use binary")
-    if len(observation) != 1 or len(observation[0].shape) != 1 or observation[0].dtype != _FLOAT:
-        raise InputError(
-            "text codec: expected one flat array of float32 as observation, got "
-            f"{', '.join(f'{a.dtype} of shape {a.shape}' for a in observation)}: use binary"
-        )
-    if action is not None and (len(action.shape) != 1 or action.dtype != _FLOAT):
-        raise InputError(f"text codec: expected flat actions of float32, got {action}: use binary")
+    what, arrays, action = "text codec", layout.observation, layout.action
+    expect(layout.drones == 1, what, "one drone", f"{layout.drones}: use binary")
+    flat = [len(array.shape) == 1 and array.dtype == _FLOAT for array in arrays]
+    got = ", ".join(f"{array.dtype} of shape {array.shape}" for array in arrays)
+    expected = "one flat array of float32 as observation"
+    expect(flat == [True], what, expected, f"{got}: use binary")
+    right = action is None or (len(action.shape) == 1 and action.dtype == _FLOAT)
+    expect(right, what, "flat actions of float32", f"{action}: use binary")
 
 
 def encode(message: State | Command | Close) -> bytes:
@@ -74,8 +72,7 @@ def _command_fields(message: Command) -> list[str]:
     order = message.orders.item()
     if order == RESET:
         return ["reset"] if message.seeds is None else ["reset", str(message.seeds.item())]
-    if order != FLY:
-        raise InputError("text codec: expected an action or a reset, got a frozen drone")
+    expect(order == FLY, "text codec", "an action or a reset", "a frozen drone")
     numbers = message.actions.ravel().tolist()
     _expect_finite(numbers)
     return [repr(action) for action in numbers]
@@ -147,8 +144,8 @@ def _action(fields: list[str], layout: Layout) -> np.ndarray:
     if not layout.choices:
         return _float32("action", fields)
     choice = _whole("action", fields[0])
-    if choice >= layout.choices:
-        raise InputError(f"action: expected a choice 0 to {layout.choices - 1}, got {choice}")
+    most = layout.choices - 1
+    expect(choice <= most, "action", f"a choice 0 to {most}", f"{choice}")
     return np.array([choice])
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from ...envs import registry
 from ...envs.spec import EnvSpec, canonical_id
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from ..layouts import layout_of
 from ..protocol import text
 from ..protocol.auth import Key, read_keys
@@ -64,10 +64,8 @@ class AgentConfig:
     env_id: str | None = None
     options: Mapping[str, Any] | None = None
     vehicle_hash: str | None = None
-    worlds: int | None = None
-    """Worlds of each simulator; None: as many as the first has."""
-    slots: int = 1
-    """Simulators to fly at the same time."""
+    worlds: int | None = None  # worlds of each simulator; None: as many as the first has
+    slots: int = 1  # simulators to fly at the same time
     connect_timeout: float = 60.0
     timeout: float = 30.0
     max_datagram: int | None = None
@@ -78,8 +76,7 @@ class AgentConfig:
     def __post_init__(self) -> None:
         for name in ("connect_timeout", "timeout"):
             seconds = getattr(self, name)
-            if not (math.isfinite(seconds) and seconds > 0):
-                raise InputError(f"{name}: expected seconds > 0, got {seconds}")
+            expect(math.isfinite(seconds) and seconds > 0, name, "seconds > 0", f"{seconds}")
         if self.env_id is not None:
             object.__setattr__(self, "env_id", canonical_id(self.env_id))
             self.expected_options(self.env_id)
@@ -103,13 +100,10 @@ class Agent:
     """Exchanges Commands for States with all simulators at the same time.
 
     Attributes:
+        address: Address that this side listens on.
         spec: Of the simulator that joined last; None before the first.
         states: The last State of each slot; None before the first.
         lost: For each slot why its simulator was lost during the last exchange; "" if it was not.
-
-    Raises:
-        InputError: An address, a time, an option or the key file is not what it should be.
-        OSError: The port is in use.
     """
 
     def __init__(self, address: Address, config: AgentConfig) -> None:
@@ -137,6 +131,7 @@ class Agent:
         self.lost = [""] * config.slots
         self._deadlines = [0.0] * config.slots
         self._port = Port(address, insecure=config.insecure or bool(keys))
+        self.address = self._port.address
         if journal:
             try:
                 journal.start(self.server.statistics, self.server.slots)
@@ -147,11 +142,6 @@ class Agent:
         self.close = weakref.finalize(self, _leave, os.getpid(), self.server, self._port, journal)
 
     @property
-    def address(self) -> Address:
-        """Address that this side listens on."""
-        return self._port.address
-
-    @property
     def worlds(self) -> int:
         """Worlds of each simulator, once one has come."""
         return self._required.worlds or 1
@@ -159,9 +149,8 @@ class Agent:
     def connect(self) -> None:
         """Wait until it is the agent's turn at every slot.
 
-        Raises:
-            PeerSilent: A slot stayed free, or its simulator fell silent and no other came.
-            PeerClosed: The last simulator ended the exchange.
+        Raises `PeerSilent` if a slot stayed free, or its simulator fell silent and no other came;
+        `PeerClosed` if the last simulator ended the exchange.
         """
         if not self.close.alive:
             raise gym.error.ClosedEnvironmentError("expected an open env, got a closed one")
@@ -172,11 +161,8 @@ class Agent:
         """Send each of these slots its Command, and wait for the States of all.
 
         A simulator that is lost meanwhile is replaced by another that comes; then `lost` says why
-        and `states` has the first State of that one.
-
-        Raises:
-            InputError: The first order is not of the layout, or not finite; nothing was sent.
-            PeerSilent, PeerClosed: As `connect`.
+        and `states` has the first State of that one. Raises `InputError` if the first order is not
+        of the layout, or not finite, and nothing was sent; otherwise as `connect`.
         """
         now = time.monotonic()
         for slot, (actions, what, seeds) in orders.items():
@@ -189,7 +175,7 @@ class Agent:
     def _gather(self) -> None:
         """Send what is due and answer what comes, until it is the agent's turn everywhere."""
         server, config, slots = self.server, self.config, self.server.slots
-        self._flush()  # before anything else: a simulator waits
+        _flush(server, self._port)  # before anything else: a simulator waits
         now = time.monotonic()
         self._deadlines = [
             now + (config.timeout if session else config.connect_timeout) for session in slots
@@ -220,7 +206,7 @@ class Agent:
                     self._handle(event, address)
                     pending = self._pending()
                 if pending:
-                    self._flush()
+                    _flush(server, self._port)
 
     def _pending(self) -> list[int]:
         """Slots at which it is not the agent's turn."""
@@ -236,7 +222,7 @@ class Agent:
             self._lose(slot, f"the simulator at {address_text(address)} closed: {message.reason}")
             self._keep_sockets()
             if not any(self.server.slots):
-                self._flush()
+                _flush(self.server, self._port)
                 raise PeerClosed(self.lost[slot])
             self._say_waiting(slot)
             return
@@ -300,9 +286,6 @@ class Agent:
         last = self.server.statistics.last_error
         return f"; last datagram dropped: {last}" if last else ""
 
-    def _flush(self) -> None:
-        _flush(self.server, self._port)
-
 
 class _Required:
     """Requirements of a simulator. The server holds them: an `Agent` held by its server would
@@ -311,11 +294,10 @@ class _Required:
 
     def __init__(self, config: AgentConfig) -> None:
         self.config = config
-        self.spec: EnvSpec | None = None
-        """Of the simulator that has flown."""
+        self.spec: EnvSpec | None = None  # of the simulator that has flown
         self.worlds = config.worlds
         self.text_spec = cache(self._text_spec)
-        self.text_layout = cache(self._text_layout)
+        self.text_layout = cache(lambda: layout_of(s) if (s := self.text_spec()) else None)
 
     def accept(self, hello: Hello) -> Layout | str:
         """The layout of a simulator, or why it is refused."""
@@ -333,10 +315,8 @@ class _Required:
             drones = "one drone" if self.worlds == 1 else f"{self.worlds} drones"
             return f"expected a simulator of {drones}, got one of {worlds}"
         if config.vehicle_hash is not None and spec.vehicle_hash != config.vehicle_hash:
-            return (
-                f"expected a vehicle of hash {config.vehicle_hash}, "
-                f"got {spec.vehicle} of {spec.vehicle_hash}"
-            )
+            got = f"{spec.vehicle} of {spec.vehicle_hash}"
+            return f"expected a vehicle of hash {config.vehicle_hash}, got {got}"
         if config.options is not None:
             expected = config.expected_options(env_id)
             both_ways = registry.is_known(env_id)
@@ -346,21 +326,15 @@ class _Required:
 
     def _text_spec(self) -> EnvSpec | None:
         """Of a simulator that speaks text, for it tells none; None if text is not flown."""
-        config = self.config
-        if config.env_id is None or not registry.is_known(config.env_id):
+        config, env_id = self.config, self.config.env_id
+        if env_id is None or not registry.is_known(env_id) or config.worlds not in (None, 1):
             return None
-        if config.worlds not in (None, 1):
-            return None
-        spec = registry.env_spec(config.env_id, dict(config.options or {}))
+        spec = registry.env_spec(env_id, dict(config.options or {}))
         try:
             text.check_layout(layout_of(spec))
         except InputError:
             return None
         return spec
-
-    def _text_layout(self) -> Layout | None:
-        spec = self.text_spec()
-        return layout_of(spec) if spec else None
 
 
 @lru_cache(maxsize=4)
@@ -373,17 +347,16 @@ def _options_difference(
     ours: Mapping[str, Any], theirs: Mapping[str, Any], *, both_ways: bool
 ) -> str:
     """In which options two envs differ, in a sentence; "" if in none."""
-    names = [*ours, *(name for name in theirs if name not in ours)] if both_ways else ours
+
+    def told(options: Mapping[str, Any], name: str) -> str:
+        return repr(options[name]) if name in options else "not to be there"
+
     differing = [
-        f"{name} {_told(ours, name)}, got {_told(theirs, name)}"
-        for name in names
+        f"{name} {told(ours, name)}, got {told(theirs, name)}"
+        for name in ({**ours, **theirs} if both_ways else ours)
         if (name in ours, ours.get(name)) != (name in theirs, theirs.get(name))
     ]
     return f"options: expected {'; expected '.join(differing)}" if differing else ""
-
-
-def _told(options: Mapping[str, Any], name: str) -> str:
-    return repr(options[name]) if name in options else "not to be there"
 
 
 def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:

@@ -14,20 +14,16 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Final
 
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from ..protocol.client import Address
 from .sockets import is_loopback, open_socket, resolve
 
 __all__ = ["FaultConfig", "Faults", "Relay"]
 
-_NAP: Final = 0.04
-"""Longest wait before the relay looks whether it was stopped, s."""
-_IDLE: Final = 600.0
-"""A client without a datagram in either direction for this long is forgotten, s."""
-_MAX_CLIENTS: Final = 200
-"""Beyond, the longest idle one is forgotten: each takes a file, and some systems lend only 256."""
-_MAX_HELD: Final = 16_384
-"""Most datagrams that are held back at one time; more are not sent."""
+_NAP: Final = 0.04  # longest wait before the relay looks whether it was stopped, s
+_IDLE: Final = 600.0  # a client without a datagram in either direction for so long is forgotten, s
+_MAX_CLIENTS: Final = 200  # each takes a file, and some systems lend only 256
+_MAX_HELD: Final = 16_384  # most datagrams that are held back at one time; more are not sent
 _LARGEST: Final = 65_535  # bytes that a packet can have
 _IP_HEADER: Final = 20
 _UDP_HEADER: Final = 8
@@ -63,24 +59,19 @@ class FaultConfig:
     """The same seed gives each client's datagrams the same fates, by their order."""
 
     def __post_init__(self) -> None:
-        if type(self.seed) is not int:
-            raise InputError(f"seed: expected a whole number, got {self.seed!r}")
-        if type(self.mtu) is not int or not (self.mtu == 0 or 68 <= self.mtu <= _LARGEST):
-            raise InputError(f"mtu: expected 0 or 68 to {_LARGEST} bytes, got {self.mtu!r}")
-        if self.black_hole and not self.mtu:
-            raise InputError("black_hole: expected an mtu with it, got none")
+        seed, mtu = self.seed, self.mtu
+        expect(type(seed) is int, "seed", "a whole number", f"{seed!r}")
+        right = type(mtu) is int and (mtu == 0 or 68 <= mtu <= _LARGEST)
+        expect(right, "mtu", f"0 or 68 to {_LARGEST} bytes", f"{mtu!r}")
+        expect(mtu or not self.black_hole, "black_hole", "an mtu with it", "none")
         for names, most, expected in (
-            (
-                ("drop", "duplicate", "reorder", "truncate", "corrupt"),
-                1,
-                "a probability from 0 to 1",
-            ),
-            (["delay", "jitter", "reorder_by"], 3600, "seconds from 0 to 3600"),
+            ("drop duplicate reorder truncate corrupt", 1, "a probability from 0 to 1"),
+            ("delay jitter reorder_by", 3600, "seconds from 0 to 3600"),
         ):
-            for name in names:
+            for name in names.split():
                 value = getattr(self, name)
-                if not (isinstance(value, int | float) and 0 <= value <= most):
-                    raise InputError(f"{name}: expected {expected}, got {value!r}")
+                right = isinstance(value, int | float) and 0 <= value <= most
+                expect(right, name, expected, f"{value!r}")
 
 
 class Faults:
@@ -110,8 +101,7 @@ class Faults:
         ]
         count["received"] += 1
         packets = _packets(len(datagram), config.mtu)
-        blocked = config.black_hole and packets > 1
-        if blocked or drop < 1 - (1 - config.drop) ** packets:
+        if (config.black_hole and packets > 1) or drop < 1 - (1 - config.drop) ** packets:
             count["dropped"] += 1
             return []
         if truncate < config.truncate and datagram:
@@ -159,10 +149,8 @@ def _reachable(address: Address, insecure: bool) -> Address:
 @dataclass(eq=False, slots=True)
 class _Client:
     address: Address
-    upstream: socket.socket
-    """Connected to the server, for this client alone: to the server it is the client."""
-    faults: tuple[Faults, Faults]
-    """Of what goes to the client, and of what goes to the server."""
+    upstream: socket.socket  # connected to the server, for this client alone
+    faults: tuple[Faults, Faults]  # of what goes to the client, and of what goes to the server
     seen: float = 0.0
 
 
@@ -182,6 +170,9 @@ class Relay:
         config: The faults; by default none.
         insecure: Allow addresses that are not loopback; the relay authenticates no datagram.
 
+    Attributes:
+        address: Address that clients send to.
+
     Raises:
         InputError: An address is wrong.
         OSError: The port is in use.
@@ -198,10 +189,9 @@ class Relay:
         self.config = config or FaultConfig()
         self.counters: Counter[str] = Counter()
         self.server = _reachable(server, insecure)
-        if self.server[1] == 0:
-            raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
-        if self.server == _reachable(listen, insecure):
-            raise InputError(f"listen: expected another address than the server's, got {listen}")
+        expect(self.server[1], "server", "the port of the agent, 1 to 65535", "0")
+        differs = self.server != _reachable(listen, insecure)
+        expect(differs, "listen", "another address than the server's", f"{listen}")
         self._any = ("0.0.0.0" if insecure else "127.0.0.1", 0)
         self._clients: OrderedDict[Address, _Client] = OrderedDict()
         self._last_number = 0
@@ -213,12 +203,7 @@ class Relay:
         # Not epoll, which counts whole milliseconds.
         self._selector = selectors.SelectSelector()
         self._selector.register(self._socket, selectors.EVENT_READ)
-
-    @property
-    def address(self) -> Address:
-        """Address that clients send to."""
-        host, port = self._socket.getsockname()
-        return host, port
+        self.address: Address = self._socket.getsockname()
 
     def run(self) -> None:
         """Carry datagrams until `stop` is called, by another thread or a signal handler.
@@ -263,7 +248,7 @@ class Relay:
         except OSError:  # ICMP says that an earlier one did not arrive
             self.counters["unreachable"] += 1
             return
-        if client is None:
+        if client is None:  # no socket is left for it
             return
         now = client.seen = time.perf_counter()
         self._clients.move_to_end(client.address)

@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import gymnasium as gym
 import numpy as np
 
-from ...models.errors import InputError, NotCopied
+from ...models.errors import NotCopied, expect
 from ..layouts import layout_of
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
@@ -21,18 +21,13 @@ from ..protocol.transitions import SimulatorState
 from .sockets import LONGEST_WAIT, address_text, log_notices, open_socket, resolve
 from .stepped import Stepped, make_stepped, reset_all
 
-if TYPE_CHECKING:
-    pass
-
 __all__ = ["DEFAULT_AGENT", "DEFAULT_SIMULATOR", "Observer", "Simulator"]
 
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
 
-_ALIVE_EVERY: Final = 0.5
-"""Period of the message Alive while a long step is computed, s."""
-_COMPLAIN_AFTER: Final = 1.0
-"""A wait for the agent that is told, once, s."""
+_ALIVE_EVERY: Final = 0.5  # period of the message Alive while a long step is computed, s
+_COMPLAIN_AFTER: Final = 1.0  # A wait for the agent that is told, once, s
 _PAUSE: Final = 1.0
 """A wait that took so much longer than it should, s: this process was stopped meanwhile."""
 
@@ -57,6 +52,7 @@ class Simulator(NotCopied):
         options: Options of the env, by name.
 
     Attributes:
+        address: Address of this side.
         spec: Spec of the env.
         stepped: The loop or the envs.
         observer: Called for every State once it is sent, while the agent thinks; None at first.
@@ -83,14 +79,12 @@ class Simulator(NotCopied):
         record: Path | str | None = None,
         **options: Any,
     ) -> None:
-        if codec not in ("binary", "text"):
-            raise InputError(f"codec: expected 'binary' or 'text', got {codec!r}")
+        expect(codec in ("binary", "text"), "codec", "'binary' or 'text'", f"{codec!r}")
         self._text = codec == "text"
         key = Key(read_keys(key_file)[0], "simulator") if key_file else None
         anywhere = insecure or key is not None
         self.server = resolve(server, insecure=anywhere)
-        if self.server[1] == 0:
-            raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
+        expect(self.server[1], "server", "the port of the agent, 1 to 65535", "0")
         self.config = config or LinkConfig()
         self.observer: Observer | None = None
         self._keyed = key is not None
@@ -122,15 +116,10 @@ class Simulator(NotCopied):
             )
             self._socket = open_socket(bind, insecure=anywhere, peer=self.server)
             failing.callback(self._socket.close)
+            self.address: Address = self._socket.getsockname()
             if self._journal:
                 self._journal.start(self.link.statistics)
             failing.pop_all()
-
-    @property
-    def address(self) -> Address:
-        """Address of this side."""
-        host, port = self._socket.getsockname()
-        return host, port
 
     def run(self) -> str:
         """Fly until the agent closes; the reason that it gave. A simulator runs once.

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import gymnasium as gym
 import numpy as np
@@ -12,39 +12,18 @@ from gymnasium import spaces
 from ...envs import registry
 from ...envs.spaces import action_space, observation_space
 from ...envs.spec import ArraySpec, Discrete, EnvSpec, canonical_id, component_names
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from ..protocol.layout import MAX_DRONES, Layout
 from ..protocol.messages import MAX_UINT64
 
+if TYPE_CHECKING:
+    from ...envs.loop import Loop, OnHost
+
 __all__ = ["Stepped", "make_stepped", "reset_all", "spec_of_gymnasium"]
 
-
+Stepped: TypeAlias = "Loop | OnHost | _Singles"
+"""N drones that take a step of the wire together, with the results of `rotorgram.envs.Loop`."""
 _Some = np.ndarray | None
-
-
-class Stepped(Protocol):
-    """N drones that take a step of the wire together: see `rotorgram.envs.Loop`."""
-
-    spec: EnvSpec
-    num_envs: int
-    observations: dict[str, np.ndarray]
-    """By name, shape (N, *shape)."""
-    rewards: np.ndarray
-    """float64, shape (N,)."""
-    terminated: np.ndarray
-    """bool, shape (N,)."""
-    truncated: np.ndarray
-    """bool, shape (N,)."""
-
-    @property
-    def telemetry(self) -> dict[str, np.ndarray]:
-        """By name, float64, shape (N, *shape)."""
-
-    def advance(self, actions: np.ndarray, resets: _Some, seeds: _Some, frozen: _Some) -> None:
-        """Reset some drones, freeze some, and fly the others for one control period."""
-
-    def close(self) -> None:
-        """Release threads, windows and memory."""
 
 
 def make_stepped(
@@ -55,7 +34,7 @@ def make_stepped(
     backend: str = "mujoco",
     options: Mapping[str, Any],
 ) -> Stepped:
-    """N drones of an env.
+    """N drones of an env. Raises `InputError` if its spaces or an argument are not right.
 
     Args:
         env: Id of a registered task, of an env of Gymnasium, or one env itself.
@@ -63,28 +42,28 @@ def make_stepped(
         vehicle: MJCF file, for a registered task; None is the paper's.
         backend: `mujoco` or `warp`, for a registered task.
         options: Of the env, by name.
-
-    Raises:
-        InputError: An argument or the env's spaces are not what they should be.
     """
-    if type(num_envs) is not int or not 1 <= num_envs <= MAX_DRONES:
-        raise InputError(f"num_envs: expected 1 to {MAX_DRONES}, got {num_envs!r}")
+    right = type(num_envs) is int and 1 <= num_envs <= MAX_DRONES
+    expect(right, "num_envs", f"1 to {MAX_DRONES}", f"{num_envs!r}")
     if isinstance(env, str):
         if registry.is_known(env):
             from ...envs.loop import Loop, OnHost
 
             name, chosen = canonical_id(env), cast(Any, backend)
-            loop: Any = Loop(name, num_envs, vehicle=vehicle, backend=chosen, options=options)
+            loop = Loop(name, num_envs, vehicle=vehicle, backend=chosen, options=options)
             return loop if backend == "mujoco" else OnHost(loop)
-        envs = [_make(env, options) for _ in range(num_envs)]
+        try:
+            envs = [gym.make(env, disable_env_checker=True, **options) for _ in range(num_envs)]
+        except (gym.error.Error, ImportError) as error:
+            raise InputError(f"env: expected a registered id, got {env!r}: {error}") from None
+        except TypeError as error:
+            raise InputError(f"options of {env}: {error}") from None
     else:
-        if options:
-            raise InputError(f"options {sorted(options)}: expected none with an env already made")
-        if num_envs > 1:
-            raise InputError(f"num_envs: expected 1 with an env already made, got {num_envs}")
+        expect(not options, f"options {sorted(options)}", "none with an env already made")
+        expect(num_envs == 1, "num_envs", "1 with an env already made", f"{num_envs}")
         envs = [env]
-    if vehicle is not None or backend != "mujoco":
-        raise InputError(f"vehicle, backend: expected none for {env!r}, which is no task of ours")
+    ours = vehicle is not None or backend != "mujoco"
+    expect(not ours, "vehicle, backend", f"none for {env!r}, which is no task of ours")
     return _Singles(envs, options)
 
 
@@ -95,17 +74,8 @@ def reset_all(stepped: Stepped, layout: Layout, seed: int) -> None:
     stepped.advance(np.zeros(actions.shape, actions.dtype), np.ones(count, bool), seeds, None)
 
 
-def _make(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
-    try:
-        return gym.make(env_id, disable_env_checker=True, **options)
-    except (gym.error.Error, ImportError) as error:
-        raise InputError(f"env: expected a registered id, got {env_id!r}: {error}") from None
-    except TypeError as error:
-        raise InputError(f"options of {env_id}: {error}") from None
-
-
 class _Singles:
-    """Gymnasium envs, one after the other: `Stepped`."""
+    """Gymnasium envs, one after the other."""
 
     def __init__(self, envs: Sequence[gym.Env[Any, Any]], options: Mapping[str, Any]) -> None:
         self.envs, self.num_envs = envs, len(envs)
@@ -141,15 +111,13 @@ class _Singles:
             env.close()
 
     def _keep(self, i: int, observation: Any, info: Mapping[str, Any]) -> None:
-        arrays = self.spec.observation
-        named = observation if isinstance(observation, dict) else {arrays[0].name: observation}
-        for array in arrays:
-            value = np.asarray(named[array.name])
+        named = isinstance(observation, dict)
+        for array in self.spec.observation:
+            value = np.asarray(observation[array.name] if named else observation)
             if value.shape != array.shape or value.dtype != array.dtype:
-                raise InputError(
-                    f"observation {array.name}: expected {array.dtype} of shape {array.shape}, "
-                    f"got {value.dtype} of shape {value.shape}"
-                )
+                expected = f"{array.dtype} of shape {array.shape}"
+                got = f"{value.dtype} of shape {value.shape}"
+                raise InputError(f"observation {array.name}: expected {expected}, got {got}")
             self.observations[array.name][i] = value
         for array in self.spec.telemetry:
             numbers = [info[name] for name in component_names(array)]
@@ -157,10 +125,7 @@ class _Singles:
 
 
 def spec_of_gymnasium(env: gym.Env[Any, Any], options: Mapping[str, Any]) -> EnvSpec:
-    """The spec of any Gymnasium env: its own if it has one, else from its spaces.
-
-    Raises `InputError` if a space cannot cross the wire.
-    """
+    """The env's own spec, or one from its spaces. `InputError`: one cannot cross the wire."""
     base: Any = env.unwrapped
     observation = env.observation_space
     boxes = observation.spaces if isinstance(observation, spaces.Dict) else {"": observation}
@@ -170,11 +135,8 @@ def spec_of_gymnasium(env: gym.Env[Any, Any], options: Mapping[str, Any]) -> Env
         action = Discrete(n=int(env.action_space.n))
     else:
         action = _array("action", env.action_space)
-    spec = getattr(base, "env_spec", None)
-    if isinstance(spec, EnvSpec) and (env.observation_space, env.action_space) == (
-        observation_space(spec),
-        action_space(spec),
-    ):
+    spec, ours = getattr(base, "env_spec", None), (env.observation_space, env.action_space)
+    if isinstance(spec, EnvSpec) and ours == (observation_space(spec), action_space(spec)):
         return spec
     try:
         json.dumps(dict(options))
