@@ -4,7 +4,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-__all__ = ["InputError", "MissingPackage", "NotCopied", "require"]
+__all__ = ["InputError", "MissingPackage", "NotCopied", "expect", "require"]
 
 
 class InputError(ValueError):
@@ -24,6 +24,14 @@ class NotCopied:
     def __reduce__(self) -> Any:
         """Raise `TypeError`."""
         raise TypeError("a running env cannot be copied or pickled: make another one")
+
+
+def expect(
+    right: object, name: str, expected: str, got: str = "", kind: type[InputError] = InputError
+) -> None:
+    """Raise an error with the sentence "name: expected this, got that", unless it is right."""
+    if not right:
+        raise kind(f"{name}: expected {expected}" + (f", got {got}" if got else ""))
 
 
 def require(module: str, extra: str, purpose: str) -> ModuleType:
