@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .learner import Learner, Terms
+from .learner import Learner
 from .networks import Critic, nn, torch
 from .policies import NetworkPolicy, flat_size
 from .presets import A2CConfig
@@ -48,8 +48,8 @@ class A2C(Learner):
         gain = (log_probability * torch.from_numpy(advantage.astype(np.float32))).mean()
         value_loss = (targets - values).square().mean()
         loss: torch.Tensor = config.vf_coef * value_loss - gain - config.ent_coef * entropy.mean()
-        critic = value_loss.detach(), held, targets
-        self.terms = Terms(gain=gain.detach(), entropy=entropy.detach(), critic=critic)
+        self.terms = {"gain": gain, "entropy": entropy, "value_loss": value_loss}
+        self.terms |= {"values": held, "targets": targets}
         return loss
 
     def advantages(self, rollout: Rollout, values: np.ndarray) -> np.ndarray:
