@@ -104,11 +104,12 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = count = self.env.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.actions = ActionMap(self.spec.action)
+        pairs = [array.bounds() for array in self.spec.observation]
         low, high = (
-            np.concatenate([array.bounds()[i].ravel() for array in self.spec.observation])
-            for i in range(2)
+            np.concatenate([bound.ravel() for bound in ends]).astype("f")
+            for ends in zip(*pairs, strict=True)
         )
-        self.single_observation_space = spaces.Box(low.astype("f"), high.astype("f"))
+        self.single_observation_space = spaces.Box(low, high)
         self.single_action_space = (
             spaces.Discrete(self.actions.outputs)
             if self.actions.discrete
@@ -144,8 +145,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def start(self) -> None:
         """Begin the first episode of every drone, unless that was done before."""
         if self._numbers[0] < 0:
-            self._number(self._all)
-            self.env.reset(seed=self._seeds.tolist())
+            self.reset()
 
     def fly(
         self,
@@ -349,7 +349,7 @@ class _OneDrone:
         self._told = [(array.name, component_names(array)) for array in arrays]
         self.telemetry: dict[str, np.ndarray] = {}
         self.observations: Any = None
-        self._set(0.0, False, False, False)
+        self._set()
 
     def reset(self, *, seed: list[int]) -> None:
         self._take(*self._env.reset(seed=seed[0]))
@@ -364,20 +364,13 @@ class _OneDrone:
         if resets is not None and resets[0] and seeds is not None:
             self.reset(seed=[int(seeds[0])])
         elif frozen is not None and frozen[0]:
-            self._set(0.0, False, False, False)
+            self._set()
         else:
             action = int(actions[0]) if self._shape is None else actions[0].reshape(self._shape)
-            observation, reward, terminated, truncated, info = self._env.step(action)
-            self._take(observation, info, float(reward), terminated, truncated)
+            observation, *result, info = self._env.step(action)
+            self._take(observation, info, *result)
 
-    def _take(
-        self,
-        observation: Any,
-        info: dict[str, Any],
-        reward: float = 0.0,
-        terminated: bool = False,
-        truncated: bool = False,
-    ) -> None:
+    def _take(self, observation: Any, info: dict[str, Any], *result: Any) -> None:
         if isinstance(observation, dict):
             self.observations = {k: np.asarray(v)[np.newaxis] for k, v in observation.items()}
         else:
@@ -386,8 +379,14 @@ class _OneDrone:
             name: np.array([[info[component] for component in components]])
             for name, components in self._told
         }
-        self._set(reward, terminated, truncated, LOST in info)
+        self._set(*result, lost=LOST in info)
 
-    def _set(self, reward: float, terminated: bool, truncated: bool, lost: bool) -> None:
-        self.rewards, self.lost = np.array((reward,)), _FLAGS[lost]
+    def _set(
+        self,
+        reward: Any = 0.0,
+        terminated: bool = False,
+        truncated: bool = False,
+        lost: bool = False,
+    ) -> None:
+        self.rewards, self.lost = np.array((float(reward),)), _FLAGS[lost]
         self.terminated, self.truncated = _FLAGS[terminated], _FLAGS[truncated]

@@ -155,11 +155,10 @@ def set_optimizer_arrays(
     """Take over what `optimizer_arrays` gave. Raises `ValueError` unless it is whole."""
     given = {k: v for k, v in arrays.items() if k.startswith("optimizer.")}
     expected = {
-        f"optimizer.{index}.{key}": tuple(shape)
+        f"optimizer.{index}.{key}": () if key == "step" else tuple(parameter.shape)
         for index, parameter in enumerate(_parameters(optimizer))
-        for key, shape in (("step", ()), ("exp_avg", parameter.shape),
-                           ("exp_avg_sq", parameter.shape))
-    }  # fmt: skip
+        for key in ("step", "exp_avg", "exp_avg_sq")
+    }
     got = {name: array.shape for name, array in given.items()}
     if got not in (expected, {}):
         raise ValueError(f"optimizer: expected arrays of shapes {expected}, got {got}")

@@ -103,7 +103,5 @@ def arrays_of(module: nn.Module) -> dict[str, np.ndarray]:
 
 def load_arrays(module: nn.Module, arrays: Mapping[str, np.ndarray], prefix: str = "") -> None:
     """Set a module's parameters from the arrays whose names begin with a prefix."""
-    given = {name: array for name, array in arrays.items() if name.startswith(prefix)}
-    module.load_state_dict(
-        {name.removeprefix(prefix): torch.from_numpy(a.copy()) for name, a in given.items()}
-    )
+    given = {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
+    module.load_state_dict({name: torch.from_numpy(a.copy()) for name, a in given.items()})

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..envs.spec import ArraySpec, Discrete, EnvSpec
-from ..models.errors import InputError
+from ..models.errors import expect
 
 __all__ = ["ActionMap", "NetworkPolicy", "Policy", "flat", "flat_size"]
 
@@ -56,9 +56,8 @@ class ActionMap:
         if isinstance(action, Discrete):
             self.outputs, self.size = action.n, 1
             return
-        if not action.dtype.startswith("float"):
-            got = action.dtype
-            raise InputError(f"action: expected a choice or numbers of type float, got {got}")
+        right = action.dtype.startswith("float")
+        expect(right, "action", "a choice or numbers of type float", action.dtype)
         self.outputs = self.size = action.size
         # Two axes here and below: NumPy is slow where it has to add one to a batch of one.
         low, high = (bound.reshape(1, -1) for bound in action.bounds())
@@ -148,8 +147,9 @@ def _check_shapes(weights: Mapping[str, np.ndarray], inputs: int, actions: Actio
     }
     if not actions.discrete:
         expected["log_std"] = (actions.outputs,)
-    if got != expected or not units:
-        raise InputError(
-            f"policy: expected weights of shapes {expected}, got {got}: it was trained for other "
-            "observations or actions; give the --vehicle and the --env options of its training"
-        )
+    reason = (
+        "it was trained for other observations or actions; give the --vehicle and the --env "
+        "options of its training"
+    )
+    right = got == expected and units
+    expect(right, "policy", f"weights of shapes {expected}", f"{got}: {reason}")

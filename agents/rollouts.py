@@ -130,9 +130,8 @@ class Collector:
             idle = done if waiting else None
             log.fly(actions, idle) if stop is None else log.fly(actions, None, idle)
             after, terminated, truncated = log.observations, env.terminated, env.truncated
-            rows.append(
-                (observations, actions, env.rewards, after, terminated, truncated, ~done, env.lost)
-            )
+            ends = (terminated, truncated, ~done, env.lost)
+            rows.append((observations, actions, env.rewards, after, *ends))
             observations, ended = after, terminated | truncated
             done = ended if stop is None else done | ended
             waiting = int(np.count_nonzero(done))  # of few drones faster than `any`

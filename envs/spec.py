@@ -228,7 +228,7 @@ class EnvSpec(_Part):
         right = _is_number(period) and 1e-6 <= period <= 1e3
         _expect(right, "control_period", "1e-6 to 1e3 s", period)
         _check_text("vehicle", self.vehicle)
-        right = isinstance(digits, str) and re.fullmatch("[0-9a-f]{32}", digits)
+        right = isinstance(digits, str) and bool(re.fullmatch("[0-9a-f]{32}", digits))
         _expect(right, "vehicle_hash", "32 hex digits", digits)
         _check_words("agents", agents)
         right = 1 <= len({*agents}) == len(agents) <= MAX_AGENTS

@@ -4,7 +4,7 @@ import io
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import closing, suppress
+from contextlib import suppress
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
@@ -70,7 +70,7 @@ def write_film(
         nonlocal count
         for frame in chain((first,), taken):
             count += 1
-            if (frame.dtype, frame.shape) != (np.uint8, shape):
+            if frame.dtype != np.uint8 or frame.shape != shape:
                 got = f"got {frame.dtype}, shape {frame.shape}"
                 raise ValueError(f"film: expected frames of uint8, shape {shape}, {got}")
             yield frame
@@ -149,13 +149,16 @@ def poster(path: Path, share: float = 0.3) -> bytes:
     ffmpeg = require("imageio_ffmpeg", "render", "a film's poster")
     try:
         frames, seconds = ffmpeg.count_frames_and_secs(str(path))
-        start = share * seconds * (frames - 1) / max(frames, 1)
-        with closing(ffmpeg.read_frames(str(path), input_params=["-ss", f"{start:.6f}"])) as film:
-            size, picture = next(film)["size"], next(film)
-    except (RuntimeError, OSError, StopIteration) as error:
+    except RuntimeError as error:
         raise OSError(f"{path}: expected a film, got none that ffmpeg reads") from error
+    start = share * seconds * (frames - 1) / max(frames, 1)
+    words = ("-v", "error", "-ss", f"{start:.6f}", "-i", str(path), "-frames:v", "1")
+    command = [_ffmpeg(), *words, "-f", "image2pipe", "-c:v", "png", "-"]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+    if done.returncode or not done.stdout:
+        raise OSError(f"{path}: expected a picture of the film, got none from ffmpeg")
     jpeg = io.BytesIO()
-    Image.frombytes("RGB", size, picture).save(jpeg, "JPEG", quality=80)
+    Image.open(io.BytesIO(done.stdout)).convert("RGB").save(jpeg, "JPEG", quality=80)
     return jpeg.getvalue()
 
 

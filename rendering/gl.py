@@ -30,9 +30,8 @@ class NoOpenGL(RuntimeError):
 def hidden_gl_setting() -> Iterator[None]:
     """Let MuJoCo be imported without an OpenGL, also where `MUJOCO_GL` names one that is not there.
 
-    MuJoCo imports one when it is imported itself, which takes a tenth of a second, and raises where
-    that fails, in commands that draw nothing too. Enter this before MuJoCo is imported;
-    `offscreen_context` raises where something is to be drawn.
+    Otherwise MuJoCo imports one as well, which takes a tenth of a second, and raises where that
+    fails, also in commands that draw nothing. `offscreen_context` raises where one is needed.
     """
     before, wanted = dict(os.environ), _wanted()
     library = _LIBRARIES.get(wanted, "")

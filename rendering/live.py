@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 import mujoco
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import expect
 from .moment import Moment
 from .pace import Pace
 from .stage import Stage
@@ -84,8 +84,8 @@ class LiveView(AbstractContextManager["LiveView"]):
 
     def draw(self, *moments: Moment) -> None:
         """Leave moments to be drawn, one of each craft. Older ones that wait are dropped."""
-        if len(moments) != self.stage.drones:
-            raise InputError(f"moments: expected {self.stage.drones}, got {len(moments)}")
+        drones = self.stage.drones
+        expect(len(moments) == drones, "moments", f"{drones}", f"{len(moments)}")
         self._latest = moments
         self._fresh.set()
 

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, get_args
 import mujoco
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import expect
 from ..models.scene import SCENE_PREFIX, World, build_scene
 from ..models.vehicle import Vehicle
 from .moment import Moment
@@ -72,8 +72,7 @@ class Stage:
         vehicle: Path | str | None = None,
         trail: bool = True,
     ) -> None:
-        if drones < 1:
-            raise InputError(f"drones: expected 1 or more, got {drones}")
+        expect(drones >= 1, "drones", "1 or more", f"{drones}")
         self.drones, self.vehicle = drones, Vehicle.load(vehicle)
         spec = build_scene(self.vehicle.path, world)
         self.radius, top = _size(spec.compile())
@@ -109,13 +108,11 @@ class Stage:
 
     def show(self, *moments: Moment) -> None:
         """Put every craft where its moment has it, and extend its path. Raises `InputError`."""
-        if len(moments) != self.drones:
-            raise InputError(f"moments: expected {self.drones}, got {len(moments)}")
-        if (rotors := len(moments[0].thrusts)) != self.vehicle.num_rotors:
-            raise InputError(
-                f"vehicle: expected a file with {rotors} rotors, as in the flight, got "
-                f"{self.vehicle.path.name} with {self.vehicle.num_rotors}"
-            )
+        expect(len(moments) == self.drones, "moments", f"{self.drones}", f"{len(moments)}")
+        craft, rotors = self.vehicle, len(moments[0].thrusts)
+        expected = f"a file with {rotors} rotors, as in the flight"
+        got = f"{craft.path.name} with {craft.num_rotors}"
+        expect(rotors == craft.num_rotors, "vehicle", expected, got)
         before, self.moments = self.moments or moments, moments
         poses = self.data.qpos.reshape(self.drones, 7)
         for i, (moment, last) in enumerate(zip(moments, before, strict=True)):
@@ -144,8 +141,7 @@ class Stage:
             camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
             camera.fixedcamid = self.model.camera(_ONBOARD).id
             return camera
-        if name not in _VIEWS:
-            raise InputError(f"camera: expected one of {', '.join(CAMERAS)}, got {name!r}")
+        expect(name in _VIEWS, "camera", f"one of {', '.join(CAMERAS)}", f"{name!r}")
         camera.azimuth, camera.elevation, distance, holds = _VIEWS[name]
         camera.distance = distance * self.radius + self._spread
         if holds == math.inf:
