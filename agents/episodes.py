@@ -1,8 +1,7 @@
 """Episodes with seeds of their own: recorded as they are flown, and flown again to resume.
 
 An episode is determined by its seed and its actions. So a training that stops in the middle of one
-needs no copy of the simulator's state: it resets to the same seed and repeats the same actions,
-over any wire and in any simulator of the same model.
+keeps no simulator's state: it resets to the same seed and repeats the same actions, over any wire.
 """
 
 import time
@@ -225,8 +224,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Every drone flies the actions of its running episode again; one whose episode is shorter
         than the longest is frozen until its turn. `steps` begins with these steps. Raises
-        `ResumeError` if the env does not repeat what it did then: another model, another version
-        of MuJoCo, or other options.
+        `ResumeError` if the env does not repeat what it did then.
         """
         if len(position.numbers) != self.num_envs:
             raise ResumeError(
@@ -379,14 +377,9 @@ class _OneDrone:
             name: np.array([[info[component] for component in components]])
             for name, components in self._told
         }
-        self._set(*result, lost=LOST in info)
+        self._set(*result)
+        self.lost = _FLAGS[LOST in info]
 
-    def _set(
-        self,
-        reward: Any = 0.0,
-        terminated: bool = False,
-        truncated: bool = False,
-        lost: bool = False,
-    ) -> None:
-        self.rewards, self.lost = np.array((float(reward),)), _FLAGS[lost]
+    def _set(self, reward: Any = 0.0, terminated: bool = False, truncated: bool = False) -> None:
+        self.rewards, self.lost = np.array((float(reward),)), _FLAGS[False]
         self.terminated, self.truncated = _FLAGS[terminated], _FLAGS[truncated]

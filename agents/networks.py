@@ -35,9 +35,8 @@ class Actor(nn.Module):
     """Policy: Gaussian for continuous actions, categorical for discrete ones.
 
     The Gaussian's standard deviation does not depend on the state; `log_std` is its logarithm to
-    begin with. An action is neither clipped nor squashed here: the env gets the clipped action, the
-    loss scores the drawn one. Inputs are n, the length of a flat observation, outputs k, the
-    numbers of an action or its choices.
+    begin with. The env gets the clipped action, the loss scores the drawn one. Inputs are n, the
+    length of a flat observation, outputs k, the numbers of an action or its choices.
     """
 
     def __init__(

@@ -24,8 +24,7 @@ class Policy(Protocol):
 def flat(observations: Any, spec: EnvSpec, *lead: int) -> np.ndarray:
     """Observations as networks take them: float32, shape (*lead, n).
 
-    They are an array of shape (*lead, ...), or a mapping with one for each array of the spec, which
-    are joined in its order. `lead` is N for N drones, nothing for a single one.
+    Given is an array of shape (*lead, ...), or a mapping with one for each array of the spec.
     """
     if not isinstance(observations, Mapping):
         return np.asarray(observations, np.float32).reshape(*lead, -1)

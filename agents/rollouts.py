@@ -87,9 +87,8 @@ class Collector:
         """Whole episodes, as many as there are drones or a multiple: at least so many.
 
         A drone whose episode ends is frozen until all have ended. A round that `most_steps`
-        cuts off is left out: all of its episodes but the shortest would be fragments. A single
-        drone's last fragment is kept. Episodes with a lost simulator are left out, and a round of
-        nothing else does not count.
+        cuts off is left out, but for a single drone's last fragment. Episodes with a lost simulator
+        are left out, and a round of nothing else does not count.
         """
         log = self._log
         rounds, last = -(-count // log.num_envs), log.env_steps + most_steps

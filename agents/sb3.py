@@ -89,8 +89,7 @@ class SB3A2C:
     """SB3's A2C behind the same interface as our own algorithms.
 
     Adam instead of SB3's RMSprop, no clipping of gradients, and every other setting from the same
-    `A2CConfig`: given the same experience, it makes the same updates as ours. SB3 wants the
-    env, the log, at construction.
+    `A2CConfig`: given the same experience, it makes the same updates as ours.
     """
 
     def __init__(self, log: EpisodeLog, config: A2CConfig, seed: int) -> None:

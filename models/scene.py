@@ -140,10 +140,9 @@ def attach_airport(spec: mujoco.MjSpec) -> None:
     up, metres. The scene moves bit for bit as without it: its geoms collide with nothing, and only
     a rangefinder would see them. `spec.compiler.discardvisual` drops them all.
 
-    Horizontal planes of the world body at z = 0, the scene's floor, still carry what stands on
-    them, but are not drawn unless geom group 3 is. The sky, haze, shadow map, and the near and far
-    end of drawing become the airport's. Lights and cameras stay. Raises `InputError` if the scene
-    has an airport already, `ValueError` if it does not compile.
+    Planes of the world body at z = 0 still carry what stands on them, but only geom group 3 draws
+    them. Sky, haze, shadow map, and the near and far end of drawing become the airport's. Raises
+    `InputError` if the scene has an airport already, `ValueError` if it does not compile.
     """
     ours = any(geom.name.startswith(AIRPORT_PREFIX) for geom in spec.geoms)
     expect(not ours, "spec", "a scene without an airport", "one that has it")
@@ -156,9 +155,8 @@ def attach_airport(spec: mujoco.MjSpec) -> None:
     for texture in list(spec.textures):
         if texture.type == _SKY:
             spec.delete(texture)
-    # See as far as the hills, and keep the scale that the scene has without them. MuJoCo measures
-    # the ends of drawing, shadows and the free camera's first distance in extents of the scene; an
-    # extent taken anew, with a runway in it, would spoil them.
+    # See as far as the hills, and keep the scale that the scene has without them: MuJoCo measures
+    # the ends of drawing, shadows and the free camera's first distance in extents of the scene.
     stat, visual = model.stat, spec.visual
     spec.stat.extent, spec.stat.center, spec.stat.meansize = stat.extent, stat.center, stat.meansize
     visual.map.znear, visual.map.zfar = _NEAR / stat.extent, _FAR / stat.extent

@@ -1,8 +1,7 @@
 """A vehicle: an MJCF file and what follows from its compiled model.
 
 A vehicle is one free body with rotors: actuators that push at a site of the body, along an axis and
-with a reaction about it. Nothing else about it is known beforehand: number of rotors, positions,
-directions, limits, mass, inertia, hover thrust and allocation are derived from the model.
+with a reaction about it. Everything else is derived from the model.
 
 Body frame: that of the free body, x forward, y left, z up; SI units.
 """

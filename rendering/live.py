@@ -139,10 +139,7 @@ class LiveView(AbstractContextManager["LiveView"]):
 
 
 def lines_over(moments: tuple[Moment, ...], thrust_high: float, pace: str, drones: int) -> Lines:
-    """The lines of an overlay: those of the first craft, and the speed in words.
-
-    `moments` are those of the craft that are shown, of so many drones; `thrust_high` in N.
-    """
+    """The lines of an overlay of so many drones: those of the first; its `thrust_high` is in N."""
     lines = [*moments[0].lines(thrust_high), ("speed", pace)]
     if drones > 1:
         shown = f"{len(moments)} of {drones}" if drones > len(moments) else str(drones)

@@ -58,7 +58,7 @@ def graph_scale(values: Iterable[float]) -> tuple[float, float]:
 class Overlay:
     """Draws on the pictures of one flight: a panel of numbers, and a graph of the headline metric.
 
-    Everything scales with the picture. A small one has no graph, and a smaller one only the title.
+    Everything scales with the picture. A small one has no graph, a smaller one only the title.
 
     Args:
         width, height: Of the pictures, pixels.

@@ -229,10 +229,7 @@ def _size(model: mujoco.MjModel) -> tuple[float, float]:
 
 
 def _scale_drawing(model: mujoco.MjModel, radius: float, spread: float) -> None:
-    """Set the near end of drawing, the shadow's fineness and the floor's squares for the craft.
-
-    Ground and light that the vehicle's file brings stay as they are.
-    """
+    """Set the near end of drawing, the shadow's fineness and our floor's squares for the craft."""
     visual, extent = model.vis, model.stat.extent
     visual.global_.fovy = _FOVY
     visual.map.znear = min(visual.map.znear * extent, _NEAR * radius) / extent
