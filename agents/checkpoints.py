@@ -245,7 +245,7 @@ def _expect(ok: bool, expected: str, got: object) -> None:
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file: after a crash at any moment, `path` holds the old one or the new one.
 
-    Two processes may write it at the same time: one of them writes last. `OSError` names the file.
+    Two processes may write it at the same time. `OSError` names the file.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
     try:

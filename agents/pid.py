@@ -31,11 +31,9 @@ class PID:
     def __init__(self, spec: EnvSpec) -> None:
         options = spec.options
         expect(spec.env_id == ENV_ID, "pid", f"the env {ENV_ID}", spec.env_id)
-        needed = {"observation": "full", "action_type": "continuous"}
-        expected = " and ".join(f"{name}={value!r}" for name, value in needed.items())
-        got = [options[name] for name in needed]
-        right = got == list(needed.values())
-        expect(right, "pid", expected, " and ".join(map(repr, got)))
+        modes = f"{options['observation']!r} and {options['action_type']!r}"
+        expected = "observation='full' and action_type='continuous'"
+        expect(modes == "'full' and 'continuous'", "pid", expected, modes)
         telemetry = {array.name: array for array in spec.telemetry}
         expect("thrust" in telemetry, "pid", "the telemetry thrust", f"{sorted(telemetry)}")
         highest = telemetry["thrust"].bounds()[1]

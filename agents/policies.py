@@ -87,7 +87,20 @@ class NetworkPolicy:
 
     def __init__(self, weights: Mapping[str, np.ndarray], spec: EnvSpec) -> None:
         self.spec, self.actions = spec, ActionMap(spec.action)
-        _check_shapes(weights, flat_size(spec), self.actions)
+        got = {name: array.shape for name, array in weights.items()}
+        units, outputs = (*got.get("hidden.bias", ()), 0)[0], self.actions.outputs
+        expected = {
+            "hidden.weight": (units, flat_size(spec)),
+            "hidden.bias": (units,),
+            "output.weight": (outputs, units),
+            "output.bias": (outputs,),
+        } | ({} if self.actions.discrete else {"log_std": (outputs,)})
+        reason = (
+            "it was trained for other observations or actions; give the --vehicle and the --env "
+            "options of its training"
+        )
+        right = got == expected and units
+        expect(right, "policy", f"weights of shapes {expected}", f"{got}: {reason}")
         self._w1, self._b1 = weights["hidden.weight"].T, weights["hidden.bias"][np.newaxis]
         self._w2, self._b2 = weights["output.weight"].T, weights["output.bias"][np.newaxis]
         self._zero = np.zeros_like(self._b1)
@@ -133,22 +146,3 @@ class NetworkPolicy:
         if self._std is None:
             output = output.argmax(axis=1)[:, np.newaxis].astype(np.float32)
         return output
-
-
-def _check_shapes(weights: Mapping[str, np.ndarray], inputs: int, actions: ActionMap) -> None:
-    got = {name: array.shape for name, array in weights.items()}
-    units = (*got.get("hidden.bias", ()), 0)[0]
-    expected = {
-        "hidden.weight": (units, inputs),
-        "hidden.bias": (units,),
-        "output.weight": (actions.outputs, units),
-        "output.bias": (actions.outputs,),
-    }
-    if not actions.discrete:
-        expected["log_std"] = (actions.outputs,)
-    reason = (
-        "it was trained for other observations or actions; give the --vehicle and the --env "
-        "options of its training"
-    )
-    right = got == expected and units
-    expect(right, "policy", f"weights of shapes {expected}", f"{got}: {reason}")

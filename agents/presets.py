@@ -72,12 +72,10 @@ class VPGConfig(_Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        expect(
-            self.baseline != "time" or self.episodes_per_update > 1,
-            "episodes_per_update",
-            "2 or more with baseline 'time', where a single episode is its own mean",
-            f"{self.episodes_per_update}",
-        )
+        count = self.episodes_per_update
+        right = self.baseline != "time" or count > 1
+        expected = "2 or more with baseline 'time', where a single episode is its own mean"
+        expect(right, "episodes_per_update", expected, f"{count}")
 
 
 @dataclass(frozen=True, kw_only=True)

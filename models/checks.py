@@ -93,9 +93,8 @@ def examine(vehicle: Vehicle, *, paper: bool | None = None) -> list[Check]:
     parts = [_mass, _rotors, _free_fall, _hover, _climb, _tumbling, _resting, _linear_drag]
     checks = [check for part in parts for check in part(vehicle, model, body)]
     if paper if paper is not None else vehicle.path == QUAD_XML.resolve():
-        got = f"{vehicle.num_rotors}"
-        four = vehicle.num_rotors == NUM_ROTORS
-        expect(four, "vehicle", f"the {NUM_ROTORS} rotors of the paper", got)
+        expected, rotors = f"the {NUM_ROTORS} rotors of the paper", vehicle.num_rotors
+        expect(rotors == NUM_ROTORS, "vehicle", expected, f"{rotors}")
         # With air and drag, if there are any, for the paper has none.
         parts = [_paper_numbers, _paper_rotors, _paper_flights, _spinning_top, _paper_drag]
         checks += [check for part in parts for check in part(vehicle, vehicle.model, body)]

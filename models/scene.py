@@ -125,11 +125,9 @@ def _copy_settings(source: Any, target: Any) -> None:
     """Copy the settings of a part of a spec, and those of its parts."""
     for name in dir(source):
         value = getattr(source, name)
-        if name.startswith("_") or callable(value):
-            continue
         if isinstance(value, int | float | np.ndarray):
             setattr(target, name, value)
-        else:
+        elif not (name.startswith("_") or callable(value)):
             _copy_settings(value, getattr(target, name))
 
 

@@ -194,12 +194,9 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
     mass, gravity = float(model.body_subtreemass[body]), -float(model.opt.gravity[2])
     center = data.subtree_com[body].copy()
     rotors = tuple(_rotor(model, data, i, body) for i in range(model.nu))
-    columns = []
-    for rotor in rotors:
-        axis = np.array(rotor.axis)
-        torque = np.cross(np.array(rotor.position) - center, axis) + rotor.reaction
-        columns.append((axis[2], *torque))
-    allocation = np.array(columns).T
+    arms = [np.array(rotor.position) - center for rotor in rotors]
+    torques = [np.cross(a, r.axis) + r.reaction for a, r in zip(arms, rotors, strict=True)]
+    allocation = np.array([(r.axis[2], *t) for r, t in zip(rotors, torques, strict=True)]).T
     model.dof_damping[0:3] = drag * mass
     return Vehicle(
         path=path,

@@ -8,7 +8,7 @@ from contextlib import suppress
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -117,17 +117,10 @@ def _write_mp4(
         *("-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(path)),
     ]
     with tempfile.TemporaryFile() as said:
-        # In a session of its own: Ctrl-C is for us, who then end it.
-        with (
-            suppress(BrokenPipeError),  # it has failed
-            subprocess.Popen(
-                words,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=said,
-                start_new_session=True,
-            ) as process,
-        ):
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL}
+        # In a session of its own: Ctrl-C is for us, who then end it. A broken pipe: it has failed.
+        pipes |= {"stderr": said, "start_new_session": True}
+        with suppress(BrokenPipeError), subprocess.Popen(words, **pipes) as process:
             assert process.stdin is not None
             try:
                 for frame in frames:

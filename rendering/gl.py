@@ -61,7 +61,10 @@ def offscreen_context(width: int, height: int) -> Any:
             with context.as_current():
                 pass
         except Exception as error:  # each library fails in a way of its own
-            reasons.append(f"{name}: {_why(error)}")
+            words = " ".join(str(error).split()) or type(error).__name__
+            if isinstance(error, AttributeError):  # PyOpenGL's way to say so
+                words = "its library is not installed"
+            reasons.append(f"{name}: {words:.200}")
         else:
             return context
     raise NoOpenGL(
@@ -72,13 +75,6 @@ def offscreen_context(width: int, height: int) -> Any:
 
 def _wanted() -> str:
     return os.environ.get(_HIDDEN, os.environ.get("MUJOCO_GL", "")).lower().strip()
-
-
-def _why(error: Exception) -> str:
-    if isinstance(error, AttributeError):  # PyOpenGL's way to say so
-        return "its library is not installed"
-    words = " ".join(str(error).split()) or type(error).__name__
-    return f"{words:.200}"
 
 
 def _candidates() -> tuple[str, ...]:

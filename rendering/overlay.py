@@ -152,11 +152,10 @@ class Overlay:
 
     def _have_room(self) -> bool:
         """Whether numbers fit, and leave the middle free."""
-        gap, (width, height) = self._gap, self._size
-        if height < _NUMBERS_HEIGHT or width < self._numbers_width() + 2 * gap:
-            return False
-        wide, high = gap + self._numbers_width(), self._panel_box(True).lower
-        return wide <= _NUMBERS_SHARE * width or high <= _NUMBERS_SHARE * height
+        wide, high = self._gap + self._numbers_width(), self._panel_box(True).lower
+        width, height = self._size
+        fits = height >= _NUMBERS_HEIGHT and width >= wide + self._gap
+        return fits and (wide <= _NUMBERS_SHARE * width or high <= _NUMBERS_SHARE * height)
 
     def _panel_box(self, numbers: bool) -> Box:
         gap, (width, height) = self._gap, self._size

@@ -157,8 +157,7 @@ class Stage:
     def focus(self) -> np.ndarray:
         """Mean of the goals, or of the craft if there are none, MuJoCo's frame, shape (3,), m."""
         goals = [goal for i in range(self.drones) if (goal := self._goal(i)) is not None]
-        points = np.array(goals) if goals else self._points()
-        return np.asarray(points.mean(axis=0))
+        return np.asarray((np.array(goals) if goals else self._points()).mean(axis=0))
 
     def decorate(self, next_geom: NextGeom, *, goals: bool = True) -> None:
         """Add the discs that mark the goals, if they are wanted, and the fading paths."""

@@ -87,7 +87,7 @@ class Window:
         return bool(self._handle.is_running())
 
     def is_watched(self) -> bool:
-        """Whether there is a viewer: a window has one from its start."""
+        """True: a window has a viewer from its start."""
         return True
 
     def close(self) -> None:

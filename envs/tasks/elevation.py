@@ -190,10 +190,9 @@ class Elevation(Task):
     def rate_bound(self) -> float:
         """Speed that no flight can exceed before its episode ends, m/s.
 
-        Thrust and gravity accelerate by a or less; drag only brakes. The band is checked at the
-        end of a control period T. So the craft may turn back outside the band, within one period
-        (out and back at no more than a T / 2), fly through the band (twice `flight_band`), and
-        then for one period more: sqrt((a T / 2)² + 2 a · 2 flight_band) + a T.
+        Thrust and gravity accelerate by a or less; drag only brakes. The band is checked at the end
+        of a control period T. So the craft may turn back outside it within one period, fly through
+        it, and fly on for one period: sqrt((a T / 2)² + 2 a · 2 flight_band) + a T.
         """
         a, period = self.vehicle.max_acceleration, self.options.control_period
         out = math.sqrt(4 * a * self.options.flight_band)

@@ -80,9 +80,7 @@ class Outcome:
 
 
 class Task:
-    """Base of all tasks: derive, set the class attributes, and write the methods below.
-
-    `examples/landing.py` is a whole one in forty lines; `register` makes it an env.
+    """Base of all tasks: derive, as `examples/landing.py` does, and `register` it.
 
     Class attributes:
         Options: Dataclass of the task's options.
