@@ -15,9 +15,8 @@ __all__ = ["A2C"]
 class A2C(Learner):
     """Two networks: the critic learns V(s), the actor follows the advantage.
 
-    Algorithm 2 weighs the actor's gradient by Q in step 3; the text and Equation 3 say by the
-    advantage A, and so do we. The critic descends the squared error to r + gamma · V(s'), with
-    the target held still, which is step 5.
+    Algorithm 2 weighs the actor's gradient by Q in step 3; the text and Equation 3 by A, as here.
+    The critic descends the squared error to r + gamma · V(s'), held still, which is step 5.
     """
 
     config: A2CConfig

@@ -1,7 +1,7 @@
 """Checkpoints: one safetensors file with weights, state, config, spec, seed and versions.
 
-Loading one runs no code from it, and imports nothing that it names. Writing one replaces the old
-file whole or not at all. A checksum over all bytes of the file detects any damage.
+Loading one runs no code from it. Writing one replaces the old file whole or not at all. A checksum
+over all bytes of the file detects any damage.
 """
 
 import hashlib

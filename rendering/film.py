@@ -43,10 +43,9 @@ def write_film(
 ) -> int:
     """Write a film, and return how many frames were taken.
 
-    `.mp4` is H.264 that every browser plays and that starts before it is loaded whole; `.gif`
-    repeats for ever; `.png` is the last frame alone; a name without a dot becomes a folder of
-    `0001.png`, `0002.png` and so on. Everything is written beside `path` and gets its name when it
-    is whole: Ctrl-C leaves nothing behind.
+    `.mp4` is H.264 that every browser plays before it is loaded whole; `.gif` repeats for ever;
+    `.png` is the last frame alone; a name without a dot becomes a folder of `0001.png` and so on.
+    Everything is written beside `path` and gets its name when whole: Ctrl-C leaves nothing behind.
 
     Args:
         path: Must not exist.

@@ -34,8 +34,7 @@ _ONBOARD: Final = "stage/onboard"
 _SPACING: Final = 2.2  # between craft that fly side by side
 _NEAR: Final = 0.14  # at most: where drawing begins
 _LOWER: Final = 0.06
-"""Front and side look this far below the goal, as a share of their distance: the graph covers the
-picture's lower end."""
+"""Front and side look this share of their distance below the goal: the graph covers the bottom."""
 _VIEWS: Final[dict[str, tuple[float, float, float, float]]] = {
     "chase": (0.0, -17.0, 3.85, math.inf),
     "front": (180.0, -7.0, 6.9, 1.65),  # from a little above the goal: its disc is seen
