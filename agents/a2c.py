@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .learner import Learner, Terms
+from .learner import Learner
 from .networks import Critic, nn, torch
 from .policies import NetworkPolicy, flat_size
 from .presets import A2CConfig
@@ -15,9 +15,8 @@ __all__ = ["A2C"]
 class A2C(Learner):
     """Two networks: the critic learns V(s), the actor follows the advantage.
 
-    Algorithm 2 weighs the actor's gradient by Q in step 3; the text and Equation 3 say by the
-    advantage A, and so do we. The critic descends the squared error to r + gamma · V(s'), with
-    the target held still, which is step 5.
+    Algorithm 2 weighs the actor's gradient by Q in step 3; the text and Equation 3 by A, as here.
+    The critic descends the squared error to r + gamma · V(s'), held still, which is step 5.
     """
 
     config: A2CConfig
@@ -48,8 +47,8 @@ class A2C(Learner):
         gain = (log_probability * torch.from_numpy(advantage.astype(np.float32))).mean()
         value_loss = (targets - values).square().mean()
         loss: torch.Tensor = config.vf_coef * value_loss - gain - config.ent_coef * entropy.mean()
-        critic = value_loss.detach(), held, targets
-        self.terms = Terms(gain=gain.detach(), entropy=entropy.detach(), critic=critic)
+        self.terms = {"gain": gain, "entropy": entropy, "value_loss": value_loss}
+        self.terms |= {"values": held, "targets": targets}
         return loss
 
     def advantages(self, rollout: Rollout, values: np.ndarray) -> np.ndarray:

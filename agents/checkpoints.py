@@ -1,7 +1,7 @@
 """Checkpoints: one safetensors file with weights, state, config, spec, seed and versions.
 
-Loading one runs no code from it, and imports nothing that it names. Writing one replaces the old
-file whole or not at all. A checksum over all bytes of the file detects any damage.
+Loading one runs no code from it. Writing one replaces the old file whole or not at all. A checksum
+over all bytes of the file detects any damage.
 """
 
 import hashlib
@@ -86,11 +86,9 @@ class Checkpoint:
     def other_versions(self) -> dict[str, tuple[str, str]]:
         """Software whose version was another: its version then and now."""
         now = software_versions()
-        return {
-            name: (self.versions.get(name, "none"), now.get(name, "none"))
-            for name in sorted({*self.versions, *now})
-            if self.versions.get(name) != now.get(name)
-        }
+        names = sorted({*self.versions, *now})
+        pairs = {name: (self.versions.get(name, "none"), now.get(name, "none")) for name in names}
+        return {name: pair for name, pair in pairs.items() if len({*pair}) > 1}
 
 
 def software_versions() -> dict[str, str]:
@@ -107,15 +105,12 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
 
     Raises `CheckpointError` where a number is not finite: training diverged. The old file stays.
     """
-    where = checkpoint.position
+    where, rows = checkpoint.position, checkpoint.position.episodes
     parts: dict[str, Mapping[str, Any]] = {
         "policy": checkpoint.actor,
         "state": checkpoint.state,
         "position": {name: getattr(where, name) for name in _POSITION},
-        "episodes": {
-            name: np.array([getattr(episode, name) for episode in where.episodes], kind)
-            for name, kind in _COLUMNS.items()
-        },
+        "episodes": {n: np.array([vars(row)[n] for row in rows], k) for n, k in _COLUMNS.items()},
     }
     arrays = {
         f"{group}/{name}": np.array(value, order="C")
@@ -184,13 +179,12 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
         episodes=tuple(Episode(**dict(zip(_COLUMNS, row, strict=True))) for row in rows),
         **arrays["position"],
     )
-    _check_shapes(position, spec)
-    plain = {name: meta[name] for name in _PLAIN}
-    actor, state = arrays["policy"], arrays["state"]
+    plain, state = {name: meta[name] for name in _PLAIN}, arrays["state"]
     config = vars(preset(meta["algorithm"], "paper", **meta["config"]))
     _expect(config == meta["config"], f"a config of all of {sorted(config)}", meta["config"])
-    _check_steps(position, meta["env_steps"], state.get("steps"))
+    _check_position(position, spec, meta["env_steps"], state.get("steps"))
     _check_optimizer(state)
+    actor = arrays["policy"]
     checkpoint = Checkpoint(**plain, spec=spec, actor=actor, state=state, position=position)
     checkpoint.policy()  # raises if it does not fit
     return checkpoint
@@ -206,30 +200,25 @@ def _is_finite(name: str, array: np.ndarray) -> bool:
     return allowed or array.dtype.kind != "f" or bool(np.isfinite(array).all())
 
 
-def _check_shapes(position: Position, spec: EnvSpec) -> None:
-    count, steps = len(position.numbers), len(position.actions)
-    action = spec.action
+def _check_position(position: Position, spec: EnvSpec, total: int, told: np.ndarray | None) -> None:
+    """Shapes fit the env; env steps, of which SB3 has told its own count, those of the episodes."""
+    count, longest, action = len(position.numbers), len(position.actions), spec.action
     drawn, kind = ((), "i") if isinstance(action, Discrete) else ((action.size,), "f")
     expected: dict[str, Any] = dict.fromkeys(_POSITION, ((count,), "i"))
-    expected["actions"] = (steps, count, *drawn), kind
+    expected["actions"] = (longest, count, *drawn), kind
     expected["observations"] = (count, flat_size(spec)), "f"
-    arrays = {name: getattr(position, name) for name in _POSITION}
-    got = {name: (array.shape, array.dtype.kind) for name, array in arrays.items()}
+    got = {n: (vars(position)[n].shape, vars(position)[n].dtype.kind) for n in _POSITION}
     _expect(got == expected and count > 0, f"a position of shapes {expected}", got)
-    _expect(position.lengths.max() == steps, f"an episode of {steps} steps", position.lengths)
-
-
-def _check_steps(position: Position, total: int, told: np.ndarray | None) -> None:
-    """Env steps are those of the episodes. `told` is SB3's count of them."""
-    steps, ended = position.env_steps, {episode.episode for episode in position.episodes}
-    running = zip(position.numbers.tolist(), position.lengths.tolist(), strict=True)
-    flown = sum(episode.length for episode in position.episodes)
-    flown += sum(length for number, length in running if number not in ended)
+    lengths, steps = position.lengths, position.env_steps
+    _expect(lengths.max() == longest, f"an episode of {longest} steps", lengths)
+    ended = {episode.episode: episode.length for episode in position.episodes}
+    running = zip(position.numbers.tolist(), lengths.tolist(), strict=True)
+    flown = sum(ended.values()) + sum(length for number, length in running if number not in ended)
     _expect(flown == steps, f"env_steps of the episodes, {flown}", steps)
-    _expect(steps < total + len(position.numbers), f"env_steps of {total} at most", steps)
+    _expect(steps < total + count, f"env_steps of {total} at most", steps)
     _expect(told is None or told.tolist() == steps, f"steps of {steps}", told)
     for name in ("numbers", "lengths", "first_steps"):
-        least = getattr(position, name).min()
+        least = vars(position)[name].min()
         _expect(least >= 0 or (not steps and least == -1), f"{name} of 0 or more", int(least))
 
 
@@ -256,7 +245,7 @@ def _expect(ok: bool, expected: str, got: object) -> None:
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file: after a crash at any moment, `path` holds the old one or the new one.
 
-    Two processes may write it at the same time: one of them writes last. `OSError` names the file.
+    Two processes may write it at the same time. `OSError` names the file.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
     try:

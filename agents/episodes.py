@@ -1,8 +1,7 @@
 """Episodes with seeds of their own: recorded as they are flown, and flown again to resume.
 
 An episode is determined by its seed and its actions. So a training that stops in the middle of one
-needs no copy of the simulator's state: it resets to the same seed and repeats the same actions,
-over any wire and in any simulator of the same model.
+keeps no simulator's state: it resets to the same seed and repeats the same actions, over any wire.
 """
 
 import time
@@ -104,11 +103,12 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = count = self.env.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.actions = ActionMap(self.spec.action)
+        pairs = [array.bounds() for array in self.spec.observation]
         low, high = (
-            np.concatenate([array.bounds()[i].ravel() for array in self.spec.observation])
-            for i in range(2)
+            np.concatenate([bound.ravel() for bound in ends]).astype("f")
+            for ends in zip(*pairs, strict=True)
         )
-        self.single_observation_space = spaces.Box(low.astype("f"), high.astype("f"))
+        self.single_observation_space = spaces.Box(low, high)
         self.single_action_space = (
             spaces.Discrete(self.actions.outputs)
             if self.actions.discrete
@@ -144,8 +144,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def start(self) -> None:
         """Begin the first episode of every drone, unless that was done before."""
         if self._numbers[0] < 0:
-            self._number(self._all)
-            self.env.reset(seed=self._seeds.tolist())
+            self.reset()
 
     def fly(
         self,
@@ -225,8 +224,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Every drone flies the actions of its running episode again; one whose episode is shorter
         than the longest is frozen until its turn. `steps` begins with these steps. Raises
-        `ResumeError` if the env does not repeat what it did then: another model, another version
-        of MuJoCo, or other options.
+        `ResumeError` if the env does not repeat what it did then.
         """
         if len(position.numbers) != self.num_envs:
             raise ResumeError(
@@ -349,7 +347,7 @@ class _OneDrone:
         self._told = [(array.name, component_names(array)) for array in arrays]
         self.telemetry: dict[str, np.ndarray] = {}
         self.observations: Any = None
-        self._set(0.0, False, False, False)
+        self._set()
 
     def reset(self, *, seed: list[int]) -> None:
         self._take(*self._env.reset(seed=seed[0]))
@@ -364,20 +362,13 @@ class _OneDrone:
         if resets is not None and resets[0] and seeds is not None:
             self.reset(seed=[int(seeds[0])])
         elif frozen is not None and frozen[0]:
-            self._set(0.0, False, False, False)
+            self._set()
         else:
             action = int(actions[0]) if self._shape is None else actions[0].reshape(self._shape)
-            observation, reward, terminated, truncated, info = self._env.step(action)
-            self._take(observation, info, float(reward), terminated, truncated)
+            observation, *result, info = self._env.step(action)
+            self._take(observation, info, *result)
 
-    def _take(
-        self,
-        observation: Any,
-        info: dict[str, Any],
-        reward: float = 0.0,
-        terminated: bool = False,
-        truncated: bool = False,
-    ) -> None:
+    def _take(self, observation: Any, info: dict[str, Any], *result: Any) -> None:
         if isinstance(observation, dict):
             self.observations = {k: np.asarray(v)[np.newaxis] for k, v in observation.items()}
         else:
@@ -386,8 +377,9 @@ class _OneDrone:
             name: np.array([[info[component] for component in components]])
             for name, components in self._told
         }
-        self._set(reward, terminated, truncated, LOST in info)
+        self._set(*result)
+        self.lost = _FLAGS[LOST in info]
 
-    def _set(self, reward: float, terminated: bool, truncated: bool, lost: bool) -> None:
-        self.rewards, self.lost = np.array((reward,)), _FLAGS[lost]
+    def _set(self, reward: Any = 0.0, terminated: bool = False, truncated: bool = False) -> None:
+        self.rewards, self.lost = np.array((float(reward),)), _FLAGS[False]
         self.terminated, self.truncated = _FLAGS[terminated], _FLAGS[truncated]

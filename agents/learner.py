@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,42 +11,23 @@ from .networks import Actor, arrays_of, load_arrays, nn, torch
 from .policies import ActionMap, NetworkPolicy, flat_size
 from .rollouts import Collector, Diverged, Rollout
 
-__all__ = ["Diverged", "Learner", "OnUpdate", "Terms", "check_finite", "optimizer_arrays",
+__all__ = ["Diverged", "Learner", "OnUpdate", "check_finite", "optimizer_arrays",
            "seeds_of", "set_optimizer_arrays", "updates_of"]  # fmt: skip
 
 OnUpdate = Callable[[], bool]
 """Called after every rollout and its update; training stops where it returns False."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Terms:
-    """Terms of the loss of an update, as tensors: few updates are logged."""
-
-    gain: torch.Tensor
-    """Mean of weight · log P, which the actor climbs."""
-    entropy: torch.Tensor
-    """Of the policy at each step, nats: shape (T,)."""
-    critic: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
-    """Mean squared error of the values; V(s_t) before the update and its targets, shape (T,)."""
-
-    def numbers(self) -> dict[str, float]:
-        """By SB3's names and with its signs."""
-        numbers = {
-            "train/policy_loss": -float(self.gain),
-            "train/entropy_loss": -float(self.entropy.mean()),
-        }
-        if self.critic is not None:
-            loss, values, targets = (tensor.numpy() for tensor in self.critic)
-            spread, left = float(np.var(targets)), float(np.var(targets - values))
-            numbers["train/value_loss"] = float(loss)
-            numbers["train/explained_variance"] = 1 - left / spread if spread else np.nan
-        return numbers
-
-
 class Learner:
     """Base of our own algorithms: `collect` and `loss` are theirs; `loss` sets `terms` too.
 
     The log gives the sizes and is not kept; the seed is that of weights and actions.
+
+    Attributes:
+        terms: Of the loss of the last update, as tensors, for few updates are logged: `gain`, the
+            mean of weight · log P, which the actor climbs; `entropy` of the policy at each step,
+            nats, shape (T,); and of a critic `value_loss`, the mean squared error of the values,
+            with `values`, V(s_t) before the update, and their `targets`, shape (T,).
     """
 
     def __init__(self, log: EpisodeLog, config: Any, seed: int) -> None:
@@ -66,8 +46,7 @@ class Learner:
         parameters = [p for network in self.networks.values() for p in network.parameters()]
         # foreach: one call for all parameters instead of one for each; same arithmetic.
         self._optimizer = torch.optim.Adam(parameters, lr=config.learning_rate, foreach=True)
-        self.terms: Terms | None = None
-        """Of the last update."""
+        self.terms: dict[str, torch.Tensor] = {}
 
     def others(self) -> dict[str, nn.Module]:
         """Networks besides the actor, by name."""
@@ -124,13 +103,22 @@ class Learner:
             load_arrays(network, state, f"{name}.")
         set_optimizer_arrays(self._optimizer, state)
         self._rng.bit_generator.state = json.loads(state["rng"].tobytes())
-        self.terms = None
+        self.terms = {}
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as in `docs/algorithms/README.md`; none before the first."""
-        if self.terms is None:
+        if not self.terms:
             return {}
-        numbers = self.terms.numbers()
+        terms = {name: tensor.detach().numpy() for name, tensor in self.terms.items()}
+        numbers = {
+            "train/policy_loss": -float(terms["gain"]),
+            "train/entropy_loss": -float(terms["entropy"].mean()),
+        }
+        if "values" in terms:
+            spread = float(np.var(terms["targets"]))
+            left = float(np.var(terms["targets"] - terms["values"]))
+            numbers["train/value_loss"] = float(terms["value_loss"])
+            numbers["train/explained_variance"] = 1 - left / spread if spread else np.nan
         numbers["train/learning_rate"] = self._optimizer.param_groups[0]["lr"]
         numbers["train/n_updates"] = updates_of(self._optimizer)
         if self._actor.log_std is not None:
@@ -167,11 +155,10 @@ def set_optimizer_arrays(
     """Take over what `optimizer_arrays` gave. Raises `ValueError` unless it is whole."""
     given = {k: v for k, v in arrays.items() if k.startswith("optimizer.")}
     expected = {
-        f"optimizer.{index}.{key}": tuple(shape)
+        f"optimizer.{index}.{key}": () if key == "step" else tuple(parameter.shape)
         for index, parameter in enumerate(_parameters(optimizer))
-        for key, shape in (("step", ()), ("exp_avg", parameter.shape),
-                           ("exp_avg_sq", parameter.shape))
-    }  # fmt: skip
+        for key in ("step", "exp_avg", "exp_avg_sq")
+    }
     got = {name: array.shape for name, array in given.items()}
     if got not in (expected, {}):
         raise ValueError(f"optimizer: expected arrays of shapes {expected}, got {got}")

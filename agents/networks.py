@@ -35,9 +35,8 @@ class Actor(nn.Module):
     """Policy: Gaussian for continuous actions, categorical for discrete ones.
 
     The Gaussian's standard deviation does not depend on the state; `log_std` is its logarithm to
-    begin with. An action is neither clipped nor squashed here: the env gets the clipped action, the
-    loss scores the drawn one. Inputs are n, the length of a flat observation, outputs k, the
-    numbers of an action or its choices.
+    begin with. The env gets the clipped action, the loss scores the drawn one. Inputs are n, the
+    length of a flat observation, outputs k, the numbers of an action or its choices.
     """
 
     def __init__(
@@ -103,7 +102,5 @@ def arrays_of(module: nn.Module) -> dict[str, np.ndarray]:
 
 def load_arrays(module: nn.Module, arrays: Mapping[str, np.ndarray], prefix: str = "") -> None:
     """Set a module's parameters from the arrays whose names begin with a prefix."""
-    given = {name: array for name, array in arrays.items() if name.startswith(prefix)}
-    module.load_state_dict(
-        {name.removeprefix(prefix): torch.from_numpy(a.copy()) for name, a in given.items()}
-    )
+    given = {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
+    module.load_state_dict({name: torch.from_numpy(a.copy()) for name, a in given.items()})

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..envs.spec import EnvSpec
 from ..models.constants import GRAVITY
-from ..models.errors import InputError
+from ..models.errors import expect
 
 __all__ = ["PID"]
 
@@ -30,16 +30,12 @@ class PID:
 
     def __init__(self, spec: EnvSpec) -> None:
         options = spec.options
-        if spec.env_id != ENV_ID:
-            raise InputError(f"pid: expected the env {ENV_ID}, got {spec.env_id}")
-        if options["observation"] != "full" or options["action_type"] != "continuous":
-            raise InputError(
-                "pid: expected observation='full' and action_type='continuous', "
-                f"got {options['observation']!r} and {options['action_type']!r}"
-            )
+        expect(spec.env_id == ENV_ID, "pid", f"the env {ENV_ID}", spec.env_id)
+        modes = f"{options['observation']!r} and {options['action_type']!r}"
+        expected = "observation='full' and action_type='continuous'"
+        expect(modes == "'full' and 'continuous'", "pid", expected, modes)
         telemetry = {array.name: array for array in spec.telemetry}
-        if "thrust" not in telemetry:
-            raise InputError(f"pid: expected the telemetry thrust, got {sorted(telemetry)}")
+        expect("thrust" in telemetry, "pid", "the telemetry thrust", f"{sorted(telemetry)}")
         highest = telemetry["thrust"].bounds()[1]
         self._hover = float(highest[0]) / (1 + float(spec.observation[0].bounds()[1][2]))
         self._increment = options["action_mode"] == "increment"

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..envs.spec import ArraySpec, Discrete, EnvSpec
-from ..models.errors import InputError
+from ..models.errors import expect
 
 __all__ = ["ActionMap", "NetworkPolicy", "Policy", "flat", "flat_size"]
 
@@ -24,8 +24,7 @@ class Policy(Protocol):
 def flat(observations: Any, spec: EnvSpec, *lead: int) -> np.ndarray:
     """Observations as networks take them: float32, shape (*lead, n).
 
-    They are an array of shape (*lead, ...), or a mapping with one for each array of the spec, which
-    are joined in its order. `lead` is N for N drones, nothing for a single one.
+    Given is an array of shape (*lead, ...), or a mapping with one for each array of the spec.
     """
     if not isinstance(observations, Mapping):
         return np.asarray(observations, np.float32).reshape(*lead, -1)
@@ -56,9 +55,8 @@ class ActionMap:
         if isinstance(action, Discrete):
             self.outputs, self.size = action.n, 1
             return
-        if not action.dtype.startswith("float"):
-            got = action.dtype
-            raise InputError(f"action: expected a choice or numbers of type float, got {got}")
+        right = action.dtype.startswith("float")
+        expect(right, "action", "a choice or numbers of type float", action.dtype)
         self.outputs = self.size = action.size
         # Two axes here and below: NumPy is slow where it has to add one to a batch of one.
         low, high = (bound.reshape(1, -1) for bound in action.bounds())
@@ -89,7 +87,20 @@ class NetworkPolicy:
 
     def __init__(self, weights: Mapping[str, np.ndarray], spec: EnvSpec) -> None:
         self.spec, self.actions = spec, ActionMap(spec.action)
-        _check_shapes(weights, flat_size(spec), self.actions)
+        got = {name: array.shape for name, array in weights.items()}
+        units, outputs = (*got.get("hidden.bias", ()), 0)[0], self.actions.outputs
+        expected = {
+            "hidden.weight": (units, flat_size(spec)),
+            "hidden.bias": (units,),
+            "output.weight": (outputs, units),
+            "output.bias": (outputs,),
+        } | ({} if self.actions.discrete else {"log_std": (outputs,)})
+        reason = (
+            "it was trained for other observations or actions; give the --vehicle and the --env "
+            "options of its training"
+        )
+        right = got == expected and units
+        expect(right, "policy", f"weights of shapes {expected}", f"{got}: {reason}")
         self._w1, self._b1 = weights["hidden.weight"].T, weights["hidden.bias"][np.newaxis]
         self._w2, self._b2 = weights["output.weight"].T, weights["output.bias"][np.newaxis]
         self._zero = np.zeros_like(self._b1)
@@ -135,21 +146,3 @@ class NetworkPolicy:
         if self._std is None:
             output = output.argmax(axis=1)[:, np.newaxis].astype(np.float32)
         return output
-
-
-def _check_shapes(weights: Mapping[str, np.ndarray], inputs: int, actions: ActionMap) -> None:
-    got = {name: array.shape for name, array in weights.items()}
-    units = (*got.get("hidden.bias", ()), 0)[0]
-    expected = {
-        "hidden.weight": (units, inputs),
-        "hidden.bias": (units,),
-        "output.weight": (actions.outputs, units),
-        "output.bias": (actions.outputs,),
-    }
-    if not actions.discrete:
-        expected["log_std"] = (actions.outputs,)
-    if got != expected or not units:
-        raise InputError(
-            f"policy: expected weights of shapes {expected}, got {got}: it was trained for other "
-            "observations or actions; give the --vehicle and the --env options of its training"
-        )

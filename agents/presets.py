@@ -8,13 +8,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
-from ..models.errors import InputError
+from ..models.errors import expect
 
 __all__ = ["PRESETS", "A2CConfig", "AlgorithmName", "PresetName", "VPGConfig", "preset"]
 
 AlgorithmName = Literal["vpg", "a2c", "sb3-a2c"]
 PresetName = Literal["paper", "tuned"]
-
 
 _Rule = tuple[str, Callable[[Any], bool]]  # What is expected, and whether a value is that
 
@@ -57,8 +56,7 @@ class _Config:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             expected, is_right = _RULES[name]
-            if not is_right(value):
-                raise InputError(f"{name}: expected {expected}, got {value!r}")
+            expect(is_right(value), name, expected, f"{value!r}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,11 +72,10 @@ class VPGConfig(_Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.baseline == "time" and self.episodes_per_update < 2:
-            raise InputError(
-                "episodes_per_update: expected 2 or more with baseline 'time', where a single "
-                f"episode is its own mean, got {self.episodes_per_update}"
-            )
+        count = self.episodes_per_update
+        right = self.baseline != "time" or count > 1
+        expected = "2 or more with baseline 'time', where a single episode is its own mean"
+        expect(right, "episodes_per_update", expected, f"{count}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,11 +118,10 @@ PRESETS["sb3-a2c"] = PRESETS["a2c"]
 
 def preset(algorithm: str, name: str, **changes: Any) -> VPGConfig | A2CConfig:
     """A preset, with some of its fields changed. Raises `InputError` if there is no such one."""
-    if algorithm not in PRESETS:
-        raise InputError(f"algorithm: expected one of {sorted(PRESETS)}, got {algorithm!r}")
-    if name not in PRESETS[algorithm]:
-        raise InputError(f"preset: expected one of {sorted(PRESETS[algorithm])}, got {name!r}")
-    base = PRESETS[algorithm][name]
-    if unknown := sorted(set(changes) - set(vars(base))):
-        raise InputError(f"hyperparameters: expected some of {sorted(vars(base))}, got {unknown}")
+    names = sorted(PRESETS)
+    expect(algorithm in PRESETS, "algorithm", f"one of {names}", f"{algorithm!r}")
+    presets = PRESETS[algorithm]
+    expect(name in presets, "preset", f"one of {sorted(presets)}", f"{name!r}")
+    base, unknown = presets[name], sorted({*changes} - {*vars(presets[name])})
+    expect(not unknown, "hyperparameters", f"some of {sorted(vars(base))}", f"{unknown}")
     return replace(base, **changes)

@@ -87,9 +87,8 @@ class Collector:
         """Whole episodes, as many as there are drones or a multiple: at least so many.
 
         A drone whose episode ends is frozen until all have ended. A round that `most_steps`
-        cuts off is left out: all of its episodes but the shortest would be fragments. A single
-        drone's last fragment is kept. Episodes with a lost simulator are left out, and a round of
-        nothing else does not count.
+        cuts off is left out, but for a single drone's last fragment. Episodes with a lost simulator
+        are left out, and a round of nothing else does not count.
         """
         log = self._log
         rounds, last = -(-count // log.num_envs), log.env_steps + most_steps
@@ -130,9 +129,8 @@ class Collector:
             idle = done if waiting else None
             log.fly(actions, idle) if stop is None else log.fly(actions, None, idle)
             after, terminated, truncated = log.observations, env.terminated, env.truncated
-            rows.append(
-                (observations, actions, env.rewards, after, terminated, truncated, ~done, env.lost)
-            )
+            ends = (terminated, truncated, ~done, env.lost)
+            rows.append((observations, actions, env.rewards, after, *ends))
             observations, ended = after, terminated | truncated
             done = ended if stop is None else done | ended
             waiting = int(np.count_nonzero(done))  # of few drones faster than `any`

@@ -7,16 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from ..models.errors import InputError, require
+from ..models.errors import expect, require
+from . import learner
 from .episodes import EpisodeLog
-from .learner import (
-    OnUpdate,
-    check_finite,
-    optimizer_arrays,
-    seeds_of,
-    set_optimizer_arrays,
-    updates_of,
-)
+from .learner import OnUpdate, check_finite, seeds_of
 from .networks import arrays_of, load_arrays, torch
 from .presets import A2CConfig
 
@@ -35,15 +29,14 @@ class SB3VecEnv(sb3_vec.VecEnv):
     """A SAME_STEP vector env, such as `RemoteVectorEnv(autoreset_mode="SameStep")`, for SB3.
 
     Where an episode ended, `infos` has SB3's `terminal_observation` and `TimeLimit.truncated`; the
-    rest of `info` is left out, for SB3 would want a dictionary for each env and step.
-
-    `close` closes it. One of another autoreset raises `InputError`.
+    rest of `info` is left out: SB3 wants a dictionary for each env and step. `close` closes the
+    vector env. One of another autoreset raises `InputError`.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         mode = env.metadata.get("autoreset_mode")
-        if mode != AutoresetMode.SAME_STEP:
-            raise InputError(f"env: expected a vector env with autoreset SAME_STEP, got {mode}")
+        right = mode == AutoresetMode.SAME_STEP
+        expect(right, "env", "a vector env with autoreset SAME_STEP", f"{mode}")
         self.env = env
         self.render_mode = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
@@ -96,8 +89,7 @@ class SB3A2C:
     """SB3's A2C behind the same interface as our own algorithms.
 
     Adam instead of SB3's RMSprop, no clipping of gradients, and every other setting from the same
-    `A2CConfig`: given the same experience, it makes the same updates as ours. SB3 wants the
-    env, the log, at construction.
+    `A2CConfig`: given the same experience, it makes the same updates as ours.
     """
 
     def __init__(self, log: EpisodeLog, config: A2CConfig, seed: int) -> None:
@@ -159,7 +151,7 @@ class SB3A2C:
         """Weights, optimizer, both generators and the state of SB3 between rollouts."""
         model = self._model
         state = {f"policy.{name}": array for name, array in arrays_of(model.policy).items()}
-        state |= optimizer_arrays(model.policy.optimizer)
+        state |= learner.optimizer_arrays(model.policy.optimizer)
         state["rng.torch"] = torch.get_rng_state().numpy().copy()
         _, keys, place, *_ = np.random.get_state()  # noqa: NPY002
         state["rng.numpy"] = np.append(keys, place).astype(np.uint32)
@@ -173,8 +165,8 @@ class SB3A2C:
         """Take over a state."""
         model = self._model
         load_arrays(model.policy, state, "policy.")
-        set_optimizer_arrays(model.policy.optimizer, state)
-        model._n_updates = updates_of(model.policy.optimizer)
+        learner.set_optimizer_arrays(model.policy.optimizer, state)
+        model._n_updates = learner.updates_of(model.policy.optimizer)
         torch.set_rng_state(torch.from_numpy(state["rng.torch"].copy()))
         *keys, place = state["rng.numpy"]
         np.random.set_state(("MT19937", np.array(keys, np.uint32), int(place), 0, 0.0))  # noqa: NPY002

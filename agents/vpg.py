@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .learner import Learner, Terms
+from .learner import Learner
 from .networks import torch
 from .policies import NetworkPolicy
 from .presets import VPGConfig
@@ -32,7 +32,7 @@ class VPG(Learner):
             torch.from_numpy(rollout.rows(rollout.actions)),
         )
         gain = (log_probability * torch.from_numpy(self.weights(rollout))).mean()
-        self.terms = Terms(gain=gain.detach(), entropy=entropy.detach())
+        self.terms = {"gain": gain, "entropy": entropy}
         return -gain
 
     def weights(self, rollout: Rollout) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 import gymnasium as gym
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import expect
 from .spec import EnvSpec
 
 if TYPE_CHECKING:
@@ -23,8 +23,8 @@ class Renderer:
     """`render` of an env: a picture of each drone, or a window that shows them in real time."""
 
     def __init__(self, mode: str | None, loop: "Loop") -> None:
-        if mode is not None and mode not in RENDER_MODES:
-            raise InputError(f"render_mode: expected None, 'human' or 'rgb_array', got {mode!r}")
+        right = mode is None or mode in RENDER_MODES
+        expect(right, "render_mode", "None, 'human' or 'rgb_array'", f"{mode!r}")
         self._mode, self._loop = mode, loop
         self._canvas: Canvas | None = None
         self._view: LiveView | None = None
@@ -50,10 +50,10 @@ class Renderer:
             one = len(now) == 1
             stage = Stage(vehicle=self._loop.vehicle.path, trail=one)
             self._canvas = Canvas(stage, *((480, 360) if one else (240, 180)))
-        pictures = []
+        canvas, pictures = self._canvas, []
         for one_drone in now:
-            self._canvas.stage.show(one_drone)
-            pictures.append(self._canvas.draw("chase"))
+            canvas.stage.show(one_drone)
+            pictures.append(canvas.draw())
         return tuple(pictures)
 
     def _show(self, now: "list[Moment]") -> None:

@@ -25,7 +25,7 @@ MAX_AGENTS: Final = 1024  # drones of one world
 MAX_NAME: Final = 200  # characters of a name, unit or frame
 
 _DTYPES: Final = ("float32", "float64", "uint8", "int32", "int64")
-_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
+_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # and halves of pairs
 _LARGEST: Final = float(np.finfo(np.float64).max)
 _NO_BOUND: Final = {"low": -math.inf, "high": math.inf}
 
@@ -53,17 +53,16 @@ class _Part:
     @classmethod
     def _fields(cls, content: Any) -> dict[str, Any]:
         """Keyword arguments from a JSON object; names that are not known are left out."""
-        if not isinstance(content, dict):
-            raise SpecError(f"spec: expected an object for {cls.__name__}, got {content!r:.80}")
+        _expect(isinstance(content, dict), "spec", f"an object for {cls.__name__}", content)
         given = {}
         for f in fields(cls):  # type: ignore[arg-type]
             name = f.metadata.get("json", f.name)
-            if name in content:
+            optional = f.default is not MISSING or f.default_factory is not MISSING
+            there = name in content
+            _expect(optional or there, "spec", f"{name} in {cls.__name__}", list(content))
+            if there:
                 value = content[name]
                 given[f.name] = tuple(value) if isinstance(value, list) else value
-            elif f.default is f.default_factory is MISSING:
-                got = f"{sorted(content)!r:.80}"
-                raise SpecError(f"spec: expected {name} in {cls.__name__}, got {got}")
         return given
 
     @classmethod
@@ -92,39 +91,28 @@ class ArraySpec(_Part):
 
     def __post_init__(self) -> None:
         _check_text("name", self.name)
-        if not self.name:
-            raise SpecError("name: expected a name for an array, got ''")
-        shape = self.shape
-        if not isinstance(shape, tuple) or not all(type(n) is int and n >= 1 for n in shape):
-            self._expect("a shape of whole numbers >= 1", shape)
-        if len(shape) > MAX_DIMENSIONS:
-            self._expect(f"at most {MAX_DIMENSIONS} axes", len(shape))
-        if self.size > MAX_ELEMENTS:
-            self._expect(f"at most {MAX_ELEMENTS} elements", shape)
-        if self.dtype not in _DTYPES:
-            self._expect(f"a dtype of {', '.join(_DTYPES)}", self.dtype)
-        for name in _NO_BOUND:
-            object.__setattr__(self, name, self._bound(name))
+        name, shape, units, names = self.name, self.shape, self.unit, self.components
+        _expect(name, "name", "a name for an array", name)
+        is_shape = isinstance(shape, tuple) and all(type(n) is int and n >= 1 for n in shape)
+        _expect(is_shape, name, "a shape of whole numbers >= 1", shape)
+        _expect(len(shape) <= MAX_DIMENSIONS, name, f"at most {MAX_DIMENSIONS} axes", len(shape))
+        _expect(self.size <= MAX_ELEMENTS, name, f"at most {MAX_ELEMENTS} elements", shape)
+        _expect(self.dtype in _DTYPES, name, f"a dtype of {', '.join(_DTYPES)}", self.dtype)
+        for end in _NO_BOUND:
+            object.__setattr__(self, end, self._bound(end))
         low, high = self.bounds()
         wrong = ~((low <= high) & (low < np.inf) & (high > -np.inf))
         if wrong.any():
             first = int(wrong.argmax())
             got = f"{low.flat[first]} and {high.flat[first]}"
-            raise SpecError(f"{self.name}: expected low <= high, got {got} at element {first}")
-        units, names = self.unit, self.components
-        if isinstance(units, str):
-            _check_text(f"{self.name}: unit", units)
-        else:
-            _check_words(f"{self.name}: unit", units)
-            if len(units) != self.size:
-                raise SpecError(f"{self.name}: expected {self.size} units, got {len(units)}")
-        _check_text(f"{self.name}: frame", self.frame)
-        _check_words(f"{self.name}: components", names)
-        if names and (len(names) != self.size or len(set(names)) < len(names) or "" in names):
-            self._expect(f"{self.size} different components", names)
-
-    def _expect(self, expected: str, got: Any) -> None:
-        raise SpecError(f"{self.name}: expected {expected}, got {got!r:.80}")
+            raise SpecError(f"{name}: expected low <= high, got {got} at element {first}")
+        _check_words(f"{name}: unit", (units,) if isinstance(units, str) else units)
+        several = not isinstance(units, str)
+        _expect(not several or len(units) == self.size, name, f"{self.size} units", len(units))
+        _check_text(f"{name}: frame", self.frame)
+        _check_words(f"{name}: components", names)
+        right = not names or len({*names} - {""}) == len(names) == self.size
+        _expect(right, name, f"{self.size} different components", names)
 
     def _bound(self, name: str) -> Bound:
         bound: Any = getattr(self, name)
@@ -132,8 +120,8 @@ class ArraySpec(_Part):
             values = np.asarray(bound, np.float64)
         except (TypeError, ValueError, OverflowError):
             values = np.asarray(np.nan)
-        if values.shape not in ((), self.shape, (self.size,)) or np.isnan(values).any():
-            self._expect(f"one number for {name} or one for each element", bound)
+        right = values.shape in ((), self.shape, (self.size,)) and not np.isnan(values).any()
+        _expect(right, self.name, f"one number for {name} or one for each element", bound)
         flat = values.ravel()
         return float(flat[0]) if (flat == flat[0]).all() else tuple(flat.tolist())
 
@@ -145,9 +133,7 @@ class ArraySpec(_Part):
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """(low, high), float64, of the array's shape."""
         pair = [np.asarray(bound, np.float64) for bound in (self.low, self.high)]
-        low, high = (
-            np.broadcast_to(b.reshape(self.shape) if b.ndim else b, self.shape) for b in pair
-        )
+        low, high = (np.broadcast_to(bound, self.size).reshape(self.shape) for bound in pair)
         return low, high
 
     @classmethod
@@ -155,8 +141,8 @@ class ArraySpec(_Part):
         given = cls._fields(content)
         for name in _NO_BOUND.keys() & given:
             values = given[name] if isinstance(given[name], tuple) else (given[name],)
-            if not all(value is None or _is_number(value) for value in values):
-                raise SpecError(f"bounds: expected numbers or null, got {given[name]!r:.80}")
+            right = all(value is None or _is_number(value) for value in values)
+            _expect(right, "bounds", "numbers or null", given[name])
             values = tuple(_NO_BOUND[name] if value is None else value for value in values)
             given[name] = values if isinstance(given[name], tuple) else values[0]
         return cls(**given)
@@ -174,12 +160,11 @@ class Discrete(_Part):
     """A name for each choice, or none."""
 
     def __post_init__(self) -> None:
-        if type(self.n) is not int or not 1 <= self.n <= 1 << 24:
-            raise SpecError(f"action: expected 1 to 2^24 choices, got {self.n!r}")
+        n, names = self.n, self.components
+        _expect(type(n) is int and 1 <= n <= 1 << 24, "action", "1 to 2^24 choices", n)
         _check_text("action", self.name)
-        _check_words("action: components", self.components)
-        if self.components and len(self.components) != self.n:
-            raise SpecError(f"action: expected {self.n} components, got {self.components}")
+        _check_words("action: components", names)
+        _expect(not names or len(names) == n, "action", f"{n} components", names)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,18 +189,15 @@ class Metric(_Part):
     def __post_init__(self) -> None:
         for name in ("name", "unit", "symbol"):
             _check_text(f"metric: {name}", getattr(self, name))
-        if not self.name:
-            raise SpecError("metric: expected a name, got ''")
-        if self.goal not in ("zero", "high"):
-            raise SpecError(f"{self.name}: expected the goal 'zero' or 'high', got {self.goal!r}")
-        if type(self.signed) is not bool:
-            raise SpecError(
-                f"{self.name}: expected signed to be true or false, got {self.signed!r}"
-            )
-        for name in ("settled", "held"):
-            value = getattr(self, name)
-            if value is not None and not (_is_number(value) and 0 < value <= _LARGEST):
-                raise SpecError(f"{self.name}: expected {name} > 0 or None, got {value!r:.80}")
+        name = self.name
+        _expect(name, "metric", "a name", name)
+        _expect(self.goal in ("zero", "high"), name, "the goal 'zero' or 'high'", self.goal)
+        right = type(self.signed) is bool
+        _expect(right, name, "signed to be true or false", self.signed)
+        for field_name in ("settled", "held"):
+            value = getattr(self, field_name)
+            right = value is None or (_is_number(value) and 0 < value <= _LARGEST)
+            _expect(right, name, f"{field_name} > 0 or None", value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,36 +224,30 @@ class EnvSpec(_Part):
     def __post_init__(self) -> None:
         _check_text("env_id", self.env_id)
         object.__setattr__(self, "options", _json_values(self.options))
-        period = self.control_period
-        if not (_is_number(period) and 1e-6 <= period <= 1e3):
-            raise SpecError(f"control_period: expected 1e-6 to 1e3 s, got {period!r:.80}")
+        period, digits, agents = self.control_period, self.vehicle_hash, self.agents
+        right = _is_number(period) and 1e-6 <= period <= 1e3
+        _expect(right, "control_period", "1e-6 to 1e3 s", period)
         _check_text("vehicle", self.vehicle)
-        digits = self.vehicle_hash
-        if not (isinstance(digits, str) and re.fullmatch("[0-9a-f]{32}", digits)):
-            raise SpecError(f"vehicle_hash: expected 32 hex digits, got {digits!r:.80}")
-        _check_words("agents", self.agents)
-        if not 1 <= len(self.agents) <= MAX_AGENTS or len(set(self.agents)) < len(self.agents):
-            raise SpecError(
-                f"agents: expected 1 to {MAX_AGENTS} different names, got {self.agents!r:.80}"
-            )
-        if not self.observation:
-            raise SpecError("observation: expected at least one array, got none")
+        right = isinstance(digits, str) and bool(re.fullmatch("[0-9a-f]{32}", digits))
+        _expect(right, "vehicle_hash", "32 hex digits", digits)
+        _check_words("agents", agents)
+        right = 1 <= len({*agents}) == len(agents) <= MAX_AGENTS
+        _expect(right, "agents", f"1 to {MAX_AGENTS} different names", agents)
+        _expect(self.observation, "observation", "at least one array", self.observation)
         for what, most in (("observation", MAX_ELEMENTS), ("telemetry", MAX_TOLD)):
             arrays = getattr(self, what)
-            if len(arrays) > MAX_ARRAYS or len({array.name for array in arrays}) < len(arrays):
-                raise SpecError(f"{what}: expected at most {MAX_ARRAYS} different names")
-            if (size := sum(array.size for array in arrays)) > most:
-                raise SpecError(f"{what}: expected at most {most} elements in all, got {size}")
+            listed = [array.name for array in arrays]
+            right = len({*listed}) == len(listed) <= MAX_ARRAYS
+            _expect(right, what, f"at most {MAX_ARRAYS} different names", listed)
+            size = sum(array.size for array in arrays)
+            _expect(size <= most, what, f"at most {most} elements in all", size)
         names = tuple(metric.name for metric in self.metrics)
         told = next((a.components for a in self.telemetry if a.name == "metrics"), ())
-        if told != names:
-            raise SpecError(
-                f"metrics: expected the components of the telemetry 'metrics' to be {names!r:.80}, "
-                f"got {told!r:.80}"
-            )
+        expected = f"the components of the telemetry 'metrics' to be {names!r:.80}"
+        _expect(told == names, "metrics", expected, told)
         listed = [name for array in self.telemetry for name in component_names(array)]
-        if len(set(listed)) < len(listed):
-            raise SpecError(f"telemetry: expected each component once, got {listed!r:.80}")
+        right = len({*listed}) == len(listed)
+        _expect(right, "telemetry", "each component once", listed)
 
     @property
     def headline(self) -> Metric | None:
@@ -295,8 +271,7 @@ class EnvSpec(_Part):
             "observation": ArraySpec, "telemetry": ArraySpec, "metrics": Metric
         }  # fmt: skip
         for name in kinds.keys() & given:
-            if not isinstance(given[name], tuple):
-                raise SpecError(f"{name}: expected a list, got {given[name]!r:.80}")
+            _expect(isinstance(given[name], tuple), name, "a list", given[name])
             given[name] = tuple(map(kinds[name]._from_content, given[name]))
         action = given["action"]
         is_discrete = isinstance(action, dict) and "choices" in action
@@ -318,21 +293,19 @@ def component_names(array: ArraySpec) -> tuple[str, ...]:
     return tuple(f"{array.name}[{index}]" for index in range(array.size))
 
 
+def _expect(right: object, name: str, expected: str, got: object) -> None:
+    if not right:
+        raise SpecError(f"{name}: expected {expected}, got {got!r:.80}")
+
+
 def _check_text(name: str, text: Any) -> None:
-    if not isinstance(text, str) or len(text) > MAX_NAME or _CONTROL.search(text):
-        raise SpecError(
-            f"{name}: expected a text of at most {MAX_NAME} characters without control "
-            f"characters, got {text!r:.80}"
-        )
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        raise SpecError(f"{name}: expected Unicode text, got {text!r:.80}") from None
+    right = isinstance(text, str) and len(text) <= MAX_NAME and not _CONTROL.search(text)
+    expected = f"a text of at most {MAX_NAME} characters without control characters"
+    _expect(right, name, expected, text)
 
 
 def _check_words(name: str, words: Any) -> None:
-    if not isinstance(words, tuple):
-        raise SpecError(f"{name}: expected a tuple of texts, got {words!r:.80}")
+    _expect(isinstance(words, tuple), name, "a tuple of texts", words)
     for word in words:
         _check_text(name, word)
 

@@ -1,11 +1,10 @@
 """The physical examination: simulated motions of a vehicle, compared with closed forms.
 
-Every figure is measured in simulation (accelerations under known forces and torques, positions
-after a flight). Any vehicle is held to mechanics and to what `Vehicle` derives from its compiled
-model; the paper's vehicle is held to the paper's numbers too, and to ours where it gives none.
-`tests/test_physics.py` shows that damaged models fail; `rotorgram check-model` prints the checks.
+Any vehicle is held to mechanics and to what `Vehicle` derives from its compiled model; the paper's
+is held to the paper's numbers too, and to ours where it gives none. `tests/test_physics.py` shows
+that damaged models fail; `rotorgram check-model` prints the checks.
 
-Frames: world x, y, z with z up; body x forward, y left, z up. SI units and radians throughout.
+World frame: z up. Body frame: x forward, y left, z up. SI units and radians throughout.
 """
 
 import copy
@@ -20,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import QUAD_XML
 from .constants import GRAVITY, MASS, MAX_THRUST, NUM_ROTORS, SIDE
-from .errors import InputError
+from .errors import expect
 from .vehicle import Vehicle
 
 __all__ = ["Check", "closed_form_inertia", "examine"]
@@ -84,36 +83,21 @@ def examine(vehicle: Vehicle, *, paper: bool | None = None) -> list[Check]:
     With `paper` it is compared with the paper's numbers too; None: if it is the vehicle of this
     package. Raises `InputError` if MuJoCo warns in flight, or the physics step is below 0.1 ms.
     """
-    if vehicle.timestep < _LEAST_TIMESTEP:
-        raise InputError(
-            f"vehicle: expected a physics step of at least {_LEAST_TIMESTEP:g} s to be examined, "
-            f"got {vehicle.timestep:g}"
-        )
+    expected = f"a physics step of at least {_LEAST_TIMESTEP:g} s to be examined"
+    long = vehicle.timestep >= _LEAST_TIMESTEP
+    expect(long, "vehicle", expected, f"{vehicle.timestep:g}")
     model = copy.copy(vehicle.model)  # without air and drag
     model.opt.density = model.opt.viscosity = 0.0
     model.opt.wind = model.dof_damping[:3] = 0.0
     body = _Body(vehicle, model)
-    checks = [
-        *_mass(vehicle, body),
-        *_rotors(vehicle, model, body),
-        *_free_fall(vehicle, model),
-        *_hover(vehicle, model),
-        *_climb(vehicle, model),
-        *_tumbling(vehicle, model, body),
-        *_resting(vehicle),
-        *_linear_drag(vehicle, model, body),
-    ]
+    parts = [_mass, _rotors, _free_fall, _hover, _climb, _tumbling, _resting, _linear_drag]
+    checks = [check for part in parts for check in part(vehicle, model, body)]
     if paper if paper is not None else vehicle.path == QUAD_XML.resolve():
-        if vehicle.num_rotors != NUM_ROTORS:
-            raise InputError(
-                f"vehicle: expected the {NUM_ROTORS} rotors of the paper, got {vehicle.num_rotors}"
-            )
+        expected, rotors = f"the {NUM_ROTORS} rotors of the paper", vehicle.num_rotors
+        expect(rotors == NUM_ROTORS, "vehicle", expected, f"{rotors}")
         # With air and drag, if there are any, for the paper has none.
-        checks += _paper_numbers(vehicle, body)
-        checks += _paper_rotors(vehicle, body)
-        checks += _paper_flights(vehicle)
-        checks += _spinning_top(vehicle)
-        checks += _paper_drag(vehicle)
+        parts = [_paper_numbers, _paper_rotors, _paper_flights, _spinning_top, _paper_drag]
+        checks += [check for part in parts for check in part(vehicle, vehicle.model, body)]
     return checks
 
 
@@ -133,23 +117,6 @@ class _Body:
         self.center_of_mass = c = np.array((m[1, 5], m[2, 3], m[0, 4])) / self.mass
         # About the centre of mass, body axes, (3, 3), kg·m².
         self.inertia = m[3:, 3:] - self.mass * (c @ c * np.eye(3) - np.outer(c, c))
-
-    def angular_momentum(self, data: Any) -> Array:
-        """About the centre of mass, world frame, (3,), kg·m²/s."""
-        return _turned(data, self.inertia @ data.qvel[3:])
-
-    def spin_energy(self, data: Any) -> float:
-        """Kinetic energy of the rotation, J."""
-        return float(data.qvel[3:] @ self.inertia @ data.qvel[3:]) / 2
-
-    def place(self, data: Any) -> Array:
-        """Position of the centre of mass, world frame, (3,), m."""
-        return np.array(data.qpos[:3]) + _turned(data, self.center_of_mass)
-
-    def velocity(self, data: Any) -> Array:
-        """Of the centre of mass, world frame, (3,), m/s."""
-        turning = np.cross(data.qvel[3:], self.center_of_mass)
-        return np.array(data.qvel[:3]) + _turned(data, turning)
 
     def forces(
         self,
@@ -185,8 +152,7 @@ def _fly(model: mujoco.MjModel, data: Any, seconds: float) -> float:
         mujoco.mj_step(model, data, nstep=min(left, _STEPS_AT_ONCE))
         left -= _STEPS_AT_ONCE
     for kind, warning in zip(mujoco.mjtWarning.__members__, data.warning, strict=False):
-        if warning.number:
-            raise InputError(f"vehicle: expected a flight without warnings, got {kind} of MuJoCo")
+        expect(not warning.number, "vehicle", "a flight without warnings", f"{kind} of MuJoCo")
     return float(steps * model.opt.timestep)
 
 
@@ -219,7 +185,7 @@ def _size(values: np.ndarray) -> float:
     return float(np.linalg.norm(values))
 
 
-def _mass(vehicle: Vehicle, body: _Body) -> Iterator[Check]:
+def _mass(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
     """Mass, centre of mass and inertia, from the answers to known forces and torques."""
     yield Check("mass", vehicle.mass, body.mass, "kg", _MODEL, _EXACT * vehicle.mass)
     off = _size(body.center_of_mass - vehicle.center_of_mass)
@@ -253,7 +219,7 @@ def _rotors(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Ch
     yield Check("rank of the allocation matrix", 4.0, rank, "", source, 0.0)
 
 
-def _free_fall(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
+def _free_fall(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
     """Depth of a fall: g t² / 2. Semi-implicit Euler misses by g h t / 2."""
     model = _unpowered(model)
     data = _ready(vehicle, model)
@@ -261,7 +227,7 @@ def _free_fall(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
     yield Check("free fall in 2 s", depth, _HEIGHT - float(data.qpos[2]), "m", _MECHANICS)
 
 
-def _hover(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
+def _hover(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
     """With hover thrusts the craft neither accelerates nor turns, and keeps its position."""
     data = _ready(vehicle, model, vehicle.hover_thrust)
     answer = _acceleration(model, data)
@@ -274,7 +240,7 @@ def _hover(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
         yield Check(f"hover: {name}", 0.0, _size(value), unit, _MECHANICS)
 
 
-def _climb(vehicle: Vehicle, model: mujoco.MjModel) -> Iterator[Check]:
+def _climb(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
     """Acceleration of a climb at the largest multiple of the hover's thrusts, from the height."""
     hover = vehicle.hover_thrust
     most = float(np.min(vehicle.thrust_high[hover > 0] / hover[hover > 0]))
@@ -289,19 +255,23 @@ def _tumbling(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[
     before, after = _ready(vehicle, model), _ready(vehicle, model)
     before.qvel[3:] = after.qvel[3:] = _SPIN
     seconds = _fly(model, after, 10.0)
-    start, end = body.angular_momentum(before), body.angular_momentum(after)
-    fallen = body.place(before) + body.velocity(before) * seconds
-    fallen[2] -= vehicle.gravity * seconds**2 / 2
-    energy = body.spin_energy(after) / body.spin_energy(before) - 1
+    inertia, center = body.inertia, body.center_of_mass
+    spins = [np.array(data.qvel[3:]) for data in (before, after)]
+    start, end = (_turned(d, inertia @ s) for d, s in zip((before, after), spins, strict=True))
+    # The path of the centre of mass: from its first place and velocity on, and where it is.
+    place, there = (data.qpos[:3] + _turned(data, center) for data in (before, after))
+    velocity = before.qvel[:3] + _turned(before, np.cross(spins[0], center))
+    fallen = place + velocity * seconds - (0, 0, vehicle.gravity * seconds**2 / 2)
+    first, last = (float(spin @ inertia @ spin) for spin in spins)
     for name, value, unit in (
         ("relative change of angular momentum", _size(end - start) / _size(start), ""),
-        ("relative change of energy", energy, ""),
-        ("centre of mass off its path", _size(body.place(after) - fallen), "m"),
+        ("relative change of energy", last / first - 1, ""),
+        ("centre of mass off its path", _size(there - fallen), "m"),
     ):
         yield Check(f"tumbling 10 s: {name}", 0.0, value, unit, _MECHANICS, _TRUNCATION)
 
 
-def _resting(vehicle: Vehicle) -> Iterator[Check]:
+def _resting(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
     """Dropped by 5 cm, the craft settles; soft contact lets it sink in by some 0.1 mm."""
     data = _ready(vehicle, vehicle.model)
     data.qpos[2] = vehicle.rest_height + 0.05
@@ -344,7 +314,7 @@ def closed_form_inertia() -> tuple[float, float]:
     return ixx, hub_z + NUM_ROTORS * (arm_across + motor_z)
 
 
-def _paper_numbers(vehicle: Vehicle, body: _Body) -> Iterator[Check]:
+def _paper_numbers(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
     """Mass, inertia, centre of mass and height of rest."""
     yield Check("mass of the paper", MASS, body.mass, "kg", _PAPER)
     off = _size(body.center_of_mass)
@@ -360,7 +330,7 @@ def _paper_numbers(vehicle: Vehicle, body: _Body) -> Iterator[Check]:
     yield Check("height of rest", _REST_HEIGHT, vehicle.rest_height, "m", _GEOMETRY)
 
 
-def _paper_rotors(vehicle: Vehicle, body: _Body) -> Iterator[Check]:
+def _paper_rotors(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
     """Total thrust at the limits, and the torques of each rotor: y, −x and ±k per newton."""
     for asked, expected in ((150.0, NUM_ROTORS * MAX_THRUST), (-50.0, 0.0)):
         thrust = float(body.forces(vehicle, vehicle.model, asked)[2])
@@ -379,7 +349,7 @@ def _paper_rotors(vehicle: Vehicle, body: _Body) -> Iterator[Check]:
             yield Check(line, expected, float(measured), "m", source)
 
 
-def _paper_flights(vehicle: Vehicle) -> Iterator[Check]:
+def _paper_flights(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
     """Acceleration of two seconds without thrust, at 49 N each and at 100 N each."""
     hover = MASS * GRAVITY / NUM_ROTORS
     for how, thrust, expected, source in (
@@ -392,7 +362,7 @@ def _paper_flights(vehicle: Vehicle) -> Iterator[Check]:
         yield Check(name, expected, measured, "m/s²", f"{_PAPER}: {source}")
 
 
-def _spinning_top(vehicle: Vehicle) -> Iterator[Check]:
+def _spinning_top(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
     """With Ixx = Iyy the rates about x and y turn about body z at (Izz − Ixx) / Ixx · ωz."""
     data = _ready(vehicle, vehicle.model)
     data.qvel[3:] = _SPIN
@@ -404,7 +374,7 @@ def _spinning_top(vehicle: Vehicle) -> Iterator[Check]:
     yield Check(name, 0.0, miss, "rad/s", _MECHANICS, _TRUNCATION)
 
 
-def _paper_drag(vehicle: Vehicle) -> Iterator[Check]:
+def _paper_drag(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
     """With drag d, hovering at 10 m/s: v(t) = 10 exp(−d t), and a turn about z goes on."""
     dragged = Vehicle.load(vehicle.path, linear_drag=0.5)
     data = _ready(dragged, dragged.model, dragged.hover_thrust)

@@ -9,8 +9,7 @@ theta about Y, psi about Z. It gives no order: we take Unity's (`Transform.euler
 R = Ry(theta) · Rx(phi) · Rz(psi). Positive phi is nose down, positive theta is nose right, and
 positive psi is right side up.
 
-Every function accepts any leading axes, or none. A row gives the same bits alone and in a batch,
-because the same NumPy functions run on contiguous arrays.
+Every function accepts any leading axes, or none. A row gives the same bits alone and in a batch.
 """
 
 from typing import Final

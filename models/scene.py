@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from . import AIRPORT_XML, QUAD_XML, SCENE_XML
-from .errors import InputError
+from .errors import expect
 
 __all__ = ["AIRPORT_PREFIX", "World", "attach_airport", "build_scene"]
 
@@ -50,8 +50,7 @@ def build_scene(
     Without visual elements the physics is faster and the same, bit for bit. Raises `InputError` if
     there is no such world, or a height field is too large; `ValueError` if the file is no MJCF.
     """
-    if world not in ("plain", "airport"):
-        raise InputError(f"world: expected 'plain' or 'airport', got {world!r}")
+    expect(world in ("plain", "airport"), "world", "'plain' or 'airport'", f"{world!r}")
     path = Path(vehicle if vehicle is not None else QUAD_XML)
     _check_size(path)
     switch_off_log_file()
@@ -90,11 +89,10 @@ def _check_size(path: Path) -> None:
         element, times = waiting.pop()
         if element.tag in ("hfield", "texture"):
             sides = [element.get(side, "0") for side in ("nrow", "ncol", "width", "height")]
-            if any(side.isdecimal() and int(side) > MOST_HEIGHTS for side in sides):
-                raise InputError(
-                    f"vehicle: expected a height field or texture of at most {MOST_HEIGHTS} × "
-                    f"{MOST_HEIGHTS} points, got {' × '.join(s for s in sides if s != '0')}"
-                )
+            large = any(side.isdecimal() and int(side) > MOST_HEIGHTS for side in sides)
+            most = f"at most {MOST_HEIGHTS} × {MOST_HEIGHTS} points"
+            got = " × ".join(side for side in sides if side != "0")
+            expect(not large, "vehicle", f"a height field or texture of {most}", got)
         elif element.tag in _REPEATED:
             times *= math.prod(int(n) for n in element.get("count", "").split() if n.isdecimal())
         elif element.tag == "include":
@@ -103,10 +101,8 @@ def _check_size(path: Path) -> None:
                 seen.add(inner)
                 waiting.append((_root(inner), times))
         total += times
-        if total > MOST_ELEMENTS:
-            raise InputError(
-                f"vehicle: expected at most {MOST_ELEMENTS} elements, got {total} or more"
-            )
+        expected = f"at most {MOST_ELEMENTS} elements"
+        expect(total <= MOST_ELEMENTS, "vehicle", expected, f"{total} or more")
         waiting += [(child, times) for child in element]
 
 
@@ -129,11 +125,9 @@ def _copy_settings(source: Any, target: Any) -> None:
     """Copy the settings of a part of a spec, and those of its parts."""
     for name in dir(source):
         value = getattr(source, name)
-        if name.startswith("_") or callable(value):
-            continue
         if isinstance(value, int | float | np.ndarray):
             setattr(target, name, value)
-        else:
+        elif not (name.startswith("_") or callable(value)):
             _copy_settings(value, getattr(target, name))
 
 
@@ -144,13 +138,12 @@ def attach_airport(spec: mujoco.MjSpec) -> None:
     up, metres. The scene moves bit for bit as without it: its geoms collide with nothing, and only
     a rangefinder would see them. `spec.compiler.discardvisual` drops them all.
 
-    Horizontal planes of the world body at z = 0, the scene's floor, still carry what stands on
-    them, but are not drawn unless geom group 3 is. The sky, haze, shadow map, and the near and far
-    end of drawing become the airport's. Lights and cameras stay. Raises `InputError` if the scene
-    has an airport already, `ValueError` if it does not compile.
+    Planes of the world body at z = 0 still carry what stands on them, but only geom group 3 draws
+    them. Sky, haze, shadow map, and the near and far end of drawing become the airport's. Raises
+    `InputError` if the scene has an airport already, `ValueError` if it does not compile.
     """
-    if any(geom.name.startswith(AIRPORT_PREFIX) for geom in spec.geoms):
-        raise InputError("spec: expected a scene without an airport, got one that has it")
+    ours = any(geom.name.startswith(AIRPORT_PREFIX) for geom in spec.geoms)
+    expect(not ours, "spec", "a scene without an airport", "one that has it")
     scene = spec.copy()
     scene.compiler.discardvisual = False
     model = scene.compile()
@@ -160,9 +153,8 @@ def attach_airport(spec: mujoco.MjSpec) -> None:
     for texture in list(spec.textures):
         if texture.type == _SKY:
             spec.delete(texture)
-    # See as far as the hills, and keep the scale that the scene has without them. MuJoCo measures
-    # the ends of drawing, shadows and the free camera's first distance in extents of the scene; an
-    # extent taken anew, with a runway in it, would spoil them.
+    # See as far as the hills, and keep the scale that the scene has without them: MuJoCo measures
+    # the ends of drawing, shadows and the free camera's first distance in extents of the scene.
     stat, visual = model.stat, spec.visual
     spec.stat.extent, spec.stat.center, spec.stat.meansize = stat.extent, stat.center, stat.meansize
     visual.map.znear, visual.map.zfar = _NEAR / stat.extent, _FAR / stat.extent

@@ -1,8 +1,7 @@
 """A vehicle: an MJCF file and what follows from its compiled model.
 
 A vehicle is one free body with rotors: actuators that push at a site of the body, along an axis and
-with a reaction about it. Nothing else about it is known beforehand: number of rotors, positions,
-directions, limits, mass, inertia, hover thrust and allocation are derived from the model.
+with a reaction about it. Everything else is derived from the model.
 
 Body frame: that of the free body, x forward, y left, z up; SI units.
 """
@@ -19,7 +18,7 @@ import mujoco
 import numpy as np
 
 from . import MOST_DRAG, QUAD_XML
-from .errors import InputError
+from .errors import InputError, expect
 from .scene import build_scene
 
 __all__ = ["Rotor", "Vehicle"]
@@ -96,11 +95,8 @@ class Vehicle:
         digits that MuJoCo writes.
         """
         file = Path(path if path is not None else QUAD_XML).resolve()
-        number = isinstance(linear_drag, int | float | np.floating)
-        if not (number and 0.0 <= linear_drag <= MOST_DRAG):
-            raise InputError(
-                f"linear_drag: expected a number from 0 to {MOST_DRAG:g} /s, got {linear_drag!r}"
-            )
+        right = isinstance(linear_drag, int | float | np.floating) and 0 <= linear_drag <= MOST_DRAG
+        expect(right, "linear_drag", f"a number from 0 to {MOST_DRAG:g} /s", f"{linear_drag!r}")
         try:
             changed = file.stat().st_mtime_ns
         except OSError as error:
@@ -137,11 +133,9 @@ class Vehicle:
     def substeps(self, period: float) -> int:
         """Physics steps in a control period of so many seconds. Raises `InputError`."""
         ratio = period / self.timestep
-        if not (ratio > 0.5 and abs(ratio - round(ratio)) < 1e-9 * max(ratio, 1.0)):
-            raise InputError(
-                f"control_period: expected a positive multiple of the physics step of "
-                f"{self.timestep:g} s, got {period!r}"
-            )
+        right = ratio > 0.5 and abs(ratio - round(ratio)) < 1e-9 * max(ratio, 1.0)
+        expected = f"a positive multiple of the physics step of {self.timestep:g} s"
+        expect(right, "control_period", expected, f"{period!r}")
         return round(ratio)
 
     def __deepcopy__(self, memo: Any) -> Self:
@@ -176,27 +170,20 @@ def _check(model: mujoco.MjModel) -> None:
     """Raise `InputError` for a model that is no multirotor, or that cannot be stepped."""
     for name in dir(model):
         array = getattr(model, name)
-        if getattr(array, "dtype", None) == np.float64 and not np.isfinite(array).all():
-            raise InputError(f"vehicle: expected finite numbers, got others in {name}")
+        finite = getattr(array, "dtype", None) != np.float64 or np.isfinite(array).all()
+        expect(finite, "vehicle", "finite numbers", f"others in {name}")
     free = int((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).sum())
-    if (free, model.njnt) != (1, 1):
-        raise InputError(
-            f"vehicle: expected one free body and no other joints, "
-            f"got {free} free of {model.njnt} joints"
-        )
-    if model.nu == 0:
-        raise InputError("vehicle: expected at least one rotor, an actuator at a site, got none")
+    got = f"{free} free of {model.njnt} joints"
+    expect((free, model.njnt) == (1, 1), "vehicle", "one free body and no other joints", got)
+    expect(model.nu, "vehicle", "at least one rotor, an actuator at a site", "none")
     mass, gravity = float(model.body_subtreemass[model.jnt_bodyid[0]]), model.opt.gravity
-    if not (mass > 0 and gravity[2] < 0 and not gravity[:2].any()):
-        raise InputError(
-            f"vehicle: expected a mass > 0 and gravity along -z, got {mass:g} kg and "
-            f"{gravity.tolist()} m/s²"
-        )
-    if not LEAST_TIMESTEP <= model.opt.timestep <= MOST_TIMESTEP:
-        raise InputError(
-            f"vehicle: expected a physics step of at least {LEAST_TIMESTEP:g} s and at most "
-            f"{MOST_TIMESTEP:g} s, got {model.opt.timestep:g}"
-        )
+    right = mass > 0 and gravity[2] < 0 and not gravity[:2].any()
+    got = f"{mass:g} kg and {gravity.tolist()} m/s²"
+    expect(right, "vehicle", "a mass > 0 and gravity along -z", got)
+    step = model.opt.timestep
+    limits = f"at least {LEAST_TIMESTEP:g} s and at most {MOST_TIMESTEP:g} s"
+    right = LEAST_TIMESTEP <= step <= MOST_TIMESTEP
+    expect(right, "vehicle", f"a physics step of {limits}", f"{step:g}")
 
 
 @lru_cache(maxsize=32)
@@ -207,12 +194,9 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
     mass, gravity = float(model.body_subtreemass[body]), -float(model.opt.gravity[2])
     center = data.subtree_com[body].copy()
     rotors = tuple(_rotor(model, data, i, body) for i in range(model.nu))
-    columns = []
-    for rotor in rotors:
-        axis = np.array(rotor.axis)
-        torque = np.cross(np.array(rotor.position) - center, axis) + rotor.reaction
-        columns.append((axis[2], *torque))
-    allocation = np.array(columns).T
+    arms = [np.array(rotor.position) - center for rotor in rotors]
+    torques = [np.cross(a, r.axis) + r.reaction for a, r in zip(arms, rotors, strict=True)]
+    allocation = np.array([(r.axis[2], *t) for r, t in zip(rotors, torques, strict=True)]).T
     model.dof_damping[0:3] = drag * mass
     return Vehicle(
         path=path,
@@ -234,23 +218,23 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
 def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
     """The rotor of an actuator; `data` is at the origin and level. Raises `InputError`."""
     name = model.actuator(index).name or f"rotor{index + 1}"
-    site = int(model.actuator_trnid[index, 0])
+    rotor = f"rotor {name}"
+    site, reference = model.actuator_trnid[index].tolist()
     at_site = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_SITE
-    if not at_site or model.body_rootid[model.site_bodyid[site]] != body:
-        raise InputError(f"vehicle: expected rotor {name} to be an actuator at a site of the body")
-    if model.actuator_trnid[index, 1] >= 0:
-        raise InputError(f"vehicle: expected rotor {name} to act without a reference site")
-    if (
-        model.actuator_gaintype[index] != mujoco.mjtGain.mjGAIN_FIXED
-        or model.actuator_biastype[index] != mujoco.mjtBias.mjBIAS_NONE
-        or model.actuator_dyntype[index] != mujoco.mjtDyn.mjDYN_NONE
-    ):
-        raise InputError(f"vehicle: expected the thrust of rotor {name} to be gain times control")
+    ours = at_site and model.body_rootid[model.site_bodyid[site]] == body
+    expect(ours, "vehicle", f"{rotor} to be an actuator at a site of the body")
+    expect(reference < 0, "vehicle", f"{rotor} to act without a reference site")
+    plain = (
+        model.actuator_gaintype[index] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
+        and model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_NONE
+    )
+    expect(plain, "vehicle", f"the thrust of {rotor} to be gain times control")
     force, torque = model.actuator_gear[index, :3], model.actuator_gear[index, 3:]
     size = math.hypot(*force)
     newtons = size * float(model.actuator_gainprm[index, 0])
-    if not model.actuator_ctrllimited[index] or newtons == 0.0:
-        raise InputError(f"vehicle: expected rotor {name} to have a thrust with limits (ctrlrange)")
+    limited = model.actuator_ctrllimited[index] and newtons != 0.0
+    expect(limited, "vehicle", f"{rotor} to have a thrust with limits (ctrlrange)")
     turn = data.site_xmat[site].reshape(3, 3)
     low, high = sorted((model.actuator_ctrlrange[index] * abs(newtons)).tolist())
     sign = math.copysign(1.0, newtons)
@@ -276,14 +260,13 @@ def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> 
     scale = weight * max(1e-3, float(np.abs(allocation[1:]).max()))
     if np.abs(allocation @ thrust - wanted).max() > _RELATIVE * scale:
         thrust = np.linalg.lstsq(allocation, wanted, rcond=None)[0]
-    if np.abs(allocation @ thrust - wanted).max() > 1e-6 * scale:
-        raise InputError("vehicle: expected rotors that can hover level, got ones that cannot")
+    hovers = np.abs(allocation @ thrust - wanted).max() <= 1e-6 * scale
+    expect(hovers, "vehicle", "rotors that can hover level", "ones that cannot")
     for rotor, newtons in zip(rotors, thrust.tolist(), strict=True):
-        if not rotor.low <= newtons < rotor.high:
-            raise InputError(
-                f"vehicle: expected rotor {rotor.name} to carry its share of the weight, "
-                f"{newtons:.4g} N, within its limits, got {rotor.low:g} to {rotor.high:g} N"
-            )
+        share = f"its share of the weight, {newtons:.4g} N, within its limits"
+        got = f"{rotor.low:g} to {rotor.high:g} N"
+        carries = rotor.low <= newtons < rotor.high
+        expect(carries, "vehicle", f"rotor {rotor.name} to carry {share}", got)
     return thrust
 
 
@@ -303,17 +286,13 @@ def _rest_height(model: mujoco.MjModel, data: Any) -> float:
 
     Raises `InputError` if it touches something at any height, like a wall.
     """
-    high = max(float(model.stat.extent), 1e-3)
-    low = 0.0
+    low, high = 0.0, max(float(model.stat.extent), 1e-3)
     if not _touches(model, data, low):
         return 0.0
     while _touches(model, data, high):
         high *= 2
-        if high > MOST_HEIGHT:
-            raise InputError(
-                f"vehicle: expected a craft that is free above the ground, "
-                f"got one that touches something at {high:.0f} m"
-            )
+        got = f"one that touches something at {high:.0f} m"
+        expect(high <= MOST_HEIGHT, "vehicle", "a craft that is free above the ground", got)
     while high - low > 1e-10 * high:
         middle = (low + high) / 2
         low, high = (middle, high) if _touches(model, data, middle) else (low, middle)

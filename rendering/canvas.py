@@ -6,7 +6,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import expect
 from .gl import NoOpenGL, offscreen_context
 from .stage import Camera, Stage, scene_geoms
 
@@ -26,8 +26,7 @@ class Canvas(AbstractContextManager["Canvas"]):
         self, stage: Stage, width: int = 640, height: int = 480, *, fast: bool = False
     ) -> None:
         for name, pixels in (("width", width), ("height", height)):
-            if not 16 <= pixels <= 8192:
-                raise InputError(f"{name}: expected 16 to 8192 pixels, got {pixels}")
+            expect(16 <= pixels <= 8192, name, "16 to 8192 pixels", f"{pixels}")
         self.stage, self.width, self.height = stage, width, height
         self._gl: Any = offscreen_context(width, height)
         model = stage.model

@@ -4,14 +4,15 @@ import io
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from ..models.errors import InputError, require
+from ..models.errors import InputError, expect, require
 from ._pillow import Image
 
 __all__ = ["QUALITY", "SUFFIXES", "check_film", "poster", "write_film"]
@@ -24,25 +25,17 @@ QUALITY: Final = 20
 
 def check_film(path: Path, width: int, height: int, fps: float) -> None:
     """Check the arguments of `write_film` before anything is drawn. Raises `InputError`."""
-    kind = path.suffix.lower()
-    if kind not in SUFFIXES:
-        raise InputError(
-            f"film: expected a name that ends in .mp4, .gif or .png, or a folder's name without a "
-            f"dot, got {path}"
-        )
+    kind, hundredths = path.suffix.lower(), 100 / max(fps, 0.01)
+    expected = "a name that ends in .mp4, .gif or .png, or a folder's name without a dot"
+    expect(kind in SUFFIXES, "film", expected, str(path))
     if path.exists():
         raise InputError(f"film: {path} is there already; choose another name")
-    if not (0.01 <= fps <= 1000):
-        raise InputError(f"fps: expected 0.01 to 1000 pictures per second, got {fps:g}")
-    if kind == ".mp4" and (width % 2 or height % 2):
-        raise InputError(
-            f"film: expected an even width and an even height for MP4, got {width}x{height}"
-        )
-    if kind == ".gif" and abs(100 / fps - round(100 / fps)) > 1e-6:
-        raise InputError(
-            "fps: expected 100 divided by a whole number (50, 25, 20, 10) for GIF, which counts "
-            f"hundredths of a second, got {fps:g}"
-        )
+    expect(0.01 <= fps <= 1000, "fps", "0.01 to 1000 pictures per second", f"{fps:g}")
+    even = kind != ".mp4" or not (width % 2 or height % 2)
+    expect(even, "film", "an even width and an even height for MP4", f"{width}x{height}")
+    whole = kind != ".gif" or abs(hundredths - round(hundredths)) <= 1e-6
+    expected = "100 divided by a whole number (50, 25, 20, 10) for GIF, which counts hundredths"
+    expect(whole, "fps", f"{expected} of a second", f"{fps:g}")
 
 
 def write_film(
@@ -50,10 +43,9 @@ def write_film(
 ) -> int:
     """Write a film, and return how many frames were taken.
 
-    `.mp4` is H.264 that every browser plays and that starts before it is loaded whole; `.gif`
-    repeats for ever; `.png` is the last frame alone; a name without a dot becomes a folder of
-    `0001.png`, `0002.png` and so on. Everything is written beside `path` and gets its name when it
-    is whole: Ctrl-C leaves nothing behind.
+    `.mp4` is H.264 that every browser plays before it is loaded whole; `.gif` repeats for ever;
+    `.png` is the last frame alone; a name without a dot becomes a folder of `0001.png` and so on.
+    Everything is written beside `path` and gets its name when whole: Ctrl-C leaves nothing behind.
 
     Args:
         path: Must not exist.
@@ -71,16 +63,15 @@ def write_film(
     if first is None:
         raise InputError("film: expected at least one frame, got none")
     check_film(path, first.shape[1], first.shape[0], fps)
-    count = 0
+    shape, count = (*first.shape[:2], 3), 0
 
     def counted() -> Iterator[np.ndarray]:
         nonlocal count
         for frame in chain((first,), taken):
-            shape = (*first.shape[:2], 3)
+            count += 1
             if frame.dtype != np.uint8 or frame.shape != shape:
                 got = f"got {frame.dtype}, shape {frame.shape}"
                 raise ValueError(f"film: expected frames of uint8, shape {shape}, {got}")
-            count += 1
             yield frame
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -125,27 +116,18 @@ def _write_mp4(
         *("-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(path)),
     ]
     with tempfile.TemporaryFile() as said:
-        # In a session of its own: Ctrl-C is for us, who then end it.
-        with subprocess.Popen(
-            words,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=said,
-            start_new_session=True,
-        ) as process:
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL}
+        # In a session of its own: Ctrl-C is for us, who then end it. A broken pipe: it has failed.
+        pipes |= {"stderr": said, "start_new_session": True}
+        with suppress(BrokenPipeError), subprocess.Popen(words, **pipes) as process:
             assert process.stdin is not None
-            broken = False
             try:
                 for frame in frames:
                     process.stdin.write(np.ascontiguousarray(frame).data)
-                process.stdin.close()
-            except BrokenPipeError:
-                broken = True
             except BaseException:
                 process.kill()
                 raise
-            failed = process.wait() != 0 or broken
-        if failed:
+        if process.returncode:
             said.seek(0)
             why = " ".join(said.read().decode(errors="replace").split())
             raise OSError(f"ffmpeg: the film could not be written: {why:.300}")
@@ -163,12 +145,8 @@ def poster(path: Path, share: float = 0.3) -> bytes:
         raise OSError(f"{path}: expected a film, got none that ffmpeg reads") from error
     start = share * seconds * (frames - 1) / max(frames, 1)
     words = ("-v", "error", "-ss", f"{start:.6f}", "-i", str(path), "-frames:v", "1")
-    done = subprocess.run(
-        [_ffmpeg(), *words, "-f", "image2pipe", "-c:v", "png", "-"],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        check=False,
-    )
+    command = [_ffmpeg(), *words, "-f", "image2pipe", "-c:v", "png", "-"]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
     if done.returncode or not done.stdout:
         raise OSError(f"{path}: expected a picture of the film, got none from ffmpeg")
     jpeg = io.BytesIO()

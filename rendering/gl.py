@@ -30,9 +30,8 @@ class NoOpenGL(RuntimeError):
 def hidden_gl_setting() -> Iterator[None]:
     """Let MuJoCo be imported without an OpenGL, also where `MUJOCO_GL` names one that is not there.
 
-    MuJoCo imports one when it is imported itself, which takes a tenth of a second, and raises where
-    that fails, in commands that draw nothing too. Enter this before MuJoCo is imported;
-    `offscreen_context` raises where something is to be drawn.
+    Otherwise MuJoCo imports one as well, which takes a tenth of a second, and raises where that
+    fails, also in commands that draw nothing. `offscreen_context` raises where one is needed.
     """
     before, wanted = dict(os.environ), _wanted()
     library = _LIBRARIES.get(wanted, "")
@@ -62,7 +61,10 @@ def offscreen_context(width: int, height: int) -> Any:
             with context.as_current():
                 pass
         except Exception as error:  # each library fails in a way of its own
-            reasons.append(f"{name}: {_why(error)}")
+            words = " ".join(str(error).split()) or type(error).__name__
+            if isinstance(error, AttributeError):  # PyOpenGL's way to say so
+                words = "its library is not installed"
+            reasons.append(f"{name}: {words:.200}")
         else:
             return context
     raise NoOpenGL(
@@ -73,13 +75,6 @@ def offscreen_context(width: int, height: int) -> Any:
 
 def _wanted() -> str:
     return os.environ.get(_HIDDEN, os.environ.get("MUJOCO_GL", "")).lower().strip()
-
-
-def _why(error: Exception) -> str:
-    if isinstance(error, AttributeError):  # PyOpenGL's way to say so
-        return "its library is not installed"
-    words = " ".join(str(error).split()) or type(error).__name__
-    return f"{words:.200}"
 
 
 def _candidates() -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 import mujoco
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import expect
 from .moment import Moment
 from .pace import Pace
 from .stage import Stage
@@ -84,8 +84,8 @@ class LiveView(AbstractContextManager["LiveView"]):
 
     def draw(self, *moments: Moment) -> None:
         """Leave moments to be drawn, one of each craft. Older ones that wait are dropped."""
-        if len(moments) != self.stage.drones:
-            raise InputError(f"moments: expected {self.stage.drones}, got {len(moments)}")
+        drones = self.stage.drones
+        expect(len(moments) == drones, "moments", f"{drones}", f"{len(moments)}")
         self._latest = moments
         self._fresh.set()
 
@@ -139,10 +139,7 @@ class LiveView(AbstractContextManager["LiveView"]):
 
 
 def lines_over(moments: tuple[Moment, ...], thrust_high: float, pace: str, drones: int) -> Lines:
-    """The lines of an overlay: those of the first craft, and the speed in words.
-
-    `moments` are those of the craft that are shown, of so many drones; `thrust_high` in N.
-    """
+    """The lines of an overlay of so many drones: those of the first; its `thrust_high` is in N."""
     lines = [*moments[0].lines(thrust_high), ("speed", pace)]
     if drones > 1:
         shown = f"{len(moments)} of {drones}" if drones > len(moments) else str(drones)

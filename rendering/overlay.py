@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import expect
 from ..models.vehicle import Vehicle
 from ._pillow import Image, ImageColor, ImageDraw, ImageFont
 from .moment import Moment
@@ -30,8 +30,6 @@ _NUMBERS_SHARE: Final = 0.4
 """Of the width or of the height: larger ones would hide the craft in the middle."""
 _TIMES: Final = 2
 """Everything is drawn so much larger, and reduced: smooth lines, letters where they belong."""
-
-Point = tuple[float, float]
 
 
 class Box(NamedTuple):
@@ -60,7 +58,7 @@ def graph_scale(values: Iterable[float]) -> tuple[float, float]:
 class Overlay:
     """Draws on the pictures of one flight: a panel of numbers, and a graph of the headline metric.
 
-    Everything scales with the picture. A small one has no graph, and a smaller one only the title.
+    Everything scales with the picture. A small one has no graph, a smaller one only the title.
 
     Args:
         width, height: Of the pictures, pixels.
@@ -118,6 +116,8 @@ class Overlay:
         self.has_strip = numbers and large and self._metric is not None
         self.panel = self._panel_box(self.has_numbers)
         self.strip, self.plot = self._strip_boxes()
+        left, upper, right, lower = self.plot
+        self._curve = Box(left - self._gap, upper, right + self._gap, lower + 1)
         boxes = (self.panel, self.strip) if self.has_strip else (self.panel,)
         self._grounds = [(box, _ground(box, self._gap)) for box in boxes]
 
@@ -130,13 +130,13 @@ class Overlay:
         period; `note` is an event, such as "terminated".
         """
         image = Image.fromarray(picture)
-        if image.size != self._size:
-            raise InputError(f"picture: expected {self._size} pixels, got {image.size}")
+        expect(image.size == self._size, "picture", f"{self._size} pixels", str(image.size))
         for box, ground in self._grounds:
             image.paste(ground, box[:2], ground)
         _enlarged(image, self.panel, lambda draw: self._write_panel(draw, moment))
         if self.has_strip:
             _enlarged(image, self.strip, lambda draw: self._write_strip(draw, values))
+            _enlarged(image, self._curve, lambda draw: self._draw_curve(draw, values))
         if note:  # below the panel, away from the craft
             wide = self._large.getlength(note) / _TIMES + 3 * self._gap
             left, upper = self.panel.left, self.panel.lower + self._gap
@@ -152,11 +152,10 @@ class Overlay:
 
     def _have_room(self) -> bool:
         """Whether numbers fit, and leave the middle free."""
-        gap, (width, height) = self._gap, self._size
-        if height < _NUMBERS_HEIGHT or width < self._numbers_width() + 2 * gap:
-            return False
-        wide, high = gap + self._numbers_width(), self._panel_box(True).lower
-        return wide <= _NUMBERS_SHARE * width or high <= _NUMBERS_SHARE * height
+        wide, high = self._gap + self._numbers_width(), self._panel_box(True).lower
+        width, height = self._size
+        fits = height >= _NUMBERS_HEIGHT and width >= wide + self._gap
+        return fits and (wide <= _NUMBERS_SHARE * width or high <= _NUMBERS_SHARE * height)
 
     def _panel_box(self, numbers: bool) -> Box:
         gap, (width, height) = self._gap, self._size
@@ -234,28 +233,34 @@ class Overlay:
             draw.line((left, y, right, y), color, max(1, round(unit / 14)))
             if share or lower - upper > 2.4 * unit:  # there is room for the zero too
                 draw.text((left - gap, y), label, _NAMES, self._small, anchor="rm")
-        self._draw_curve(draw, Box(left, upper, right, lower), values)
 
-    def _draw_curve(self, draw: ImageDraw.ImageDraw, box: Box, values: Sequence[float]) -> None:
+    def _draw_curve(self, draw: ImageDraw.ImageDraw, values: Sequence[float]) -> None:
         low, high = self._scale
         shares = (np.asarray(values, float) - (low + high) / 2) / ((high - low) / 2)
-        across = (box.right - box.left) * self._period / self._seconds
-        xs = np.minimum(box.left + across * np.arange(len(shares)), box.right)
-        points = list(zip(xs.tolist(), shares.tolist(), strict=True))
+        left, _, right, _ = ((edge - self._curve.left) * _TIMES for edge in self.plot)
+        tall = (self.plot.lower - self.plot.upper) * _TIMES
+        across = (right - left) * self._period / self._seconds
+        xs = np.minimum(left + across * np.arange(len(shares)), right)
+        told = np.isfinite(shares)
+        points = list(zip(xs[told].tolist(), shares[told].tolist(), strict=True))
         thick = max(_TIMES, round(self._unit * _TIMES / 6))
-
-        def height(share: float) -> float:
-            return box.lower - (box.lower - box.upper) * (1 + share) / 2
-
-        pieces, exits = _within(points)
-        for piece in pieces:
-            draw.line([(x, height(y)) for x, y in piece], self._color, thick, joint="curve")
-        for x, side in exits:
-            edge, inside = height(side), 2.5 * thick * side  # rows count downwards
-            x = min(max(x, box.left + 2 * thick), box.right - 2 * thick)
-            corners = [(x, edge), (x - 2 * thick, edge + inside), (x + 2 * thick, edge + inside)]
-            draw.polygon(corners, self._color)
-        for x, y in ((x, height(y)) for x, y in points[-1:] if abs(y) <= 1):
+        path: list[tuple[float, float]] = []  # what is beyond the box is cut off
+        for (x, y), (next_x, next_y) in pairwise([(left, 0.0), *points]):
+            crossed = [edge for edge in (-1.0, 1.0) if (y * edge <= 1) != (next_y * edge <= 1)]
+            for edge in sorted(crossed, reverse=next_y < y):
+                across = x + (edge - y) / (next_y - y) * (next_x - x)
+                ends = [(across, edge), (across, 2 * edge)]
+                path += ends if next_y * edge > 1 else ends[::-1]
+                if next_y * edge > 1:  # it leaves
+                    corner = min(max(across, left + 2 * thick), right - 2 * thick)
+                    start = tall * (1 - edge) / 2
+                    inside = start + 2.5 * thick * edge  # rows count downwards
+                    sides = (corner - 2 * thick, inside), (corner + 2 * thick, inside)
+                    draw.polygon(((corner, start), *sides), self._color)
+            path.append((next_x, next_y if abs(next_y) <= 1 else math.copysign(2, next_y)))
+        curve = [(x, tall * (1 - y) / 2) for x, y in path]
+        draw.line(curve, self._color, thick, joint="curve")
+        for x, y in ((x, tall * (1 - y) / 2) for x, y in points[-1:] if abs(y) <= 1):
             draw.ellipse((x - thick, y - thick, x + thick, y + thick), self._color)
 
     def _write_note(self, draw: ImageDraw.ImageDraw, box: Box, note: str) -> None:
@@ -281,27 +286,6 @@ def _ground(box: Box, radius: int) -> Image.Image:
     return image.reduce(_TIMES)
 
 
-def _within(points: Sequence[Point]) -> tuple[list[list[Point]], list[Point]]:
-    """Pieces of a line between -1 and +1, and the points at which it leaves."""
-    pieces: list[list[Point]] = []
-    exits = [(x, math.copysign(1.0, y)) for x, y in points[:1] if abs(y) > 1]
-    connected = False
-    for (x, y), (next_x, next_y) in pairwise(points):
-        if y == next_y:
-            first, last = (0.0, 1.0) if abs(y) <= 1 else (1.0, 0.0)
-        else:  # shares of the way at which it enters and leaves
-            edges = sorted((edge - y) / (next_y - y) for edge in (-1.0, 1.0))
-            first, last = max(edges[0], 0.0), min(edges[1], 1.0)
-        if first <= last:
-            if not (connected and first == 0):
-                pieces.append([(x + first * (next_x - x), y + first * (next_y - y))])
-            pieces[-1].append((x + last * (next_x - x), y + last * (next_y - y)))
-        connected = first <= last == 1
-        if first <= last < 1:
-            exits.append((pieces[-1][-1][0], math.copysign(1.0, next_y)))
-    return pieces, exits
-
-
 def _spaced(value: str) -> str:
     """The same with more space between numbers than between number and unit."""
     words = value.split()
@@ -310,11 +294,8 @@ def _spaced(value: str) -> str:
 
 def _fitted(text: str, font: ImageFont.FreeTypeFont, room: float) -> str:
     """The text, or its beginning where it is too long."""
-    if font.getlength(text) <= room:
-        return text
-    while text and font.getlength(text + "...") > room:
-        text = text[:-1]
-    return text + "..."
+    shorter = (f"{text[:length]}..." for length in range(len(text) - 1, 0, -1))
+    return next((t for t in (text, *shorter) if font.getlength(t) <= room), "...")
 
 
 @lru_cache

@@ -3,7 +3,7 @@
 from queue import SimpleQueue
 from typing import Final, Literal
 
-from ..models.errors import InputError
+from ..models.errors import expect
 
 __all__ = ["FASTEST", "SLOWEST", "SPEEDS", "Pace", "Press"]
 
@@ -25,8 +25,8 @@ class Pace:
     """
 
     def __init__(self, period: float, speed: float = 1.0) -> None:
-        if not SLOWEST <= speed <= FASTEST:
-            raise InputError(f"speed: expected {SLOWEST:g} to {FASTEST:g}, got {speed:g}")
+        right = SLOWEST <= speed <= FASTEST
+        expect(right, "speed", f"{SLOWEST:g} to {FASTEST:g}", f"{speed:g}")
         self.period, self.speed, self.paused = period, speed, False
         self._presses: SimpleQueue[Press] = SimpleQueue()
         self._asked = 0  # steps that a pause lets pass

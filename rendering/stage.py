@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, get_args
 import mujoco
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import expect
 from ..models.scene import SCENE_PREFIX, World, build_scene
 from ..models.vehicle import Vehicle
 from .moment import Moment
@@ -34,8 +34,7 @@ _ONBOARD: Final = "stage/onboard"
 _SPACING: Final = 2.2  # between craft that fly side by side
 _NEAR: Final = 0.14  # at most: where drawing begins
 _LOWER: Final = 0.06
-"""Front and side look this far below the goal, as a share of their distance: the graph covers the
-picture's lower end."""
+"""Front and side look this share of their distance below the goal: the graph covers the bottom."""
 _VIEWS: Final[dict[str, tuple[float, float, float, float]]] = {
     "chase": (0.0, -17.0, 3.85, math.inf),
     "front": (180.0, -7.0, 6.9, 1.65),  # from a little above the goal: its disc is seen
@@ -72,8 +71,7 @@ class Stage:
         vehicle: Path | str | None = None,
         trail: bool = True,
     ) -> None:
-        if drones < 1:
-            raise InputError(f"drones: expected 1 or more, got {drones}")
+        expect(drones >= 1, "drones", "1 or more", f"{drones}")
         self.drones, self.vehicle = drones, Vehicle.load(vehicle)
         spec = build_scene(self.vehicle.path, world)
         self.radius, top = _size(spec.compile())
@@ -109,13 +107,11 @@ class Stage:
 
     def show(self, *moments: Moment) -> None:
         """Put every craft where its moment has it, and extend its path. Raises `InputError`."""
-        if len(moments) != self.drones:
-            raise InputError(f"moments: expected {self.drones}, got {len(moments)}")
-        if (rotors := len(moments[0].thrusts)) != self.vehicle.num_rotors:
-            raise InputError(
-                f"vehicle: expected a file with {rotors} rotors, as in the flight, got "
-                f"{self.vehicle.path.name} with {self.vehicle.num_rotors}"
-            )
+        expect(len(moments) == self.drones, "moments", f"{self.drones}", f"{len(moments)}")
+        craft, rotors = self.vehicle, len(moments[0].thrusts)
+        expected = f"a file with {rotors} rotors, as in the flight"
+        got = f"{craft.path.name} with {craft.num_rotors}"
+        expect(rotors == craft.num_rotors, "vehicle", expected, got)
         before, self.moments = self.moments or moments, moments
         poses = self.data.qpos.reshape(self.drones, 7)
         for i, (moment, last) in enumerate(zip(moments, before, strict=True)):
@@ -144,8 +140,7 @@ class Stage:
             camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
             camera.fixedcamid = self.model.camera(_ONBOARD).id
             return camera
-        if name not in _VIEWS:
-            raise InputError(f"camera: expected one of {', '.join(CAMERAS)}, got {name!r}")
+        expect(name in _VIEWS, "camera", f"one of {', '.join(CAMERAS)}", f"{name!r}")
         camera.azimuth, camera.elevation, distance, holds = _VIEWS[name]
         camera.distance = distance * self.radius + self._spread
         if holds == math.inf:
@@ -161,8 +156,7 @@ class Stage:
     def focus(self) -> np.ndarray:
         """Mean of the goals, or of the craft if there are none, MuJoCo's frame, shape (3,), m."""
         goals = [goal for i in range(self.drones) if (goal := self._goal(i)) is not None]
-        points = np.array(goals) if goals else self._points()
-        return np.asarray(points.mean(axis=0))
+        return np.asarray((np.array(goals) if goals else self._points()).mean(axis=0))
 
     def decorate(self, next_geom: NextGeom, *, goals: bool = True) -> None:
         """Add the discs that mark the goals, if they are wanted, and the fading paths."""
@@ -233,10 +227,7 @@ def _size(model: mujoco.MjModel) -> tuple[float, float]:
 
 
 def _scale_drawing(model: mujoco.MjModel, radius: float, spread: float) -> None:
-    """Set the near end of drawing, the shadow's fineness and the floor's squares for the craft.
-
-    Ground and light that the vehicle's file brings stay as they are.
-    """
+    """Set the near end of drawing, the shadow's fineness and our floor's squares for the craft."""
     visual, extent = model.vis, model.stat.extent
     visual.global_.fovy = _FOVY
     visual.map.znear = min(visual.map.znear * extent, _NEAR * radius) / extent

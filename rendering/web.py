@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from http import HTTPStatus
 from ipaddress import ip_address
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import mujoco
 from mujoco.studio import launch_thread, messages, plugin, viewer_protocol, web_viewer
@@ -40,9 +40,8 @@ _COLUMN: Final = 90.0  # Left edge of values, in pixels of the panel
 def refusal(host: str | None, origin: str | None) -> str | None:
     """The reason to refuse a request, by its headers; None if it is accepted.
 
-    A page of another site may open a WebSocket to this machine, and its name server may name this
-    machine's address. `Host`, the address that was opened, and `Origin`, the page that asks, then
-    tell the other site's name. Programs that are no browsers have no `Origin`.
+    A page of another site may open a WebSocket to this machine. `Host`, the address that was
+    opened, or `Origin`, the page that asks, then has that site's name. Only browsers send `Origin`.
     """
     name, _, port = (host or "").lower().rpartition(":")
     if not port.isdecimal():
@@ -194,8 +193,7 @@ class _Panel(plugin.ViewerPlugin):  # type: ignore[misc]
             imgui.Text(name)
             imgui.SameLine(_COLUMN)
             imgui.Text(value)
-        presses: list[Press] = ["pause", "step"]
-        presses += ["slower", "faster"] if self._pace.period else []
+        presses: tuple[Press, ...] = get_args(Press)[: 4 if self._pace.period else 2]
         for press in presses:
             if press != "pause":
                 imgui.SameLine()

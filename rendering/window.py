@@ -87,7 +87,7 @@ class Window:
         return bool(self._handle.is_running())
 
     def is_watched(self) -> bool:
-        """Whether there is a viewer: a window has one from its start."""
+        """True: a window has a viewer from its start."""
         return True
 
     def close(self) -> None:
@@ -124,11 +124,11 @@ def _viewer() -> Any:
             from mujoco import viewer
 
             if on_x:
-                if not glfw.init():
-                    raise RuntimeError("none that OpenGL can draw on")
-                glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
-                window = glfw.create_window(16, 16, "", None, None)
-                glfw.default_window_hints()
+                window = None
+                if glfw.init():
+                    glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
+                    window = glfw.create_window(16, 16, "", None, None)
+                    glfw.default_window_hints()
                 if not window:
                     raise RuntimeError("none that OpenGL can draw on")
                 glfw.destroy_window(window)

@@ -6,7 +6,7 @@ from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from ...sim import Array, CollectiveThrust, Draw, Pose, WorldState, component, plain, stack
 from ..spec import ArraySpec, Metric
 from .task import Outcome, Task, TaskOptions, check_choice, check_number, finite
@@ -51,11 +51,9 @@ class ElevationOptions(TaskOptions):
         """Check the options of this task. Raises `InputError`."""
         check_number(self, "start_band", 0.0, FURTHEST, "m")
         check_number(self, "flight_band", 0.0, FURTHEST, "m")
-        if self.flight_band <= self.start_band:
-            raise InputError(
-                f"flight_band: expected more than start_band = {self.start_band:g} m, "
-                f"got {self.flight_band!r}"
-            )
+        wider = self.flight_band > self.start_band
+        least = f"more than start_band = {self.start_band:g} m"
+        expect(wider, "flight_band", least, f"{self.flight_band!r}")
         check_choice(self, "action_mode", get_args(ActionMode))
         check_choice(self, "action_type", get_args(ActionType))
         check_choice(self, "observation", get_args(Observed))
@@ -64,11 +62,9 @@ class ElevationOptions(TaskOptions):
         target: Any = self.target
         pair = target if isinstance(target, tuple | list) else (target, target)
         values = [value for value in map(finite, pair) if value is not None]
-        if not len(values) == len(pair) == 2 or values[0] > values[1]:
-            raise InputError(
-                "target: expected an elevation in m, or a pair (low, high) with low <= high, "
-                f"got {target!r}"
-            )
+        right = len(values) == len(pair) == 2 and values[0] <= values[1]
+        expected = "an elevation in m, or a pair (low, high) with low <= high"
+        expect(right, "target", expected, f"{target!r}")
         object.__setattr__(self, "target", tuple(values) if pair is target else values[0])
 
     @property
@@ -134,21 +130,16 @@ class Elevation(Task):
     def setup(self) -> None:
         """See the class."""
         options, vehicle = self.options, self.vehicle
-        self.least_target = vehicle.rest_height + AIR + options.start_band
+        room = vehicle.rest_height + AIR
+        self.least_target = least = room + options.start_band
         low, high = options.target_range
-        if low < self.least_target or high > FURTHEST:
-            raise InputError(
-                f"target: expected {self.least_target:g} m (start_band = {options.start_band:g} m, "
-                f"and {vehicle.rest_height + AIR:g} m of room) to {FURTHEST:g} m, "
-                f"got {options.target!r}"
-            )
+        reasons = f"(start_band = {options.start_band:g} m, and {room:g} m of room)"
+        expected = f"{least:g} m {reasons} to {FURTHEST:g} m"
+        expect(least <= low and high <= FURTHEST, "target", expected, f"{options.target!r}")
         increment, most = options.action_mode == "increment", float(vehicle.thrust_high.max())
         scale = options.thrust_scale or (0.05 if increment else 0.2) * most
-        if scale > most:
-            raise InputError(
-                f"thrust_scale: expected at most {most:g} N, the largest thrust of a rotor, "
-                f"got {options.thrust_scale!r}"
-            )
+        expected = f"at most {most:g} N, the largest thrust of a rotor"
+        expect(scale <= most, "thrust_scale", expected, f"{options.thrust_scale!r}")
         self.controller = CollectiveThrust(
             vehicle, scale, increment=increment, discrete=options.action_type == "discrete"
         )
@@ -199,10 +190,9 @@ class Elevation(Task):
     def rate_bound(self) -> float:
         """Speed that no flight can exceed before its episode ends, m/s.
 
-        Thrust and gravity accelerate by a or less; drag only brakes. The band is checked at the
-        end of a control period T. So the craft may turn back outside the band, within one period
-        (out and back at no more than a T / 2), fly through the band (twice `flight_band`), and
-        then for one period more: sqrt((a T / 2)² + 2 a · 2 flight_band) + a T.
+        Thrust and gravity accelerate by a or less; drag only brakes. The band is checked at the end
+        of a control period T. So the craft may turn back outside it within one period, fly through
+        it, and fly on for one period: sqrt((a T / 2)² + 2 a · 2 flight_band) + a T.
         """
         a, period = self.vehicle.max_acceleration, self.options.control_period
         out = math.sqrt(4 * a * self.options.flight_band)

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import expect
 from ...sim import Array, Draw, Pose, RotorThrust, WorldState, clip, component, constant, stack
 from ..spec import ArraySpec, Metric
 from .task import Outcome, Task, TaskOptions, check_number, finite
@@ -46,19 +46,17 @@ class HoverOptions(TaskOptions):
         """Check the options of this task. Raises `InputError`."""
         goal: Any = self.goal
         values = [finite(x) for x in goal] if isinstance(goal, tuple | list) else []
-        if len(values) != 3 or not all(x is not None and abs(x) <= FURTHEST for x in values):
-            raise InputError(f"goal: expected three numbers (x, y, z) in m, got {goal!r}")
+        right = len(values) == 3 and all(x is not None and abs(x) <= FURTHEST for x in values)
+        expect(right, "goal", "three numbers (x, y, z) in m", f"{goal!r}")
         object.__setattr__(self, "goal", tuple(values))
         check_number(self, "heading", -360.0, 360.0, "degrees")
         check_number(self, "start_band", 0.0, FURTHEST, "m")
         check_number(self, "start_tilt", 0.0, 80.0, "degrees")
         check_number(self, "start_heading", 0.0, 180.0, "degrees")
         check_number(self, "flight_band", 0.0, FURTHEST, "m")
-        if self.flight_band <= self.start_band * math.sqrt(3):
-            raise InputError(
-                "flight_band: expected more than sqrt(3) · start_band = "
-                f"{self.start_band * math.sqrt(3):.4g} m, got {self.flight_band!r}"
-            )
+        least = self.start_band * math.sqrt(3)
+        expected = f"more than sqrt(3) · start_band = {least:.4g} m"
+        expect(self.flight_band > least, "flight_band", expected, f"{self.flight_band!r}")
 
 
 class Hover(Task):
@@ -105,34 +103,31 @@ class Hover(Task):
         """See the class."""
         options, vehicle = self.options, self.vehicle
         least = vehicle.rest_height + AIR + options.start_band
-        if options.goal[2] < least:
-            raise InputError(
-                f"goal: expected a height of at least {least:g} m above the ground, "
-                f"got {options.goal[2]:g}"
-            )
+        expected = f"a height of at least {least:g} m above the ground"
+        expect(options.goal[2] >= least, "goal", expected, f"{options.goal[2]:g}")
         self.controller = RotorThrust(vehicle)
         self._wanted = math.radians(options.heading)
+        self._hover_thrust = vehicle.hover_thrust
+        vectors = (
+            ("goal - position", "m", 2 * options.flight_band),
+            ("velocity", "m/s", MOST_SPEED),
+            ("nose", "1", 1.001),
+            ("thrust axis", "1", 1.001),
+            ("body rate", "rad/s", MOST_RATE),
+        )
         rotors = vehicle.num_rotors
         ratio = vehicle.thrust_high / vehicle.hover_thrust - 1
-        self._hover_thrust = vehicle.hover_thrust
-        most = (
-            *[2 * options.flight_band] * 3,
-            *[MOST_SPEED] * 3,
-            *[1.001] * 6,
-            *[MOST_RATE] * 3,
-            *(ratio + 0.001).tolist(),
-        )
-        vectors = ("goal - position", "velocity", "nose", "thrust axis", "body rate")
+        most = (*(bound for *_, bound in vectors for _ in "xyz"), *(ratio + 0.001).tolist())
         self.observation = (
             ArraySpec(
                 name="observation",
                 shape=(15 + rotors,),
-                low=tuple(-bound for bound in most[:15]) + (-1.001,) * rotors,
+                low=(*(-bound for bound in most[:15]), *[-1.001] * rotors),
                 high=most,
-                unit=("m",) * 3 + ("m/s",) * 3 + ("1",) * 6 + ("rad/s",) * 3 + ("1",) * rotors,
+                unit=(*(unit for _, unit, _ in vectors for _ in "xyz"), *["1"] * rotors),
                 frame="world turned by the wanted heading; body rates: body",
                 components=(
-                    *(f"{vector} {axis}" for vector in vectors for axis in "xyz"),
+                    *(f"{vector} {axis}" for vector, *_ in vectors for axis in "xyz"),
                     *(f"thrust {i + 1} over hover" for i in range(rotors)),
                 ),
             ),

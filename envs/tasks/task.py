@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 import numpy as np
 
 from ...models import MOST_DRAG
-from ...models.errors import InputError
+from ...models.errors import expect
 from ...sim import Array, Controller, Draw, Pose, WorldState
 from ..spec import ArraySpec, Metric
 
@@ -47,12 +47,10 @@ class TaskOptions:
 
     def __post_init__(self) -> None:
         length = finite(self.episode_length)
-        if length is None or length != int(length) or not 1 <= length <= LONGEST_EPISODE:
-            raise InputError(
-                "episode_length: expected a whole number of control steps, 1 or more, "
-                f"got {self.episode_length!r}"
-            )
-        object.__setattr__(self, "episode_length", int(length))
+        right = length is not None and length == int(length) and 1 <= length <= LONGEST_EPISODE
+        expected = "a whole number of control steps, 1 or more"
+        expect(right, "episode_length", expected, f"{self.episode_length!r}")
+        object.__setattr__(self, "episode_length", int(self.episode_length))
         check_number(self, "control_period", 1e-6, LONGEST_CONTROL_PERIOD, "s")
         check_number(self, "linear_drag", 0.0, MOST_DRAG, "/s")
         self.check()
@@ -65,8 +63,7 @@ class TaskOptions:
         """Options by name. An unknown name raises `InputError`, which names those there are."""
         known = [field.name for field in fields(cls)]
         for name in options:
-            if name not in known:
-                raise InputError(f"options: expected some of {', '.join(known)}, got {name!r}")
+            expect(name in known, "options", f"some of {', '.join(known)}", f"{name!r}")
         return cls(**options)
 
 
@@ -83,9 +80,7 @@ class Outcome:
 
 
 class Task:
-    """Base of all tasks: derive, set the class attributes, and write the methods below.
-
-    `examples/landing.py` is a whole one in forty lines; `register` makes it an env.
+    """Base of all tasks: derive, as `examples/landing.py` does, and `register` it.
 
     Class attributes:
         Options: Dataclass of the task's options.
@@ -160,15 +155,14 @@ def finite(value: Any) -> float | None:
 
 def check_number(options: Any, name: str, low: float, high: float, unit: str = "") -> None:
     """Keep an option as a float within bounds. Raises `InputError`."""
-    value = finite(getattr(options, name))
-    if value is None or not low <= value <= high:
-        expected = f"a number from {low:g} to {high:g} {unit}".rstrip()
-        raise InputError(f"{name}: expected {expected}, got {getattr(options, name)!r}")
+    value, given = finite(getattr(options, name)), getattr(options, name)
+    expected = f"a number from {low:g} to {high:g} {unit}".rstrip()
+    expect(value is not None and low <= value <= high, name, expected, f"{given!r}")
     object.__setattr__(options, name, value)
 
 
 def check_choice(options: Any, name: str, allowed: tuple[str, ...]) -> None:
     """Check an option that is one of some words. Raises `InputError`."""
     value = getattr(options, name)
-    if not (isinstance(value, str) and value in allowed):
-        raise InputError(f"{name}: expected {' or '.join(map(repr, allowed))}, got {value!r}")
+    right = isinstance(value, str) and value in allowed
+    expect(right, name, " or ".join(map(repr, allowed)), f"{value!r}")
