@@ -130,9 +130,10 @@ def read_sweep_runs(folder: Path, config: SweepConfig) -> pd.DataFrame:
     path = folder / results.RUNS_FILE
     if not path.exists():
         return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in RUN_COLUMNS.items()})
-    names, types = list(RUN_COLUMNS), dict(RUN_COLUMNS)
-    try:  # they are written again with every run, and have to keep their bits
-        rows = pd.read_csv(path, usecols=names, dtype=types, float_precision="round_trip")[names]
+    try:
+        # By way of strings: they are written again with every run, and have to keep their bits.
+        text = pd.read_csv(path, usecols=list(RUN_COLUMNS), dtype=str)
+        rows = text[list(RUN_COLUMNS)].astype(dict(RUN_COLUMNS))
     except ValueError as error:  # an empty file, a missing column, or a value of another type
         raise ResultsError(f"{path}: expected the runs of a sweep: {error}") from None
     wanted = {(job.point, job.run.seed) for job in config.runs()}
