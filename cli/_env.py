@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from ..models.errors import InputError
-from ._flags import AgentFlags, EnvFlags
-from ._inputs import parse_address
+from ._flags import AgentFlags, EnvFlags, parse_address
 
 if TYPE_CHECKING:
     from ..agents.checkpoints import Checkpoint
@@ -59,11 +58,8 @@ def chosen_env(
 
 
 def policy_for(command: EnvFlags, checkpoint: "Checkpoint | None", spec: "EnvSpec") -> "Policy":
-    """The policy of a checkpoint, or the PID.
-
-    Raises:
-        InputError: It does not fit the env, or was trained on another vehicle and the user has not
-            named one.
+    """The policy of a checkpoint, or the PID. Raises `InputError` if it does not fit the env, or
+    was trained on another vehicle and the user has not named one.
     """
     if checkpoint is None:
         from ..agents import PID
@@ -116,21 +112,13 @@ def remote_env(
     num_envs: int | None = 1,
     num_simulators: int = 1,
 ) -> Iterator[Any]:
-    """A remote env with a simulator of its own, or those that come to `command.listen`.
+    """A remote env with a simulator of its own, or those that come to `command.listen`; at the end
+    the counters of the wire are printed.
 
-    One drone is a `RemoteEnv`, more are a `RemoteVectorEnv` without autoreset. At the end the
-    counters of the wire are printed.
-
-    Args:
-        command: Says where, and with which key.
-        env_id, options: Of the task; only options that are not the default.
-        required: Whether simulators that come must fly this task, with these options if there are
-            any; otherwise the first that comes decides.
-        num_envs: Drones. None: as many as the first simulator has, in a `RemoteVectorEnv`.
-        num_simulators: Simulators to wait for.
-
-    Raises:
-        InputError: Flags that contradict each other.
+    One drone is a `RemoteEnv`, more are a `RemoteVectorEnv` without autoreset; None are as many as
+    the first simulator has, in a `RemoteVectorEnv`. Where it is `required`, simulators that come
+    must fly this task, with these options (not the default ones) if there are any; otherwise the
+    first that comes decides. Raises `InputError` for flags that contradict each other.
     """
     if command.listen is not None:
         settings = {"env_id": env_id, "options": options or None} if required else {}

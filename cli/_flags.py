@@ -1,8 +1,10 @@
 """Base of all commands, and the parser of their flags: tyro, plus the options of any task."""
 
 import json
+import shlex
 from argparse import ArgumentParser
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
 from types import UnionType
@@ -92,8 +94,7 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
         return cast(C, replace(command, given=given, options=required))
     env_id = registry.load(env_id)
     options_type = registry.options_type(env_id)
-    # Wrong values are refused by the options themselves, below, as every other wrong input.
-    raw = _for_tyro(options_type, __post_init__=lambda self: None, __doc__=f"Options of {env_id}.")
+    raw = _for_tyro(options_type, __doc__=f"Options of {env_id}.")
     typed = make_dataclass(
         kind.__name__,
         [("options", Annotated[raw, arg(name="env")], field(default_factory=raw))],
@@ -111,8 +112,9 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
 
 
 def _for_tyro(kind: type[Any], **namespace: Any) -> Any:
-    """A dataclass with `Union[X, Y]` in place of `X | Y`: for the latter, and Python before 3.14,
-    tyro imports typeguard, which takes as long as all else.
+    """A dataclass without checks: wrong values are refused later, as every other wrong input. Has
+    `Union[X, Y]` for `X | Y`, for which tyro, before Python 3.14, imports typeguard: that takes as
+    long as all else.
     """
     hints = get_type_hints(kind, include_extras=True)
     changed = {}
@@ -123,8 +125,8 @@ def _for_tyro(kind: type[Any], **namespace: Any) -> Any:
         if isinstance(hint, UnionType):
             union: Any = Union[get_args(hint)]  # noqa: UP007
             changed[one.name] = Annotated[union, *extras] if extras else union
-    namespace = {"__annotations__": changed, "__doc__": kind.__doc__, **namespace}
-    return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), namespace))
+    own = {"__annotations__": changed, "__doc__": kind.__doc__, "__post_init__": lambda self: None}
+    return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), own | namespace))
 
 
 def parse_value(text: str) -> Any:
@@ -159,3 +161,55 @@ def _without_requirements(words: Sequence[str]) -> tuple[list[str], dict[str, An
             raise InputError(f"{name}: expected a value, got none")
         required[name.removeprefix("--env.").replace("-", "_")] = parse_value(text)
     return kept, required
+
+
+# ---- checks: addresses, counts, folders, and the settings that a resumed run keeps
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """HOST:PORT as a pair. Raises `InputError`."""
+    host, _, port = text.rpartition(":")
+    if not (host and port.isascii() and port.isdecimal() and int(port) <= 65535):
+        raise InputError(f"address: expected HOST:PORT with a port up to 65535, got {text!r}")
+    return host, int(port)
+
+
+def check_count(name: str, value: int | None) -> None:
+    """Raises `InputError` for a number that is given and less than 1."""
+    if value is not None and value < 1:
+        raise InputError(f"{name}: expected at least 1, got {value}")
+
+
+@contextmanager
+def folder_to_write(out: Path | None, name: str) -> Iterator[Path]:
+    """A new folder for the block, by default named by the time. A block that fails before it has
+    written anything leaves none. Raises `InputError` if `out` exists.
+    """
+    from ..experiments.folders import new_folder
+
+    folder = new_folder(out, name)
+    try:
+        yield folder
+    except BaseException:
+        with suppress(OSError):  # it holds something
+            folder.rmdir()
+        raise
+
+
+def refuse_settings(command: Command, folder: Path, *, free: tuple[str, ...]) -> None:
+    """Raises `InputError` if a setting but the free ones was given, if only its default: the run in
+    the folder that the command resumes keeps its own.
+    """
+    if changed := sorted(name for name in command.given if name not in free):
+        flags = ", ".join("--" + name.replace("_", "-") for name in changed)
+        raise InputError(f"resume: expected the settings of {folder}, got others by {flags}")
+
+
+def go_on_with(command: Command, words: str, folder: Path, *flags: str) -> str:
+    """The line that tells how to resume: of the flags those that were given."""
+    line: list[Any] = ["rotorgram", *words.split(), "--resume", folder]
+    for flag in flags:
+        if flag in command.given:
+            value = getattr(command, flag)
+            line += [f"--{flag.replace('_', '-')}", *([] if value is True else [value])]
+    return f"go on with: {shlex.join(map(str, line))}"

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, Task, TextColumn
 from rich.table import Column
 from rich.text import Text
 
-from ..experiments.progress import OnProgress
+from ..experiments.workers import OnProgress
 
 _LINE_EVERY: Final = 10.0  # s
 _RATE_OVER: Final = 10.0  # s: the rate is that of so long a time up to now
@@ -41,14 +41,28 @@ def frame_bar(name: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: show(name, done, total, "done" if done == total else "frames")
 
 
-class _Runs:
-    """Base: the task of each run, by name, with its recent amounts done and their times."""
+class Bars:
+    """Shows runs by a bar each, with done and total, rate, elapsed and remaining time, and words.
+    The clock tells seconds.
+    """
 
-    def __init__(self, progress: Progress) -> None:
-        self.progress = progress
+    def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
+        self.progress = Progress(
+            TextColumn("{task.description}"), BarColumn(bar_width=None), _Figures(_count),
+            _Figures(_rate), _Figures(_times), TextColumn("{task.fields[words]}"),
+            console=console, get_time=clock,
+        )  # fmt: skip
         self._tasks: dict[str, Task] = {}
 
-    def update(self, name: str, done: int, total: int, words: str) -> Task:
+    def __call__(self, name: str, done: int, total: int, words: str) -> None:
+        """Show it."""
+        task = self._update(name, done, total, words)
+        if words == "done":  # more runs than lines: what is done makes room
+            self.progress.update(task.id, visible=False)
+            self.progress.print(f"{name:14} done", highlight=False)
+
+    def _update(self, name: str, done: int, total: int, words: str) -> Task:
+        """The task of a run, with its recent amounts done and their times."""
         now = self.progress.get_time()
         if name not in self._tasks:
             # There is always a point: a bar may be drawn, by a thread of rich's, at any time.
@@ -64,47 +78,16 @@ class _Runs:
         return task
 
 
-class Bars(_Runs):
-    """Shows runs by a bar each, with done and total, rate, elapsed and remaining time, and words.
-
-    Args:
-        console: Where.
-        clock: Tells seconds.
-    """
-
-    def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=None),
-            _Figures(_count),
-            _Figures(_rate),
-            _Figures(_times),
-            TextColumn("{task.fields[words]}"),
-        )
-        super().__init__(Progress(*columns, console=console, get_time=clock))
-
-    def __call__(self, name: str, done: int, total: int, words: str) -> None:
-        """Show it."""
-        task = self.update(name, done, total, words)
-        if words == "done":  # more runs than lines: what is done makes room
-            self.progress.update(task.id, visible=False)
-            self.progress.print(f"{name:14} done", highlight=False)
-
-
-class Lines(_Runs):
-    """Prints a run at most every ten seconds, and when it is done.
-
-    Args:
-        clock: Tells seconds.
-    """
+class Lines(Bars):
+    """Prints a run at most every ten seconds, and when it is done. The clock tells seconds."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__(Progress(get_time=clock))  # never started: it shows nothing
+        super().__init__(Console(), clock)  # its bars are never started: they show nothing
         self._last: dict[str, float] = {}
 
     def __call__(self, name: str, done: int, total: int, words: str) -> None:
         """Print it, unless that was done a moment ago."""
-        task, now = self.update(name, done, total, words), self.progress.get_time()
+        task, now = self._update(name, done, total, words), self.progress.get_time()
         if words == "done" or now - self._last.get(name, now - _LINE_EVERY) >= _LINE_EVERY:
             self._last[name] = now
             figures = (_count(task), _rate(task), _times(task), words)

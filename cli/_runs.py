@@ -7,15 +7,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final
 
 from tyro.conf import arg
 
-from ._flags import EnvFlags, PresetName
-from ._inputs import folder_to_write, go_on_with
+from ..experiments.settings import RunsConfig
+from ._flags import EnvFlags, folder_to_write, go_on_with
 
 if TYPE_CHECKING:
-    from ..experiments.progress import OnProgress
+    from ..experiments.workers import OnProgress
 
 RESUMED: Final = ("jobs", "backend", "address", "resume", "env")
 """Flags that a resumed command may be given: they change no number. `--env` imports the module of a
@@ -23,26 +23,13 @@ task."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunsFlags(EnvFlags):
+class RunsFlags(RunsConfig, EnvFlags):
     """A command of many runs, on the cores of this machine or on many machines."""
 
-    preset: PresetName = "tuned"
-    """Hyperparameters: the paper's, or ours."""
-    env_steps: int = 200_000
-    """Env steps of each training, of all its drones together; a learning rate that falls, falls
-    over all of them."""
-    num_envs: int = 1
-    """Drones that fly at the same time, in lock-step, in each training."""
-    episodes: int = 20
-    """Evaluation episodes of each final policy."""
     out: Path | None = None
     """Folder to write; it must not exist. Default: runs/COMMAND-TIME."""
     resume: Path | None = None
     """Folder of an interrupted command to go on with; it keeps its settings."""
-    jobs: int | None = None
-    """Runs at a time. Default: one for each core of this machine, or of the cluster."""
-    backend: Literal["loky", "ray"] = "loky"
-    """loky: processes of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
     address: Annotated[str | None, arg(metavar="ray://HOST:PORT")] = None
     """The Ray cluster. Default: the one that this machine is part of."""
 
@@ -74,8 +61,9 @@ def report_comparison(folder: Path, *, film: bool = True) -> None:
     """Write figures, film and report from the folder's files, and print the table."""
     from rich.console import Console
 
-    from ..experiments.report import VIDEO_FILE, table_of, terminal_table, write_report
+    from ..experiments.report import VIDEO_FILE, table_of, write_report
     from ..experiments.results import read_results
+    from ..experiments.tables import terminal_table
     from ..models.errors import InputError
     from ._progress import frame_bar
 
@@ -102,11 +90,11 @@ def report_sweep(folder: Path) -> None:
     from rich.table import Table
 
     from ..experiments.metrics import Headline
-    from ..experiments.results import read_config, read_spec
+    from ..experiments.results import read_spec
     from ..experiments.sweep import SWEEP_FILE, read_sweep_config, write_sweep_table
 
     config = read_sweep_config(folder)
-    headline = Headline.of(read_spec(folder, read_config(folder)))
+    headline = Headline.of(read_spec(folder))
     results = write_sweep_table(config, folder)
     steady = headline.labelled(f"Steady {headline.size_symbol},\nworst")
     table = Table(box=box.SIMPLE_HEAD)
@@ -117,18 +105,11 @@ def report_sweep(folder: Path) -> None:
         "Env\nsteps/s",
     ):  # fmt: skip
         table.add_column(heading, justify="right")
+    cells = ("{worst:.3g}", "{median:.3g}", "{return:.0f}", "{settled} of {episodes}", "{crashed}",
+             "{seeds}", "{seconds:.1f}", "{steps_per_second:,.0f}")  # fmt: skip
     for row in results.to_dict("records"):
-        table.add_row(
-            *(str(row[name]) for name in config.grid),
-            f"{row['worst']:.3g}",
-            f"{row['median']:.3g}",
-            f"{row['return']:.0f}",
-            f"{row['settled']} of {row['episodes']}",
-            str(row["crashed"]),
-            str(row["seeds"]),
-            f"{row['seconds']:.1f}",
-            f"{row['steps_per_second']:,.0f}",
-        )
+        own = (str(row[name]) for name in config.grid)
+        table.add_row(*own, *(cell.format(**row) for cell in cells))
     Console(width=100).print(table)
     print(f"{results['seeds'].sum()} of {len(config.runs())} runs done")
     print(f"table: {folder / SWEEP_FILE}")

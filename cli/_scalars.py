@@ -18,13 +18,9 @@ class ScalarWriter:
     """Writes numbers by name at the first update, then at the first after so many env steps.
 
     So many are a two hundredth of the run, and at least 100: curves of agents that update at
-    different times have points near the same env steps.
-
-    Args:
-        folder: For the event files, one for each time that the training was begun or resumed.
-        env_steps: Of the whole run.
-        behind: Env steps flown before. What the folder holds from beyond them was lost with a
-            process that was killed: TensorBoard is told to forget it.
+    different times have points near the same env steps. The folder gets an event file each time
+    that the training is begun or resumed. What it holds from beyond the env steps that were flown
+    before was lost with a process that was killed: TensorBoard is told to forget it.
     """
 
     def __init__(self, folder: Path, env_steps: int, *, behind: int = 0) -> None:

@@ -10,13 +10,10 @@ from rich import box
 from rich.table import Table
 
 from ..models.errors import require
-from ._flags import Command
-from ._inputs import folder_to_write
+from ._flags import Command, folder_to_write
 
 if TYPE_CHECKING:
     from ..experiments.bench import Layer
-
-__all__ = ["Bench"]
 
 
 @dataclass(frozen=True, kw_only=True)

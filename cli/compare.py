@@ -3,11 +3,8 @@
 from dataclasses import dataclass, replace
 
 from ..models.errors import InputError, require
-from ._flags import AlgorithmName
-from ._inputs import refuse_settings
+from ._flags import AlgorithmName, refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_comparison, runs_folder
-
-__all__ = ["Compare"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,8 +19,6 @@ class Compare(RunsFlags):
     """Algorithms to train; the PID flies beside them."""
     seeds: int = 5
     """Number of seeds, the same for every agent. The paper's claims are decided from 30 on."""
-    first_seed: int = 0
-    """The first of them."""
     snapshots: int = 10
     """Policies kept during each training, for the learning curves."""
     film: bool = True

@@ -5,10 +5,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from ._flags import AgentFlags
-from ._inputs import check_count
-
-__all__ = ["Evaluate"]
+from ._flags import AgentFlags, check_count
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,11 +44,11 @@ class Evaluate(AgentFlags):
         print(f"episodes   {len(rows)}, {sum(row['terminated'] for row in rows)} terminated")
         print(f"return     {mean('return'):.1f}")
         print(f"steady     {headline.size_symbol} {amount('steady')}")
-        if (bound := headline.settled) is not None and not headline.high:
+        if headline.settles:
             count = sum(not np.isnan(row["settling_time"]) for row in rows)
             when = f"{mean('settling_time'):.2f} s" if count else "never"
-            bound_text = headline.amount(f"{bound:g}")
-            print(f"settling   to {bound_text}: {when} ({count} of {len(rows)} episodes)")
+            bound = headline.amount(f"{headline.settled:g}")
+            print(f"settling   to {bound}: {when} ({count} of {len(rows)} episodes)")
         if headline.signed:
             print(f"overshoot  {amount('overshoot')}")
         return 0

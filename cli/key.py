@@ -7,8 +7,6 @@ from tyro.conf import Positional
 
 from ._flags import Command
 
-__all__ = ["Key"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Key(Command):

@@ -9,14 +9,11 @@ from typing import TYPE_CHECKING, Final, Literal
 from tyro.conf import Positional
 
 from ..models.errors import InputError
-from ._flags import EnvFlags
-from ._inputs import check_count
+from ._flags import EnvFlags, check_count
 
 if TYPE_CHECKING:
     from ..experiments.filming import Shot
     from ..experiments.trajectories import Trajectory
-
-__all__ = ["Render", "parse_size"]
 
 _ALIKE: Final = ("pid", "random")  # their words tell no two of them apart
 

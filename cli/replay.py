@@ -7,8 +7,6 @@ from tyro.conf import Positional
 
 from ._flags import Command
 
-__all__ = ["Replay"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Replay(Command):

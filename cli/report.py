@@ -7,8 +7,6 @@ from tyro.conf import Positional
 
 from ._flags import Command
 
-__all__ = ["Report"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Report(Command):

@@ -8,10 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from ._flags import AgentFlags
-from ._inputs import check_count
-
-__all__ = ["Serve"]
+from ._flags import AgentFlags, check_count
 
 
 @dataclass(frozen=True, kw_only=True)

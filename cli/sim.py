@@ -5,10 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ._flags import EnvFlags
-from ._inputs import parse_address
-
-__all__ = ["Sim"]
+from ._flags import EnvFlags, parse_address
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,11 +8,8 @@ from typing import Annotated, Any
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ..models.errors import InputError
-from ._flags import AlgorithmName, parse_value
-from ._inputs import refuse_settings
+from ._flags import AlgorithmName, parse_value, refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_sweep, runs_folder
-
-__all__ = ["Sweep"]
 
 
 @dataclass(frozen=True, kw_only=True)

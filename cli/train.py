@@ -13,14 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ..models.errors import InputError, require
-from ._flags import AgentFlags, AlgorithmName, PresetName, parse_value
-from ._inputs import folder_to_write, go_on_with, refuse_settings
+from . import _flags
+from ._flags import AgentFlags, AlgorithmName, PresetName
 
 if TYPE_CHECKING:
     from ..experiments.settings import Run
     from ..experiments.training import Training
-
-__all__ = ["Train"]
 
 EPISODES: Final = "episodes.csv"
 _FREE: Final = ("resume", "listen", "num_simulators", "key_file", "insecure", "record",
@@ -83,7 +81,7 @@ class Train(AgentFlags):
             print(f"note: {advice}", flush=True)
         required = bool(self.options) or "env" in self.given
         with (
-            folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
+            _flags.folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
             remote_env(self, self.env_id, self.options, required=required, num_envs=run.num_envs,
                        num_simulators=self.num_simulators) as env,
             locked(folder),
@@ -109,7 +107,7 @@ class Train(AgentFlags):
                     f"resume: expected a training of {self.algorithm}, "
                     f"{folder} holds one of {kept.algorithm}"
                 )
-            refuse_settings(self, folder, free=("algorithm", *_FREE))
+            _flags.refuse_settings(self, folder, free=("algorithm", *_FREE))
             if "env" in self.given and self.env_id != kept.env_id:
                 raise InputError(f"resume: expected --env {kept.env_id}, got {self.env}")
             if is_finished(kept):
@@ -129,7 +127,7 @@ class Train(AgentFlags):
 
         before = training.log.env_steps
         flags = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
-        go_on = go_on_with(self, f"train {self.algorithm}", folder, *flags)
+        go_on = _flags.go_on_with(self, f"train {self.algorithm}", folder, *flags)
         keeper = _Keeper(training, folder, self.store_every)
         try:
             with _stop_at_update() as stop_is_asked, bars() as progress:
@@ -165,7 +163,7 @@ def _change(word: str) -> tuple[str, Any]:
     name, equals, value = word.partition("=")
     if not equals:
         raise InputError(f"set: expected NAME=VALUE, got {word!r}")
-    return name, parse_value(value)
+    return name, _flags.parse_value(value)
 
 
 def _advice(run: "Run") -> str:

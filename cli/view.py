@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from ..models.errors import InputError
-from ._flags import EnvFlags
-from ._inputs import check_count
+from ._flags import EnvFlags, check_count
 
 if TYPE_CHECKING:
     from ..experiments.trajectories import Trajectory
-
-__all__ = ["View"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from itertools import cycle
 from pathlib import Path
@@ -156,16 +156,16 @@ def bench(
         opened: list[tuple[str, Slice]] = []
         for name, _, _, open_ in _LAYERS:
             on_layer(f"opening {name}", 0, 1)
-            opened.append((name, stack.enter_context(open_())))
-        turns = (rounds + 1) * len(opened)
-        for number in range(rounds + 1):
-            first = number % len(opened)
-            for place, (name, run) in enumerate(opened[first:] + opened[:first]):
-                on_layer(name, number * len(opened) + place, turns)
-                start = time.perf_counter()
-                rate = run(seconds) / (time.perf_counter() - start)
-                if number:  # the first round warms up
-                    rates[name].append(round(rate, 1))
+            opened.append((name, open_(stack)))
+        count = len(opened)
+        for turn in range((rounds + 1) * count):
+            number, place = divmod(turn, count)
+            name, run = opened[(number + place) % count]
+            on_layer(name, turn, (rounds + 1) * count)
+            start = time.perf_counter()
+            rate = run(seconds) / (time.perf_counter() - start)
+            if number:  # the first round warms up
+                rates[name].append(round(rate, 1))
     layers = [
         Layer(name=name, about=about, drones=drones, rates=tuple(rates[name]))
         for name, about, drones, _ in _LAYERS
@@ -196,10 +196,10 @@ def parts_of(layers: Sequence[Layer]) -> list[tuple[str, float]]:
     return [*parts, ("links", whole - sum(seconds for _, seconds in parts)), ("step", whole)]
 
 
-# ---- the layers, each a context that gives a `Slice`
+# ---- the layers: each is opened for as long as the stack is, and gives a `Slice`
 
 
-def _for_a_while(fly: Callable[[], int], prepare: Callable[[], None] = lambda: None) -> Slice:
+def _for_a_while(fly: Callable[[], int], prepare: Callable[[], object] = lambda: None) -> Slice:
     def run(seconds: float) -> int:
         prepare()
         until, steps = time.perf_counter() + seconds, 0
@@ -211,7 +211,7 @@ def _for_a_while(fly: Callable[[], int], prepare: Callable[[], None] = lambda: N
 
 
 def _again(
-    call: Callable[[], Any], drones: int = 1, prepare: Callable[[], None] = lambda: None
+    call: Callable[[], Any], drones: int = 1, prepare: Callable[[], object] = lambda: None
 ) -> Slice:
     """Calls it, a step of so many drones, `_STEPS_AT_ONCE` times between two looks at the clock."""
 
@@ -223,8 +223,7 @@ def _again(
     return _for_a_while(fly, prepare)
 
 
-@contextmanager
-def _mj_step() -> Iterator[Slice]:
+def _mj_step(_: ExitStack) -> Slice:
     vehicle = Vehicle.load()
     model, substeps = vehicle.model, vehicle.substeps(_PERIOD)
     data = mujoco.MjData(model)
@@ -234,11 +233,10 @@ def _mj_step() -> Iterator[Slice]:
         mujoco.mj_resetData(model, data)
         data.qpos[2], data.ctrl[:] = 5.0, vehicle.hover_thrust
 
-    yield _again(lambda: mujoco.mj_step(model, data, substeps), prepare=prepare)
+    return _again(lambda: mujoco.mj_step(model, data, substeps), prepare=prepare)
 
 
-@contextmanager
-def _batch_step(drones: int, timestep: float | None = None) -> Iterator[Slice]:
+def _batch_step(drones: int, timestep: float | None = None) -> Slice:
     vehicle = Vehicle.load()
     model = copy.deepcopy(vehicle.model)
     model.opt.timestep = timestep or model.opt.timestep
@@ -252,63 +250,57 @@ def _batch_step(drones: int, timestep: float | None = None) -> Iterator[Slice]:
         batch.step(nstep=substeps)
         return drones
 
-    yield _for_a_while(fly, prepare)
+    return _for_a_while(fly, prepare)
 
 
-@contextmanager
-def _local(drones: int) -> Iterator[Slice]:
+def _actions(*shape: int) -> Iterator[Any]:
+    """Random actions near hover, the same ones again and again."""
+    return cycle(np.random.default_rng(0).uniform(-0.1, 0.1, shape).astype(np.float32))
+
+
+def _local(stack: ExitStack, drones: int) -> Slice:
     one = drones == 1
     made: Any = gym.make(ENV_ID, disable_env_checker=True) if one else gym.make_vec(ENV_ID, drones)
-    with closing(made.unwrapped) as env:
-        yield _single(env) if one else _vector(env)
+    return _env(stack.enter_context(closing(made.unwrapped)))
 
 
-@contextmanager
-def _remote(drones: int) -> Iterator[Slice]:
-    with socket_pair(ENV_ID, num_envs=drones) as env:
-        yield _single(env) if drones == 1 else _vector(env)
+def _remote(stack: ExitStack, drones: int) -> Slice:
+    return _env(stack.enter_context(socket_pair(ENV_ID, num_envs=drones)))
 
 
-def _single(env: Any) -> Slice:
-    actions = cycle(np.random.default_rng(0).uniform(-0.1, 0.1, (4096, 1)).astype(np.float32))
+def _env(env: Any) -> Slice:
+    """Of a vector env, drones whose episode ended are reset by the next step, as in NEXT_STEP."""
     env.reset(seed=0)
+    if hasattr(env, "num_envs"):
+        actions = _actions(16, env.num_envs, 1)
+
+        def fly() -> int:
+            resets = env.done
+            env.advance(next(actions), resets if resets.any() else None)
+            return int((~resets).sum())
+
+        return _for_a_while(fly)
+    single = _actions(4096, 1)
 
     def step() -> None:
-        _, _, terminated, truncated, _ = env.step(next(actions))
+        _, _, terminated, truncated, _ = env.step(next(single))
         if terminated or truncated:
             env.reset()
 
     return _again(step)
 
 
-def _vector(env: Any) -> Slice:
-    """Random actions; drones whose episode ended are reset by the next step, as in NEXT_STEP."""
-    dice = np.random.default_rng(0)
-    actions = cycle(dice.uniform(-0.1, 0.1, (16, env.num_envs, 1)).astype(np.float32))
-    env.reset(seed=0)
-
-    def fly() -> int:
-        resets = env.done
-        env.advance(next(actions), resets if resets.any() else None)
-        return int((~resets).sum())
-
-    return _for_a_while(fly)
-
-
-@contextmanager
-def _simulate() -> Iterator[Slice]:
+def _simulate(stack: ExitStack) -> Slice:
     """The simulator's part between a Command and a State."""
-    dice = np.random.default_rng(0)
-    actions = cycle(dice.uniform(-0.1, 0.1, (_STEPS_AT_ONCE, 1, 1)).astype(np.float32))
-    everyone = np.ones(1, bool)
-    with closing(Loop(ENV_ID)) as loop:
-        loop.advance(next(actions), everyone)
+    actions, everyone = _actions(_STEPS_AT_ONCE, 1, 1), np.ones(1, bool)
+    loop = stack.enter_context(closing(Loop(ENV_ID)))
+    loop.advance(next(actions), everyone)
 
-        def step() -> None:
-            loop.advance(next(actions), everyone if loop.done[0] else None)
-            loop.telemetry  # noqa: B018  # made when it is asked for
+    def step() -> None:
+        loop.advance(next(actions), everyone if loop.done[0] else None)
+        loop.telemetry  # noqa: B018  # made when it is asked for
 
-        yield _again(step)
+    return _again(step)
 
 
 def _messages() -> tuple[Any, dict[str, State | Command]]:
@@ -321,51 +313,43 @@ def _messages() -> tuple[Any, dict[str, State | Command]]:
             sequence=2,
             time=0.02,
             observations=tuple(loop.observations.values()),
-            rewards=loop.rewards,
-            terminated=loop.terminated,
-            truncated=loop.truncated,
             telemetry=tuple(loop.telemetry.values()),
+            **{name: getattr(loop, name) for name in ("rewards", "terminated", "truncated")},
         )
         command = Command(session=1, sequence=2, actions=action, orders=np.zeros(1, np.uint8))
         return layout_of(loop.spec, 1), {"State": state, "Command": command}
 
 
-@contextmanager
-def _codec(name: str) -> Iterator[Slice]:
+def _codec(name: str) -> Slice:
     layout, messages = _messages()
     what, kind = name.split()
     message = messages[kind]
     datagram = binary.encode(message, layout)
     if what == "encode":
-        yield _again(lambda: binary.encode(message, layout))
-    else:
-        yield _again(lambda: binary.decode(datagram, layout))
+        return _again(lambda: binary.encode(message, layout))
+    return _again(lambda: binary.decode(datagram, layout))
 
 
-@contextmanager
-def _echo() -> Iterator[Slice]:
+def _echo(stack: ExitStack) -> Slice:
     """A blocking Python client and server; datagrams of the sizes of a State and a Command."""
     layout, messages = _messages()
     sizes = {kind: len(binary.encode(one, layout)) for kind, one in messages.items()}
     words = [sys.executable, "-c", _ECHO, str(sizes["Command"])]
-    with subprocess.Popen(words, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        address, message = ("127.0.0.1", int(process.stdout.readline())), bytes(sizes["State"])
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-            sock.settimeout(1.0)
+    process = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE))
+    assert process.stdout is not None
+    address, message = ("127.0.0.1", int(process.stdout.readline())), bytes(sizes["State"])
+    sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    sock.settimeout(1.0)
+    stack.callback(sock.sendto, b"", address)
 
-            def exchange() -> None:
-                sock.sendto(message, address)
-                sock.recvfrom(65536)
+    def exchange() -> None:
+        sock.sendto(message, address)
+        sock.recvfrom(65536)
 
-            try:
-                yield _again(exchange)
-            finally:
-                sock.sendto(b"", address)
+    return _again(exchange)
 
 
-@contextmanager
-def _policy(drones: int) -> Iterator[Slice]:
+def _policy(drones: int) -> Slice:
     dice = np.random.default_rng(0)
     shapes: dict[str, Any] = {
         "hidden.weight": (16, 3), "hidden.bias": 16, "output.weight": (1, 16), "output.bias": 1,
@@ -375,55 +359,42 @@ def _policy(drones: int) -> Iterator[Slice]:
     policy = NetworkPolicy(weights, env_spec(ENV_ID))
     observations = dice.normal(size=(drones, 3)).astype(np.float32)
     noise = policy.draw_noise(dice, drones)
-    yield _again(lambda: policy.actions.to_envs(policy.sample(observations, noise)), drones)
+    return _again(lambda: policy.actions.to_envs(policy.sample(observations, noise)), drones)
 
 
-@contextmanager
-def _training(algorithm: str, drones: int) -> Iterator[Slice]:
+def _training(stack: ExitStack, algorithm: str, drones: int) -> Slice:
     # With 64 drones: five steps of each for an update, as SB3's default has it; VPG an episode.
     batch = {"episodes_per_update": 64} if algorithm == "vpg" else {"steps_per_update": 64 * 5}
-    run = Run(
-        algorithm=algorithm,
-        config=preset(algorithm, "tuned", **({} if drones == 1 else batch)),
-        seed=0,
-        env_steps=10**9,
-        num_envs=drones,
-    )
-    with socket_pair(**run.env, num_envs=drones) as env:
-        training = Training(run, env)
+    config = preset(algorithm, "tuned", **({} if drones == 1 else batch))
+    run = Run(algorithm=algorithm, config=config, seed=0, env_steps=10**9, num_envs=drones)
+    env = stack.enter_context(socket_pair(**run.env, num_envs=drones))
+    training = Training(run, env)
 
-        def fly(seconds: float) -> int:
-            until, before = time.perf_counter() + seconds, training.log.env_steps
-            training.train(lambda: time.perf_counter() < until)
-            return training.log.env_steps - before
+    def fly(seconds: float) -> int:
+        until, before = time.perf_counter() + seconds, training.log.env_steps
+        training.train(lambda: time.perf_counter() < until)
+        return training.log.env_steps - before
 
-        yield fly
+    return fly
 
 
 _MANY: Final = (64, 1024, 4096)
 _CODEC: Final = ("encode State", "decode State", "encode Command", "decode Command")
-_LAYERS: Final[list[tuple[str, str, int, Callable[[], Any]]]] = [
+_LAYERS: Final[list[tuple[str, str, int, Callable[[ExitStack], Slice]]]] = [
     ("mj_step", "a loop over mj_step, substeps of one control step", 1, _mj_step),
-    ("env", "the single env's step", 1, lambda: _local(1)),
-    ("Batch.step, 1024", "mujoco.batch, the same substeps", 1024, lambda: _batch_step(1024)),
-    (
-        "Batch.step at 5 ms, 1024",
-        "the same with the first version's physics step",
-        1024,
-        lambda: _batch_step(1024, _OLD_TIMESTEP),
-    ),
-    *((f"vector env, {n}", "the vector env", n, lambda n=n: _local(n)) for n in _MANY),
+    ("env", "the single env's step", 1, lambda s: _local(s, 1)),
+    ("Batch.step, 1024", "mujoco.batch, the same substeps", 1024, lambda _: _batch_step(1024)),
+    ("Batch.step at 5 ms, 1024", "the same with the first version's physics step", 1024,
+     lambda _: _batch_step(1024, _OLD_TIMESTEP)),
+    *((f"vector env, {n}", "the vector env", n, lambda s, n=n: _local(s, n)) for n in _MANY),
     ("UDP echo", "blocking sockets in Python, datagrams of the same sizes", 1, _echo),
-    ("UDP, 1", "RemoteEnv and a simulator", 1, lambda: _remote(1)),
-    *((f"UDP, {n}", "RemoteVectorEnv and a simulator", n, lambda n=n: _remote(n)) for n in _MANY),
+    *((f"UDP, {n}", f"Remote{'Vector' * (n > 1)}Env and a simulator", n,
+       lambda s, n=n: _remote(s, n)) for n in (1, *_MANY)),
     ("simulate", "physics, task and telemetry of one drone", 1, _simulate),
-    *((name, "of one drone, binary", 1, lambda name=name: _codec(name)) for name in _CODEC),
-    ("decide", "16 units, sampled", 1, lambda: _policy(1)),
-    ("policy, 1024", "16 units, sampled", 1024, lambda: _policy(1024)),
-    *(
-        (f"{a}, {n}", "training over UDP", n, lambda a=a, n=n: _training(a, n))
-        for n in (1, 64)
-        for a in ("vpg", "a2c", "sb3-a2c")
-    ),
-]
+    *((name, "of one drone, binary", 1, lambda _, name=name: _codec(name)) for name in _CODEC),
+    ("decide", "16 units, sampled", 1, lambda _: _policy(1)),
+    ("policy, 1024", "16 units, sampled", 1024, lambda _: _policy(1024)),
+    *((f"{a}, {n}", "training over UDP", n, lambda s, a=a, n=n: _training(s, a, n))
+      for n in (1, 64) for a in ("vpg", "a2c", "sb3-a2c")),
+]  # fmt: skip
 """Name, what it is, drones, and how it is opened."""

@@ -21,8 +21,6 @@ from ..agents.pid import SHARES
 from ..envs.tasks.elevation import ERROR_SCALE, ElevationOptions
 from ..models.vehicle import Vehicle
 
-__all__ = ["bang_bang", "elevation_bounds", "elevation_reward"]
-
 _HALVINGS: Final = 24
 
 Floats = npt.NDArray[np.float64]
@@ -65,19 +63,11 @@ def bang_bang(
     distance: Floats, steps: int, period: float, towards: Floats, against: Floats,
     change: float = np.inf, drag: float = 0.0,
 ) -> Floats:  # fmt: skip
-    """Distance left after each control step of the time-optimal flight between two rests.
+    """Distance left after each control step of the time-optimal flight between two rests, m, shape
+    (n, steps), for a distance to go, m, shape (n,), 0 or more, and the period of a step, s.
 
-    Args:
-        distance: To go, m, shape (n,), 0 or more.
-        steps: Number of control steps.
-        period: Of one, s.
-        towards: Largest acceleration towards the goal, m/s², shape (n,).
-        against: Largest acceleration away from it, m/s², shape (n,).
-        change: Largest change of the acceleration from one step to the next, m/s².
-        drag: Linear drag, 1/s.
-
-    Returns:
-        m, shape (n, steps).
+    The largest accelerations, m/s², shape (n,), are those towards the goal and away from it;
+    `change` is the largest change of one from step to step, m/s². Drag is linear, 1/s.
     """
     limits = towards, against, change, drag, period
     # More than enough, also for limited changes of the acceleration, and a speed that drag limits.

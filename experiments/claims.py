@@ -18,18 +18,10 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
-from .metrics import (
-    Headline,
-    bootstrap_difference,
-    bootstrap_interval,
-    episode_ends,
-    final_per_run,
-    iqm,
-    training_runs,
-)
+from . import metrics
+from .metrics import Headline
 
 __all__ = ["MIN_SEEDS", "OURS", "Verdict", "convergence_step", "fluctuation", "judge_claims",
            "judge_no_worse", "long_run_return"]  # fmt: skip
@@ -74,7 +66,7 @@ _TOO_FEW: Final = f"fewer than {MIN_SEEDS} seeds with a value decide nothing"
 Outcome = Literal["borne out", "not borne out", "undecided", "not tested"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Verdict:
     """The verdict on one claim of the paper."""
 
@@ -90,16 +82,13 @@ class Verdict:
     evidence: str
     """The numbers."""
 
-    @classmethod
-    def of(cls, found: tuple[Outcome, str], preset: str, **texts: str) -> "Verdict":
-        """From an outcome and its evidence."""
-        return cls(verdict=found[0], evidence=found[1], preset=preset, **texts)
 
-
-def _late(run: pd.DataFrame) -> npt.NDArray[np.bool_]:
-    """Which episodes of a run ended in the last quarter of its training, shape (episodes,)."""
-    ends = episode_ends(run)
-    return np.asarray(ends > 0.75 * ends.max(initial=0.0))
+def _late_returns(run: pd.DataFrame, returns: pd.Series) -> pd.Series:
+    """Those of the episodes that ended in the last quarter of a run's training; none of a run of
+    fewer than `MIN_EPISODES` episodes.
+    """
+    ends = metrics.episode_ends(run)
+    return returns[(ends > 0.75 * ends.max(initial=0.0)) & (len(run) >= MIN_EPISODES)]
 
 
 def convergence_step(run: pd.DataFrame) -> float:
@@ -113,7 +102,7 @@ def convergence_step(run: pd.DataFrame) -> float:
     """
     if len(run) < MIN_EPISODES:
         return np.nan
-    ends = episode_ends(run)
+    ends = metrics.episode_ends(run)
     total = np.concatenate([[0.0], np.cumsum(run["return"].to_numpy())])
     grid = ends[-1] * np.arange(1, _GRID + 1) / _GRID
     # Episodes first..last-1 ended within the window behind each grid point.
@@ -132,31 +121,25 @@ def convergence_step(run: pd.DataFrame) -> float:
 
 def long_run_return(run: pd.DataFrame) -> float:
     """Mean return of one run's episodes in the last quarter of training; nan if too few."""
-    return float(run["return"][_late(run)].mean()) if len(run) >= MIN_EPISODES else np.nan
+    return float(_late_returns(run, run["return"]).mean())
 
 
 def fluctuation(run: pd.DataFrame) -> float:
     """Standard deviation of one run's episode returns around their moving average, over the last
     quarter of training; nan if it has fewer than `MIN_EPISODES` episodes, or two in that quarter.
     """
-    late = _late(run)
-    if len(run) < MIN_EPISODES or late.sum() < 2:
-        return np.nan
     moving = run["return"].rolling(FLUCTUATION_WINDOW, center=True, min_periods=1).mean()
-    return float((run["return"] - moving).to_numpy()[late].std(ddof=1))
+    return float(_late_returns(run, run["return"] - moving).std())
 
 
 def judge_claims(
     episodes: pd.DataFrame, evaluations: pd.DataFrame, preset: str, headline: Headline
 ) -> list[Verdict]:
-    """Judge the paper's four claims from the training episodes and the evaluations.
-
-    Args:
-        episodes, evaluations, headline: As of `results.Results`.
-        preset: Hyperparameters with which the agents were trained; stated in every verdict.
+    """Judge the paper's four claims from training episodes, evaluations and headline as of
+    `results.Results`. Every verdict states the preset with which the agents were trained.
     """
     trained = set(episodes["agent"])
-    final = final_per_run(evaluations, headline)
+    final = metrics.final_per_run(evaluations, headline)
     holds = {
         name: _holds(final[(final["agent"] == name) & (name in trained)], headline)
         for name in ("a2c", "vpg")
@@ -165,80 +148,65 @@ def judge_claims(
     order: tuple[Outcome, ...] = ("not borne out", "not tested", "undecided", "borne out")
     both = min((outcome for outcome, _ in holds.values()), key=order.index)
     texts = (f"{name.upper()} {text}" for name, (_, text) in holds.items())
-    return [
-        Verdict.of(
-            _compare(
-                episodes,
-                convergence_step,
-                larger=True,
-                unit=" env steps",
-                without="did not converge",
-            ),
-            preset,
-            claim="A2C converges later than VPG: it “takes much more episodes to converge”.",
-            source="Section 3, Figure 6 (“A2C converge slower than VPG”)",
-            definition="Convergence: the env step from which the training return, averaged over "
+    later = _compare(episodes, convergence_step, True, " env steps", "did not converge")
+    judged = (
+        (
+            "A2C converges later than VPG: it “takes much more episodes to converge”.",
+            "Section 3, Figure 6 (“A2C converge slower than VPG”)",
+            "Convergence: the env step from which the training return, averaged over "
             f"{100 * SMOOTHING_SHARE:.0f} % of training, stays within "
             f"{100 * CONVERGENCE_BAND:.0f} % of its own range around its final level. A run that "
             "does not raise this average, from the first tenth of training to the last, by more "
             f"than {LEARNING_RISE:g} times its standard deviation in the last quarter did not "
             "converge and is left out. Env steps are compared, not episodes, because crashes make "
             "episodes of unequal length.",
+            later,
         ),
-        Verdict.of(
-            _compare(episodes, long_run_return, larger=True),
-            preset,
-            claim="A2C's long-run average reward is higher: it “can reach to higher average "
-            "reward”.",
-            source="Section 3, Figures 6 and 7 (“A2C outperform the VPG on the long run”)",
-            definition="Long run: the mean return of the episodes in the last quarter of training.",
+        (
+            "A2C's long-run average reward is higher: it “can reach to higher average reward”.",
+            "Section 3, Figures 6 and 7 (“A2C outperform the VPG on the long run”)",
+            "Long run: the mean return of the episodes in the last quarter of training.",
+            _compare(episodes, long_run_return, True),
         ),
-        Verdict.of(
-            _compare(episodes, fluctuation, larger=False),
-            preset,
-            claim="A2C fluctuates less than VPG: “with much more stability”, “with minimum "
-            "fluctuation”.",
-            source="Section 3, Figures 6 and 8",
-            definition="Fluctuation: the standard deviation of the episode return around its "
-            f"centred moving average over {FLUCTUATION_WINDOW} episodes, in the last quarter of "
-            "training.",
+        (
+            "A2C fluctuates less than VPG: “with much more stability”, “with minimum fluctuation”.",
+            "Section 3, Figures 6 and 8",
+            "Fluctuation: the standard deviation of the episode return around its centred moving "
+            f"average over {FLUCTUATION_WINDOW} episodes, in the last quarter of training.",
+            _compare(episodes, fluctuation, False),
         ),
-        Verdict.of(
+        (
+            "Both agents hold the target: “both implemented algorithms achieve high stability, by "
+            "achieving convergence to the required performance”.",
+            "Abstract; section 3, Figure 8",
+            f"Holding: the steady state (mean {headline.size_symbol} over the last quarter of each "
+            f"episode) of the final deterministic evaluation fulfils {headline.held_text} with the "
+            "far end of its 95 % interval, and no episode of it crashes. Fewer than "
+            f"{MIN_SEEDS} seeds decide nothing.",
             (both, "; ".join(texts) + "."),
-            preset,
-            claim="Both agents hold the target: “both implemented algorithms achieve high "
-            "stability, by achieving convergence to the required performance”.",
-            source="Abstract; section 3, Figure 8",
-            definition=f"Holding: the steady state (mean {headline.size_symbol} over the last "
-            "quarter of each episode) of the final deterministic evaluation fulfils "
-            f"{headline.held_text} with the far end of its 95 % interval, and no episode of it "
-            f"crashes. Fewer than {MIN_SEEDS} seeds decide nothing.",
         ),
-    ]
+    )
+    return [Verdict(claim, source, preset, outcome, definition, evidence)
+            for claim, source, definition, (outcome, evidence) in judged]  # fmt: skip
 
 
 def _compare(
-    episodes: pd.DataFrame, measure: Callable[[pd.DataFrame], float], *, larger: bool,
+    episodes: pd.DataFrame, measure: Callable[[pd.DataFrame], float], larger: bool,
     unit: str = "", without: str = "",
 ) -> tuple[Outcome, str]:  # fmt: skip
-    """Judge a claim that A2C's number is larger (or smaller) than VPG's: outcome and the numbers.
-
-    Args:
-        episodes: Of training.
-        measure: The number of one run.
-        larger: Whether the claim is that A2C's is larger.
-        unit: Of the number, behind a space.
-        without: Words for a run that is long enough and yet has no number.
+    """Judge a claim that A2C's measure of a run is larger (or smaller) than VPG's: outcome and the
+    numbers, with a unit behind a space. `without` says what it means that a run which is long
+    enough has no number.
     """
-    runs = {name: training_runs(episodes, name.lower()) for name in ("A2C", "VPG")}
+    runs = {name: metrics.training_runs(episodes, name.lower()) for name in ("A2C", "VPG")}
     if missing := [name for name, own in runs.items() if not own]:
-        return "not tested", f"{_join(missing)} not trained."
+        return "not tested", _untrained(missing)
     values = {name: [measure(run) for run in own] for name, own in runs.items()}
     counts, parts = [], []
     for name, numbers in values.items():
         finite = np.isfinite(numbers)
         counts.append(int(finite.sum()))
-        text, value = _seeds(counts[-1], len(numbers)), iqm(numbers)
+        text, value = _seeds(counts[-1], len(numbers)), metrics.iqm(numbers)
         long = np.array([len(run) >= MIN_EPISODES for run in runs[name]])
         if without and (count := int((long & ~finite).sum())):
             text += f", {count} {without}"
@@ -246,7 +214,7 @@ def _compare(
     evidence = ", ".join(parts) + "; "
     if min(counts) < MIN_SEEDS:
         return "undecided", f"{evidence}{_TOO_FEW}."
-    difference, low, high = bootstrap_difference(values["A2C"], values["VPG"])
+    difference, low, high = metrics.bootstrap_difference(values["A2C"], values["VPG"])
     evidence += f"difference {_number(difference)}, 95 % interval {_range(low, high)}."
     if low <= 0.0 <= high:
         return "undecided", evidence
@@ -256,23 +224,22 @@ def _compare(
 def judge_no_worse(
     evaluations: pd.DataFrame, agents: Collection[str], preset: str, headline: Headline
 ) -> Verdict:
-    """Judge whether our A2C is no worse than SB3's after as many env steps.
-
-    Args:
-        evaluations, headline: As of `results.Results`; the metric has a bound of its goal.
-        agents: Those that were trained.
-        preset: Hyperparameters with which they were trained.
+    """Judge whether our A2C is no worse than SB3's after as many env steps, of the agents that were
+    trained with a preset. The headline metric has a bound of its goal.
     """
     margin = MARGIN_SHARE * (headline.held or np.nan)
-    return Verdict.of(
-        _no_worse(final_per_run(evaluations, headline), agents, margin, headline),
-        preset,
+    final = metrics.final_per_run(evaluations, headline)
+    outcome, evidence = _no_worse(final, agents, margin, headline)
+    return Verdict(
         claim="Our A2C is no worse than Stable-Baselines3's after as many env steps.",
         source=OURS,
+        preset=preset,
+        verdict=outcome,
         definition=f"No worse: the steady {headline.size_symbol} of our A2C minus that of SB3's, "
         "in the final deterministic evaluation, lies on the better side of a margin of "
         f"{headline.amount(_number(margin))} with its whole 95 % interval. The margin is ours: "
         f"{MARGIN_SHARE:.0%} of the bound for holding the goal.",
+        evidence=evidence,
     )
 
 
@@ -281,11 +248,11 @@ def _no_worse(
 ) -> tuple[Outcome, str]:
     names = ("a2c", "sb3-a2c")
     if missing := [name for name in names if name not in agents]:
-        return "not tested", f"{_join(missing)} not trained."
+        return "not tested", _untrained(missing)
     ours, theirs = (final.loc[final["agent"] == name, "steady"].to_numpy() for name in names)
-    difference, low, high = bootstrap_difference(ours, theirs)
+    difference, low, high = metrics.bootstrap_difference(ours, theirs)
     evidence = (
-        f"A2C {_number(iqm(ours))}, SB3 A2C {_number(iqm(theirs))}; difference "
+        f"A2C {_number(metrics.iqm(ours))}, SB3 A2C {_number(metrics.iqm(theirs))}; difference "
         f"{headline.amount(_number(difference))}"
     )
     if min(np.isfinite(ours).sum(), np.isfinite(theirs).sum()) < MIN_SEEDS:
@@ -302,9 +269,9 @@ def _holds(runs: pd.DataFrame, headline: Headline) -> tuple[Outcome, str]:
     if runs.empty:
         return "not tested", "not trained"
     values = runs["steady"].to_numpy()
-    low, high = bootstrap_interval(values)
+    low, high = metrics.bootstrap_interval(values)
     count, crashed = int(np.isfinite(values).sum()), int(runs["crashed"].sum())
-    text = f"{headline.amount(_number(iqm(values)))} ({_seeds(count, len(values))}"
+    text = f"{headline.amount(_number(metrics.iqm(values)))} ({_seeds(count, len(values))}"
     interval = f"95 % interval {headline.amount(_range(low, high))}"
     text += f", {interval if np.isfinite(low) else 'no interval'}"
     text += f", {int(runs['held'].sum())} hold)"
@@ -332,5 +299,5 @@ def _seeds(count: int, total: int) -> str:
     return f"{count} of {total} seeds" if count < total else f"{total} seed{'s' * (total != 1)}"
 
 
-def _join(names: list[str]) -> str:
-    return f"{' and '.join(names)} {'were' if len(names) > 1 else 'was'}"
+def _untrained(names: list[str]) -> str:
+    return f"{' and '.join(names)} {'were' if len(names) > 1 else 'was'} not trained."

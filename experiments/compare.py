@@ -17,31 +17,16 @@ from ..envs.registry import env_spec, options_type
 from ..envs.spec import canonical_id
 from ..models.errors import InputError
 from ..models.vehicle import Vehicle
+from . import results
 from .bounds import elevation_bounds
 from .folders import locked
 from .metrics import Headline
 from .pairs import shared_pair
-from .progress import OnProgress, Tell
-from .results import (
-    CONFIG_FILE,
-    EPISODES_FILE,
-    EVALUATIONS_FILE,
-    RUNS_FILE,
-    ResultsError,
-    Rows,
-    episode_row,
-    evaluation_row,
-    evaluation_steps,
-    join_parts,
-    read_config,
-    step_table,
-    write_config,
-    write_part,
-)
+from .results import CONFIG_FILE, ResultsError
 from .settings import CompareConfig, EnvConfig, Run
 from .training import Snapshot, train_run
 from .trajectories import Trajectory, evaluation_seed, fly_episodes
-from .workers import open_workers
+from .workers import OnProgress, Tell, open_workers
 
 __all__ = ["PARTS", "compare", "evaluation_pair", "read_compare_config"]
 
@@ -59,11 +44,7 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
     which a run failed, goes on where it was: call it again with the same folder (and the config of
     `read_compare_config`). `report.write_report` draws figures, table and verdicts.
 
-    Args:
-        config: Settings of the comparison.
-        folder: One that exists: see `folders.new_folder`.
-        command: The user's command, for `config.json`.
-        on_progress: Told how far it is.
+    The folder exists: see `folders.new_folder`. The user's command is for `config.json`.
 
     Raises:
         RunsFailed: Some runs failed; the others are done, and their parts kept.
@@ -79,7 +60,7 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
             content = config.content(*config.agents)
             content["evaluation"] = {name: getattr(config, name) for name in _SETTINGS}
             content["bounds"] = _bounds(config)
-            write_config(folder, command, spec, config.vehicle, content)
+            results.write_config(folder, command, spec, config.vehicle, content)
         for unfinished in parts.glob(".*"):
             shutil.rmtree(unfinished)
         runs: list[Run | None] = [*config.runs()]
@@ -92,7 +73,7 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
             if not (parts / _part(run)).exists()
         }
         workers.fly_all(partial(_fly, config), jobs, partial(_keep, folder, metric), config)
-        join_parts(parts, folder, metric)
+        results.join_parts(parts, folder, metric)
 
 
 def _part(run: Run | None) -> str:
@@ -102,7 +83,7 @@ def _part(run: Run | None) -> str:
 class _Done(NamedTuple):
     """What a run gives."""
 
-    rows: Rows
+    rows: results.Rows
     steps: list[Any]  # tables of `steps.parquet`
     checkpoint: Checkpoint | None = None
 
@@ -111,7 +92,7 @@ def _keep(folder: Path, metric: str, run: Run | None, done: _Done) -> None:
     """Write checkpoint and part; the part last, for with it the run is done."""
     if done.checkpoint:
         store(done.checkpoint, folder / "checkpoints" / f"{_part(run)}.safetensors")
-    write_part(folder / PARTS / _part(run), metric, done.rows, done.steps)
+    results.write_part(folder / PARTS / _part(run), metric, done.rows, done.steps)
 
 
 def _fly(config: CompareConfig, run: Run | None, tell: Tell) -> _Done:
@@ -123,15 +104,15 @@ def _fly(config: CompareConfig, run: Run | None, tell: Tell) -> _Done:
         checkpoint, log = training.checkpoint(), training.log
     evaluated = _evaluate(run.algorithm, run.seed, config, training.taken)
     label = {"agent": run.algorithm, "seed": run.seed}
-    episodes = [episode_row(one, run.num_envs, log.env_steps) for one in log.episodes]
+    episodes = [results.episode_row(one, run.num_envs, log.env_steps) for one in log.episodes]
     rows = {
         **evaluated.rows,
-        EPISODES_FILE: [label | episode for episode in episodes],
-        RUNS_FILE: [label | times],
+        results.EPISODES_FILE: [label | episode for episode in episodes],
+        results.RUNS_FILE: [label | times],
     }
     steps = log.steps()
     steps["step"] = np.arange(1, len(steps["episode"]) + 1)
-    trained = step_table(Headline.of(log.spec).name, **label, phase="train", **steps)
+    trained = results.step_table(Headline.of(log.spec).name, **label, phase="train", **steps)
     return _Done(rows, [trained, *evaluated.steps], checkpoint)
 
 
@@ -159,8 +140,9 @@ def _evaluate(
                 flown = fly_episodes(env, policy, config.curve_episodes, "curve")
             steps, seconds = (snapshot.env_steps, snapshot.seconds) if snapshot else (0, 0.0)
             label = {"agent": agent, "seed": seed, "env_steps": steps, "seconds": seconds}
-            rows += [label | evaluation_row(one, headline) for one in flown]
-    return _Done({EVALUATIONS_FILE: rows}, evaluation_steps(agent, seed, headline, flown))
+            rows += [label | results.evaluation_row(one, headline) for one in flown]
+    steps_flown = results.evaluation_steps(agent, seed, headline, flown)
+    return _Done({results.EVALUATIONS_FILE: rows}, steps_flown)
 
 
 def _bounds(config: CompareConfig) -> dict[str, float]:
@@ -179,7 +161,7 @@ def _bounds(config: CompareConfig) -> dict[str, float]:
 
 def read_compare_config(folder: Path) -> CompareConfig:
     """Settings of a comparison, from its `config.json`. Raises `ResultsError`."""
-    content = read_config(folder)
+    content = results.read_config(folder)
     try:
         common = CompareConfig.read_content(content)
         return CompareConfig(agents=tuple(content["agents"]), **common, **content["evaluation"])

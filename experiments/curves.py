@@ -5,6 +5,7 @@ the range from the lowest to the highest seed. Curves of one agent's seeds end w
 them ends. An agent without any data for a curve is not in that curve's dictionary.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -13,24 +14,10 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from .metrics import (
-    Curve,
-    Headline,
-    Spread,
-    average_return,
-    episode_ends,
-    extent,
-    iqm,
-    spread_over_seeds,
-    training_runs,
-)
+from . import metrics
+from .metrics import Curve, Headline, Spread
 from .palette import sort_agents
 from .results import Results, read_steps
-
-__all__ = [
-    "AVERAGING_SHARE", "Curves", "Fan", "Flown", "cumulative_returns", "flown_sizes",
-    "learning_curves", "make_curves", "pick_trajectories", "return_curves", "value_fan",
-]  # fmt: skip
 
 AVERAGING_SHARE: Final = 0.05
 """Share of training over which the average reward is a running mean."""
@@ -82,16 +69,14 @@ def make_curves(folder: Path | str, results: Results) -> Curves:
     metric, period = results.headline.name, results.spec.control_period
     columns = ("agent", "step", "value")
     training = read_steps(folder, metric, "train", columns, max_rows=_MAX_STEP_ROWS)
-    flown = read_steps(folder, metric, "evaluation")
+    flown = _by_agent(read_steps(folder, metric, "evaluation"))
     return Curves(
         average_return=return_curves(results.episodes),
         return_by_step=by_step,
         return_by_episode=by_episode,
         training_values={name: value_fan(rows) for name, rows in _by_agent(training)},
-        flown={name: pick_trajectories(rows, period) for name, rows in _by_agent(flown)},
-        flown_sizes={
-            name: flown_sizes(rows, period, results.headline) for name, rows in _by_agent(flown)
-        },
+        flown={name: pick_trajectories(rows, period) for name, rows in flown},
+        flown_sizes={name: flown_sizes(rows, period, results.headline) for name, rows in flown},
         learning=learning,
         levels=levels,
     )
@@ -104,7 +89,7 @@ def _by_agent(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
 def return_curves(episodes: pd.DataFrame, share: float = AVERAGING_SHARE) -> dict[str, Spread]:
     """The running mean of the return over the last `share` of training, spread over seeds."""
     return {
-        agent: spread_over_seeds([average_return(run, share) for run in runs])
+        agent: metrics.spread_over_seeds([metrics.average_return(run, share) for run in runs])
         for agent, runs in _runs(episodes)
     }
 
@@ -113,17 +98,15 @@ def cumulative_returns(episodes: pd.DataFrame) -> tuple[dict[str, Spread], dict[
     """The sum of all rewards since training began, over env steps and over episodes (from 1)."""
     by_step, by_episode = {}, {}
     for agent, runs in _runs(episodes):
-        totals = [run["return"].cumsum().to_numpy() for run in runs]
-        ends = [Curve(episode_ends(run), total) for run, total in zip(runs, totals, strict=True)]
-        numbers = [Curve(np.arange(1.0, len(total) + 1), total) for total in totals]
-        by_step[agent] = spread_over_seeds(ends)
-        by_episode[agent] = spread_over_seeds(numbers)
+        ends = [Curve(metrics.episode_ends(run), run["return"].cumsum().to_numpy()) for run in runs]
+        by_step[agent] = metrics.spread_over_seeds(ends)
+        numbers = [Curve(np.arange(1.0, len(curve.x) + 1), curve.y) for curve in ends]
+        by_episode[agent] = metrics.spread_over_seeds(numbers)
     return by_step, by_episode
 
 
-def _runs(episodes: pd.DataFrame) -> list[tuple[str, list[pd.DataFrame]]]:
-    agents = sort_agents(episodes["agent"])
-    return [(agent, training_runs(episodes, agent)) for agent in agents]
+def _runs(episodes: pd.DataFrame) -> Iterator[tuple[str, list[pd.DataFrame]]]:
+    return ((name, metrics.training_runs(rows, name)) for name, rows in _by_agent(episodes))
 
 
 def value_fan(steps: pd.DataFrame) -> Fan:
@@ -137,7 +120,7 @@ def value_fan(steps: pd.DataFrame) -> Fan:
 
 
 def pick_trajectories(steps: pd.DataFrame, control_period: float) -> Flown:
-    """Pick at most 40 trajectories of an agent's evaluation, at random but always the same ones."""
+    """At most 40 trajectories of an agent's evaluation, at random but always the same ones."""
     found = [one for _, one in steps.groupby(["seed", "episode"], sort=True)]
     # At random: every n-th would be the same few start positions for every seed.
     order = np.random.default_rng(0).permutation(len(found))[:_MAX_TRAJECTORIES]
@@ -154,9 +137,9 @@ def flown_sizes(steps: pd.DataFrame, control_period: float, headline: Headline) 
     moments = np.unique(np.linspace(0, last, min(last + 1, _MAX_MOMENTS)).round().astype(np.int64))
     shown = steps[steps["step"].isin(moments)]
     groups = [headline.size(rows.to_numpy()) for _, rows in shown.groupby("step")["value"]]
-    ends = np.array([np.quantile(values, extent(len(values))) for values in groups])
+    ends = np.array([np.quantile(values, metrics.extent(len(values))) for values in groups])
     x = np.unique(shown["step"]) * control_period
-    return Spread(x, np.array([iqm(values) for values in groups]), ends[:, 0], ends[:, 1])
+    return Spread(x, np.array([metrics.iqm(values) for values in groups]), *ends.T)
 
 
 def learning_curves(evaluations: pd.DataFrame) -> tuple[dict[str, Spread], dict[str, float]]:
@@ -165,15 +148,12 @@ def learning_curves(evaluations: pd.DataFrame) -> tuple[dict[str, Spread], dict[
     """
     curves: dict[str, Spread] = {}
     levels: dict[str, float] = {}
-    for agent in sort_agents(evaluations["agent"]):
-        own = evaluations[evaluations["agent"] == agent].dropna(subset="steady")
-        if own.empty:
-            continue
+    for agent, own in _by_agent(evaluations.dropna(subset="steady")):
         means = own.groupby(["seed", "env_steps"])["steady"].mean().reset_index()
         if means["env_steps"].max() == 0:
-            levels[agent] = iqm(means["steady"].to_numpy())
+            levels[agent] = metrics.iqm(means["steady"].to_numpy())
             continue
         columns = ["env_steps", "steady"]
         runs = [Curve(*run[columns].to_numpy(float).T) for _, run in means.groupby("seed")]
-        curves[agent] = spread_over_seeds(runs, np.unique(means["env_steps"]))
+        curves[agent] = metrics.spread_over_seeds(runs, np.unique(means["env_steps"]))
     return curves, levels

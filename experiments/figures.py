@@ -21,8 +21,6 @@ from .metrics import Headline, Spread, episode_ends, training_runs
 from .palette import agent_color, agent_label, sort_agents
 from .results import Results
 
-__all__ = ["FIGURE_FILES", "draw_figures"]
-
 FIGURE_FILES: Final = ("fig6_reward.png", "fig7_cumulative_reward.png", "fig8_error.png",
                        "learning_curve.png")  # fmt: skip
 
@@ -58,8 +56,7 @@ def draw_figures(folder: Path, results: Results, curves: Curves) -> None:
 def _draw_reward(episodes: pd.DataFrame, curves: Curves) -> Figure:
     """Draw figure 6: a panel per agent (episodes and average), and all averages in one panel."""
     agents = sort_agents(episodes["agent"])
-    panels = max(1, len(agents) + (len(agents) > 1))
-    figure, axes = _panels(panels)
+    figure, axes = _panels(max(1, len(agents) + (len(agents) > 1)))
     for axis, agent in zip(axes, agents, strict=False):
         runs = training_runs(episodes, agent)
         _scatter_episodes(axis, pd.concat(runs), agent)
@@ -73,7 +70,7 @@ def _draw_reward(episodes: pd.DataFrame, curves: Curves) -> Figure:
         _legend_above(axes[-1])
     for axis in axes:
         _env_steps_axis(axis)
-    for axis in axes[:: _columns(panels)]:
+    for axis in axes[:: 2 if len(axes) > 3 else 3]:  # the first of each row
         axis.set_ylabel("reward per episode")
     _share_y(axes[: len(agents)])  # the averages keep a scale of their own
     if not agents:
@@ -105,8 +102,14 @@ def _draw_error(agents: Sequence[str], curves: Curves, headline: Headline) -> Fi
     figure = Figure(figsize=(max(5.0, 3.1 * len(agents)), 5.6), dpi=110)
     axes = figure.subplots(2, max(1, len(agents)), squeeze=False, sharey="row")
     for (above, below), agent in zip(axes.T, agents, strict=False):
-        _training_values(above, curves.training_values.get(agent), agent)
-        _flown_values(below, curves.flown.get(agent), agent, headline)
+        if agent in curves.training_values:
+            _training_values(above, curves.training_values[agent], agent_color(agent))
+        else:
+            _say(above, "no training")
+        if agent in curves.flown:
+            _flown_values(below, curves.flown[agent], agent_color(agent), headline)
+        else:
+            _say(below, "not evaluated")
         above.set_title(agent_label(agent))
         below.set_xlabel("time in the episode (s)")
     handles = [  # in grey, once for all agents' colours
@@ -120,27 +123,20 @@ def _draw_error(agents: Sequence[str], curves: Curves, headline: Headline) -> Fi
     return figure
 
 
-def _training_values(axis: Axes, fan: Fan | None, agent: str) -> None:
+def _training_values(axis: Axes, fan: Fan, color: str) -> None:
     """Draw quantiles of the metric over windows of env steps, pooled over the agent's seeds."""
-    if fan is None:
-        _say(axis, "no training")
-        return
     _env_steps_axis(axis)
-    color = agent_color(agent)
     axis.fill_between(fan.x, fan.low, fan.high, color=color, alpha=_OUTER, lw=0)
     axis.fill_between(fan.x, fan.lower, fan.upper, color=color, alpha=_INNER, lw=0)
     axis.plot(fan.x, fan.middle, color=color, lw=1.2)
     axis.axhline(0.0, color="#333333", lw=0.7, ls=":")
 
 
-def _flown_values(axis: Axes, flown: Flown | None, agent: str, headline: Headline) -> None:
+def _flown_values(axis: Axes, flown: Flown, color: str, headline: Headline) -> None:
     """Draw the metric over time of some episodes of the agent's final evaluations."""
-    if flown is None:
-        _say(axis, "not evaluated")
-        return
     shown, total = flown
     for time, value in shown:
-        axis.plot(time, value, color=agent_color(agent), lw=0.8, alpha=0.45)
+        axis.plot(time, value, color=color, lw=0.8, alpha=0.45)
     if (held := headline.held) is not None:
         low = axis.get_ylim()[1] if headline.high else -held if headline.signed else 0.0
         axis.axhspan(low, held, color="#333333", alpha=0.12, lw=0)
@@ -170,15 +166,11 @@ def _draw_learning_curve(evaluations: pd.DataFrame, curves: Curves, headline: He
     return figure
 
 
-def _columns(panels: int) -> int:
-    return panels if panels <= 3 else 2
-
-
 def _panels(count: int) -> tuple[Figure, list[Axes]]:
     """Make a figure with some panels, at most three side by side."""
-    columns = _columns(count)
+    columns = count if count <= 3 else 2
     rows = -(-count // columns)
-    width = {1: 7.2, 2: 4.6}.get(columns, 3.7) * columns
+    width = {1: 7.2, 2: 4.6, 3: 3.7}[columns] * columns
     figure = Figure(figsize=(width, (3.6 if columns < 3 else 3.3) * rows), dpi=110)
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
     for unused in axes[count:]:

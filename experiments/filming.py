@@ -54,14 +54,11 @@ def moments(trajectory: Trajectory) -> list[Moment]:
         )
     return [
         moment(
-            trajectory.spec,
-            {name: array[step] for name, array in told.items()},
-            reward=float(trajectory.rewards[step - 1]) if step else 0.0,
-            step=step,
-            episode=trajectory.episode,
+            trajectory.spec, {name: array[step] for name, array in told.items()}, step=step,
+            reward=float(trajectory.rewards[step - 1]) if step else 0.0, episode=trajectory.episode,
         )
         for step in range(len(trajectory) + 1)
-    ]
+    ]  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,14 +110,11 @@ class Film:
 def film(
     path: Path, shots: Sequence[Shot], config: Film, on_frame: OnFrame = lambda *_: None
 ) -> int:
-    """Film trajectories side by side; the number of frames written.
+    """Film trajectories side by side, into a path as of `write_film`; the number of frames written.
 
-    Args:
-        path: As of `write_film`. A `.png` is the picture at `config.at`, or the last.
-        shots: One or more, each with as many trajectories. An episode lasts until the longest
-            trajectory of it has ended; one that ended before stays on its last picture.
-        config: Settings.
-        on_frame: Told how far it is.
+    A `.png` is the picture at `config.at`, or the last. There are one or more shots, each with as
+    many trajectories. An episode lasts until the longest trajectory of it has ended; one that ended
+    before stays on its last picture.
 
     Raises:
         NoOpenGL: No OpenGL works here.
@@ -167,7 +161,7 @@ def grid(count: int, width: int, height: int) -> tuple[int, int]:
 
     def badness(shape: tuple[int, int]) -> float:
         columns, rows = shape
-        aspect = (width / columns) / (height / rows)
+        aspect = (width * rows) / (height * columns)
         return abs(math.log(aspect / _ASPECT)) + (columns * rows - count) / count
 
     return min(((columns, -(-count // columns)) for columns in range(1, count + 1)), key=badness)
@@ -183,58 +177,46 @@ def _frames(
     stage = Stage(config.world, vehicle=config.vehicle)
     flown = [one for shot in shots for one in shot.trajectories]
     with Canvas(stage, width, height, fast=config.fast) as canvas:
-        panes = [_Pane(shot, config, canvas, stage.twin(), flown, len(shots) > 1) for shot in shots]
-        for number, (episode, seconds) in enumerate(times, 1):
+        panes = [_pane(shot, config, canvas, stage.twin(), flown, len(shots) > 1) for shot in shots]
+        for pane in panes:
+            next(pane)
+        for number, now in enumerate(times, 1):
             frame = np.full((config.height, config.width, 3), _DARK, np.uint8)
             for place, pane in enumerate(panes):
                 x, y = (width + _SPACE) * (place % columns), (height + _SPACE) * (place // columns)
-                frame[y : y + height, x : x + width] = pane.picture(episode, seconds)
+                frame[y : y + height, x : x + width] = pane.send(now)
             yield frame
             on_frame(number, len(times))
 
 
-class _Pane:
-    """The picture of one flight, drawn again only where it changes."""
-
-    def __init__(
-        self, shot: Shot, config: Film, canvas: Canvas, stage: Stage, flown: Sequence[Trajectory],
-        named: bool,
-    ) -> None:  # fmt: skip
-        self._shot, self._config = shot, config
-        self._canvas, self._stage = canvas, stage
-        self._shown = (-1, -1)  # episode and step
-        self._picture = np.empty(0, np.uint8)
-        self._bare = not (config.overlay or named)
-        self._overlay = Overlay(
-            canvas.width,
-            canvas.height,
-            title=shot.name,
-            color=shot.color,
-            like=shot.moments[0][0],
-            vehicle=stage.vehicle,
-            period=shot.trajectories[0].control_period,
-            seconds=max(one.seconds for one in flown),
-            scale=_scale(flown),
-            numbers=config.overlay,
-        )
-
-    def picture(self, episode: int, seconds: float) -> np.ndarray:
-        trajectory = self._shot.trajectories[episode]
+def _pane(
+    shot: Shot, config: Film, canvas: Canvas, stage: Stage, flown: Sequence[Trajectory], named: bool
+) -> Generator[np.ndarray, tuple[int, float], None]:
+    """Pictures of one flight, each for the episode and the time that are sent; drawn again only
+    where they change.
+    """
+    overlay = Overlay(
+        canvas.width, canvas.height, title=shot.name, color=shot.color, like=shot.moments[0][0],
+        vehicle=stage.vehicle, period=shot.trajectories[0].control_period,
+        seconds=max(one.seconds for one in flown), scale=_scale(flown), numbers=config.overlay,
+    )  # fmt: skip
+    picture, shown = np.empty(0, np.uint8), (-1, -1)  # episode and step
+    while True:
+        episode, seconds = yield picture
+        trajectory, told = shot.trajectories[episode], shot.moments[episode]
         step = trajectory.step_at(seconds)
-        if (episode, step) == self._shown:
-            return self._picture
-        begin = self._shown[1] + 1 if episode == self._shown[0] else 0
-        told = self._shot.moments[episode]
+        if (episode, step) == shown:
+            continue
+        begin = shown[1] + 1 if episode == shown[0] else 0
         for one in told[begin : step + 1]:  # its path has no gaps
-            self._stage.show(one)
-        self._shown = episode, step
-        self._picture = self._canvas.draw(self._config.camera, self._stage)
-        if not self._bare:
-            ended = self._config.overlay and step == len(trajectory)
+            stage.show(one)
+        shown = episode, step
+        picture = canvas.draw(config.camera, stage)
+        if config.overlay or named:
+            ended = config.overlay and step == len(trajectory)
             note = trajectory.ending if ended and trajectory.ending != "truncated" else ""
             values = trajectory.headline[: step + 1].tolist()
-            self._picture = self._overlay.draw(self._picture, told[step], values, note)
-        return self._picture
+            picture = overlay.draw(picture, told[step], values, note)
 
 
 def _scale(flown: Sequence[Trajectory]) -> tuple[float, float]:
@@ -262,14 +244,8 @@ def film_comparison(
     even number the better of the two in the middle). Of the episodes of that evaluation they fly
     the one that starts furthest from its goal.
 
-    Args:
-        folder: Where `rotorgram compare` wrote.
-        out: The film; one that exists is replaced.
-        on_frame: Told how far it is.
-        world: Surroundings.
-
-    Returns:
-        Whether there is a film. Without OpenGL there is none, and a line in the log says why.
+    The folder is one that `rotorgram compare` wrote; a film that exists is replaced. Returns
+    whether there is a film: without OpenGL there is none, and a line in the log says why.
 
     Raises:
         InputError: The folder is not a comparison's.

@@ -9,17 +9,10 @@ from pathlib import Path
 
 from ..models.errors import InputError
 
-__all__ = ["locked", "new_folder"]
-
 
 def new_folder(out: Path | None, name: str, runs: Path = Path("runs")) -> Path:
-    """Make the folder to write to.
-
-    Args:
-        out: Where; None: a folder in `runs`, named by the command and the time. Of two processes
-            that ask for one of the same second, the second gets a number behind it.
-        name: Of the command.
-        runs: Where folders named by the time are made.
+    """Make the folder to write to: `out`, or one in `runs`, named by the command and the time. Of
+    two processes that ask for one of the same second, the second gets a number behind it.
 
     Raises:
         InputError: `out` exists, or the place allows no folder.

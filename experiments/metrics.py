@@ -31,6 +31,7 @@ __all__ = [
 ]  # fmt: skip
 
 _RESAMPLES: Final = 2000
+_MEASURES: Final = ("steady", "settling_time", "overshoot", "return")
 _COUNTS: Final = ("seeds", "episodes", "settled", "crashed")
 
 Floats = npt.NDArray[np.float64]
@@ -55,10 +56,8 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Headline(Metric):
-    """The metric that decides, and how its numbers are read.
-
-    The *size* of an error (goal `zero`) is its magnitude; of a metric that is to be high, its
-    value.
+    """The metric that decides, and how its numbers are read. The *size* of an error (goal `zero`)
+    is its magnitude; of a metric that is to be high, its value.
     """
 
     @classmethod
@@ -100,7 +99,7 @@ class Headline(Metric):
         return f"{self.size_symbol} {sign} {self.amount(f'{self.held:g}')}"
 
     def size(self, values: Values) -> Floats:
-        """Magnitude of an error, value of a metric with goal `high`; same shape, float64."""
+        """Sizes of some values; same shape, float64."""
         return np.asarray(values, float) if self.high else np.abs(np.asarray(values, float))
 
     def holds(self, sizes: Values) -> npt.NDArray[np.bool_]:
@@ -111,10 +110,8 @@ class Headline(Metric):
 
     def worst(self, sizes: Values) -> float:
         """The worst of the values that are not missing; nan if there is none."""
-        finite = _finite(sizes)
-        if not finite.size:
-            return math.nan
-        return float(finite.min() if self.high else finite.max())
+        worst = np.fmin if self.high else np.fmax  # nan only if all are
+        return float(worst.reduce(np.asarray(sizes, float), initial=math.nan))
 
 
 def steady_state(sizes: Values) -> float:
@@ -126,10 +123,8 @@ def steady_state(sizes: Values) -> float:
 def settling_time(errors: Values, control_period: float, tolerance: float) -> float:
     """Time from which the error stays inside the tolerance until the episode ends, s; nan if never.
 
-    Args:
-        errors: The metric at every control step, shape (T,); `errors[0]` is at time 0.
-        control_period: Time between two control steps, s.
-        tolerance: Half width of the band around zero, in the metric's unit.
+    The metric is given at every control step, shape (T,), the first at time 0; the tolerance is the
+    half width of the band around zero, in the metric's unit, and the control period in s.
     """
     outside = ~(np.abs(np.asarray(errors, float)) < tolerance)
     if outside.size == 0 or outside[-1]:
@@ -146,9 +141,8 @@ def overshoot(errors: Values) -> float:
     values = np.asarray(errors, float)
     if not values.size:
         return math.nan
-    if values[0] == 0.0:
-        return float(np.abs(values).max())
-    return max(0.0, float((-np.sign(values[0]) * values).max()))
+    passed = -np.sign(values[0]) * values if values[0] else np.abs(values)
+    return max(0.0, float(passed.max()))
 
 
 def _finite(values: Values) -> Floats:
@@ -172,20 +166,13 @@ def iqm(values: Values) -> float:
     return float(trimmed_mean(finite)) if finite.size else math.nan
 
 
-def _resampled_iqms(values: Floats, rng: np.random.Generator) -> Floats:
-    return trimmed_mean(rng.choice(values, size=(_RESAMPLES, values.size), replace=True), axis=1)
-
-
 def bootstrap_interval(values: Values) -> tuple[float, float]:
     """95 % percentile-bootstrap interval of the interquartile mean over seeds, always the same.
 
     Missing values are left out. Fewer than two give (nan, nan): one seed shows no spread, which is
     not the same as a spread of zero. With few seeds the interval is narrower than it should be.
     """
-    finite = _finite(values)
-    if finite.size < 2:
-        return math.nan, math.nan
-    return _ends(_resampled_iqms(finite, np.random.default_rng(0)))
+    return _interval(np.random.default_rng(0), values)
 
 
 def bootstrap_difference(first: Values, second: Values) -> tuple[float, float, float]:
@@ -196,16 +183,16 @@ def bootstrap_difference(first: Values, second: Values) -> tuple[float, float, f
     starting states, and VPG's and A2C's also the actor's first weights and the stream of noise. As
     far as this makes the runs of a seed alike, the interval is wider than it need be.
     """
-    one, other = _finite(first), _finite(second)
-    difference = iqm(one) - iqm(other)
-    if min(one.size, other.size) < 2:
-        return difference, math.nan, math.nan
-    rng = np.random.default_rng(0)
-    return difference, *_ends(_resampled_iqms(one, rng) - _resampled_iqms(other, rng))
+    return iqm(first) - iqm(second), *_interval(np.random.default_rng(0), first, second)
 
 
-def _ends(means: Floats) -> tuple[float, float]:
-    low, high = np.quantile(means, [0.025, 0.975])
+def _interval(rng: np.random.Generator, *samples: Values) -> tuple[float, float]:
+    """Interval of the first sample's interquartile mean, minus the second's if there is one."""
+    finite = [_finite(values) for values in samples]
+    if min(one.size for one in finite) < 2:
+        return math.nan, math.nan
+    means = [trimmed_mean(rng.choice(one, size=(_RESAMPLES, one.size))) for one in finite]
+    low, high = np.quantile(np.subtract(*means) if len(means) > 1 else means[0], [0.025, 0.975])
     return float(low), float(high)
 
 
@@ -232,12 +219,10 @@ def average_return(run: pd.DataFrame, share: float) -> Curve:
 
 
 def spread_over_seeds(curves: Sequence[Curve], grid: Floats | None = None) -> Spread:
-    """Put several seeds' curves on one grid: interquartile mean and `extent`.
+    """Put several seeds' curves, at least one, on one grid: interquartile mean and `extent`.
 
-    Args:
-        curves: One per seed, at least one, of at least one point each.
-        grid: Ascending, shape (m,), of which points that all curves reach are kept; 300 even points
-            if not given.
+    Of a grid, ascending, shape (m,), the points are kept that all curves reach; without one there
+    are 300 even points.
     """
     start = max(curve.x[0] for curve in curves)
     end = min(curve.x[-1] for curve in curves)
@@ -255,14 +240,12 @@ def extent(count: int) -> tuple[float, float]:
 
 
 def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tuple[float, float]:
-    """Training after which one run holds its goal for good, by its evaluation episodes.
+    """Env steps and seconds of training after which one run holds its goal for good, by its
+    evaluation episodes: of the first snapshot from which on every snapshot holds without a crash;
+    nan if there is none.
 
     A snapshot is judged by few episodes, in which even an untrained network can pass by luck:
     hence a snapshot counts only if none after it fails.
-
-    Returns:
-        Env steps and seconds of training of the first snapshot from which on every snapshot holds
-        without a crash; nan if there is none.
     """
     # A crash, or a value that is missing, must not vanish in a mean that skips it.
     never = -np.inf if headline.high else np.inf
@@ -291,7 +274,7 @@ def final_per_run(evaluations: pd.DataFrame, headline: Headline) -> pd.DataFrame
     settling_time = final["settling_time"].mask(final["terminated"])
     final = final.assign(settling_time=settling_time, missing=final["steady"].isna())
     rows = final.groupby(["agent", "seed"], sort=True).agg(
-        **{name: (name, "mean") for name in ("steady", "settling_time", "overshoot", "return")},
+        **{name: (name, "mean") for name in _MEASURES},
         episodes=("episode", "size"),
         settled=("settling_time", "count"),
         crashed=("terminated", "sum"),
@@ -324,38 +307,26 @@ def results_table(
     final = final_per_run(evaluations, headline)
     rows: dict[str, dict[str, float]] = {}
     for agent in sort_agents(evaluations["agent"]):
-        own = evaluations[evaluations["agent"] == agent]
+        own = final[final["agent"] == agent]
+        row: dict[str, float] = {"seeds": len(own)}
+        for name in _MEASURES:
+            row[name] = iqm(own[name])
+            row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(own[name])
+        row["held"] = math.nan if headline.held is None else int(own["held"].sum())
+        row["worst"] = headline.worst(own["steady"])
+        row |= {name: int(own[name].sum()) for name in _COUNTS[1:]}
         trained = runs[(runs["agent"] == agent) & (runs["env_steps"] > 0)]
-        rows[agent] = _final_row(final[final["agent"] == agent], headline)
-        rows[agent] |= _training_row(own, trained, headline)
+        reached, steps, seconds = math.nan, np.empty(0), np.empty(0)
+        if len(trained) and headline.held is not None:
+            seeds = evaluations[evaluations["agent"] == agent].groupby("seed")
+            first = [first_lasting_snapshot(run, headline) for _, run in seeds]
+            steps, seconds = np.array(first).T
+            reached = int(np.isfinite(steps).sum())
+        row |= {"reached": reached, "env_steps_to_reach": iqm(steps)}
+        row["seconds_to_reach"] = iqm(seconds)
+        row["steps_per_second"] = iqm(trained["steps_per_second"])
+        rows[agent] = row
     for name, value in (bounds or {}).items():
         rows[name] = {**dict.fromkeys(_COUNTS, 0), "return": value}
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("agent")
     return table.astype(dict.fromkeys(_COUNTS, "int64"))
-
-
-def _final_row(final: pd.DataFrame, headline: Headline) -> dict[str, float]:
-    row: dict[str, float] = {"seeds": len(final)}
-    for name in ("steady", "settling_time", "overshoot", "return"):
-        values = final[name].to_numpy()
-        row[name] = iqm(values)
-        row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(values)
-    row["held"] = math.nan if headline.held is None else int(final["held"].sum())
-    row["worst"] = headline.worst(final["steady"].to_numpy())
-    return row | {name: int(final[name].sum()) for name in _COUNTS[1:]}
-
-
-def _training_row(
-    evaluations: pd.DataFrame, runs: pd.DataFrame, headline: Headline
-) -> dict[str, float]:
-    reached, steps, seconds = math.nan, np.empty(0), np.empty(0)
-    if len(runs) and headline.held is not None:
-        first = [first_lasting_snapshot(run, headline) for _, run in evaluations.groupby("seed")]
-        steps, seconds = np.array(first).T
-        reached = int(np.isfinite(steps).sum())
-    return {
-        "reached": reached,
-        "env_steps_to_reach": iqm(steps),
-        "seconds_to_reach": iqm(seconds),
-        "steps_per_second": iqm(runs["steps_per_second"].to_numpy()),
-    }

@@ -31,16 +31,11 @@ def socket_pair(
     vehicle: str | Path | None = None,
     record: Path | None = None,
 ) -> Iterator[Any]:
-    """A connected remote env, on free ports of the loopback interface.
+    """A connected remote env, on free ports of the loopback interface: of a task that is registered
+    here, with a vehicle from an MJCF file, or the paper's. One drone makes a `RemoteEnv`, more make
+    a `RemoteVectorEnv` without autoreset. `record` is the MCAP file of the agent's journal.
 
     The simulator ends with this process, however this one ends.
-
-    Args:
-        env_id: Of an env that is registered here.
-        options: Of the env.
-        num_envs: Drones: one makes a `RemoteEnv`, more a `RemoteVectorEnv` without autoreset.
-        vehicle: MJCF file; None: the paper's.
-        record: MCAP file for the agent's journal.
 
     Raises:
         PeerClosed: The simulator did not start, or ended: its own sentence, or its last words.
@@ -80,7 +75,13 @@ def socket_pair(
             raise PeerClosed(sentence if own else ended + words) from error
         finally:
             env.close()
-            _end(process)
+            assert process.stdin is not None
+            process.stdin.close()
+            try:
+                process.wait(_STOP_TIMEOUT)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 def _connect(env: RemoteEnv | RemoteVectorEnv, process: subprocess.Popen[bytes]) -> None:
@@ -92,17 +93,6 @@ def _connect(env: RemoteEnv | RemoteVectorEnv, process: subprocess.Popen[bytes])
         except PeerSilent:
             if process.poll() is not None or time.monotonic() > deadline:
                 raise
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """The simulator was told to end: wait for it."""
-    assert process.stdin is not None
-    process.stdin.close()
-    try:
-        process.wait(_STOP_TIMEOUT)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 _shared: dict[str, tuple[Any, ExitStack]] = {}

@@ -4,26 +4,50 @@ All of it is written from the comparison's files, into the comparison's folder; 
 nothing outside itself.
 """
 
+import base64
 import json
+import math
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple, get_args
 
+import jinja2
+import numpy as np
 import pandas as pd
+from markupsafe import Markup
 
 from ..envs.spec import canonical_id
-from .claims import Verdict, judge_claims, judge_no_worse
-from .curves import make_curves
+from . import tables
+from .claims import MIN_SEEDS, OURS, Outcome, Verdict, judge_claims, judge_no_worse
+from .curves import AVERAGING_SHARE, Curves, make_curves
 from .figures import draw_figures
-from .metrics import results_table
-from .page import render_page
+from .metrics import Headline, Spread, results_table
+from .palette import agent_color, agent_label, sort_agents
 from .results import Results, read_results
-from .tables import markdown_table, terminal_table
 
-__all__ = ["VIDEO_FILE", "table_of", "terminal_table", "write_report"]
+__all__ = ["MAX_POINTS", "VIDEO_FILE", "Chart", "chart_data", "make_charts", "table_of",
+           "write_report"]  # fmt: skip
+
 
 VIDEO_FILE: Final = "video.mp4"
 """The agents side by side; the page has it in itself where it lies in the folder."""
+
+MAX_POINTS: Final = 500
+"""Points of a series above which it is thinned."""
+
+_X_DIGITS: Final = 7
+_Y_DIGITS: Final = 4
+
+_ASSETS: Final = {
+    "style": "report.css",
+    "script": "report.js",
+    "uplot_style": "uplot/uPlot.min.css",
+    "uplot_script": "uplot/uPlot.iife.min.js",
+    "uplot_licence": "uplot/LICENSE",
+}
 
 
 def table_of(results: Results) -> pd.DataFrame:
@@ -54,12 +78,188 @@ def write_report(folder: Path | str, results: Results | None = None) -> Path:
     curves = make_curves(folder, results)
     draw_figures(folder, results, curves)
     table.to_csv(folder / "results.csv")
-    markdown = markdown_table(table, results.headline)
+    markdown = tables.markdown_table(table, results.headline)
     (folder / "results.md").write_text(markdown, encoding="utf-8")
     claims = json.dumps([asdict(verdict) for verdict in verdicts], indent=2, ensure_ascii=False)
     (folder / "claims.json").write_text(claims + "\n", encoding="utf-8")
     video, report = folder / VIDEO_FILE, folder / "report.html"
     film = video.read_bytes() if video.is_file() else None
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
-    report.write_text(render_page(results, table, verdicts, curves, film, files), encoding="utf-8")
+    report.write_text(_page(results, table, verdicts, curves, film, files), encoding="utf-8")
     return report
+
+
+# ---- the page: one HTML file, without other files or a network
+
+
+def _page(
+    results: Results,
+    table: pd.DataFrame,
+    verdicts: Sequence[Verdict],
+    curves: Curves,
+    video: bytes | None,
+    files: Collection[str],
+) -> str:
+    """The page, with an MP4 where there is one, and the names of the files beside it."""
+    config, headline = results.config, results.headline
+    agents = sort_agents(table.index[table["seeds"] > 0])
+    bounds = [name for name in table.index if name not in agents]
+    trained = sort_agents(config["agents"])
+    charts = make_charts(curves, headline)
+    data = {"agents": [agent_label(one) for one in agents], "charts": chart_data(charts, agents)}
+    settings = config["agents"]
+    annealed = [name for name in ("vpg", "a2c") if settings.get(name, {}).get("anneal")]
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    # NaN has no place in JSON: better an error here than a page without charts.
+    environment.filters |= {"written": _written, "label": agent_label}
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    return environment.from_string(_read("report.html")).render(
+        # Ours or uPlot's, and so not to be escaped.
+        **{name: Markup(_read(f"assets/{path}")) for name, path in _ASSETS.items()},
+        config=config,
+        headline=headline,
+        outcome=_outcome(table.loc[agents], verdicts, config["env_steps"], headline),
+        colors=[agent_color(agent) for agent in agents],
+        dark_colors=[agent_color(agent, dark=True) for agent in agents],
+        headings=tables.headings(headline),
+        rows=tables.result_rows(table.loc[[*agents, *bounds]]),
+        note=tables.table_note(headline),
+        verdicts=verdicts,
+        annealed=[agent_label(name) for name in annealed],
+        charts=charts,
+        averaging_share=AVERAGING_SHARE,
+        data=data,
+        video=base64.b64encode(video).decode("ascii") if video else None,
+        trained=trained,
+        hyperparameters=dict.fromkeys(chain(*(settings[agent] for agent in trained))),
+        files=files,
+    )
+
+
+def _read(path: str) -> str:
+    return (Path(__file__).parent / path).read_text(encoding="utf-8")
+
+
+def _outcome(
+    table: pd.DataFrame, verdicts: Sequence[Verdict], env_steps: int, headline: Headline
+) -> str:
+    """The result in one sentence."""
+    seen = table[table["steady"].notna()]
+    trained = _ends(seen[seen["steps_per_second"].notna()], headline)
+    others = _ends(seen[seen["steps_per_second"].isna()], headline)
+    parts = []
+    if trained:
+        parts.append(
+            f"After {tables.count_text(env_steps)} env steps of training, episodes end with a mean "
+            f"{headline.size_symbol} of {trained}"
+        )
+    if others:
+        parts.append(f"without training, with {others}")
+    paper = [verdict for verdict in verdicts if verdict.source != OURS]
+    counts = Counter(verdict.verdict for verdict in paper)
+    found = [f"{counts[name]} {'is' if counts[name] == 1 else 'are'} {name}"
+             for name in get_args(Outcome) if counts[name]]  # fmt: skip
+    if paper:
+        parts.append(f"of the paper's {len(paper)} claims, {_listed(found)}")
+    most = int(table["seeds"].max())
+    if paper and most < MIN_SEEDS:
+        parts.append(f"{most} seed{'s' * (most != 1)} decide no claim, that takes {MIN_SEEDS}")
+    text = "; ".join(parts) + "."
+    return text[0].upper() + text[1:]
+
+
+def _ends(table: pd.DataFrame, headline: Headline) -> str:
+    ends = table["steady"].map(tables.number_text).map(headline.amount).items()
+    return _listed([f"{amount} ({agent_label(str(name))})" for name, amount in ends])
+
+
+def _listed(words: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
+
+
+def _written(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+# ---- charts
+
+
+class Chart(NamedTuple):
+    """One chart; the page has its title and caption."""
+
+    key: str
+    """Names it in the page."""
+    x_label: str
+    y_label: str
+    spreads: Mapping[str, Spread]
+    """By agent; never without a point."""
+    levels: Mapping[str, float] = {}
+    """By agent; drawn as a dashed line."""
+    log: bool = False
+    """Whether y is drawn on a logarithmic scale."""
+    mark: float | None = None
+    """Value of y with a dotted line."""
+
+
+def make_charts(curves: Curves, headline: Headline) -> list[Chart]:
+    """Make the charts in the order in which the page shows them; those without data too."""
+    size, held, log = headline.size_symbol, headline.held, not headline.high
+    steps, steady = "env steps", headline.labelled(f"steady-state {size}")
+    training = {
+        agent: Spread(fan.x, fan.middle, fan.lower, fan.upper)
+        for agent, fan in curves.training_values.items()
+    }
+    value, target = headline.labelled(headline.symbol), None if headline.high else 0.0
+    total = "cumulative reward"
+    return [
+        Chart("learning", steps, steady, curves.learning, curves.levels, log=log, mark=held),
+        Chart("flown", "time (s)", headline.labelled(size), curves.flown_sizes, log=log, mark=held),
+        Chart("reward", steps, "reward per episode", curves.average_return),
+        Chart("training-error", steps, value, training, mark=target),
+        Chart("total-by-step", steps, total, curves.return_by_step),
+        Chart("total-by-episode", "episodes", total, curves.return_by_episode),
+    ]
+
+
+def chart_data(charts: Sequence[Chart], agents: Sequence[str]) -> list[dict[str, Any]]:
+    """Give the charts as what JSON can hold: rounded, thinned, missing values as None.
+
+    A series names its agent by the place in `agents`.
+    """
+    return [
+        {
+            "key": chart.key,
+            "x": chart.x_label,
+            "y": chart.y_label,
+            "log": chart.log,
+            "mark": chart.mark,
+            "series": [
+                {"agent": agents.index(agent)}
+                | (
+                    {"level": _rounded(chart.levels[agent], _Y_DIGITS)}
+                    if agent in chart.levels
+                    else _series(chart.spreads[agent], chart.log)
+                )
+                for agent in sort_agents((*chart.spreads, *chart.levels))
+            ],
+        }
+        for chart in charts
+    ]
+
+
+def _series(spread: Spread, log: bool) -> dict[str, list[float | None]]:
+    count = len(spread.x)
+    kept = np.unique(np.linspace(0, count - 1, min(count, MAX_POINTS)).round().astype(np.int64))
+    names = {"y": spread.middle, "low": spread.low, "high": spread.high}
+    columns = {name: [_rounded(y, _Y_DIGITS, log) for y in ys[kept]] for name, ys in names.items()}
+    return {"x": [_rounded(x, _X_DIGITS) for x in spread.x[kept]], **columns}
+
+
+def _rounded(value: float, digits: int, log: bool = False) -> float | None:
+    """Round to significant digits; None where there is no value, or none on a logarithmic scale."""
+    if not math.isfinite(value) or (log and value <= 0.0):
+        return None
+    rounded = float(f"{value:.{digits}g}")
+    return int(rounded) if rounded.is_integer() else rounded

@@ -135,10 +135,8 @@ def write_config(
 ) -> None:
     """Write `config.json`; one that exists stays: a resumed run keeps its settings.
 
-    Args:
-        folder: Where to.
-        command, spec, vehicle: The user's command; of the env; path of its file or None.
-        content: Settings of the comparison or the sweep; with them all of `CONFIG_KEYS` are there.
+    Besides the user's command, the env's spec and the path of its vehicle it has the content:
+    settings of the comparison or the sweep, with which all of `CONFIG_KEYS` are there.
     """
     path = folder / CONFIG_FILE
     if path.exists():
@@ -172,10 +170,10 @@ def read_config(folder: Path | str) -> dict[str, Any]:
     return config
 
 
-def read_spec(folder: Path | str, config: Mapping[str, Any]) -> EnvSpec:
+def read_spec(folder: Path | str) -> EnvSpec:
     """The env's spec from `config.json`. Raises `ResultsError`."""
     try:
-        return EnvSpec.from_json(json.dumps(config["spec"]))
+        return EnvSpec.from_json(json.dumps(read_config(folder)["spec"]))
     except SpecError as error:
         raise ResultsError(f"{Path(folder) / CONFIG_FILE}: {error}") from None
 
@@ -245,18 +243,12 @@ def evaluation_steps(
     """Every env step of evaluation trajectories."""
     return [
         step_table(
-            headline.name,
-            agent=agent,
-            seed=seed,
-            phase="evaluation",
-            episode=one.episode,
-            step=np.arange(1, len(one) + 1),
-            value=one.headline[1:],
-            reward=one.rewards,
+            headline.name, agent=agent, seed=seed, phase="evaluation", episode=one.episode,
+            step=np.arange(1, len(one) + 1), value=one.headline[1:], reward=one.rewards,
             thrust=one.mean_thrust[1:],
         )
         for one in trajectories
-    ]
+    ]  # fmt: skip
 
 
 def step_table(metric: str, **columns: Any) -> pa.Table:
@@ -287,11 +279,10 @@ class Results:
 
 def read_results(folder: Path | str) -> Results:
     """Read all files of a comparison but the step rows. Raises `ResultsError`."""
-    config = read_config(folder)
-    spec = read_spec(folder, config)
+    spec = read_spec(folder)
     headline = Headline.of(spec)
     tables = {name.removesuffix(".csv"): _read_csv(folder, name, headline.name) for name in _TABLES}
-    return Results(config=config, spec=spec, headline=headline, **tables)
+    return Results(config=read_config(folder), spec=spec, headline=headline, **tables)
 
 
 def read_steps(
@@ -301,15 +292,11 @@ def read_steps(
     columns: Iterable[str] = ("agent", "seed", "episode", "step", "value"),
     max_rows: int | None = None,
 ) -> pd.DataFrame:
-    """Read some columns of one phase of `steps.parquet`.
+    """Read some columns of one phase of `steps.parquet`, "train" or "evaluation"; others are not
+    read from the disk. The column of the headline metric, which is given by name, becomes `value`.
 
-    Args:
-        folder: The comparison's folder.
-        metric: Name of the headline metric; its column is `value` in the frame.
-        phase: "train" or "evaluation".
-        columns: Others are not read from the disk.
-        max_rows: Keep about so many, picked at random but always the same ones: a stride that
-            divides the episode length would show the same moments of every episode.
+    Of more than `max_rows` rows about so many are kept, picked at random but always the same ones:
+    a stride that divides the episode length would show the same moments of every episode.
     """
     path = _existing(folder, STEPS_FILE)
     try:
@@ -343,15 +330,13 @@ def _check_names(path: Path, kind: str, wanted: Iterable[str], present: Iterable
 
 
 def _read_csv(folder: Path | str, name: str, metric: str) -> pd.DataFrame:
-    path = _existing(folder, name)
-    columns = _TABLES[name]
+    path, columns = _existing(folder, name), _TABLES[name]
     types = {_in_file(column, metric): kind for column, kind in columns.items()}
     try:
         _check_names(path, "column", types, list(pd.read_csv(path, nrows=0).columns))
-        frame = pd.read_csv(path, usecols=list(types), dtype=dict(types))[list(types)]
+        frame = pd.read_csv(path, usecols=list(types), dtype=types)[list(types)]
     except ResultsError:
         raise
     except ValueError as error:  # an empty file, or a value that is not of the column's type
         raise ResultsError(f"{path} cannot be read: {error}") from error
-    frame.columns = list(columns)
-    return frame
+    return frame.set_axis(list(columns), axis=1)

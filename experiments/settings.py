@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import product
 from typing import Any, Literal
 
-from ..agents.presets import A2CConfig, VPGConfig, preset
+from ..agents.presets import A2CConfig, PresetName, VPGConfig, preset
 from ..envs.registry import env_spec, is_known, options_type, task_type
 from ..models.errors import InputError
 
@@ -76,9 +76,9 @@ class WorkersConfig:
     """Kind and number of workers."""
 
     jobs: int | None = None
-    """Jobs at a time; None: one for each core of the machine or of the cluster."""
+    """Runs at a time. Default: one for each core of this machine, or of the cluster."""
     backend: Literal["loky", "ray"] = "loky"
-    """`loky`: processes of this machine. `ray`: a Ray cluster."""
+    """loky: processes of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
     address: str | None = None
     """The cluster's: `ray://HOST:PORT` of its client server from anywhere, `HOST:PORT` or None on
     one of its machines."""
@@ -91,24 +91,30 @@ class WorkersConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ManyRuns(WorkersConfig, EnvConfig):
-    """Base of comparisons and sweeps."""
+class RunsConfig(WorkersConfig):
+    """Settings that comparisons and sweeps share, besides the env; flags of their commands."""
 
-    preset: str = "tuned"
-    """`paper` or `tuned`."""
+    preset: PresetName = "tuned"
+    """Hyperparameters: the paper's, or ours."""
+    env_steps: int = 200_000
+    """Env steps of each training, of all its drones together; a learning rate that falls, falls
+    over all of them."""
+    num_envs: int = 1
+    """Drones that fly at the same time, in lock-step, in each training."""
+    episodes: int = 20
+    """Evaluation episodes of each final policy."""
     seeds: int = 5
     """Number of seeds, the same for every agent or point."""
     first_seed: int = 0
     """The first of them."""
-    env_steps: int = 200_000
-    """Env steps of each training."""
-    num_envs: int = 1
-    """Drones of each training."""
-    episodes: int = 20
-    """Evaluation episodes of the final policies."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ManyRuns(RunsConfig, EnvConfig):
+    """Base of comparisons and sweeps."""
 
     def __post_init__(self) -> None:
-        WorkersConfig.__post_init__(self)
+        super().__post_init__()
         EnvConfig.__post_init__(self)
         self._check_counts("seeds", "env_steps", "episodes")
         if self.first_seed < 0:
@@ -182,12 +188,10 @@ class CompareConfig(_ManyRuns):
 
 @dataclass(frozen=True, kw_only=True)
 class SweepRun:
-    """A training of the sweep."""
+    """A training of the sweep: its point of the grid, with that one's changes to the preset."""
 
     point: int
-    """Of the grid."""
     settings: dict[str, Any]
-    """Changes of the point to the preset."""
     run: Run
 
     @property
@@ -216,9 +220,8 @@ class SweepConfig(_ManyRuns):
         for name, values in self.grid.items():
             if not values:
                 raise InputError(f"grid: expected at least one value of {name}, got none")
-            for place, value in enumerate(values):
-                if value in values[:place]:
-                    raise InputError(f"grid: expected each {name} once, got {value!r} twice")
+            if twice := [value for place, value in enumerate(values) if value in values[:place]]:
+                raise InputError(f"grid: expected each {name} once, got {twice[0]!r} twice")
 
     def points(self) -> list[dict[str, Any]]:
         """Settings of every point; the value that is named last changes fastest."""

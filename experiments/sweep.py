@@ -19,24 +19,16 @@ import pandas as pd
 from ..agents.checkpoints import write_whole
 from ..agents.policies import NetworkPolicy
 from ..envs.registry import env_spec
+from . import results
 from .compare import evaluation_pair
 from .folders import locked
 from .metrics import Headline, final_per_run
 from .pairs import shared_pair
-from .progress import OnProgress, Tell
-from .results import (
-    CONFIG_FILE,
-    RUNS_FILE,
-    ResultsError,
-    evaluation_row,
-    read_config,
-    read_spec,
-    write_config,
-)
+from .results import CONFIG_FILE, ResultsError
 from .settings import SweepConfig, SweepRun
 from .training import train_run
 from .trajectories import fly_episodes
-from .workers import open_workers
+from .workers import OnProgress, Tell, open_workers
 
 __all__ = ["SWEEP_FILE", "is_sweep", "missing_runs", "read_sweep_config", "read_sweep_runs",
            "sweep", "sweep_table", "write_sweep_table"]  # fmt: skip
@@ -67,18 +59,17 @@ def sweep(config: SweepConfig, folder: Path, command: str, on_progress: OnProgre
     Arguments and errors are those of `compare.compare`.
     """
     spec = env_spec(**config.env)
-    Headline.of(spec)
     with open_workers(config, on_progress) as workers, locked(folder):
         content = config.content(config.algorithm)
         content["sweep"] = {"grid": dict(config.grid), "episodes": config.episodes}
-        write_config(folder, command, spec, config.vehicle, content)
+        results.write_config(folder, command, spec, config.vehicle, content)
         done = read_sweep_runs(folder, config)
         rows = done.to_dict("records")
 
         def keep(_: SweepRun, row: dict[str, Any]) -> None:
             rows.append(row)
             table = _with_settings(pd.DataFrame(rows, columns=list(RUN_COLUMNS)), config)
-            write_whole(folder / RUNS_FILE, table.to_csv(index=False).encode())
+            write_whole(folder / results.RUNS_FILE, table.to_csv(index=False).encode())
 
         jobs = {job.name: job for job in missing_runs(config, done)}
         workers.fly_all(partial(_fly, config), jobs, keep, config)
@@ -99,7 +90,7 @@ def _fly(config: SweepConfig, job: SweepRun, tell: Tell) -> dict[str, Any]:
     with evaluation_pair(config, config.episodes) as env:
         trajectories = fly_episodes(env, policy, config.episodes, "tuning")
     headline = Headline.of(training.log.spec)
-    frame = pd.DataFrame([evaluation_row(one, headline) for one in trajectories])
+    frame = pd.DataFrame([results.evaluation_row(one, headline) for one in trajectories])
     frame = frame.assign(agent=run.algorithm, seed=run.seed, env_steps=times["env_steps"])
     (row,) = final_per_run(frame, headline).to_dict("records")
     whole = {"point": job.point, **row, **times}
@@ -128,7 +119,7 @@ def sweep_table(config: SweepConfig, rows: pd.DataFrame, headline: Headline) -> 
 
 def write_sweep_table(config: SweepConfig, folder: Path) -> pd.DataFrame:
     """Make `sweep.csv` of `runs.csv`, and return it: see `sweep_table`. Raises `ResultsError`."""
-    headline = Headline.of(read_spec(folder, read_config(folder)))
+    headline = Headline.of(results.read_spec(folder))
     table = sweep_table(config, read_sweep_runs(folder, config), headline)
     write_whole(folder / SWEEP_FILE, table.to_csv(index=False).encode())
     return table
@@ -136,7 +127,7 @@ def write_sweep_table(config: SweepConfig, folder: Path) -> pd.DataFrame:
 
 def read_sweep_runs(folder: Path, config: SweepConfig) -> pd.DataFrame:
     """The runs that are done, columns `RUN_COLUMNS`. Raises `ResultsError` if others are there."""
-    path = folder / RUNS_FILE
+    path = folder / results.RUNS_FILE
     if not path.exists():
         return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in RUN_COLUMNS.items()})
     try:
@@ -154,12 +145,12 @@ def read_sweep_runs(folder: Path, config: SweepConfig) -> pd.DataFrame:
 
 def is_sweep(folder: Path) -> bool:
     """Whether a folder is a sweep's, not a comparison's. Raises `ResultsError` if neither's."""
-    return "sweep" in read_config(folder)
+    return "sweep" in results.read_config(folder)
 
 
 def read_sweep_config(folder: Path) -> SweepConfig:
     """Settings of a sweep, from its `config.json`. Raises `ResultsError`."""
-    content = read_config(folder)
+    content = results.read_config(folder)
     try:
         (algorithm,) = content["agents"]
         return SweepConfig(

@@ -13,9 +13,6 @@ from rich.text import Text
 from .metrics import Headline
 from .palette import agent_label
 
-__all__ = ["NOTHING", "Cell", "count_text", "headings", "markdown_table", "number_text",
-           "result_rows", "table_note", "terminal_table"]  # fmt: skip
-
 NOTHING: Final = "–"
 """Shown where there is no value."""
 

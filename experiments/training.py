@@ -4,29 +4,18 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
 import torch
 
-from ..agents import (
-    A2CConfig,
-    Checkpoint,
-    CheckpointError,
-    EpisodeLog,
-    make_agent,
-    preset,
-    resume_agent,
-    store,
-)
+from .. import agents
+from ..agents import A2CConfig, Checkpoint, CheckpointError
 from ..envs.autoreset import AdvancingVectorEnv
 from ..models.errors import InputError
-from .progress import Tell
 from .settings import Run
-
-if TYPE_CHECKING:
-    from ..agents import Agent
+from .workers import Tell
 
 __all__ = ["AnyEnv", "Run", "Snapshot", "Training", "is_finished", "train_run"]
 
@@ -56,13 +45,10 @@ def is_finished(kept: Checkpoint) -> bool:
 class Training:
     """A run on an env, to be started, stopped, stored and resumed at update boundaries.
 
-    Args:
-        run: Settings of the training.
-        env: Local or remote, a vector env where the run has many drones; not closed here.
-        snapshots: How many times, evenly spread, the policy is kept for later evaluation, besides
-            the untrained one.
-        keep_steps: Keep every step, for `log.steps()`.
-        kept: What to go on from; its run is `run`.
+    The env is local or remote, a vector env where the run has many drones, and not closed here.
+    Besides the untrained policy, so many `snapshots` are kept in `taken` for later evaluation,
+    evenly spread. With `keep_steps` every step is kept, for `log.steps()`. A run that goes on does
+    so from the checkpoint `kept`.
     """
 
     run: Run
@@ -78,11 +64,11 @@ class Training:
         drones = getattr(self.env, "num_envs", 1)
         if drones != self.run.num_envs:
             raise InputError(f"env: expected one of {self.run.num_envs} drones, got {drones}")
-        self.log = EpisodeLog(self.env, self.run.seed, keep_steps=self.keep_steps)
-        self.agent: Agent = (
-            resume_agent(self.kept, self.log)
+        self.log = agents.EpisodeLog(self.env, self.run.seed, keep_steps=self.keep_steps)
+        self.agent: agents.Agent = (
+            agents.resume_agent(self.kept, self.log)
             if self.kept
-            else make_agent(self.run.algorithm, self.log, self.run.config, self.run.seed)
+            else agents.make_agent(self.run.algorithm, self.log, self.run.config, self.run.seed)
         )
 
     @classmethod
@@ -90,7 +76,7 @@ class Training:
         """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
         try:
             names = ("algorithm", "env_id", "options", "seed", "env_steps", "num_envs")
-            config = preset(kept.algorithm, "paper", **kept.config)
+            config = agents.preset(kept.algorithm, "paper", **kept.config)
             run = Run(config=config, **{name: getattr(kept, name) for name in names})
         except (InputError, TypeError, ValueError) as error:
             raise CheckpointError(f"checkpoint: its parts do not fit together: {error}") from None
@@ -166,7 +152,7 @@ class Training:
 
     def store(self, path: Path) -> None:
         """Write a checkpoint."""
-        store(self.checkpoint(), path)
+        agents.store(self.checkpoint(), path)
 
     def _recent_means(self, count: int) -> dict[str, float]:
         """Over so many episodes, or as many as there are drones, if that is more: of those that

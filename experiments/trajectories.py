@@ -100,13 +100,8 @@ class Trajectory:
 
 
 def fly(env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int = 0) -> Trajectory:
-    """One episode of a policy in an env of one drone; once more, if its simulator was lost.
-
-    Args:
-        env: Local or remote.
-        policy: None draws actions at random, the same for the same seed.
-        seed: Of the episode.
-        episode: Its number, for the trajectory.
+    """One episode of a policy in an env of one drone, local or remote; once more, if its simulator
+    was lost. Without a policy, actions are drawn at random, the same for the same seed.
     """
     from ..udp import LOST
 
@@ -114,46 +109,36 @@ def fly(env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int =
     while lost:
         observation, info = env.reset(seed=seed)
         spec: EnvSpec = env.get_wrapper_attr("env_spec")  # of the simulator that came
-        names = [name for array in spec.telemetry for name in component_names(array)]
         if policy is None:
             env.action_space.seed(seed)
         else:
             policy.reset()
-        rows, rewards = [[info[name] for name in names]], []
+        told, rewards = [info], []
         terminated = truncated = lost = False
         while not (terminated or truncated or lost):
             action = env.action_space.sample() if policy is None else policy.act(observation)
             observation, reward, terminated, truncated, info = env.step(action)
-            rows.append([info[name] for name in names])
+            told.append(info)
             rewards.append(float(reward))
             lost = LOST in info
-    table = np.array(rows, np.float64)
-    ends = np.cumsum([array.size for array in spec.telemetry])[:-1]
-    columns = np.split(table, ends, axis=1) if spec.telemetry else []
+    telemetry = {}
+    for array in spec.telemetry:
+        names = component_names(array)
+        rows = np.array([[info[name] for name in names] for info in told], np.float64)
+        telemetry[array.name] = rows.reshape(len(told), *array.shape)
+    ending: Ending = "terminated" if terminated else "truncated"
     return Trajectory(
-        spec=spec,
-        telemetry={
-            array.name: part.reshape(len(rows), *array.shape)
-            for array, part in zip(spec.telemetry, columns, strict=True)
-        },
-        rewards=np.array(rewards),
-        ending="terminated" if terminated else "truncated",
-        episode=episode,
+        spec=spec, telemetry=telemetry, rewards=np.array(rewards), ending=ending, episode=episode
     )
 
 
 def fly_episodes(
     env: Any, policy: Policy, episodes: int, of: EpisodeSet = "curve", first: int = 0
 ) -> list[Trajectory]:
-    """So many evaluation episodes of a policy, in their order.
+    """So many evaluation episodes of a set, from the number `first` on, in their order.
 
-    A vector env flies as many at a time as it has drones, each bit as if they were flown one after
-    the other.
-
-    Args:
-        env: Of one drone, or a vector env without autoreset.
-        policy: Chooses the actions. Every drone of a vector env gets a copy.
-        episodes, first, of: How many, the number of the first, and of which set.
+    The env has one drone, or is a vector env without autoreset. That one flies as many at a time as
+    it has drones, each with a copy of the policy and to the same bits as one after the other.
     """
     seeds = {first + i: evaluation_seed(first + i, of) for i in range(episodes)}
     if not isinstance(env, AdvancingVectorEnv):
@@ -178,18 +163,18 @@ def _fly_batch(
     else:
         actions = np.zeros((count, *spec.action.shape), np.float32)
     env.reset(seed=[*seeds.values(), *[0] * (count - len(seeds))])
-    rows, rewards = [_copied(env.telemetry)], []
+    rows, rewards = [env.telemetry], []
     lengths, terminated = np.zeros(count, int), np.zeros(count, bool)
-    done, lost = np.arange(count) >= len(seeds), env.lost.copy()
-    done |= lost
+    lost = env.lost.copy()
+    done = lost | (np.arange(count) >= len(seeds))
     while not done.all():
         told: Any = env.observations
         for drone in np.flatnonzero(~done).tolist():
             own = {k: v[drone] for k, v in told.items()} if isinstance(told, dict) else told[drone]
             actions[drone] = policies[drone].act(own)
         env.advance(actions, np.zeros(count, bool), None, done)
-        rows.append(_copied(env.telemetry))
-        rewards.append(env.rewards.copy())
+        rows.append(env.telemetry)
+        rewards.append(env.rewards)
         lengths += ~done
         terminated |= env.terminated & ~done
         lost |= env.lost & ~done
@@ -210,11 +195,7 @@ def _fly_batch(
 
 
 def _stacked(rows: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-
-
-def _copied(telemetry: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return {name: np.array(array, np.float64) for name, array in telemetry.items()}
+    return {name: np.array([row[name] for row in rows], np.float64) for name in rows[0]}
 
 
 def flown_trajectories(
@@ -226,13 +207,8 @@ def flown_trajectories(
     vehicle: str | Path | None = None,
     of: EpisodeSet = "curve",
 ) -> list[Trajectory]:
-    """Evaluation episodes by number, flown in process without exploration.
-
-    Args:
-        policy: As of `fly`.
-        env_id, options: A registered env.
-        episodes, of: Their numbers, in which set.
-        vehicle: MJCF file; None: the paper's.
+    """Evaluation episodes of a set by number, flown in process: see `fly`. The vehicle is an MJCF
+    file, None the paper's.
     """
     made = gym.make(env_id, disable_env_checker=True, vehicle=vehicle, **options)
     with closing(made.unwrapped) as env:
@@ -245,14 +221,12 @@ def flown_trajectories(
 def recorded_trajectories(
     path: Path, episodes: Sequence[int] | None = None, *, session: int | None = None, drone: int = 0
 ) -> list[Trajectory]:
-    """Episodes of one drone of one session of a journal.
+    """Episodes of one drone (of the session, from 0) of one session of a journal of `--record`; one
+    that a crash cut off is read up to the cut. Sessions are counted from 1, as `rotorgram replay`
+    does; None is the first with a step in it.
 
-    Args:
-        path: Journal of `--record`; one that a crash cut off is read up to the cut.
-        episodes: Their numbers; None for all. They count, from 0, the episodes of which a step is
-            recorded, those that were given up and one that the journal's end cut off among them.
-        session: As `rotorgram replay` counts them, from 1. None: the first with a step in it.
-        drone: Of the session, from 0.
+    Episodes are given by number, None for all. They count, from 0, those of which a step is
+    recorded: those that were given up and one that the journal's end cut off among them.
 
     Raises:
         InputError: It is no journal, or has no such session, drone or episode.
@@ -304,38 +278,31 @@ class _Reader:
         """The next message of the session."""
         from ..udp.protocol.messages import Command, State
 
+        command, drone = self._command, self._drone
         if isinstance(message, Command):
             self._command = message
-        elif isinstance(message, State):
-            self.has_steps |= self._command is not None and not self._command.resets.all()
-            if 0 <= self._drone < self.num_envs:
-                self._take_state(message, self._command)
-
-    def _take_state(self, state: Any, command: Any) -> None:
-        drone = self._drone
-        begins = command is None or bool(command.resets[drone])
-        if command is not None and command.frozen[drone]:
+        if not isinstance(message, State):
             return
+        self.has_steps |= command is not None and not command.resets.all()
+        if not 0 <= drone < self.num_envs or (command is not None and command.frozen[drone]):
+            return
+        begins = command is None or bool(command.resets[drone])
         if begins:
             self.keep("cut off")
         elif not self._rows:  # stepped after its end: no episode
             return
-        named = zip(self._spec.telemetry, state.telemetry, strict=True)
-        self._rows.append({array.name: np.array(told[drone], np.float64) for array, told in named})
+        named = zip(self._spec.telemetry, message.telemetry, strict=True)
+        self._rows.append({array.name: np.array(told[drone]) for array, told in named})
         if not begins:
-            self._rewards.append(float(state.rewards[drone]))
-            if state.terminated[drone] or state.truncated[drone]:
-                self.keep("terminated" if state.terminated[drone] else "truncated")
+            self._rewards.append(float(message.rewards[drone]))
+            if message.terminated[drone] or message.truncated[drone]:
+                self.keep("terminated" if message.terminated[drone] else "truncated")
 
     def keep(self, ending: Ending) -> None:
         """The episode has ended; it counts if it has a step."""
         if self._rewards:
-            flown = Trajectory(
-                spec=self._spec,
-                telemetry=_stacked(self._rows),
-                rewards=np.array(self._rewards),
-                ending=ending,
-                episode=len(self.found),
-            )
-            self.found.append(flown)
+            telemetry, rewards = _stacked(self._rows), np.array(self._rewards)
+            number = len(self.found)
+            self.found.append(Trajectory(spec=self._spec, telemetry=telemetry, rewards=rewards,
+                                         ending=ending, episode=number))  # fmt: skip
         self._rows, self._rewards = [], []

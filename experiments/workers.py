@@ -4,8 +4,13 @@ A job is anything that can be pickled, done by a function that can be pickled to
 no folder with the main process, so the result of a job comes back as a value; and a job that fails
 comes back as a sentence, so that the others go on. A worker of this machine ends with the process
 that started it, however that ends, and its simulators end with the worker.
+
+Workers tell their progress by a small datagram now and then. A lost one does no harm: the next has
+the same numbers. Processes share no pipe or lock, and a run goes on without a listener. Datagrams
+stay on this machine: a run on another machine reports nothing before it is done.
 """
 
+import json
 import logging
 import os
 import signal
@@ -13,23 +18,31 @@ import socket
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from itertools import islice
-from threading import Thread
+from threading import Lock, Thread
 from typing import Any, Final, NamedTuple, TypeVar
 
 from ..agents.checkpoints import software_versions
 from ..envs.registry import load
 from ..models.errors import InputError, require
 from .pairs import close_shared_pairs
-from .progress import Home, OnProgress, Tell, listening, telling
 from .settings import EnvConfig, WorkersConfig
 
-__all__ = ["Result", "RunsFailed", "Workers", "WorkersConfig", "open_workers"]
+__all__ = ["OnProgress", "Result", "RunsFailed", "Tell", "Workers", "WorkersConfig", "open_workers"]
 
 _LISTENING_TIMEOUT: Final = 5.0  # s
 _WATCH_EVERY: Final = 0.5  # s
+
+OnProgress = Callable[[str, int, int, str], None]
+"""Called with a run's name, the amounts done and in total, and a status text."""
+
+Tell = Callable[[int, int, str], None]
+"""The same for one run, without its name."""
+
+_Home = tuple[str, int]
+"""Where progress is told: the name of the machine, and a port."""
 
 _Job = TypeVar("_Job")
 _Value = TypeVar("_Value")
@@ -56,18 +69,16 @@ with keywords that all have."""
 class Workers:
     """Do jobs: made by `open_workers`."""
 
-    def __init__(self, do: _Do, home: Home, tell: OnProgress, parent: int | None) -> None:
+    def __init__(self, do: _Do, home: _Home, tell: OnProgress, parent: int | None) -> None:
         self._do, self._home, self._tell, self._parent = do, home, tell, parent
 
     def fly(
         self, function: _Function[_Job, Any], jobs: Mapping[str, _Job], env: EnvConfig | None = None
     ) -> Generator[Result, None, None]:
-        """Give results as they come. To be closed: what still flies then is ended.
+        """Call a function in workers, with each job and what tells its progress: its result, as it
+        comes. Jobs are given by name. To be closed: what still flies then is ended.
 
-        Args:
-            function: Called in a worker, with a job and what tells its progress.
-            jobs: By name.
-            env: Of the jobs: a worker imports the module of the user's task.
+        If the jobs fly an env, a worker imports the module of the user's task.
         """
         shared = {
             "function": function,
@@ -111,9 +122,52 @@ def open_workers(config: WorkersConfig, on_progress: OnProgress) -> Iterator[Wor
     done. Raises `InputError` if there is no such Ray cluster.
     """
     here = config.backend == "loky"
-    opened = _loky(config) if here else _ray(config)
-    with opened as do, listening(on_progress) as (home, tell):
+    with (_loky if here else _ray)(config) as do, _listening(on_progress) as (home, tell):
         yield Workers(do, home, tell, os.getpid() if here else None)
+
+
+@contextmanager
+def _listening(on_progress: OnProgress) -> Iterator[tuple[_Home, OnProgress]]:
+    """Pass on the progress of runs, from a thread of its own, to the end of the block: the home
+    of the listener, and a function that passes on progress of this process.
+    """
+    lock = Lock()
+
+    def tell(name: str, done: int, total: int, words: str) -> None:
+        with lock:
+            on_progress(name, done, total, words)
+
+    def listen() -> None:
+        while datagram := sock.recv(4096):
+            try:
+                name, done, total, words = json.loads(datagram)
+            except (TypeError, ValueError):
+                continue
+            tell(str(name), int(done), int(total), str(words))
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        address = sock.getsockname()
+        thread = Thread(target=listen, daemon=True)
+        thread.start()
+        try:
+            yield (socket.gethostname(), address[1]), tell
+        finally:
+            sock.sendto(b"", address)
+            thread.join()
+
+
+def _telling(name: str, home: _Home) -> Tell:
+    """A function that tells the progress of one run to a listener on the same machine."""
+    host, port = home
+
+    def tell(done: int, total: int, words: str) -> None:
+        if host == socket.gethostname():
+            data = json.dumps([name, done, total, words]).encode()
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock, suppress(OSError):
+                sock.sendto(data, ("127.0.0.1", port))
+
+    return tell
 
 
 @contextmanager
@@ -155,8 +209,10 @@ def _ray(config: WorkersConfig) -> Iterator[_Do]:
     """Connect to the cluster. Raises `InputError`."""
     ray: Any = require("ray", "ray", "the backend ray")
     address = config.address or "auto"
+    host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
-        _check_listening(address)
+        if host and port.isdecimal():  # Ray takes minutes to find out that nothing listens
+            socket.create_connection((host, int(port)), _LISTENING_TIMEOUT).close()
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, RuntimeError, ValueError) as error:
         words = str(getattr(error, "strerror", None) or error).rpartition("Error: ")[2]
@@ -167,13 +223,6 @@ def _ray(config: WorkersConfig) -> Iterator[_Do]:
         yield partial(_do_by_ray, ray=ray, workers=config.jobs or max(cores, 1))
     finally:
         ray.shutdown()
-
-
-def _check_listening(address: str) -> None:
-    """Raise `OSError` if nothing listens: Ray itself takes minutes to find that out."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if host and port.isdecimal():
-        socket.create_connection((host, int(port)), _LISTENING_TIMEOUT).close()
 
 
 def _do_by_ray(
@@ -204,27 +253,28 @@ def _do_by_ray(
 
 
 def _done(
-    name: str, job: Any, *, function: _Function[Any, Any], task: str | None, home: Home,
+    name: str, job: Any, *, function: _Function[Any, Any], task: str | None, home: _Home,
     versions: dict[str, str], parent: int | None,
 ) -> Result:  # fmt: skip
-    """Do a job (in a worker process).
+    """Do a job, by its name, as of `Workers.fly` (in a worker process).
 
-    Args:
-        name, job, function: As of `Workers.fly`.
-        task: `module:id` of a task of the user's own, which the worker has to import.
-        home: Where progress is told.
-        versions: Software of the main process.
-        parent: Process that the worker ends with; None: another machine's.
+    A `task` of the user's own, `module:id`, is imported. Progress is told at `home`. The versions
+    of software have to be the main process's: `config.json` tells one of each. The worker ends with
+    the process `parent`; None is another machine's.
     """
     if parent is not None and os.getpid() != parent:  # one of loky's
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's affair
         _watch(parent)
     try:
-        _check_software(versions)
+        for package, here in software_versions().items():
+            if here != versions[package]:
+                raise InputError(
+                    f"{package}: expected version {versions[package]} as on the machine of the "
+                    f"command, got {here} on {socket.gethostname()}"
+                )
         if task:
             load(task)
-        with telling(name, home) as tell:
-            return Result(name, "", function(job, tell))
+        return Result(name, "", function(job, _telling(name, home)))
     except Exception as error:
         return Result(name, f"{name}: {type(error).__name__}: {error}", None)
 
@@ -244,13 +294,3 @@ def _watch(parent: int) -> None:
         os._exit(1)
 
     Thread(target=watch, daemon=True).start()
-
-
-def _check_software(expected: dict[str, str]) -> None:
-    """The config that is written tells one version of each."""
-    for name, here in software_versions().items():
-        if here != expected[name]:
-            raise InputError(
-                f"{name}: expected version {expected[name]} as on the machine of the command, "
-                f"got {here} on {socket.gethostname()}"
-            )

@@ -25,9 +25,14 @@ from rotorgram.experiments.curves import (
 )
 from rotorgram.experiments.figures import FIGURE_FILES
 from rotorgram.experiments.metrics import Spread
-from rotorgram.experiments.page import MAX_POINTS, Chart, chart_data
 from rotorgram.experiments.palette import agent_color
-from rotorgram.experiments.report import VIDEO_FILE, write_report
+from rotorgram.experiments.report import (
+    MAX_POINTS,
+    VIDEO_FILE,
+    Chart,
+    chart_data,
+    write_report,
+)
 
 CHARTS = ["learning", "flown", "reward", "training-error", "total-by-step", "total-by-episode"]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
