@@ -9,7 +9,7 @@ from ._flags import Command, parse_address
 
 @dataclass(frozen=True, kw_only=True)
 class Relay(relay.FaultConfig, Command):
-    """Stand between simulators and an agent, and lose, double, reorder, delay and spoil datagrams.
+    """Relay datagrams between simulators and an agent; lose, double, reorder, delay and spoil some.
 
     Simulators fly through it with --server set to its address.
     """

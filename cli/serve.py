@@ -13,7 +13,7 @@ from ._flags import AgentFlags, check_count
 
 @dataclass(frozen=True, kw_only=True)
 class Serve(AgentFlags):
-    """Fly simulators that come, one after the other, with a trained policy or the PID.
+    """Fly each simulator that connects, one after the other, with a trained policy or the PID.
 
     The first decides the number of drones: each flies an episode of its own at the same time.
     """

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class View(EnvFlags):
-    """Look at flights, in real time or slower: in a window, or on a page for browsers.
+    """Show flights, in real time or slower, in a window or in a browser.
 
     Keys: space pauses, the arrow to the right takes one step, - and + change the speed.
     """

@@ -215,7 +215,7 @@ def _rotors(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Ch
         measured = float(body.forces(vehicle, model, asked)[2])
         yield Check(name, float(vertical @ given), measured, "N", _MODEL, _EXACT * weight)
     rank = float(np.linalg.matrix_rank(np.array(columns), rtol=1e-6))
-    source = "six degrees of freedom, four of them to be had singly"
+    source = "thrust and three torques, each without the others"
     yield Check("rank of the allocation matrix", 4.0, rank, "", source, 0.0)
 
 
