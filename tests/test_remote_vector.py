@@ -394,4 +394,3 @@ def test_an_env_of_others_is_held_too() -> None:
                 assert (info["_final_obs"] == terminated).all()
                 assert (abs(observations[terminated]) < 0.05).all()
                 push = push[::-1]
-        assert remote.statistics.counters["resent"] == 0
