@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from peers import ANY, ENV_ID, Running
+from peers import ANY, ENV_ID, Running, launch
 from remotes import QUICK, Broken, flying
 from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
@@ -65,6 +65,7 @@ def test_wrong_arguments(make: Any, sentence: str) -> None:
         (['{"env": 5}'], "env: expected an id, got 5"),
         (['{"insecure": "false"}'], "insecure: expected true or false, got 'false'"),
         (['{"config": {"timeout": 1}}'], "config: expected one of"),
+        (['{"module": "no.such"}'], "module: expected one that can be imported, got no.such"),
     ],
 )
 def test_wrong_arguments_of_the_simulator_program(words: list[str], sentence: str) -> None:
@@ -79,6 +80,18 @@ def test_arguments_of_the_simulator_program() -> None:
         "target": 3.0,
         "server": ("127.0.0.1", 5),
     }
+
+
+def test_the_simulator_program_says_which_package_is_missing(tmp_path: Path) -> None:
+    code = """
+        import runpy, sys
+        sys.modules["mcap"] = None
+        runpy.run_module("rotorgram.udp", run_name="__main__")
+    """
+    process = launch(code, json.dumps({"record": str(tmp_path / "j")}))
+    out, err = process.communicate(timeout=60)
+    sentence = "the journal of a flight needs the package mcap: pip install 'rotorgram[record]'"
+    assert (process.returncode, out, err) == (1, "", f"rotorgram simulator: {sentence}\n")
 
 
 # ---- fault 4: options are compared both ways
