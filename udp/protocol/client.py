@@ -44,6 +44,9 @@ _LONGEST_RESEND: Final = 1.0  # longest wait before a resend, s
 _PATIENCE: Final = 8  # resends before the waits double: most that was lost was lost by chance
 _LATER: Final = 1.25
 """By so much each Alive for a State lengthens the wait before the next is asked for."""
+_LATEST: Final = 10.0
+"""Longest such wait, s; a quarter of the timeout, if that is less. A Command that was lost is asked
+for again before an agent takes the simulator for lost (30 s)."""
 _TOO_EARLY: Final = 1.5  # by so much round trips are taken for longer when answers come twice
 _AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING, Way.RECEIVED, Command]
 
@@ -178,7 +181,8 @@ class Client:
         self.layout = layout
         self.state = SimulatorState.READY if by_text else SimulatorState.IDLE
         self.sequence = 0
-        self.sends = self._tries = self._alives = 0
+        self.sends = self._tries = 0
+        self._stretch = 1.0  # of the next wait, by the Alives for this State
         self.statistics = Statistics()
         self._config = config
         self._largest = largest
@@ -356,8 +360,9 @@ class Client:
             elif isinstance(message, m.Alive):  # others are late
                 self._round_trips.answered(now, alive=True)
                 self._progress(now)
-                self._alives += 1
-                self._resend_at = now + self._round_trips.wait(1) * _LATER**self._alives
+                self._stretch *= _LATER
+                wait = self._round_trips.wait(1) * self._stretch
+                self._resend_at = now + min(wait, _LATEST, self._config.timeout / 4)
             elif not self._is_queued:
                 self._is_queued = True
                 self.statistics.notice("every slot of the agent is taken; waiting for a free one")
@@ -466,7 +471,7 @@ class Client:
         self.state = SIMULATOR[self.state, Way.SENT, kind]
         self.sequence = 0 if isinstance(message, m.Hello) else message.sequence
         self.sends = self._tries = 1
-        self._alives = 0
+        self._stretch = 1.0
         self._round_trips.sent(now, first=True)
         self._put(transfer.start(), self._transfer_key)
         closing = kind is m.Close
