@@ -41,6 +41,7 @@ posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and fo
         (lambda: RemoteEnv(ANY, env_id=ENV_ID, options={"wind": 1}), "wind"),
         (lambda: RemoteEnv(ANY, timeout=0), "timeout: expected seconds > 0, got 0"),
         (lambda: RemoteEnv(ANY, connect_timeout=float("nan")), "connect_timeout: expected"),
+        (lambda: RemoteEnv(ANY, max_datagram=32), "max_datagram: expected at least 256, got 32"),
         (lambda: RemoteVectorEnv(ANY, num_envs=10**9), "num_envs: expected a multiple"),  # fault 32
         (lambda: RemoteVectorEnv(ANY, num_envs=3, num_simulators=2), "multiple of num_simulators"),
         (lambda: RemoteVectorEnv(ANY, num_simulators=0), "num_simulators: expected 1 to"),

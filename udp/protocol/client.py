@@ -19,7 +19,17 @@ from . import binary, text
 from . import messages as m
 from .auth import Key, is_sealed, message_of
 from .errors import DecodeError, Forged
-from .fragments import FAR, NEAR, Assembler, Transfer, Window, asks, is_fragment
+from .fragments import (
+    FAR,
+    LEAST,
+    NEAR,
+    Assembler,
+    Transfer,
+    Window,
+    asks,
+    check_size,
+    is_fragment,
+)
 from .layout import Layout
 from .messages import Command, Message, State, one_line
 from .statistics import Statistics
@@ -70,7 +80,8 @@ class LinkConfig:
     """It gives up when nothing has answered for this long, s: longer than an agent waits for one
     to replace another that it has lost."""
     max_datagram: int | None = None
-    """Largest datagram, bytes, a seal not counted. None: 65,483 on loopback, 1,200 elsewhere."""
+    """Largest datagram, bytes, a seal not counted, at least 256. None: 65,483 on loopback, 1,200
+    elsewhere."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -78,7 +89,7 @@ class LinkConfig:
             right = value is None or (isfinite(value) and value > 0)
             expect(right, field.name, "a number > 0", f"{value}")
         most = self.max_datagram
-        expect(most is None or most >= 256, "max_datagram", "at least 256", f"{most}")
+        expect(most is None or most >= LEAST, "max_datagram", f"at least {LEAST}", f"{most}")
 
 
 class RoundTrips:
@@ -157,6 +168,10 @@ class Client:
         key: Shared with the agent. Then nothing unsealed is taken.
         draw_session: Gives the number of the next session.
 
+    Raises:
+        InputError: The layout is not of text, there is a key with text, or a message would take too
+            many datagrams.
+
     Attributes:
         sequence: Number of the State sent last: they count from 1.
         sends: How often the outstanding message was sent.
@@ -177,6 +192,7 @@ class Client:
         if by_text:
             expect(not key, "text codec", "no key", "one: only binary can be sealed")
             text.check_layout(layout)
+        check_size(max(layout.state_size, len(binary.encode(hello))), largest)
         self.hello = hello
         self.layout = layout
         self.state = SimulatorState.READY if by_text else SimulatorState.IDLE
