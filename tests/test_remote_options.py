@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,9 +15,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from peers import ANY, ENV_ID, Running, launch
+from peers import ANY, ENV_ID, Running, launch, plain_socket
 from remotes import QUICK, Broken, flying
 from rotorgram.envs.registry import env_spec
+from rotorgram.models import QUAD_XML
 from rotorgram.models.errors import InputError
 from rotorgram.udp import LinkError, PeerClosed, Refused, RemoteEnv, RemoteVectorEnv, Simulator
 from rotorgram.udp.__main__ import parse_arguments
@@ -342,6 +344,44 @@ def test_an_agent_that_flies_on_after_the_end() -> None:
         with pytest.raises(PeerClosed, match="expected a reset"):
             pair.remote.step(np.zeros(1))
         assert isinstance(pair.running.join(), LinkError)
+
+
+def test_an_env_that_the_papers_vehicle_cannot_fly(tmp_path: Path) -> None:
+    """Binary never needs that vehicle, and a line of text from a stranger changes nothing."""
+    vehicle = tmp_path / "slow.xml"
+    vehicle.write_text(re.sub('timestep="[^"]*"', 'timestep="0.005"', QUAD_XML.read_text("utf-8")))
+    options = {"control_period": 0.015}
+    with (
+        RemoteEnv(ANY, env_id=ENV_ID, options=options, connect=False, connect_timeout=5) as remote,
+        plain_socket() as stranger,
+    ):
+        stranger.sendto(b"1", remote.address)
+        simulator = Simulator(
+            server=remote.address, bind=ANY, vehicle=vehicle, config=QUICK, **options
+        )
+        running = Running(simulator)
+        remote.reset(seed=1)
+        assert remote.control_period == 0.015
+    assert running.join() == "the agent closed"
+
+
+def test_an_agent_that_asks_for_an_env_needs_no_mujoco(tmp_path: Path) -> None:
+    code = """
+        import sys
+        sys.modules["mujoco"] = None
+        from rotorgram.udp import RemoteEnv
+        wanted = {"env_id": "rotorgram/Elevation-v0", "options": {}, "record": sys.argv[1]}
+        with RemoteEnv(("127.0.0.1", 0), connect=False, connect_timeout=10, **wanted) as env:
+            print(env.address[1], flush=True)
+            print(env.reset(seed=1)[0].shape)
+    """
+    agent = launch(code, tmp_path / "j")
+    assert agent.stdout is not None
+    server = "127.0.0.1", int(agent.stdout.readline())
+    running = Running(Simulator(server=server, bind=ANY, config=QUICK))
+    out, err = agent.communicate(timeout=60)
+    assert (out, err) == ("(3,)\n", "")
+    assert running.join() == "the agent closed"
 
 
 def test_text_needs_an_env_that_is_known_here() -> None:

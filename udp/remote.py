@@ -55,7 +55,8 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
 
     The simulator may start before or after. Its Hello brings the spec of its env, and the spaces
     follow from that: this side needs neither the env's code nor MuJoCo. A text simulator says no
-    Hello, and is read by the spec of `env_id` with `options`, which must be registered here.
+    Hello, and is read by the spec of `env_id` with `options` and the paper's vehicle: this side
+    makes that env, so the id must be registered here.
     Observations, rewards, ends of episodes and telemetry are those of the env in the simulator, bit
     for bit; `info` carries the telemetry by its components.
 

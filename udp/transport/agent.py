@@ -238,10 +238,11 @@ class Agent:
         session = self.server.slots[slot]
         assert session is not None
         self._keep_sockets()
-        self.spec, self._required.worlds = self._required.text_spec(), 1
         if session.hello:
             self.server.takes_text = False
             self.spec, self._required.worlds = _spec(session.hello.spec), session.hello.worlds
+        else:
+            self.spec, self._required.worlds = self._required.text_spec(), 1
         self._required.spec = self.spec
         if self.states[slot] is not None and not self.lost[slot]:
             self._lose(slot, f"the simulator at {address_text(address)} was started anew")
@@ -328,14 +329,17 @@ class _Required:
         return _spec_difference(self.spec, spec) if self.spec else ""
 
     def _text_spec(self) -> EnvSpec | None:
-        """Of a simulator that speaks text, for it tells none; None if text is not flown."""
+        """Of a simulator that speaks text, for it tells none; None if text is not flown.
+
+        It is the env with the paper's vehicle, made here: text is not flown where that cannot be.
+        """
         config, env_id = self.config, self.config.env_id
         if env_id is None or not registry.is_known(env_id) or config.worlds not in (None, 1):
             return None
-        spec = registry.env_spec(env_id, dict(config.options or {}))
         try:
+            spec = registry.env_spec(env_id, dict(config.options or {}))
             text.check_layout(layout_of(spec))
-        except InputError:
+        except (InputError, ImportError):  # the latter without MuJoCo
             return None
         return spec
 
