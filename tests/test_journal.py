@@ -409,6 +409,19 @@ def test_text_simulators_one_after_another_are_sessions_of_their_own(tmp_path: P
     assert verify(path).identical
 
 
+def test_a_binary_session_may_have_the_number_0(tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    with RemoteEnv(ANY, env_id=ENV_ID, connect=False, record=path, **TIMES) as remote:
+        simulator = Simulator(server=remote.address, bind=ANY, config=QUICK)
+        simulator.link.hello = replace(simulator.link.hello, session=0)
+        running = Running(simulator)
+        fly(remote, 20)
+    assert running.join() == "the agent closed"
+    (session,) = summarize(path).sessions
+    assert (session.session.codec, session.steps) == ("binary", 20)
+    assert verify(path).identical
+
+
 def test_several_simulators_at_once(tmp_path: Path) -> None:
     path = tmp_path / "agent.mcap"
     remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=4, connect=False, record=path, **TIMES)
