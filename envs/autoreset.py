@@ -61,8 +61,8 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
 
         Rewards and flags of a drone that is reset or frozen are 0, and its action is ignored. One
         that is frozen is afterwards as it was before. Actions have shape (N, k), discrete ones (N,)
-        or (N, 1); masks are bool, shape (N,), or None. Seeds, shape (N,), are of those that are
-        reset; None leaves their streams as they are.
+        or (N, 1); masks are bool, shape (N,), or None; a drone of both masks is reset. Seeds, shape
+        (N,), are of those that are reset; None leaves their streams as they are.
         """
 
     def step(self, actions: Any) -> Step:
@@ -123,8 +123,13 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         masks = {name: mask & ended for name, mask in last_info.items() if name.startswith("_")}
         info = self._info(~self._nobody)
         info |= {"final_obs": last, "_final_obs": ended}
-        info |= {"final_info": last_info | masks, "_final_info": ended | self._nobody}
+        finals = last_info | masks | self._losses()
+        info |= {"final_info": finals, "_final_info": ended | self._nobody}
         return truncated, info
+
+    def _losses(self) -> dict[str, Any]:
+        """What the info of this step says of simulators that were lost, in any round trip."""
+        return {}
 
     def _info(self, mask: np.ndarray) -> dict[str, Any]:
         """The telemetry of the drones by its components, each name with its mask."""
@@ -161,8 +166,8 @@ def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | 
     numbers: Seeds = seed
     if isinstance(seed, int | np.integer):
         numbers = range(int(seed), int(seed) + num_envs)
-    several = isinstance(numbers, Sequence | np.ndarray) and len(numbers) == num_envs
-    if not (several and all(map(is_seed, numbers))):
+    several = isinstance(numbers, Sequence | np.ndarray) and getattr(numbers, "ndim", 1) == 1
+    if not (several and len(numbers) == num_envs and all(map(is_seed, numbers))):
         up_to = "from 0 on" if most is None else f"from 0 to 2^{most.bit_length()} - 1"
         raise InputError(
             f"seed: expected a whole number {up_to}, or {num_envs} of them, got {seed!r}"

@@ -1,6 +1,7 @@
 """Messages larger than a datagram: only what is missing is sent again."""
 
 import random
+import re
 import struct
 
 import numpy as np
@@ -20,7 +21,7 @@ from rotorgram.udp.protocol.fragments import (
     asks,
     is_fragment,
 )
-from rotorgram.udp.protocol.messages import Missing
+from rotorgram.udp.protocol.messages import MAX_SPEC, Missing, Refuse
 from rotorgram.udp.transport.relay import FaultConfig, Faults
 
 QUAD = ((3,), (3,), (4,), (3,), (1,))
@@ -61,6 +62,21 @@ def test_any_message_comes_through(size: int, largest: int, seed: int, loss: flo
         missing = assembler.missing() if any(map(asks, arriving)) else None
         out = transfer.resend(missing) if missing else transfer.probe()
     pytest.fail("never whole")
+
+
+def test_messages_of_too_many_fragments_are_not_begun() -> None:
+    of = layout(1, 1_000_000)
+    sentence = r"max_datagram: expected at least 277 for messages of 40000\d\d bytes, got 256"
+    with pytest.raises(InputError, match=sentence):
+        simulator(of=of, largest=256)
+    server = agent(of=of, max_datagram=256)
+    server.receive(binary.encode(hello()), ("127.0.0.1", 1), 0.0)
+    ((refuse, _),) = server.take_outgoing()
+    assert isinstance(binary.decode(refuse), Refuse)
+    assert re.search(sentence, server.statistics.last_error)
+    simulator(of=of, largest=277)
+    with pytest.raises(InputError, match="at least 289 for messages of 41943"):
+        simulator(said=hello(spec=" " * MAX_SPEC), largest=256)
 
 
 def test_only_what_is_missing_is_sent_again() -> None:

@@ -34,6 +34,7 @@ from peers import ANY, ENV_ID, Running
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rotorgram.envs.loop import Loop
 from rotorgram.envs.spec import EnvSpec
+from rotorgram.models.errors import InputError
 from rotorgram.udp import (
     LinkConfig,
     PeerClosed,
@@ -408,6 +409,19 @@ def test_text_simulators_one_after_another_are_sessions_of_their_own(tmp_path: P
     assert verify(path).identical
 
 
+def test_a_binary_session_may_have_the_number_0(tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    with RemoteEnv(ANY, env_id=ENV_ID, connect=False, record=path, **TIMES) as remote:
+        simulator = Simulator(server=remote.address, bind=ANY, config=QUICK)
+        simulator.link.hello = replace(simulator.link.hello, session=0)
+        running = Running(simulator)
+        fly(remote, 20)
+    assert running.join() == "the agent closed"
+    (session,) = summarize(path).sessions
+    assert (session.session.codec, session.steps) == ("binary", 20)
+    assert verify(path).identical
+
+
 def test_several_simulators_at_once(tmp_path: Path) -> None:
     path = tmp_path / "agent.mcap"
     remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=4, connect=False, record=path, **TIMES)
@@ -699,6 +713,20 @@ def test_a_chunk_that_grows_is_not_read(flight: SimpleNamespace, tmp_path: Path)
         assert (errors, ending.startswith("cut off")) == ("", True)
         assert float(seconds) < 1.0
         assert int(kilobytes) < 3 * MAX_CHUNK / 1024
+
+
+def test_an_event_that_is_nested_too_deep(tmp_path: Path) -> None:
+    path = tmp_path / "deep.mcap"
+    with path.open("wb") as new:
+        writer = Writer(new)
+        writer.start()
+        writer.add_metadata("rotorgram", {"format": "2"})
+        schema = writer.register_schema("rotorgram.Event", "jsonschema", b"{}")
+        channel = writer.register_channel("/slot0/events", "json", schema)
+        writer.add_message(channel, 0, b"[" * 200_000, 0)
+        writer.finish()
+    with pytest.raises(InputError, match=r"deep\.mcap: a message that cannot be read: maximum"):
+        summarize(path)
 
 
 def test_terminal_escapes_are_not_printed(flight: SimpleNamespace, tmp_path: Path) -> None:

@@ -287,6 +287,24 @@ def test_an_agent_that_waits_for_others_is_not_silent() -> None:
     assert not link.handle_timer(19.0)
 
 
+@pytest.mark.parametrize(("timeout", "longest"), [(20.0, 5.0), (120.0, 10.0)])
+def test_an_agent_that_waits_for_long_is_asked_before_the_timeout(
+    timeout: float, longest: float
+) -> None:
+    wire = Wire("agent", False)
+    link = to(simulator(config=LinkConfig(timeout=timeout)), SimulatorState.WAITING, wire)
+    alive = wire(Alive(session=link.hello.session, sequence=link.sequence))
+    now, asked = 0.0, 0
+    while now < 50_000.0:
+        now, before = link.next_timer() or 0.0, now
+        assert link.handle_timer(now)
+        assert link.take_outgoing()
+        assert now - before <= longest + 1e-6
+        link.receive(alive, now)
+        asked += 1
+    assert asked < 50_000 / longest + 50
+
+
 def test_silence_ends_a_simulator_and_a_pause_of_its_own_does_not() -> None:  # fault 25
     link = to(simulator(), SimulatorState.WAITING, Wire("agent", False))
     link.pardon(100.0)

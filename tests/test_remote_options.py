@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,9 +15,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from peers import ANY, ENV_ID, Running
+from peers import ANY, ENV_ID, Running, launch, plain_socket
 from remotes import QUICK, Broken, flying
 from rotorgram.envs.registry import env_spec
+from rotorgram.models import QUAD_XML
 from rotorgram.models.errors import InputError
 from rotorgram.udp import LinkError, PeerClosed, Refused, RemoteEnv, RemoteVectorEnv, Simulator
 from rotorgram.udp.__main__ import parse_arguments
@@ -41,6 +43,7 @@ posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and fo
         (lambda: RemoteEnv(ANY, env_id=ENV_ID, options={"wind": 1}), "wind"),
         (lambda: RemoteEnv(ANY, timeout=0), "timeout: expected seconds > 0, got 0"),
         (lambda: RemoteEnv(ANY, connect_timeout=float("nan")), "connect_timeout: expected"),
+        (lambda: RemoteEnv(ANY, max_datagram=32), "max_datagram: expected at least 256, got 32"),
         (lambda: RemoteVectorEnv(ANY, num_envs=10**9), "num_envs: expected a multiple"),  # fault 32
         (lambda: RemoteVectorEnv(ANY, num_envs=3, num_simulators=2), "multiple of num_simulators"),
         (lambda: RemoteVectorEnv(ANY, num_simulators=0), "num_simulators: expected 1 to"),
@@ -65,6 +68,7 @@ def test_wrong_arguments(make: Any, sentence: str) -> None:
         (['{"env": 5}'], "env: expected an id, got 5"),
         (['{"insecure": "false"}'], "insecure: expected true or false, got 'false'"),
         (['{"config": {"timeout": 1}}'], "config: expected one of"),
+        (['{"module": "no.such"}'], "module: expected one that can be imported, got no.such"),
     ],
 )
 def test_wrong_arguments_of_the_simulator_program(words: list[str], sentence: str) -> None:
@@ -79,6 +83,18 @@ def test_arguments_of_the_simulator_program() -> None:
         "target": 3.0,
         "server": ("127.0.0.1", 5),
     }
+
+
+def test_the_simulator_program_says_which_package_is_missing(tmp_path: Path) -> None:
+    code = """
+        import runpy, sys
+        sys.modules["mcap"] = None
+        runpy.run_module("rotorgram.udp", run_name="__main__")
+    """
+    process = launch(code, json.dumps({"record": str(tmp_path / "j")}))
+    out, err = process.communicate(timeout=60)
+    sentence = "the journal of a flight needs the package mcap: pip install 'rotorgram[record]'"
+    assert (process.returncode, out, err) == (1, "", f"rotorgram simulator: {sentence}\n")
 
 
 # ---- fault 4: options are compared both ways
@@ -328,6 +344,44 @@ def test_an_agent_that_flies_on_after_the_end() -> None:
         with pytest.raises(PeerClosed, match="expected a reset"):
             pair.remote.step(np.zeros(1))
         assert isinstance(pair.running.join(), LinkError)
+
+
+def test_an_env_that_the_papers_vehicle_cannot_fly(tmp_path: Path) -> None:
+    """Binary never needs that vehicle, and a line of text from a stranger changes nothing."""
+    vehicle = tmp_path / "slow.xml"
+    vehicle.write_text(re.sub('timestep="[^"]*"', 'timestep="0.005"', QUAD_XML.read_text("utf-8")))
+    options = {"control_period": 0.015}
+    with (
+        RemoteEnv(ANY, env_id=ENV_ID, options=options, connect=False, connect_timeout=5) as remote,
+        plain_socket() as stranger,
+    ):
+        stranger.sendto(b"1", remote.address)
+        simulator = Simulator(
+            server=remote.address, bind=ANY, vehicle=vehicle, config=QUICK, **options
+        )
+        running = Running(simulator)
+        remote.reset(seed=1)
+        assert remote.control_period == 0.015
+    assert running.join() == "the agent closed"
+
+
+def test_an_agent_that_asks_for_an_env_needs_no_mujoco(tmp_path: Path) -> None:
+    code = """
+        import sys
+        sys.modules["mujoco"] = None
+        from rotorgram.udp import RemoteEnv
+        wanted = {"env_id": "rotorgram/Elevation-v0", "options": {}, "record": sys.argv[1]}
+        with RemoteEnv(("127.0.0.1", 0), connect=False, connect_timeout=10, **wanted) as env:
+            print(env.address[1], flush=True)
+            print(env.reset(seed=1)[0].shape)
+    """
+    agent = launch(code, tmp_path / "j")
+    assert agent.stdout is not None
+    server = "127.0.0.1", int(agent.stdout.readline())
+    running = Running(Simulator(server=server, bind=ANY, config=QUICK))
+    out, err = agent.communicate(timeout=60)
+    assert (out, err) == ("(3,)\n", "")
+    assert running.join() == "the agent closed"
 
 
 def test_text_needs_an_env_that_is_known_here() -> None:

@@ -212,19 +212,26 @@ def test_wrong_discrete_actions() -> None:
 
 
 @pytest.mark.parametrize("seed", [-1, 2**64 - 3, [1, 2, 3], [1, 2, 3, -1], [1, 2, 3, 2**64],
-                                  [1, 2, 3, 0.5], [1, 2, 3, None], 0.5, "1234"])  # fmt: skip
+                                  [1, 2, 3, 0.5], [1, 2, 3, None], 0.5, "1234",
+                                  np.array(3)])  # fmt: skip
 def test_wrong_seeds(seed: Any) -> None:
-    with flying(2, 2) as (remote, _):
-        remote.reset(seed=[0, 2**64 - 1, 5, 5])
+    with flying(2, 2) as (remote, _), sync(4) as local:
+        seeds = [0, 2**64 - 1, 5, 5]
+        assert_same(remote.reset(seed=seeds), local.reset(seed=seeds))
         sent = remote.statistics.counters["sent"]
         sentence = r"seed: expected a whole number from 0 to 2\^64 - 1, or 4 of them, got"
         with pytest.raises(ValueError, match=sentence):
             remote.reset(seed=seed)
+        if np.ndim(seed):
+            with pytest.raises(ValueError, match=sentence):
+                remote.advance(np.zeros((4, 1)), np.ones(4, bool), seed)
         with pytest.raises(
             ValueError, match="options: expected reset_mask or none over UDP, got 'target'"
         ):
             remote.reset(options={"target": 5.0})
         assert remote.statistics.counters["sent"] == sent
+        actions = np.full((4, 1), 0.5, np.float32)  # the episodes go on
+        assert_same(remote.step(actions), local.step(actions))
         remote.reset(seed=2**64 - 4)
 
 
@@ -296,6 +303,18 @@ def test_a_mask_resets_some_and_the_others_hold() -> None:
             assert (masked[0][1]["_Y"] == mask).all()
         with pytest.raises(ValueError, match="reset_mask: expected an array of 4 bool"):
             remote.reset(options={"reset_mask": np.zeros(4, bool)})
+
+
+def test_a_drone_of_both_masks_is_reset() -> None:
+    local = LocalVectorEnv(ENV_ID, 2, autoreset_mode="Disabled")
+    resets, frozen = np.array([True, False]), np.array([True, True])
+    with flying(1, 2, autoreset="Disabled") as (remote, _):
+        for env in (remote, local):
+            env.reset(seed=1)
+            env.step(np.full((2, 1), 0.5, np.float32))
+            env.advance(np.zeros((2, 1), np.float32), resets, [7, 8], frozen)
+        assert remote.observations.tobytes() == local.observations.tobytes()
+        assert (remote.observations[:, 1] == 0.0).tolist() == [True, False], "velocities"
 
 
 def test_a_mask_before_the_first_reset_leaves_the_others_to_be_reset() -> None:

@@ -325,3 +325,34 @@ def test_a_simulator_lost_during_a_reset_is_replaced_and_seeded() -> None:
         running[0] = simulate(remote, bind=here)
         assert_same(remote.reset(seed=9), local.reset(seed=9))
         assert assert_parity(remote, local, 260) >= 2
+
+
+def test_a_simulator_lost_in_the_second_round_trip_of_a_step_is_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """SAME_STEP: drone 0 begins its next episode, and the simulator is lost that drone 1 flies."""
+    with flying(1, 2, autoreset="SameStep", episode_length=3) as (remote, running):
+        remote.reset(seed=0)
+        remote.step(np.zeros((2, 1)))
+        remote.reset(options={"reset_mask": np.array([False, True])})
+        remote.step(np.zeros((2, 1)))
+        advance, here = remote.advance, running[0].simulator.address
+        calls: list[Any] = []
+
+        def lose_it(*arguments: Any) -> None:
+            calls.append(arguments)
+            if len(calls) == 2:
+                running[0].cut()
+                running[0] = simulate(remote, bind=here, num_envs=2, episode_length=3)
+            advance(*arguments)
+
+        monkeypatch.setattr(remote, "advance", lose_it)
+        *_, truncated, info = remote.step(np.zeros((2, 1)))
+        assert len(calls) == 3
+        assert truncated.tolist() == info["_final_info"].tolist() == [True, True]
+        reason = f"the simulator at 127.0.0.1:{here[1]} was started anew"
+        for where in (info, info["final_info"]):
+            assert where["simulator_lost"].tolist() == [None, reason]
+            assert where["_simulator_lost"].tolist() == [False, True]
+        *_, info = remote.step(np.zeros((2, 1)))
+        assert "simulator_lost" not in info

@@ -14,7 +14,7 @@ from importlib import import_module
 from threading import Thread
 from typing import Any, Final
 
-from ..models.errors import InputError, expect
+from ..models.errors import InputError, MissingPackage, expect
 from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
 from .transport.simulator import Simulator
@@ -60,7 +60,7 @@ def main() -> int:
                 Thread(target=stop_with_stdin, daemon=True).start()
             simulator.run()
             return 128 + ended[0] if ended else 0
-    except (LinkError, OSError, InputError) as error:
+    except (LinkError, OSError, InputError, MissingPackage) as error:
         print(f"rotorgram simulator: {error}", file=sys.stderr)
         return 1
 
@@ -81,7 +81,12 @@ def parse_arguments(words: list[str]) -> dict[str, Any]:
         expect(isinstance(value, kind), name, expected, f"{value!r}")
     if module := arguments.pop("module", None):
         sys.path.append(os.getcwd())  # last, and with -P not there: it shadows no other module
-        import_module(module)
+        try:
+            import_module(module)
+        except ModuleNotFoundError as error:
+            if not f"{module}.".startswith(f"{error.name}."):
+                raise  # it is there, and lacks something of its own
+            raise InputError(f"module: expected one that can be imported, got {module}") from None
     pairs = {name: tuple(arguments[name]) for name in ("server", "bind") if name in arguments}
     return {**arguments.pop("options", {}), **arguments, **pairs}
 

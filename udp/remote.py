@@ -55,7 +55,8 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
 
     The simulator may start before or after. Its Hello brings the spec of its env, and the spaces
     follow from that: this side needs neither the env's code nor MuJoCo. A text simulator says no
-    Hello, and is read by the spec of `env_id` with `options`, which must be registered here.
+    Hello, and is read by the spec of `env_id` with `options` and the paper's vehicle: this side
+    makes that env, so the id must be registered here.
     Observations, rewards, ends of episodes and telemetry are those of the env in the simulator, bit
     for bit; `info` carries the telemetry by its components.
 
@@ -75,8 +76,8 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
             60.
         timeout: Longest wait for an answer from it, s, before another may take its slot; 30. While
             it computes, it says so.
-        max_datagram: Largest datagram, bytes, a seal not counted. None: 65,483 on loopback, 1,200
-            elsewhere.
+        max_datagram: Largest datagram, bytes, a seal not counted, at least 256. None: 65,483 on
+            loopback, 1,200 elsewhere.
         key_file: File with the key that the simulators have too (`rotorgram key`). With it any
             address is allowed, because only holders of the key can take part.
         insecure: Allow an address that is not loopback without a key.
@@ -206,7 +207,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
 
     A simulator that is lost is replaced by the next that comes. The running episodes of its drones
     end as truncated, with the observation before, reward 0 and the reason in
-    `info["simulator_lost"]`. The other slots wait meanwhile.
+    `info["simulator_lost"]`, with SAME_STEP in `final_info` too. The other slots wait meanwhile.
 
     Args:
         address: Address (host, port) to listen on; port 0 takes a free one.
@@ -282,13 +283,15 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         options = options or {}
         if unknown := [name for name in options if name != "reset_mask"]:
             raise InputError(f"options: expected reset_mask or none over UDP, got {unknown[0]!r}")
-        if "reset_mask" in options and self._flying:
-            mask = checked_mask(options["reset_mask"], self.num_envs)
-            self.advance(self._nothing, mask, self._seeds(seed), ~mask)
+        in_flight = "reset_mask" in options and self._flying
+        if not in_flight:
+            self.connect()
+        mask, seeds = checked_mask(options.get("reset_mask"), self.num_envs), self._seeds(seed)
+        self._broken = None
+        if in_flight:
+            self.advance(self._nothing, mask, seeds, ~mask)
             return self.observations, self._info(mask)
         self._flying = False
-        self.connect()
-        mask, seeds = checked_mask(options.get("reset_mask"), self.num_envs), self._seeds(seed)
         self._reset_until_done(mask, seeds)
         self.done, self._idle = np.zeros(self.num_envs, bool), ~mask
         self._flying = True
@@ -299,6 +302,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         """Fly every drone for one control period; what follows an episode, the autoreset says."""
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        self._broken = None
         return super().step(actions)
 
     def advance(
@@ -308,23 +312,28 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         seeds: Seeds | None = None,
         frozen: np.ndarray | None = None,
     ) -> None:
-        """Reset some drones, freeze some, and fly the others: see `AdvancingVectorEnv`."""
+        """Reset some drones, freeze some, and fly the others: see `AdvancingVectorEnv`.
+
+        With seeds every drone has one, also where it is ignored.
+        """
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
         nobody = np.zeros(self.num_envs, bool)
+        if resets is not None and frozen is not None:
+            frozen = frozen & ~resets
         resets, frozen = nobody if resets is None else resets, nobody if frozen is None else frozen
         grounded = self.done | self._idle
         if (waiting := grounded & ~(resets | frozen)).any():
             first = int(waiting.argmax())
             raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
         sent = self._sent(actions, resets | frozen)
-        numbers = None if seeds is None else np.asarray(seeds, np.uint64)
+        numbers = None if seeds is None else self._seeds(seeds)
         rows: np.ndarray = np.all(frozen.reshape(self._shape), axis=1)
         slots = [slot for slot in range(self.num_simulators) if not rows[slot]]
         self._flying = False  # until the answers are there
         self._agent.exchange(self._orders(slots, sent, resets, numbers, frozen))
         lost = self._agent.lost
-        if any(lost) and seeds is not None:  # a simulator in place of a lost one knows none
+        if any(lost) and numbers is not None:  # a simulator in place of a lost one knows none
             lost = self._reset_until_done(resets, numbers, lost)
         before, telemetry = self._arrays, self.telemetry
         self._take_states(resets | frozen)
@@ -337,8 +346,9 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
             self.rewards[broken] = 0.0
             self.terminated[broken] = False
             self.truncated[broken] = True
-            reasons[~broken] = None
-            self._broken, self.lost = (reasons, broken), broken.copy()
+            earlier, told = self._broken or (None, nobody)  # in an earlier round trip of this step
+            self._broken = np.where(broken, reasons, earlier), broken | told
+            self.lost = broken
         self.done = self.terminated | self.truncated | (self.done & ~resets)
         self._idle = self._idle & ~resets
         self._flying = True
@@ -349,6 +359,9 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         self._flying = False
 
     def _seeds(self, seed: Any) -> np.ndarray | None:
+        """Seeds as they cross the wire. Raises `InputError`."""
+        if getattr(seed, "dtype", None) == np.uint64 and seed.shape == (self.num_envs,):
+            return np.asarray(seed)
         seeds = checked_seeds(seed, self.num_envs, MAX_UINT64)
         return None if seeds is None else np.array(seeds, np.uint64)
 
@@ -401,7 +414,6 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         self.rewards = np.where(still, 0.0, np.concatenate([s.rewards for s in states]))
         self.terminated = np.concatenate([s.terminated for s in states]) & ~still
         self.truncated = np.concatenate([s.truncated for s in states]) & ~still
-        self._broken = None
         self.lost = np.zeros(self.num_envs, bool)
 
     def _sent(self, actions: np.ndarray, idle: np.ndarray) -> np.ndarray:
@@ -423,10 +435,10 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         return sent
 
     def _info(self, mask: np.ndarray) -> dict[str, Any]:
-        info = super()._info(mask)
-        if self._broken:
-            info[LOST], info[f"_{LOST}"] = self._broken
-        return info
+        return super()._info(mask) | self._losses()
+
+    def _losses(self) -> dict[str, Any]:
+        return dict(zip((LOST, f"_{LOST}"), self._broken, strict=True)) if self._broken else {}
 
 
 def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:

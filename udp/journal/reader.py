@@ -152,7 +152,9 @@ class Recording:
             if isinstance(message, Hello):
                 layout_of(EnvSpec.from_json(message.spec), message.worlds)
             return message, data, codec
-        except (ValueError, KeyError, TypeError, AttributeError, DecodeError) as error:
+        except (
+            ValueError, KeyError, TypeError, AttributeError, RecursionError, DecodeError
+        ) as error:  # fmt: skip
             raise InputError(f"{self.path}: a message that cannot be read: {error}") from None
 
     def _records(self) -> Iterator[records.McapRecord]:

@@ -71,6 +71,7 @@ class Journal:
         self._path, self._side, self._model = Path(path), side, model
         self._text_hello = text_hello
         self._slots: Sequence[object] = ()
+        self._numbers: dict[int, int] = {}  # of the binary session in each slot
         self._holders: dict[int, object] = {}
         self._channels: dict[tuple[int, int], int] = {}  # by slot and kind: binary's or _SEEDED
         self._size = self._sessions = 0
@@ -114,7 +115,8 @@ class Journal:
         try:
             if isinstance(message, Hello):
                 self._begin(slot, message, datagram, "binary", now)
-            elif not message.session or (slot, binary.STATE) not in self._channels:
+                self._numbers[slot] = message.session
+            elif message.session != self._numbers.get(slot):  # no Hello: by text
                 self._begin_by_text(slot, now)
             if isinstance(message, State | Command):
                 seeded = isinstance(message, Command) and message.seeds is not None

@@ -19,7 +19,17 @@ from . import binary, text
 from . import messages as m
 from .auth import Key, is_sealed, message_of
 from .errors import DecodeError, Forged
-from .fragments import FAR, NEAR, Assembler, Transfer, Window, asks, is_fragment
+from .fragments import (
+    FAR,
+    LEAST,
+    NEAR,
+    Assembler,
+    Transfer,
+    Window,
+    asks,
+    check_size,
+    is_fragment,
+)
 from .layout import Layout
 from .messages import Command, Message, State, one_line
 from .statistics import Statistics
@@ -44,6 +54,9 @@ _LONGEST_RESEND: Final = 1.0  # longest wait before a resend, s
 _PATIENCE: Final = 8  # resends before the waits double: most that was lost was lost by chance
 _LATER: Final = 1.25
 """By so much each Alive for a State lengthens the wait before the next is asked for."""
+_LATEST: Final = 10.0
+"""Longest such wait, s; a quarter of the timeout, if that is less. A Command that was lost is asked
+for again before an agent takes the simulator for lost (30 s)."""
 _TOO_EARLY: Final = 1.5  # by so much round trips are taken for longer when answers come twice
 _AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING, Way.RECEIVED, Command]
 
@@ -67,7 +80,8 @@ class LinkConfig:
     """It gives up when nothing has answered for this long, s: longer than an agent waits for one
     to replace another that it has lost."""
     max_datagram: int | None = None
-    """Largest datagram, bytes, a seal not counted. None: 65,483 on loopback, 1,200 elsewhere."""
+    """Largest datagram, bytes, a seal not counted, at least 256. None: 65,483 on loopback, 1,200
+    elsewhere."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -75,7 +89,7 @@ class LinkConfig:
             right = value is None or (isfinite(value) and value > 0)
             expect(right, field.name, "a number > 0", f"{value}")
         most = self.max_datagram
-        expect(most is None or most >= 256, "max_datagram", "at least 256", f"{most}")
+        expect(most is None or most >= LEAST, "max_datagram", f"at least {LEAST}", f"{most}")
 
 
 class RoundTrips:
@@ -154,6 +168,10 @@ class Client:
         key: Shared with the agent. Then nothing unsealed is taken.
         draw_session: Gives the number of the next session.
 
+    Raises:
+        InputError: The layout is not of text, there is a key with text, or a message would take too
+            many datagrams.
+
     Attributes:
         sequence: Number of the State sent last: they count from 1.
         sends: How often the outstanding message was sent.
@@ -174,11 +192,13 @@ class Client:
         if by_text:
             expect(not key, "text codec", "no key", "one: only binary can be sealed")
             text.check_layout(layout)
+        check_size(max(layout.state_size, len(binary.encode(hello))), largest)
         self.hello = hello
         self.layout = layout
         self.state = SimulatorState.READY if by_text else SimulatorState.IDLE
         self.sequence = 0
-        self.sends = self._tries = self._alives = 0
+        self.sends = self._tries = 0
+        self._stretch = 1.0  # of the next wait, by the Alives for this State
         self.statistics = Statistics()
         self._config = config
         self._largest = largest
@@ -356,8 +376,9 @@ class Client:
             elif isinstance(message, m.Alive):  # others are late
                 self._round_trips.answered(now, alive=True)
                 self._progress(now)
-                self._alives += 1
-                self._resend_at = now + self._round_trips.wait(1) * _LATER**self._alives
+                self._stretch *= _LATER
+                wait = self._round_trips.wait(1) * self._stretch
+                self._resend_at = now + min(wait, _LATEST, self._config.timeout / 4)
             elif not self._is_queued:
                 self._is_queued = True
                 self.statistics.notice("every slot of the agent is taken; waiting for a free one")
@@ -466,7 +487,7 @@ class Client:
         self.state = SIMULATOR[self.state, Way.SENT, kind]
         self.sequence = 0 if isinstance(message, m.Hello) else message.sequence
         self.sends = self._tries = 1
-        self._alives = 0
+        self._stretch = 1.0
         self._round_trips.sent(now, first=True)
         self._put(transfer.start(), self._transfer_key)
         closing = kind is m.Close

@@ -15,18 +15,22 @@ from zlib import crc32
 
 import numpy as np
 
+from ...models.errors import expect
 from . import binary
 from .binary import HEADER_SIZE
 from .errors import DecodeError
 from .layout import MAX_MESSAGE
 from .messages import Missing
 
-__all__ = ["FAR", "NEAR", "Assembler", "Transfer", "Window", "asks", "is_fragment"]
+__all__ = [
+    "FAR", "LEAST", "NEAR", "Assembler", "Transfer", "Window", "asks", "check_size", "is_fragment"
+]  # fmt: skip
 
 NEAR: Final = 65_507 - 24
 """Largest datagram of the binary codec on loopback, bytes: UDP's over IPv4, less a seal."""
 FAR: Final = 1_200
 """The same elsewhere: less than any network's, so that no datagram is cut on its way."""
+LEAST: Final = 256  # the smallest that either side may be set to, bytes
 MAX_FRAGMENTS: Final = 1 << 14
 
 _FRAGMENT: Final = struct.Struct("<HHB3x")
@@ -37,6 +41,13 @@ _LARGEST_BURST: Final = 1 << 20
 _MOST_LOST: Final = 0.25  # A burst of which more was lost was too large for a buffer on its way
 _LARGEST_BITMAP: Final = 128
 """Bytes of the bitmap of a Missing: it says what 1,024 fragments are about."""
+
+
+def check_size(size: int, largest: int) -> None:
+    """Raise `InputError` if a message of so many bytes takes too many datagrams of the largest."""
+    least = ceil(size / MAX_FRAGMENTS) + _OVERHEAD
+    expected = f"at least {least} for messages of {size} bytes"
+    expect(largest >= least, "max_datagram", expected, f"{largest}")
 
 
 class Window:

@@ -15,12 +15,13 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from ...models.errors import InputError
 from . import binary, text
 from . import messages as m
 from .auth import OVERHEAD, Key, is_sealed, key_id, message_of
 from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address, Tap, largest_datagram
 from .errors import DecodeError, Forged, VersionMismatch
-from .fragments import Assembler, Transfer, Window, asks, is_fragment
+from .fragments import Assembler, Transfer, Window, asks, check_size, is_fragment
 from .layout import Layout
 from .messages import MAX_SPEC, Command, Message, State, one_line
 from .statistics import Statistics
@@ -315,7 +316,7 @@ class Server:
         elif opening and not self.closed:
             self._repeat(opening)
             self._drop("duplicate", "", arrival)
-        elif isinstance(layout := self._fit(hello), str):
+        elif isinstance(layout := self._fit(hello, address), str):
             self._refuse(hello.session, layout, address, size, key)
             self._drop("refused", layout, arrival)
         elif None in self.slots or address in self._slot_of:
@@ -323,7 +324,7 @@ class Server:
         else:
             self._let_wait(Session(address, hello.session, layout, hello, key=key), size)
 
-    def _fit(self, hello: m.Hello) -> Layout | str:
+    def _fit(self, hello: m.Hello, address: Address) -> Layout | str:
         """The layout of a simulator that is accepted, or the reason to refuse it."""
         if self.closed:
             return "the agent has closed"
@@ -332,7 +333,13 @@ class Server:
             return f"expected protocol version {binary.VERSION}, got {low} to {high}"
         if unknown := [e.number for e in hello.extensions if e.critical]:
             return f"expected no critical extension of type {unknown[0]}"
-        return self._accept(hello)
+        layout = self._accept(hello)
+        try:
+            if isinstance(layout, Layout):
+                check_size(layout.command_size, largest_datagram(address, self._max_datagram))
+        except InputError as error:
+            return str(error)
+        return layout
 
     def _welcome(self, hello: m.Hello, layout: Layout, address: Address, key: Key | None) -> None:
         self._queue.pop(address, None)
@@ -379,7 +386,7 @@ class Server:
                 self._forget(other)
             if other is opening:
                 break
-        layout = self._fit(opening.hello)  # another one may have come since its Hello
+        layout = self._fit(opening.hello, opening.peer)  # another one may have come since its Hello
         if isinstance(layout, str):
             words = _cut(layout, len(plain) - _REASON_AT)
             close = m.Close(session=opening.number, sequence=1, reason=words)

@@ -24,6 +24,7 @@ from ..protocol import text
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address
 from ..protocol.errors import PeerClosed, PeerSilent
+from ..protocol.fragments import LEAST
 from ..protocol.layout import Layout
 from ..protocol.messages import Close, Hello, State
 from ..protocol.server import Event, Server
@@ -77,6 +78,8 @@ class AgentConfig:
         for name in ("connect_timeout", "timeout"):
             seconds = getattr(self, name)
             expect(math.isfinite(seconds) and seconds > 0, name, "seconds > 0", f"{seconds}")
+        most = self.max_datagram
+        expect(most is None or most >= LEAST, "max_datagram", f"at least {LEAST}", f"{most}")
         if self.env_id is not None:
             object.__setattr__(self, "env_id", canonical_id(self.env_id))
             self.expected_options(self.env_id)
@@ -235,10 +238,11 @@ class Agent:
         session = self.server.slots[slot]
         assert session is not None
         self._keep_sockets()
-        self.spec, self._required.worlds = self._required.text_spec(), 1
         if session.hello:
             self.server.takes_text = False
             self.spec, self._required.worlds = _spec(session.hello.spec), session.hello.worlds
+        else:
+            self.spec, self._required.worlds = self._required.text_spec(), 1
         self._required.spec = self.spec
         if self.states[slot] is not None and not self.lost[slot]:
             self._lose(slot, f"the simulator at {address_text(address)} was started anew")
@@ -325,14 +329,17 @@ class _Required:
         return _spec_difference(self.spec, spec) if self.spec else ""
 
     def _text_spec(self) -> EnvSpec | None:
-        """Of a simulator that speaks text, for it tells none; None if text is not flown."""
+        """Of a simulator that speaks text, for it tells none; None if text is not flown.
+
+        It is the env with the paper's vehicle, made here: text is not flown where that cannot be.
+        """
         config, env_id = self.config, self.config.env_id
         if env_id is None or not registry.is_known(env_id) or config.worlds not in (None, 1):
             return None
-        spec = registry.env_spec(env_id, dict(config.options or {}))
         try:
+            spec = registry.env_spec(env_id, dict(config.options or {}))
             text.check_layout(layout_of(spec))
-        except InputError:
+        except (InputError, ImportError):  # the latter without MuJoCo
             return None
         return spec
 
