@@ -72,7 +72,7 @@ def _check_returned(
         told = list(outcome.metrics)
         expect(metric.name in told, f"the metric {metric.name!r}, got {told}")
     expect(
-        alone or any(hasattr(term, "shape") for term in outcome.reward.values()),
+        alone or any(getattr(term, "shape", ()) for term in outcome.reward.values()),
         f"a reward for each drone, got {outcome.reward}: make an array of it, as "
         "1.0 + 0.0 * state.position[..., 2]",
     )
@@ -282,14 +282,16 @@ class Loop(NotCopied):
         for term in self.terms.values():
             total = total + term
         if not self.world.shape:  # a single drone's numbers
-            self.rewards = np.array((total,))
+            self.rewards = np.array((total,), np.float64)
             may_end = bool(ended or late)
             # New arrays, as below; an array of truth values is fastest as a copy of another.
             self.terminated, self.truncated = self._nobody.copy(), self._nobody.copy()
             if may_end:
                 self.terminated[0], self.truncated[0] = ended, late
         else:
-            self.rewards = self._xp.reshape(total, (n,))
+            # A task may compute in float32.
+            total = np.asarray(total, np.float64) if self._xp is np else total
+            self.rewards = total.reshape(n)
             # New arrays, whatever the task gave: arrays of earlier steps must not change.
             self.terminated = (ended | self._none).reshape(n)
             self.truncated = late.reshape(n)
@@ -388,7 +390,7 @@ class Loop(NotCopied):
             told[:, at["goal"]] = self._goal[1]
         if self._outcome is not None:
             for column, metric in enumerate(self.task.metrics, told.shape[1] - self._told):
-                told[:, column] = on_host(self._outcome.metrics[metric.name]).reshape(n)
+                told[:, column] = on_host(self._outcome.metrics[metric.name]).reshape(-1)
         return told
 
     def row(self) -> list[float]:
@@ -426,6 +428,8 @@ class Loop(NotCopied):
     def _per_drone(self, values: Array) -> Array:
         if not self.world.shape:
             return np.array((values,))
+        if not getattr(values, "shape", ()):  # one number for all drones
+            values = values + 0.0 * self._nobody
         return _as_type(values.reshape(self.num_envs), values.dtype)
 
 

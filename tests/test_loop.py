@@ -175,6 +175,27 @@ def test_what_a_step_gave_stays_as_it_was(careless: str, num_envs: int) -> None:
     assert loop.metrics["climb"] == pytest.approx(0.12, abs=1e-9)
 
 
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_a_task_may_give_constants_and_float32(num_envs: int) -> None:
+    class Plain(registry.task_type(ID)):  # type: ignore[misc]
+        def outcome(self, state: Any) -> Any:
+            outcome = super().outcome(state)
+            height = np.float32(1) * np.asarray(state.position[..., 2], np.float32)
+            outcome.reward = {"alive": 1.0, "height": height}
+            outcome.metrics = {"elevation_error": 0.25}
+            return outcome
+
+    register("Plain-v0", Plain)
+    loop, still = Loop("Plain-v0", num_envs), np.zeros((num_envs, 1), np.float32)
+    loop.advance(still, np.ones(num_envs, bool), chosen={"start": np.full(num_envs, 4.5)})
+    loop.advance(still)
+    assert loop.rewards.dtype == np.float64
+    assert loop.rewards.tolist() == [5.5] * num_envs
+    assert loop.reward_terms["alive"].tolist() == [1.0] * num_envs
+    assert loop.metrics["elevation_error"].tolist() == [0.25] * num_envs
+    assert loop.telemetry["metrics"].tolist() == [[0.25]] * num_envs
+
+
 def test_several_arrays_are_a_dict(careless: str) -> None:
     env = gym.make(careless, disable_env_checker=True)
     check_env(env.unwrapped, skip_render_check=True)
