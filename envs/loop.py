@@ -18,6 +18,7 @@ from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..models.vehicle import Vehicle
 from ..sim import Array, Backend, Draw, PhysicsError, Pose, World, make_world, on_host
 from . import registry
+from .autoreset import Seeds, checked_seeds
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
 
@@ -144,7 +145,8 @@ class Loop(NotCopied):
         terms: Terms of the last rewards by name, with the leading axes of the world.
 
     Raises:
-        InputError: An argument, seed or action is not what it should be; nothing has changed.
+        InputError: An argument, seed or action is not what it should be; nothing has changed, but
+            for a start that the task refuses: see `advance`.
         PhysicsError: A state is bad; reset the drones that flew.
         gymnasium.error.ResetNeeded: An action came before an episode's beginning or after its end.
     """
@@ -192,14 +194,15 @@ class Loop(NotCopied):
         self,
         actions: Array,
         resets: Array | None = None,
-        seeds: Sequence[int | None] | np.ndarray | None = None,
+        seeds: Seeds | None = None,
         frozen: Array | None = None,
         chosen: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Reset some drones, freeze some, and fly the others for one control period.
 
         As `AdvancingVectorEnv.advance`; `chosen` has by the names of `Task.choices` what replaces
-        a draw, shape (N,).
+        a draw, shape (N,). Where the task refuses such a start, the others have flown, those to be
+        reset are where they were, and their streams of random numbers have moved on.
         """
         resets, frozen = self.ours(resets), self.ours(frozen)
         idle = resets if frozen is None else frozen if resets is None else resets | frozen
@@ -209,9 +212,12 @@ class Loop(NotCopied):
             if waiting.any():
                 first = f"env {int(waiting.nonzero()[0][0])}"
                 raise gym.error.ResetNeeded(f"step: expected a call of reset() for {first} first")
+        begins = resets is not None and resets.any()
+        if begins:
+            seeds = checked_seeds(seeds, self.num_envs)
         if flown is None or flown.any():
             self._fly(actions, flown)
-        if resets is not None and resets.any():
+        if begins:
             self._begin(resets, seeds, chosen or {})
         self._look(flown)
 
@@ -239,14 +245,12 @@ class Loop(NotCopied):
             everybody = (~self._nobody).reshape(lead)[()]
             if not mask.all():
                 world.reset(everybody, self._start(everybody, world.draw(everybody)))
-            self._begun = True
         some = mask.reshape(lead)[()]
         if seeds is not None:
-            if len(seeds) != self.num_envs:
-                raise InputError(f"seeds: expected {self.num_envs}, got {len(seeds)}")
             world.seed(some, seeds)
         draws = {name: values.reshape(lead)[()] for name, values in chosen.items()}
         world.reset(some, self._start(some, world.draw(some, draws)))
+        self._begun = True
         self._steps = self._xp.where(some, 0, self._steps)[()]
         self._waiting = self._waiting & ~mask
         self._anyone_waits = bool(self._waiting.any())

@@ -44,7 +44,8 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         options: Of the task, by name.
 
     Raises:
-        InputError: An option, seed or action is not what it should be; the envs are as before.
+        InputError: An option, seed or action is not what it should be; the drones are as before.
+            A start that is refused has used their streams of random numbers: seed them again.
         PhysicsError: The physics reported a bad state; `reset` makes the envs usable again.
         gymnasium.error.ResetNeeded: A step before a reset, or (DISABLED) after an episode's end.
     """

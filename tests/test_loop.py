@@ -73,9 +73,25 @@ def test_masks_and_seeds_of_another_shape_are_refused(num_envs: int) -> None:
         for name in ("resets", "frozen"):
             with pytest.raises(InputError, match=r"^resets, frozen: expected bool of shape"):
                 loop.advance(actions, **{name: wrong})  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=rf"^seeds: expected {num_envs}, got 3"):
-        loop.advance(actions, every, [1, 2, 3])
+    for seeds in ([1, 2, 3], [-1] * num_envs):
+        with pytest.raises(InputError, match=rf"^seed: expected .* from 0 on, or {num_envs} of"):
+            loop.advance(actions, every, seeds)
     assert shown(loop, 0) == before
+
+
+def test_wrong_seeds_are_refused_before_the_others_fly() -> None:
+    loop, actions = started()
+    with pytest.raises(InputError, match=r"^seed: expected .*, or 2 of them, got \[1\]"):
+        loop.advance(actions, np.array([True, False]), [1])
+    assert loop.steps.tolist() == [0, 0]
+
+
+def test_a_first_reset_that_is_refused_begins_nothing() -> None:
+    loop, still, some = Loop(ID, 2), np.zeros((2, 1), np.float32), np.array([True, False])
+    with pytest.raises(InputError, match=r"^start: expected at least"):
+        loop.advance(still, np.ones(2, bool), chosen={"start": np.full(2, 1e5)})
+    loop.advance(still, some, frozen=~some)
+    assert abs(loop.telemetry["position"][:, 1] - 5.0).max() <= 1.0
 
 
 def test_the_first_reset_may_be_of_some() -> None:
