@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from mujoco.batch import Batch, SimulationError
 from rotorgram.envs import LocalVectorEnv, Loop
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError
@@ -230,6 +231,26 @@ def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
         loop.advance(still)
     loop.advance(still, every, [0, 1, 2])
     assert loop.observations["observation"].tobytes() == before.tobytes()
+    loop.advance(still)
+
+
+def test_an_error_of_the_physics_leaves_no_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Env 1 goes bad in the call in which MuJoCo fails in env 0."""
+    loop, step = Loop(ID, 2), Batch.step
+
+    def failing(batch: Any, *arguments: Any, **named: Any) -> None:
+        step(batch, *arguments, **named)
+        raise SimulationError(np.array([0]), "out of memory")
+
+    still, first = np.zeros((2, 1), np.float32), np.array([True, False])
+    loop.advance(still, first | True, [0, 1])
+    loop.world.state.velocity[1, 0, 2] = 1e12
+    with monkeypatch.context() as patch, pytest.raises(PhysicsError, match="out of memory"):
+        patch.setattr(Batch, "step", failing)
+        loop.advance(still)
+    loop.advance(still, first, frozen=~first)
+    loop.advance(still, frozen=~first)
+    loop.advance(still, ~first)
     loop.advance(still)
 
 
