@@ -149,6 +149,7 @@ class Loop(NotCopied):
             for a start that the task refuses: see `advance`.
         PhysicsError: A state is bad; reset the drones that flew.
         gymnasium.error.ResetNeeded: An action came before an episode's beginning or after its end.
+        gymnasium.error.ClosedEnvironmentError: A step or a reset after `close`.
     """
 
     def __init__(
@@ -179,7 +180,7 @@ class Loop(NotCopied):
         self.observations: dict[str, Array] = {}
         self._steps: Array = (0 * self._nobody).reshape(lead)[()]
         self._waiting, self._anyone_waits = ~self._nobody, True  # for a reset
-        self._begun = False
+        self._begun = self._closed = False
         self._outcome: Outcome | None = None
         self.terms: dict[str, Array] = {}
         self._telemetry: np.ndarray | None = None
@@ -207,7 +208,9 @@ class Loop(NotCopied):
         resets, frozen = self.ours(resets), self.ours(frozen)
         idle = resets if frozen is None else frozen if resets is None else resets | frozen
         flown = None if idle is None or not idle.any() else ~idle
-        if self._anyone_waits:
+        if self._anyone_waits:  # always after `close`
+            if self._closed:
+                raise gym.error.ClosedEnvironmentError("expected an open env, got a closed one")
             waiting = self._waiting if flown is None else self._waiting & flown
             if waiting.any():
                 first = f"env {int(waiting.nonzero()[0][0])}"
@@ -415,8 +418,9 @@ class Loop(NotCopied):
         return row
 
     def close(self) -> None:
-        """Release threads and memory."""
+        """Release threads and memory; what the last step gave can be read on."""
         self.world.close()
+        self._closed = self._anyone_waits = True
 
     def ours(self, mask: Array | None) -> Array | None:
         """A mask that the caller gave, NumPy's or a tensor, as an array of the world's kind."""

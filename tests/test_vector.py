@@ -278,6 +278,35 @@ def test_the_registered_entry_point() -> None:
         assert isinstance(gym.make_vec(env_id, num_envs=2), LocalVectorEnv)
 
 
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_a_closed_env_says_so(num_envs: int) -> None:
+    env = LocalVectorEnv(ID, num_envs)
+    env.reset(seed=0)
+    before = env.telemetry["position"].copy()
+    env.close()
+    env.close()
+    for call in (env.reset, lambda: env.step(np.zeros((num_envs, 1), np.float32))):
+        with pytest.raises(gym.error.ClosedEnvironmentError, match="expected an open env"):
+            call()
+    assert env.telemetry["position"].tobytes() == before.tobytes()
+
+
+TASKS = Path("/proc/self/task")
+
+
+@pytest.mark.skipif(not TASKS.is_dir(), reason="no list of threads here")
+def test_closing_ends_the_threads() -> None:
+    others = set(os.listdir(TASKS))
+    env = LocalVectorEnv(ID, 8, num_threads=4)
+    ours = set(os.listdir(TASKS)) - others
+    assert len(ours) == 3  # and the caller's
+    env.close()
+    deadline = time.monotonic() + 5.0  # one that is joined may be listed a little longer
+    while ours & set(os.listdir(TASKS)) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not ours & set(os.listdir(TASKS))
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
 def test_threads_do_not_follow_into_a_fork() -> None:
     """A child has no thread that would step its drones: it is told, and does not wait for them."""

@@ -124,7 +124,13 @@ class MujocoWorld:
         return NumpyDraw(self._streams, np.flatnonzero(mask).tolist(), self.shape, chosen)
 
     def close(self) -> None:
-        """Nothing to release but memory."""
+        """As `World.close`."""
+        if self._owner not in (None, os.getpid()):
+            return  # a fork has none of the threads
+        state = {name: getattr(self.state, name).copy() for name in WorldState.__slots__}
+        self.state = WorldState(**state)
+        for view in ("_batch", "_ctrl", "_contacts", "_warnings", "_thrust"):
+            vars(self).pop(view, None)
 
     def _check_process(self) -> None:
         if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
