@@ -215,7 +215,7 @@ class Loop(NotCopied):
             if waiting.any():
                 first = f"env {int(waiting.nonzero()[0][0])}"
                 raise gym.error.ResetNeeded(f"step: expected a call of reset() for {first} first")
-        begins = resets is not None and resets.any()
+        begins = resets is not None and bool(resets.any())
         if begins:
             seeds = checked_seeds(seeds, self.num_envs)
         if flown is None or flown.any():
@@ -285,7 +285,8 @@ class Loop(NotCopied):
         self._outcome = outcome
         ended: Array = outcome.terminated
         late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b
-        self.terms, total = outcome.reward, 0.0
+        self.terms = outcome.reward
+        total: Array = 0.0
         for term in self.terms.values():
             total = total + term
         if not self.world.shape:  # a single drone's numbers
