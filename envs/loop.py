@@ -18,6 +18,7 @@ from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..models.vehicle import Vehicle
 from ..sim import Array, Backend, Draw, PhysicsError, Pose, World, make_world, on_host
 from . import registry
+from .autoreset import Seeds, checked_seeds
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
 
@@ -72,7 +73,7 @@ def _check_returned(
         told = list(outcome.metrics)
         expect(metric.name in told, f"the metric {metric.name!r}, got {told}")
     expect(
-        alone or any(hasattr(term, "shape") for term in outcome.reward.values()),
+        alone or any(getattr(term, "shape", ()) for term in outcome.reward.values()),
         f"a reward for each drone, got {outcome.reward}: make an array of it, as "
         "1.0 + 0.0 * state.position[..., 2]",
     )
@@ -144,9 +145,11 @@ class Loop(NotCopied):
         terms: Terms of the last rewards by name, with the leading axes of the world.
 
     Raises:
-        InputError: An argument, seed or action is not what it should be; nothing has changed.
+        InputError: An argument, seed or action is not what it should be; nothing has changed, but
+            for a start that the task refuses: see `advance`.
         PhysicsError: A state is bad; reset the drones that flew.
         gymnasium.error.ResetNeeded: An action came before an episode's beginning or after its end.
+        gymnasium.error.ClosedEnvironmentError: A step or a reset after `close`.
     """
 
     def __init__(
@@ -177,7 +180,7 @@ class Loop(NotCopied):
         self.observations: dict[str, Array] = {}
         self._steps: Array = (0 * self._nobody).reshape(lead)[()]
         self._waiting, self._anyone_waits = ~self._nobody, True  # for a reset
-        self._begun = False
+        self._begun = self._closed = False
         self._outcome: Outcome | None = None
         self.terms: dict[str, Array] = {}
         self._telemetry: np.ndarray | None = None
@@ -192,26 +195,32 @@ class Loop(NotCopied):
         self,
         actions: Array,
         resets: Array | None = None,
-        seeds: Sequence[int | None] | np.ndarray | None = None,
+        seeds: Seeds | None = None,
         frozen: Array | None = None,
         chosen: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Reset some drones, freeze some, and fly the others for one control period.
 
         As `AdvancingVectorEnv.advance`; `chosen` has by the names of `Task.choices` what replaces
-        a draw, shape (N,).
+        a draw, shape (N,). Where the task refuses such a start, the others have flown, those to be
+        reset are where they were, and their streams of random numbers have moved on.
         """
         resets, frozen = self.ours(resets), self.ours(frozen)
         idle = resets if frozen is None else frozen if resets is None else resets | frozen
         flown = None if idle is None or not idle.any() else ~idle
-        if self._anyone_waits:
+        if self._anyone_waits:  # always after `close`
+            if self._closed:
+                raise gym.error.ClosedEnvironmentError("expected an open env, got a closed one")
             waiting = self._waiting if flown is None else self._waiting & flown
             if waiting.any():
                 first = f"env {int(waiting.nonzero()[0][0])}"
                 raise gym.error.ResetNeeded(f"step: expected a call of reset() for {first} first")
+        begins = resets is not None and bool(resets.any())
+        if begins:
+            seeds = checked_seeds(seeds, self.num_envs)
         if flown is None or flown.any():
             self._fly(actions, flown)
-        if resets is not None and resets.any():
+        if begins:
             self._begin(resets, seeds, chosen or {})
         self._look(flown)
 
@@ -239,14 +248,12 @@ class Loop(NotCopied):
             everybody = (~self._nobody).reshape(lead)[()]
             if not mask.all():
                 world.reset(everybody, self._start(everybody, world.draw(everybody)))
-            self._begun = True
         some = mask.reshape(lead)[()]
         if seeds is not None:
-            if len(seeds) != self.num_envs:
-                raise InputError(f"seeds: expected {self.num_envs}, got {len(seeds)}")
             world.seed(some, seeds)
         draws = {name: values.reshape(lead)[()] for name, values in chosen.items()}
         world.reset(some, self._start(some, world.draw(some, draws)))
+        self._begun = True
         self._steps = self._xp.where(some, 0, self._steps)[()]
         self._waiting = self._waiting & ~mask
         self._anyone_waits = bool(self._waiting.any())
@@ -278,18 +285,21 @@ class Loop(NotCopied):
         self._outcome = outcome
         ended: Array = outcome.terminated
         late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b
-        self.terms, total = outcome.reward, 0.0
+        self.terms = outcome.reward
+        total: Array = 0.0
         for term in self.terms.values():
             total = total + term
         if not self.world.shape:  # a single drone's numbers
-            self.rewards = np.array((total,))
+            self.rewards = np.array((total,), np.float64)
             may_end = bool(ended or late)
             # New arrays, as below; an array of truth values is fastest as a copy of another.
             self.terminated, self.truncated = self._nobody.copy(), self._nobody.copy()
             if may_end:
                 self.terminated[0], self.truncated[0] = ended, late
         else:
-            self.rewards = self._xp.reshape(total, (n,))
+            # A task may compute in float32.
+            total = np.asarray(total, np.float64) if self._xp is np else total
+            self.rewards = total.reshape(n)
             # New arrays, whatever the task gave: arrays of earlier steps must not change.
             self.terminated = (ended | self._none).reshape(n)
             self.truncated = late.reshape(n)
@@ -388,7 +398,7 @@ class Loop(NotCopied):
             told[:, at["goal"]] = self._goal[1]
         if self._outcome is not None:
             for column, metric in enumerate(self.task.metrics, told.shape[1] - self._told):
-                told[:, column] = on_host(self._outcome.metrics[metric.name]).reshape(n)
+                told[:, column] = on_host(self._outcome.metrics[metric.name]).reshape(-1)
         return told
 
     def row(self) -> list[float]:
@@ -409,8 +419,9 @@ class Loop(NotCopied):
         return row
 
     def close(self) -> None:
-        """Release threads and memory."""
+        """Release threads and memory; what the last step gave can be read on."""
         self.world.close()
+        self._closed = self._anyone_waits = True
 
     def ours(self, mask: Array | None) -> Array | None:
         """A mask that the caller gave, NumPy's or a tensor, as an array of the world's kind."""
@@ -426,6 +437,8 @@ class Loop(NotCopied):
     def _per_drone(self, values: Array) -> Array:
         if not self.world.shape:
             return np.array((values,))
+        if not getattr(values, "shape", ()):  # one number for all drones
+            values = values + 0.0 * self._nobody
         return _as_type(values.reshape(self.num_envs), values.dtype)
 
 

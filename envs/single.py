@@ -34,6 +34,7 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         InputError: An option or action is not what it should be; the env is as before.
         PhysicsError: The physics reported a bad state; `reset` makes the env usable again.
         gymnasium.error.ResetNeeded: A step before a reset, or after an episode's end.
+        gymnasium.error.ClosedEnvironmentError: A step or a reset after `close`.
         rotorgram.rendering.NoOpenGL: There is nothing to draw with, or no display.
     """
 
@@ -89,7 +90,7 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         return pictures[0] if pictures else None
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window, if there is one; release memory."""
         self._renderer.close()
         self._loop.close()
 

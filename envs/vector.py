@@ -44,9 +44,11 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         options: Of the task, by name.
 
     Raises:
-        InputError: An option, seed or action is not what it should be; the envs are as before.
+        InputError: An option, seed or action is not what it should be; the drones are as before.
+            A start that is refused has used their streams of random numbers: seed them again.
         PhysicsError: The physics reported a bad state; `reset` makes the envs usable again.
         gymnasium.error.ResetNeeded: A step before a reset, or (DISABLED) after an episode's end.
+        gymnasium.error.ClosedEnvironmentError: A step or a reset after `close`.
     """
 
     def __init__(
@@ -102,7 +104,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         return self._renderer.render(self._episodes.tolist())
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the window, if there is one."""
+        """Close the window, if there is one; release threads and memory."""
         self._renderer.close()
         self._loop.close()
 

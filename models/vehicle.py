@@ -31,6 +31,7 @@ MOST_HEIGHT: Final = 1e4
 """Height above which no craft may touch anything, m."""
 
 _RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves
+_ROUNDED: Final = 1e-5  # of the weight, sideways: what a file's six digits leave
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +79,7 @@ class Vehicle:
     """Effect of one newton of each rotor, shape (4, R): thrust along body z (N), and torque about
     body x, y and z at the center of mass (N·m)."""
     hover_thrust: np.ndarray
-    """Thrusts at which the level craft neither moves nor turns, shape (R,), N."""
+    """Thrusts at which the level craft neither moves nor turns, all above 0, shape (R,), N."""
     rest_height: float
     """Height of the body's origin when it touches level ground, m."""
 
@@ -250,23 +251,31 @@ def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
 
 
 def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> np.ndarray:
-    """Thrusts that carry the weight and turn nothing: equal ones, or the least of all.
+    """Thrusts that carry the weight, turn nothing and push nowhere else: equal, or the least.
 
-    Raises `InputError` if there are none within the rotors' limits.
+    Raises `InputError` if there are none above 0 and within the rotors' limits.
     """
-    wanted = np.array((weight, 0.0, 0.0, 0.0))
+    wanted, drift = np.array((weight, 0.0, 0.0, 0.0)), _ROUNDED * weight
+    sideways = np.array([rotor.axis[:2] for rotor in rotors]).T
     total = float(allocation[0].sum())
     thrust = np.full(len(rotors), weight / total if total > 0 else 0.0)
     scale = weight * max(1e-3, float(np.abs(allocation[1:]).max()))
     if np.abs(allocation @ thrust - wanted).max() > _RELATIVE * scale:
         thrust = np.linalg.lstsq(allocation, wanted, rcond=None)[0]
-    hovers = np.abs(allocation @ thrust - wanted).max() <= 1e-6 * scale
-    expect(hovers, "vehicle", "rotors that can hover level", "ones that cannot")
+    if np.abs(sideways @ thrust).max() > drift:
+        every = np.vstack((allocation, sideways))
+        thrust = np.linalg.lstsq(every, np.append(wanted, (0.0, 0.0)), rcond=None)[0]
+    steady = np.abs(allocation @ thrust - wanted).max() <= 1e-6 * scale
+    hovers = steady and np.abs(sideways @ thrust).max() <= drift
+    able = "rotors that can carry the level craft without a torque or a sideways force"
+    expect(hovers, "vehicle", able, "ones that cannot")
     for rotor, newtons in zip(rotors, thrust.tolist(), strict=True):
-        share = f"its share of the weight, {newtons:.4g} N, within its limits"
+        carries = f"rotor {rotor.name} to carry"
+        part = f"{carries} a part of the weight of the level craft"
+        expect(newtons > _RELATIVE * weight, "vehicle", part, f"{newtons:.4g} N")
+        share = f"{carries} its share of the weight, {newtons:.4g} N, within its limits"
         got = f"{rotor.low:g} to {rotor.high:g} N"
-        carries = rotor.low <= newtons < rotor.high
-        expect(carries, "vehicle", f"rotor {rotor.name} to carry {share}", got)
+        expect(rotor.low <= newtons < rotor.high, "vehicle", share, got)
     return thrust
 
 

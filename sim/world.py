@@ -71,7 +71,7 @@ class World(Protocol):
         """A `Draw` for the worlds of the mask; `chosen` as in `random.NumpyDraw`."""
 
     def close(self) -> None:
-        """Release threads and memory."""
+        """Release threads and memory. The state keeps its numbers; nothing else can be called."""
 
 
 def contact_check(timestep: float) -> int:

@@ -88,6 +88,15 @@ def test_metrics_by_hand() -> None:
     assert metrics["heading_error"] == pytest.approx(20.0)  # 190 to the left of it: past the back
 
 
+def test_thrust_below_zero_is_observed(tmp_path: Path) -> None:
+    """-20 N over 49 N: rotors that push down as well."""
+    text = Vehicle.load().path.read_text()
+    file = tmp_path / "reverse.xml"
+    file.write_text(text.replace('ctrlrange="0 100"', 'ctrlrange="-20 100"'))
+    seen = make_task(ID, {}, file).observe(state_of(thrust=(-20.0,) * 4))["observation"]
+    assert seen[15:] == pytest.approx([-20 / 49 - 1] * 4)
+
+
 @pytest.mark.parametrize("file", [None, HEXA], ids=["paper", "hexa"])
 def test_actions_are_thrusts_between_the_limits(file: Path | None) -> None:
     vehicle = Vehicle.load(file)

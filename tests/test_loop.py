@@ -73,9 +73,25 @@ def test_masks_and_seeds_of_another_shape_are_refused(num_envs: int) -> None:
         for name in ("resets", "frozen"):
             with pytest.raises(InputError, match=r"^resets, frozen: expected bool of shape"):
                 loop.advance(actions, **{name: wrong})  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=rf"^seeds: expected {num_envs}, got 3"):
-        loop.advance(actions, every, [1, 2, 3])
+    for seeds in ([1, 2, 3], [-1] * num_envs):
+        with pytest.raises(InputError, match=rf"^seed: expected .* from 0 on, or {num_envs} of"):
+            loop.advance(actions, every, seeds)
     assert shown(loop, 0) == before
+
+
+def test_wrong_seeds_are_refused_before_the_others_fly() -> None:
+    loop, actions = started()
+    with pytest.raises(InputError, match=r"^seed: expected .*, or 2 of them, got \[1\]"):
+        loop.advance(actions, np.array([True, False]), [1])
+    assert loop.steps.tolist() == [0, 0]
+
+
+def test_a_first_reset_that_is_refused_begins_nothing() -> None:
+    loop, still, some = Loop(ID, 2), np.zeros((2, 1), np.float32), np.array([True, False])
+    with pytest.raises(InputError, match=r"^start: expected at least"):
+        loop.advance(still, np.ones(2, bool), chosen={"start": np.full(2, 1e5)})
+    loop.advance(still, some, frozen=~some)
+    assert abs(loop.telemetry["position"][:, 1] - 5.0).max() <= 1.0
 
 
 def test_the_first_reset_may_be_of_some() -> None:
@@ -173,6 +189,27 @@ def test_what_a_step_gave_stays_as_it_was(careless: str, num_envs: int) -> None:
     assert loop.observations["position"].shape == (num_envs, 3)
     # 40 N on 20 kg: 2 m/s² for 3 steps of 0.02 s
     assert loop.metrics["climb"] == pytest.approx(0.12, abs=1e-9)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_a_task_may_give_constants_and_float32(num_envs: int) -> None:
+    class Plain(registry.task_type(ID)):  # type: ignore[misc]
+        def outcome(self, state: Any) -> Any:
+            outcome = super().outcome(state)
+            height = np.float32(1) * np.asarray(state.position[..., 2], np.float32)
+            outcome.reward = {"alive": 1.0, "height": height}
+            outcome.metrics = {"elevation_error": 0.25}
+            return outcome
+
+    register("Plain-v0", Plain)
+    loop, still = Loop("Plain-v0", num_envs), np.zeros((num_envs, 1), np.float32)
+    loop.advance(still, np.ones(num_envs, bool), chosen={"start": np.full(num_envs, 4.5)})
+    loop.advance(still)
+    assert loop.rewards.dtype == np.float64
+    assert loop.rewards.tolist() == [5.5] * num_envs
+    assert loop.reward_terms["alive"].tolist() == [1.0] * num_envs
+    assert loop.metrics["elevation_error"].tolist() == [0.25] * num_envs
+    assert loop.telemetry["metrics"].tolist() == [[0.25]] * num_envs
 
 
 def test_several_arrays_are_a_dict(careless: str) -> None:

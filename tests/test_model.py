@@ -227,6 +227,15 @@ def test_rotors_whose_sites_point_down() -> None:
     )
 
 
+def test_tilted_rotors_share_the_weight_without_a_drift(tmp_path: Path) -> None:
+    gears = ("0.6 0 0.8 0 0 0", "-0.28 0 0.96 0 0 0")
+    motors = "".join(f'<motor class="quad" site="imu" gear="{gear}"/>' for gear in gears)
+    hover = Vehicle.load(_moved(tmp_path, "</actuator>", motors + "</actuator>")).hover_thrust
+    assert 0.6 * hover[4] == pytest.approx(0.28 * hover[5], rel=1e-9)
+    weight = hover[:4].sum() + 0.8 * hover[4] + 0.96 * hover[5]
+    assert weight == pytest.approx(20 * 9.8, rel=1e-9)
+
+
 def test_a_vehicle_is_never_copied_and_is_pickled_by_its_file() -> None:
     vehicle = Vehicle.load(DATA / "hexa.xml", linear_drag=0.5)
     assert copy.deepcopy(vehicle) is vehicle
@@ -292,6 +301,7 @@ FREE = '<freejoint name="free"/>'
 WALL = '<worldbody><geom type="plane" size="1 1 1"/><geom type="plane" size="1 1 1" zaxis="1 0 0"/>'
 SECOND = '<body pos="3 0 0"><freejoint/><geom size="0.1" mass="1"/></body></worldbody>'
 ROTOR1 = '<motor name="rotor1" class="quad" site="rotor1" gear="0 0 1 0 0  0.05"/>'
+PUSHER = '<actuator><motor name="push" class="quad" site="imu" gear="1 0 0 0 0 0"/>'
 SPHERES = '<replicate count="3000000" offset="0 0 1"><geom size="0.1"/></replicate>'
 NESTED = 2 * '<replicate count="300">' + '<geom size="0.1"/>' + 2 * "</replicate>"
 GRID = '<flexcomp name="f" type="grid" count="300 300 300" spacing="1 1 1" dim="3"/>'
@@ -315,6 +325,8 @@ HEIGHTS = '<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>
         (ROTOR1, ROTOR1.replace("0 0 1 0", "0 0 0 0"), "rotor1 to have a thrust with limits"),
         ('ctrllimited="true"', 'ctrllimited="false"', "rotor1 to have a thrust with limits"),
         ('ctrlrange="0 100"', 'ctrlrange="0 40"', r"49 N, within its limits, got 0 to 40 N"),
+        ('gear="0 0 1', 'gear="0.2 0 1', "without a torque or a sideways force, got ones that cannot"),
+        ("<actuator>", PUSHER, "rotor push to carry a part of the weight of the level craft, got"),
         ('gravity="0 0 -9.8"', 'gravity="0 1 -9.8"', "gravity along -z, got 20 kg and"),
         ('gravity="0 0 -9.8"', 'gravity="0 0 0"', "gravity along -z, got 20 kg and"),
         ("<worldbody>", WALL, "free above the ground, got one that touches something at .* m"),

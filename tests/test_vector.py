@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from mujoco.batch import Batch, SimulationError
 from rotorgram.envs import LocalVectorEnv, Loop
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError
@@ -233,6 +234,26 @@ def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
     loop.advance(still)
 
 
+def test_an_error_of_the_physics_leaves_no_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Env 1 goes bad in the call in which MuJoCo fails in env 0."""
+    loop, step = Loop(ID, 2), Batch.step
+
+    def failing(batch: Any, *arguments: Any, **named: Any) -> None:
+        step(batch, *arguments, **named)
+        raise SimulationError(np.array([0]), "out of memory")
+
+    still, first = np.zeros((2, 1), np.float32), np.array([True, False])
+    loop.advance(still, first | True, [0, 1])
+    loop.world.state.velocity[1, 0, 2] = 1e12
+    with monkeypatch.context() as patch, pytest.raises(PhysicsError, match="out of memory"):
+        patch.setattr(Batch, "step", failing)
+        loop.advance(still)
+    loop.advance(still, first, frozen=~first)
+    loop.advance(still, frozen=~first)
+    loop.advance(still, ~first)
+    loop.advance(still)
+
+
 def test_tilted_drones_cost_what_level_ones_do() -> None:
     """1,024 drones, telemetry and all: nothing is computed drone by drone."""
     envs = {
@@ -255,6 +276,35 @@ def test_the_registered_entry_point() -> None:
     for env_id in (ID, HOVER):
         assert gym.spec(env_id).vector_entry_point == "rotorgram.envs.vector:LocalVectorEnv"
         assert isinstance(gym.make_vec(env_id, num_envs=2), LocalVectorEnv)
+
+
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_a_closed_env_says_so(num_envs: int) -> None:
+    env = LocalVectorEnv(ID, num_envs)
+    env.reset(seed=0)
+    before = env.telemetry["position"].copy()
+    env.close()
+    env.close()
+    for call in (env.reset, lambda: env.step(np.zeros((num_envs, 1), np.float32))):
+        with pytest.raises(gym.error.ClosedEnvironmentError, match="expected an open env"):
+            call()
+    assert env.telemetry["position"].tobytes() == before.tobytes()
+
+
+TASKS = Path("/proc/self/task")
+
+
+@pytest.mark.skipif(not TASKS.is_dir(), reason="no list of threads here")
+def test_closing_ends_the_threads() -> None:
+    others = set(os.listdir(TASKS))
+    env = LocalVectorEnv(ID, 8, num_threads=4)
+    ours = set(os.listdir(TASKS)) - others
+    assert len(ours) == 3  # and the caller's
+    env.close()
+    deadline = time.monotonic() + 5.0  # one that is joined may be listed a little longer
+    while ours & set(os.listdir(TASKS)) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not ours & set(os.listdir(TASKS))
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")

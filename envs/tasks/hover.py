@@ -116,14 +116,18 @@ class Hover(Task):
             ("body rate", "rad/s", MOST_RATE),
         )
         rotors = vehicle.num_rotors
-        ratio = vehicle.thrust_high / vehicle.hover_thrust - 1
-        most = (*(bound for *_, bound in vectors for _ in "xyz"), *(ratio + 0.001).tolist())
+        weakest, strongest = (
+            limit / vehicle.hover_thrust - 1 for limit in (vehicle.thrust_low, vehicle.thrust_high)
+        )
+        bounds = [bound for *_, bound in vectors for _ in "xyz"]
+        low = (*(-bound for bound in bounds), *(weakest - 0.001).tolist())
+        high = (*bounds, *(strongest + 0.001).tolist())
         self.observation = (
             ArraySpec(
                 name="observation",
                 shape=(15 + rotors,),
-                low=(*(-bound for bound in most[:15]), *[-1.001] * rotors),
-                high=most,
+                low=low,
+                high=high,
                 unit=(*(unit for _, unit, _ in vectors for _ in "xyz"), *["1"] * rotors),
                 frame="world turned by the wanted heading; body rates: body",
                 components=(
@@ -132,7 +136,7 @@ class Hover(Task):
                 ),
             ),
         )
-        self._bounds = tuple(np.array(b) for b in (self.observation[0].low, most))
+        self._bounds = tuple(np.array(bound) for bound in (low, high))
 
     def begin(self, mask: Array, draw: Draw) -> Pose:
         """At rest near the goal, tilted and turned."""

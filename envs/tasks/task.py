@@ -72,11 +72,12 @@ class Outcome:
     """Result of a control step."""
 
     reward: dict[str, Array]
-    """Terms by name, each of shape (W, A); their sum is the reward."""
+    """Terms by name, each of shape (W, A) or one number for all; their sum is the reward. One term
+    at least has the shape."""
     terminated: Array
     """Whether the episode ends here for another reason than time, bool, shape (W, A)."""
     metrics: dict[str, Array]
-    """By the names of `Task.metrics`, each of shape (W, A)."""
+    """By the names of `Task.metrics`, each of shape (W, A) or one number for all."""
 
 
 class Task:

@@ -75,6 +75,7 @@ class MujocoWorld:
         self._check_process()
         ids = np.flatnonzero(mask)
         self._batch.state[ids] = self._initial
+        self._warnings[ids] = 0
         state, here = self.state, () if self.shape == () else ids
         state.position[here] = pose.position[here]
         for name, plain in (
@@ -105,6 +106,7 @@ class MujocoWorld:
             try:
                 self._batch.step(ids, nstep=min(substeps, self._check))
             except SimulationError as error:
+                self._warnings.fill(0)  # of the other worlds: a reset is due all the same
                 raise PhysicsError(f"{error}: reset the env") from None
             if np.count_nonzero(self._contacts):
                 touching[some] |= self._contacts[some] > 0
@@ -122,7 +124,13 @@ class MujocoWorld:
         return NumpyDraw(self._streams, np.flatnonzero(mask).tolist(), self.shape, chosen)
 
     def close(self) -> None:
-        """Nothing to release but memory."""
+        """As `World.close`."""
+        if self._owner not in (None, os.getpid()):
+            return  # a fork has none of the threads
+        state = {name: getattr(self.state, name).copy() for name in WorldState.__slots__}
+        self.state = WorldState(**state)
+        for view in ("_batch", "_ctrl", "_contacts", "_warnings", "_thrust"):
+            vars(self).pop(view, None)
 
     def _check_process(self) -> None:
         if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
