@@ -1,7 +1,7 @@
 """MCAP files: written so that a killed program leaves a readable file, and read in bounded memory.
 
 Messages wait in a list, which costs the exchange next to nothing. The package `mcap` makes a chunk
-of them in memory while the other side is at work, and whole records reach the file at once.
+of them in memory, and whole records reach the file at once.
 """
 
 import sys
@@ -94,11 +94,11 @@ class McapFile:
             with self._whole():
                 self._writer.add_attachment(0, time, name, media_type, data)
 
-    def flush(self, *, whole: bool = True) -> None:
-        """Put all messages into the chunk, and write it if it is `whole`."""
+    def flush(self) -> None:
+        """Write all messages as one chunk."""
         with self._lock:
             # Busy: called by a signal handler that interrupted us.
-            if self._busy or self._file.closed:
+            if self._busy or self._file.closed or not self.pending:
                 return
             self._busy = True
             try:
@@ -107,8 +107,7 @@ class McapFile:
                     for channel, time, sequence, data in self.pending[:count]:
                         self._writer.add_message(channel, time, data, time, sequence & 0xFFFFFFFF)
                     del self.pending[:count]
-                    if whole:
-                        self._writer.flush()
+                    self._writer.flush()
             finally:
                 self._busy = False
 

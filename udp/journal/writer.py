@@ -139,8 +139,6 @@ class Journal:
             # Clocks are set back at times.
             if self._size > _CHUNK or not 0 <= now - self._flushed < _SECOND:
                 self._flush(now)
-            else:
-                self._file.flush(whole=False)
         except OSError as error:
             self._give_up(error)
 
