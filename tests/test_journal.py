@@ -850,6 +850,30 @@ def test_the_end_of_the_program_finishes_the_file(goodbye: str, tmp_path: Path) 
     assert (summary.complete, summary.steps) == (True, 100)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no forks there")
+@pytest.mark.parametrize("goodbye", ["sys.exit()", "del remote; os._exit(0)"])
+def test_a_forked_child_leaves_its_parents_file_alone(goodbye: str, tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"  # fault 34
+    fork = f"""
+import os
+if not os.fork():
+    {goodbye}
+os.wait()
+for _ in range(50):
+    remote.step(np.zeros(1, np.float32))
+"""
+    process = launch(textwrap.dedent(RECORD) + fork, 0, path, 100)
+    assert process.stdout is not None
+    server = "127.0.0.1", int(process.stdout.readline())
+    running = Running(Simulator(server=server, bind=ANY, config=QUICK))
+    _, errors = process.communicate(timeout=30)
+    assert errors == ""
+    assert running.join() == "the agent closed"
+    summary = summarize(path)
+    assert (summary.complete, summary.steps) == (True, 150)
+    assert verify(path).identical
+
+
 def test_garbage_finishes_the_file(tmp_path: Path) -> None:
     ours, theirs = tmp_path / "agent.mcap", tmp_path / "simulator.mcap"
     remote = RemoteEnv(ANY, connect=False, record=ours, **TIMES)

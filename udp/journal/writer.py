@@ -7,6 +7,7 @@ JSON with the message in it as hexadecimal digits.
 
 import json
 import logging
+import os
 import platform
 import re
 import time
@@ -103,8 +104,8 @@ class Journal:
             self._path.unlink()
             raise
         self._file, self._pending = file, file.pending
-        self._statistics, self._slots = statistics, slots
-        self._finalizer = weakref.finalize(self, _finish, file, self._path)
+        self._statistics, self._slots, self._pid = statistics, slots, os.getpid()
+        self._finalizer = weakref.finalize(self, _finish, self._pid, file, self._path)
         self._open = True
 
     def tap(self, slot: int, message: Message, datagram: bytes) -> None:
@@ -151,7 +152,7 @@ class Journal:
         except OSError as error:
             self._give_up(error)
         self._open = False
-        _finish(self._file, self._path)
+        _finish(self._pid, self._file, self._path)
         self._finalizer.detach()  # not before: Ctrl-C may have come in between
 
     def _flush(self, now: int) -> None:
@@ -281,8 +282,10 @@ def _words(message: Message, datagram: bytes) -> dict[str, Any]:
 # ---- the end
 
 
-def _finish(file: McapFile, path: Path) -> None:
+def _finish(pid: int, file: McapFile, path: Path) -> None:
     """Finish a file, also when its program ends."""
+    if os.getpid() != pid:  # a fork of the process that writes it
+        return
     try:
         file.finish()
     except OSError as error:
