@@ -195,7 +195,13 @@ def test_large_fragments_on_loopback() -> None:
 def test_a_long_hello_is_cut_too() -> None:  # fault 3
     bounds = np.arange(65_535).tolist()
     spec = '{"low":' + str(bounds) + "}"
-    pair = Pair(simulator(said=hello(spec=spec), largest=FAR), agent(max_datagram=FAR), lossy(0.1))
+    through = lossy(0.1)
+
+    def fate(datagram: bytes) -> list[tuple[float, bytes]]:
+        assert len(datagram) <= FAR
+        return through(datagram)
+
+    pair = Pair(simulator(said=hello(spec=spec), largest=FAR), agent(max_datagram=FAR), fate)
     pair.run(3)
     session = pair.server.slots[0]
     assert session is not None

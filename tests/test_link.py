@@ -506,15 +506,17 @@ def test_an_agent_takes_any_of_its_keys() -> None:  # fault 18: keys change whil
 def test_a_simulator_that_computes_says_that_it_lives(sealed: bool) -> None:  # fault 33
     client, server = simulator(sealed=sealed), agent(sealed=sealed)
     Pair(client, server, lossy(0)).run(3)
-    client.take_outgoing()
-    ((datagram, _),) = server.take_outgoing() or [(b"", HERE)]
+    (datagram,) = client.take_outgoing()
+    server.receive(datagram, HERE, 1.0)
+    assert client.alive() == [], "it waits"
+    send_command(server, 0, 0.0, 1.0)
+    ((datagram, _),) = server.take_outgoing()
     client.receive(datagram, 1.0)
+    (datagram,) = client.alive()
+    assert server.receive(datagram, HERE, 50.0) is None
     session = server.slots[0]
     assert session is not None
-    for datagram in client.alive():
-        assert server.receive(datagram, HERE, 50.0) is None
-    if client.state is SimulatorState.READY:
-        assert session.heard_at == 50.0
+    assert session.heard_at == 50.0
 
 
 # ---- text

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from rotorgram.models import QUAD_XML
 from rotorgram.models.errors import InputError
 from rotorgram.udp import LinkError, PeerClosed, Refused, RemoteEnv, RemoteVectorEnv, Simulator
 from rotorgram.udp.__main__ import parse_arguments
+from rotorgram.udp.protocol import binary
+from rotorgram.udp.protocol.messages import Hello, Refuse
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and forks")
 
@@ -148,6 +151,22 @@ def test_refusals_say_why(wanted: Any, env: str, given: Any, sentence: str) -> N
         error = running.join()
     assert isinstance(error, Refused)
     assert sentence.replace("\\", "") in str(error)
+
+
+def test_an_option_that_the_agent_does_not_know_is_refused() -> None:
+    """A later version of the env may have more of them."""
+    spec = env_spec(ENV_ID, {})
+    spec = replace(spec, options={**spec.options, "gusts": 1.0})
+    with (
+        RemoteEnv(ANY, env_id=ENV_ID, options={}, connect=False, connect_timeout=0.2) as remote,
+        plain_socket() as sock,
+    ):
+        sock.sendto(binary.encode(Hello(session=1, spec=spec.to_json())), remote.address)
+        with pytest.raises(ConnectionError):
+            remote.connect()
+        refuse = binary.decode(sock.recv(65507))
+    assert isinstance(refuse, Refuse)
+    assert refuse.reason == "options: expected gusts not to be there, got 1.0"
 
 
 @pytest.mark.parametrize(
