@@ -296,10 +296,7 @@ def test_a_long_step_is_no_silence() -> None:  # fault 33
     running.join()
 
 
-@posix
-def test_an_agent_that_was_stopped_for_a_while_ends_no_episode() -> None:  # fault 25
-    code = """
-import sys, threading, os, signal, time
+AGENT = """
 import numpy as np
 from rotorgram.udp import RemoteEnv
 env = RemoteEnv(("127.0.0.1", 0), connect=False, timeout=1.5)
@@ -315,26 +312,42 @@ for i in range(60):
 env.close()
 print(lost)
 """
-    agent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+SIMULATOR = """
+import sys, time
+import gymnasium as gym
+import numpy as np
+from rotorgram.udp import Simulator
+
+class Slow(gym.Env):
+    observation_space = action_space = gym.spaces.Box(-9.0, 9.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        time.sleep(0.02)
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+with Simulator(Slow(), server=("127.0.0.1", int(sys.argv[1])), bind=("127.0.0.1", 0)) as simulator:
+    print(simulator.run())
+"""
+
+
+@posix
+def test_sides_that_were_stopped_for_a_while_end_no_episode() -> None:  # fault 25
+    agent = launch(AGENT)
     assert agent.stdout is not None
-    port = int(agent.stdout.readline())
-
-    class Slow(Own):
-        observation_space = spaces.Box(-1, 1, (1,), np.float32)  # type: ignore[assignment]
-        action_space = spaces.Box(-9.0, 9.0, (1,), np.float32)  # type: ignore[assignment]
-
-        def step(self, action: Any) -> Any:
-            time.sleep(0.02)
-            return np.zeros(1, np.float32), 0.0, False, False, {}
-
-    running = Running(Simulator(Slow(), server=("127.0.0.1", port), bind=ANY, config=QUICK))
+    simulator = launch(SIMULATOR, int(agent.stdout.readline()))
     agent.stdout.readline()
+    simulator.send_signal(signal.SIGSTOP)
+    time.sleep(0.1)  # the agent waits, and nothing comes
     agent.send_signal(signal.SIGSTOP)
     time.sleep(2.5)
     agent.send_signal(signal.SIGCONT)
-    out, _ = agent.communicate(timeout=20)
-    assert out == "0\n"
-    running.join()
+    time.sleep(0.2)
+    simulator.send_signal(signal.SIGCONT)
+    assert agent.communicate(timeout=20) == ("0\n", "")
+    assert simulator.communicate(timeout=20) == ("the agent closed\n", "")
 
 
 @posix
