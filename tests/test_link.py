@@ -421,6 +421,21 @@ def test_a_session_of_another_address_is_not_ended_by_a_stranger() -> None:
     assert server.slots[0] is not None
 
 
+@pytest.mark.parametrize("slots", [1, 2])
+def test_one_session_number_from_two_addresses(slots: int) -> None:  # fault 18
+    nonces = {HERE: NONCE, STRANGER: NONCE + 1}
+    server = agent(slots=slots, draw_nonce=iter(nonces.values()).__next__)
+    for address, nonce in nonces.items():
+        server.receive(binary.encode(hello()), address, 0.0)
+        ((reply, to_),) = server.take_outgoing()
+        assert (plain(reply), to_) == (Welcome(session=SESSION, nonce=nonce), address)
+    event = server.receive(binary.encode(state(1, nonce=NONCE + 1), ONE), STRANGER, 0.0)
+    assert event is not None
+    assert event.joined
+    assert server.receive(binary.encode(state(1), ONE), HERE, 0.0) is None
+    assert server.take_outgoing() == []
+
+
 def test_an_old_hello_that_came_late_is_forgotten() -> None:
     """Its State 5 says that the simulator flew with another agent: it is to begin again."""
     server = agent_at(AgentState.WELCOMED, Wire("simulator", False))

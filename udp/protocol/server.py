@@ -394,7 +394,8 @@ class Server:
             opening.move(Way.SENT, m.Close)
             self._drop("refused", layout, arrival)
             return None
-        if None not in self.slots and opening.peer not in self._slot_of:  # another was quicker
+        full = None not in self.slots and opening.peer not in self._slot_of
+        if full or self._seated(opening.number, elsewhere=opening.peer):  # another was quicker
             self._disown(plain, arrival)
             return None
         opening.key = self._session_key(opening)
