@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from links import Pair, agent, hello, layout, lossy, simulator, state
+from links import Pair, agent, hello, layout, lossy, send_command, simulator, state
 from rotorgram.models.errors import InputError
 from rotorgram.udp.protocol import binary
+from rotorgram.udp.protocol.client import largest_datagram
 from rotorgram.udp.protocol.errors import DecodeError
 from rotorgram.udp.protocol.fragments import (
     FAR,
@@ -95,6 +96,16 @@ def test_only_what_is_missing_is_sent_again() -> None:
     again = transfer.resend(missing)
     assert [asks(datagram) for datagram in again] == [False, False, True]
     assert [assembler.take(datagram) for datagram in again] == [None, None, data]
+
+
+def test_other_cuts_of_a_message_begin_it_anew() -> None:  # fault 18
+    data = message(5000)
+    assembler = Assembler(len(data))
+    for datagram in Transfer(data, FAR, Window()).start()[:9]:
+        assert assembler.take(datagram) is None
+    *others, last = Transfer(data, FAR // 2, Window()).start()
+    assert [assembler.take(datagram) for datagram in others] == [None] * len(others)
+    assert assembler.take(last) == data
 
 
 def test_a_large_message_goes_in_bursts_that_grow_and_shrink() -> None:
@@ -183,6 +194,20 @@ def test_steps_a_second_through_the_network_of_the_soak(drones: int) -> None:
     pair.run(300)
     assert pair.steps == [float(i + 1) for i in range(300)]
     assert 300 / pair.now >= 80
+
+
+def test_small_fragments_to_other_machines() -> None:
+    assert largest_datagram(("127.0.0.1", 1)) == NEAR == 65_483
+    assert largest_datagram(("10.0.0.1", 1)) == FAR == 1_200
+    of = layout(1024)
+    for host in ("127.0.0.1", "10.0.0.1"):
+        server = agent(of=of)
+        for said in (hello(), state(1, of=of)):
+            server.receive(binary.encode(said, of), (host, 1), 0.0)
+        server.take_outgoing()
+        send_command(server, 0, 0.0, 0.0)
+        sizes = [len(datagram) for datagram, _ in server.take_outgoing()]
+        assert max(sizes) == sum(sizes) if host == "127.0.0.1" else max(sizes) <= FAR
 
 
 def test_large_fragments_on_loopback() -> None:

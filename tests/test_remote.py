@@ -1,6 +1,7 @@
 """One drone over real sockets: parity, the env, strangers, and peers that others wrote."""
 
 import copy
+import json
 import pickle
 import re
 import threading
@@ -298,13 +299,16 @@ def test_a_text_simulator_that_somebody_else_wrote() -> None:
     assert (out, err) == ("closed after 3\n", "")
 
 
-def test_the_wire_does_not_load_mujoco_nor_torch() -> None:
+@pytest.mark.parametrize(
+    "wanted", [{}, {"env_id": f"rotorgram.envs:{ENV_ID}", "options": {}}], ids=["any", "fault 5"]
+)
+def test_the_wire_does_not_load_mujoco_nor_torch(wanted: dict[str, Any]) -> None:
     code = """
-        import sys
+        import json, sys
         from rotorgram.udp import RemoteEnv
-        env = RemoteEnv(("127.0.0.1", 0), connect=False)
+        env = RemoteEnv(("127.0.0.1", 0), connect=False, **json.loads(sys.argv[1]))
         env.close()
         print([name for name in ("mujoco", "torch", "stable_baselines3") if name in sys.modules])
     """
-    out, err = launch(code).communicate(timeout=60)
+    out, err = launch(code, json.dumps(wanted)).communicate(timeout=60)
     assert (out, err) == ("[]\n", "")

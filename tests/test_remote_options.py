@@ -44,6 +44,8 @@ posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and fo
         (lambda: Simulator(num_envs=10**9), "num_envs: expected 1 to 65536"),
         (lambda: Simulator(num_envs=2, codec="text"), "text codec: expected one drone"),
         (lambda: RemoteEnv(ANY, env_id=ENV_ID, options={"wind": 1}), "wind"),
+        (lambda: RemoteEnv(ANY, env_id="Own-v0", options={"wind": np.zeros(3)}), "JSON values"),
+        (lambda: Simulator("Own-v0", wind=np.zeros(3)), "expected JSON values"),  # fault 3
         (lambda: RemoteEnv(ANY, timeout=0), "timeout: expected seconds > 0, got 0"),
         (lambda: RemoteEnv(ANY, connect_timeout=float("nan")), "connect_timeout: expected"),
         (lambda: RemoteEnv(ANY, max_datagram=32), "max_datagram: expected at least 256, got 32"),
@@ -128,6 +130,7 @@ class Own(gym.Env[Any, Any]):
 
 
 gym.register("Own-v0", Own)
+WAYPOINTS = [[1.25, -0.5, 0.01 * i] for i in range(40)]
 
 
 @pytest.mark.parametrize(
@@ -175,6 +178,7 @@ def test_an_option_that_the_agent_does_not_know_is_refused() -> None:
         ({}, "Own-v0", {}),
         ({"env_id": ENV_ID}, ENV_ID, {"target": 8.0}),
         ({"options": {"wind": 2.0}}, "Own-v0", {"wind": 2.0, "gusts": 5}),
+        ({"options": {"wind": WAYPOINTS}}, "Own-v0", {"wind": WAYPOINTS}),  # fault 3
         ({"env_id": ENV_ID, "options": {"target": 8.0}}, ENV_ID, {"target": 8.0}),
         ({"env_id": f"rotorgram.envs:{ENV_ID}"}, ENV_ID, {}),  # fault 5
         ({"env_id": ENV_ID}, f"rotorgram.envs:{ENV_ID}", {}),  # fault 5

@@ -143,6 +143,13 @@ def test_names_that_an_agent_does_not_know_are_left_out() -> None:
     assert EnvSpec.from_json(json.dumps(content)) == spec_of()
 
 
+def test_of_doubled_names_the_last_counts() -> None:  # fault 4
+    text = spec_of(options={"a": 2}).to_json()
+    doubled = text.replace('"a":2', '"a":1,"a":2')
+    assert doubled != text
+    assert EnvSpec.from_json(doubled).options == {"a": 2}
+
+
 def test_spaces() -> None:
     several = spec_of(observation=(PICTURE, ArraySpec(name="speed", shape=(), high=3.0)))
     space = observation_space(several)
