@@ -4,6 +4,7 @@ import socket
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from typing import Any
 
 import pytest
 from rotorgram.udp.transport import sockets
@@ -108,3 +109,46 @@ def test_the_port_cannot_be_taken_while_a_simulator_joins(
     monkeypatch.setattr("rotorgram.udp.transport.sockets.Socket", Socket)
     port.keep([others[0].getsockname()])
     assert tried == [port.address]
+
+
+class Quiet(sockets.Socket):
+    """Nothing ever comes; it has a clock of its own, and counts how often one looks."""
+
+    looks, now, pace = 0, 0.0, 2e-6
+
+    def recvfrom(self, *_: object) -> Any:
+        self.looks += 1
+        raise BlockingIOError
+
+    def monotonic(self) -> float:
+        self.now += self.pace
+        return self.now
+
+    def waits(self, count: int) -> list[int]:
+        """How often each of so many waits looks before it sleeps."""
+        looks = []
+        for _ in range(count):
+            before = self.looks
+            with pytest.raises(TimeoutError):
+                self.receive(0.05)
+            looks.append(self.looks - before - 1)
+        return looks
+
+
+def test_waits_look_for_a_moment_and_seldom_in_vain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fault 17: looking costs the processor."""
+    slept: list[float] = []
+    monkeypatch.setattr(sockets, "_sleep", lambda _, timeout: slept.append(timeout))
+    with Quiet() as sock:
+        monkeypatch.setattr(sockets, "time", sock)
+        looks = sock.waits(200)
+        assert [wait for wait, count in enumerate(looks) if count] == [0, 5, 22, 87, 152]
+        assert 50 < max(looks) <= 101
+        assert slept == [0.05] * 200
+    with Quiet() as sock:
+        monkeypatch.setattr(sockets, "time", sock)
+        sock.pace = 100e-6  # others have the core in between
+        assert sock.waits(1) == [1]
+        sock.pace = 2e-6
+        assert sock.waits(64) == [0] * 64
+        assert sock.waits(1)[0] > 50
