@@ -19,7 +19,7 @@ from rotorgram.agents import preset
 from rotorgram.agents.policies import NetworkPolicy
 from rotorgram.cli import main
 from rotorgram.cli.sweep import parse_grid
-from rotorgram.experiments.compare import read_compare_config
+from rotorgram.experiments.compare import compare, read_compare_config
 from rotorgram.experiments.folders import locked
 from rotorgram.experiments.metrics import Headline
 from rotorgram.experiments.results import CONFIG_KEYS, ResultsError
@@ -210,10 +210,13 @@ def test_seeds_of_a_sweep_are_not_those_of_a_comparison() -> None:
         CompareConfig(first_seed=-1)
 
 
-def test_a_folder_is_swept_by_one_process(tmp_path: Path) -> None:
+@pytest.mark.parametrize("work", [sweep, compare])
+def test_a_folder_is_swept_by_one_process(work: Any, tmp_path: Path) -> None:
+    """And compared by one."""  # fault 23
+    config = CONFIG if work is sweep else CompareConfig(agents=("a2c",), seeds=1, env_steps=300)
     busy = pytest.raises(ValueError, match="expected a folder that no other process writes to")
     with locked(tmp_path), busy:
-        sweep(CONFIG, tmp_path, "", nothing)
+        work(config, tmp_path, "", nothing)
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]
 
 
