@@ -12,7 +12,7 @@ import numpy as np
 
 from ..agents.policies import Policy
 from ..envs.autoreset import AdvancingVectorEnv
-from ..envs.spec import Discrete, EnvSpec, component_names
+from ..envs.spec import Discrete, EnvSpec, canonical_id, component_names
 from ..models.errors import InputError
 
 __all__ = ["Ending", "EpisodeSet", "Trajectory", "evaluation_seed", "flown_trajectories", "fly",
@@ -210,7 +210,8 @@ def flown_trajectories(
     """Evaluation episodes of a set by number, flown in process: see `fly`. The vehicle is an MJCF
     file, None the paper's.
     """
-    made = gym.make(env_id, disable_env_checker=True, vehicle=vehicle, **options)
+    name = canonical_id(env_id)  # a checkpoint may name a module, which is not to be imported
+    made = gym.make(name, disable_env_checker=True, vehicle=vehicle, **options)
     with closing(made.unwrapped) as env:
         return [fly(env, policy, evaluation_seed(episode, of), episode) for episode in episodes]
 

@@ -27,6 +27,7 @@ from rotorgram.cli._scalars import ScalarWriter
 from rotorgram.cli.serve import Serve
 from rotorgram.cli.sim import Sim
 from rotorgram.experiments.results import read_results, read_steps
+from rotorgram.experiments.trajectories import flown_trajectories
 from rotorgram.models import QUAD_XML, InputError
 from rotorgram.udp import Simulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -457,6 +458,27 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     }  # fmt: skip
     (folder / "episodes.csv").unlink()  # a result: the checkpoint has the episodes
     assert run(capsys, "train", "a2c", "--resume", folder)[0] == 0
+
+
+def test_nothing_that_a_checkpoint_names_is_imported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fault 28: not in the processes of its simulators either."""
+    imported, folder = tmp_path / "imported", tmp_path / "run"
+    (tmp_path / "evil.py").write_text(f"open({str(imported)!r}, 'w')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    settings = ("--env-steps", 300, "--set", "steps_per_update=100", "--env.episode-length", 60)
+    assert run(capsys, "train", "a2c", "--out", folder, *settings)[0] == 0
+    kept = load(folder / "checkpoint.safetensors")
+    for name, known in (("evil:Evil-v0", False), ("evil:rotorgram/Elevation-v0", True)):
+        named = replace(kept, spec=replace(kept.spec, env_id=name), env_steps=600)
+        store(named, folder / "checkpoint.safetensors")
+        assert run(capsys, "evaluate", folder, "--episodes", 1)[0] == (not known)
+        assert run(capsys, "train", "a2c", "--resume", folder)[0] == 1
+    (trajectory,) = flown_trajectories(named.policy(), name, named.options, [0])  # as `render`
+    assert trajectory.spec.env_id == "rotorgram/Elevation-v0"
+    assert not imported.exists()
 
 
 def test_of_two_trainings_with_one_folder_one_is_refused(tmp_path: Path) -> None:

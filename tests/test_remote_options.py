@@ -192,6 +192,25 @@ def test_what_fits_flies(wanted: Any, env: str, given: Any) -> None:
     assert running.join() == "the agent closed"
 
 
+@pytest.mark.parametrize("env_id", ["evil:Evil-v0", f"evil:{ENV_ID}"])
+def test_nothing_that_a_simulator_names_is_imported(
+    env_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fault 28
+    (tmp_path / "evil.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    wanted: dict[str, Any] = {"options": {"target": 3.0}, "record": tmp_path / "j"}
+    with RemoteEnv(ANY, connect=False, connect_timeout=5, **wanted) as remote:
+        simulator = Simulator(server=remote.address, bind=ANY, config=QUICK, target=3.0)
+        spec = replace(simulator.spec, env_id=env_id).to_json()
+        simulator.link.hello = replace(simulator.link.hello, spec=spec)
+        running = Running(simulator)
+        remote.reset(seed=1)
+        assert remote.env_spec.env_id == env_id
+        remote.step(np.zeros(1))
+    assert running.join() == "the agent closed"
+    assert "evil" not in sys.modules
+
+
 def test_the_agent_trusts_hello() -> None:
     """Pictures, dicts and choices of an env that this side has no code of."""
     with flying(Own()) as pair:
