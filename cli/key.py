@@ -10,7 +10,7 @@ from ._flags import Command
 
 @dataclass(frozen=True, kw_only=True)
 class Key(Command):
-    """Write a new key for both sides of the wire. Copy it to the other machine over a secure channel."""
+    """Write a new key for both sides of the wire. Copy it over a secure channel."""
 
     file: Positional[Path]
     """File to write; it must not exist."""

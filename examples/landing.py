@@ -1,4 +1,4 @@
-"""A task of one's own in one file: come down and stand on the ground. docs/extending.md explains it.
+"""A task of one's own in one file: come down and stand on the ground. See docs/extending.md.
 
 rotorgram train a2c --env landing:Landing-v0
 """
