@@ -96,16 +96,18 @@ class RoundTrips:
     """Measures round trips, and derives the time of a resend (RFC 6298).
 
     A round trip counts at most as twice the wait of then: a side that paused once, to learn for
-    example, does not make every resend of the next second late.
+    example, does not make every resend of the next second late. An agent of several simulators
+    answers one that asks again with Alive, while it waits for the others. Then a long wait for its
+    Command tells how the others fare, and counts no more: their losses would make the waits of this
+    simulator longer, and those theirs.
     """
 
     def __init__(self) -> None:
         self._smoothed: float | None = None
         self._variation = 0.0
         self._sent_at = 0.0
-        self._is_repeat = self._was_repeated = self._came_twice = False
-        self._in_a_row = 0
-        """Messages in a row that were repeated, and then answered twice."""
+        self._is_repeat = self._was_repeated = self._came_twice = self._says_alive = False
+        self._in_a_row = 0  # messages in a row that were repeated, and then answered twice
 
     def sent(self, now: float, *, first: bool = False) -> None:
         """Something was sent that wants an answer, for the first time or again."""
@@ -116,11 +118,17 @@ class RoundTrips:
             self._came_twice = False
         self._sent_at, self._is_repeat = now, not first
 
-    def answered(self, now: float) -> None:
-        """The answer came: to the last sending, but to which one is unclear if it came too soon."""
+    def answered(self, now: float, *, alive: bool = False) -> None:
+        """The answer came, or only Alive.
+
+        It is one to the last sending, but to which one is unclear if it came too soon.
+        """
         seconds = now - self._sent_at
+        self._says_alive |= alive
         if self._smoothed is None:
             self._smoothed, self._variation = seconds, seconds / 2
+        elif self._says_alive and not alive and seconds > self._smoothed:
+            return
         elif not (self._is_repeat and seconds < self._smoothed / 2):
             seconds = min(seconds, 2 * self.wait(0))
             self._variation += (abs(self._smoothed - seconds) - self._variation) / 4
@@ -145,7 +153,9 @@ class RoundTrips:
             wait = _FIRST_RESEND
         else:
             wait = self._smoothed + max(_GRANULARITY, 4 * self._variation)
-        return min(wait * 2.0 ** min(max(tries - _PATIENCE, 0), 16), _LONGEST_RESEND)
+        if tries > _PATIENCE:
+            wait *= 2.0 ** min(tries - _PATIENCE, 16)
+        return min(wait, _LONGEST_RESEND)
 
 
 class Client:
