@@ -9,6 +9,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -20,6 +21,8 @@ import pandas as pd
 from markupsafe import Markup
 
 from ..envs.spec import canonical_id
+from ..models.errors import MissingPackage
+from ..rendering.film import poster
 from . import tables
 from .claims import MIN_SEEDS, OURS, Outcome, Verdict, judge_claims, judge_no_worse
 from .curves import AVERAGING_SHARE, Curves, make_curves
@@ -84,8 +87,11 @@ def write_report(folder: Path | str, results: Results | None = None) -> Path:
     (folder / "claims.json").write_text(claims + "\n", encoding="utf-8")
     video, report = folder / VIDEO_FILE, folder / "report.html"
     film = video.read_bytes() if video.is_file() else None
+    picture = b""
+    with suppress(MissingPackage, OSError):  # where FFmpeg is missing, the film has no poster
+        picture = poster(video) if film else b""
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
-    report.write_text(_page(results, table, verdicts, curves, film, files), encoding="utf-8")
+    report.write_text(_page(results, table, verdicts, curves, film, picture, files), "utf-8")
     return report
 
 
@@ -98,9 +104,12 @@ def _page(
     verdicts: Sequence[Verdict],
     curves: Curves,
     video: bytes | None,
+    picture: bytes,
     files: Collection[str],
 ) -> str:
-    """The page, with an MP4 where there is one, and the names of the files beside it."""
+    """The page, with an MP4 where there is one and its poster, and the names of the files beside
+    it.
+    """
     config, headline = results.config, results.headline
     agents = sort_agents(table.index[table["seeds"] > 0])
     bounds = [name for name in table.index if name not in agents]
@@ -132,6 +141,7 @@ def _page(
         averaging_share=AVERAGING_SHARE,
         data=data,
         video=base64.b64encode(video).decode("ascii") if video else None,
+        poster=base64.b64encode(picture).decode("ascii"),
         trained=trained,
         hyperparameters=dict.fromkeys(chain(*(settings[agent] for agent in trained))),
         files=files,

@@ -33,6 +33,7 @@ from rotorgram.experiments.report import (
     chart_data,
     write_report,
 )
+from rotorgram.rendering.film import poster, write_film
 
 CHARTS = ["learning", "flown", "reward", "training-error", "total-by-step", "total-by-episode"]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -290,11 +291,16 @@ def test_a_video_in_the_folder_is_in_the_page(tmp_path: Path, page: str) -> None
     assert "<video" not in page
     assert 'href="#video"' not in page
     folder = synthetic_folder(tmp_path, ("vpg", "a2c"), seeds=1, env_steps=300)
-    (folder / VIDEO_FILE).write_bytes(b"\x00\x01 a film")
+    video = folder / VIDEO_FILE
+    write_film(video, np.full((5, 32, 48, 3), 90, np.uint8), 25.0)
     film = write_report(folder).read_text(encoding="utf-8")
     (tag,) = re.findall(r"<video[^>]*>", film)
-    encoded = re.findall(r'src="data:video/mp4;base64,([^"]*)"', tag)
-    assert [base64.b64decode(text) for text in encoded] == [b"\x00\x01 a film"]
+    for data, content in (
+        ('src="data:video/mp4', video.read_bytes()),
+        ('poster="data:image/jpeg', poster(video)),  # fault 20
+    ):
+        encoded = re.findall(f' {data};base64,([^"]*)"', tag)
+        assert [base64.b64decode(text) for text in encoded] == [content]
     assert all(f" {name}" in tag for name in ("controls", "muted", "loop", "playsinline"))
     assert f"<code>{VIDEO_FILE}</code>" in film
 
