@@ -325,7 +325,7 @@ HEIGHTS = '<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>
         (ROTOR1, ROTOR1.replace("0 0 1 0", "0 0 0 0"), "rotor1 to have a thrust with limits"),
         ('ctrllimited="true"', 'ctrllimited="false"', "rotor1 to have a thrust with limits"),
         ('ctrlrange="0 100"', 'ctrlrange="0 40"', r"49 N, within its limits, got 0 to 40 N"),
-        ('gear="0 0 1', 'gear="0.2 0 1', "without a torque or a sideways force, got ones that cannot"),
+        ('gear="0 0 1', 'gear="0.2 0 1', "a torque or a sideways force, got ones that cannot"),
         ("<actuator>", PUSHER, "rotor push to carry a part of the weight of the level craft, got"),
         ('gravity="0 0 -9.8"', 'gravity="0 1 -9.8"', "gravity along -z, got 20 kg and"),
         ('gravity="0 0 -9.8"', 'gravity="0 0 0"', "gravity along -z, got 20 kg and"),
