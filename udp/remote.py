@@ -346,7 +346,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
             self.rewards[broken] = 0.0
             self.terminated[broken] = False
             self.truncated[broken] = True
-            earlier, told = self._broken or (reasons, nobody)  # of this step's round trips before
+            earlier, told = self._broken or (np.array(None), nobody)  # earlier in this step
             self._broken = np.where(broken, reasons, earlier), broken | told
             self.lost = broken
         self.done = self.terminated | self.truncated | (self.done & ~resets)
