@@ -1,8 +1,9 @@
 """The speed of each layer of a training on this machine, from raw physics to an update.
 
-Every layer is open at the same time and they take turns to run for a moment, in an order that
-changes from round to round. Ratios are made within a round, and their medians count, so that a
-machine that slows down for a while slows all alike.
+Layers of one drone, of many drones and of training are open at the same time, each group by
+itself, and take turns to run for a moment, in an order that changes from round to round. Ratios are
+made within a round, and their medians count, so that a machine that slows down for a while slows
+all alike.
 
 The parts of a lock-step exchange are layers too, each measured by itself; the links take the rest
 of the time of a step.
@@ -152,20 +153,22 @@ def bench(
     if not 0 < seconds <= 60:
         raise InputError(f"seconds: expected more than 0 and at most 60, got {seconds}")
     rates: dict[str, list[float]] = {name: [] for name, *_ in _LAYERS}
-    with ExitStack() as stack:
-        opened: list[tuple[str, Slice]] = []
-        for name, _, _, open_ in _LAYERS:
-            on_layer(f"opening {name}", 0, 1)
-            opened.append((name, open_(stack)))
-        count = len(opened)
-        for turn in range((rounds + 1) * count):
-            number, place = divmod(turn, count)
-            name, run = opened[(number + place) % count]
-            on_layer(name, turn, (rounds + 1) * count)
-            start = time.perf_counter()
-            rate = run(seconds) / (time.perf_counter() - start)
-            if number:  # the first round warms up
-                rates[name].append(round(rate, 1))
+    turns, done = (rounds + 1) * len(_LAYERS), 0
+    for group in _GROUPS:
+        with ExitStack() as stack:
+            opened: list[tuple[str, Slice]] = []
+            for name, _, _, open_ in group:
+                on_layer(f"opening {name}", done, turns)
+                opened.append((name, open_(stack)))
+            for number in range(rounds + 1):
+                first = number % len(opened)
+                for name, run in opened[first:] + opened[:first]:
+                    on_layer(name, done, turns)
+                    start = time.perf_counter()
+                    rate = run(seconds) / (time.perf_counter() - start)
+                    done += 1
+                    if number:  # the first round warms up
+                        rates[name].append(round(rate, 1))
     layers = [
         Layer(name=name, about=about, drones=drones, rates=tuple(rates[name]))
         for name, about, drones, _ in _LAYERS
@@ -398,3 +401,9 @@ _LAYERS: Final[list[tuple[str, str, int, Callable[[ExitStack], Slice]]]] = [
       for n in (1, 64) for a in ("vpg", "a2c", "sb3-a2c")),
 ]  # fmt: skip
 """Name, what it is, drones, and how it is opened."""
+_GROUPS: Final = (
+    [layer for layer in _LAYERS if layer[2] == 1 and "training" not in layer[1]],
+    [layer for layer in _LAYERS if layer[2] > 1 and "training" not in layer[1]],
+    [layer for layer in _LAYERS if "training" in layer[1]],
+)
+"""Those that are compared with each other are open together, and no others."""
