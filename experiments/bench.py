@@ -47,7 +47,7 @@ __all__ = ["PARTS", "RATIOS", "Layer", "Ratio", "bench", "parts_of"]
 
 ENV_ID: Final = "rotorgram/Elevation-v0"
 _PERIOD: Final = 0.02  # s, of a control step
-_OLD_TIMESTEP: Final = 0.005  # s, of a finer physics, for comparison
+_FINER_TIMESTEP: Final = 0.005  # s, for comparison
 
 Slice = Callable[[float], int]
 """Runs for about so many seconds; how many env steps it made."""
@@ -388,7 +388,7 @@ _LAYERS: Final[list[tuple[str, str, int, Callable[[ExitStack], Slice]]]] = [
     ("env", "the single env's step", 1, lambda s: _local(s, 1)),
     ("Batch.step, 1024", "mujoco.batch, the same substeps", 1024, lambda _: _batch_step(1024)),
     ("Batch.step at 5 ms, 1024", "the same with physics steps of 5 ms", 1024,
-     lambda _: _batch_step(1024, _OLD_TIMESTEP)),
+     lambda _: _batch_step(1024, _FINER_TIMESTEP)),
     *((f"vector env, {n}", "the vector env", n, lambda s, n=n: _local(s, n)) for n in _MANY),
     ("UDP echo", "blocking sockets in Python, datagrams of the same sizes", 1, _echo),
     *((f"UDP, {n}", f"Remote{'Vector' * (n > 1)}Env and a simulator", n,

@@ -32,6 +32,33 @@ def test_the_command_is_the_one_that_was_given(preset: str) -> None:
     assert settings in (ROOT / "docs" / "results.md").read_text()
 
 
+@pytest.mark.parametrize("folder", ["paper", "error"])
+def test_the_other_tables_are_those_of_their_comparisons(folder: str) -> None:
+    page = (ROOT / "docs" / "results.md").read_text()
+    assert (RESULTS / folder / "results.md").read_text().split("\n\n")[0] in page
+    assert json.loads((RESULTS / folder / "config.json").read_text())["command"] in page
+
+
+@pytest.mark.parametrize("agent", ["vpg", "a2c"])
+def test_the_tuning_trials_are_those_of_the_sweeps(agent: str) -> None:
+    page = (ROOT / "docs" / "results.md").read_text()
+    for point in pd.read_csv(RESULTS / "tuning" / f"{agent}.csv").itertuples():
+        assert (
+            f"| {point.learning_rate} | {point[3]} | {point.worst:.3f} | {point.median:.3f} "
+            f"| {point[7]:.0f} | {point.crashed} of {point.episodes} |"
+        ) in page
+
+
+def test_the_seeds_of_vpg_that_do_not_hold_are_those_that_were_measured() -> None:
+    page = (ROOT / "docs" / "algorithms" / "vpg.md").read_text().replace("−", "-")
+    seeds = pd.read_csv(RESULTS / "tuned" / "vpg_seeds.csv")
+    failing = seeds[seeds["crashes"] > 0]
+    assert not failing.empty
+    for row in failing.itertuples(index=False):
+        slopes = " | ".join(f"{slope:.2f}" for slope in row[3:])
+        assert f"| {row.seed} | {row[2]} | {slopes} |" in page
+
+
 def test_the_speeds_are_those_of_the_benchmark() -> None:
     speed = json.loads((RESULTS / "training_speed.json").read_text())
     page = (ROOT / "docs" / "results.md").read_text()

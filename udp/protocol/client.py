@@ -21,12 +21,12 @@ from .auth import Key, is_sealed, message_of
 from .errors import DecodeError, Forged
 from .fragments import (
     FAR,
-    LEAST,
     NEAR,
     Assembler,
     Transfer,
     Window,
     asks,
+    check_largest,
     check_size,
     is_fragment,
 )
@@ -88,8 +88,7 @@ class LinkConfig:
             value = getattr(self, field.name)
             right = value is None or (isfinite(value) and value > 0)
             expect(right, field.name, "a number > 0", f"{value}")
-        most = self.max_datagram
-        expect(most is None or most >= LEAST, "max_datagram", f"at least {LEAST}", f"{most}")
+        check_largest(self.max_datagram)
 
 
 class RoundTrips:

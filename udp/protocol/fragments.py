@@ -23,14 +23,15 @@ from .layout import MAX_MESSAGE
 from .messages import Missing
 
 __all__ = [
-    "FAR", "LEAST", "NEAR", "Assembler", "Transfer", "Window", "asks", "check_size", "is_fragment"
+    "FAR", "NEAR", "Assembler", "Transfer", "Window", "asks", "check_largest", "check_size",
+    "is_fragment",
 ]  # fmt: skip
 
 NEAR: Final = 65_507 - 24
 """Largest datagram of the binary codec on loopback, bytes: UDP's over IPv4, less a seal."""
 FAR: Final = 1_200
 """The same elsewhere: less than any network's, so that no datagram is cut on its way."""
-LEAST: Final = 256  # the smallest that either side may be set to, bytes
+_LEAST: Final = 256  # the smallest that either side may be set to, bytes
 MAX_FRAGMENTS: Final = 1 << 14
 
 _FRAGMENT: Final = struct.Struct("<HHB3x")
@@ -41,6 +42,12 @@ _LARGEST_BURST: Final = 1 << 20
 _MOST_LOST: Final = 0.25  # A burst of which more was lost was too large for a buffer on its way
 _LARGEST_BITMAP: Final = 128
 """Bytes of the bitmap of a Missing: it says what 1,024 fragments are about."""
+
+
+def check_largest(largest: int | None) -> None:
+    """Raise `InputError` for a largest datagram, bytes, that is too small."""
+    right = largest is None or largest >= _LEAST
+    expect(right, "max_datagram", f"at least {_LEAST}", f"{largest}")
 
 
 def check_size(size: int, largest: int) -> None:

@@ -24,7 +24,7 @@ from ..protocol import text
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address
 from ..protocol.errors import PeerClosed, PeerSilent
-from ..protocol.fragments import LEAST
+from ..protocol.fragments import check_largest
 from ..protocol.layout import Layout
 from ..protocol.messages import Close, Hello, State
 from ..protocol.server import Event, Server
@@ -78,8 +78,7 @@ class AgentConfig:
         for name in ("connect_timeout", "timeout"):
             seconds = getattr(self, name)
             expect(math.isfinite(seconds) and seconds > 0, name, "seconds > 0", f"{seconds}")
-        most = self.max_datagram
-        expect(most is None or most >= LEAST, "max_datagram", f"at least {LEAST}", f"{most}")
+        check_largest(self.max_datagram)
         if self.env_id is not None:
             object.__setattr__(self, "env_id", canonical_id(self.env_id))
             self.expected_options(self.env_id)
