@@ -6,7 +6,7 @@ flies the others for one control period: `advance` is that step, the step of the
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from math import prod
+from math import isfinite, prod
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,6 +17,7 @@ from ..models.errors import InputError, NotCopied
 from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..models.vehicle import Vehicle
 from ..sim import Array, Backend, Draw, PhysicsError, Pose, World, make_world, on_host
+from ..sim.state import plain
 from . import registry
 from .autoreset import Seeds, checked_seeds
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
@@ -172,13 +173,16 @@ class Loop(NotCopied):
         self._length = draft.options.episode_length
         self._choices = self.task.controller.choices
         self._width = len(self.task.controller.low)
-        self._dtypes = [(a.name, a.shape, getattr(self._xp, a.dtype)) for a in draft.observation]
+        self._action_shape = (*lead, self._width)
+        self._arrays = [
+            (a.name, (num_envs, *a.shape), getattr(self._xp, a.dtype)) for a in draft.observation
+        ]
         none = self.world.state.touching != self.world.state.touching  # all False, on its device
         self._none, self._nobody = none, none.reshape(num_envs)
         self.terminated = self.truncated = self.done = self._nobody
         self.rewards: Array = 0.0 * self._nobody
         self.observations: dict[str, Array] = {}
-        self._steps: Array = (0 * self._nobody).reshape(lead)[()]
+        self._steps: Array = plain((0 * self._nobody).reshape(lead))
         self._waiting, self._anyone_waits = ~self._nobody, True  # for a reset
         self._begun = self._closed = False
         self._outcome: Outcome | None = None
@@ -205,7 +209,8 @@ class Loop(NotCopied):
         a draw, shape (N,). Where the task refuses such a start, the others have flown, those to be
         reset are where they were, and their streams of random numbers have moved on.
         """
-        resets, frozen = self.ours(resets), self.ours(frozen)
+        resets = None if resets is None else self.ours(resets)
+        frozen = None if frozen is None else self.ours(frozen)
         idle = resets if frozen is None else frozen if resets is None else resets | frozen
         flown = None if idle is None or not idle.any() else ~idle
         if self._anyone_waits:  # always after `close`
@@ -225,14 +230,14 @@ class Loop(NotCopied):
         self._look(flown)
 
     def _fly(self, actions: Array, flown: Array | None) -> None:
-        world, lead = self.world, self.world.shape
+        world = self.world
         if self._xp is np:
             values = self._checked(np.asarray(actions), flown)
         else:
             values = world.checked(actions, self._width, self._choices, flown)
-        action = values.reshape((*lead, self._width))
-        thrust = self.task.controller.thrust(action, world.state)
-        some = None if flown is None else flown.reshape(lead)[()]
+            values = values.reshape(self._action_shape)
+        thrust = self.task.controller.thrust(values, world.state)
+        some = None if flown is None else flown.reshape(world.shape)[()]
         try:
             world.step(thrust, self._substeps, some)
         except PhysicsError:
@@ -254,7 +259,7 @@ class Loop(NotCopied):
         draws = {name: values.reshape(lead)[()] for name, values in chosen.items()}
         world.reset(some, self._start(some, world.draw(some, draws)))
         self._begun = True
-        self._steps = self._xp.where(some, 0, self._steps)[()]
+        self._steps = plain(self._xp.where(some, 0, self._steps))
         self._waiting = self._waiting & ~mask
         self._anyone_waits = bool(self._waiting.any())
         self.done = self.done & ~mask
@@ -278,33 +283,33 @@ class Loop(NotCopied):
         observed, outcome = task.observe(state), task.outcome(state)
         if self._outcome is None:
             _check_returned(self.spec, observed, outcome, n, alone=not self.world.shape)
-        self.observations = {
-            name: _as_type(observed[name].reshape((n, *shape)), dtype)
-            for name, shape, dtype in self._dtypes
-        }
-        self._outcome = outcome
+        self.observations = {}
+        for name, shape, dtype in self._arrays:
+            self.observations[name] = _as_type(observed[name].reshape(shape), dtype)
+        self._outcome, self.terms = outcome, outcome.reward
         ended: Array = outcome.terminated
         late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b
-        self.terms = outcome.reward
         total: Array = 0.0
         for term in self.terms.values():
             total = total + term
+        # New arrays, whatever the task gave: arrays of earlier steps must not change.
         if not self.world.shape:  # a single drone's numbers
-            self.rewards = np.array((total,), np.float64)
-            may_end = bool(ended or late)
-            # New arrays, as below; an array of truth values is fastest as a copy of another.
+            finite = isfinite(total)
+            self.rewards = np.array((float(total),))
+            # An array of truth values is fastest as a copy of another.
             self.terminated, self.truncated = self._nobody.copy(), self._nobody.copy()
-            if may_end:
+            if may_end := bool(ended or late):
                 self.terminated[0], self.truncated[0] = ended, late
         else:
             # A task may compute in float32.
             total = np.asarray(total, np.float64) if self._xp is np else total
             self.rewards = total.reshape(n)
-            # New arrays, whatever the task gave: arrays of earlier steps must not change.
+            finite = self._xp is not np or _is_finite(self.rewards)
             self.terminated = (ended | self._none).reshape(n)
             self.truncated = late.reshape(n)
             may_end = True
-        self._expect_finite()
+        if self._xp is np and not (finite and all(map(_is_finite, self.observations.values()))):
+            self._refuse_not_finite()
         if flown is not None:
             # A drone that did not fly gets no reward: nothing has ended, nothing was won.
             self.rewards = self._xp.where(flown, self.rewards, 0.0)
@@ -315,12 +320,8 @@ class Loop(NotCopied):
                 self._waiting, self._anyone_waits = self._waiting | ends, True
                 self.done = self.done | ends
 
-    def _expect_finite(self) -> None:
-        """Raise `InputError` where a task gave NaN or infinity, but on a GPU."""
-        if self._xp is not np:
-            return
-        if all(map(_is_finite, self.observations.values())) and _is_finite(self.rewards):
-            return
+    def _refuse_not_finite(self) -> None:
+        """Raise `InputError` for the NaN or infinity that a task gave."""
         for name, values in (*self.observations.items(), ("reward", self.rewards)):
             bad = ~np.isfinite(values.reshape(self.num_envs, -1)).all(axis=1)
             if bad.any():
@@ -330,13 +331,13 @@ class Loop(NotCopied):
                 )
 
     def _checked(self, actions: np.ndarray, flown: Array | None) -> np.ndarray:
-        """Actions as controllers take them: float64, shape (N, k). Raises `InputError`."""
+        """Actions as controllers take them: float64, shape (W, A, k). Raises `InputError`."""
         if actions.dtype.kind not in "iuf":
             raise InputError(f"actions: expected real numbers, got {actions.dtype}")
         if actions.size != self.num_envs * self._width:
             shape = (self.num_envs, self._width)
             raise InputError(f"actions: expected shape {shape}, got {actions.shape}")
-        values = actions.reshape(self.num_envs, self._width)
+        values = actions.reshape(self._action_shape)
         if values.dtype != np.float32 and not self._choices:
             with np.errstate(over="ignore"):  # an overflow is infinite, and refused as such
                 values = values.astype(np.float32)
@@ -346,13 +347,13 @@ class Loop(NotCopied):
         if self._choices:
             right = (values >= 0) & (values < self._choices) & (values % 1 == 0)
             expected = f"a whole number 0 to {self._choices - 1}"
-        wrong = ~right.all(axis=1)
+        wrong = ~right.reshape(self.num_envs, -1).all(axis=1)
         if wrong.any():
             if (refused := wrong if flown is None else wrong & flown).any():
                 first = int(refused.argmax())
-                got = values[first].tolist()
+                got = values.reshape(self.num_envs, -1)[first].tolist()
                 raise InputError(f"actions: expected {expected}, got {got} for env {first}")
-            values = np.where(wrong[:, None], values.dtype.type(0), values)
+            values = np.where(wrong.reshape(*self.world.shape, 1), values.dtype.type(0), values)
         return values.astype(np.float64)
 
     @property
@@ -405,17 +406,15 @@ class Loop(NotCopied):
         """The only row of the table of a single drone, in a third of the time."""
         state = self.world.state
         x, y, z = state.position.tolist()
-        row = [0.0 - y, z, x]
-        quaternion = state.quaternion
-        turned = any(quaternion[1:].tolist())
-        row += attitudes_in_paper_frame(quaternion).tolist() if turned else (0.0, 0.0, 0.0)
-        row += state.thrust.tolist()
+        level = not any(state.quaternion.tolist()[1:])
+        angles = (0.0, 0.0, 0.0) if level else attitudes_in_paper_frame(state.quaternion).tolist()
+        row = [0.0 - y, z, x, *angles, *state.thrust.tolist()]
         if self._has_goal:
             x, y, z = self.task.goal(state).tolist()
             row += (0.0 - y, z, x)
         if self._outcome is not None:
-            metrics = self._outcome.metrics
-            row += [float(metrics[metric.name]) for metric in self.task.metrics]
+            for metric in self.task.metrics:
+                row.append(float(self._outcome.metrics[metric.name]))
         return row
 
     def close(self) -> None:
@@ -423,11 +422,11 @@ class Loop(NotCopied):
         self.world.close()
         self._closed = self._anyone_waits = True
 
-    def ours(self, mask: Array | None) -> Array | None:
+    def ours(self, mask: Array) -> Array:
         """A mask that the caller gave, NumPy's or a tensor, as an array of the world's kind."""
-        if mask is None:
-            return None
-        if "bool" not in str(getattr(mask, "dtype", "")) or tuple(mask.shape) != (self.num_envs,):
+        kind = getattr(mask, "dtype", None)
+        right = kind == np.bool_ or str(kind) == "torch.bool"
+        if not right or tuple(mask.shape) != (self.num_envs,):
             expected = f"bool of shape ({self.num_envs},)"
             raise InputError(f"resets, frozen: expected {expected}, got {mask!r:.80}")
         if self._xp is np:
@@ -472,10 +471,9 @@ class OnHost:
 
 
 def _is_finite(values: np.ndarray) -> bool:
-    if values.size <= _SMALL:
-        total = sum(values.ravel().tolist())
-        if total - total == 0.0:  # else one is NaN or infinite, or they add up to too much
-            return True
+    # Else one is NaN or infinite, or they add up to too much.
+    if values.size <= _SMALL and isfinite(sum(values.ravel().tolist())):
+        return True
     return values.dtype.kind != "f" or bool(np.isfinite(values).all())
 
 

@@ -55,7 +55,8 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         self.metadata = self.metadata | {"render_fps": max(1, round(1 / self.control_period))}
         self.observation_space = observation_space(loop.spec)
         self.action_space = action_space(loop.spec)
-        self._names = telemetry_names(loop.spec)
+        self._usual = self.action_space.dtype, self.action_space.shape
+        self._names = dict.fromkeys(telemetry_names(loop.spec), 0.0)
         arrays = loop.spec.observation
         self._only = arrays[0].name if len(arrays) == 1 else ""
         self._all = np.ones(1, bool)
@@ -69,7 +70,7 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         if options:
             raise InputError(f"reset: expected no options, got {options!r}")
         super().reset(seed=seed)
-        self._loop.advance(self._no_action, self._all, [seed])
+        self._loop.advance(self._no_action, self._all, None if seed is None else [seed])
         self._episodes += 1
         if self.render_mode == "human":
             self.render()
@@ -81,8 +82,13 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         loop.advance(self._checked(action))
         if self.render_mode == "human":
             self.render()
-        ends = loop.terminated.item(), loop.truncated.item()
-        return self._observation(), loop.rewards.item(), *ends, self._info()
+        return (
+            self._observation(),
+            loop.rewards.item(),
+            loop.terminated.item(),
+            loop.truncated.item(),
+            self._info(),
+        )
 
     def render(self) -> Any:
         """A picture of now, uint8, shape (360, 480, 3), with `rgb_array`; None otherwise."""
@@ -95,9 +101,9 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         self._loop.close()
 
     def _checked(self, action: Any) -> np.ndarray:
-        space, shape = self.action_space, self.action_space.shape
-        if isinstance(action, np.ndarray) and (action.dtype, action.shape) == (np.float32, shape):
+        if isinstance(action, np.ndarray) and (action.dtype, action.shape) == self._usual:
             return action
+        space, shape = self.action_space, self.action_space.shape
         if isinstance(space, gym.spaces.Discrete):
             if not space.contains(action):
                 expected = f"a whole number 0 to {space.n - 1}"
@@ -123,7 +129,8 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
 
     def _info(self) -> dict[str, Any]:
         loop = self._loop
-        info = dict(zip(self._names, loop.row(), strict=True))
+        info = self._names.copy()  # faster than to insert one name after the other
+        info |= zip(self._names, loop.row(), strict=False)
         for name, term in loop.terms.items():
             info["reward_" + name] = float(term)
         return info

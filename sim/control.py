@@ -27,7 +27,7 @@ class Controller(Protocol):
     """0: an action is k numbers. Otherwise it is one number, 0 to choices - 1."""
 
     def thrust(self, action: Array, state: WorldState) -> Array:
-        """Thrust of each rotor until the next action, N, shape (W, A, R).
+        """Thrust of each rotor until the next action, N, shape (W, A, R), or what broadcasts to it.
 
         Actions are float64, shape (W, A, k), finite; one beyond a bound counts as the bound.
         """
@@ -66,13 +66,15 @@ class CollectiveThrust:
         share = component(action, 0)
         share = share - 1.0 if self.choices else clip(share, -1.0, 1.0)
         if self._alike:
-            return stack((self._clipped(component(state.thrust, 0), share),))
-        return self._clipped(state.thrust, stack((share,)))
-
-    def _clipped(self, thrust: Array, share: Array) -> Array:
-        base = thrust if self._increment else constant(self._hover, thrust)
-        low, high = constant(self._low, thrust), constant(self._high, thrust)
-        return clip(base + constant(self._per_action, thrust) * share, low, high)
+            present = component(state.thrust, 0) if self._increment else self._hover
+            thrust = clip(present + self._per_action * share, self._low, self._high)
+            return thrust if isinstance(thrust, float) else stack((thrust,))
+        per_action, hover, low, high = (
+            constant(x, state.thrust)
+            for x in (self._per_action, self._hover, self._low, self._high)
+        )
+        present = state.thrust if self._increment else hover
+        return clip(present + per_action * stack((share,)), low, high)
 
 
 class RotorThrust:

@@ -21,6 +21,7 @@ from ..world import PhysicsError, contact_check
 __all__ = ["MujocoWorld"]
 
 _FEW: Final = 8
+_ONLY: Final = np.zeros(1, int)
 
 
 class MujocoWorld:
@@ -52,8 +53,8 @@ class MujocoWorld:
         qvel: np.ndarray = batch.bind("qvel")
         self._ctrl: np.ndarray = batch.bind("ctrl")
         self._contacts: np.ndarray = batch.bind("ncon")
-        self._warnings: np.ndarray = batch.warning[:, :, 1]  # counts, beside the last info
-        self._no_warnings = self._warnings.tobytes()
+        self._warnings = batch.warning  # of each kind the last info, and how many
+        self._no_warnings, self._no_contacts = self._warnings.tobytes(), self._contacts.tobytes()
         newtons = np.array([rotor.newtons for rotor in vehicle.rotors])
         self._newtons = None if (newtons == 1.0).all() else newtons
         # Where controls are newtons, they are the thrusts.
@@ -73,7 +74,7 @@ class MujocoWorld:
     def reset(self, mask: Array, pose: Pose) -> None:
         """As `World.reset`."""
         self._check_process()
-        ids = np.flatnonzero(mask)
+        ids = self._ids(mask)
         self._batch.state[ids] = self._initial
         self._warnings[ids] = 0
         state, here = self.state, () if self.shape == () else ids
@@ -89,17 +90,16 @@ class MujocoWorld:
         self._apply_thrust()
         # To wake the threads takes longer than a few worlds.
         for some in (ids,) if len(ids) > _FEW else ids[:, None]:
-            self._batch.forward(some)
+            self._batch.forward(some if self.shape else None)
         self._touching[ids] = self._contacts[ids] > 0
 
     def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
         """As `World.step`."""
         self._check_process()
-        ids = None if mask is None else np.flatnonzero(mask)
-        here = ... if ids is None or self.shape == () else ids
-        self.state.thrust[here] = thrust[here]
+        ids = None if mask is None else self._ids(mask)
+        here, some = ... if ids is None or not self.shape else ids, ... if ids is None else ids
+        self.state.thrust[here] = thrust if here is ... else thrust[here]
         self._apply_thrust()
-        some = ... if ids is None else ids
         touching = self._touching
         touching[some] = False
         while substeps > 0:
@@ -108,7 +108,7 @@ class MujocoWorld:
             except SimulationError as error:
                 self._warnings.fill(0)  # of the other worlds: a reset is due all the same
                 raise PhysicsError(f"{error}: reset the env") from None
-            if np.count_nonzero(self._contacts):
+            if self._contacts.tobytes() != self._no_contacts:  # faster than to count
                 touching[some] |= self._contacts[some] > 0
             substeps -= self._check
         if self._warnings.tobytes() != self._no_warnings:
@@ -116,12 +116,12 @@ class MujocoWorld:
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """As `World.seed`."""
-        ids = np.flatnonzero(mask).tolist()
+        ids = self._ids(mask).tolist()
         self._streams.seed(ids, [seeds[i] for i in ids])
 
     def draw(self, mask: Array, chosen: Mapping[str, Any] | None = None) -> Draw:
         """As `World.draw`."""
-        return NumpyDraw(self._streams, np.flatnonzero(mask).tolist(), self.shape, chosen)
+        return NumpyDraw(self._streams, self._ids(mask).tolist(), self.shape, chosen)
 
     def close(self) -> None:
         """As `World.close`."""
@@ -132,6 +132,10 @@ class MujocoWorld:
         for view in ("_batch", "_ctrl", "_contacts", "_warnings", "_thrust"):
             vars(self).pop(view, None)
 
+    def _ids(self, mask: Array) -> np.ndarray:
+        """The worlds of a mask; of a single one it is always true."""
+        return np.flatnonzero(mask) if self.shape else _ONLY
+
     def _check_process(self) -> None:
         if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
             raise RuntimeError("the threads of an env do not follow into a fork: make another env")
@@ -141,8 +145,9 @@ class MujocoWorld:
             np.divide(self._thrust, self._newtons, out=self._ctrl)
 
     def _describe_warnings(self) -> str:
-        ids = np.flatnonzero(self._warnings.any(axis=1)).tolist()
-        kinds = np.flatnonzero(self._warnings.any(axis=0)).tolist()
+        counts = self._warnings[:, :, 1]
+        ids = np.flatnonzero(counts.any(axis=1)).tolist()
+        kinds = np.flatnonzero(counts.any(axis=0)).tolist()
         names = ", ".join(mujoco.mjtWarning(kind).name for kind in kinds)
         self._warnings.fill(0)  # so that a reset gives usable worlds again
         return f"MuJoCo warned of {names} in envs {ids[:5]}: reset the env"
