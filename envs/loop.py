@@ -187,13 +187,12 @@ class Loop(NotCopied):
         self._begun = self._closed = False
         self._outcome: Outcome | None = None
         self.terms: dict[str, Array] = {}
-        self._telemetry: np.ndarray | None = None
-        self._goal: tuple[Any, Any] = (None, None)
+        self._telemetry: dict[str, np.ndarray] | None = None
         ends = np.cumsum([0, *(array.size for array in self.spec.telemetry)]).tolist()
-        self._columns = {  # where each array of the telemetry lies in the table of all
+        self._columns = {  # where each array of the telemetry lies in the row of a single drone
             array.name: slice(*ends[i : i + 2]) for i, array in enumerate(self.spec.telemetry)
         }
-        self._has_goal, self._told = "goal" in self._columns, len(draft.metrics)
+        self._has_goal = "goal" in self._columns
 
     def advance(
         self,
@@ -375,35 +374,31 @@ class Loop(NotCopied):
     @property
     def telemetry(self) -> dict[str, np.ndarray]:
         """By the names of `spec.telemetry`, float64, shape (N, *shape), in the paper's frame."""
-        told = self.telemetry_table
-        return {name: told[:, columns] for name, columns in self._columns.items()}
-
-    @property
-    def telemetry_table(self) -> np.ndarray:
-        """All telemetry side by side, float64, shape (N, T), T in the order of `spec.telemetry`."""
         if self._telemetry is None:
-            alone = not self.world.shape
-            self._telemetry = np.array((self.row(),)) if alone else self._table()
+            if self.world.shape:
+                self._telemetry = self._tell()
+            else:
+                told = np.array((self.row(),))
+                self._telemetry = {name: told[:, at] for name, at in self._columns.items()}
         return self._telemetry
 
-    def _table(self) -> np.ndarray:
-        state, n, at = self.world.state, self.num_envs, self._columns
-        told = np.empty((n, at[self.spec.telemetry[-1].name].stop))
-        positions_in_paper_frame(on_host(state.position).reshape(n, 3), told[:, :3])
-        attitudes_in_paper_frame(on_host(state.quaternion).reshape(n, 4), told[:, 3:6])
-        told[:, at["thrust"]] = on_host(state.thrust).reshape(n, -1)
+    def _tell(self) -> dict[str, np.ndarray]:
+        state, n = self.world.state, self.num_envs
+        told = {
+            "position": positions_in_paper_frame(on_host(state.position).reshape(n, 3)),
+            "attitude": attitudes_in_paper_frame(on_host(state.quaternion).reshape(n, 4)),
+            "thrust": on_host(state.thrust).reshape(n, -1).astype(np.float64),
+        }
         if self._has_goal:
-            goal = self.task.goal(state)
-            if goal is not self._goal[0]:  # many goals stay as they are
-                self._goal = goal, positions_in_paper_frame(on_host(goal).reshape(n, 3))
-            told[:, at["goal"]] = self._goal[1]
-        if self._outcome is not None:
-            for column, metric in enumerate(self.task.metrics, told.shape[1] - self._told):
-                told[:, column] = on_host(self._outcome.metrics[metric.name]).reshape(-1)
+            goal = on_host(self.task.goal(state))
+            told["goal"] = positions_in_paper_frame(goal.reshape(n, 3))
+        if metrics := self.metrics:
+            columns = [on_host(metrics[metric.name]) for metric in self.task.metrics]
+            told["metrics"] = np.stack(columns, axis=1, dtype=np.float64)
         return told
 
     def row(self) -> list[float]:
-        """The only row of the table of a single drone, in a third of the time."""
+        """The telemetry of a single drone in a row, in a third of the time."""
         state = self.world.state
         x, y, z = state.position.tolist()
         level = not any(state.quaternion.tolist()[1:])

@@ -24,31 +24,25 @@ Array = NDArray[np.float64]
 _POLE: Final = 1 - 1e-12  # sine of phi past which (within 1e-4 degrees) the nose counts as vertical
 
 
-def positions_in_paper_frame(positions: ArrayLike, out: Array | None = None) -> Array:
-    """(x, y, z) in MuJoCo's world -> (X, Y, Z) in the paper's, m; both (..., 3).
-
-    Written to `out` if it is given, which is not `positions` itself.
-    """
+def positions_in_paper_frame(positions: ArrayLike) -> Array:
+    """(x, y, z) in MuJoCo's world -> (X, Y, Z) in the paper's, m; both (..., 3)."""
     positions = np.asarray(positions, np.float64)
-    if out is None:
-        out = np.empty(positions.shape)
+    out = np.empty(positions.shape)
     np.subtract(0.0, positions[..., 1], out=out[..., 0])  # no negative zeros
     out[..., 1:] = positions[..., 2::-2]
     return out
 
 
-def attitudes_in_paper_frame(quaternions: ArrayLike, out: Array | None = None) -> Array:
-    """Unit quaternions (w, x, y, z) in MuJoCo's world -> (phi, theta, psi), degrees.
+def attitudes_in_paper_frame(quaternions: ArrayLike) -> Array:
+    """Unit quaternions (w, x, y, z) in MuJoCo's world -> (phi, theta, psi), degrees, (..., 3).
 
     phi lies in [-90, 90], the others in [-180, 180]. With the nose straight up or down only a sum
     of theta and psi is defined: psi is then 0. Level craft that point forward, as all of the
-    elevation task, cost next to nothing. Written to `out`, (..., 3), if it is given.
+    elevation task, cost next to nothing.
     """
     quaternions = np.asarray(quaternions, np.float64)
-    if out is None:
-        out = np.empty((*quaternions.shape[:-1], 3))
+    out = np.zeros((*quaternions.shape[:-1], 3))
     if not np.count_nonzero(quaternions[..., 1:]):
-        out.fill(0.0)
         return out
     # One craft as four floats, many as four contiguous rows: the same bits, and fast for one.
     if quaternions.size == 4:

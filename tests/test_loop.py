@@ -27,7 +27,7 @@ def started(env_id: str = ID, num_envs: int = 2, **options: Any) -> tuple[Loop, 
 
 def shown(loop: Loop, drone: int) -> bytes:
     """All that is told of a drone."""
-    arrays = [*loop.observations.values(), loop.telemetry_table]
+    arrays = [*loop.observations.values(), *loop.telemetry.values()]
     return b"".join(array[drone].tobytes() for array in arrays)
 
 
@@ -177,7 +177,7 @@ def test_what_a_step_gave_stays_as_it_was(careless: str, num_envs: int) -> None:
     loop.advance(actions, np.ones(num_envs, bool), range(num_envs))
     loop.advance(actions)
     given = [*loop.observations.values(), *loop.metrics.values(), *loop.reward_terms.values()]
-    given += [loop.rewards, loop.terminated, loop.truncated, loop.telemetry_table]
+    given += [loop.rewards, loop.terminated, loop.truncated, *loop.telemetry.values()]
     kept = [array.copy() for array in given]
     loop.advance(actions)
     loop.advance(actions)
