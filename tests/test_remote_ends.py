@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -30,6 +31,7 @@ from rotorgram.udp import (
 from rotorgram.udp import __main__ as udp_main
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.messages import Close, Hello, Welcome
+from rotorgram.udp.transport import simulator as simulators
 from rotorgram.udp.transport import sockets
 
 # ---- silence and ends
@@ -389,3 +391,21 @@ def test_a_simulator_of_our_own_waits_as_long_as_its_agent_lives(
         assert udp_main.main() == 0
     assert made[0] == LinkConfig().timeout
     assert made[1] >= 86_400
+
+
+def test_a_pause_of_its_own_does_not_end_a_simulator(  # fault 25
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(simulators, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    with plain_socket() as nobody, Simulator(server=nobody.getsockname(), bind=ANY) as simulator:
+        simulator.link.connect(0.0)
+        welcome = Welcome(session=1, nonce=1)
+        answers = iter([None, welcome])
+
+        def receive(_: float) -> Welcome | None:  # the process was stopped meanwhile
+            now[0] += 1e4
+            return next(answers)
+
+        monkeypatch.setattr(simulator, "_receive", receive)
+        assert simulator._wait() is welcome
