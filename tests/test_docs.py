@@ -66,6 +66,13 @@ def test_the_speeds_are_those_of_the_benchmark() -> None:
         assert f"| `{agent}` | {median:,.0f} | {speed['ratio_to_sb3'][agent]:.2f} |" in page
 
 
+def test_the_steps_of_the_ppo_example_are_those_that_were_measured() -> None:  # fault 19
+    page = (ROOT / "docs" / "extending.md").read_text()
+    for rows in json.loads((RESULTS / "performance" / "ppo_example.json").read_text()).values():
+        steps = [row["return_200"] for row in rows]
+        assert f"{min(steps):,} to {max(steps):,}" in page
+
+
 def test_committed_results_are_small() -> None:
     sizes = {p: p.stat().st_size for p in RESULTS.rglob("*") if p.is_file()}
     assert {str(p): s for p, s in sizes.items() if s > 300_000} == {}
