@@ -12,7 +12,7 @@ Neither loads MuJoCo before an env is made.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from .registry import is_known, register
+from .registry import register
 from .spec import ArraySpec, Discrete, EnvSpec, Metric
 
 if TYPE_CHECKING:
@@ -24,17 +24,9 @@ if TYPE_CHECKING:
 __all__ = [
     "ArraySpec", "Discrete", "EnvSpec", "LocalVectorEnv", "Loop", "Metric", "Outcome",
     "SingleEnv", "Task", "TaskOptions", "check_choice", "check_number", "register",
-    "register_all",
 ]  # fmt: skip
 
 _HOMES: Final = {"Loop": "loop", "LocalVectorEnv": "vector", "SingleEnv": "single"}
-
-
-def register_all() -> None:
-    """Add our envs to Gymnasium's registry, once."""
-    for name in ("Elevation", "Hover"):
-        if not is_known(f"rotorgram/{name}-v0"):
-            register(f"rotorgram/{name}-v0", f"rotorgram.envs.tasks.{name.lower()}:{name}")
 
 
 def __getattr__(name: str) -> Any:
@@ -44,4 +36,5 @@ def __getattr__(name: str) -> Any:
     return getattr(import_module(f".{_HOMES.get(name, 'tasks.task')}", __name__), name)
 
 
-register_all()
+for _name in ("Elevation", "Hover"):
+    register(f"rotorgram/{_name}-v0", f"rotorgram.envs.tasks.{_name.lower()}:{_name}")

@@ -12,8 +12,6 @@ from ..models.errors import InputError
 from .spaces import action_space, info_columns, observation_space
 from .spec import Discrete, EnvSpec
 
-__all__ = ["AdvancingVectorEnv", "Seeds", "Step", "checked_mask", "checked_seeds"]
-
 Step = tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 Seeds = Sequence[int | None] | np.ndarray
 

@@ -23,8 +23,6 @@ from .autoreset import Seeds, checked_seeds
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
 
-__all__ = ["Loop", "OnHost", "make_task", "spec_of"]
-
 _SMALL: Final = 64  # Up to this many numbers Python's loop is faster than NumPy's call
 
 

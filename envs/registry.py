@@ -13,8 +13,6 @@ from .spec import EnvSpec, canonical_id
 if TYPE_CHECKING:
     from .tasks.task import Task, TaskOptions
 
-__all__ = ["env_spec", "is_known", "load", "options_type", "register", "task_type"]
-
 _ID: Final = re.compile(r"([\w.-]+/)?[\w.-]+-v\d+")
 _tasks: Final[dict[str, "str | type[Task]"]] = {}
 

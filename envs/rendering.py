@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from ..rendering.live import LiveView
     from .loop import Loop
 
-__all__ = ["RENDER_MODES", "Renderer", "moment", "moments"]
-
 RENDER_MODES: Final = ["human", "rgb_array"]
 
 

@@ -11,8 +11,6 @@ from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
 from .spaces import action_space, observation_space, telemetry_names
 
-__all__ = ["SingleEnv"]
-
 
 class SingleEnv(NotCopied, gym.Env[Any, Any]):
     """A drone that flies a task, in process.

@@ -8,8 +8,6 @@ from gymnasium import spaces
 
 from .spec import ArraySpec, Discrete, EnvSpec, component_names
 
-__all__ = ["action_space", "info_columns", "joined", "observation_space", "telemetry_names"]
-
 
 def box(array: ArraySpec) -> spaces.Box:
     """The space of one array."""

@@ -15,8 +15,6 @@ import numpy as np
 
 from ..models.errors import InputError
 
-__all__ = ["ArraySpec", "Discrete", "EnvSpec", "Metric", "SpecError", "canonical_id"]
-
 MAX_ELEMENTS: Final = 1 << 22  # numbers of all observations of one drone
 MAX_TOLD: Final = 1 << 14  # numbers of all its telemetry: each has a name in `info`
 MAX_DIMENSIONS: Final = 16  # axes of an array

@@ -14,8 +14,6 @@ from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
 from .spaces import joined
 
-__all__ = ["LocalVectorEnv"]
-
 
 class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
     """N drones that fly a task in process, bit for bit as N single ones do.

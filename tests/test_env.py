@@ -19,7 +19,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rotorgram.envs import Loop, SingleEnv, register_all
+from rotorgram.envs import Loop, SingleEnv
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.tasks.elevation import Elevation
 from rotorgram.models.errors import InputError
@@ -124,16 +124,12 @@ def test_module_prefix_needs_no_import_and_importing_loads_no_simulator() -> Non
         "import rotorgram.envs\n"
         "assert 'mujoco' not in sys.modules\n"
         "assert 'torch' not in sys.modules\n"
-        "rotorgram.envs.register_all()\n"
         "env = gymnasium.make('rotorgram.envs:rotorgram/Hover-v0', heading=7)\n"
         "assert env.unwrapped.env_spec.options['heading'] == 7.0\n"
         "assert env.unwrapped.env_spec.env_id == 'rotorgram/Hover-v0'\n"
         "assert 'torch' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
-    before = gym.registry[ID]
-    register_all()  # twice does no harm
-    assert gym.registry[ID] is before
 
 
 def test_options_through_make() -> None:

@@ -260,8 +260,8 @@ def test_what_a_user_typed_is_imported_and_nothing_else(
 
 
 def test_options_are_a_plain_dataclass() -> None:
-    assert registry.options_type(HOVER).from_options({"heading": 3}).heading == 3.0  # type: ignore[attr-defined]
-    assert issubclass(registry.options_type(ID), TaskOptions)
+    assert registry.task_type(HOVER).Options.from_options({"heading": 3}).heading == 3.0  # type: ignore[attr-defined]
+    assert issubclass(registry.task_type(ID).Options, TaskOptions)
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])

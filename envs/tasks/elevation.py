@@ -11,8 +11,6 @@ from ...sim import Array, CollectiveThrust, Draw, Pose, WorldState, component, p
 from ..spec import ArraySpec, Metric
 from .task import Outcome, Task, TaskOptions, check_choice, check_number, finite
 
-__all__ = ["Elevation", "ElevationOptions"]
-
 ERROR_SCALE: Final = 0.5  # |E| at which the reward crosses zero, m
 TERMINATION_REWARD: Final = -20.0
 """Added to the reward of the step that terminates an episode (crash, flip-over, out of band)."""

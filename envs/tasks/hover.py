@@ -11,8 +11,6 @@ from ...sim import Array, Draw, Pose, RotorThrust, WorldState, clip, component, 
 from ..spec import ArraySpec, Metric
 from .task import Outcome, Task, TaskOptions, check_number, finite
 
-__all__ = ["Hover", "HoverOptions"]
-
 ERROR_SCALE: Final = 0.5  # Distance at which the reward for nearness crosses zero, m
 HEADING_WEIGHT: Final = 0.2  # Cost of a heading half a turn off
 RATE_WEIGHT: Final = 0.02  # Cost of a body rate of 1 rad/s

@@ -23,8 +23,6 @@ from ..spec import ArraySpec, Metric
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
 
-__all__ = ["Outcome", "Task", "TaskOptions", "check_choice", "check_number", "finite"]
-
 LONGEST_CONTROL_PERIOD: Final = 1.0  # Longest time between two actions, s
 LONGEST_EPISODE: Final = 1 << 31  # Most control steps of an episode
 
