@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..envs.rendering import moment
-from ..rendering.live import MOST_DRONES, LiveView, open_surface
+from ..rendering.live import MOST_DRONES, LiveView, Pace, open_surface
 from ..rendering.moment import Moment
-from ..rendering.pace import Pace
 from ..rendering.stage import Stage
 from ..udp.protocol.messages import Command, Message, State
 from ..udp.transport.simulator import Observer, Simulator

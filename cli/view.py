@@ -39,8 +39,7 @@ class View(EnvFlags):
     def run(self) -> int:
         """Fly and show, episode after episode."""
         from ..experiments.filming import moments
-        from ..rendering.live import LiveView, open_surface
-        from ..rendering.pace import Pace
+        from ..rendering.live import LiveView, Pace, open_surface
         from ..rendering.stage import Stage
         from ._env import words_of
 

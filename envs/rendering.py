@@ -56,12 +56,11 @@ class Renderer:
 
     def _show(self, now: "list[Moment]") -> None:
         from ..rendering import Stage, live
-        from ..rendering.pace import Pace
 
         shown = now[: live.MOST_DRONES]
         if self._view is None:
             stage = Stage(drones=len(shown), vehicle=self._loop.vehicle.path)
-            pace = Pace(self._loop.spec.control_period)
+            pace = live.Pace(self._loop.spec.control_period)
             surface = live.open_surface("window", stage, pace)
             self._view = live.LiveView(stage, surface, pace, of=len(now))
         if shown != self._shown:  # `step` shows by itself, and a script may ask once more

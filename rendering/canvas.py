@@ -8,7 +8,7 @@ import numpy as np
 
 from ..models.errors import expect
 from .gl import NoOpenGL, offscreen_context
-from .stage import Camera, Stage, scene_geoms
+from .stage import Camera, Stage
 
 __all__ = ["Canvas"]
 
@@ -56,7 +56,7 @@ class Canvas(AbstractContextManager["Canvas"]):
             if light.headlight and camera == "top":  # it would add itself to the sun
                 light.diffuse[:] = 0.0
         # From on board, at the goal, its disc would fill the lower half.
-        stage.decorate(scene_geoms(scene), goals=camera != "onboard")
+        stage.decorate(scene, goals=camera != "onboard")
         pixels = np.empty((self.height, self.width, 3), np.uint8)
         try:
             with self._gl.as_current():

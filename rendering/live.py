@@ -1,4 +1,4 @@
-"""Live views: the latest moment in a window or a browser.
+"""Live views: the latest moment in a window or a browser, and the speed of what is shown.
 
 `LiveView.draw` returns at once, and a thread draws the latest moment. A slow machine draws fewer
 pictures; the simulation goes on, slowed only by the processor that both share.
@@ -6,6 +6,7 @@ pictures; the simulation goes on, slowed only by the processor that both share.
 
 import time
 from contextlib import AbstractContextManager
+from queue import SimpleQueue
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
@@ -14,7 +15,6 @@ import numpy as np
 
 from ..models.errors import expect
 from .moment import Moment
-from .pace import Pace
 from .stage import Stage
 
 if TYPE_CHECKING:
@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 
     Surface: TypeAlias = Window | WebPage
 
-__all__ = ["MOST_DRONES", "Aim", "Lines", "LiveView", "lines_over", "open_surface"]
+__all__ = [
+    "MOST_DRONES", "SPEEDS", "Aim", "Lines", "LiveView", "Pace", "Press", "lines_over",
+    "open_surface",
+]  # fmt: skip
 
 MOST_DRONES: Final = 16
 """Most craft side by side; of more, the first ones are shown."""
@@ -32,6 +35,72 @@ _NAP: Final = 0.02  # s, at most, before keys are looked at again
 
 Lines = list[tuple[str, str]]
 """Names and values."""
+Press = Literal["pause", "step", "slower", "faster"]
+"""Effect of a key or a button."""
+
+SPEEDS: Final = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
+"""Steps of `slower` and `faster`; 1 is real time."""
+_SLOWEST, _FASTEST = SPEEDS[0], SPEEDS[-1]
+_CATCH_UP: Final = 0.1  # Longest delay that later steps make up for, s
+
+
+class Pace:
+    """When the next control step is due, in seconds of any clock: the time is passed in.
+
+    Args:
+        period: Time between two steps, s; 0 for as fast as possible.
+        speed: 2 is twice as fast as real time. One beyond `SPEEDS` raises `InputError`.
+    """
+
+    def __init__(self, period: float, speed: float = 1.0) -> None:
+        right = _SLOWEST <= speed <= _FASTEST
+        expect(right, "speed", f"{_SLOWEST:g} to {_FASTEST:g}", f"{speed:g}")
+        self.period, self.speed, self.paused = period, speed, False
+        self._presses: SimpleQueue[Press] = SimpleQueue()
+        self._asked = 0  # steps that a pause lets pass
+        self._since: float | None = None  # when the last step was due
+
+    @property
+    def words(self) -> str:
+        """Speed and pause, for an overlay."""
+        speed = f"1/{1 / self.speed:g} x" if self.speed < 1 else f"{self.speed:g} x"
+        if not self.period:
+            return "paused" if self.paused else "as fast as it flies"
+        return f"{speed}, paused" if self.paused else speed
+
+    def press(self, press: Press) -> None:
+        """Tell of a press, which `wait` then obeys; from any thread."""
+        self._presses.put(press)
+
+    def wait(self, now: float) -> float | None:
+        """Seconds until the next step is due, 0 if it is; None while paused."""
+        while not self._presses.empty():
+            self._obey(self._presses.get())
+        if self.paused:
+            return 0.0 if self._asked else None
+        if self._since is None:
+            return 0.0
+        return max(0.0, self._since + self.period / self.speed - now)
+
+    def stepped(self, now: float) -> None:
+        """A step was taken now."""
+        if self.paused:
+            self._asked = max(0, self._asked - 1)
+            self._since = now
+            return
+        due = now if self._since is None else self._since + self.period / self.speed
+        self._since = min(max(due, now - _CATCH_UP), now)
+
+    def _obey(self, press: Press) -> None:
+        if press == "pause":
+            self.paused, self._asked, self._since = not self.paused, 0, None
+        elif press == "step":
+            self._asked = self._asked + 1 if self.paused else 1
+            self.paused = True
+        elif press == "slower":
+            self.speed = max((s for s in SPEEDS if s < self.speed), default=_SLOWEST)
+        else:
+            self.speed = min((s for s in SPEEDS if s > self.speed), default=_FASTEST)
 
 
 class Aim:

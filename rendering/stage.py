@@ -3,7 +3,7 @@
 import copy
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
@@ -16,14 +16,11 @@ from ..models.scene import SCENE_PREFIX, World, build_scene
 from ..models.vehicle import Vehicle
 from .moment import Moment
 
-__all__ = ["CAMERAS", "WORLDS", "Camera", "NextGeom", "Stage", "World", "scene_geoms"]
+__all__ = ["CAMERAS", "WORLDS", "Camera", "Stage", "World"]
 
 Camera = Literal["chase", "front", "side", "top", "onboard"]
 CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
 WORLDS: Final[tuple[World, ...]] = get_args(World)
-
-NextGeom = Callable[[], mujoco.MjvGeom | None]
-"""Returns a geom to fill in, or None if the scene is full."""
 
 _TRAIL, _EVERY = 150, 3  # control steps of a path, and of one piece of it
 _DISC = (0.13, 0.78, 0.52, 0.30)
@@ -158,19 +155,19 @@ class Stage:
         goals = [goal for i in range(self.drones) if (goal := self._goal(i)) is not None]
         return np.asarray((np.array(goals) if goals else self._points()).mean(axis=0))
 
-    def decorate(self, next_geom: NextGeom, *, goals: bool = True) -> None:
-        """Add the discs that mark the goals, if they are wanted, and the fading paths."""
+    def decorate(self, scene: mujoco.MjvScene, *, goals: bool = True) -> None:
+        """Add the fading paths to a scene, and the discs that mark the goals if they are wanted."""
         for i, path in enumerate(self._paths if self.moments else ()):
             goal = self._goal(i)
             if goals and goal is not None:
                 size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
-                _decoration(next_geom, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, _DISC)
+                _decoration(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, _DISC)
             points = [*path, self._points()[i]]
             for number, (start, end) in enumerate(pairwise(points), 1):
                 if np.array_equal(start, end):
                     continue
                 kind, rgba = mujoco.mjtGeom.mjGEOM_CAPSULE, (*_PATH, 0.85 * number / len(path))
-                geom = _decoration(next_geom, kind, (1.0, 1.0, 1.0), start, rgba)
+                geom = _decoration(scene, kind, (1.0, 1.0, 1.0), start, rgba)
                 if geom is not None:
                     mujoco.mjv_connector(geom, kind, 0.019 * self.radius, start, end)
 
@@ -189,18 +186,6 @@ class Stage:
             return 0.0
         now = float(np.linalg.norm(goal - here))
         return max(before, now if before == 0.0 else min(now, _FAR * self.radius))
-
-
-def scene_geoms(scene: mujoco.MjvScene) -> NextGeom:
-    """A function that returns the next free geom of a scene."""
-
-    def next_geom() -> mujoco.MjvGeom | None:
-        if scene.ngeom == scene.maxgeom:
-            return None
-        scene.ngeom += 1
-        return scene.geoms[scene.ngeom - 1]
-
-    return next_geom
 
 
 def _free_body(spec: mujoco.MjSpec) -> Any:
@@ -247,15 +232,17 @@ def _grid(drones: int, spacing: float) -> np.ndarray:
 
 
 def _decoration(
-    next_geom: NextGeom,
+    scene: mujoco.MjvScene,
     kind: mujoco.mjtGeom,
     size: Sequence[float],
     centre: np.ndarray,
     rgba: Sequence[float],
 ) -> mujoco.MjvGeom | None:
-    """A geom that casts no shadow; None if the scene is full."""
-    if (geom := next_geom()) is not None:
-        color = np.array(rgba, np.float32)
-        mujoco.mjv_initGeom(geom, kind, np.array(size), centre, np.eye(3).ravel(), color)
-        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+    """A new geom that casts no shadow; None if the scene is full."""
+    if scene.ngeom == scene.maxgeom:
+        return None
+    geom, color = scene.geoms[scene.ngeom], np.array(rgba, np.float32)
+    scene.ngeom += 1
+    mujoco.mjv_initGeom(geom, kind, np.array(size), centre, np.eye(3).ravel(), color)
+    geom.category = mujoco.mjtCatBit.mjCAT_DECOR
     return geom

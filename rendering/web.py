@@ -3,6 +3,7 @@
 The server draws nothing: the browser gets the model once and then poses, and draws them itself.
 """
 
+import copy
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,8 +18,7 @@ from mujoco.studio.web import web_server
 from mujoco.studio.web.state_payload import MAX_EXTRA_GEOMS
 
 from ..models.errors import InputError
-from .live import Aim, Lines
-from .pace import Pace, Press
+from .live import Aim, Lines, Pace, Press
 from .stage import Stage
 
 __all__ = ["WebPage", "refusal"]
@@ -83,6 +83,7 @@ class WebPage:
         if not 0 <= port <= 65535:
             raise InputError(f"port: expected 0 to 65535, got {port}")
         self._stage, self._panel = stage, _Panel(pace, Aim(stage))
+        self._scene = mujoco.MjvScene(stage.model, MAX_EXTRA_GEOMS)
         config = viewer_protocol.ViewerConfig(title="rotorgram", gfx="web", http_port=port)
 
         def serve(endpoint: Any) -> None:
@@ -104,15 +105,9 @@ class WebPage:
 
     def show(self, lines: Lines) -> None:
         """Draw the stage as it is now, with these lines over it."""
-        geoms: list[mujoco.MjvGeom] = []
-
-        def next_geom() -> mujoco.MjvGeom | None:
-            if len(geoms) == MAX_EXTRA_GEOMS:
-                return None
-            geoms.append(mujoco.MjvGeom())
-            return geoms[-1]
-
-        self._stage.decorate(next_geom)
+        self._scene.ngeom = 0
+        self._stage.decorate(self._scene)
+        geoms = [copy.copy(geom) for geom in self._scene.geoms[: self._scene.ngeom]]
         self._handle.sync()
         self._handle.send_to_viewer(_Look(lines=lines, geoms=geoms))
 

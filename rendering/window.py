@@ -12,9 +12,8 @@ from typing import Any, Final
 import mujoco
 
 from .gl import NoOpenGL
-from .live import Aim, Lines
-from .pace import Pace, Press
-from .stage import Stage, scene_geoms
+from .live import Aim, Lines, Pace, Press
+from .stage import Stage
 
 __all__ = ["KEYS", "NoDisplay", "Window"]
 
@@ -76,7 +75,7 @@ class Window:
         with handle.lock():
             self._aim.apply(handle.cam)
             handle.user_scn.ngeom = 0
-            self._stage.decorate(scene_geoms(handle.user_scn))
+            self._stage.decorate(handle.user_scn)
         keys = _HELP if self._pace.period else _HELP[:2]
         top, bottom = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
         handle.set_texts([_text(top, lines), _text(bottom, keys)])

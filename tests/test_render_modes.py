@@ -122,12 +122,12 @@ def test_no_picture_without_a_mode(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_a_path_begins_anew_with_each_episode() -> None:
     stage = Stage("plain")
-    geoms = []
+    scene = mujoco.MjvScene(stage.model, 100)
 
     def count() -> int:
-        geoms.clear()
-        stage.decorate(lambda: geoms.append(mujoco.MjvGeom()) or geoms[-1])
-        return len(geoms)
+        scene.ngeom = 0
+        stage.decorate(scene)
+        return int(scene.ngeom)
 
     stage.show(at(5.0))
     assert count() == 1, "the disc"

@@ -22,8 +22,7 @@ from rotorgram.envs import SingleEnv
 from rotorgram.envs.registry import env_spec
 from rotorgram.models import InputError
 from rotorgram.rendering import Moment, Stage, live
-from rotorgram.rendering.live import Aim, Lines, LiveView, lines_over
-from rotorgram.rendering.pace import Pace
+from rotorgram.rendering.live import Aim, Lines, LiveView, Pace, lines_over
 from rotorgram.udp import RemoteEnv, Simulator
 from rotorgram.udp.protocol.messages import Command, Message, State, Welcome
 

@@ -12,8 +12,7 @@ WINDOW = """
 import os, sys, threading, time
 import mujoco
 from rotorgram.rendering import Moment, Stage
-from rotorgram.rendering.live import LiveView, open_surface
-from rotorgram.rendering.pace import Pace
+from rotorgram.rendering.live import LiveView, Pace, open_surface
 
 niceness = os.getpriority(os.PRIO_PROCESS, 0)
 stage, pace = Stage("plain", 2), Pace(0.02)
@@ -115,8 +114,7 @@ from urllib.request import urlopen
 import mujoco
 from rotorgram.rendering import Moment, Stage
 from rotorgram.rendering import web
-from rotorgram.rendering.live import LiveView, open_surface
-from rotorgram.rendering.pace import Pace
+from rotorgram.rendering.live import LiveView, Pace, open_surface
 
 def wait_until(condition):
     end = time.monotonic() + 30
