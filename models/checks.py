@@ -89,28 +89,29 @@ def examine(vehicle: Vehicle, *, paper: bool | None = None) -> list[Check]:
     model = copy.copy(vehicle.model)  # without air and drag
     model.opt.density = model.opt.viscosity = 0.0
     model.opt.wind = model.dof_damping[:3] = 0.0
-    body = _Body(vehicle, model)
+    craft = _Craft(vehicle, model)
     parts = [_mass, _rotors, _free_fall, _hover, _climb, _tumbling, _resting, _linear_drag]
-    checks = [check for part in parts for check in part(vehicle, model, body)]
+    checks = [check for part in parts for check in part(craft)]
     if paper if paper is not None else vehicle.path == QUAD_XML.resolve():
         expected, rotors = f"the {NUM_ROTORS} rotors of the paper", vehicle.num_rotors
         expect(rotors == NUM_ROTORS, "vehicle", expected, f"{rotors}")
-        # With air and drag, if there are any, for the paper has none.
+        craft = _Craft(vehicle, vehicle.model)  # with air and drag, if any, for the paper has none
         parts = [_paper_numbers, _paper_rotors, _paper_flights, _spinning_top, _paper_drag]
-        checks += [check for part in parts for check in part(vehicle, vehicle.model, body)]
+        checks += [check for part in parts for check in part(craft)]
     return checks
 
 
-class _Body:
-    """A body as its answers to a newton and a newton metre about each axis show it."""
+class _Craft:
+    """A vehicle as one of its models flies, and as it answers to known forces and torques."""
 
     def __init__(self, vehicle: Vehicle, model: mujoco.MjModel) -> None:
-        data = _ready(vehicle, model)
-        rest = _acceleration(model, data)
+        self.vehicle, self.model = vehicle, model
+        data = self.ready()
+        rest = self.acceleration(data)
         answers = []
         for wrench in np.eye(6):
             data.qfrc_applied[:] = wrench
-            answers.append(_acceleration(model, data) - rest)
+            answers.append(self.acceleration(data) - rest)
         # Of the free joint, at rest and level: (6, 6), kg, kg·m, kg·m².
         self.mass_matrix = m = np.asarray(np.linalg.inv(np.array(answers).T), np.float64)
         self.mass = float(m[2, 2])
@@ -118,52 +119,51 @@ class _Body:
         # About the centre of mass, body axes, (3, 3), kg·m².
         self.inertia = m[3:, 3:] - self.mass * (c @ c * np.eye(3) - np.outer(c, c))
 
-    def forces(
-        self,
-        vehicle: Vehicle,
-        model: mujoco.MjModel,
-        thrust: ArrayLike = 0.0,
-        velocity: ArrayLike = 0.0,
-    ) -> Array:
+    def unpowered(self) -> "_Craft":
+        """The same with rotors that give no thrust, not even their least."""
+        model = copy.copy(self.model)
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+        return _Craft(self.vehicle, model)
+
+    def ready(self, thrust: ArrayLike = 0.0) -> Any:
+        """New `MjData`: level, at rest, at `_HEIGHT`; thrusts in N, one for all rotors or (R,)."""
+        data = mujoco.MjData(self.model)
+        data.qpos[:] = (0.0, 0.0, _HEIGHT, 1.0, 0.0, 0.0, 0.0)
+        data.ctrl[:] = np.asarray(thrust) / [rotor.newtons for rotor in self.vehicle.rotors]
+        return data
+
+    def acceleration(self, data: Any) -> Array:
+        """Of the free joint: (6,), m/s², rad/s²."""
+        mujoco.mj_forward(self.model, data)
+        return np.array(data.qacc)
+
+    def forces(self, thrust: ArrayLike = 0.0, velocity: ArrayLike = 0.0) -> Array:
         """Force and torque about its origin, level, less its weight: (6,), N, N·m.
 
-        `thrust` in N, one for all rotors or (R,); `velocity` in the world frame, (3,), m/s.
+        `thrust` as of `ready`; `velocity` in the world frame, (3,), m/s.
         """
-        data = _ready(vehicle, model, thrust)
+        data = self.ready(thrust)
         data.qvel[:3] = velocity
-        return self.mass_matrix @ (_acceleration(model, data) - (0, 0, -vehicle.gravity, 0, 0, 0))
+        fall = (0, 0, -self.vehicle.gravity, 0, 0, 0)
+        return self.mass_matrix @ (self.acceleration(data) - fall)
 
+    def fly(self, data: Any, seconds: float) -> float:
+        """Step for `seconds`, as a whole number of steps; returns the time flown, s.
 
-def _ready(vehicle: Vehicle, model: mujoco.MjModel, thrust: ArrayLike = 0.0) -> Any:
-    """New `MjData`: level, at rest, at `_HEIGHT`; thrusts in N, one for all rotors or (R,)."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = (0.0, 0.0, _HEIGHT, 1.0, 0.0, 0.0, 0.0)
-    data.ctrl[:] = np.asarray(thrust) / [rotor.newtons for rotor in vehicle.rotors]
-    return data
+        Raises `InputError` if MuJoCo warned of anything. It resets bad states silently otherwise.
+        """
+        steps = left = max(1, round(seconds / self.model.opt.timestep))
+        while left > 0:
+            mujoco.mj_step(self.model, data, nstep=min(left, _STEPS_AT_ONCE))
+            left -= _STEPS_AT_ONCE
+        for kind, warning in zip(mujoco.mjtWarning.__members__, data.warning, strict=False):
+            expect(not warning.number, "vehicle", "a flight without warnings", f"{kind} of MuJoCo")
+        return float(steps * self.model.opt.timestep)
 
-
-def _fly(model: mujoco.MjModel, data: Any, seconds: float) -> float:
-    """Step for `seconds`, as a whole number of steps; returns the time flown, s.
-
-    Raises `InputError` if MuJoCo warned of anything. It resets bad states silently otherwise.
-    """
-    steps = left = max(1, round(seconds / model.opt.timestep))
-    while left > 0:
-        mujoco.mj_step(model, data, nstep=min(left, _STEPS_AT_ONCE))
-        left -= _STEPS_AT_ONCE
-    for kind, warning in zip(mujoco.mjtWarning.__members__, data.warning, strict=False):
-        expect(not warning.number, "vehicle", "a flight without warnings", f"{kind} of MuJoCo")
-    return float(steps * model.opt.timestep)
-
-
-def _climbed(model: mujoco.MjModel, data: Any) -> float:
-    """Mean acceleration of a vertical flight of two seconds from rest, m/s²."""
-    return 2 / _fly(model, data, 2.0) ** 2 * (float(data.qpos[2]) - _HEIGHT)
-
-
-def _acceleration(model: mujoco.MjModel, data: Any) -> Array:
-    mujoco.mj_forward(model, data)
-    return np.array(data.qacc)
+    def climb(self, thrust: ArrayLike) -> float:
+        """Mean acceleration of a vertical flight of two seconds from rest, m/s²."""
+        data = self.ready(thrust)
+        return 2 / self.fly(data, 2.0) ** 2 * (float(data.qpos[2]) - _HEIGHT)
 
 
 def _turned(data: Any, vector: Array) -> Array:
@@ -173,36 +173,31 @@ def _turned(data: Any, vector: Array) -> Array:
     return turned
 
 
-def _unpowered(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy with rotors that give no thrust, not even their least."""
-    model = copy.copy(model)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
-    return model
-
-
 def _size(values: np.ndarray) -> float:
     """Euclidean length of all elements."""
     return float(np.linalg.norm(values))
 
 
-def _mass(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _mass(craft: _Craft) -> Iterator[Check]:
     """Mass, centre of mass and inertia, from the answers to known forces and torques."""
-    yield Check("mass", vehicle.mass, body.mass, "kg", _MODEL, _EXACT * vehicle.mass)
-    off = _size(body.center_of_mass - vehicle.center_of_mass)
+    vehicle = craft.vehicle
+    yield Check("mass", vehicle.mass, craft.mass, "kg", _MODEL, _EXACT * vehicle.mass)
+    off = _size(craft.center_of_mass - vehicle.center_of_mass)
     yield Check("centre of mass: difference", 0.0, off, "m", _MODEL)
-    off, size = _size(body.inertia - vehicle.inertia), _size(vehicle.inertia)
+    off, size = _size(craft.inertia - vehicle.inertia), _size(vehicle.inertia)
     yield Check("inertia: difference of the matrices", 0.0, off, "kg·m²", _MODEL, _EXACT * size)
 
 
-def _rotors(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _rotors(craft: _Craft) -> Iterator[Check]:
     """Effect and limits of each rotor, and of all rotors together."""
+    vehicle, columns = craft.vehicle, []
     low, high = vehicle.thrust_low, vehicle.thrust_high
-    idle = body.forces(vehicle, model, low)
-    columns = []
+    idle = craft.forces(low)
     for i, rotor in enumerate(vehicle.rotors):
         one = np.where(np.arange(vehicle.num_rotors) == i, high, low)
-        pushed = (body.forces(vehicle, model, one) - idle) / (rotor.high - rotor.low)
-        columns.append(np.append(pushed[2], pushed[3:] - np.cross(body.center_of_mass, pushed[:3])))
+        pushed = (craft.forces(one) - idle) / (rotor.high - rotor.low)
+        torque = pushed[3:] - np.cross(craft.center_of_mass, pushed[:3])
+        columns.append(np.append(pushed[2], torque))
         off = _size(columns[i] - vehicle.allocation[:, i])
         name = f"{rotor.name}: difference of thrust and torques per newton"
         yield Check(name, 0.0, off, "", _MODEL)
@@ -212,26 +207,26 @@ def _rotors(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Ch
         ("less", low - 50.0, low),
     ):
         name = f"thrust of all when asked for {more_or_less}"
-        measured = float(body.forces(vehicle, model, asked)[2])
+        measured = float(craft.forces(asked)[2])
         yield Check(name, float(vertical @ given), measured, "N", _MODEL, _EXACT * weight)
     rank = float(np.linalg.matrix_rank(np.array(columns), rtol=1e-6))
     source = "thrust and three torques, each without the others"
     yield Check("rank of the allocation matrix", 4.0, rank, "", source, 0.0)
 
 
-def _free_fall(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _free_fall(craft: _Craft) -> Iterator[Check]:
     """Depth of a fall: g t² / 2. Semi-implicit Euler misses by g h t / 2."""
-    model = _unpowered(model)
-    data = _ready(vehicle, model)
-    depth = vehicle.gravity * _fly(model, data, 2.0) ** 2 / 2
+    craft = craft.unpowered()
+    data = craft.ready()
+    depth = craft.vehicle.gravity * craft.fly(data, 2.0) ** 2 / 2
     yield Check("free fall in 2 s", depth, _HEIGHT - float(data.qpos[2]), "m", _MECHANICS)
 
 
-def _hover(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _hover(craft: _Craft) -> Iterator[Check]:
     """With hover thrusts the craft neither accelerates nor turns, and keeps its position."""
-    data = _ready(vehicle, model, vehicle.hover_thrust)
-    answer = _acceleration(model, data)
-    _fly(model, data, 5.0)
+    data = craft.ready(craft.vehicle.hover_thrust)
+    answer = craft.acceleration(data)
+    craft.fly(data, 5.0)
     for name, value, unit in (
         ("acceleration", answer[:3], "m/s²"),
         ("angular acceleration", answer[3:], "rad/s²"),
@@ -240,28 +235,27 @@ def _hover(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Che
         yield Check(f"hover: {name}", 0.0, _size(value), unit, _MECHANICS)
 
 
-def _climb(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _climb(craft: _Craft) -> Iterator[Check]:
     """Acceleration of a climb at the largest multiple of the hover's thrusts, from the height."""
-    hover = vehicle.hover_thrust
-    most = float(np.min(vehicle.thrust_high[hover > 0] / hover[hover > 0]))
-    measured = _climbed(model, _ready(vehicle, model, most * hover))
-    expected, name = vehicle.gravity * (most - 1), "climb at the largest balanced thrust"
+    vehicle, name = craft.vehicle, "climb at the largest balanced thrust"
+    most = float(np.min(vehicle.thrust_high / vehicle.hover_thrust))
+    expected, measured = vehicle.gravity * (most - 1), craft.climb(most * vehicle.hover_thrust)
     yield Check(name, expected, measured, "m/s²", _MECHANICS, _EXACT * max(1.0, most))
 
 
-def _tumbling(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _tumbling(craft: _Craft) -> Iterator[Check]:
     """Ten seconds of torque-free tumbling: conserved quantities, and the path of the fall."""
-    model = _unpowered(model)
-    before, after = _ready(vehicle, model), _ready(vehicle, model)
+    craft = craft.unpowered()
+    before, after = craft.ready(), craft.ready()
     before.qvel[3:] = after.qvel[3:] = _SPIN
-    seconds = _fly(model, after, 10.0)
-    inertia, center = body.inertia, body.center_of_mass
+    seconds = craft.fly(after, 10.0)
+    inertia, center = craft.inertia, craft.center_of_mass
     spins = [np.array(data.qvel[3:]) for data in (before, after)]
     start, end = (_turned(d, inertia @ s) for d, s in zip((before, after), spins, strict=True))
     # The path of the centre of mass: from its first place and velocity on, and where it is.
     place, there = (data.qpos[:3] + _turned(data, center) for data in (before, after))
     velocity = before.qvel[:3] + _turned(before, np.cross(spins[0], center))
-    fallen = place + velocity * seconds - (0, 0, vehicle.gravity * seconds**2 / 2)
+    fallen = place + velocity * seconds - (0, 0, craft.vehicle.gravity * seconds**2 / 2)
     first, last = (float(spin @ inertia @ spin) for spin in spins)
     for name, value, unit in (
         ("relative change of angular momentum", _size(end - start) / _size(start), ""),
@@ -271,23 +265,24 @@ def _tumbling(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[
         yield Check(f"tumbling 10 s: {name}", 0.0, value, unit, _MECHANICS, _TRUNCATION)
 
 
-def _resting(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _resting(craft: _Craft) -> Iterator[Check]:
     """Dropped by 5 cm, the craft settles; soft contact lets it sink in by some 0.1 mm."""
-    data = _ready(vehicle, vehicle.model)
-    data.qpos[2] = vehicle.rest_height + 0.05
-    _fly(vehicle.model, data, 5.0)
-    rest, height = vehicle.rest_height, float(data.qpos[2])
+    craft = _Craft(craft.vehicle, craft.vehicle.model)  # with air and drag, if there are any
+    data, rest = craft.ready(), craft.vehicle.rest_height
+    data.qpos[2] = rest + 0.05
+    craft.fly(data, 5.0)
+    height = float(data.qpos[2])
     yield Check("at rest on the floor: height", rest, height, "m", _MODEL, 1e-3)
     for name, value, unit in (("speed", data.qvel[:3], "m/s"), ("turning", data.qvel[3:], "rad/s")):
         yield Check(f"at rest on the floor: {name}", 0.0, _size(value), unit, _MECHANICS, 1e-6)
 
 
-def _linear_drag(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _linear_drag(craft: _Craft) -> Iterator[Check]:
     """With the option `linear_drag` d, speed v is met by a force of −d m v and by no torque."""
-    drag, velocity = 0.5, np.array((6.0, -8.0, 10.0))
-    dragged = copy.copy(model)
-    dragged.dof_damping[:] = Vehicle.load(vehicle.path, linear_drag=drag).model.dof_damping
-    added = body.forces(vehicle, dragged, velocity=velocity) - body.forces(vehicle, model)
+    vehicle, drag, velocity = craft.vehicle, 0.5, np.array((6.0, -8.0, 10.0))
+    model = copy.copy(craft.model)
+    model.dof_damping[:] = Vehicle.load(vehicle.path, linear_drag=drag).model.dof_damping
+    added = _Craft(vehicle, model).forces(velocity=velocity) - craft.forces()
     tolerance = _EXACT * vehicle.mass * vehicle.gravity
     for name, value, unit in (
         ("force", added[:3] + drag * vehicle.mass * velocity, "N"),
@@ -314,12 +309,12 @@ def closed_form_inertia() -> tuple[float, float]:
     return ixx, hub_z + NUM_ROTORS * (arm_across + motor_z)
 
 
-def _paper_numbers(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _paper_numbers(craft: _Craft) -> Iterator[Check]:
     """Mass, inertia, centre of mass and height of rest."""
-    yield Check("mass of the paper", MASS, body.mass, "kg", _PAPER)
-    off = _size(body.center_of_mass)
+    yield Check("mass of the paper", MASS, craft.mass, "kg", _PAPER)
+    off = _size(craft.center_of_mass)
     yield Check("centre of mass off the geometrical centre", 0.0, off, "m", _PAPER)
-    (ixx, izz), inertia = closed_form_inertia(), body.inertia
+    (ixx, izz), inertia = closed_form_inertia(), craft.inertia
     for name, expected, value in (
         ("inertia Ixx", ixx, inertia[0, 0]),
         ("inertia Iyy", ixx, inertia[1, 1]),
@@ -327,19 +322,18 @@ def _paper_numbers(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iter
         ("largest product of inertia", 0.0, np.abs(inertia - np.diag(np.diag(inertia))).max()),
     ):
         yield Check(name, expected, float(value), "kg·m²", _GEOMETRY)
-    yield Check("height of rest", _REST_HEIGHT, vehicle.rest_height, "m", _GEOMETRY)
+    yield Check("height of rest", _REST_HEIGHT, craft.vehicle.rest_height, "m", _GEOMETRY)
 
 
-def _paper_rotors(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _paper_rotors(craft: _Craft) -> Iterator[Check]:
     """Total thrust at the limits, and the torques of each rotor: y, −x and ±k per newton."""
     for asked, expected in ((150.0, NUM_ROTORS * MAX_THRUST), (-50.0, 0.0)):
-        thrust = float(body.forces(vehicle, vehicle.model, asked)[2])
+        thrust = float(craft.forces(asked)[2])
         name = f"thrust of all four when asked for {asked:g} N each"
         yield Check(name, expected, thrust, "N", f"{_PAPER}: 0 to 100 N")
     square = f"{_PAPER}: square; numbering ours"
     for i, (name, (x, y, sign)) in enumerate(_ROTORS.items()):
-        thrusts = MAX_THRUST * np.eye(NUM_ROTORS)[i]
-        torque = body.forces(vehicle, vehicle.model, thrusts)[3:] / MAX_THRUST
+        torque = craft.forces(MAX_THRUST * np.eye(NUM_ROTORS)[i])[3:] / MAX_THRUST
         for axis, expected, measured, source in (
             ("roll", y * SIDE / 2, torque[0], square),
             ("pitch", -x * SIDE / 2, torque[1], square),
@@ -349,7 +343,7 @@ def _paper_rotors(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Itera
             yield Check(line, expected, float(measured), "m", source)
 
 
-def _paper_flights(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _paper_flights(craft: _Craft) -> Iterator[Check]:
     """Acceleration of two seconds without thrust, at 49 N each and at 100 N each."""
     hover = MASS * GRAVITY / NUM_ROTORS
     for how, thrust, expected, source in (
@@ -357,16 +351,15 @@ def _paper_flights(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iter
         (f"{hover:g} N each", hover, 0.0, "m g / 4 = 49 N"),
         ("100 N each", MAX_THRUST, NUM_ROTORS * MAX_THRUST / MASS - GRAVITY, "4 · 100 N / m − g"),
     ):
-        measured = _climbed(vehicle.model, _ready(vehicle, vehicle.model, thrust))
-        name = f"2 s at {how}: acceleration"
+        name, measured = f"2 s at {how}: acceleration", craft.climb(thrust)
         yield Check(name, expected, measured, "m/s²", f"{_PAPER}: {source}")
 
 
-def _spinning_top(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _spinning_top(craft: _Craft) -> Iterator[Check]:
     """With Ixx = Iyy the rates about x and y turn about body z at (Izz − Ixx) / Ixx · ωz."""
-    data = _ready(vehicle, vehicle.model)
+    data = craft.ready()
     data.qvel[3:] = _SPIN
-    seconds = _fly(vehicle.model, data, 10.0)
+    seconds = craft.fly(data, 10.0)
     ixx, izz = closed_form_inertia()
     turned = complex(*_SPIN[:2]) * np.exp(1j * (izz - ixx) / ixx * _SPIN[2] * seconds)
     miss = math.dist(data.qvel[3:], (turned.real, turned.imag, _SPIN[2]))
@@ -374,12 +367,13 @@ def _spinning_top(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Itera
     yield Check(name, 0.0, miss, "rad/s", _MECHANICS, _TRUNCATION)
 
 
-def _paper_drag(vehicle: Vehicle, model: mujoco.MjModel, body: _Body) -> Iterator[Check]:
+def _paper_drag(craft: _Craft) -> Iterator[Check]:
     """With drag d, hovering at 10 m/s: v(t) = 10 exp(−d t), and a turn about z goes on."""
-    dragged = Vehicle.load(vehicle.path, linear_drag=0.5)
-    data = _ready(dragged, dragged.model, dragged.hover_thrust)
+    vehicle = Vehicle.load(craft.vehicle.path, linear_drag=0.5)
+    craft = _Craft(vehicle, vehicle.model)
+    data = craft.ready(vehicle.hover_thrust)
     data.qvel[:] = (10.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    expected = 10 * math.exp(-0.5 * _fly(dragged.model, data, 2.0))
+    expected = 10 * math.exp(-0.5 * craft.fly(data, 2.0))
     speed, turn = float(data.qvel[0]), float(data.qvel[5])
     yield Check("speed after 2 s of drag 0.5 /s from 10 m/s", expected, speed, "m/s", _DRAG)
     yield Check("turn of 1 rad/s after 2 s of linear drag", 1.0, turn, "rad/s", _DRAG)
