@@ -10,8 +10,7 @@ import numpy as np
 
 from ..envs.rendering import moment
 from ..rendering.live import MOST_DRONES, LiveView, Pace, open_surface
-from ..rendering.moment import Moment
-from ..rendering.stage import Stage
+from ..rendering.stage import Moment, Stage
 from ..udp.protocol.messages import Command, Message, State
 from ..udp.transport.simulator import Observer, Simulator
 

@@ -9,17 +9,14 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from .canvas import Canvas
     from .gl import NoOpenGL
-    from .moment import MetricValue, Moment
-    from .stage import CAMERAS, WORLDS, Camera, Stage, World
+    from .stage import CAMERAS, WORLDS, Camera, MetricValue, Moment, Stage, World
 
 __all__ = [
     "CAMERAS", "WORLDS", "Camera", "Canvas", "MetricValue", "Moment", "NoOpenGL", "Stage",
     "World",
 ]  # fmt: skip
 
-_MODULES: Final = {
-    "Canvas": "canvas", "MetricValue": "moment", "Moment": "moment", "NoOpenGL": "gl"
-}  # fmt: skip
+_MODULES: Final = {"Canvas": "canvas", "NoOpenGL": "gl"}
 
 
 def __getattr__(name: str) -> Any:

@@ -14,8 +14,7 @@ import mujoco
 import numpy as np
 
 from ..models.errors import expect
-from .moment import Moment
-from .stage import Stage
+from .stage import Moment, Stage
 
 if TYPE_CHECKING:
     from .web import WebPage

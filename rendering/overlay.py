@@ -12,7 +12,7 @@ import numpy as np
 from ..models.errors import expect
 from ..models.vehicle import Vehicle
 from ._pillow import Image, ImageColor, ImageDraw, ImageFont
-from .moment import Moment
+from .stage import Moment
 
 __all__ = ["Overlay", "graph_scale"]
 
