@@ -103,10 +103,9 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = count = self.env.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.actions = ActionMap(self.spec.action)
-        pairs = [array.bounds() for array in self.spec.observation]
         low, high = (
-            np.concatenate([bound.ravel() for bound in ends]).astype("f")
-            for ends in zip(*pairs, strict=True)
+            np.concatenate([a.bounds()[side].ravel() for a in self.spec.observation]).astype("f")
+            for side in (0, 1)
         )
         self.single_observation_space = spaces.Box(low, high)
         self.single_action_space = (
@@ -345,12 +344,12 @@ class _OneDrone:
         self._shape = getattr(self.env_spec.action, "shape", None)
         arrays = [array for array in self.env_spec.telemetry if array.name in told]
         self._told = [(array.name, component_names(array)) for array in arrays]
-        self.telemetry: dict[str, np.ndarray] = {}
         self.observations: Any = None
-        self._set()
+        self._rest()
 
     def reset(self, *, seed: list[int]) -> None:
         self._take(*self._env.reset(seed=seed[0]))
+        self._rest()
 
     def advance(
         self,
@@ -362,13 +361,15 @@ class _OneDrone:
         if resets is not None and resets[0] and seeds is not None:
             self.reset(seed=[int(seeds[0])])
         elif frozen is not None and frozen[0]:
-            self._set()
+            self._rest()
         else:
             action = int(actions[0]) if self._shape is None else actions[0].reshape(self._shape)
-            observation, *result, info = self._env.step(action)
-            self._take(observation, info, *result)
+            observation, reward, terminated, truncated, info = self._env.step(action)
+            self._take(observation, info)
+            self.rewards, self.lost = np.array((float(reward),)), _FLAGS[LOST in info]
+            self.terminated, self.truncated = _FLAGS[terminated], _FLAGS[truncated]
 
-    def _take(self, observation: Any, info: dict[str, Any], *result: Any) -> None:
+    def _take(self, observation: Any, info: dict[str, Any]) -> None:
         if isinstance(observation, dict):
             self.observations = {k: np.asarray(v)[np.newaxis] for k, v in observation.items()}
         else:
@@ -377,9 +378,7 @@ class _OneDrone:
             name: np.array([[info[component] for component in components]])
             for name, components in self._told
         }
-        self._set(*result)
-        self.lost = _FLAGS[LOST in info]
 
-    def _set(self, reward: Any = 0.0, terminated: bool = False, truncated: bool = False) -> None:
-        self.rewards, self.lost = np.array((float(reward),)), _FLAGS[False]
-        self.terminated, self.truncated = _FLAGS[terminated], _FLAGS[truncated]
+    def _rest(self) -> None:
+        self.rewards = np.zeros(1)
+        self.terminated = self.truncated = self.lost = _FLAGS[False]

@@ -162,6 +162,9 @@ def set_optimizer_arrays(
     got = {name: array.shape for name, array in given.items()}
     if got not in (expected, {}):
         raise ValueError(f"optimizer: expected arrays of shapes {expected}, got {got}")
+    steps = {float(array) for name, array in given.items() if name.endswith(".step")}
+    if len(steps) > 1 or min(steps, default=1) < 1:
+        raise ValueError(f"optimizer: expected one step of 1 or more, got {sorted(steps)}")
     state: dict[int, dict[str, torch.Tensor]] = {}
     for name, value in given.items():
         _, index, key = name.split(".")

@@ -124,12 +124,14 @@ class SB3A2C:
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
         """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
-        model, rollout = self._model, self._rollout
-        done, whole = model.num_timesteps, self.last_step(env_steps)
+        model, done, whole = self._model, log.env_steps, self.last_step(env_steps)
         if done >= whole:
             return
-        self._ahead = rollout / whole
-        model.on_update = on_update
+        if done:  # the log is where the training stopped
+            model._last_obs = log.observations
+            model._last_episode_starts = log.position().lengths == 0
+        model.num_timesteps, model.on_update = done, on_update
+        self._ahead = self._rollout / whole
         with suppress(_Stopped):
             model.learn(whole - done, reset_num_timesteps=done == 0)
 
@@ -148,18 +150,13 @@ class SB3A2C:
         return {ours: weights[theirs] for ours, theirs in _NAMES.items() if theirs in weights}
 
     def state(self) -> dict[str, np.ndarray]:
-        """Weights, optimizer, both generators and the state of SB3 between rollouts."""
+        """Weights, optimizer and both generators."""
         model = self._model
         state = {f"policy.{name}": array for name, array in arrays_of(model.policy).items()}
         state |= learner.optimizer_arrays(model.policy.optimizer)
         state["rng.torch"] = torch.get_rng_state().numpy().copy()
         _, keys, place, *_ = np.random.get_state()  # noqa: NPY002
-        state["rng.numpy"] = np.append(keys, place).astype(np.uint32)
-        state["steps"] = np.array(model.num_timesteps)
-        if model._last_obs is not None:
-            state["observation"] = np.array(model._last_obs)
-            state["starts"] = np.array(model._last_episode_starts)
-        return state
+        return state | {"rng.numpy": np.append(keys, place).astype(np.uint32)}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over a state."""
@@ -170,14 +167,6 @@ class SB3A2C:
         torch.set_rng_state(torch.from_numpy(state["rng.torch"].copy()))
         *keys, place = state["rng.numpy"]
         np.random.set_state(("MT19937", np.array(keys, np.uint32), int(place), 0, 0.0))  # noqa: NPY002
-        model.num_timesteps = int(state["steps"])
-        if "observation" in state:
-            shapes = state["observation"].shape, state["starts"].shape
-            expected = (model.n_envs, *(model.observation_space.shape or ())), (model.n_envs,)
-            if shapes != expected:
-                raise ValueError(f"observation, starts: expected shapes {expected}, got {shapes}")
-            model._last_obs = state["observation"]
-            model._last_episode_starts = state["starts"]
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as SB3 logs them; none before the first."""

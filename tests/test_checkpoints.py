@@ -211,9 +211,13 @@ def test_parts_that_do_not_fit_are_refused(algorithm: str) -> None:
     kept = checkpoint_of(algorithm, log, trained(algorithm, log, updates=3))
     network = "policy.value_net.bias" if algorithm == "sb3-a2c" else "actor.output.bias"
     rng = "rng.torch" if algorithm == "sb3-a2c" else "rng"
+    arrays = kept.state.items()
+    moments = next(name for name, v in arrays if v.ndim == 2 and name.endswith(".exp_avg_sq"))
     changes: list[dict[str, Any]] = [
         {"optimizer.0.exp_avg": None},
         {"optimizer.0.step": np.zeros(3, np.float32)},
+        {"optimizer.0.step": np.array(-5, np.float32)},
+        {moments: kept.state[moments].T},
         {"optimizer.1.exp_avg_sq": np.zeros((7, 7), np.float32)},
         {"optimizer.9999.exp_avg": np.zeros(1, np.float32)},
         {network: None},
@@ -221,8 +225,6 @@ def test_parts_that_do_not_fit_are_refused(algorithm: str) -> None:
         {rng: None},
         {rng: np.zeros(3, np.uint8)},
     ]
-    if algorithm == "sb3-a2c":
-        changes.append({"observation": np.zeros((2, 9), np.float32)})
     for change in changes:
         state = {k: v for k, v in {**kept.state, **change}.items() if v is not None}
         with pytest.raises(CheckpointError, match="its parts do not fit together"):
@@ -241,8 +243,6 @@ def test_parts_that_cannot_be_of_a_training_are_not_loaded(algorithm: str, tmp_p
     store(kept, path)
     assert load(path).position.env_steps == kept.position.env_steps == log.env_steps
     position = kept.position
-    optimizer = {k: v for k, v in kept.state.items() if k.startswith("optimizer.")}
-    one = next(name for name, v in optimizer.items() if v.ndim == 2 and name.endswith("_sq"))
     negative = position.numbers - 1 - position.numbers.max()
     changes: list[tuple[str, dict[str, Any]]] = [
         ("gamma: expected a number", {"config": {**kept.config, "gamma": "[[["}}),
@@ -250,10 +250,6 @@ def test_parts_that_cannot_be_of_a_training_are_not_loaded(algorithm: str, tmp_p
         ("env_steps", {"position": replace(position, env_steps=5)}),
         ("env_steps", {"position": replace(position, episodes=())}),
         ("numbers", {"position": replace(position, numbers=negative)}),
-        ("exp_avg_sq", {"state": {**kept.state, one: optimizer[one].T}}),
-        ("exp_avg_sq", {"state": {k: v for k, v in kept.state.items() if k != one}}),
-        ("step", {"state": {**kept.state, "optimizer.0.step": np.array(-5, np.float32)}}),
-        ("steps", {"state": {**kept.state, "steps": np.array(1)}}),
     ]
     for field, change in changes:
         store(replace(kept, **change), path)
