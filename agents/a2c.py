@@ -9,8 +9,6 @@ from .presets import A2CConfig
 from .returns import advantages
 from .rollouts import Collector, Rollout
 
-__all__ = ["A2C"]
-
 
 class A2C(Learner):
     """Two networks: the critic learns V(s), the actor follows the advantage.

@@ -25,8 +25,6 @@ from .episodes import Episode, Position
 from .policies import NetworkPolicy, flat_size
 from .presets import PRESETS, preset
 
-__all__ = ["Checkpoint", "CheckpointError", "load", "software_versions", "store", "write_whole"]
-
 FORMAT: Final = 2
 _GROUPS: Final = ("policy", "state", "position", "episodes")
 _PLAIN: Final = ("algorithm", "config", "seed", "env_steps", "versions")

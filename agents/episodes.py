@@ -18,8 +18,6 @@ from ..envs.spec import EnvSpec, component_names
 from ..models.errors import InputError
 from .policies import ActionMap, flat
 
-__all__ = ["LOST", "Episode", "EpisodeLog", "Position", "ResumeError", "episode_seed"]
-
 LOST: Final = "simulator_lost"
 """Name in the `info` of a step whose simulator was lost, as `rotorgram.udp` has it."""
 

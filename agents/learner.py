@@ -11,9 +11,6 @@ from .networks import Actor, arrays_of, load_arrays, nn, torch
 from .policies import ActionMap, NetworkPolicy, flat_size
 from .rollouts import Collector, Diverged, Rollout
 
-__all__ = ["Diverged", "Learner", "OnUpdate", "check_finite", "optimizer_arrays",
-           "seeds_of", "set_optimizer_arrays", "updates_of"]  # fmt: skip
-
 OnUpdate = Callable[[], bool]
 """Called after every rollout and its update; training stops where it returns False."""
 

@@ -8,8 +8,6 @@ from ..envs.spec import EnvSpec
 from ..models.constants import GRAVITY
 from ..models.errors import expect
 
-__all__ = ["PID"]
-
 ENV_ID: Final = "rotorgram/Elevation-v0"
 PROPORTIONAL: Final = 9.0  # 1/s²: closed-loop natural frequency of 3 rad/s
 DERIVATIVE: Final = 5.4  # 1/s: damping ratio 0.9

@@ -8,8 +8,6 @@ import numpy as np
 from ..envs.spec import ArraySpec, Discrete, EnvSpec
 from ..models.errors import expect
 
-__all__ = ["ActionMap", "NetworkPolicy", "Policy", "flat", "flat_size"]
-
 
 class Policy(Protocol):
     """Chooses actions: called once for each control step."""

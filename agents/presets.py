@@ -10,8 +10,6 @@ from typing import Any, Final, Literal
 
 from ..models.errors import expect
 
-__all__ = ["PRESETS", "A2CConfig", "AlgorithmName", "PresetName", "VPGConfig", "preset"]
-
 AlgorithmName = Literal["vpg", "a2c", "sb3-a2c"]
 PresetName = Literal["paper", "tuned"]
 

@@ -7,8 +7,6 @@ truncation and never over a termination; a recursion stops at either, and at the
 
 import numpy as np
 
-__all__ = ["advantages", "discounted_sums", "rewards_to_go", "step_of_episode"]
-
 
 def discounted_sums(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
     """S_t = v_t + f_t · S_t+1, where S is 0 after the last row: float64, shape of `values`.

@@ -9,8 +9,6 @@ from .episodes import EpisodeLog
 from .policies import NetworkPolicy
 from .returns import rewards_to_go
 
-__all__ = ["Collector", "Diverged", "Rollout"]
-
 
 class Diverged(InputError):
     """Weights or actions are not finite. Checkpoints from before are whole."""

@@ -22,8 +22,6 @@ else:
     sb3 = require("stable_baselines3", "train", "sb3-a2c")
     sb3_logger, sb3_vec = sb3.common.logger, sb3.common.vec_env
 
-__all__ = ["SB3A2C", "SB3VecEnv"]
-
 
 class SB3VecEnv(sb3_vec.VecEnv):
     """A SAME_STEP vector env, such as `RemoteVectorEnv(autoreset_mode="SameStep")`, for SB3.

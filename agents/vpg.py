@@ -9,8 +9,6 @@ from .presets import VPGConfig
 from .returns import rewards_to_go, step_of_episode
 from .rollouts import Collector, Rollout
 
-__all__ = ["VPG"]
-
 
 class VPG(Learner):
     """Raise the log-probability of every action by the return that followed it.

@@ -22,8 +22,6 @@ from .constants import GRAVITY, MASS, MAX_THRUST, NUM_ROTORS, SIDE
 from .errors import expect
 from .vehicle import Vehicle
 
-__all__ = ["Check", "closed_form_inertia", "examine"]
-
 Array = NDArray[np.float64]
 
 _LEAST_TIMESTEP: Final = 1e-4  # s: 20 s of flights take seconds

@@ -6,8 +6,6 @@ examination of the paper's vehicle and its documentation.
 
 from typing import Final
 
-__all__ = ["GRAVITY", "MASS", "MAX_THRUST", "NUM_ROTORS", "SIDE"]
-
 MASS: Final = 20.0
 """Mass, kg."""
 GRAVITY: Final = 9.8

@@ -4,8 +4,6 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-__all__ = ["InputError", "MissingPackage", "NotCopied", "expect", "require"]
-
 
 class InputError(ValueError):
     """Wrong input from the user, a peer or a file. The message gives expected and actual value.

@@ -17,8 +17,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["attitudes_in_paper_frame", "pose_in_mujoco_frame", "positions_in_paper_frame"]
-
 Array = NDArray[np.float64]
 
 _POLE: Final = 1 - 1e-12  # sine of phi past which (within 1e-4 degrees) the nose counts as vertical

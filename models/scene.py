@@ -15,8 +15,6 @@ import numpy as np
 from . import AIRPORT_XML, QUAD_XML, SCENE_XML
 from .errors import expect
 
-__all__ = ["AIRPORT_PREFIX", "World", "attach_airport", "build_scene"]
-
 World = Literal["plain", "airport"]
 """Surroundings of the vehicle."""
 

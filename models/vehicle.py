@@ -21,8 +21,6 @@ from . import MOST_DRAG, QUAD_XML
 from .errors import InputError, expect
 from .scene import build_scene
 
-__all__ = ["Rotor", "Vehicle"]
-
 LEAST_TIMESTEP: Final = 1e-5
 """Smallest physics step, s: a control step of 0.02 s then takes a hundredth of a second."""
 MOST_TIMESTEP: Final = 1.0

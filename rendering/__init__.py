@@ -7,9 +7,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
+    from ..models.scene import World
     from .canvas import Canvas
     from .gl import NoOpenGL
-    from .stage import CAMERAS, WORLDS, Camera, MetricValue, Moment, Stage, World
+    from .stage import CAMERAS, WORLDS, Camera, MetricValue, Moment, Stage
 
 __all__ = [
     "CAMERAS", "WORLDS", "Camera", "Canvas", "MetricValue", "Moment", "NoOpenGL", "Stage",

@@ -10,8 +10,6 @@ from ..models.errors import expect
 from .gl import NoOpenGL, offscreen_context
 from .stage import Camera, Stage
 
-__all__ = ["Canvas"]
-
 _ROOM = 10_000  # geoms
 _SAMPLES = 4  # of every pixel, for smooth edges; software has no more
 

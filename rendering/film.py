@@ -15,8 +15,6 @@ import numpy as np
 from ..models.errors import InputError, expect, require
 from ._pillow import Image
 
-__all__ = ["QUALITY", "SUFFIXES", "check_film", "poster", "write_film"]
-
 SUFFIXES: Final = (".mp4", ".gif", ".png", "")
 """Kinds of film, by suffix; no suffix is a folder of PNGs."""
 QUALITY: Final = 20

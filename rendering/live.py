@@ -22,11 +22,6 @@ if TYPE_CHECKING:
 
     Surface: TypeAlias = Window | WebPage
 
-__all__ = [
-    "MOST_DRONES", "SPEEDS", "Aim", "Lines", "LiveView", "Pace", "Press", "lines_over",
-    "open_surface",
-]  # fmt: skip
-
 MOST_DRONES: Final = 16
 """Most craft side by side; of more, the first ones are shown."""
 _PICTURES: Final = 30.0  # a second, at most

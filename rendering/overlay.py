@@ -14,8 +14,6 @@ from ..models.vehicle import Vehicle
 from ._pillow import Image, ImageColor, ImageDraw, ImageFont
 from .stage import Moment
 
-__all__ = ["Overlay", "graph_scale"]
-
 _GROUND: Final = (13, 18, 26, 150)  # Of panels: dark, and some of the picture shows through
 _EDGE: Final = (255, 255, 255, 36)
 _NAMES, _VALUES = (164, 176, 190), (238, 242, 246)

@@ -17,8 +17,6 @@ from ..models.frames import pose_in_mujoco_frame
 from ..models.scene import SCENE_PREFIX, World, build_scene
 from ..models.vehicle import Vehicle
 
-__all__ = ["CAMERAS", "WORLDS", "Camera", "MetricValue", "Moment", "Stage", "World"]
-
 Camera = Literal["chase", "front", "side", "top", "onboard"]
 CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
 WORLDS: Final[tuple[World, ...]] = get_args(World)

@@ -21,8 +21,6 @@ from ..models.errors import InputError
 from .live import Aim, Lines, Pace, Press
 from .stage import Stage
 
-__all__ = ["WebPage", "refusal"]
-
 _HOST: Final = "127.0.0.1"
 _NAMES: Final = ("127.0.0.1", "localhost", "[::1]")
 """Of this machine in a browser's address, and of the near end of an `ssh -L`."""

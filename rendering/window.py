@@ -15,8 +15,6 @@ from .gl import NoOpenGL
 from .live import Aim, Lines, Pace, Press
 from .stage import Stage
 
-__all__ = ["KEYS", "NoDisplay", "Window"]
-
 KEYS: Final[dict[int, Press]] = {
     32: "pause",  # space
     262: "step",  # arrow to the right

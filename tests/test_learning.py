@@ -10,8 +10,7 @@ import torch
 from gymnasium import spaces
 from rotorgram.agents import A2CConfig, EpisodeLog, NetworkPolicy, VPGConfig, make_agent, preset
 from rotorgram.agents.a2c import A2C
-from rotorgram.agents.learner import Diverged
-from rotorgram.agents.rollouts import Collector, Rollout
+from rotorgram.agents.rollouts import Collector, Diverged, Rollout
 from rotorgram.agents.vpg import VPG
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.spec import ArraySpec, EnvSpec
