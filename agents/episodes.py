@@ -95,8 +95,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def __init__(
         self, env: gym.Env[Any, Any] | AdvancingVectorEnv, seed: int, *, keep_steps: bool = False
     ) -> None:
-        told = ("metrics", "thrust") if keep_steps else ("metrics",)
-        self.env = env if isinstance(env, AdvancingVectorEnv) else _OneDrone(env, told)
+        self.env = env if isinstance(env, AdvancingVectorEnv) else _OneDrone(env)
         self.spec: EnvSpec = self.env.env_spec  # type: ignore[assignment]  # not Gymnasium's
         self.num_envs = count = self.env.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
@@ -192,10 +191,10 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Fly one step. `info` has `final_obs` where an episode ended."""
-        env = self.env
+        env, info = self.env, {}
         self.fly(np.asarray(actions, np.float32).reshape(self.num_envs, -1))
-        last, rewards, terminated = self.observations, env.rewards, env.terminated
-        truncated, info = env.truncated, {}
+        last, rewards = self.observations, env.rewards
+        terminated, truncated = env.terminated, env.truncated
         if (terminated | truncated).any():
             truncated = truncated | self.begin(terminated | truncated)
             info = {"final_obs": last, "_final_obs": terminated | truncated}
@@ -281,8 +280,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._forget(drones)
 
     def _forget(self, drones: np.ndarray) -> None:
-        self._lengths[drones] = 0
-        self._rewards[drones] = self._sizes[drones] = 0.0
+        self._lengths[drones] = self._rewards[drones] = self._sizes[drones] = 0
 
     def _draw_seeds(self, drones: np.ndarray) -> None:
         for drone in np.flatnonzero(drones).tolist():
@@ -303,8 +301,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _keep_episodes(self, ended: np.ndarray) -> None:
         env = self.env
         for drone in np.flatnonzero(ended).tolist():
-            length = int(self._lengths[drone])
-            if length == 0:  # lost before its first step
+            if not (length := int(self._lengths[drone])):  # lost before its first step
                 continue
             self.episodes.append(
                 Episode(
@@ -324,23 +321,20 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._flown = self._flown[len(self._flown) - keep :]
 
 
+# A truth value as an array of one, never written to: to make another takes a microsecond.
 _FLAGS: Final = (np.array((False,)), np.array((True,)))
-"""A truth value as an array of one, never written to: to make another takes a microsecond."""
 
 
 class _OneDrone:
-    """An env of one drone as a batch of one: what the log needs of `AdvancingVectorEnv`.
-
-    `told` has the names of the arrays of the telemetry that are asked for.
-    """
+    """An env of one drone as a batch of one: what the log needs of `AdvancingVectorEnv`."""
 
     num_envs = 1
 
-    def __init__(self, env: gym.Env[Any, Any], told: tuple[str, ...]) -> None:
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._env = env
         self.env_spec: EnvSpec = env.get_wrapper_attr("env_spec")
         self._shape = getattr(self.env_spec.action, "shape", None)
-        arrays = [array for array in self.env_spec.telemetry if array.name in told]
+        arrays = [a for a in self.env_spec.telemetry if a.name in ("metrics", "thrust")]
         self._told = [(array.name, component_names(array)) for array in arrays]
         self.observations: Any = None
         self._rest()
