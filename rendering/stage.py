@@ -119,16 +119,6 @@ class Moment:
             **rest,
         )
 
-    @property
-    def qpos(self) -> np.ndarray:
-        """Pose of the free joint in MuJoCo's frame, float64, shape (7,)."""
-        return pose_in_mujoco_frame(self.position, self.attitude)
-
-    @property
-    def goal_point(self) -> np.ndarray | None:
-        """The goal in MuJoCo's frame, float64, shape (3,), m."""
-        return None if self.goal is None else pose_in_mujoco_frame(self.goal, (0, 0, 0))[:3]
-
     def lines(self, thrust_high: float) -> list[tuple[str, str]]:
         """Names and values for an overlay; a rotor's largest thrust, N, sets the digits."""
         lines = [(metric.label, metric.text) for metric in self.metrics[:_MOST_METRICS]]
@@ -193,6 +183,8 @@ class Stage:
         self.data = mujoco.MjData(self.model)
         self.moments: tuple[Moment, ...] = ()
         self._paths: list[deque[np.ndarray]] = [deque(maxlen=self._length) for _ in self._offsets]
+        self._goals: list[np.ndarray | None] = [None] * self.drones
+        # Distance between each craft and its goal for which a camera makes room, m.
         self._reach = np.zeros(self.drones)
         mujoco.mj_forward(self.model, self.data)
 
@@ -212,15 +204,20 @@ class Stage:
         before, self.moments = self.moments or moments, moments
         poses = self.data.qpos.reshape(self.drones, 7)
         for i, (moment, last) in enumerate(zip(moments, before, strict=True)):
-            pose, path = poses[i], self._paths[i]
-            pose[:] = moment.qpos
+            pose, path, goal = poses[i], self._paths[i], None
+            pose[:] = pose_in_mujoco_frame(moment.position, moment.attitude)
             pose[:3] += self._offsets[i]
+            if moment.goal is not None:
+                goal = pose_in_mujoco_frame(moment.goal, (0, 0, 0))[:3] + self._offsets[i]
+            self._goals[i] = goal
             if moment.step == 0 or moment.step < last.step or moment.episode != last.episode:
                 path.clear()
                 self._reach[i] = 0.0
             if moment.step // _EVERY != last.step // _EVERY or not path:  # steps may be left out
                 path.append(pose[:3].copy())
-            self._reach[i] = self._reached(i, pose[:3])
+            now = 0.0 if goal is None else float(np.linalg.norm(goal - pose[:3]))
+            reach = self._reach[i]
+            self._reach[i] = max(reach, min(now, _FAR * self.radius) if reach else now)
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)  # the body that cameras and lights follow
         mujoco.mj_camlight(self.model, self.data)
@@ -252,18 +249,16 @@ class Stage:
     @property
     def focus(self) -> np.ndarray:
         """Mean of the goals, or of the craft if there are none, MuJoCo's frame, shape (3,), m."""
-        goals = [goal for i in range(self.drones) if (goal := self._goal(i)) is not None]
+        goals = [goal for goal in self._goals if goal is not None]
         return np.asarray((np.array(goals) if goals else self._points()).mean(axis=0))
 
     def decorate(self, scene: mujoco.MjvScene, *, goals: bool = True) -> None:
         """Add the fading paths to a scene, and the discs that mark the goals if they are wanted."""
-        for i, path in enumerate(self._paths if self.moments else ()):
-            goal = self._goal(i)
+        for path, goal, here in zip(self._paths, self._goals, self._points(), strict=True):
             if goals and goal is not None:
                 size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
                 _decoration(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, _DISC)
-            points = [*path, self._points()[i]]
-            for number, (start, end) in enumerate(pairwise(points), 1):
+            for number, (start, end) in enumerate(pairwise([*path, here]), 1):
                 if np.array_equal(start, end):
                     continue
                 kind, rgba = mujoco.mjtGeom.mjGEOM_CAPSULE, (*_PATH, 0.85 * number / len(path))
@@ -274,18 +269,6 @@ class Stage:
     def _points(self) -> np.ndarray:
         """Positions of the craft, MuJoCo's frame, shape (drones, 3), m."""
         return np.asarray(self.data.qpos.reshape(self.drones, 7)[:, :3])
-
-    def _goal(self, i: int) -> np.ndarray | None:
-        goal = self.moments[i].goal_point if self.moments else None
-        return None if goal is None else goal + self._offsets[i]
-
-    def _reached(self, i: int, here: np.ndarray) -> float:
-        """Distance between craft i and its goal for which a camera makes room, m."""
-        before, goal = float(self._reach[i]), self._goal(i)
-        if goal is None:
-            return 0.0
-        now = float(np.linalg.norm(goal - here))
-        return max(before, now if before == 0.0 else min(now, _FAR * self.radius))
 
 
 def _free_body(spec: mujoco.MjSpec) -> Any:
