@@ -39,11 +39,10 @@ def check_film(path: Path, width: int, height: int, fps: float) -> None:
 def write_film(
     path: Path, frames: Iterable[np.ndarray], fps: float, *, quality: int = QUALITY
 ) -> int:
-    """Write a film, and return how many frames were taken.
+    """Write a film, and return how many frames were taken. Ctrl-C leaves nothing behind.
 
     `.mp4` is H.264 that every browser plays before it is loaded whole; `.gif` repeats for ever;
     `.png` is the last frame alone; a name without a dot becomes a folder of `0001.png` and so on.
-    Everything is written beside `path` and gets its name when whole: Ctrl-C leaves nothing behind.
 
     Args:
         path: Must not exist.
@@ -52,13 +51,12 @@ def write_film(
         quality: Of `.mp4`, x264's constant rate factor: 0 (every bit) to 51.
 
     Raises:
-        InputError: The name, the size or the rate is not what it should be; there are no frames.
+        InputError: The name, the size or the rate is wrong; there are no frames.
         OSError: It cannot be written, or the encoder failed.
         MissingPackage: Pillow or imageio-ffmpeg is not installed.
     """
     taken = iter(frames)
-    first = next(taken, None)
-    if first is None:
+    if (first := next(taken, None)) is None:
         raise InputError("film: expected at least one frame, got none")
     check_film(path, first.shape[1], first.shape[0], fps)
     shape, count = (*first.shape[:2], 3), 0
@@ -94,12 +92,9 @@ def write_film(
 def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     # Without dithering: parts that stand still do not change, and cost nothing.
     pictures = (Image.fromarray(f).quantize(256, dither=Image.Dither.NONE) for f in frames)
-    first = next(pictures)
-    milliseconds = round(100 / fps) * 10
+    first, settings = next(pictures), {"duration": round(100 / fps) * 10, "loop": 0}
     with path.open("wb") as file:  # Pillow's own stays open when it is interrupted
-        first.save(
-            file, "GIF", save_all=True, append_images=pictures, duration=milliseconds, loop=0
-        )
+        first.save(file, "GIF", save_all=True, append_images=pictures, **settings)
 
 
 def _write_mp4(
@@ -132,10 +127,7 @@ def _write_mp4(
 
 
 def poster(path: Path, share: float = 0.3) -> bytes:
-    """A JPEG to show in place of an MP4 that does not play yet, from this share of its length.
-
-    Raises `OSError` if it cannot be read, `MissingPackage` without Pillow or imageio-ffmpeg.
-    """
+    """A JPEG of an MP4, from this share of its length. Raises `OSError` or `MissingPackage`."""
     ffmpeg = require("imageio_ffmpeg", "render", "a film's poster")
     try:
         frames, seconds = ffmpeg.count_frames_and_secs(str(path))

@@ -11,7 +11,6 @@ from typing import Any, Final
 _OFF: Final = ("disable", "disabled", "off", "false", "0")
 _ON: Final = ("enable", "enabled", "on", "true", "1", "glfw", "glx", "wgl")
 _LIBRARIES: Final = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "OpenGL"}
-
 _HIDDEN: Final = "ROTORGRAM_GL"
 """Keeps `MUJOCO_GL` as the user set it while `hidden_gl_setting` hides it from MuJoCo. An
 environment variable, so that the processes that this one starts know it too."""
@@ -28,8 +27,7 @@ class NoOpenGL(RuntimeError):
 def hidden_gl_setting() -> Iterator[None]:
     """Let MuJoCo be imported without an OpenGL, also where `MUJOCO_GL` names one that is not there.
 
-    Otherwise MuJoCo imports one as well, which takes a tenth of a second, and raises where that
-    fails, also in commands that draw nothing. `offscreen_context` raises where one is needed.
+    Otherwise MuJoCo imports one, which takes a tenth of a second, and raises where that fails.
     """
     before, wanted = dict(os.environ), _wanted()
     library = _LIBRARIES.get(wanted, "")
@@ -46,11 +44,10 @@ def hidden_gl_setting() -> Iterator[None]:
 
 
 def offscreen_context(width: int, height: int) -> Any:
-    """A context of MuJoCo's for pictures of so many pixels, which is not current yet.
+    """A context of MuJoCo's for pictures of so many pixels, not current yet. Raises `NoOpenGL`.
 
-    `MUJOCO_GL` decides if it is set (egl, osmesa, glfw; MuJoCo itself reads it once, when it is
-    imported). Otherwise it is EGL on Linux, with a display or without; a window that is hidden
-    where there is a display and no EGL; elsewhere the system's own. Without any: `NoOpenGL`.
+    `MUJOCO_GL` decides if it is set (egl, osmesa, glfw). Otherwise it is EGL on Linux, or a hidden
+    window where there is a display and no EGL; elsewhere the system's own.
     """
     reasons = []
     for name in _candidates():
@@ -85,10 +82,8 @@ def _candidates() -> tuple[str, ...]:
         return ("glfw",)
     if wanted:
         raise NoOpenGL(f"MUJOCO_GL: expected egl, osmesa, glfw or disable, got {wanted!r:.80}")
-    if sys.platform == "darwin":
-        return ("cgl", "glfw")
     if sys.platform != "linux":
-        return ("glfw",)
+        return ("cgl", "glfw") if sys.platform == "darwin" else ("glfw",)
     # Without a display GLFW writes warnings of its own; it has nothing to offer there.
     display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     return ("egl", "glfw") if display else ("egl",)

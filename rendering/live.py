@@ -1,7 +1,7 @@
 """Live views: the latest moment in a window or a browser, and the speed of what is shown.
 
-`LiveView.draw` returns at once, and a thread draws the latest moment. A slow machine draws fewer
-pictures; the simulation goes on, slowed only by the processor that both share.
+A slow machine draws fewer pictures; the simulation goes on, slowed only by the processor that both
+share.
 """
 
 import time
@@ -31,10 +31,8 @@ Lines = list[tuple[str, str]]
 """Names and values."""
 Press = Literal["pause", "step", "slower", "faster"]
 """Effect of a key or a button."""
-
 SPEEDS: Final = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
 """Steps of `slower` and `faster`; 1 is real time."""
-_SLOWEST, _FASTEST = SPEEDS[0], SPEEDS[-1]
 _CATCH_UP: Final = 0.1  # Longest delay that later steps make up for, s
 
 
@@ -47,8 +45,8 @@ class Pace:
     """
 
     def __init__(self, period: float, speed: float = 1.0) -> None:
-        right = _SLOWEST <= speed <= _FASTEST
-        expect(right, "speed", f"{_SLOWEST:g} to {_FASTEST:g}", f"{speed:g}")
+        low, high = SPEEDS[0], SPEEDS[-1]
+        expect(low <= speed <= high, "speed", f"{low:g} to {high:g}", f"{speed:g}")
         self.period, self.speed, self.paused = period, speed, False
         self._presses: SimpleQueue[Press] = SimpleQueue()
         self._asked = 0  # steps that a pause lets pass
@@ -92,9 +90,9 @@ class Pace:
             self._asked = self._asked + 1 if self.paused else 1
             self.paused = True
         elif press == "slower":
-            self.speed = max((s for s in SPEEDS if s < self.speed), default=_SLOWEST)
+            self.speed = max((s for s in SPEEDS if s < self.speed), default=self.speed)
         else:
-            self.speed = min((s for s in SPEEDS if s > self.speed), default=_FASTEST)
+            self.speed = min((s for s in SPEEDS if s > self.speed), default=self.speed)
 
 
 class Aim:
@@ -117,11 +115,7 @@ class Aim:
 
 
 class LiveView(AbstractContextManager["LiveView"]):
-    """Draws the latest moments on a surface, in a thread of its own.
-
-    The view alone shows moments on the stage. The pace's speed is a line of the overlay; `of` is
-    the number of drones, if more than are shown.
-    """
+    """Draws the latest moments in a thread of its own; `of` drones, if more than are shown."""
 
     def __init__(self, stage: Stage, surface: "Surface", pace: Pace, of: int | None = None) -> None:
         self.stage, self.surface, self.pace = stage, surface, pace

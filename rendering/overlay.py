@@ -24,10 +24,8 @@ _STEPS: Final = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # Round numbers for the ends of
 _LEAST: Final = 0.1  # Smallest end of a graph, in the metric's unit
 _STRIP_SIZE: Final = 160, 240  # Width and height of the smallest picture with a graph, pixels
 _NUMBERS_HEIGHT: Final = 160  # Of the smallest picture with numbers, pixels
-_NUMBERS_SHARE: Final = 0.4
-"""Of the width or of the height: larger ones would hide the craft in the middle."""
-_TIMES: Final = 2
-"""Everything is drawn so much larger, and reduced: smooth lines, letters where they belong."""
+_NUMBERS_SHARE: Final = 0.4  # Of width or height: larger ones would hide the craft in the middle
+_TIMES: Final = 2  # Everything is drawn so much larger, and reduced: smooth lines and letters
 
 
 class Box(NamedTuple):
@@ -187,9 +185,9 @@ class Overlay:
         gap = min(self._gap * _TIMES, (box.right - box.left) // (3 * len(thrusts)))
         long = (box.right - box.left - gap * (len(thrusts) - 1)) / len(thrusts)
         thick = max(1, round(self._unit / 7))
-        vehicle = self._vehicle
-        limits = zip(vehicle.thrust_low, vehicle.thrust_high, vehicle.hover_thrust, strict=True)
-        for number, (thrust, (low, high, hover)) in enumerate(zip(thrusts, limits, strict=True)):
+        craft = self._vehicle
+        columns = (thrusts, craft.thrust_low, craft.thrust_high, craft.hover_thrust)
+        for number, (thrust, low, high, hover) in enumerate(zip(*columns, strict=True)):
             start = box.left + number * (long + gap)
             full, mark = (
                 start + long * min(max((value - low) / (high - low), 0.0), 1.0)
@@ -222,9 +220,7 @@ class Overlay:
         time = f"{max(len(values) - 1, 0) * self._period:.2f} s"
         draw.text((self.strip.size[0] - 2 * gap, gap), time, _VALUES, self._font, anchor="ra")
         corner = self.strip[:2] * 2
-        left, upper, right, lower = (
-            (edge - start) * _TIMES for edge, start in zip(self.plot, corner, strict=True)
-        )
+        left, upper, right, lower = (np.subtract(self.plot, corner) * _TIMES).tolist()
         for label, share in self._levels():
             y = lower - (lower - upper) * (1 + share) / 2
             color = _ZERO if label == "0" else _LIMIT
@@ -239,8 +235,7 @@ class Overlay:
         tall = (self.plot.lower - self.plot.upper) * _TIMES
         across = (right - left) * self._period / self._seconds
         xs = np.minimum(left + across * np.arange(len(shares)), right)
-        told = np.isfinite(shares)
-        points = list(zip(xs[told].tolist(), shares[told].tolist(), strict=True))
+        points = np.stack((xs, shares), axis=1)[np.isfinite(shares)].tolist()
         thick = max(_TIMES, round(self._unit * _TIMES / 6))
         path: list[tuple[float, float]] = []  # what is beyond the box is cut off
         for (x, y), (next_x, next_y) in pairwise([(left, 0.0), *points]):
@@ -270,8 +265,7 @@ class Overlay:
 
 def _enlarged(image: Image.Image, box: Box, write: Callable[[ImageDraw.ImageDraw], None]) -> None:
     """Write on a part of the picture, in enlarged pixels from its own corner on."""
-    part = image.crop(box)
-    part = part.resize((part.width * _TIMES, part.height * _TIMES), Image.Resampling.NEAREST)
+    part = image.crop(box).resize(box.size, Image.Resampling.NEAREST)
     write(ImageDraw.Draw(part))
     image.paste(part.reduce(_TIMES), box[:2])
 
@@ -286,8 +280,8 @@ def _ground(box: Box, radius: int) -> Image.Image:
 
 def _spaced(value: str) -> str:
     """The same with more space between numbers than between number and unit."""
-    words = value.split()
-    return " ".join(("  ".join(words[:-1]), words[-1])) if len(words) > 2 else " ".join(words)
+    numbers, _, unit = value.rpartition(" ")
+    return f"{numbers.replace(' ', '  ')} {unit}".strip()
 
 
 def _fitted(text: str, font: ImageFont.FreeTypeFont, room: float) -> str:

@@ -47,7 +47,7 @@ _FOVY: Final = 50.0  # vertical field of view of every camera but `onboard`, deg
 _FAR: Final = 10.0
 """Cameras move back until craft and goal are so far apart, or as far as at the episode's start."""
 
-Vector = tuple[float, float, float]
+_Vector = tuple[float, float, float]
 
 
 class MetricValue(NamedTuple):
@@ -76,13 +76,13 @@ class MetricValue(NamedTuple):
 class Moment:
     """One craft after one control step. Positions are in the paper's frame."""
 
-    position: Vector
+    position: _Vector
     """X, Y, Z, m."""
-    attitude: Vector
+    attitude: _Vector
     """phi, theta, psi, degrees."""
     thrusts: tuple[float, ...]
     """F1 to FR, N."""
-    goal: Vector | None = None
+    goal: _Vector | None = None
     """Position to reach or hold, X, Y, Z, m; None if the task has no goal."""
     metrics: tuple[MetricValue, ...] = ()
     """The headline first."""
@@ -122,14 +122,12 @@ class Moment:
     def lines(self, thrust_high: float) -> list[tuple[str, str]]:
         """Names and values for an overlay; a rotor's largest thrust, N, sets the digits."""
         lines = [(metric.label, metric.text) for metric in self.metrics[:_MOST_METRICS]]
-        lines.append(("elevation", f"{self.position[1]:.2f} m"))
-        if self.goal is not None:
-            lines.append(("goal", f"{self.goal[1]:.2f} m"))
+        heights = {"elevation": self.position, "goal": self.goal}
+        lines += [(name, f"{point[1]:.2f} m") for name, point in heights.items() if point]
         unit, scale = ("N", 1.0) if thrust_high >= 1 else ("mN", 1e3)
         decimals = max(0, 2 - math.floor(math.log10(thrust_high * scale)))
-        rotors = len(self.thrusts)
+        shown, rotors = self.thrusts, len(self.thrusts)
         name = f"F1 to F{rotors}" if rotors > 1 else "F1"
-        shown = self.thrusts
         if rotors > _MOST_THRUSTS:
             name, shown = f"{name}, mean", (float(np.mean(shown)),)
         thrusts = " ".join(f"{scale * thrust:.{decimals}f}" for thrust in shown)
@@ -138,10 +136,9 @@ class Moment:
 
 
 class Stage:
-    """Craft over an airport or a plain floor. It simulates nothing: it shows moments.
+    """Craft over an airport or a plain floor, side by side, each with a goal and a path if wanted.
 
-    The craft, of an MJCF file or the paper's, stand side by side, each with a goal and, with
-    `trail`, a path. What is wrong raises `InputError`.
+    It simulates nothing: it shows moments. What is wrong raises `InputError`.
 
     Attributes:
         radius: Of a sphere about the body's origin that holds the craft, m. Cameras, goals and

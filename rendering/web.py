@@ -1,7 +1,4 @@
-"""A page for browsers, MuJoCo's web viewer: for machines without a display.
-
-The server draws nothing: the browser gets the model once and then poses, and draws them itself.
-"""
+"""A page for browsers, MuJoCo's web viewer. The browser draws, not this machine."""
 
 import copy
 import threading
@@ -41,12 +38,11 @@ def refusal(host: str | None, origin: str | None) -> str | None:
     A page of another site may open a WebSocket to this machine. `Host`, the address that was
     opened, or `Origin`, the page that asks, then has that site's name. Only browsers send `Origin`.
     """
-    name, _, port = (host or "").lower().rpartition(":")
-    if not port.isdecimal():
-        name = (host or "").lower()
-    if name not in _NAMES:
+    here = (host or "").lower()
+    name, _, port = here.rpartition(":")
+    if (name if port.isdecimal() else here) not in _NAMES:
         return f"Host: expected {', '.join(_NAMES)}, got {host!r:.80}"
-    if origin is not None and origin.lower() != f"http://{(host or '').lower()}":
+    if origin is not None and origin.lower() != f"http://{here}":
         return f"Origin: expected the page of this viewer, got {origin!r:.80}"
     return None
 
@@ -73,8 +69,7 @@ web_server.serve = _guarded
 class WebPage:
     """A stage in browsers, served on this machine's loopback alone: `Surface`.
 
-    Buttons and keys change the pace. Port 0 takes the first free one from 8080 on; one in use
-    raises `InputError`.
+    Port 0 takes the first free one from 8080 on; one in use raises `InputError`.
     """
 
     def __init__(self, stage: Stage, pace: Pace, port: int) -> None:
@@ -123,12 +118,9 @@ class WebPage:
 
 
 class _LoopbackViewer(web_viewer.WebViewer):  # type: ignore[misc]
-    """MuJoCo's viewer on the loopback; by itself it binds every interface of the machine.
+    """MuJoCo's viewer on the loopback; by itself it binds every interface of the machine."""
 
-    It has no option for the address, only an attribute that it sets itself.
-    """
-
-    _host = property(lambda _: _HOST, lambda _, everywhere: None)
+    _host = property(lambda _: _HOST, lambda _, everywhere: None)  # an attribute that it sets
 
     @property
     def address(self) -> tuple[str, int]:

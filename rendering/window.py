@@ -95,8 +95,8 @@ class Window:
         atexit.unregister(self.close)
 
     def _press(self, key: int) -> None:
-        if (press := KEYS.get(key)) is not None:
-            self._pace.press(press)
+        if key in KEYS:
+            self._pace.press(KEYS[key])
 
 
 def _text(place: mujoco.mjtGridPos, lines: Lines) -> tuple[Any, ...]:
