@@ -39,10 +39,10 @@ class Learner:
             hidden=config.hidden,
             log_std=config.log_std,
         )
-        self.networks: dict[str, nn.Module] = {"actor": self._actor, **self.others()}
-        parameters = [p for network in self.networks.values() for p in network.parameters()]
+        self.networks = nn.ModuleDict({"actor": self._actor, **self.others()})
+        parameters, rate = self.networks.parameters(), config.learning_rate
         # foreach: one call for all parameters instead of one for each; same arithmetic.
-        self._optimizer = torch.optim.Adam(parameters, lr=config.learning_rate, foreach=True)
+        self._optimizer = torch.optim.Adam(parameters, lr=rate, foreach=True)
         self.terms: dict[str, torch.Tensor] = {}
 
     def others(self) -> dict[str, nn.Module]:
@@ -85,14 +85,9 @@ class Learner:
 
     def state(self) -> dict[str, np.ndarray]:
         """All that the next update depends on: weights, Adam's moments and the generator."""
-        state = {
-            f"{name}.{key}": value
-            for name, network in self.networks.items()
-            for key, value in arrays_of(network).items()
-        }
-        state |= optimizer_arrays(self._optimizer)
-        text = json.dumps(self._rng.bit_generator.state)
-        return state | {"rng": np.frombuffer(text.encode(), np.uint8)}
+        text = json.dumps(self._rng.bit_generator.state).encode()
+        arrays = arrays_of(self.networks) | optimizer_arrays(self._optimizer)
+        return arrays | {"rng": np.frombuffer(text, np.uint8)}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over a state."""
@@ -110,14 +105,14 @@ class Learner:
         numbers = {
             "train/policy_loss": -float(terms["gain"]),
             "train/entropy_loss": -float(terms["entropy"].mean()),
+            "train/learning_rate": self._optimizer.param_groups[0]["lr"],
+            "train/n_updates": updates_of(self._optimizer),
         }
         if "values" in terms:
             spread = float(np.var(terms["targets"]))
             left = float(np.var(terms["targets"] - terms["values"]))
             numbers["train/value_loss"] = float(terms["value_loss"])
             numbers["train/explained_variance"] = 1 - left / spread if spread else np.nan
-        numbers["train/learning_rate"] = self._optimizer.param_groups[0]["lr"]
-        numbers["train/n_updates"] = updates_of(self._optimizer)
         if self._actor.log_std is not None:
             numbers["train/std"] = float(self._actor.log_std.detach().exp().mean())
         return numbers
@@ -125,16 +120,13 @@ class Learner:
 
 def check_finite(optimizer: torch.optim.Optimizer) -> None:
     """Raise `Diverged` unless all weights that an optimizer moves are finite numbers."""
-    weights = torch.cat([p.detach().flatten() for p in _parameters(optimizer)])
+    (group,) = optimizer.param_groups
+    weights = torch.cat([parameter.detach().flatten() for parameter in group["params"]])
     if not torch.isfinite(weights).all():
         raise Diverged(
             f"training diverged: weights are not finite after update {updates_of(optimizer)}; "
             "try a lower learning_rate"
         )
-
-
-def _parameters(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:
-    return [p for group in optimizer.param_groups for p in group["params"]]
 
 
 def optimizer_arrays(optimizer: torch.optim.Optimizer) -> dict[str, np.ndarray]:
@@ -151,9 +143,10 @@ def set_optimizer_arrays(
 ) -> None:
     """Take over what `optimizer_arrays` gave. Raises `ValueError` unless it is whole."""
     given = {k: v for k, v in arrays.items() if k.startswith("optimizer.")}
+    (group,) = optimizer.param_groups
     expected = {
         f"optimizer.{index}.{key}": () if key == "step" else tuple(parameter.shape)
-        for index, parameter in enumerate(_parameters(optimizer))
+        for index, parameter in enumerate(group["params"])
         for key in ("step", "exp_avg", "exp_avg_sq")
     }
     got = {name: array.shape for name, array in given.items()}

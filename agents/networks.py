@@ -1,8 +1,4 @@
-"""The networks of the paper, section 2.3: one hidden layer of 16 ReLU units, in PyTorch.
-
-Weights go to and from plain arrays, the form in which rollouts use them (`policies`) and
-checkpoints keep them.
-"""
+"""The networks of the paper, section 2.3, in PyTorch. Rollouts use their weights as arrays."""
 
 import math
 from collections.abc import Mapping
