@@ -1,8 +1,7 @@
 """The physical examination: simulated motions of a vehicle, compared with closed forms.
 
 Any vehicle is held to mechanics and to what `Vehicle` derives from its compiled model; the paper's
-is held to the paper's numbers too, and to ours where it gives none. `tests/test_physics.py` shows
-that damaged models fail; `rotorgram check-model` prints the checks.
+is held to the paper's numbers too, and to ours where it gives none.
 
 World frame: z up. Body frame: x forward, y left, z up. SI units and radians throughout.
 """
@@ -30,9 +29,9 @@ _HEIGHT: Final = 1000.0  # m: flights begin here, and none reaches the floor
 _SPIN: Final = (1.0, 2.0, 3.0)  # rad/s: tumbling begins about no axis of symmetry
 
 _EXACT: Final = 1e-9  # Tolerance where the integrator is exact: the rounding errors of a flight
+# Tolerance for tumbling flight, where RK4 truncates: 4e-7 rad/s in ten seconds at 10 ms for the
+# paper's vehicle. MuJoCo's Euler misses by 1 rad/s.
 _TRUNCATION: Final = 1e-6
-"""Tolerance for tumbling flight, where RK4 truncates: 4e-7 rad/s in ten seconds at 10 ms for the
-paper's vehicle. MuJoCo's Euler misses by 1 rad/s."""
 
 # Sources of expected values.
 _MODEL: Final = "compiled model"

@@ -1,8 +1,4 @@
-"""The scene around a vehicle: ground, sky and light, and a visual airport.
-
-Only the ground affects the physics. A vehicle file keeps its own ground, sky and lights, and gets
-those that it lacks.
-"""
+"""The scene around a vehicle: what its file lacks of ground, sky and light; a visual airport."""
 
 import math
 from pathlib import Path
@@ -18,15 +14,11 @@ from .errors import expect
 World = Literal["plain", "airport"]
 """Surroundings of the vehicle."""
 
-AIRPORT_PREFIX: Final = "airport/"
-"""Prefix of all names that `attach_airport` adds."""
-SCENE_PREFIX: Final = "scene/"  # Prefix of all names that `build_scene` adds
-MOST_HEIGHTS: Final = 4096  # Most rows and columns of a height field: 16.8 million points, 0.3 GB
-
-MOST_ELEMENTS: Final = 10_000
-"""Most elements of a file, each as often as it is repeated: seconds to compile."""
+AIRPORT_PREFIX: Final = "airport/"  # Of all names that `attach_airport` adds
+SCENE_PREFIX: Final = "scene/"  # Of all names that `build_scene` adds
+_MOST_HEIGHTS: Final = 4096  # Rows and columns of a height field: 16.8 million points, 0.3 GB
+_MOST_ELEMENTS: Final = 10_000  # Of a file, each as often as it is repeated: seconds to compile
 _REPEATED: Final = ("replicate", "composite", "flexcomp")
-
 _GROUNDS: Final = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 _SKY: Final = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 _HIDDEN_GROUP: Final = 3  # viewers and renderers draw groups 0 to 2 unless told otherwise
@@ -87,8 +79,8 @@ def _check_size(path: Path) -> None:
         element, times = waiting.pop()
         if element.tag in ("hfield", "texture"):
             sides = [element.get(side, "0") for side in ("nrow", "ncol", "width", "height")]
-            large = any(side.isdecimal() and int(side) > MOST_HEIGHTS for side in sides)
-            most = f"at most {MOST_HEIGHTS} × {MOST_HEIGHTS} points"
+            large = any(side.isdecimal() and int(side) > _MOST_HEIGHTS for side in sides)
+            most = f"at most {_MOST_HEIGHTS} × {_MOST_HEIGHTS} points"
             got = " × ".join(side for side in sides if side != "0")
             expect(not large, "vehicle", f"a height field or texture of {most}", got)
         elif element.tag in _REPEATED:
@@ -99,8 +91,8 @@ def _check_size(path: Path) -> None:
                 seen.add(inner)
                 waiting.append((_root(inner), times))
         total += times
-        expected = f"at most {MOST_ELEMENTS} elements"
-        expect(total <= MOST_ELEMENTS, "vehicle", expected, f"{total} or more")
+        expected = f"at most {_MOST_ELEMENTS} elements"
+        expect(total <= _MOST_ELEMENTS, "vehicle", expected, f"{total} or more")
         waiting += [(child, times) for child in element]
 
 

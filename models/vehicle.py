@@ -1,8 +1,6 @@
-"""A vehicle: an MJCF file and what follows from its compiled model.
+"""A vehicle: one free body with rotors, of an MJCF file; all else is derived from its model.
 
-A vehicle is one free body with rotors: actuators that push at a site of the body, along an axis and
-with a reaction about it. Everything else is derived from the model.
-
+Rotors are actuators that push at a site of the body, along an axis and with a reaction about it.
 Body frame: that of the free body, x forward, y left, z up; SI units.
 """
 
@@ -21,13 +19,9 @@ from . import MOST_DRAG, QUAD_XML
 from .errors import InputError, expect
 from .scene import build_scene
 
-LEAST_TIMESTEP: Final = 1e-5
-"""Smallest physics step, s: a control step of 0.02 s then takes a hundredth of a second."""
-MOST_TIMESTEP: Final = 1.0
-"""Largest physics step, s: that of the longest control step."""
-MOST_HEIGHT: Final = 1e4
-"""Height above which no craft may touch anything, m."""
-
+_LEAST_TIMESTEP: Final = 1e-5  # s: a control step of 0.02 s then takes a hundredth of a second
+_MOST_TIMESTEP: Final = 1.0  # s: that of the longest control step
+_MOST_HEIGHT: Final = 1e4  # m: above it no craft may touch anything
 _RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves
 _ROUNDED: Final = 1e-5  # of the weight, sideways: what a file's six digits leave
 
@@ -180,8 +174,8 @@ def _check(model: mujoco.MjModel) -> None:
     got = f"{mass:g} kg and {gravity.tolist()} m/s²"
     expect(right, "vehicle", "a mass > 0 and gravity along -z", got)
     step = model.opt.timestep
-    limits = f"at least {LEAST_TIMESTEP:g} s and at most {MOST_TIMESTEP:g} s"
-    right = LEAST_TIMESTEP <= step <= MOST_TIMESTEP
+    limits = f"at least {_LEAST_TIMESTEP:g} s and at most {_MOST_TIMESTEP:g} s"
+    right = _LEAST_TIMESTEP <= step <= _MOST_TIMESTEP
     expect(right, "vehicle", f"a physics step of {limits}", f"{step:g}")
 
 
@@ -192,6 +186,7 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
     body = int(model.jnt_bodyid[0])
     mass, gravity = float(model.body_subtreemass[body]), -float(model.opt.gravity[2])
     center = data.subtree_com[body].copy()
+    xx, yy, zz, xy, xz, yz = data.crb[body, :6]  # of the free body and what is welded to it
     rotors = tuple(_rotor(model, data, i, body) for i in range(model.nu))
     arms = [np.array(rotor.position) - center for rotor in rotors]
     torques = [np.cross(a, r.axis) + r.reaction for a, r in zip(arms, rotors, strict=True)]
@@ -206,7 +201,7 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
         mass=mass,
         gravity=gravity,
         center_of_mass=center,
-        inertia=_inertia(model, data, body),
+        inertia=np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))),
         rotors=rotors,
         allocation=allocation,
         hover_thrust=_hover(rotors, allocation, mass * gravity),
@@ -277,17 +272,6 @@ def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> 
     return thrust
 
 
-def _inertia(model: mujoco.MjModel, data: Any, body: int) -> np.ndarray:
-    """About the center of mass of all bodies that are welded to the free one, shape (3, 3)."""
-    total = np.zeros((3, 3))
-    for part in np.flatnonzero(model.body_rootid == body):
-        turn = data.ximat[part].reshape(3, 3)
-        offset = data.xipos[part] - data.subtree_com[body]
-        steiner = model.body_mass[part] * (offset @ offset * np.eye(3) - np.outer(offset, offset))
-        total += turn @ np.diag(model.body_inertia[part]) @ turn.T + steiner
-    return total
-
-
 def _rest_height(model: mujoco.MjModel, data: Any) -> float:
     """Height at which the level body first touches anything, by bisection; 0 if it never does.
 
@@ -299,7 +283,7 @@ def _rest_height(model: mujoco.MjModel, data: Any) -> float:
     while _touches(model, data, high):
         high *= 2
         got = f"one that touches something at {high:.0f} m"
-        expect(high <= MOST_HEIGHT, "vehicle", "a craft that is free above the ground", got)
+        expect(high <= _MOST_HEIGHT, "vehicle", "a craft that is free above the ground", got)
     while high - low > 1e-10 * high:
         middle = (low + high) / 2
         low, high = (middle, high) if _touches(model, data, middle) else (low, middle)
@@ -308,9 +292,7 @@ def _rest_height(model: mujoco.MjModel, data: Any) -> float:
 
 def _touches(model: mujoco.MjModel, data: Any, height: float) -> bool:
     data.qpos[2] = height
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_collision(model, data)
+    mujoco.mj_fwdPosition(model, data)
     return bool(data.ncon > 0)
 
 
