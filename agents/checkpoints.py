@@ -136,9 +136,7 @@ def load(path: Path) -> Checkpoint:
     if not path.is_file():
         raise CheckpointError(f"checkpoint: no file {path}")
     try:
-        data = path.read_bytes()
-        _expect(len(data) > 8, "a file of more than 8 bytes", len(data))
-        return _read(data, numpy.load)
+        return _read(path.read_bytes(), numpy.load)
     except OSError as error:
         raise CheckpointError(f"checkpoint: cannot read {path}: {error.strerror}") from None
     except (require("safetensors", "train", "").SafetensorError, *_MALFORMED) as error:
@@ -162,10 +160,9 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
     _expect(meta["algorithm"] in PRESETS, f"one of {sorted(PRESETS)}", meta["algorithm"])
     for name in ("config", "versions", "position"):
         _expect(isinstance(meta[name], dict), f"an object for {name}", meta[name])
-    where = meta["position"]
+    where, seconds = meta["position"], meta["position"]["seconds"]
     for count in (meta["seed"], meta["env_steps"], where["env_steps"]):
         _expect(type(count) is int and 0 <= count < _MOST, "a whole number, 0 or more", count)
-    seconds = where["seconds"]
     _expect(type(seconds) is float and 0 <= seconds < float("inf"), "seconds", seconds)
     spec, columns = EnvSpec.from_json(meta["spec"]), arrays["episodes"]
     kinds = {name: column.dtype.type for name, column in columns.items()}

@@ -13,27 +13,22 @@ from ..models.errors import expect
 AlgorithmName = Literal["vpg", "a2c", "sb3-a2c"]
 PresetName = Literal["paper", "tuned"]
 
-_Rule = tuple[str, Callable[[Any], bool]]  # What is expected, and whether a value is that
-
 
 def _is_number(value: Any, low: float, high: float = math.inf) -> bool:
     return type(value) in (int, float) and math.isfinite(value) and low <= value <= high
 
 
-def _rule(expected: str, is_right: Callable[[Any], bool], *names: str) -> dict[str, _Rule]:
-    return dict.fromkeys(names, (expected, is_right))
-
-
-_RULES: Final = {
-    **_rule("a whole number, 1 or more", lambda value: type(value) is int and value >= 1,
-            "hidden", "episodes_per_update", "steps_per_update"),
-    **_rule("a number from 0 to 1", lambda value: _is_number(value, 0, 1), "gamma", "gae_lambda"),
-    **_rule("a number, 0 or more", lambda value: _is_number(value, 0), "vf_coef", "ent_coef"),
-    **_rule("true or false", lambda value: type(value) is bool, "anneal", "normalize"),
-    **_rule("a number above 0", lambda value: _is_number(value, 5e-324, 1e30), "learning_rate"),
-    **_rule("a number from -4 to 1", lambda value: _is_number(value, -4, 1), "log_std"),
-    **_rule("'none' or 'time'", lambda value: value in ("none", "time"), "baseline"),
-}  # fmt: skip
+_RULES: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
+    ("hidden episodes_per_update steps_per_update", "a whole number, 1 or more",
+     lambda value: type(value) is int and value >= 1),
+    ("gamma gae_lambda", "a number from 0 to 1", lambda value: _is_number(value, 0, 1)),
+    ("vf_coef ent_coef", "a number, 0 or more", lambda value: _is_number(value, 0)),
+    ("anneal normalize", "true or false", lambda value: type(value) is bool),
+    ("learning_rate", "a number above 0", lambda value: _is_number(value, 5e-324, 1e30)),
+    ("log_std", "a number from -4 to 1", lambda value: _is_number(value, -4, 1)),
+    ("baseline", "'none' or 'time'", lambda value: value in ("none", "time")),
+)  # fmt: skip
+"""Names of fields, what is expected of them, and whether a value is that."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,9 +47,10 @@ class _Config:
     """Initial logarithm of the policy's standard deviation, in units of the action."""
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            expected, is_right = _RULES[name]
-            expect(is_right(value), name, expected, f"{value!r}")
+        for names, expected, is_right in _RULES:
+            for name in (name for name in names.split() if name in vars(self)):
+                value = getattr(self, name)
+                expect(is_right(value), name, expected, f"{value!r}")
 
 
 @dataclass(frozen=True, kw_only=True)
