@@ -4,24 +4,21 @@ Importing this package imports none of its modules and no OpenGL: training never
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ..models.scene import World
-    from .canvas import Canvas
     from .gl import NoOpenGL
-    from .stage import CAMERAS, WORLDS, Camera, MetricValue, Moment, Stage
+    from .stage import CAMERAS, WORLDS, Camera, Canvas, MetricValue, Moment, Stage
 
 __all__ = [
     "CAMERAS", "WORLDS", "Camera", "Canvas", "MetricValue", "Moment", "NoOpenGL", "Stage",
     "World",
 ]  # fmt: skip
 
-_MODULES: Final = {"Canvas": "canvas", "NoOpenGL": "gl"}
-
 
 def __getattr__(name: str) -> Any:
     """Import names on first use (PEP 562)."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f".{_MODULES.get(name, 'stage')}", __name__), name)
+    return getattr(import_module(".stage", __name__), name)
