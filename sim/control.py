@@ -11,8 +11,6 @@ from .state import Array, WorldState, clip, component, constant, stack
 if TYPE_CHECKING:
     from ..models.vehicle import Vehicle
 
-__all__ = ["CollectiveThrust", "Controller", "RotorThrust"]
-
 
 class Controller(Protocol):
     """Turns actions into thrusts."""

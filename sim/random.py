@@ -11,8 +11,6 @@ import numpy as np
 
 from .state import Array
 
-__all__ = ["START", "Draw", "NumpyDraw", "Streams"]
-
 START: Final = 0
 """Child of a world's seed that draws how its episodes begin."""
 

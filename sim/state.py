@@ -14,18 +14,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = [
-    "Array",
-    "Pose",
-    "WorldState",
-    "clip",
-    "component",
-    "constant",
-    "on_host",
-    "plain",
-    "stack",
-]
-
 _PLAIN = (np.ndarray, float)
 _NUMBERS = (float, int)
 

@@ -11,8 +11,6 @@ from .state import Array, Pose, WorldState
 if TYPE_CHECKING:
     from ..models.vehicle import Vehicle
 
-__all__ = ["BACKENDS", "Backend", "PhysicsError", "World", "contact_check", "make_world"]
-
 Backend = Literal["mujoco", "warp"]
 """`mujoco`: threads of this machine, float64. `warp`: MuJoCo Warp, float32, a GPU if there is
 one."""

@@ -18,8 +18,6 @@ from ..random import Draw, NumpyDraw, Streams
 from ..state import Array, Pose, WorldState
 from ..world import PhysicsError, contact_check
 
-__all__ = ["MujocoWorld"]
-
 _FEW: Final = 8
 _ONLY: Final = np.zeros(1, int)
 

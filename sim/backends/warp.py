@@ -18,8 +18,6 @@ from ..random import START, Draw
 from ..state import Array, Pose, WorldState, constant
 from ..world import PhysicsError, contact_check
 
-__all__ = ["FURTHEST", "WarpWorld"]
-
 wp: Any = warp  # its types have gaps
 mjw: Any = mujoco_warp
 
