@@ -1,6 +1,6 @@
 """Collecting experience: a policy flies, and every transition is kept."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ class Diverged(InputError):
     """Weights or actions are not finite. Checkpoints from before are whole."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Rollout:
     """T steps of N drones. Rows that are not kept are no transitions: no loss has them.
 
@@ -98,8 +98,8 @@ class Collector:
                 rollout = replace(rollout, kept=np.zeros_like(rollout.kept))
             flown.append(rollout)
             rounds -= bool(len(rollout))
-        columns = {name: [vars(part)[name] for part in flown] for name in vars(flown[0])}
-        return Rollout(**{name: np.concatenate(parts) for name, parts in columns.items()})
+        columns = zip(*(vars(part).values() for part in flown), strict=True)
+        return Rollout(*map(np.concatenate, columns))
 
     def _fly(
         self, policy: NetworkPolicy, length: int | None, most_steps: int | None
@@ -140,5 +140,4 @@ class Collector:
         if waiting and (stop is None or waiting == count):
             log.begin(done)
         *columns, lost = (np.array(column) for column in zip(*rows, strict=True))
-        names = (field.name for field in fields(Rollout))
-        return Rollout(**dict(zip(names, columns, strict=True))), lost, waiting == count
+        return Rollout(*columns), lost, waiting == count

@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 from xml.etree import ElementTree
 
 import mujoco
@@ -58,8 +58,7 @@ def _attach_scene(spec: mujoco.MjSpec, *, ground: bool) -> None:
     """Add the sky and the sun of `SCENE_XML` unless `spec` has its own, and its ground if asked."""
     scene = mujoco.MjSpec.from_file(str(SCENE_XML))
     source, target = (scene, spec) if ground else (spec, scene)  # both alike: MuJoCo warns if not
-    _copy_settings(source.visual, target.visual)
-    _copy_settings(source.stat, target.stat)
+    target.visual, target.stat = source.visual, source.stat
     if not ground:
         scene.delete(scene.geom("floor"))
     if any(texture.type == _SKY for texture in spec.textures):
@@ -109,16 +108,6 @@ def switch_off_log_file() -> None:
     if config.logto_file and config.logfile == "MUJOCO_LOG.TXT":
         config.logto_file = False
         config.set()
-
-
-def _copy_settings(source: Any, target: Any) -> None:
-    """Copy the settings of a part of a spec, and those of its parts."""
-    for name in dir(source):
-        value = getattr(source, name)
-        if isinstance(value, int | float | np.ndarray):
-            setattr(target, name, value)
-        elif not (name.startswith("_") or callable(value)):
-            _copy_settings(value, getattr(target, name))
 
 
 def attach_airport(spec: mujoco.MjSpec) -> None:
