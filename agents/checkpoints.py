@@ -33,7 +33,6 @@ _COLUMNS: Final[dict[str, type[np.generic]]] = {
     f.name: {int: np.int64, float: np.float64, bool: np.bool_}[f.type]  # type: ignore[index]
     for f in fields(Episode)
 }
-_MOST: Final = 2**62
 _CHECKSUM: Final = re.compile(rb'"sha256":"([0-9a-f]{64})"')
 _MALFORMED: Final = (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError)
 """Errors that reading a crafted file can raise."""
@@ -162,7 +161,7 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
         _expect(isinstance(meta[name], dict), f"an object for {name}", meta[name])
     where, seconds = meta["position"], meta["position"]["seconds"]
     for count in (meta["seed"], meta["env_steps"], where["env_steps"]):
-        _expect(type(count) is int and 0 <= count < _MOST, "a whole number, 0 or more", count)
+        _expect(type(count) is int and 0 <= count < 2**62, "a whole number, 0 or more", count)
     _expect(type(seconds) is float and 0 <= seconds < float("inf"), "seconds", seconds)
     spec, columns = EnvSpec.from_json(meta["spec"]), arrays["episodes"]
     kinds = {name: column.dtype.type for name, column in columns.items()}

@@ -59,7 +59,7 @@ class Position:
 
     env_steps: int
     seconds: float
-    """Wall time since training began."""
+    """Wall time since training began, s."""
     actions: np.ndarray
     """Actions of the env: float32, shape (t, N, k), or int64, shape (t, N), for the t steps of the
     longest running episode."""
@@ -82,10 +82,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     make the log a vector env of Gymnasium's SAME_STEP, whatever the autoreset of `env`. Its
     observations are flat, and its continuous actions are in the units of `ActionMap`.
 
-    Args:
-        env: Local or remote; of one drone, or a vector env.
-        seed: Seed of the run.
-        keep_steps: Keep every step, for `steps`.
+    `seed` is that of the run. With `keep_steps` every step is kept, for `steps`.
 
     Attributes:
         env_steps: Control steps of all drones together.

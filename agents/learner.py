@@ -18,8 +18,6 @@ OnUpdate = Callable[[], bool]
 class Learner:
     """Base of our own algorithms: `collect` and `loss` are theirs; `loss` sets `terms` too.
 
-    The log gives the sizes and is not kept; the seed is that of weights and actions.
-
     Attributes:
         terms: Of the loss of the last update, as tensors, for few updates are logged: `gain`, the
             mean of weight · log P, which the actor climbs; `entropy` of the policy at each step,

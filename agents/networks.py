@@ -17,8 +17,6 @@ else:
 
 __all__ = ["Actor", "Critic", "arrays_of", "load_arrays", "nn", "torch"]
 
-LOG_STD_MIN, LOG_STD_MAX = -4.0, 1.0
-
 
 def _layer(inputs: int, outputs: int, gain: float) -> nn.Linear:
     layer = nn.Linear(inputs, outputs)
@@ -30,9 +28,9 @@ def _layer(inputs: int, outputs: int, gain: float) -> nn.Linear:
 class Actor(nn.Module):
     """Policy: Gaussian for continuous actions, categorical for discrete ones.
 
-    The Gaussian's standard deviation does not depend on the state; `log_std` is its logarithm to
-    begin with. The env gets the clipped action, the loss scores the drawn one. Inputs are n, the
-    length of a flat observation, outputs k, the numbers of an action or its choices.
+    The Gaussian's standard deviation does not depend on the state; its logarithm begins as
+    `log_std`. Inputs are n, the length of a flat observation, outputs k, the numbers of an action
+    or its choices.
     """
 
     def __init__(
@@ -74,7 +72,7 @@ class Actor(nn.Module):
         """Keep the standard deviation between e^-4 and e."""
         if self.log_std is not None:
             with torch.no_grad():
-                self.log_std.clamp_(LOG_STD_MIN, LOG_STD_MAX)
+                self.log_std.clamp_(-4.0, 1.0)
 
 
 class Critic(nn.Module):

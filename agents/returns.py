@@ -26,10 +26,7 @@ def discounted_sums(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
 
 
 def rewards_to_go(rewards: np.ndarray, ends: np.ndarray, gamma: float) -> np.ndarray:
-    """Discounted return from each step to the end of its episode (paper, Algorithm 1, step 2).
-
-    R_t = sum of gamma^(t' - t) · r_t' for t' = t ... the end.
-    """
+    """R_t = sum of gamma^(t' - t) · r_t' to the episode's end (paper, Algorithm 1, step 2)."""
     return discounted_sums(rewards, gamma * ~ends)
 
 

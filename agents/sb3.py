@@ -10,7 +10,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from ..models.errors import expect, require
 from . import learner
 from .episodes import EpisodeLog
-from .learner import OnUpdate, check_finite, seeds_of
 from .networks import arrays_of, load_arrays, torch
 from .presets import A2CConfig
 
@@ -86,12 +85,12 @@ class SB3VecEnv(sb3_vec.VecEnv):
 class SB3A2C:
     """SB3's A2C behind the same interface as our own algorithms.
 
-    Adam instead of SB3's RMSprop, no clipping of gradients, and every other setting from the same
-    `A2CConfig`: given the same experience, it makes the same updates as ours.
+    With Adam, without clipping of gradients, and with all settings from the same `A2CConfig`: given
+    the same experience, it makes the same updates as ours.
     """
 
     def __init__(self, log: EpisodeLog, config: A2CConfig, seed: int) -> None:
-        torch_seed, _ = seeds_of(seed)
+        torch_seed, _ = learner.seeds_of(seed)
         # SB3 draws from the global generators: torch for actions, NumPy for the order of samples.
         torch.manual_seed(torch_seed)
         np.random.seed(torch_seed % 2**32)  # noqa: NPY002
@@ -120,7 +119,7 @@ class SB3A2C:
         # It keeps the numbers of the last update for us; SB3's own makes a folder in /tmp.
         self._model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
 
-    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
+    def train(self, log: EpisodeLog, env_steps: int, on_update: learner.OnUpdate) -> None:
         """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
         model, done, whole = self._model, log.env_steps, self.last_step(env_steps)
         if done >= whole:
@@ -179,11 +178,11 @@ class _Stopped(Exception):
 class _A2C(sb3.A2C):
     """SB3's A2C, which has no callback between an update and the next rollout."""
 
-    on_update: OnUpdate
+    on_update: learner.OnUpdate
 
     def train(self) -> None:
         super().train()
-        check_finite(self.policy.optimizer)
+        learner.check_finite(self.policy.optimizer)
         if not self.on_update():
             raise _Stopped
 
