@@ -6,8 +6,7 @@ from .learner import Learner
 from .networks import Critic, nn, torch
 from .policies import NetworkPolicy, flat_size
 from .presets import A2CConfig
-from .returns import advantages
-from .rollouts import Collector, Rollout
+from .rollouts import Collector, Rollout, advantages
 
 
 class A2C(Learner):

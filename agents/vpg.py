@@ -6,8 +6,7 @@ from .learner import Learner
 from .networks import torch
 from .policies import NetworkPolicy
 from .presets import VPGConfig
-from .returns import rewards_to_go, step_of_episode
-from .rollouts import Collector, Rollout
+from .rollouts import Collector, Rollout, rewards_to_go, step_of_episode
 
 
 class VPG(Learner):

@@ -23,8 +23,8 @@ from rotorgram.experiments.filming import Film, Shot, film, moments
 from rotorgram.experiments.trajectories import Trajectory, flown_trajectories
 from rotorgram.models import Vehicle
 from rotorgram.rendering import Canvas, Moment, Stage
+from rotorgram.rendering.film import Overlay
 from rotorgram.rendering.gl import offscreen_context
-from rotorgram.rendering.overlay import Overlay
 
 SIZES = ((640, 360), (1280, 720))
 ENV = "rotorgram/Elevation-v0"

@@ -17,8 +17,7 @@ from ..agents.policies import Policy
 from ..envs.rendering import moment
 from ..models.errors import InputError
 from ..rendering import Camera, Canvas, Moment, NoOpenGL, Stage, World
-from ..rendering.film import QUALITY, check_film, write_film
-from ..rendering.overlay import Overlay, graph_scale
+from ..rendering.film import QUALITY, Overlay, check_film, graph_scale, write_film
 from .palette import agent_color, agent_label, sort_agents
 from .trajectories import Trajectory, flown_trajectories
 

@@ -1,24 +1,48 @@
-"""Films of pictures: MP4, GIF, PNGs. A film is there whole or not at all."""
+"""Films: numbers and graphs on pictures, and MP4, GIF or PNGs of them.
+
+A film is there whole or not at all.
+"""
 
 import io
+import math
 import subprocess
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from fractions import Fraction
-from itertools import chain
+from functools import lru_cache
+from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from ..models.errors import InputError, expect, require
-from ._pillow import Image
+from ..models.vehicle import Vehicle
+from .stage import Moment
+
+require("PIL", "render", "what is written on pictures and into films")
+
+from PIL import Image, ImageColor, ImageDraw, ImageFont  # noqa: E402
 
 SUFFIXES: Final = (".mp4", ".gif", ".png", "")
 """Kinds of film, by suffix; no suffix is a folder of PNGs."""
 QUALITY: Final = 20
 """x264's constant rate factor: less is better and larger."""
+
+_GROUND: Final = (13, 18, 26, 150)  # Of panels: dark, and some of the picture shows through
+_EDGE: Final = (255, 255, 255, 36)
+_NAMES, _VALUES = (164, 176, 190), (238, 242, 246)
+_ZERO, _LIMIT = (150, 162, 176), (84, 96, 110)
+_ALARM: Final = (255, 107, 96)
+_BAR, _BAR_GROUND = (120, 190, 255), (70, 82, 98)
+_STEPS: Final = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # Round numbers for the ends of a graph
+_LEAST: Final = 0.1  # Smallest end of a graph, in the metric's unit
+_STRIP_SIZE: Final = 160, 240  # Width and height of the smallest picture with a graph, pixels
+_NUMBERS_HEIGHT: Final = 160  # Of the smallest picture with numbers, pixels
+_NUMBERS_SHARE: Final = 0.4  # Of width or height: larger ones would hide the craft in the middle
+_TIMES: Final = 2  # Everything is drawn so much larger, and reduced: smooth lines and letters
 
 
 def check_film(path: Path, width: int, height: int, fps: float) -> None:
@@ -152,3 +176,273 @@ def _ffmpeg() -> str:
             "ffmpeg: expected one that imageio-ffmpeg brings or finds, got none; "
             "write a .gif or a folder of PNGs"
         ) from None
+
+
+class Box(NamedTuple):
+    """Edges, pixels."""
+
+    left: int
+    upper: int
+    right: int
+    lower: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of what is drawn into it, enlarged."""
+        return (self.right - self.left) * _TIMES, (self.lower - self.upper) * _TIMES
+
+
+def graph_scale(values: Iterable[float]) -> tuple[float, float]:
+    """Round ends of a graph that holds the values: from 0, or symmetrical if one is negative."""
+    finite = [value for value in values if math.isfinite(value)]
+    largest = max(map(abs, finite), default=0.0)
+    decade = 10.0 ** math.floor(math.log10(max(largest, _LEAST)))
+    high = next(step * decade for step in _STEPS if largest <= step * decade * (1 + 1e-9))
+    return (-high if min(finite, default=0.0) < 0 else 0.0), high
+
+
+class Overlay:
+    """Draws on the pictures of one flight: a panel of numbers, and a graph of the headline metric.
+
+    Everything scales with the picture. A small one has no graph, a smaller one only the title.
+
+    Args:
+        width, height: Of the pictures, pixels.
+        title: Name of the flight.
+        color: Of title and curve, "#RRGGBB"; light, the ground is dark.
+        like: A moment of the flight: it says which metrics, goal and rotors there are.
+        vehicle: It gives the limits of the thrusts.
+        period: Time between two values of the graph, s.
+        seconds: Length of the graph's time axis, s.
+        scale: Lower and upper end of the graph, in the metric's unit. Values beyond are not drawn:
+            a triangle marks where the curve leaves.
+        numbers: Whether there is more than the title.
+
+    Attributes:
+        has_numbers: Whether the panel has numbers.
+        has_strip: Whether there is a graph.
+        panel, strip, plot: Where title and numbers are, where the graph, and where in it its curve.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        *,
+        title: str,
+        color: str = "#7CC8F2",
+        like: Moment,
+        vehicle: Vehicle,
+        period: float,
+        seconds: float,
+        scale: tuple[float, float],
+        numbers: bool = True,
+    ) -> None:
+        self._size = width, height
+        self._title, self._color = title, ImageColor.getrgb(color)[:3]
+        self._period, self._seconds, self._scale = period, max(seconds, period), scale
+        self._vehicle, self._high = vehicle, float(vehicle.thrust_high.max())
+        self._widest = replace(  # its lines are as wide as any of the flight
+            like,
+            position=(0.0, -100.0, 0.0),
+            thrusts=(self._high,) * len(like.thrusts),
+            goal=like.goal and (0.0, -100.0, 0.0),
+            metrics=tuple(metric._replace(value=-1.001) for metric in like.metrics),
+            reward=-10.0,
+            step=100_000,
+            episode=100_000,
+        ).lines(self._high)
+        self._metric = like.metrics[0] if like.metrics else None
+        unit = max(7.0, min(height / 30, width / 34))
+        self._unit, self._gap = unit, max(2, round(0.55 * unit))
+        self._line = round(1.28 * unit)
+        self._small, self._font, self._large = (_font(unit * share) for share in (0.85, 1, 1.25))
+        self.has_numbers = numbers and self._have_room()
+        large = width >= _STRIP_SIZE[0] and height >= _STRIP_SIZE[1]
+        self.has_strip = numbers and large and self._metric is not None
+        self.panel = self._panel_box(self.has_numbers)
+        self.strip, self.plot = self._strip_boxes()
+        left, upper, right, lower = self.plot
+        self._curve = Box(left - self._gap, upper, right + self._gap, lower + 1)
+        boxes = (self.panel, self.strip) if self.has_strip else (self.panel,)
+        self._grounds = [(box, _ground(box, self._gap)) for box in boxes]
+
+    def draw(
+        self, picture: np.ndarray, moment: Moment, values: Sequence[float], note: str = ""
+    ) -> np.ndarray:
+        """A copy of a picture, uint8, shape (height, width, 3), with everything on it.
+
+        `values` are those of the headline metric from the episode's start to this moment, one each
+        period; `note` is an event, such as "terminated".
+        """
+        image = Image.fromarray(picture)
+        expect(image.size == self._size, "picture", f"{self._size} pixels", str(image.size))
+        for box, ground in self._grounds:
+            image.paste(ground, box[:2], ground)
+        _enlarged(image, self.panel, lambda draw: self._write_panel(draw, moment))
+        if self.has_strip:
+            _enlarged(image, self.strip, lambda draw: self._write_strip(draw, values))
+            _enlarged(image, self._curve, lambda draw: self._draw_curve(draw, values))
+        if note:  # below the panel, away from the craft
+            wide = self._large.getlength(note) / _TIMES + 3 * self._gap
+            left, upper = self.panel.left, self.panel.lower + self._gap
+            box = Box(left, upper, round(left + wide), round(upper + 1.9 * self._unit))
+            _enlarged(image, box, lambda draw: self._write_note(draw, box, note))
+        return np.asarray(image)
+
+    def _numbers_width(self) -> int:
+        """Of a panel in which every name and its value fit beside each other."""
+        lines = ((name, _spaced(value)) for name, value in self._widest)
+        texts = max(sum(map(self._font.getlength, line)) for line in lines) / _TIMES
+        return round(texts + self._unit + 4 * self._gap)
+
+    def _have_room(self) -> bool:
+        """Whether numbers fit, and leave the middle free."""
+        wide, high = self._gap + self._numbers_width(), self._panel_box(True).lower
+        width, height = self._size
+        fits = height >= _NUMBERS_HEIGHT and width >= wide + self._gap
+        return fits and (wide <= _NUMBERS_SHARE * width or high <= _NUMBERS_SHARE * height)
+
+    def _panel_box(self, numbers: bool) -> Box:
+        gap, (width, height) = self._gap, self._size
+        title = math.ceil(self._large.getlength(self._title) / _TIMES + 1.2 * self._unit) + 1
+        lower, right = 3 * gap + round(1.6 * self._unit), 5 * gap + title
+        if numbers:
+            lower += len(self._widest) * self._line + 3 * gap
+            right = max(right, gap + self._numbers_width())
+        return Box(gap, gap, min(right, width - gap), min(lower, height - gap))
+
+    def _write_panel(self, draw: ImageDraw.ImageDraw, moment: Moment) -> None:
+        unit, gap, line = self._unit * _TIMES, self._gap * _TIMES, self._line * _TIMES
+        left, y = 2 * gap, gap
+        right = self.panel.size[0] - 2 * gap
+        middle, radius = y + 0.8 * unit, 0.36 * unit
+        draw.ellipse((left, middle - radius, left + 2 * radius, middle + radius), self._color)
+        title = _fitted(self._title, self._large, right - left - 1.2 * unit)
+        draw.text((left + 1.2 * unit, middle), title, self._color, self._large, anchor="lm")
+        y += round(1.6 * unit) + gap // 2
+        for name, value in moment.lines(self._high) if self.has_numbers else ():
+            draw.text((left, y), name, _NAMES, self._font)
+            draw.text((right, y), _spaced(value), _VALUES, self._font, anchor="ra")
+            y += line
+            if "F1" in name:
+                y += gap // 2
+                self._draw_bars(draw, Box(left, y, right, y + gap), moment.thrusts)
+                y += round(1.5 * gap)
+
+    def _draw_bars(self, draw: ImageDraw.ImageDraw, box: Box, thrusts: Sequence[float]) -> None:
+        """The thrusts side by side, from the least to the largest, with a mark at hover."""
+        gap = min(self._gap * _TIMES, (box.right - box.left) // (3 * len(thrusts)))
+        long = (box.right - box.left - gap * (len(thrusts) - 1)) / len(thrusts)
+        thick = max(1, round(self._unit / 7))
+        craft = self._vehicle
+        columns = (thrusts, craft.thrust_low, craft.thrust_high, craft.hover_thrust)
+        for number, (thrust, low, high, hover) in enumerate(zip(*columns, strict=True)):
+            start = box.left + number * (long + gap)
+            full, mark = (
+                start + long * min(max((value - low) / (high - low), 0.0), 1.0)
+                for value in (thrust, hover)
+            )
+            draw.rectangle((start, box.upper, start + long, box.lower), _BAR_GROUND)
+            if full > start:
+                draw.rectangle((start, box.upper, full, box.lower), _BAR)
+            draw.line((mark, box.upper - _TIMES, mark, box.lower + _TIMES), _VALUES, thick)
+
+    def _strip_boxes(self) -> tuple[Box, Box]:
+        gap, (width, height) = self._gap, self._size
+        upper = max(height - gap - round(6.6 * self._unit), 0)
+        strip = Box(gap, upper, width - gap, height - gap)
+        label = max(self._small.getlength(name) for name, _ in self._levels()) / _TIMES
+        left, upper = strip.left + round(label) + 3 * gap, upper + gap + round(1.75 * self._unit)
+        right, lower = strip.right - 2 * gap, strip.lower - round(1.5 * gap)
+        return strip, Box(left, upper, max(left, right), max(upper, lower))
+
+    def _levels(self) -> tuple[tuple[str, float], ...]:
+        """Labels of the graph's lines, and their heights, -1 to 1."""
+        low, high = self._scale
+        return (f"{high:g}", 1.0), (f"{(low + high) / 2:g}", 0.0), (f"{low:g}", -1.0)
+
+    def _write_strip(self, draw: ImageDraw.ImageDraw, values: Sequence[float]) -> None:
+        unit, gap = self._unit * _TIMES, self._gap * _TIMES
+        assert self._metric is not None
+        words = [f"{self._metric.label} over time", *filter(None, [self._metric.unit])]
+        draw.text((2 * gap, gap), ", ".join(words), _NAMES, self._font)
+        time = f"{max(len(values) - 1, 0) * self._period:.2f} s"
+        draw.text((self.strip.size[0] - 2 * gap, gap), time, _VALUES, self._font, anchor="ra")
+        corner = self.strip[:2] * 2
+        left, upper, right, lower = (np.subtract(self.plot, corner) * _TIMES).tolist()
+        for label, share in self._levels():
+            y = lower - (lower - upper) * (1 + share) / 2
+            color = _ZERO if label == "0" else _LIMIT
+            draw.line((left, y, right, y), color, max(1, round(unit / 14)))
+            if share or lower - upper > 2.4 * unit:  # there is room for the zero too
+                draw.text((left - gap, y), label, _NAMES, self._small, anchor="rm")
+
+    def _draw_curve(self, draw: ImageDraw.ImageDraw, values: Sequence[float]) -> None:
+        low, high = self._scale
+        shares = (np.asarray(values, float) - (low + high) / 2) / ((high - low) / 2)
+        left, _, right, _ = ((edge - self._curve.left) * _TIMES for edge in self.plot)
+        tall = (self.plot.lower - self.plot.upper) * _TIMES
+        across = (right - left) * self._period / self._seconds
+        xs = np.minimum(left + across * np.arange(len(shares)), right)
+        points = np.stack((xs, shares), axis=1)[np.isfinite(shares)].tolist()
+        thick = max(_TIMES, round(self._unit * _TIMES / 6))
+        path: list[tuple[float, float]] = []  # what is beyond the box is cut off
+        for (x, y), (next_x, next_y) in pairwise([(left, 0.0), *points]):
+            crossed = [edge for edge in (-1.0, 1.0) if (y * edge <= 1) != (next_y * edge <= 1)]
+            for edge in sorted(crossed, reverse=next_y < y):
+                across = x + (edge - y) / (next_y - y) * (next_x - x)
+                ends = [(across, edge), (across, 2 * edge)]
+                path += ends if next_y * edge > 1 else ends[::-1]
+                if next_y * edge > 1:  # it leaves
+                    corner = min(max(across, left + 2 * thick), right - 2 * thick)
+                    start = tall * (1 - edge) / 2
+                    inside = start + 2.5 * thick * edge  # rows count downwards
+                    sides = (corner - 2 * thick, inside), (corner + 2 * thick, inside)
+                    draw.polygon(((corner, start), *sides), self._color)
+            path.append((next_x, next_y if abs(next_y) <= 1 else math.copysign(2, next_y)))
+        curve = [(x, tall * (1 - y) / 2) for x, y in path]
+        draw.line(curve, self._color, thick, joint="curve")
+        for x, y in ((x, tall * (1 - y) / 2) for x, y in points[-1:] if abs(y) <= 1):
+            draw.ellipse((x - thick, y - thick, x + thick, y + thick), self._color)
+
+    def _write_note(self, draw: ImageDraw.ImageDraw, box: Box, note: str) -> None:
+        size = box.size[0] - 1, box.size[1] - 1
+        thick = max(1, round(self._unit * _TIMES / 12))
+        draw.rounded_rectangle((0, 0, *size), self._gap * _TIMES, _GROUND[:3], _ALARM, thick)
+        draw.text((size[0] / 2, size[1] / 2), note, _ALARM, self._large, anchor="mm")
+
+
+def _enlarged(image: Image.Image, box: Box, write: Callable[[ImageDraw.ImageDraw], None]) -> None:
+    """Write on a part of the picture, in enlarged pixels from its own corner on."""
+    part = image.crop(box).resize(box.size, Image.Resampling.NEAREST)
+    write(ImageDraw.Draw(part))
+    image.paste(part.reduce(_TIMES), box[:2])
+
+
+def _ground(box: Box, radius: int) -> Image.Image:
+    """An empty panel, RGBA."""
+    image = Image.new("RGBA", box.size)
+    edges = (0, 0, image.width - 1, image.height - 1)
+    ImageDraw.Draw(image).rounded_rectangle(edges, radius * _TIMES, _GROUND, _EDGE, _TIMES)
+    return image.reduce(_TIMES)
+
+
+def _spaced(value: str) -> str:
+    """The same with more space between numbers than between number and unit."""
+    numbers, _, unit = value.rpartition(" ")
+    return f"{numbers.replace(' ', '  ')} {unit}".strip()
+
+
+def _fitted(text: str, font: ImageFont.FreeTypeFont, room: float) -> str:
+    """The text, or its beginning where it is too long."""
+    shorter = (f"{text[:length]}..." for length in range(len(text) - 1, 0, -1))
+    return next((t for t in (text, *shorter) if font.getlength(t) <= room), "...")
+
+
+@lru_cache
+def _font(size: float) -> ImageFont.FreeTypeFont:
+    """For so many pixels of the picture."""
+    font = ImageFont.load_default(size * _TIMES)
+    assert isinstance(font, ImageFont.FreeTypeFont)  # Pillow's wheels bring FreeType
+    return font

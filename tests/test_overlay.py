@@ -8,7 +8,7 @@ import pytest
 from pictures import HEXA, TINY, at
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering import MetricValue
-from rotorgram.rendering.overlay import Overlay, graph_scale
+from rotorgram.rendering.film import Overlay, graph_scale
 
 QUAD = Vehicle.load()
 

@@ -4,7 +4,7 @@ import timeit
 
 import numpy as np
 import pytest
-from rotorgram.agents.returns import advantages, discounted_sums, rewards_to_go, step_of_episode
+from rotorgram.agents.rollouts import advantages, discounted_sums, rewards_to_go, step_of_episode
 
 
 def flags(*values: int) -> np.ndarray:
