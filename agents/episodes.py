@@ -96,17 +96,14 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.spec: EnvSpec = self.env.env_spec  # type: ignore[assignment]  # not Gymnasium's
         self.num_envs = count = self.env.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        self.actions = ActionMap(self.spec.action)
+        self.actions = actions = ActionMap(self.spec.action)
         low, high = (
             np.concatenate([a.bounds()[side].ravel() for a in self.spec.observation]).astype("f")
             for side in (0, 1)
         )
         self.single_observation_space = spaces.Box(low, high)
-        self.single_action_space = (
-            spaces.Discrete(self.actions.outputs)
-            if self.actions.discrete
-            else spaces.Box(-1, 1, (self.actions.size,))
-        )
+        box = spaces.Box(-1, 1, (actions.size,))
+        self.single_action_space = spaces.Discrete(actions.outputs) if actions.discrete else box
         self.run_seed, self.env_steps = seed, 0
         self.episodes: list[Episode] = []
         self._began: float | None = None
@@ -117,7 +114,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._all, self._nothing = np.ones(count, bool), np.full(count, np.nan)
         self._flown: list[np.ndarray] = []  # actions; at least those of the running episodes
         self._steps: list[np.ndarray] | None = [] if keep_steps else None
-        self._still = self.actions.to_envs(np.zeros((count, self.actions.size), np.float32))
+        self._still = actions.to_envs(np.zeros((count, actions.size), np.float32))
 
     def start_clock(self) -> None:
         """Training begins now; after `resume` it has begun before."""

@@ -121,10 +121,8 @@ def check_finite(optimizer: torch.optim.Optimizer) -> None:
     (group,) = optimizer.param_groups
     weights = torch.cat([parameter.detach().flatten() for parameter in group["params"]])
     if not torch.isfinite(weights).all():
-        raise Diverged(
-            f"training diverged: weights are not finite after update {updates_of(optimizer)}; "
-            "try a lower learning_rate"
-        )
+        what = f"weights are not finite after update {updates_of(optimizer)}"
+        raise Diverged(f"training diverged: {what}; try a lower learning_rate")
 
 
 def optimizer_arrays(optimizer: torch.optim.Optimizer) -> dict[str, np.ndarray]:

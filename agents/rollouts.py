@@ -65,8 +65,6 @@ class Rollout:
 
     def without_episodes(self, lost: np.ndarray) -> "Rollout":
         """Without the episodes that end with such a step: their returns are unknown."""
-        if not lost.any():
-            return self
         return replace(self, kept=self.kept & (rewards_to_go(lost, self.ends, 1.0) == 0))
 
 
@@ -125,9 +123,8 @@ class Collector:
                 noise = policy.draw_noise(self._rng, block * count).reshape(block, count, -1)
             actions = policy.sample(observations, noise[len(rows) % block])
             if not np.isfinite(actions).all():
-                raise Diverged(
-                    "training diverged: actions are not finite; try a lower learning_rate"
-                )
+                hint = "try a lower learning_rate"
+                raise Diverged(f"training diverged: actions are not finite; {hint}")
             idle = done if waiting else None
             log.fly(actions, idle) if stop is None else log.fly(actions, None, idle)
             after, terminated, truncated = log.observations, env.terminated, env.truncated

@@ -7,6 +7,7 @@ import io
 import math
 import subprocess
 import tempfile
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -26,8 +27,6 @@ require("PIL", "render", "what is written on pictures and into films")
 
 from PIL import Image, ImageColor, ImageDraw, ImageFont  # noqa: E402
 
-SUFFIXES: Final = (".mp4", ".gif", ".png", "")
-"""Kinds of film, by suffix; no suffix is a folder of PNGs."""
 QUALITY: Final = 20
 """x264's constant rate factor: less is better and larger."""
 
@@ -49,7 +48,7 @@ def check_film(path: Path, width: int, height: int, fps: float) -> None:
     """Check the arguments of `write_film` before anything is drawn. Raises `InputError`."""
     kind, hundredths = path.suffix.lower(), 100 / max(fps, 0.01)
     expected = "a name that ends in .mp4, .gif or .png, or a folder's name without a dot"
-    expect(kind in SUFFIXES, "film", expected, str(path))
+    expect(kind in (".mp4", ".gif", ".png", ""), "film", expected, str(path))
     if path.exists():
         raise InputError(f"film: {path} is there already; choose another name")
     expect(0.01 <= fps <= 1000, "fps", "0.01 to 1000 pictures per second", f"{fps:g}")
@@ -103,7 +102,7 @@ def write_film(
             case ".gif":
                 _write_gif(unfinished, counted(), fps)
             case ".png":
-                *_, last = counted()
+                last = deque(counted(), maxlen=1).pop()
                 Image.fromarray(last).save(unfinished)
             case _:
                 unfinished.mkdir()

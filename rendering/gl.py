@@ -54,14 +54,12 @@ def offscreen_context(width: int, height: int) -> Any:
         try:
             context = import_module(f"mujoco.{name}").GLContext(width, height)
             with context.as_current():
-                pass
+                return context
         except Exception as error:  # each library fails in a way of its own
             words = " ".join(str(error).split()) or type(error).__name__
             if isinstance(error, AttributeError):  # PyOpenGL's way to say so
                 words = "its library is not installed"
             reasons.append(f"{name}: {words:.200}")
-        else:
-            return context
     raise NoOpenGL(
         "OpenGL: expected EGL (on Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri), "
         f"got none ({'; '.join(reasons) or 'MUJOCO_GL switches it off'})"

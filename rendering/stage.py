@@ -35,8 +35,7 @@ _SAMPLES = 4  # of every pixel, for smooth edges; software has no more
 # Lengths below are in radii of the craft.
 _SPACING: Final = 2.2  # between craft that fly side by side
 _NEAR: Final = 0.14  # at most: where drawing begins
-_LOWER: Final = 0.06
-"""Front and side look this share of their distance below the goal: the graph covers the bottom."""
+_LOWER: Final = 0.06  # of their distance front and side look below the goal: there is the graph
 _VIEWS: Final[dict[str, tuple[float, float, float, float]]] = {
     "chase": (0.0, -17.0, 3.85, math.inf),
     "front": (180.0, -7.0, 6.9, 1.65),  # from a little above the goal: its disc is seen
@@ -48,8 +47,7 @@ _VIEWS: Final[dict[str, tuple[float, float, float, float]]] = {
 picture holds: if they are further apart, the camera is further away."""
 _BACK: Final = 2.6  # distance of a camera per distance between craft and goal
 _FOVY: Final = 50.0  # vertical field of view of every camera but `onboard`, degrees
-_FAR: Final = 10.0
-"""Cameras move back until craft and goal are so far apart, or as far as at the episode's start."""
+_FAR: Final = 10.0  # Cameras move back until craft and goal are as far apart, or as at the start
 
 _Vector = tuple[float, float, float]
 
