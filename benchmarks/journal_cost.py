@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 from rotorgram.udp import RemoteEnv
-from rotorgram.udp.journal import Journal, read_journal, software, summarize
+from rotorgram.udp.journal import Journal, Recording, Summary, software
 from rotorgram.udp.protocol.messages import Command, Hello, State
 from rotorgram.udp.protocol.statistics import Statistics
 
@@ -126,7 +126,7 @@ def compare(name: str, slices: dict[str, list[Slice]]) -> dict[str, object]:
 
 def journal_alone(source: Path, target: Path, repeats: int = 9) -> float:
     """Shortest time of a State and its Command in the journal, µs."""
-    items = list(read_journal(source))
+    items = list(Recording(source))
     hello = next(item for item in items if isinstance(item.message, Hello))
     flown = [(i.message, i.datagram) for i in items if isinstance(i.message, State | Command)]
     flown = flown[:40_000]
@@ -154,7 +154,7 @@ def main() -> None:
         folder = Path(name)
         slices = measure(args.rounds, args.seconds, folder)
         files = {side: folder / f"both-{side}.mcap" for side in ("agent", "simulator")}
-        states = {side: summarize(file).sessions[0].states for side, file in files.items()}
+        states = {side: Summary(file).sessions[0].states for side, file in files.items()}
         sizes = {side: round(files[side].stat().st_size / states[side], 1) for side in files}
         alone = journal_alone(files["agent"], folder)
     rates = {name: [one.rate for one in many] for name, many in slices.items()}

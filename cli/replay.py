@@ -24,16 +24,16 @@ class Replay(Command):
 
     def run(self) -> int:
         """Print the summary and the verdict."""
-        from ..udp.journal.reader import summarize
-        from ..udp.journal.replay import verify
+        from ..udp.journal.reader import Summary
+        from ..udp.journal.replay import Verification
 
-        print(summarize(self.file))
+        print(Summary(self.file))
         if not self.verify:
             return 0
         if self.env:
             from ..envs import registry
 
             registry.load(self.env)
-        verdict = verify(self.file, vehicle=self.vehicle)
+        verdict = Verification(self.file, vehicle=self.vehicle)
         print(verdict)
         return 0 if verdict.identical else 1

@@ -13,7 +13,7 @@ from rotorgram.agents import PID
 from rotorgram.experiments.filming import Film, Shot, film
 from rotorgram.experiments.pairs import socket_pair
 from rotorgram.experiments.trajectories import fly, recorded_trajectories
-from rotorgram.udp.journal.replay import verify
+from rotorgram.udp.journal.replay import Verification
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 journal = folder / "flight.mcap"
@@ -24,7 +24,7 @@ with socket_pair("rotorgram/Elevation-v0", record=journal) as env:
     trajectory = fly(env, PID(env.env_spec), seed=7)
 print(f"return {trajectory.rewards.sum():.1f}: {journal}")
 
-print(verify(journal))
+print(Verification(journal))
 
 # A film needs OpenGL; flying and comparing do not.
 shot = Shot(name="PID", color="#E69F00", trajectories=recorded_trajectories(journal, [0]))

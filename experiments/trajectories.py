@@ -233,12 +233,12 @@ def recorded_trajectories(
         InputError: It is no journal, or has no such session, drone or episode.
         OSError: It cannot be read.
     """
-    from ..udp.journal.reader import read_journal
+    from ..udp.journal.reader import Recording
 
     if not path.is_file():
         raise InputError(f"{path}: expected a journal (.mcap), got no such file")
     readers: dict[int, _Reader] = {}
-    for item in read_journal(path):
+    for item in Recording(path):
         found = item.session
         reader = readers.setdefault(found.index, _Reader(found.spec, found.num_envs, drone))
         if session in (None, found.index):

@@ -44,10 +44,11 @@ from rotorgram.udp import (
     RemoteVectorEnv,
     Simulator,
 )
-from rotorgram.udp.journal import Journal, read_journal, summarize
+from rotorgram.udp.journal import Journal, Recording, Summary
 from rotorgram.udp.journal import writer as journal_module
-from rotorgram.udp.journal._file import MAX_CHUNK, McapFile
-from rotorgram.udp.journal.replay import verify
+from rotorgram.udp.journal.reader import MAX_CHUNK
+from rotorgram.udp.journal.replay import Verification
+from rotorgram.udp.journal.writer import McapFile
 from rotorgram.udp.layouts import layout_of
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.auth import write_key
@@ -123,7 +124,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 def datagrams(path: Path, *kinds: type) -> list[bytes]:
     """Those of States and Commands, or of the messages asked for, in order."""
     wanted = kinds or (State, Command)
-    return [item.datagram for item in read_journal(path) if isinstance(item.message, wanted)]
+    return [item.datagram for item in Recording(path) if isinstance(item.message, wanted)]
 
 
 def rewrite(source: Path, target: Path, change: Callable[[Message], Message]) -> None:
@@ -188,7 +189,7 @@ def test_both_sides_can_be_repeated_bit_for_bit(
     assert seen.episodes > 1
     for side in ("agent", "simulator"):
         path = getattr(both, side)
-        summary, verdict = summarize(path), verify(path)
+        summary, verdict = Summary(path), Verification(path)
         assert (summary.side, summary.complete, summary.ending) == (side, True, "complete")
         assert (summary.steps, summary.episodes) == (seen.steps, seen.episodes)
         assert summary.mean_return == pytest.approx(seen.returns / seen.episodes, rel=1e-12)
@@ -221,15 +222,15 @@ def test_nothing_that_a_journal_names_is_imported(
     for env_id in ("evil:Evil-v0", "CartPole-v1", "rotorgram/No-v0"):
         path = tmp_path / "named.mcap"
         rewrite(flight.simulator, path, changed_spec(env_id=env_id))
-        (session,) = verify(path).sessions
+        (session,) = Verification(path).sessions
         assert session.problem.startswith(
             f"State 1 cannot be repeated: expected a registered env id, got {env_id!r}"
         )
-        assert summarize(path).sessions[0].session.spec.env_id == env_id
+        assert Summary(path).sessions[0].session.spec.env_id == env_id
     path = tmp_path / "named.mcap"  # a module before an id that is registered changes nothing
     name = f"evil:{ENV_ID}"
     rewrite(flight.simulator, path, changed_spec(env_id=name))
-    assert verify(path).identical
+    assert Verification(path).identical
 
 
 def changed_spec(**values: Any) -> Callable[[Message], Message]:
@@ -252,9 +253,9 @@ def test_a_flight_of_another_env_is_recorded_and_not_repeated(tmp_path: Path) ->
     with remote:
         fly(remote, 60)
     running.join()
-    assert summarize(path).steps == 60
-    assert not verify(path).identical
-    assert read_journal(path).attachments == {}
+    assert Summary(path).steps == 60
+    assert not Verification(path).identical
+    assert Recording(path).attachments == {}
 
 
 def test_a_flight_that_never_began(tmp_path: Path) -> None:
@@ -263,10 +264,10 @@ def test_a_flight_that_never_began(tmp_path: Path) -> None:
     with Simulator(server=("127.0.0.1", 9), bind=ANY, record=path, config=config) as simulator:
         with pytest.raises(PeerSilent):
             simulator.run()
-        (session,) = summarize(path).sessions  # finished by the end of `run`
+        (session,) = Summary(path).sessions  # finished by the end of `run`
     assert (session.ending, session.steps) == ("not closed", 0)
-    assert str(verify(path)).endswith("nothing to compare")
-    assert not verify(path).identical
+    assert str(Verification(path)).endswith("nothing to compare")
+    assert not Verification(path).identical
 
 
 def test_a_refused_simulator(tmp_path: Path) -> None:
@@ -277,7 +278,7 @@ def test_a_refused_simulator(tmp_path: Path) -> None:
         with pytest.raises(PeerSilent):
             remote.connect()
         assert isinstance(running.join(), Refused)
-    (session,) = summarize(path).sessions
+    (session,) = Summary(path).sessions
     assert session.ending.startswith("refused: ")
     assert ENV_ID in session.ending
 
@@ -303,9 +304,9 @@ def test_one_flipped_bit_is_found(field: str, flight: SimpleNamespace, tmp_path:
         return CHANGES[field](message) if chosen else message
 
     rewrite(flight.simulator, path, lambda message: message)
-    assert verify(path).identical
+    assert Verification(path).identical
     rewrite(flight.simulator, path, change)
-    verdict = verify(path)
+    verdict = Verification(path)
     assert not verdict.identical
     (session,) = verdict.sessions
     found = session.difference
@@ -327,27 +328,27 @@ def test_other_options_and_another_model_are_noticed(
         rewrite(flight.simulator, path, changed_spec(**values))
         return path
 
-    options = dict(next(iter(read_journal(flight.simulator))).session.spec.options)
-    verdict = verify(other(options=options | {"linear_drag": 0.5}))
+    options = dict(next(iter(Recording(flight.simulator))).session.spec.options)
+    verdict = Verification(other(options=options | {"linear_drag": 0.5}))
     found = verdict.sessions[0].difference
     assert found is not None
     assert found.sequence == 3  # the resets are at rest; drag slows what moves
     assert re.match("the vehicle was [0-9a-f]{32}, and is", verdict.sessions[0].notes[0])
-    verdict = verify(other(vehicle_hash="1" * 32))
+    verdict = Verification(other(vehicle_hash="1" * 32))
     assert verdict.identical
     assert verdict.sessions[0].notes[0].startswith(f"the vehicle was {'1' * 32}, and is ")
-    verdict = verify(other(options=options | {"observation": "error"}))
+    verdict = Verification(other(options=options | {"observation": "error"}))
     assert "State 1 cannot be repeated: expected an env of the observation " in (
         verdict.sessions[0].problem
     )
     assert str(verdict).endswith("not identical")
-    verdict = verify(other(options=options | {"gravity": 1}))
+    verdict = Verification(other(options=options | {"gravity": 1}))
     assert "State 1 cannot be repeated: " in verdict.sessions[0].problem
     monkeypatch.setattr("rotorgram.udp.journal.replay.software", lambda: {"mujoco": "9.9"})
     assert re.match(
-        "recorded with mujoco [0-9.]+, repeated with 9.9", verify(flight.simulator).notes[0]
+        "recorded with mujoco [0-9.]+, repeated with 9.9", Verification(flight.simulator).notes[0]
     )
-    assert verify(flight.agent).notes == []  # those of the agent have no part in the numbers
+    assert Verification(flight.agent).notes == []  # those of the agent have no part in the numbers
 
 
 def test_a_missing_command_is_noticed(flight: SimpleNamespace, tmp_path: Path) -> None:
@@ -359,7 +360,7 @@ def test_a_missing_command_is_noticed(flight: SimpleNamespace, tmp_path: Path) -
         return message
 
     rewrite(flight.agent, path, change)
-    (session,) = verify(path).sessions
+    (session,) = Verification(path).sessions
     assert session.same == 50
     assert session.problem == "State 51 cannot be repeated: expected Command 50 before it, got 51"
 
@@ -381,12 +382,12 @@ def test_simulators_that_come_and_go(tmp_path: Path) -> None:
             fly(remote, 1)
         running.join()
     remote.close()
-    summary = summarize(path)
+    summary = Summary(path)
     assert [s.steps for s in summary.sessions] == [30, 30, 30]
     assert len({s.session.hello.session for s in summary.sessions}) == 3
     assert all(s.ending.startswith("closed") for s in summary.sessions)
-    assert verify(path).identical
-    assert all(verify(file).identical for file in own)
+    assert Verification(path).identical
+    assert all(Verification(file).identical for file in own)
 
 
 def test_text_simulators_one_after_another_are_sessions_of_their_own(tmp_path: Path) -> None:
@@ -403,10 +404,10 @@ def test_text_simulators_one_after_another_are_sessions_of_their_own(tmp_path: P
             if seed == 1:
                 with pytest.raises(PeerSilent):
                     remote.reset()
-    summary = summarize(path)
+    summary = Summary(path)
     assert len(summary.sessions) == 2
     assert [s.session.codec for s in summary.sessions] == ["text", "text"]
-    assert verify(path).identical
+    assert Verification(path).identical
 
 
 def test_a_binary_session_may_have_the_number_0(tmp_path: Path) -> None:
@@ -417,9 +418,9 @@ def test_a_binary_session_may_have_the_number_0(tmp_path: Path) -> None:
         running = Running(simulator)
         fly(remote, 20)
     assert running.join() == "the agent closed"
-    (session,) = summarize(path).sessions
+    (session,) = Summary(path).sessions
     assert (session.session.codec, session.steps) == ("binary", 20)
-    assert verify(path).identical
+    assert Verification(path).identical
 
 
 def test_several_simulators_at_once(tmp_path: Path) -> None:
@@ -433,10 +434,10 @@ def test_several_simulators_at_once(tmp_path: Path) -> None:
     remote.close()
     for one in running:
         one.join()
-    summary = summarize(path)
+    summary = Summary(path)
     assert [s.session.slot for s in summary.sessions] == [0, 1]
     assert (summary.steps, summary.episodes) == (seen.steps, seen.episodes)
-    assert verify(path).identical
+    assert Verification(path).identical
     with path.open("rb") as file:
         topics = {c.topic for c in make_reader(file).get_summary().channels.values()}
     assert topics == {
@@ -458,13 +459,13 @@ def test_an_agent_that_was_started_anew(tmp_path: Path) -> None:
     with RemoteEnv(address, connect=False, **TIMES) as second:
         fly(second, 20)
     running.join()
-    summary = summarize(path)
+    summary = Summary(path)
     assert [s.ending for s in summary.sessions] == [
         "the agent does not know this session",
         "closed: the agent closed",
     ]
     assert [s.steps for s in summary.sessions] == [20, 20]
-    assert verify(path).identical
+    assert Verification(path).identical
 
 
 def test_loss_and_repetition_do_not_enter(tmp_path: Path) -> None:
@@ -484,8 +485,8 @@ def test_loss_and_repetition_do_not_enter(tmp_path: Path) -> None:
     assert datagrams(ours)[:-1] == datagrams(theirs)[: len(datagrams(ours)) - 1]
     numbers = [binary.peek(datagram)[::2] for datagram in datagrams(theirs)]
     assert numbers[:-1] == [(kind, n) for n in range(1, len(numbers) // 2 + 1) for kind in (4, 5)]
-    assert verify(ours).identical
-    assert verify(theirs).identical
+    assert Verification(ours).identical
+    assert Verification(theirs).identical
 
 
 # ---- the file
@@ -551,7 +552,7 @@ def test_message_indexes_point_at_the_messages(flight: SimpleNamespace) -> None:
                     opcode, _, channel, _, log_time = struct.unpack_from("<BQHIQ", raw, offset)
                     assert (opcode, channel, log_time) == (5, record.channel_id, when)
                     checked += 1
-    assert checked == sum(1 for _ in read_journal(flight.agent)) + 1  # and the statistics
+    assert checked == sum(1 for _ in Recording(flight.agent)) + 1  # and the statistics
 
 
 def test_states_and_commands_are_ros_messages(flight: SimpleNamespace) -> None:
@@ -559,7 +560,7 @@ def test_states_and_commands_are_ros_messages(flight: SimpleNamespace) -> None:
         messages = list(make_reader(file).iter_messages())
     stores: dict[int, Any] = {}
     decoded = (
-        i.message for i in read_journal(flight.simulator) if isinstance(i.message, State | Command)
+        i.message for i in Recording(flight.simulator) if isinstance(i.message, State | Command)
     )
     seen = 0
     for schema, channel, message in messages:
@@ -597,7 +598,7 @@ def test_states_and_commands_are_ros_messages(flight: SimpleNamespace) -> None:
 
 
 def test_what_else_is_in_it(flight: SimpleNamespace) -> None:
-    ours, theirs = read_journal(flight.agent), read_journal(flight.simulator)
+    ours, theirs = Recording(flight.agent), Recording(flight.simulator)
     assert ours.attachments == {}
     hello = next(iter(theirs)).session.hello
     assert list(theirs.attachments) == ["model.xml"]
@@ -664,16 +665,16 @@ def test_what_is_no_journal(tmp_path: Path) -> None:
     path = tmp_path / "x"
     path.write_bytes(b"not at all an mcap file")
     with pytest.raises(ValueError, match="expected an MCAP file, got another"):
-        summarize(path)
+        Summary(path)
     buffer = io.BytesIO()
     writer = Writer(buffer)
     writer.start()
     writer.finish()
     path.write_bytes(buffer.getvalue())
     with pytest.raises(ValueError, match="expected a journal of format 2, got 'another MCAP file'"):
-        verify(path)
+        Verification(path)
     with pytest.raises(FileNotFoundError):
-        verify(tmp_path / "none")
+        Verification(tmp_path / "none")
 
 
 # ---- hostile files
@@ -702,10 +703,10 @@ def test_a_chunk_that_grows_is_not_read(flight: SimpleNamespace, tmp_path: Path)
         path = tmp_path / "bomb.mcap"
         path.write_bytes(head[:begin] + struct.pack("<BQ", 6, len(body)) + body)
         program = (
-            "import resource, sys, time; from rotorgram.udp.journal import summarize; "
+            "import resource, sys, time; from rotorgram.udp.journal import Summary; "
             "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; "
             "began = time.process_time(); "
-            "print(summarize(sys.argv[1]).ending); print(time.process_time() - began); "
+            "print(Summary(sys.argv[1]).ending); print(time.process_time() - began); "
             "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
         )
         out, errors = launch(program, path).communicate(timeout=60)
@@ -726,7 +727,7 @@ def test_an_event_that_is_nested_too_deep(tmp_path: Path) -> None:
         writer.add_message(channel, 0, b"[" * 200_000, 0)
         writer.finish()
     with pytest.raises(InputError, match=r"deep\.mcap: a message that cannot be read: maximum"):
-        summarize(path)
+        Summary(path)
 
 
 def test_terminal_escapes_are_not_printed(flight: SimpleNamespace, tmp_path: Path) -> None:
@@ -741,7 +742,7 @@ def test_terminal_escapes_are_not_printed(flight: SimpleNamespace, tmp_path: Pat
             }
             writer.add_metadata(metadata.name, changed)
         writer.finish()
-    out = str(summarize(path)) + str(verify(path))
+    out = str(Summary(path)) + str(Verification(path))
     assert "[2J" in out
     assert all(character.isprintable() or character == "\n" for character in out)
 
@@ -764,7 +765,7 @@ def test_a_file_that_was_cut_is_read_up_to_the_cut(
                 cut.write_bytes(data[:size])
                 part = datagrams(cut, object)
                 assert part == whole[: len(part)]
-                summary, verdict = summarize(cut), verify(cut)
+                summary, verdict = Summary(cut), Verification(cut)
                 assert not summary.complete
                 assert summary.ending.startswith("cut off")
                 assert all(session.identical for session in verdict.sessions)
@@ -774,7 +775,7 @@ def test_a_file_that_was_cut_is_read_up_to_the_cut(
         assert sizes[-1] > 0.8 * len(whole)
         cut.write_bytes(data[:-1])  # no message is missing, and yet it is not complete
         assert datagrams(cut, object) == whole
-        assert not summarize(cut).complete
+        assert not Summary(cut).complete
 
 
 def test_a_damaged_file_is_read_up_to_the_damage(flight: SimpleNamespace, tmp_path: Path) -> None:
@@ -782,10 +783,10 @@ def test_a_damaged_file_is_read_up_to_the_damage(flight: SimpleNamespace, tmp_pa
     data[len(data) // 2] ^= 0x10
     path = tmp_path / "damaged.mcap"
     path.write_bytes(data)
-    summary = summarize(path)
+    summary = Summary(path)
     assert not summary.complete
     assert summary.ending.startswith("damaged (")
-    assert all(session.identical for session in verify(path).sessions)
+    assert all(session.identical for session in Verification(path).sessions)
 
 
 RECORD = """
@@ -826,11 +827,11 @@ def test_sigkill_costs_at_most_a_second(tmp_path: Path) -> None:
     process.kill()
     process.communicate()
     assert isinstance(running.join(), PeerSilent)
-    items = list(read_journal(path))
+    items = list(Recording(path))
     lost = int(last.split()[1]) - items[-1].time
     assert lost < 1.1e9
     assert len(items) > 1000
-    verdict = verify(path)
+    verdict = Verification(path)
     assert verdict.identical
     assert not verdict.complete
     assert "note: the file is cut off" in str(verdict)
@@ -846,7 +847,7 @@ def test_the_end_of_the_program_finishes_the_file(goodbye: str, tmp_path: Path) 
     _, errors = process.communicate(timeout=30)
     assert bool(errors) == bool(goodbye)
     assert running.join() == "the agent closed"
-    summary = summarize(path)
+    summary = Summary(path)
     assert (summary.complete, summary.steps) == (True, 100)
 
 
@@ -869,9 +870,9 @@ for _ in range(50):
     _, errors = process.communicate(timeout=30)
     assert errors == ""
     assert running.join() == "the agent closed"
-    summary = summarize(path)
+    summary = Summary(path)
     assert (summary.complete, summary.steps) == (True, 150)
-    assert verify(path).identical
+    assert Verification(path).identical
 
 
 def test_garbage_finishes_the_file(tmp_path: Path) -> None:
@@ -882,12 +883,12 @@ def test_garbage_finishes_the_file(tmp_path: Path) -> None:
     del remote
     gc.collect()
     assert running.join() == "the agent closed"
-    assert summarize(ours).complete
-    assert summarize(theirs).complete
+    assert Summary(ours).complete
+    assert Summary(theirs).complete
     journal = Journal(tmp_path / "j", side="x")
     journal.start(Statistics())
     del journal
-    assert read_journal(tmp_path / "j").complete
+    assert Recording(tmp_path / "j").complete
 
 
 def test_a_full_device_ends_the_record_and_not_the_flight(
@@ -916,9 +917,9 @@ def test_a_full_device_ends_the_record_and_not_the_flight(
         )
     for path in (both.agent, both.simulator):
         assert path.stat().st_size <= room
-        assert not summarize(path).complete
-        assert summarize(path).steps > 100
-        assert verify(path).identical
+        assert not Summary(path).complete
+        assert Summary(path).steps > 100
+        assert Verification(path).identical
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
@@ -955,7 +956,7 @@ def test_an_interrupted_write_costs_its_chunk_alone(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="a write was interrupted"):
         file.finish()
     file.abandon()
-    assert path.stat().st_size == file._waiting.begin
+    assert path.stat().st_size == file.size
     seen = []
     with path.open("rb") as stream, suppress(EndOfFile, McapError):
         for record in StreamReader(stream, record_size_limit=1 << 20).records:
@@ -971,7 +972,7 @@ def test_interrupts_at_any_moment(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(journal_module, "_CHUNK", 10_000)
-    items = list(read_journal(flight.agent))
+    items = list(Recording(flight.agent))
     hello, state = items[0], next(i for i in items if isinstance(i.message, State)).message
     journal = Journal(tmp_path / "j", side="agent")
     journal.start(Statistics())
@@ -1000,7 +1001,7 @@ def test_interrupts_at_any_moment(
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
     journal.close()
-    recorded = read_journal(tmp_path / "j")
+    recorded = Recording(tmp_path / "j")
     written = [item.message.sequence for item in recorded if isinstance(item.message, State)]
     assert interrupts > 0
     assert written == sorted(set(written))
@@ -1009,7 +1010,7 @@ def test_interrupts_at_any_moment(
 
 
 def test_what_a_message_costs(tmp_path: Path, flight: SimpleNamespace) -> None:
-    items = list(read_journal(flight.agent))
+    items = list(Recording(flight.agent))
     journal = Journal(tmp_path / "j", side="agent")
     journal.start(Statistics())
     start = time.process_time()
@@ -1033,6 +1034,6 @@ def test_the_snippet_of_the_page(
     assert len(code.splitlines()) <= 12
     exec(code.replace("flight.mcap", str(flight.simulator)), {})
     lines = capsys.readouterr().out.splitlines()
-    states = [i.message for i in read_journal(flight.simulator) if isinstance(i.message, State)]
+    states = [i.message for i in Recording(flight.simulator) if isinstance(i.message, State)]
     assert len(lines) == len(states)
     assert float(lines[-1].split()[-1]) == states[-1].telemetry[0][0, 1]

@@ -3,8 +3,6 @@
 from ..envs.spec import ArraySpec, EnvSpec
 from .protocol.layout import ArrayLayout, Layout
 
-__all__ = ["layout_of"]
-
 
 def layout_of(spec: EnvSpec, worlds: int = 1) -> Layout:
     """The layout of so many worlds, each with every drone of the spec. Raises as `Layout`."""

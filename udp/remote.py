@@ -18,8 +18,6 @@ from .protocol.statistics import Statistics
 from .transport.agent import Agent, AgentConfig, AgentSettings, Order
 from .transport.simulator import DEFAULT_AGENT
 
-__all__ = ["LOST", "RemoteEnv", "RemoteVectorEnv"]
-
 LOST: Final = "simulator_lost"
 """Key of `info`: why the simulator was lost whose episode ends here as truncated."""
 

@@ -5,7 +5,7 @@ from ...models.errors import require
 require("mcap", "record", "the journal of a flight")
 require("zstandard", "record", "the journal of a flight")
 
-from .reader import Item, Recording, Session, Summary, read_journal, summarize  # noqa: E402
+from .reader import Item, Recording, Session, Summary  # noqa: E402
 from .writer import Journal, software  # noqa: E402
 
 __all__ = [
@@ -14,7 +14,5 @@ __all__ = [
     "Recording",
     "Session",
     "Summary",
-    "read_journal",
     "software",
-    "summarize",
 ]

@@ -3,25 +3,31 @@
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import BinaryIO, Final, NamedTuple
 
 import numpy as np
+import zstandard
 from mcap import records
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import MCAP0_MAGIC
 
 from ...envs.spec import EnvSpec
 from ...models.errors import InputError
 from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.errors import DecodeError
-from ..protocol.layout import Layout
+from ..protocol.layout import MAX_MESSAGE, Layout
 from ..protocol.messages import FLY, Close, Command, Hello, Message, Refuse, State, Unknown, Welcome
-from ._file import MAGIC, read_records
 from .writer import ABOUT, FORMAT
 
+MAX_CHUNK: Final = 2 * MAX_MESSAGE
+"""Most bytes of a record or of a decompressed chunk that is read. Ours are of 64 KiB, or of one
+message and 256 KiB where that is longer."""
 _TOPIC: Final = re.compile(r"/slot([0-9]{1,9})/(state|command|events)")
 
 
@@ -99,11 +105,11 @@ class Recording:
         self.about: dict[str, str] = {}
         self.attachments: dict[str, bytes] = {}
         with self.path.open("rb") as file:
-            head = file.read(len(MAGIC))
-            if not MAGIC.startswith(head):
+            head = file.read(len(MCAP0_MAGIC))
+            if not MCAP0_MAGIC.startswith(head):
                 raise InputError(f"{self.path}: expected an MCAP file, got another")
             file.seek(-len(head), 2)
-            self.complete = file.read() == MAGIC
+            self.complete = file.read() == MCAP0_MAGIC
         self.ending = "complete" if self.complete else "cut off before its end"
         for record in self._records():
             if isinstance(record, records.Metadata) and record.name == ABOUT:
@@ -159,23 +165,53 @@ class Recording:
 
     def _records(self) -> Iterator[records.McapRecord]:
         with self.path.open("rb") as file:
-            following = read_records(file)
-            while True:
-                try:
-                    record = next(following)
-                except StopIteration:
-                    return
-                except OSError:
-                    raise
-                except Exception as error:  # half a record raises anything
-                    what = f"damaged ({error})" if self.complete else "cut off"
-                    self.complete = False
-                    self.ending = f"{what} at or before byte {file.tell()}"
-                    return
-                yield record
+            try:
+                yield from _read_records(file)
+            except OSError:
+                raise
+            except Exception as error:  # half a record raises anything
+                what = f"damaged ({error})" if self.complete else "cut off"
+                self.complete = False
+                self.ending = f"{what} at or before byte {file.tell()}"
 
 
-read_journal: Final = Recording
+def _read_records(file: BinaryIO) -> Iterator[records.McapRecord]:
+    """The records of an MCAP file, those in chunks too, in order.
+
+    Raises:
+        ValueError: A record or chunk is larger than `MAX_CHUNK`, or compressed in another way, or
+            a chunk has more records than bytes: each of ours has a checksum, and that stays.
+        OSError: The file cannot be read.
+        Exception: Any other, of the package `mcap`, where the file is damaged or cut off.
+    """
+    reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_CHUNK)
+    for record in reader.records:
+        if isinstance(record, records.Chunk):
+            chunk = _decompressed(record)
+            at = count = 0
+            while at < len(chunk.data):  # before all of them are made
+                at += 9 + int.from_bytes(chunk.data[at + 1 : at + 9], "little")  # opcode, length
+                count += 1
+                if count > (most := len(record.data)):
+                    raise ValueError(f"expected at most {most} records in so many bytes, got more")
+            yield from breakup_chunk(chunk, validate_crc=True)
+        else:
+            yield record
+
+
+def _decompressed(chunk: records.Chunk) -> records.Chunk:
+    """The same chunk without compression. A short chunk can decompress to any number of bytes."""
+    if not chunk.compression:
+        return chunk
+    if chunk.compression != "zstd":
+        raise ValueError(f"expected a chunk compressed by zstd, got {chunk.compression!r:.80}")
+    if (size := chunk.uncompressed_size) > MAX_CHUNK:
+        raise ValueError(f"expected chunks of at most {MAX_CHUNK} bytes, got one of {size}")
+    decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK)
+    data = decompressor.stream_reader(BytesIO(chunk.data)).read(size + 1)
+    if len(data) != size:
+        raise ValueError(f"expected a chunk of {size} bytes, got one of another size")
+    return replace(chunk, compression="", data=data)
 
 
 # ---- what is in it
@@ -286,9 +322,6 @@ class Summary(Recording):
         side = f"written by the {self.side}, " if self.side else ""
         head = f"{self.path}: {side}{self.ending}, {count_of(len(self.sessions), 'session')}"
         return printable([head, *map(str, self.sessions)])
-
-
-summarize: Final = Summary
 
 
 def count_of(count: int, what: str) -> str:

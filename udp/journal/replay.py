@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,6 @@ from ..protocol.messages import Command, State
 from ..transport.stepped import reset_all
 from .reader import Item, Recording, Session, count_of, printable
 from .writer import software
-
-__all__ = ["Difference", "SessionVerdict", "Verification", "verify"]
 
 
 class Difference(NamedTuple):
@@ -193,9 +191,6 @@ class Verification(Recording):
         else:
             lines.append("nothing to compare")
         return printable(lines)
-
-
-verify: Final = Verification
 
 
 def _difference(recorded: State, loop: Loop) -> Difference | None:

@@ -10,13 +10,18 @@ import logging
 import os
 import platform
 import re
+import sys
 import time
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from errno import EFBIG, EINTR
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from threading import RLock
 from typing import Any, Final
+
+from mcap.writer import Writer
 
 from ...envs.spec import ArraySpec, EnvSpec
 from ..layouts import layout_of
@@ -24,9 +29,6 @@ from ..protocol import binary
 from ..protocol.layout import COMMAND_ARRAYS_AT, STATE_ARRAYS_AT, Layout, Slot
 from ..protocol.messages import Command, Hello, Message, State
 from ..protocol.statistics import Statistics
-from ._file import McapFile
-
-__all__ = ["ABOUT", "FORMAT", "Journal", "model_of", "software"]
 
 ABOUT: Final = "rotorgram"  # name of the metadata about the whole file
 FORMAT: Final = "2"  # version of the file's content, beside the protocol's in each datagram
@@ -35,7 +37,8 @@ _CHUNK: Final = 1 << 16  # bytes; 2 ms to write
 _SECOND: Final = 10**9
 _STATISTICS: Final = 10 * _SECOND
 _SEEDED: Final = binary.COMMAND | 0x100  # a Command whose ROS 1 message has one more array
-_ONE: Final = object()
+_MAX_CHANNELS: Final = 0xFFFF
+_BUFFER: Final = 1 << 20  # bytes; more than a chunk, so that its records reach the file at once
 _PACKAGES: Final = ("rotorgram", "mujoco", "gymnasium", "numpy", "mcap")
 
 _log: Final = logging.getLogger("rotorgram.udp")
@@ -76,7 +79,6 @@ class Journal:
         self._holders: dict[int, object] = {}
         self._channels: dict[tuple[int, int], int] = {}  # by slot and kind: binary's or _SEEDED
         self._size = self._sessions = 0
-        self._open = False
 
     def start(self, statistics: Statistics, slots: Sequence[object] = ()) -> None:
         """Make the file. Raises `FileExistsError`, or `OSError` if it cannot be written.
@@ -104,14 +106,13 @@ class Journal:
             self._path.unlink()
             raise
         self._file, self._pending = file, file.pending
-        self._statistics, self._slots, self._pid = statistics, slots, os.getpid()
-        self._finalizer = weakref.finalize(self, _finish, self._pid, file, self._path)
-        self._open = True
+        self._statistics, self._slots = statistics, slots
+        weakref.finalize(self, file.close)
 
     def tap(self, slot: int, message: Message, datagram: bytes) -> None:
         """Take note of a message: a `Tap`. `write` pays for writing it."""
         now = time.time_ns()
-        if not self._open:
+        if self._file.closed:
             return
         try:
             if isinstance(message, Hello):
@@ -129,11 +130,11 @@ class Journal:
             if self._size > 4 * _CHUNK:  # nobody calls `write`
                 self._flush(now)
         except OSError as error:
-            self._give_up(error)
+            self._file.give_up(error)
 
     def write(self) -> None:
         """Write the messages. Call it when there is time: while the other side is at work."""
-        if not self._open:
+        if self._file.closed:
             return
         now = time.time_ns()
         try:
@@ -141,19 +142,17 @@ class Journal:
             if self._size > _CHUNK or not 0 <= now - self._flushed < _SECOND:
                 self._flush(now)
         except OSError as error:
-            self._give_up(error)
+            self._file.give_up(error)
 
     def close(self) -> None:
         """Write all, and finish the file. May be called again."""
-        if not self._open:
+        if self._file.closed:
             return
         try:
             self._count(time.time_ns())
         except OSError as error:
-            self._give_up(error)
-        self._open = False
-        _finish(self._pid, self._file, self._path)
-        self._finalizer.detach()  # not before: Ctrl-C may have come in between
+            self._file.give_up(error)
+        self._file.close()
 
     def _flush(self, now: int) -> None:
         if not 0 <= now - self._counted < _STATISTICS:
@@ -161,18 +160,13 @@ class Journal:
         self._file.flush()
         self._size, self._flushed = 0, now
 
-    def _give_up(self, error: OSError) -> None:
-        self._open = False
-        _abandon(self._file, self._path, error)
-        self._finalizer.detach()  # not before: Ctrl-C may have come in between
-
     # ---- sessions
 
     def _begin_by_text(self, slot: int, now: int) -> None:
         """Begin a session if this is the first message of a new text simulator."""
         hello = self._text_hello
         assert hello is not None, "the text codec needs a text_hello"
-        holder = self._slots[slot] if self._slots else _ONE  # a simulator has one agent
+        holder = self._slots[slot]
         if holder is not self._holders.get(slot):
             self._holders[slot] = holder
             self._begin(slot, hello, binary.encode(hello), "text", now)
@@ -279,21 +273,127 @@ def _words(message: Message, datagram: bytes) -> dict[str, Any]:
     return words | {"datagram": datagram.hex()}
 
 
-# ---- the end
+# ---- the file
 
 
-def _finish(pid: int, file: McapFile, path: Path) -> None:
-    """Finish a file, also when its program ends."""
-    if os.getpid() != pid:  # a fork of the process that writes it
-        return
-    try:
-        file.finish()
-    except OSError as error:
-        _abandon(file, path, error)
+class McapFile:
+    """Appends whole records to a new file, so that a killed program leaves a readable one.
 
+    Messages wait in a list, which costs the exchange next to nothing, until `flush` makes a chunk
+    of them. Nothing is written before the first flush. `library` is name and version of the
+    program. Every method but `close` and `give_up` raises `OSError` where it fails.
 
-def _abandon(file: McapFile, path: Path, error: OSError) -> None:
-    sentence = "record: writing %s failed (%s): the flight goes on, its journal ends here"
-    _log.warning(sentence, path, error.strerror or error)
-    with suppress(OSError):  # what was written can be read
-        file.abandon()
+    A write that an exception interrupts (a full device, Ctrl-C) may leave half a record. Then
+    nothing more can be written, and `abandon` closes the file after the last whole record.
+    """
+
+    def __init__(self, path: Path, library: str) -> None:
+        self.closed = False
+        self.pending: list[tuple[int, int, int, bytes]] = []
+        """Messages of the next chunk: channel, nanoseconds since 1970, sequence number, data.
+        Append to it; `flush` takes them."""
+        self.size = 0  # bytes of the whole records in the file
+        self._path, self._pid = path, os.getpid()
+        self._schemas: dict[str, dict[str, int]] = {}  # ids by name and text
+        self._channels: dict[tuple[str, int], int] = {}  # ids by topic and schema
+        self._file: Any = path.open("xb", buffering=_BUFFER)
+        self._writer: Any = Writer(self._file, chunk_size=sys.maxsize, use_summary_offsets=False)
+        self._lock = RLock()
+        self._broken = self._busy = False
+        self._writer.start("", library)
+
+    def channel(self, topic: str, encoding: str, name: str, text: str) -> int:
+        """Id of the channel with this schema: `ros1` or `json`. A file has at most 65,535.
+
+        A second schema of the same name, with another text, is numbered.
+        """
+        with self._lock:
+            schemas = self._schemas.setdefault(name, {})
+            if text not in schemas:
+                name += f"{len(schemas) + 1}" if schemas else ""
+                language = {"ros1": "ros1msg", "json": "jsonschema"}[encoding]
+                schemas[text] = self._writer.register_schema(name, language, text.encode())
+            key = topic, schemas[text]
+            if key not in self._channels:
+                if len(self._channels) == _MAX_CHANNELS:
+                    raise OSError(EFBIG, f"more than {_MAX_CHANNELS} channels")
+                self._channels[key] = self._writer.register_channel(topic, encoding, key[1])
+            return self._channels[key]
+
+    def add_metadata(self, name: str, words: Mapping[str, str]) -> None:
+        """Write names and values, after all messages before."""
+        self.flush()
+        with self._whole():
+            self._writer.add_metadata(name, dict(words))
+
+    def add_attachment(self, name: str, media_type: str, data: bytes, time: int) -> None:
+        """Write a whole file, after all messages before."""
+        self.flush()
+        with self._whole():
+            self._writer.add_attachment(0, time, name, media_type, data)
+
+    def flush(self) -> None:
+        """Write all messages as one chunk."""
+        with self._lock:
+            # Busy: called by a signal handler that interrupted us.
+            if self._busy or self.closed or not self.pending:
+                return
+            self._busy = True
+            try:
+                count = len(self.pending)  # another thread may append meanwhile
+                with self._whole():
+                    for channel, time, sequence, data in self.pending[:count]:
+                        self._writer.add_message(channel, time, data, time, sequence & 0xFFFFFFFF)
+                    del self.pending[:count]
+                    self._writer.flush()
+            finally:
+                self._busy = False
+
+    def finish(self) -> None:
+        """Write pending messages and the summary, and close the file. May be called again."""
+        with self._lock:
+            if self._busy or self.closed:
+                return
+            self.flush()
+            with self._whole():
+                self._writer.finish()
+            self.closed = True
+            self._file.close()
+
+    def close(self) -> None:
+        """Finish the file, or give it up where that fails. A fork leaves it to its parent."""
+        if os.getpid() == self._pid:
+            try:
+                self.finish()
+            except OSError as error:
+                self.give_up(error)
+
+    def give_up(self, error: OSError) -> None:
+        """Log why the journal ends here, and abandon the file: what was written can be read."""
+        sentence = "record: writing %s failed (%s): the flight goes on, its journal ends here"
+        _log.warning(sentence, self._path, error.strerror or error)
+        with suppress(OSError):
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close the file after its last whole record. Pending messages are lost."""
+        with self._lock:
+            if self.closed:
+                return
+            self.closed = True
+            raw = self._file.raw  # its buffer still holds the bytes that a full device refused
+            with suppress(OSError):
+                raw.truncate(self.size)
+            raw.close()
+
+    @contextmanager
+    def _whole(self) -> Iterator[None]:
+        """Write what is added here, up to the device. If that is interrupted, it is the last."""
+        with self._lock:
+            if self._broken:
+                raise OSError(EINTR, "a write was interrupted")
+            self._broken = True
+            yield
+            self._file.flush()
+            self.size = self._file.tell()
+            self._broken = False

@@ -21,8 +21,6 @@ from typing import Final, Literal
 from ...models.errors import InputError, expect
 from .errors import Forged
 
-__all__ = ["OVERHEAD", "Key", "is_sealed", "key_id", "message_of", "read_keys", "write_key"]
-
 KEY_SIZE: Final = 32  # bytes of a shared key
 OVERHEAD: Final = 24  # bytes that sealing adds to a datagram
 

@@ -1,7 +1,5 @@
 """Errors of the peer and the wire. Misuse of our own code raises `ValueError`."""
 
-__all__ = ["DecodeError", "LinkError", "PeerClosed", "PeerSilent", "Refused", "VersionMismatch"]
-
 
 class DecodeError(Exception):
     """A datagram is not a message. It is counted and dropped; it never ends a run by itself."""

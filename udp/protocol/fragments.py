@@ -22,11 +22,6 @@ from .errors import DecodeError
 from .layout import MAX_MESSAGE
 from .messages import Missing
 
-__all__ = [
-    "FAR", "NEAR", "Assembler", "Transfer", "Window", "asks", "check_largest", "check_size",
-    "is_fragment",
-]  # fmt: skip
-
 NEAR: Final = 65_507 - 24
 """Largest datagram of the binary codec on loopback, bytes: UDP's over IPv4, less a seal."""
 FAR: Final = 1_200

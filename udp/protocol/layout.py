@@ -14,8 +14,6 @@ import numpy as np
 
 from ...models.errors import InputError, expect
 
-__all__ = ["MAX_DRONES", "MAX_MESSAGE", "ArrayLayout", "Layout", "Slot"]
-
 MAX_DRONES: Final = 1 << 16  # most drones of one simulator
 MAX_MESSAGE: Final = 1 << 24  # largest message in all its fragments, bytes
 STATE_ARRAYS_AT: Final = 40

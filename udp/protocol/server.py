@@ -27,8 +27,6 @@ from .messages import MAX_SPEC, Command, Message, State, one_line
 from .statistics import Statistics
 from .transitions import AGENT, AgentState, Way
 
-__all__ = ["Event", "Server", "Session"]
-
 _MOST: Final = 1024
 """Simulators that are remembered between Hello and first State, while they wait, and after."""
 _LEAST_ASSEMBLING: Final = 16
@@ -40,11 +38,11 @@ _AFTER_STATE: Final = AGENT[AgentState.EXPECTING, Way.RECEIVED, State]
 _REASON_AT: Final = binary.HEADER_SIZE + 2  # bytes of a Refuse or a Close before its reason
 
 
-class KeyMismatch(Forged):
+class _KeyMismatch(Forged):
     """One side has a key, the other has none."""
 
 
-class NoSuchSession(DecodeError):
+class _NoSuchSession(DecodeError):
     """A sealed message of a session whose key is not here."""
 
 
@@ -508,15 +506,15 @@ class Server:
     def _open(self, arrival: _Arrival, session: Session | None) -> tuple[bytes, Key | None]:
         """A binary datagram without its seal, and the shared key that it was sealed with.
 
-        Raises `KeyMismatch`, `Forged`, or `NoSuchSession` where it has no key here.
+        Raises `_KeyMismatch`, `Forged`, or `_NoSuchSession` where it has no key here.
         """
         datagram, address, _ = arrival
         if not (self._keys or is_sealed(datagram)):
             return datagram, None
         if not self._keys:
-            raise KeyMismatch("key: this agent has none (--key-file), and the simulator has")
+            raise _KeyMismatch("key: this agent has none (--key-file), and the simulator has")
         if not is_sealed(datagram):
-            raise KeyMismatch("key: this agent has one (--key-file), and the simulator has none")
+            raise _KeyMismatch("key: this agent has one (--key-file), and the simulator has none")
         shared = self._keys.get(key_id(datagram))
         if shared is None:
             raise Forged("key: the simulator has another one")
@@ -531,7 +529,7 @@ class Server:
             # If the Welcome was for an old copy of its Hello, it is as good as none.
             with suppress(Forged):
                 return key.open(datagram), shared
-        raise NoSuchSession(f"session {number:016x}")
+        raise _NoSuchSession(f"session {number:016x}")
 
     def _session_key(self, opening: Session) -> Key | None:
         assert opening.welcome is not None
@@ -593,11 +591,11 @@ class Server:
         under_seal, size = is_sealed(datagram), len(datagram)
         plain = message_of(datagram) if under_seal else datagram
         kind, number, _ = binary.peek(plain)
-        if isinstance(error, NoSuchSession):
+        if isinstance(error, _NoSuchSession):
             self._receive_stranger(kind, plain, arrival)
             return
-        if isinstance(error, KeyMismatch | VersionMismatch) and kind == binary.HELLO:
-            trusted = under_seal and not isinstance(error, KeyMismatch)
+        if isinstance(error, _KeyMismatch | VersionMismatch) and kind == binary.HELLO:
+            trusted = under_seal and not isinstance(error, _KeyMismatch)
             key = self._keys.get(key_id(datagram)) if trusted else None
             self._refuse(number, str(error), address, size, key)
         self._drop("forged" if isinstance(error, Forged) else "malformed", str(error), arrival)

@@ -6,8 +6,6 @@ from typing import Final
 
 from .messages import one_line
 
-__all__ = ["Durations", "Statistics"]
-
 NOTICE_INTERVAL: Final = 10.0  # shortest time between two notices of the same cause, s
 REPORT_INTERVAL: Final = 60.0  # time between two reports of all numbers, s
 

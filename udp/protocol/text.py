@@ -19,8 +19,6 @@ from .errors import DecodeError
 from .layout import Layout
 from .messages import FLY, MAX_UINT64, RESET, Close, Command, State
 
-__all__ = ["check_layout", "decode_command", "decode_state", "encode", "is_text", "split"]
-
 MAX_LINE: Final = 1024
 _FLOAT: Final = "float32"
 _WHOLE: Final = re.compile(r"0|[1-9][0-9]{0,19}")

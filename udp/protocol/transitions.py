@@ -9,8 +9,6 @@ from typing import Final
 
 from . import messages as m
 
-__all__ = ["AGENT", "SIMULATOR", "AgentState", "SimulatorState", "Way"]
-
 
 class _Enum(Enum):
     __hash__ = object.__hash__  # of Enum's own, a lookup in a table takes four times as long

@@ -34,8 +34,6 @@ from .sockets import LONGEST_WAIT, Port, address_text, log_notices
 if TYPE_CHECKING:
     from ..journal import Journal
 
-__all__ = ["Agent", "AgentConfig", "AgentSettings", "Order"]
-
 _log: Final = logging.getLogger("rotorgram.udp")
 _PAUSE: Final = 1.0
 """A wait that took so much longer than it should, s: this process was stopped meanwhile."""

@@ -18,8 +18,6 @@ from ...models.errors import InputError, expect
 from ..protocol.client import Address
 from .sockets import is_loopback, open_socket, resolve
 
-__all__ = ["FaultConfig", "Faults", "Relay"]
-
 _NAP: Final = 0.04  # longest wait before the relay looks whether it was stopped, s
 _IDLE: Final = 600.0  # a client without a datagram in either direction for so long is forgotten, s
 _MAX_CLIENTS: Final = 200  # each takes a file, and some systems lend only 256

@@ -21,8 +21,6 @@ from ..protocol.transitions import SimulatorState
 from .sockets import LONGEST_WAIT, address_text, log_notices, open_socket, resolve
 from .stepped import Stepped, make_stepped, reset_all
 
-__all__ = ["DEFAULT_AGENT", "DEFAULT_SIMULATOR", "Observer", "Simulator"]
-
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
 
@@ -118,7 +116,7 @@ class Simulator(NotCopied):
             failing.callback(self._socket.close)
             self.address: Address = self._socket.getsockname()
             if self._journal:
-                self._journal.start(self.link.statistics)
+                self._journal.start(self.link.statistics, [self.link])
             failing.pop_all()
 
     def run(self) -> str:

@@ -25,17 +25,6 @@ from ...models.errors import InputError
 from ..protocol.client import Address
 from ..protocol.statistics import Statistics
 
-__all__ = [
-    "LONGEST_WAIT",
-    "Port",
-    "Socket",
-    "address_text",
-    "is_loopback",
-    "log_notices",
-    "open_socket",
-    "resolve",
-]
-
 LONGEST_WAIT: Final = 0.1
 """Longest wait in one go, s: flags that other threads and signals set are looked at as often."""
 

@@ -19,8 +19,6 @@ from ..protocol.messages import MAX_UINT64
 if TYPE_CHECKING:
     from ...envs.loop import Loop, OnHost
 
-__all__ = ["Stepped", "make_stepped", "reset_all", "spec_of_gymnasium"]
-
 Stepped: TypeAlias = "Loop | OnHost | _Singles"
 """N drones that take a step of the wire together, with the results of `rotorgram.envs.Loop`."""
 _Some = np.ndarray | None
