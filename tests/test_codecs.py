@@ -279,7 +279,6 @@ def test_sizes_that_do_not_fit() -> None:
     for make in (
         lambda: layout(MAX_DRONES + 1),
         lambda: layout(MAX_DRONES, 300),
-        lambda: ArrayLayout(shape=(1,), dtype="float16"),
         lambda: hello(worlds=0),
         lambda: hello(versions=(3, 2)),
         lambda: hello(spec=""),

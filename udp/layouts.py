@@ -1,6 +1,6 @@
 """The layout of the messages of an env, from its spec."""
 
-from ..envs.spec import ArraySpec, EnvSpec
+from ..envs.spec import Discrete, EnvSpec
 from .protocol.layout import ArrayLayout, Layout
 
 
@@ -9,12 +9,8 @@ def layout_of(spec: EnvSpec, worlds: int = 1) -> Layout:
     action = spec.action
     return Layout(
         drones=worlds * len(spec.agents),
-        observation=tuple(map(_array, spec.observation)),
-        action=_array(action) if isinstance(action, ArraySpec) else None,
-        choices=0 if isinstance(action, ArraySpec) else action.n,
-        telemetry=tuple(array.shape for array in spec.telemetry),
+        observation=tuple(ArrayLayout(a.shape, a.dtype) for a in spec.observation),
+        action=None if isinstance(action, Discrete) else ArrayLayout(action.shape, action.dtype),
+        choices=action.n if isinstance(action, Discrete) else 0,
+        telemetry=tuple(a.shape for a in spec.telemetry),
     )
-
-
-def _array(spec: ArraySpec) -> ArrayLayout:
-    return ArrayLayout(shape=spec.shape, dtype=spec.dtype)

@@ -7,7 +7,6 @@ multiple of 8 bytes, and the size of a message is exactly where its last array e
 import math
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,17 +23,12 @@ _LETTERS: Final = {"float32": "f", "float64": "d", "uint8": "B", "int32": "i", "
 _SMALL: Final = 256  # up to this many numbers Python's loop is faster than NumPy's calls
 
 
-@dataclass(frozen=True, kw_only=True)
-class ArrayLayout:
+class ArrayLayout(NamedTuple):
     """An array of one drone."""
 
     shape: tuple[int, ...]
     dtype: str = "float32"
     """`float32`, `float64`, `uint8`, `int32` or `int64`."""
-
-    def __post_init__(self) -> None:
-        known = f"one of {', '.join(_LETTERS)}"
-        expect(self.dtype in _LETTERS, "dtype", known, f"{self.dtype!r}")
 
 
 class Slot(NamedTuple):
@@ -90,16 +84,14 @@ class Layout:
         telemetry: tuple[tuple[int, ...], ...] = (),
     ) -> None:
         expect(1 <= drones <= MAX_DRONES, "drones", f"1 to {MAX_DRONES}", f"{drones}")
-        either = (action is None) == (choices >= 1)
-        expect(either, "action", "an array or a number of choices, not both")
         self.drones, self.observation, self.action = drones, observation, action
         self.choices, self.telemetry = choices, telemetry
 
-        arrays = [*((array.shape, array.dtype) for array in observation), ((), "float64")]
-        *slots, self.rewards = _slots(STATE_ARRAYS_AT, drones, arrays)
+        reward = ArrayLayout((), "float64")
+        *slots, self.rewards = _slots(STATE_ARRAYS_AT, drones, [*observation, reward])
         at, end, flag = self.rewards.end, self.rewards.end + drones, np.dtype(bool)
         self.flags = Slot(at, end, (drones,), flag), Slot(end, end + drones, (drones,), flag)
-        told = _slots(end + drones, drones, [(shape, "float64") for shape in telemetry])
+        told = _slots(end + drones, drones, [ArrayLayout(shape, "float64") for shape in telemetry])
         self.observation_slots, self.telemetry_slots = tuple(slots), tuple(told)
         slots += [self.rewards, *self.flags, *told]
         ends = [STATE_ARRAYS_AT, *(slot.end for slot in slots)]
@@ -111,10 +103,9 @@ class Layout:
         self.state_floats = [slot for slot in slots if slot.dtype.kind == "f"]
         self.state_numbers = _numbers("d8x", STATE_ARRAYS_AT, self.state_floats)
 
-        actions = (action.shape, action.dtype) if action else ((), "int64")
-        self.actions, self.orders, self.seeds = _slots(
-            COMMAND_ARRAYS_AT, drones, [actions, ((), "uint8"), ((), "uint64")]
-        )
+        actions = action or ArrayLayout((), "int64")
+        arrays = [actions, ArrayLayout((), "uint8"), ArrayLayout((), "uint64")]
+        self.actions, self.orders, self.seeds = _slots(COMMAND_ARRAYS_AT, drones, arrays)
         self.command_size = self.seeds.end
         self.command_numbers = _numbers("", COMMAND_ARRAYS_AT, [self.actions] if action else [])
         if (size := max(self.state_size, self.command_size)) > MAX_MESSAGE:
@@ -123,7 +114,7 @@ class Layout:
             )
 
 
-def _slots(at: int, drones: int, arrays: Sequence[tuple[tuple[int, ...], str]]) -> list[Slot]:
+def _slots(at: int, drones: int, arrays: Sequence[ArrayLayout]) -> list[Slot]:
     slots = []
     for shape, name in arrays:
         at = -(-at // 8) * 8

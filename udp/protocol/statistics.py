@@ -81,10 +81,6 @@ class Statistics:
         notices, self._notices = self._notices, []
         return notices
 
-    def has_news(self, now: float) -> bool:
-        """Whether there are notices to take, or a report may be due."""
-        return bool(self._notices) or self._next_report is None or now >= self._next_report
-
     def report_due(self, now: float) -> bool:
         """Whether a minute has passed since the last report, or since the first call."""
         is_due = self._next_report is not None and now >= self._next_report

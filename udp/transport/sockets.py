@@ -90,6 +90,8 @@ class Socket(socket.socket):
     def __init__(self) -> None:
         super().__init__(socket.AF_INET, socket.SOCK_DGRAM)
         self.setblocking(False)
+        with suppress(OSError):  # room for the fragments of a large message, if the system has it
+            self.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
         self._asleep = 0  # of the next waits so many sleep at once
         self._row = 1  # and so many after the next wait in which nothing came
 
@@ -162,14 +164,7 @@ def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -
     except OSError as error:
         sock.close()
         raise OSError(error.errno, f"cannot {what}: {_explain(error)}") from None
-    _enlarge_buffer(sock)
     return sock
-
-
-def _enlarge_buffer(sock: socket.socket) -> None:
-    """Ask for room for the fragments of a large message; the system may give less."""
-    with suppress(OSError):
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
 
 
 def _explain(error: OSError) -> str:
@@ -273,7 +268,6 @@ class Port:
             return
         finally:
             self._everybody.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
-        _enlarge_buffer(sock)
         self._own[peer] = sock
         for selector in (self._simulators, self._all):
             selector.register(sock, selectors.EVENT_READ)
@@ -290,8 +284,6 @@ def _receive_any(selector: selectors.BaseSelector, timeout: float) -> tuple[byte
 
 def log_notices(statistics: Statistics, now: float) -> None:
     """Write warnings, and a report each minute, to the log `rotorgram.udp`."""
-    if not statistics.has_news(now):
-        return
     for notice in statistics.take_notices():
         _log.warning("%s", notice)
     if statistics.report_due(now):
