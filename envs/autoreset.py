@@ -79,11 +79,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
 
         Spaces that have not changed are kept: their generators may have been seeded.
         """
-        try:
-            mode = AutoresetMode(mode)
-        except ValueError:
-            expected = " or ".join(repr(m.value) for m in AutoresetMode)
-            raise InputError(f"autoreset_mode: expected {expected}, got {mode!r}") from None
+        mode = checked_mode(mode)
         if getattr(self, "env_spec", None) != spec or self.num_envs != num_envs:
             self.single_observation_space = observation_space(spec)
             self.single_action_space = action_space(spec)
@@ -134,6 +130,15 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         columns = info_columns(self.env_spec, self.telemetry)
         info: dict[str, Any] = {name: column.copy() for name, column in columns.items()}
         return info | {f"_{name}": mask for name in info}
+
+
+def checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    """A mode from its value too. Raises `InputError`."""
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        expected = " or ".join(repr(m.value) for m in AutoresetMode)
+        raise InputError(f"autoreset_mode: expected {expected}, got {mode!r}") from None
 
 
 def checked_mask(mask: Any, num_envs: int) -> np.ndarray:

@@ -1,19 +1,19 @@
 """A simulator process for programs: `python -m rotorgram.udp JSON [--until-stdin-closes]`.
 
 The JSON object holds the keyword arguments of `Simulator`, but for `config`: the options of the env
-as `options`. `module`, which only our own command line gives, is imported first: it registers the
-env of a user. With the flag the process ends with the program that holds its standard input,
-however that ends. People use `rotorgram sim`.
+as `options`. The env `module:id` of a user is registered by its module, which is imported first.
+With the flag the process ends with the program that holds its standard input, however that ends.
+People use `rotorgram sim`.
 """
 
 import json
 import os
 import signal
 import sys
-from importlib import import_module
 from threading import Thread
 from typing import Any, Final
 
+from ..envs import registry
 from ..models.errors import InputError, MissingPackage, expect
 from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
@@ -22,7 +22,6 @@ from .transport.simulator import Simulator
 _FOR_EVER: Final = 30 * 86_400.0  # s
 _KINDS: Final[dict[str, tuple[Any, str]]] = {
     "env": (str, "an id"),
-    "module": (str, "the name of a module"),
     "options": (dict, "an object"),
     "num_envs": (int, "a number"),
     **dict.fromkeys(("backend", "codec"), (str, "a name")),
@@ -79,14 +78,8 @@ def parse_arguments(words: list[str]) -> dict[str, Any]:
         expect(name in _KINDS, name, f"one of {', '.join(_KINDS)}")
         kind, expected = _KINDS[name]
         expect(isinstance(value, kind), name, expected, f"{value!r}")
-    if module := arguments.pop("module", None):
-        sys.path.append(os.getcwd())  # last, and with -P not there: it shadows no other module
-        try:
-            import_module(module)
-        except ModuleNotFoundError as error:
-            if not f"{module}.".startswith(f"{error.name}."):
-                raise  # it is there, and lacks something of its own
-            raise InputError(f"module: expected one that can be imported, got {module}") from None
+    if "env" in arguments:
+        arguments["env"] = registry.load(arguments["env"])
     pairs = {name: tuple(arguments[name]) for name in ("server", "bind") if name in arguments}
     return {**arguments.pop("options", {}), **arguments, **pairs}
 

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from ..envs.autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
+from ..envs.autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_mode, checked_seeds
 from ..envs.spaces import action_space, joined, observation_space, telemetry_names
 from ..envs.spec import Discrete, EnvSpec
 from ..models.errors import InputError, NotCopied, expect
@@ -165,7 +165,7 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         """Set spaces and other attributes from the spec. Spaces that have not changed are kept:
         their generators may have been seeded.
         """
-        spec = self._agent.spec
+        spec = self._agent.required.spec
         assert spec is not None
         if getattr(self, "env_spec", None) == spec:
             return
@@ -244,9 +244,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
             expect(right and not num_envs % num_simulators, "num_envs", expected, f"{num_envs!r}")
         self.num_simulators, self.num_envs = num_simulators, num_envs or 0
         self._broken: tuple[np.ndarray, np.ndarray] | None = None
-        self._mode = autoreset_mode
         self._flying = False
-        self.metadata = {"render_modes": [], "autoreset_mode": _checked_mode(autoreset_mode)}
+        self.metadata = {"render_modes": [], "autoreset_mode": checked_mode(autoreset_mode)}
         worlds = num_envs // num_simulators if num_envs else None
         self._agent = Agent(address, AgentConfig(worlds=worlds, slots=num_simulators, **settings))
         self.closed = False
@@ -256,10 +255,10 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
     def connect(self) -> None:
         """Wait until every slot is taken."""
         self._agent.connect()
-        spec = self._agent.spec
+        spec = self._agent.required.spec
         assert spec is not None
-        num_envs = self.num_simulators * self._agent.worlds * len(spec.agents)
-        self._take_spec(spec, num_envs, self._mode)
+        num_envs = self.num_simulators * (self._agent.required.worlds or 1) * len(spec.agents)
+        self._take_spec(spec, num_envs, self.metadata["autoreset_mode"])
         self._take_actions(spec.action, num_envs)
         self._shape = self.num_simulators, num_envs // self.num_simulators
         if not self._flying:
@@ -316,10 +315,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         """
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
-        nobody = np.zeros(self.num_envs, bool)
-        if resets is not None and frozen is not None:
-            frozen = frozen & ~resets
-        resets, frozen = nobody if resets is None else resets, nobody if frozen is None else frozen
+        resets = self._nobody if resets is None else resets
+        frozen = self._nobody if frozen is None else frozen & ~resets
         grounded = self.done | self._idle
         if (waiting := grounded & ~(resets | frozen)).any():
             first = int(waiting.argmax())
@@ -344,7 +341,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
             self.rewards[broken] = 0.0
             self.terminated[broken] = False
             self.truncated[broken] = True
-            earlier, told = self._broken or (np.array(None), nobody)  # earlier in this step
+            earlier, told = self._broken or (np.array(None), self._nobody)  # earlier in this step
             self._broken = np.where(broken, reasons, earlier), broken | told
             self.lost = broken
         self.done = self.terminated | self.truncated | (self.done & ~resets)
@@ -437,15 +434,6 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
 
     def _losses(self) -> dict[str, Any]:
         return dict(zip((LOST, f"_{LOST}"), self._broken, strict=True)) if self._broken else {}
-
-
-def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    """Raises `InputError` if it is no autoreset mode."""
-    try:
-        return AutoresetMode(mode)
-    except ValueError:
-        expected = " or ".join(repr(m.value) for m in AutoresetMode)
-        raise InputError(f"autoreset_mode: expected {expected}, got {mode!r}") from None
 
 
 def _connect(env: RemoteEnv | RemoteVectorEnv) -> None:

@@ -225,6 +225,7 @@ class SessionSummary:
     first: int
     """Time of its first message, nanoseconds since 1970."""
     last: int = 0
+    """Time of its last message."""
     states: int = 0
     steps: int = 0
     """Of all drones together; resets do not count."""
@@ -239,18 +240,14 @@ class SessionSummary:
     def __post_init__(self) -> None:
         self._returns = np.zeros(self.session.num_envs)
 
-    @property
-    def seconds(self) -> float:
-        """From its first message to its last."""
-        return (self.last - self.first) / 1e9
-
     def __str__(self) -> str:
         session = self.session
         began = datetime.fromtimestamp(self.first // 10**9, UTC)
+        seconds = (self.last - self.first) / 1e9
         mean = f", mean return {self.returns / self.episodes:.2f}" if self.episodes else ""
         return (
             f"{session}: {count_of(session.num_envs, 'drone')} of {session.spec.env_id}, "
-            f"{session.codec}, {began:%Y-%m-%d %H:%M:%S} UTC, {self.seconds:.1f} s, "
+            f"{session.codec}, {began:%Y-%m-%d %H:%M:%S} UTC, {seconds:.1f} s, "
             f"{self.steps} steps, {self.episodes} episodes{mean}; {self.ending}"
         )
 
@@ -288,13 +285,11 @@ class Summary(Recording):
     """Counts of a journal.
 
     Attributes:
-        side: `simulator` or `agent`.
         sessions: Counts of each session.
     """
 
     def __init__(self, path: Path | str) -> None:
         super().__init__(path)
-        self.side = self.about.get("side", "")
         of: dict[int, SessionSummary] = {}
         for item in self:
             if item.session.index not in of:
@@ -312,14 +307,8 @@ class Summary(Recording):
         """Episodes that ended, of all sessions."""
         return sum(session.episodes for session in self.sessions)
 
-    @property
-    def mean_return(self) -> float | None:
-        """Of the episodes that ended; None without one."""
-        total = sum(session.returns for session in self.sessions)
-        return total / self.episodes if self.episodes else None
-
     def __str__(self) -> str:
-        side = f"written by the {self.side}, " if self.side else ""
+        side = f"written by the {self.about['side']}, " if "side" in self.about else ""
         head = f"{self.path}: {side}{self.ending}, {count_of(len(self.sessions), 'session')}"
         return printable([head, *map(str, self.sessions)])
 

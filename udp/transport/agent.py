@@ -29,14 +29,12 @@ from ..protocol.layout import Layout
 from ..protocol.messages import Close, Hello, State
 from ..protocol.server import Event, Server
 from ..protocol.transitions import AgentState
-from .sockets import LONGEST_WAIT, Port, address_text, log_notices
+from .sockets import LONGEST_WAIT, PAUSE, Port, address_text, log_notices
 
 if TYPE_CHECKING:
     from ..journal import Journal
 
 _log: Final = logging.getLogger("rotorgram.udp")
-_PAUSE: Final = 1.0
-"""A wait that took so much longer than it should, s: this process was stopped meanwhile."""
 
 Order = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 """Actions, orders and seeds of the drones of one simulator: see `messages.Command`."""
@@ -101,27 +99,26 @@ class Agent:
 
     Attributes:
         address: Address that this side listens on.
-        spec: Of the simulator that joined last; None before the first.
+        required: What a simulator must be: once one has come, as that one.
         states: The last State of each slot; None before the first.
         lost: For each slot why its simulator was lost during the last exchange; "" if it was not.
     """
 
     def __init__(self, address: Address, config: AgentConfig) -> None:
         self.config = config
-        self.spec: EnvSpec | None = None
-        self._required = _Required(config)
+        self.required = _Required(config)
         keys = read_keys(config.key_file) if config.key_file else ()
         self._journal: Any = None
         if config.record:
             from ..journal import Journal
 
-            spec = self._required.text_spec()
+            spec = self.required.text_spec()
             hello = Hello(session=0, spec=spec.to_json()) if spec else None
             self._journal = Journal(config.record, side="agent", text_hello=hello)
         journal = self._journal
         self.server = Server(
-            self._required.accept,
-            self._required.text_layout,
+            self.required.accept,
+            self.required.text_layout,
             slots=config.slots,
             keys=[Key(key, "agent") for key in keys],
             max_datagram=config.max_datagram,
@@ -140,11 +137,6 @@ class Agent:
                 raise
         # Runs once: in close(), with the garbage, or when the program ends.
         self.close = weakref.finalize(self, _leave, os.getpid(), self.server, self._port, journal)
-
-    @property
-    def worlds(self) -> int:
-        """Worlds of each simulator, once one has come."""
-        return self._required.worlds or 1
 
     def connect(self) -> None:
         """Wait until it is the agent's turn at every slot.
@@ -197,7 +189,7 @@ class Agent:
                     raise gym.error.ClosedEnvironmentError("the env was closed") from None
                 datagram = None  # nothing came; or (Windows) an earlier datagram found nobody
             before, now = now, time.monotonic()
-            if (pause := now - before - min(left, LONGEST_WAIT)) > _PAUSE:
+            if (pause := now - before - min(left, LONGEST_WAIT)) > PAUSE:
                 # This process was stopped: what the simulators sent meanwhile was not read.
                 self._deadlines = [deadline + pause for deadline in self._deadlines]
             if datagram is not None:
@@ -232,15 +224,14 @@ class Agent:
 
     def _welcome(self, slot: int, address: Address) -> None:
         """Another simulator has this slot now."""
-        session = self.server.slots[slot]
+        session, required = self.server.slots[slot], self.required
         assert session is not None
         self._keep_sockets()
         if session.hello:
             self.server.takes_text = False
-            self.spec, self._required.worlds = _spec(session.hello.spec), session.hello.worlds
+            required.spec, required.worlds = _spec(session.hello.spec), session.hello.worlds
         else:
-            self.spec, self._required.worlds = self._required.text_spec(), 1
-        self._required.spec = self.spec
+            required.spec, required.worlds = required.text_spec(), 1
         if self.states[slot] is not None and not self.lost[slot]:
             self._lose(slot, f"the simulator at {address_text(address)} was started anew")
             _log.warning("%s", self.lost[slot])
@@ -291,11 +282,15 @@ class Agent:
 class _Required:
     """Requirements of a simulator. The server holds them: an `Agent` held by its server would
     never be garbage.
+
+    Attributes:
+        spec: Of the simulator that joined last; None before the first.
+        worlds: Of each simulator; None before the first, unless they are configured.
     """
 
     def __init__(self, config: AgentConfig) -> None:
         self.config = config
-        self.spec: EnvSpec | None = None  # of the simulator that has flown
+        self.spec: EnvSpec | None = None
         self.worlds = config.worlds
         self.text_spec = cache(self._text_spec)
         self.text_layout = cache(lambda: layout_of(s) if (s := self.text_spec()) else None)

@@ -18,7 +18,7 @@ from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new
 from ..protocol.errors import LinkError, PeerSilent, Refused
 from ..protocol.messages import Close, Command, Hello, Message, Refuse, State, Welcome
 from ..protocol.transitions import SimulatorState
-from .sockets import LONGEST_WAIT, address_text, log_notices, open_socket, resolve
+from .sockets import LONGEST_WAIT, PAUSE, address_text, log_notices, open_socket, resolve
 from .stepped import Stepped, make_stepped, reset_all
 
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
@@ -26,8 +26,6 @@ DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
 
 _ALIVE_EVERY: Final = 0.5  # period of the message Alive while a long step is computed, s
 _COMPLAIN_AFTER: Final = 1.0  # A wait for the agent that is told, once, s
-_PAUSE: Final = 1.0
-"""A wait that took so much longer than it should, s: this process was stopped meanwhile."""
 
 Observer = Callable[[Message | None, State], None]
 """Called with the message that moved the drones, a Command or the Welcome that resets them all, and
@@ -260,7 +258,7 @@ class Simulator(NotCopied):
             if message is not None:
                 return message
             pause = time.monotonic() - before - min(left, LONGEST_WAIT)
-            if pause > _PAUSE:
+            if pause > PAUSE:
                 link.pardon(pause)
         return None
 

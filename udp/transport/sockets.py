@@ -28,6 +28,8 @@ from ..protocol.statistics import Statistics
 LONGEST_WAIT: Final = 0.1
 """Longest wait in one go, s: flags that other threads and signals set are looked at as often."""
 
+PAUSE: Final = 1.0
+"""A wait that took so much longer than it should, s: this process was stopped meanwhile."""
 _LOOK: Final = 200e-6
 """A wait looks for so long before it sleeps, s: a step of one drone takes less."""
 _LOST: Final = 60e-6
