@@ -132,8 +132,7 @@ def journal_alone(source: Path, target: Path, repeats: int = 9) -> float:
     flown = flown[:40_000]
     times = []
     for number in range(repeats):
-        journal = Journal(target / f"{number}.mcap", side="agent")
-        journal.start(Statistics())
+        journal = Journal(target / f"{number}.mcap", Statistics(), side="agent")
         journal.tap(0, hello.message, hello.datagram)
         start = time.perf_counter()
         for message, datagram in flown:

@@ -623,8 +623,7 @@ def test_statistics_every_ten_seconds_and_a_clock_that_is_set_back(
     monkeypatch.setattr(time, "time_ns", lambda: now[0])
     path = tmp_path / "j.mcap"
     sizes = []
-    journal = Journal(path, side="agent")
-    journal.start(Statistics())
+    journal = Journal(path, Statistics(), side="agent")
     close = Close(session=1, sequence=1, reason="x" * 500)
     hello = Hello(session=1, spec=Loop(ENV_ID, options={}).spec.to_json())
     journal.tap(0, hello, binary.encode(hello))
@@ -885,8 +884,7 @@ def test_garbage_finishes_the_file(tmp_path: Path) -> None:
     assert running.join() == "the agent closed"
     assert Summary(ours).complete
     assert Summary(theirs).complete
-    journal = Journal(tmp_path / "j", side="x")
-    journal.start(Statistics())
+    journal = Journal(tmp_path / "j", Statistics(), side="x")
     del journal
     assert Recording(tmp_path / "j").complete
 
@@ -974,8 +972,7 @@ def test_interrupts_at_any_moment(
     monkeypatch.setattr(journal_module, "_CHUNK", 10_000)
     items = list(Recording(flight.agent))
     hello, state = items[0], next(i for i in items if isinstance(i.message, State)).message
-    journal = Journal(tmp_path / "j", side="agent")
-    journal.start(Statistics())
+    journal = Journal(tmp_path / "j", Statistics(), side="agent")
     journal.tap(0, hello.message, hello.datagram)
     armed, returned, interrupts = False, [], 0
 
@@ -1011,8 +1008,7 @@ def test_interrupts_at_any_moment(
 
 def test_what_a_message_costs(tmp_path: Path, flight: SimpleNamespace) -> None:
     items = list(Recording(flight.agent))
-    journal = Journal(tmp_path / "j", side="agent")
-    journal.start(Statistics())
+    journal = Journal(tmp_path / "j", Statistics(), side="agent")
     start = time.process_time()
     for _ in range(10):
         for item in items:

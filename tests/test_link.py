@@ -613,8 +613,9 @@ def test_recorded_messages_of_another_session_are_forged() -> None:
 
 def test_every_message_is_shown_once() -> None:
     seen: dict[str, list[Any]] = {"simulator": [], "agent": []}
-    client = simulator(tap=lambda slot, m, data: seen["simulator"].append((slot, data)))
-    server = agent(tap=lambda slot, m, data: seen["agent"].append((slot, data)))
+    client, server = simulator(), agent()
+    client.tap = lambda slot, m, data: seen["simulator"].append((slot, data))
+    server.tap = lambda slot, m, data: seen["agent"].append((slot, data))
     pair = Pair(client, server, lossy(0.3))
     pair.run(30)
     client.close("done", pair.now)

@@ -5,7 +5,6 @@ import logging
 import re
 import time
 from contextlib import ExitStack, closing
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -76,7 +75,7 @@ def test_a_late_simulator_waits_until_another_leaves(caplog: pytest.LogCaptureFi
         assert late.simulator.link.statistics.counters["refused"] == 0
         assert "every slot of the agent is taken; waiting for a free one" in caplog.text
         running[0].cut()
-        remote._agent.config = replace(remote._agent.config, timeout=0.3)
+        remote._agent.config.timeout = 0.3
         *_, truncated, info = remote.step(np.zeros((4, 1)))
         assert truncated.sum() == 2
         assert late.simulator.link.state.value == "waiting"

@@ -110,8 +110,7 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
 
     def connect(self) -> None:
         """Wait until it is the agent's turn: for the simulator's first State, if none has come."""
-        self._agent.connect()
-        self._take_spec()
+        self._take_spec(self._agent.connect())
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -126,9 +125,8 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         self._agent.exchange({0: (self._nothing, _RESET, seeds)})
         while self._agent.lost[0]:  # the simulator that has come instead was not reset
             self._agent.exchange({0: (self._nothing, _RESET, seeds)})
-        self._take_spec()
         self._flying = True
-        self._state = self._take_state()
+        self._state = self._agent.states[0]
         return self._observation(self._state), self._info(self._state)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -145,7 +143,7 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         if reason := self._agent.lost[0]:
             info = {**self._info(self._state), LOST: reason}
             return self._observation(self._state), 0.0, False, True, info
-        self._state = state = self._take_state()
+        self._state = state = self._agent.states[0]
         terminated, truncated = state.terminated.item(), state.truncated.item()
         self._flying = not (terminated or truncated)
         observation = self._observation(state)
@@ -156,20 +154,11 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         self._agent.close()
         self._flying = False
 
-    def _take_state(self) -> State:
-        state = self._agent.states[0]
-        assert state is not None
-        return state
-
-    def _take_spec(self) -> None:
-        """Set spaces and other attributes from the spec. Spaces that have not changed are kept:
-        their generators may have been seeded.
-        """
-        spec = self._agent.required.spec
-        assert spec is not None
+    def _take_spec(self, spec: EnvSpec) -> None:
+        """Set spaces and other attributes. Spaces that stay may have seeded generators."""
         if getattr(self, "env_spec", None) == spec:
             return
-        self.env_spec: EnvSpec = spec
+        self.env_spec = spec
         self.control_period = spec.control_period
         self.observation_space = observation_space(spec)
         self.action_space = action_space(spec)
@@ -254,10 +243,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
 
     def connect(self) -> None:
         """Wait until every slot is taken."""
-        self._agent.connect()
-        spec = self._agent.required.spec
-        assert spec is not None
-        num_envs = self.num_simulators * (self._agent.required.worlds or 1) * len(spec.agents)
+        spec = self._agent.connect()
+        num_envs = self.num_simulators * (self._agent.config.worlds or 1) * len(spec.agents)
         self._take_spec(spec, num_envs, self.metadata["autoreset_mode"])
         self._take_actions(spec.action, num_envs)
         self._shape = self.num_simulators, num_envs // self.num_simulators
@@ -395,7 +382,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
 
     def _take_states(self, still: np.ndarray) -> None:
         """Take over the States; rewards and flags are 0 for the drones that did not fly."""
-        states = [state for state in self._agent.states if state]
+        states = [self._agent.states[slot] for slot in range(self.num_simulators)]
         spec = self.env_spec
         self._arrays = {
             array.name: np.concatenate([state.observations[i] for state in states])

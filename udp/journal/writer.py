@@ -63,50 +63,51 @@ class Journal:
 
     Args:
         path: The file; it must not exist.
+        statistics: Those of the link. They are written every 10 s, and at the end.
         side: `simulator` or `agent`.
+        slots: Sessions in the slots of an agent; another one in a slot is another session. Only the
+            text codec needs them: there all sessions have the same number.
         text_hello: Stands for the Hello that the text codec does not have. An agent gives it the
             session 0.
         model: MJCF of the vehicle, to keep in the file.
+
+    Raises:
+        FileExistsError: The file exists.
+        OSError: It cannot be written.
     """
 
     def __init__(
-        self, path: Path | str, *, side: str, text_hello: Hello | None = None, model: str = ""
+        self,
+        path: Path | str,
+        statistics: Statistics,
+        *,
+        side: str,
+        slots: Sequence[object] = ("the only agent",),
+        text_hello: Hello | None = None,
+        model: str = "",
     ) -> None:
-        self._path, self._side, self._model = Path(path), side, model
-        self._text_hello = text_hello
-        self._slots: Sequence[object] = ()
+        self._statistics, self._slots, self._text_hello = statistics, slots, text_hello
         self._numbers: dict[int, int] = {}  # of the binary session in each slot
         self._holders: dict[int, object] = {}
         self._channels: dict[tuple[int, int], int] = {}  # by slot and kind: binary's or _SEEDED
         self._size = self._sessions = 0
-
-    def start(self, statistics: Statistics, slots: Sequence[object] = ()) -> None:
-        """Make the file. Raises `FileExistsError`, or `OSError` if it cannot be written.
-
-        Args:
-            statistics: Those of the link. They are written every 10 s, and at the end.
-            slots: Sessions in the slots of an agent; another one in a slot is another session.
-                Only the text codec needs them: there all sessions have the same number.
-        """
         now = self._flushed = self._counted = time.time_ns()
         versions = software()
         about = {f"version of {name}": number for name, number in versions.items()}
         try:
-            file = McapFile(self._path, f"rotorgram {versions.get('rotorgram', '')}")
+            file = McapFile(Path(path), f"rotorgram {versions.get('rotorgram', '')}")
         except FileExistsError:
-            raise FileExistsError(
-                f"record: expected a file that does not exist yet, got {self._path}"
-            ) from None
+            sentence = f"record: expected a file that does not exist yet, got {path}"
+            raise FileExistsError(sentence) from None
         try:
-            file.add_metadata(ABOUT, {"format": FORMAT, "side": self._side, **about})
-            if self._model:
-                file.add_attachment("model.xml", "application/xml", self._model.encode(), now)
+            file.add_metadata(ABOUT, {"format": FORMAT, "side": side, **about})
+            if model:
+                file.add_attachment("model.xml", "application/xml", model.encode(), now)
         except BaseException:
             file.abandon()
-            self._path.unlink()
+            Path(path).unlink()
             raise
         self._file, self._pending = file, file.pending
-        self._statistics, self._slots = statistics, slots
         weakref.finalize(self, file.close)
 
     def tap(self, slot: int, message: Message, datagram: bytes) -> None:

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from . import messages
 from .errors import DecodeError, VersionMismatch
 from .layout import COMMAND_ARRAYS_AT, MAX_MESSAGE, Layout, Slot
@@ -50,7 +50,6 @@ _EXTENSION: Final = struct.Struct("<HH")
 _LENGTH: Final = struct.Struct("<H")
 _CRITICAL: Final = 1 << 15
 _MOST_EXTENSIONS: Final = 64
-_PADS: Final = tuple(bytes(size) for size in range(8))
 
 
 def encode(message: Message, layout: Layout | None = None) -> bytes:
@@ -252,8 +251,7 @@ def _adds_up(numbers: tuple[Any, ...]) -> bool:
 
 
 def _expect_finite_state(data: bytes, time: float, layout: Layout) -> None:
-    if not isfinite(time):
-        raise InputError(f"time: expected a finite number, got {time}")
+    expect(isfinite(time), "time", "a finite number", f"{time}")
     _expect_finite("observation, reward, telemetry", data, layout.state_floats)
 
 
@@ -297,8 +295,7 @@ def _decode_hello(body: bytes) -> dict[str, Any]:
     low, high, worlds, size = _HELLO_BODY.unpack_from(body)
     at = _HELLO_BODY.size
     most = min(MAX_SPEC, len(body) - at)
-    if size > most:
-        raise InputError(f"spec: expected at most {most} bytes, got {size}")
+    expect(size <= most, "spec", f"at most {most} bytes", f"{size}")
     spec, extensions = body[at : at + size].decode(), _take_extensions(body, at + size)
     return {"spec": spec, "worlds": worlds, "versions": (low, high), "extensions": extensions}
 
@@ -310,8 +307,7 @@ def _encode_welcome(m: messages.Welcome) -> bytes:
 
 def _decode_welcome(body: bytes) -> dict[str, Any]:
     nonce, seed, has_seed, version = _WELCOME_BODY.unpack_from(body)
-    if has_seed > 1:
-        raise InputError(f"has seed: expected 0 or 1, got {has_seed}")
+    expect(has_seed <= 1, "has seed", "0 or 1", f"{has_seed}")
     extensions = _take_extensions(body, _WELCOME_BODY.size)
     seed = seed if has_seed else None
     return {"nonce": nonce, "version": version, "seed": seed, "extensions": extensions}
@@ -343,8 +339,7 @@ def _encode_reason(m: messages.Refuse | messages.Close) -> bytes:
 
 def _decode_reason(body: bytes) -> dict[str, Any]:
     (size,) = _LENGTH.unpack_from(body)
-    if size > MAX_TEXT:
-        raise InputError(f"reason: expected at most {MAX_TEXT} bytes, got {size}")
+    expect(size <= MAX_TEXT, "reason", f"at most {MAX_TEXT} bytes", f"{size}")
     _expect_size(body, _LENGTH.size + size)
     return {"reason": body[_LENGTH.size :].decode()}
 
@@ -359,12 +354,11 @@ def _extensions(extensions: tuple[Extension, ...]) -> bytes:
 def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
     extensions: list[Extension] = []
     while at < len(data):
-        if len(extensions) == _MOST_EXTENSIONS:
-            raise InputError(f"extensions: expected at most {_MOST_EXTENSIONS}, got more")
+        few = len(extensions) < _MOST_EXTENSIONS
+        expect(few, "extensions", f"at most {_MOST_EXTENSIONS}", "more")
         number, size = _EXTENSION.unpack_from(data, at)
         at += _EXTENSION.size
-        if size > len(data) - at:
-            raise InputError(f"extension: expected {size} bytes, got {len(data) - at}")
+        expect(size <= len(data) - at, "extension", f"{size} bytes", f"{len(data) - at}")
         critical = bool(number & _CRITICAL)
         value = data[at : at + size]
         extensions.append(Extension(number=number & ~_CRITICAL, value=value, critical=critical))

@@ -8,7 +8,7 @@ outstanding at any time, so a sequence number suffices to step the physics once 
 
 import secrets
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Final
 
@@ -84,10 +84,8 @@ class LinkConfig:
     elsewhere."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            right = value is None or (isfinite(value) and value > 0)
-            expect(right, field.name, "a number > 0", f"{value}")
+        right = isfinite(self.timeout) and self.timeout > 0
+        expect(right, "timeout", "a number > 0", f"{self.timeout}")
         check_largest(self.max_datagram)
 
 
@@ -174,6 +172,7 @@ class Client:
     Attributes:
         sequence: Number of the State sent last: they count from 1.
         sends: How often the outstanding message was sent.
+        tap: None at first.
     """
 
     def __init__(
@@ -185,7 +184,6 @@ class Client:
         largest: int = NEAR,
         by_text: bool = False,
         key: Key | None = None,
-        tap: Tap | None = None,
         draw_session: Callable[[], int] = new_session,
     ) -> None:
         if by_text:
@@ -206,7 +204,7 @@ class Client:
         self._key = key
         self._session_key: Key | None = None
         self._nonce = 0
-        self._tap = tap
+        self.tap: Tap | None = None
         self._draw_session = draw_session
         self._is_queued = False
         self._assembler = Assembler(layout.command_size)
@@ -362,7 +360,7 @@ class Client:
         """A message that may come now."""
         if isinstance(message, Command):
             self.state, self._transfer = state, None
-            if self._tap:
+            if self.tap:
                 self._record(message, plain)
             self.statistics.round_trips.add(now - self._sent_at)
             self._round_trips.answered(now)
@@ -477,7 +475,7 @@ class Client:
     def _send(self, message: m.Hello | State | m.Close, now: float) -> None:
         """Send a message and repeat it until it is answered."""
         data = self._encode(message)
-        if self._tap:
+        if self.tap:
             self._record(message, data)
         self._transfer = transfer = Transfer(data, self._largest, self._window)
         self._due = data[8:24]
@@ -507,8 +505,8 @@ class Client:
         return binary.encode(message, self.layout)
 
     def _record(self, message: Message, data: bytes) -> None:
-        if self._tap:
-            self._tap(0, message, binary.encode(message, self.layout) if self._text else data)
+        if self.tap:
+            self.tap(0, message, binary.encode(message, self.layout) if self._text else data)
 
     def _end(self) -> None:
         self.state, self._transfer = SimulatorState.CLOSED, None

@@ -112,6 +112,7 @@ class Server:
     Attributes:
         slots: Session of each slot, None where it is free.
         takes_text: Whether a text simulator may take a free slot.
+        tap: None at first.
     """
 
     def __init__(
@@ -122,7 +123,6 @@ class Server:
         slots: int = 1,
         keys: Sequence[Key] = (),
         max_datagram: int | None = None,
-        tap: Tap | None = None,
         draw_nonce: Callable[[], int] = lambda: secrets.randbits(64),
     ) -> None:
         self.slots: list[Session | None] = [None] * slots
@@ -133,7 +133,7 @@ class Server:
         self._text_layout = text_layout or (lambda: None)
         self._keys = {key.id: key for key in keys}
         self._max_datagram = max_datagram
-        self._tap = tap
+        self.tap: Tap | None = None
         self._draw_nonce = draw_nonce
         self._slot_of: dict[Address, int] = {}
         self._openings: OrderedDict[tuple[Address, int], Session] = OrderedDict()  # WELCOMED
@@ -361,7 +361,7 @@ class Server:
         """The next State of a slot."""
         session.sequence, session.state = state.sequence, _AFTER_STATE
         self.statistics.round_trips.add(now - session.asked_at)
-        if self._tap:
+        if self.tap:
             self._record(slot, state, plain, session)
         return Event(slot, state)
 
@@ -609,7 +609,7 @@ class Server:
         """
         data = text.encode(message) if session.is_text else binary.encode(message, session.layout)
         session.move(Way.SENT, type(message))
-        if self._tap:
+        if self.tap:
             self._record(slot, message, data, session)
         session.reply = reply = self._transfer(data, session)
         self._put(reply.start(), session.peer, session.key)
@@ -650,9 +650,9 @@ class Server:
         self.statistics.counters[count] += 1
 
     def _record(self, slot: int, message: Message, data: bytes, session: Session) -> None:
-        if self._tap:
+        if self.tap:
             whole = binary.encode(message, session.layout) if session.is_text else data
-            self._tap(slot, message, whole)
+            self.tap(slot, message, whole)
 
     def _drop(self, cause: str, reason: str, arrival: _Arrival) -> None:
         host, port = arrival.address

@@ -9,9 +9,9 @@ import weakref
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import cache, lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypedDict
+from typing import Any, Final, TypedDict
 
 import gymnasium as gym
 import numpy as np
@@ -30,9 +30,6 @@ from ..protocol.messages import Close, Hello, State
 from ..protocol.server import Event, Server
 from ..protocol.transitions import AgentState
 from .sockets import LONGEST_WAIT, PAUSE, Port, address_text, log_notices
-
-if TYPE_CHECKING:
-    from ..journal import Journal
 
 _log: Final = logging.getLogger("rotorgram.udp")
 
@@ -54,21 +51,28 @@ class AgentSettings(TypedDict, total=False):
     record: Path | str | None
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True, eq=False)
 class AgentConfig:
-    """The settings, their defaults, and the size of the fleet."""
+    """The settings, their defaults, and whether a simulator is what they require.
+
+    A server holds this object: an `Agent` held by its server would never be garbage.
+    """
 
     env_id: str | None = None
     options: Mapping[str, Any] | None = None
     vehicle_hash: str | None = None
-    worlds: int | None = None  # worlds of each simulator; None: as many as the first has
-    slots: int = 1  # simulators to fly at the same time
     connect_timeout: float = 60.0
     timeout: float = 30.0
     max_datagram: int | None = None
     key_file: Path | str | None = None
     insecure: bool = False
     record: Path | str | None = None
+    slots: int = 1
+    """Simulators to fly at the same time."""
+    worlds: int | None = None
+    """Worlds of each simulator; None: as many as the first has."""
+    spec: EnvSpec | None = None
+    """Of the simulator that joined last; None before the first."""
 
     def __post_init__(self) -> None:
         for name in ("connect_timeout", "timeout"):
@@ -76,10 +80,35 @@ class AgentConfig:
             expect(math.isfinite(seconds) and seconds > 0, name, "seconds > 0", f"{seconds}")
         check_largest(self.max_datagram)
         if self.env_id is not None:
-            object.__setattr__(self, "env_id", canonical_id(self.env_id))
-            self.expected_options(self.env_id)
+            self.env_id = canonical_id(self.env_id)
+            self._expected_options(self.env_id)
 
-    def expected_options(self, env_id: str) -> dict[str, Any]:
+    def accept(self, hello: Hello) -> Layout | str:
+        """The layout of a simulator, or why it is refused."""
+        try:
+            spec = _spec(hello.spec)
+            return self._difference(spec, hello.worlds) or layout_of(spec, hello.worlds)
+        except InputError as error:
+            return str(error)
+
+    def _difference(self, spec: EnvSpec, worlds: int) -> str:
+        env_id = canonical_id(spec.env_id)
+        if self.env_id is not None and env_id != self.env_id:
+            return f"expected a simulator of {self.env_id}, got one of {env_id}"
+        if self.worlds is not None and worlds != self.worlds:
+            drones = "one drone" if self.worlds == 1 else f"{self.worlds} drones"
+            return f"expected a simulator of {drones}, got one of {worlds}"
+        if self.vehicle_hash is not None and spec.vehicle_hash != self.vehicle_hash:
+            got = f"{spec.vehicle} of {spec.vehicle_hash}"
+            return f"expected a vehicle of hash {self.vehicle_hash}, got {got}"
+        if self.options is not None:
+            expected = self._expected_options(env_id)
+            both_ways = registry.is_known(env_id)
+            if reason := _options_difference(expected, spec.options, both_ways=both_ways):
+                return reason
+        return _spec_difference(self.spec, spec) if self.spec else ""
+
+    def _expected_options(self, env_id: str) -> dict[str, Any]:
         """The options that a simulator of this env must have, as JSON values.
 
         Raises `InputError` if the env is known here and has no such options.
@@ -93,53 +122,66 @@ class AgentConfig:
             raise InputError(f"options: expected JSON values, got {options!r}: {error}") from None
         return plain
 
+    @cached_property
+    def text_spec(self) -> EnvSpec | None:
+        """Of a simulator that speaks text, for it tells none; None if text is not flown.
+
+        It is the env with the paper's vehicle, made here: text is not flown where that cannot be.
+        """
+        env_id = self.env_id
+        if env_id is None or not registry.is_known(env_id) or self.worlds not in (None, 1):
+            return None
+        try:
+            spec = registry.env_spec(env_id, dict(self.options or {}))
+            text.check_layout(layout_of(spec))
+        except (InputError, ImportError):  # the latter without MuJoCo
+            return None
+        return spec
+
+    @cached_property
+    def text_layout(self) -> Layout | None:
+        """Of the messages of such a simulator."""
+        return layout_of(self.text_spec) if self.text_spec else None
+
 
 class Agent:
     """Exchanges Commands for States with all simulators at the same time.
 
     Attributes:
         address: Address that this side listens on.
-        required: What a simulator must be: once one has come, as that one.
-        states: The last State of each slot; None before the first.
+        config: What a simulator must be: once one has come, as that one.
+        states: The last State of each slot.
         lost: For each slot why its simulator was lost during the last exchange; "" if it was not.
     """
 
     def __init__(self, address: Address, config: AgentConfig) -> None:
         self.config = config
-        self.required = _Required(config)
         keys = read_keys(config.key_file) if config.key_file else ()
-        self._journal: Any = None
-        if config.record:
-            from ..journal import Journal
-
-            spec = self.required.text_spec()
-            hello = Hello(session=0, spec=spec.to_json()) if spec else None
-            self._journal = Journal(config.record, side="agent", text_hello=hello)
-        journal = self._journal
-        self.server = Server(
-            self.required.accept,
-            self.required.text_layout,
+        self.server = server = Server(
+            config.accept,
+            lambda: config.text_layout,
             slots=config.slots,
             keys=[Key(key, "agent") for key in keys],
             max_datagram=config.max_datagram,
-            tap=journal.tap if journal else None,
         )
-        self.states: list[State | None] = [None] * config.slots
+        self.states: dict[int, State] = {}
         self.lost = [""] * config.slots
         self._deadlines = [0.0] * config.slots
         self._port = Port(address, insecure=config.insecure or bool(keys))
         self.address = self._port.address
-        if journal:
+        self._journal: Any = None
+        if config.record:
             try:
-                journal.start(self.server.statistics, self.server.slots)
+                self._journal = self._record(config.record)
+                server.tap = self._journal.tap
             except BaseException:
                 self._port.close()
                 raise
         # Runs once: in close(), with the garbage, or when the program ends.
-        self.close = weakref.finalize(self, _leave, os.getpid(), self.server, self._port, journal)
+        self.close = weakref.finalize(self, _leave, os.getpid(), server, self._port, self._journal)
 
-    def connect(self) -> None:
-        """Wait until it is the agent's turn at every slot.
+    def connect(self) -> EnvSpec:
+        """Wait until it is the agent's turn at every slot. Returns the spec of the simulators.
 
         Raises `PeerSilent` if a slot stayed free, or its simulator fell silent and no other came;
         `PeerClosed` if the last simulator ended the exchange.
@@ -148,6 +190,8 @@ class Agent:
             raise gym.error.ClosedEnvironmentError("expected an open env, got a closed one")
         self._gather()
         self.lost = [""] * len(self.lost)
+        assert self.config.spec is not None
+        return self.config.spec
 
     def exchange(self, orders: Mapping[int, Order]) -> None:
         """Send each of these slots its Command, and wait for the States of all.
@@ -161,6 +205,13 @@ class Agent:
             self.server.send_command(slot, actions, what, seeds, now)
         self.lost = [""] * len(self.lost)
         self._gather()
+
+    def _record(self, path: Path | str) -> Any:
+        from ..journal import Journal
+
+        server, spec = self.server, self.config.text_spec
+        hello = Hello(session=0, spec=spec.to_json()) if spec else None
+        return Journal(path, server.statistics, side="agent", slots=server.slots, text_hello=hello)
 
     # ---- the exchange
 
@@ -212,7 +263,6 @@ class Agent:
         slot, message = event.slot, event.message
         if isinstance(message, Close):
             self._lose(slot, f"the simulator at {address_text(address)} closed: {message.reason}")
-            self._keep_sockets()
             if not any(self.server.slots):
                 _flush(self.server, self._port)
                 raise PeerClosed(self.lost[slot])
@@ -224,15 +274,15 @@ class Agent:
 
     def _welcome(self, slot: int, address: Address) -> None:
         """Another simulator has this slot now."""
-        session, required = self.server.slots[slot], self.required
+        session, config = self.server.slots[slot], self.config
         assert session is not None
         self._keep_sockets()
         if session.hello:
             self.server.takes_text = False
-            required.spec, required.worlds = _spec(session.hello.spec), session.hello.worlds
+            config.spec, config.worlds = _spec(session.hello.spec), session.hello.worlds
         else:
-            required.spec, required.worlds = required.text_spec(), 1
-        if self.states[slot] is not None and not self.lost[slot]:
+            config.spec, config.worlds = config.text_spec, 1
+        if slot in self.states and not self.lost[slot]:
             self._lose(slot, f"the simulator at {address_text(address)} was started anew")
             _log.warning("%s", self.lost[slot])
 
@@ -258,7 +308,6 @@ class Agent:
                 f"waiting at {here} for State {session.sequence + 1}{self._last_dropped()}"
             )
             self.server.free(slot)
-            self._keep_sockets()
             self._lose(slot, reason)
             self._say_waiting(slot)
 
@@ -268,6 +317,7 @@ class Agent:
     def _lose(self, slot: int, reason: str) -> None:
         self.lost[slot] = reason
         self._deadlines[slot] = time.monotonic() + self.config.connect_timeout
+        self._keep_sockets()
 
     def _say_waiting(self, slot: int) -> None:
         here, wait = address_text(self.address), self.config.connect_timeout
@@ -277,63 +327,6 @@ class Agent:
     def _last_dropped(self) -> str:
         last = self.server.statistics.last_error
         return f"; last datagram dropped: {last}" if last else ""
-
-
-class _Required:
-    """Requirements of a simulator. The server holds them: an `Agent` held by its server would
-    never be garbage.
-
-    Attributes:
-        spec: Of the simulator that joined last; None before the first.
-        worlds: Of each simulator; None before the first, unless they are configured.
-    """
-
-    def __init__(self, config: AgentConfig) -> None:
-        self.config = config
-        self.spec: EnvSpec | None = None
-        self.worlds = config.worlds
-        self.text_spec = cache(self._text_spec)
-        self.text_layout = cache(lambda: layout_of(s) if (s := self.text_spec()) else None)
-
-    def accept(self, hello: Hello) -> Layout | str:
-        """The layout of a simulator, or why it is refused."""
-        try:
-            spec = _spec(hello.spec)
-            return self._difference(spec, hello.worlds) or layout_of(spec, hello.worlds)
-        except InputError as error:
-            return str(error)
-
-    def _difference(self, spec: EnvSpec, worlds: int) -> str:
-        config, env_id = self.config, canonical_id(spec.env_id)
-        if config.env_id is not None and env_id != config.env_id:
-            return f"expected a simulator of {config.env_id}, got one of {env_id}"
-        if self.worlds is not None and worlds != self.worlds:
-            drones = "one drone" if self.worlds == 1 else f"{self.worlds} drones"
-            return f"expected a simulator of {drones}, got one of {worlds}"
-        if config.vehicle_hash is not None and spec.vehicle_hash != config.vehicle_hash:
-            got = f"{spec.vehicle} of {spec.vehicle_hash}"
-            return f"expected a vehicle of hash {config.vehicle_hash}, got {got}"
-        if config.options is not None:
-            expected = config.expected_options(env_id)
-            both_ways = registry.is_known(env_id)
-            if reason := _options_difference(expected, spec.options, both_ways=both_ways):
-                return reason
-        return _spec_difference(self.spec, spec) if self.spec else ""
-
-    def _text_spec(self) -> EnvSpec | None:
-        """Of a simulator that speaks text, for it tells none; None if text is not flown.
-
-        It is the env with the paper's vehicle, made here: text is not flown where that cannot be.
-        """
-        config, env_id = self.config, self.config.env_id
-        if env_id is None or not registry.is_known(env_id) or config.worlds not in (None, 1):
-            return None
-        try:
-            spec = registry.env_spec(env_id, dict(config.options or {}))
-            text.check_layout(layout_of(spec))
-        except (InputError, ImportError):  # the latter without MuJoCo
-            return None
-        return spec
 
 
 @lru_cache(maxsize=4)
@@ -370,7 +363,7 @@ def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
     return ""
 
 
-def _leave(pid: int, server: Server, port: Port, journal: "Journal | None") -> None:
+def _leave(pid: int, server: Server, port: Port, journal: Any) -> None:
     """Tell every simulator, until it has answered or will not."""
     if os.getpid() != pid:  # a fork of the process that owns the agent
         return

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Final
 
-from ...models.errors import InputError, expect
+from ...models.errors import expect
 from ..protocol.client import Address
-from .sockets import is_loopback, open_socket, resolve
+from .sockets import open_socket, resolve
 
 _NAP: Final = 0.04  # longest wait before the relay looks whether it was stopped, s
 _IDLE: Final = 600.0  # a client without a datagram in either direction for so long is forgotten, s
@@ -25,6 +25,9 @@ _MAX_HELD: Final = 16_384  # most datagrams that are held back at one time; more
 _LARGEST: Final = 65_535  # bytes that a packet can have
 _IP_HEADER: Final = 20
 _UDP_HEADER: Final = 8
+_WAY_OUT: Final = (
+    "insecure=True (--insecure) where everybody that reaches the relay may send through it"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +91,7 @@ class Faults:
         self._random = random.Random(f"{config.seed}/{stream}").random
 
     def fate(self, datagram: bytes) -> list[tuple[float, bytes]]:
-        """The copies that come out of a datagram: delay, s, and bytes. None if it is dropped.
+        """The copies that come out of a datagram: delay, s, and bytes; empty if it is dropped.
 
         Both copies of a duplicated datagram hold the same bytes.
         """
@@ -134,16 +137,6 @@ def _flip(datagram: bytes, places: list[float]) -> bytes:
     return bytes(flipped)
 
 
-def _reachable(address: Address, insecure: bool) -> Address:
-    found = resolve(address, insecure=True)
-    if not (insecure or is_loopback(found)):
-        raise InputError(
-            f"{address[0]} is not a loopback address: expected 127.0.0.1, or insecure=True "
-            "(--insecure) where everybody that reaches the relay may send through it"
-        )
-    return found
-
-
 @dataclass(eq=False, slots=True)
 class _Client:
     address: Address
@@ -186,9 +179,9 @@ class Relay:
     ) -> None:
         self.config = config or FaultConfig()
         self.counters: Counter[str] = Counter()
-        self.server = _reachable(server, insecure)
+        self.server = resolve(server, insecure=insecure, way_out=_WAY_OUT)
         expect(self.server[1], "server", "the port of the agent, 1 to 65535", "0")
-        differs = self.server != _reachable(listen, insecure)
+        differs = self.server != resolve(listen, insecure=insecure, way_out=_WAY_OUT)
         expect(differs, "listen", "another address than the server's", f"{listen}")
         self._any = ("0.0.0.0" if insecure else "127.0.0.1", 0)
         self._clients: OrderedDict[Address, _Client] = OrderedDict()

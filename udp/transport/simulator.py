@@ -94,13 +94,6 @@ class Simulator(NotCopied):
             failing.callback(self.stepped.close)
             self.spec = self.stepped.spec
             hello = Hello(session=new_session(), spec=self.spec.to_json(), worlds=num_envs)
-            self._journal: Any = None
-            if record:
-                from ..journal import Journal
-                from ..journal.writer import model_of
-
-                model = model_of(self.stepped)
-                self._journal = Journal(record, side="simulator", text_hello=hello, model=model)
             self.link = Client(
                 hello,
                 layout_of(self.spec, num_envs),
@@ -108,13 +101,18 @@ class Simulator(NotCopied):
                 largest=largest_datagram(self.server, self.config.max_datagram),
                 by_text=self._text,
                 key=key,
-                tap=self._journal.tap if self._journal else None,
             )
             self._socket = open_socket(bind, insecure=anywhere, peer=self.server)
             failing.callback(self._socket.close)
             self.address: Address = self._socket.getsockname()
-            if self._journal:
-                self._journal.start(self.link.statistics, [self.link])
+            self._journal: Any = None
+            if record:
+                from ..journal import Journal
+                from ..journal.writer import model_of
+
+                said, model = self.link.statistics, model_of(self.stepped)
+                journal = Journal(record, said, side="simulator", text_hello=hello, model=model)
+                self._journal, self.link.tap = journal, journal.tap
             failing.pop_all()
 
     def run(self) -> str:

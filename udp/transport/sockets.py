@@ -44,6 +44,16 @@ _BUFFER: Final = 1 << 22
 """Bytes of datagrams that a socket may hold until they are looked at."""
 _MAX_DATAGRAM: Final = 65507
 """Largest payload of a UDP datagram over IPv4, bytes."""
+_WAY_OUT: Final = (
+    "a key that both sides share (key_file, --key-file), or insecure=True (--insecure) where "
+    "everybody who reaches this port may fly the drone"
+)
+_SENTENCES: Final = {
+    errno.EADDRINUSE: "the port is in use: choose another one, or end the program on it",
+    errno.EADDRNOTAVAIL: "this machine has no such address",
+    errno.EACCES: "ports below 1024 need more rights: choose a higher one",
+    errno.EINVAL: "a loopback address reaches this machine only: bind another one",
+}
 
 
 def address_text(address: Address) -> str:
@@ -51,16 +61,12 @@ def address_text(address: Address) -> str:
     return f"{address[0]}:{address[1]}"
 
 
-def is_loopback(address: Address) -> bool:
-    """Whether a resolved address reaches this machine only."""
-    return ipaddress.ip_address(address[0]).is_loopback
-
-
-def resolve(address: Address, *, insecure: bool) -> Address:
+def resolve(address: Address, *, insecure: bool, way_out: str = _WAY_OUT) -> Address:
     """The IPv4 address and port of a host name and port.
 
     Args:
         insecure: Allow any address; otherwise loopback ones only. Set where a key protects.
+        way_out: What allows any address, in words.
 
     Raises:
         InputError: It is not an address, or not a loopback one and `insecure` is not set.
@@ -77,12 +83,8 @@ def resolve(address: Address, *, insecure: bool) -> Address:
     except (socket.gaierror, UnicodeError):
         raise InputError(f"host: expected a name or IPv4 address, got {host!r}") from None
     number = str(found[0][4][0])
-    if not insecure and not is_loopback((number, port)):
-        raise InputError(
-            f"{host} is not a loopback address: expected 127.0.0.1, or a key that both sides share "
-            "(key_file, --key-file), or insecure=True (--insecure) where everybody who reaches "
-            "this port may fly the drone"
-        )
+    if not (insecure or ipaddress.ip_address(number).is_loopback):
+        raise InputError(f"{host} is not a loopback address: expected 127.0.0.1, or {way_out}")
     return number, port
 
 
@@ -165,25 +167,16 @@ def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -
             sock.connect(peer)
     except OSError as error:
         sock.close()
-        raise OSError(error.errno, f"cannot {what}: {_explain(error)}") from None
+        why = _SENTENCES.get(error.errno or 0, error.strerror)
+        raise OSError(error.errno, f"cannot {what}: {why}") from None
     return sock
-
-
-def _explain(error: OSError) -> str:
-    sentences = {
-        errno.EADDRINUSE: "the port is in use: choose another one, or end the program on it",
-        errno.EADDRNOTAVAIL: "this machine has no such address",
-        errno.EACCES: "ports below 1024 need more rights: choose a higher one",
-        errno.EINVAL: "a loopback address reaches this machine only: bind another one",
-    }
-    return sentences.get(error.errno or 0, str(error.strerror))
 
 
 class Port:
     """The agent's port: a socket for all senders and, if the system can, one for each simulator.
 
     Those are connected, so that the system sorts the datagrams, each socket has a buffer of its
-    own, and no other sender can fill the one of a simulator.
+    own, and no other sender can fill the one of a simulator. `address` is listened on.
 
     Raises:
         InputError, OSError: As `open_socket`.
@@ -191,18 +184,13 @@ class Port:
 
     def __init__(self, address: Address, *, insecure: bool) -> None:
         self._everybody = open_socket(address, insecure=insecure)
+        self.address: Address = self._everybody.getsockname()
         self._own: dict[Address, Socket] = {}
         self._simulators = selectors.DefaultSelector()
         self._all = selectors.DefaultSelector()
         self._all.register(self._everybody, selectors.EVENT_READ)
         self._missing = False  # whether a simulator's datagrams come to the socket for all senders
         self._next_look = 0.0
-
-    @property
-    def address(self) -> Address:
-        """Address that is listened on."""
-        host, port = self._everybody.getsockname()
-        return host, port
 
     def keep(self, peers: Collection[Address]) -> None:
         """Have a socket for each of these, and no others."""
@@ -263,7 +251,7 @@ class Port:
             # Not SO_REUSEADDR, with which another user could take the port in this moment.
             for one in (self._everybody, sock):
                 one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-            sock.bind(self._everybody.getsockname())
+            sock.bind(self.address)
             sock.connect(peer)
         except OSError:  # then its datagrams come to the socket for all senders
             sock.close()
