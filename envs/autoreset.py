@@ -129,7 +129,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         """The telemetry of the drones by its components, each name with its mask."""
         columns = info_columns(self.env_spec, self.telemetry)
         info: dict[str, Any] = {name: column.copy() for name, column in columns.items()}
-        return info | {f"_{name}": mask for name in info}
+        return info | {f"_{name}": mask for name in info} | self._losses()
 
 
 def checked_mode(mode: AutoresetMode | str) -> AutoresetMode:

@@ -274,12 +274,12 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         self._broken = None
         if in_flight:
             self.advance(self._nothing, mask, seeds, ~mask)
-            return self.observations, self._info(mask)
-        self._flying = False
-        self._reset_until_done(mask, seeds)
-        self.done, self._idle = np.zeros(self.num_envs, bool), ~mask
-        self._flying = True
-        self._take_states(np.ones(self.num_envs, bool))
+        else:
+            self._flying = False
+            self._reset_until_done(mask, seeds)
+            self.done, self._idle = np.zeros(self.num_envs, bool), ~mask
+            self._flying = True
+            self._take_states(np.ones(self.num_envs, bool))
         return self.observations, self._info(mask)
 
     def step(self, actions: Any) -> Any:
@@ -309,7 +309,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
             first = int(waiting.argmax())
             raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
         sent = self._sent(actions, resets | frozen)
-        numbers = None if seeds is None else self._seeds(seeds)
+        numbers = self._seeds(seeds)
         rows: np.ndarray = np.all(frozen.reshape(self._shape), axis=1)
         slots = [slot for slot in range(self.num_simulators) if not rows[slot]]
         self._flying = False  # until the answers are there
@@ -415,9 +415,6 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         if isinstance(action, Discrete) and (wrong := (sent < 0) | (sent >= action.n)).any():
             raise InputError(f"action: expected 0 to {action.n - 1}, got {sent[wrong][0]}")
         return sent
-
-    def _info(self, mask: np.ndarray) -> dict[str, Any]:
-        return super()._info(mask) | self._losses()
 
     def _losses(self) -> dict[str, Any]:
         return dict(zip((LOST, f"_{LOST}"), self._broken, strict=True)) if self._broken else {}

@@ -85,11 +85,8 @@ class Session:
         return self.hello is None
 
     def move(self, way: Way, kind: type[Message]) -> None:
-        """Be in the state that such a message leads to. Raises `ValueError` if it may not."""
-        state = AGENT.get((self.state, way, kind))
-        if state is None:
-            raise ValueError(f"{kind.__name__}: expected another state, got {self.state.value}")
-        self.state = state
+        """Be in the state that such a message leads to. Raises `KeyError` if it may not."""
+        self.state = AGENT[self.state, way, kind]
 
 
 class _Arrival(NamedTuple):

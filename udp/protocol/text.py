@@ -95,23 +95,20 @@ def decode_state(datagram: bytes, layout: Layout) -> State | Close:
             f"state: expected {expected + 1} fields (sequence, reward, terminated, truncated, "
             f"{size} of observation, {sum(sizes)} of telemetry), got {len(fields) + 1}"
         )
-    try:
-        told = iter(_floats("telemetry", fields[3 + size :]))
-        return State(
-            session=0,
-            sequence=sequence,
-            time=0.0,
-            rewards=np.array(_floats("reward", fields[:1])),
-            terminated=np.array([_flag("terminated", fields[1])]),
-            truncated=np.array([_flag("truncated", fields[2])]),
-            observations=(_float32("observation", fields[3 : 3 + size]),),
-            telemetry=tuple(
-                np.array([*islice(told, count)]).reshape(slot.shape)
-                for slot, count in zip(telemetry, sizes, strict=True)
-            ),
-        )
-    except ValueError as error:
-        raise DecodeError(f"state: {error}") from None
+    told = iter(_floats("state: telemetry", fields[3 + size :]))
+    return State(
+        session=0,
+        sequence=sequence,
+        time=0.0,
+        rewards=np.array(_floats("state: reward", fields[:1])),
+        terminated=np.array([_flag("state: terminated", fields[1])]),
+        truncated=np.array([_flag("state: truncated", fields[2])]),
+        observations=(_float32("state: observation", fields[3 : 3 + size]),),
+        telemetry=tuple(
+            np.array([*islice(told, count)]).reshape(slot.shape)
+            for slot, count in zip(telemetry, sizes, strict=True)
+        ),
+    )
 
 
 def decode_command(datagram: bytes, layout: Layout, session: int) -> Command | Close:
@@ -125,25 +122,22 @@ def decode_command(datagram: bytes, layout: Layout, session: int) -> Command | C
     expected = f"sequence,reset[,seed] or sequence and {size} of action"
     if len(fields) > 2 if reset else len(fields) != size:
         raise DecodeError(f"command: expected {expected}, got {datagram[:80]!r}")
-    try:
-        seed = [_whole("seed", fields[1])] if reset and len(fields) == 2 else None
-        return Command(
-            session=session,
-            sequence=sequence,
-            actions=np.zeros(actions.shape, actions.dtype) if reset else _action(fields, layout),
-            orders=np.array([RESET if reset else FLY], np.uint8),
-            seeds=None if seed is None else np.array(seed, np.uint64),
-        )
-    except ValueError as error:
-        raise DecodeError(f"command: {error}") from None
+    seed = [_whole("command: seed", fields[1])] if reset and len(fields) == 2 else None
+    return Command(
+        session=session,
+        sequence=sequence,
+        actions=np.zeros(actions.shape, actions.dtype) if reset else _action(fields, layout),
+        orders=np.array([RESET if reset else FLY], np.uint8),
+        seeds=None if seed is None else np.array(seed, np.uint64),
+    )
 
 
 def _action(fields: list[str], layout: Layout) -> np.ndarray:
     if not layout.choices:
-        return _float32("action", fields)
-    choice = _whole("action", fields[0])
-    most = layout.choices - 1
-    expect(choice <= most, "action", f"a choice 0 to {most}", f"{choice}")
+        return _float32("command: action", fields)
+    choice, most = _whole("command: action", fields[0]), layout.choices - 1
+    if choice > most:
+        raise DecodeError(f"command: action: expected a choice 0 to {most}, got {choice}")
     return np.array([choice])
 
 
@@ -158,36 +152,37 @@ def split(datagram: bytes) -> tuple[int, list[str]]:
     sequence, _, rest = line.partition(",")
     if not rest:
         raise DecodeError(f"text line: expected sequence,field..., got {line[:80]!r}")
-    try:
-        return _whole("sequence", sequence), rest.split(",")
-    except ValueError as error:
-        raise DecodeError(f"text line: {error}") from None
+    return _whole("text line: sequence", sequence), rest.split(",")
 
 
 def _whole(name: str, field: str) -> int:
     number = int(field) if _WHOLE.fullmatch(field) else -1
     if not 0 <= number <= MAX_UINT64:
-        raise InputError(f"{name}: expected a whole number below 2^64, got {field[:80]!r}")
+        raise DecodeError(f"{name}: expected a whole number below 2^64, got {field[:80]!r}")
     return number
 
 
 def _flag(name: str, field: str) -> bool:
     if field not in ("0", "1"):
-        raise InputError(f"{name}: expected 0 or 1, got {field[:80]!r}")
+        raise DecodeError(f"{name}: expected 0 or 1, got {field[:80]!r}")
     return field == "1"
 
 
 def _floats(name: str, fields: list[str]) -> list[float]:
     if not all(map(_NUMBER.fullmatch, fields)):
-        raise InputError(f"{name}: expected decimal numbers, got {','.join(fields)[:80]!r}")
-    numbers = [float(field) for field in fields]
-    _expect_finite(numbers)
-    return numbers
+        raise DecodeError(f"{name}: expected decimal numbers, got {','.join(fields)[:80]!r}")
+    return _finite(name, [float(field) for field in fields])
 
 
 def _float32(name: str, fields: list[str]) -> np.ndarray:
     """Numbers of one drone, float32, shape (1, len(fields))."""
     with np.errstate(over="ignore", under="ignore"):  # independent of the program's settings
         array: np.ndarray = np.array([_floats(name, fields)]).astype(np.float32)
-    _expect_finite(array[0].tolist())
+    _finite(name, array[0].tolist())
     return array
+
+
+def _finite(name: str, numbers: list[float]) -> list[float]:
+    if not all(map(isfinite, numbers)):
+        raise DecodeError(f"{name}: expected finite numbers, got {numbers}")
+    return numbers
