@@ -10,7 +10,7 @@ from gymnasium.vector.utils import batch_space
 
 from ..models.errors import InputError
 from .spaces import action_space, info_columns, observation_space
-from .spec import Discrete, EnvSpec
+from .spec import EnvSpec
 
 Step = tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 Seeds = Sequence[int | None] | np.ndarray
@@ -99,9 +99,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         return array
 
     def _no_actions(self) -> np.ndarray:
-        action = self.env_spec.action
-        shape = (1,) if isinstance(action, Discrete) else action.shape
-        return np.zeros((self.num_envs, *shape), np.float32)
+        return np.zeros(self.action_space.shape or (), np.float32)
 
     def _begin_next(self, truncated: Any, last_info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """SAME_STEP: reset those whose episode ended; the info, with that of their last step.

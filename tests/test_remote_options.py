@@ -86,7 +86,7 @@ def test_arguments_of_the_simulator_program() -> None:
     assert parse_arguments([json.dumps(words)]) == {
         "env": ENV_ID,
         "target": 3.0,
-        "server": ("127.0.0.1", 5),
+        "server": ["127.0.0.1", 5],
     }
 
 

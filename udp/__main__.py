@@ -80,8 +80,7 @@ def parse_arguments(words: list[str]) -> dict[str, Any]:
         expect(isinstance(value, kind), name, expected, f"{value!r}")
     if "env" in arguments:
         arguments["env"] = registry.load(arguments["env"])
-    pairs = {name: tuple(arguments[name]) for name in ("server", "bind") if name in arguments}
-    return {**arguments.pop("options", {}), **arguments, **pairs}
+    return {**arguments.pop("options", {}), **arguments}
 
 
 if __name__ == "__main__":

@@ -37,10 +37,6 @@ def _check_text(name: str, text: str) -> None:
     expect(not _CONTROL.search(text), name, "no control characters", f"{text!r}")
 
 
-def _check_uint64(name: str, number: int) -> None:
-    expect(0 <= number <= MAX_UINT64, name, "0 to 2^64 - 1", f"{number}")
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Extension:
     """Something of a later version or of a user, in Hello or Welcome."""
@@ -93,9 +89,8 @@ class Welcome:
     extensions: tuple[Extension, ...] = ()
 
     def __post_init__(self) -> None:
-        _check_uint64("nonce", self.nonce)
-        if self.seed is not None:
-            _check_uint64("seed", self.seed)
+        for name, number in (("nonce", self.nonce), ("seed", self.seed or 0)):
+            expect(0 <= number <= MAX_UINT64, name, "0 to 2^64 - 1", f"{number}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

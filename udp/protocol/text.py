@@ -8,6 +8,7 @@ is written as the float64 of the same value.
 """
 
 import re
+from collections.abc import Iterable
 from itertools import islice
 from math import isfinite, prod
 from typing import Final
@@ -46,9 +47,16 @@ def encode(message: State | Command | Close) -> bytes:
     """One line, without its end. Raises `InputError` if it is too long or cannot be told."""
     match message:
         case State():
-            fields = _state_fields(message)
+            flags = ["01"[message.terminated.item()], "01"[message.truncated.item()]]
+            arrays = (message.rewards, *message.observations, *message.telemetry)
+            reward, *others = _numbers(arrays)
+            fields = [reward, *flags, *others]
+        case Command() if message.orders.item() == RESET:
+            fields = ["reset"] if message.seeds is None else ["reset", str(message.seeds.item())]
         case Command():
-            fields = _command_fields(message)
+            flies = message.orders.item() == FLY
+            expect(flies, "text codec", "an action or a reset", "a frozen drone")
+            fields = _numbers([message.actions])
         case Close():
             fields = ["close"]
     line = ",".join([str(message.sequence), *fields]).encode()
@@ -57,28 +65,11 @@ def encode(message: State | Command | Close) -> bytes:
     return line
 
 
-def _state_fields(message: State) -> list[str]:
-    flags = ["01"[message.terminated.item()], "01"[message.truncated.item()]]
-    arrays = (message.rewards, *message.observations, *message.telemetry)
+def _numbers(arrays: Iterable[np.ndarray]) -> list[str]:
     numbers = [number for array in arrays for number in array.ravel().tolist()]
-    _expect_finite(numbers)
-    reward, *others = map(repr, numbers)
-    return [reward, *flags, *others]
-
-
-def _command_fields(message: Command) -> list[str]:
-    order = message.orders.item()
-    if order == RESET:
-        return ["reset"] if message.seeds is None else ["reset", str(message.seeds.item())]
-    expect(order == FLY, "text codec", "an action or a reset", "a frozen drone")
-    numbers = message.actions.ravel().tolist()
-    _expect_finite(numbers)
-    return [repr(action) for action in numbers]
-
-
-def _expect_finite(numbers: list[float]) -> None:
     if not all(map(isfinite, numbers)):
         raise InputError(f"expected finite numbers, got {numbers}")
+    return [repr(number) for number in numbers]
 
 
 def decode_state(datagram: bytes, layout: Layout) -> State | Close:
