@@ -169,7 +169,7 @@ def test_only_the_datagram_that_is_due_takes_the_short_way(due: Message) -> None
     session, sequence = struct.unpack_from("<QQ", data, 8)
 
     def read(datagram: bytes) -> Message | None:
-        return binary.decode_due(data[3], datagram, data[8:24], session, sequence, ONE)
+        return binary.decode_due(data[3], datagram, session, sequence, ONE)
 
     taken = read(data)
     assert taken is not None

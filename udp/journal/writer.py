@@ -87,8 +87,7 @@ class Journal:
         model: str = "",
     ) -> None:
         self._statistics, self._slots, self._text_hello = statistics, slots, text_hello
-        self._numbers: dict[int, int] = {}  # of the binary session in each slot
-        self._holders: dict[int, object] = {}
+        self._holders: dict[int, object] = {}  # by slot: number of a binary session, or a text one
         self._channels: dict[tuple[int, int], int] = {}  # by slot and kind: binary's or _SEEDED
         self._size = self._sessions = 0
         now = self._flushed = self._counted = time.time_ns()
@@ -118,8 +117,8 @@ class Journal:
         try:
             if isinstance(message, Hello):
                 self._begin(slot, message, datagram, "binary", now)
-                self._numbers[slot] = message.session
-            elif message.session != self._numbers.get(slot):  # no Hello: by text
+                self._holders[slot] = message.session
+            elif message.session != self._holders.get(slot):  # no Hello: by text
                 self._begin_by_text(slot, now)
             if isinstance(message, State | Command):
                 seeded = isinstance(message, Command) and message.seeds is not None
@@ -267,11 +266,10 @@ def _field_names(prefix: str, arrays: Iterable[ArraySpec]) -> list[str]:
 
 def _words(message: Message, datagram: bytes) -> dict[str, Any]:
     """A message for readers, and its datagram for programs."""
-    words: dict[str, Any] = {"type": type(message).__name__, "session": f"{message.session:016x}"}
-    for name in ("worlds", "spec", "seed", "sequence", "reason"):
-        if hasattr(message, name):
-            words[name] = getattr(message, name)
-    return words | {"datagram": datagram.hex()}
+    words = {"type": type(message).__name__, "session": f"{message.session:016x}"}
+    names = ("worlds", "spec", "seed", "sequence", "reason")
+    told = {name: getattr(message, name) for name in names if hasattr(message, name)}
+    return {**words, **told, "datagram": datagram.hex()}
 
 
 # ---- the file

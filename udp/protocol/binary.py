@@ -115,16 +115,15 @@ def decode(datagram: bytes, layout: Layout | None = None) -> Message:
 
 
 def decode_due(
-    kind: int, datagram: bytes, numbers: bytes, session: int, sequence: int, layout: Layout
+    kind: int, datagram: bytes, session: int, sequence: int, layout: Layout
 ) -> Message | None:
     """The message that is waited for, if this datagram is that one and whole.
 
-    The short way of a lock-step: only one header can come, so it is compared, not read. Its bytes 8
-    to 23 are `numbers`, from `session` and `sequence`. None sends any other datagram, and one that
-    is wrong, the way of `decode`, which tells why.
+    The short way of a lock-step: only one header can come, so it is compared, not read. None sends
+    any other datagram, and one that is wrong, the way of `decode`, which tells why.
     """
     start, crc, decoder = _DUE[kind]
-    if datagram[:4] != start or datagram[8:24] != numbers:
+    if datagram[:4] != start or datagram[8:24] != _NUMBERS.pack(session, sequence):
         return None
     if zlib.crc32(datagram[8:], crc) != int.from_bytes(datagram[4:8], "little"):
         return None
@@ -133,11 +132,6 @@ def decode_due(
         return message
     except (ValueError, struct.error):
         return None
-
-
-def numbers_of(session: int, sequence: int) -> bytes:
-    """Bytes 8 to 23 of a message."""
-    return _NUMBERS.pack(session, sequence)
 
 
 def peek(datagram: bytes) -> tuple[int, int, int]:

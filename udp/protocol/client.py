@@ -41,19 +41,15 @@ Tap = Callable[[int, Message, bytes], None]
 """Sees every message once, when it is first sent or taken: the number of its slot (0 at the
 simulator), the message, and its bytes in the binary codec, whole and not sealed."""
 
-_Moving = m.Welcome | m.Refuse | Command | m.Close
-
 CLOSE_INTERVAL: Final = 0.025
 """A Close is repeated after so long, s, until the other side has answered it with its own."""
 CLOSE_LINGER: Final = 0.25  # longest wait for that answer, s: the other side may be gone
 
 _FIRST_RESEND: Final = 0.2  # wait before a resend while no round trip has been measured, s
-_GRANULARITY: Final = 0.005
-"""A system may let a process wait for so long, s: the least that is added to a round trip."""
+_GRANULARITY: Final = 0.005  # least that is added to a round trip, s: a process may wait so long
 _LONGEST_RESEND: Final = 1.0  # longest wait before a resend, s
 _PATIENCE: Final = 8  # resends before the waits double: most that was lost was lost by chance
-_LATER: Final = 1.25
-"""By so much each Alive for a State lengthens the wait before the next is asked for."""
+_LATER: Final = 1.25  # each Alive for a State makes the wait before the next so much longer
 _LATEST: Final = 10.0
 """Longest such wait, s; a quarter of the timeout, if that is less. A Command that was lost is asked
 for again before an agent takes the simulator for lost (30 s)."""
@@ -211,7 +207,6 @@ class Client:
         self._window = Window()
         self._transfer: Transfer | None = None  # of the outstanding message
         self._transfer_key: Key | None = None
-        self._due = b""  # bytes 8 to 23 of the Command that is waited for: those of the State
         self._asking = b""  # the datagram that was sent last and wants an answer
         self._outgoing: list[bytes] = []
         self._round_trips = RoundTrips()
@@ -267,19 +262,17 @@ class Client:
         elif self.state is not SimulatorState.CLOSING:
             self._end()  # a Hello that was not answered is not repeated
 
-    def receive(self, datagram: bytes, now: float) -> _Moving | None:
+    def receive(self, datagram: bytes, now: float) -> Message | None:
         """Take a datagram from the agent; the message, if it moves the exchange on."""
         self.statistics.counters["received"] += 1
         if self.state is SimulatorState.WAITING and self._is_plain:
             session, sequence = self.hello.session, self.sequence
-            message = binary.decode_due(
-                binary.COMMAND, datagram, self._due, session, sequence, self.layout
-            )
+            message = binary.decode_due(binary.COMMAND, datagram, session, sequence, self.layout)
             if message is not None:
                 return self._take(message, _AFTER_COMMAND, datagram, now)
         return self._receive_any(datagram, now)
 
-    def _receive_any(self, datagram: bytes, now: float) -> _Moving | None:
+    def _receive_any(self, datagram: bytes, now: float) -> Message | None:
         """Whatever comes: `receive` knows only the Command that is waited for."""
         try:
             plain = datagram if self._key is None else self._open(datagram)
@@ -314,9 +307,7 @@ class Client:
 
     def next_timer(self) -> float | None:
         """When `handle_timer` wants to be called; None if never."""
-        if self._transfer is None:
-            return None
-        return min(self._resend_at, self._deadline)
+        return min(self._resend_at, self._deadline) if self._transfer else None
 
     def handle_timer(self, now: float) -> bool:
         """Resend what is due. False once the agent has been silent for the whole timeout."""
@@ -356,12 +347,11 @@ class Client:
 
     def _take(
         self, message: Message, state: SimulatorState, plain: bytes, now: float
-    ) -> _Moving | None:
+    ) -> Message | None:
         """A message that may come now."""
         if isinstance(message, Command):
             self.state, self._transfer = state, None
-            if self.tap:
-                self._record(message, plain)
+            self._record(message, plain)
             self.statistics.round_trips.add(now - self._sent_at)
             self._round_trips.answered(now)
             return message
@@ -400,7 +390,6 @@ class Client:
             self._put([data], self._session_key)
             self.statistics.counters["sent"] += 1
             self._record(close, data)
-        assert isinstance(message, _Moving)
         return message
 
     def _open(self, datagram: bytes) -> bytes:
@@ -475,10 +464,8 @@ class Client:
     def _send(self, message: m.Hello | State | m.Close, now: float) -> None:
         """Send a message and repeat it until it is answered."""
         data = self._encode(message)
-        if self.tap:
-            self._record(message, data)
+        self._record(message, data)
         self._transfer = transfer = Transfer(data, self._largest, self._window)
-        self._due = data[8:24]
         kind = type(message)
         self._transfer_key = self._key if kind is m.Hello else self._session_key
         self.state = SIMULATOR[self.state, Way.SENT, kind]

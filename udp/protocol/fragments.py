@@ -35,8 +35,7 @@ _ASKS_AT: Final = 28
 _FIRST_BURST: Final = 3 << 16  # bytes: what the smallest buffer that systems give a socket holds
 _LARGEST_BURST: Final = 1 << 20
 _MOST_LOST: Final = 0.25  # A burst of which more was lost was too large for a buffer on its way
-_LARGEST_BITMAP: Final = 128
-"""Bytes of the bitmap of a Missing: it says what 1,024 fragments are about."""
+_LARGEST_BITMAP: Final = 128  # bytes of the bitmap of a Missing: it tells of 1,024 fragments
 
 
 def check_largest(largest: int | None) -> None:

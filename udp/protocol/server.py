@@ -27,13 +27,11 @@ from .messages import MAX_SPEC, Command, Message, State, one_line
 from .statistics import Statistics
 from .transitions import AGENT, AgentState, Way
 
-_MOST: Final = 1024
-"""Simulators that are remembered between Hello and first State, while they wait, and after."""
+_MOST: Final = 1024  # simulators remembered between Hello and State 1, in the queue, and after
 _LEAST_ASSEMBLING: Final = 16
 """Simulators without a slot of which fragments are kept; more, if there are more slots: so many
 may come at the same moment."""
-_TEXT_REMEMBERED: Final = 2.0
-"""Time in which a copy of the last line of a closed text simulator is recognized, s."""
+_TEXT_REMEMBERED: Final = 2.0  # for so long the last line of a closed text simulator is known, s
 _AFTER_STATE: Final = AGENT[AgentState.EXPECTING, Way.RECEIVED, State]
 _REASON_AT: Final = binary.HEADER_SIZE + 2  # bytes of a Refuse or a Close before its reason
 
@@ -72,8 +70,8 @@ class Session:
     window: Window = field(default_factory=Window)
     largest: int = 0
     """Bytes of the largest datagram to it, a seal not counted; 0 before the first message."""
-    due: bytes = b""
-    """Bytes 8 to 23 of the State that is expected; empty where it is sealed, or a line of text."""
+    is_plain: bool = False
+    """Whether it has a slot, and its messages are neither sealed nor text."""
     asked_at: float = 0.0  # when the Command was sent whose State is expected
     heard_at: float = 0.0  # when it last said that it lives, or brought a fragment that was missing
     room: int = 0  # bytes that a Refuse may have, while it waits for a slot
@@ -148,11 +146,9 @@ class Server:
         self.statistics.counters["received"] += 1
         slot = self._slot_of.get(address, -1)
         session = self.slots[slot] if slot >= 0 else None
-        if session and session.state is AgentState.EXPECTING and session.due:
+        if session and session.state is AgentState.EXPECTING and session.is_plain:
             number, sequence = session.number, session.sequence + 1
-            state = binary.decode_due(
-                binary.STATE, datagram, session.due, number, sequence, session.layout
-            )
+            state = binary.decode_due(binary.STATE, datagram, number, sequence, session.layout)
             if isinstance(state, State):
                 return self._take_state(slot, session, state, datagram, now)
         return self._receive_any(slot, session, _Arrival(datagram, address, now))
@@ -208,13 +204,14 @@ class Server:
         if session is None or session.state is not AgentState.DECIDING:
             got = session.state.value if session else "a free slot"
             raise ValueError(f"send_command: expected a session that is deciding, got {got}")
-        number, sequence = session.number, session.sequence
         command = Command(
-            session=number, sequence=sequence, actions=actions, orders=orders, seeds=seeds
+            session=session.number,
+            sequence=session.sequence,
+            actions=actions,
+            orders=orders,
+            seeds=seeds,
         )
         self._answer(slot, session, command)
-        if session.key is None and not session.is_text:
-            session.due = binary.numbers_of(number, sequence + 1)
         session.asked_at = session.heard_at = now
 
     def free(self, slot: int) -> None:
@@ -241,9 +238,7 @@ class Server:
 
     def next_timer(self) -> float | None:
         """When `handle_timer` wants to be called; None if never."""
-        if self.closed and any(self.slots):
-            return min(self._resend_at, self._deadline)
-        return None
+        return min(self._resend_at, self._deadline) if self.closed and any(self.slots) else None
 
     def handle_timer(self, now: float) -> None:
         """Repeat what is due: a Close that nobody has answered, until nobody will."""
@@ -358,8 +353,7 @@ class Server:
         """The next State of a slot."""
         session.sequence, session.state = state.sequence, _AFTER_STATE
         self.statistics.round_trips.add(now - session.asked_at)
-        if self.tap:
-            self._record(slot, state, plain, session)
+        self._record(slot, state, plain, session)
         return Event(slot, state)
 
     def _join(
@@ -407,6 +401,7 @@ class Server:
         self._slot_of[session.peer] = slot
         session.move(Way.RECEIVED, State)
         session.sequence = state.sequence
+        session.is_plain = session.key is None and not session.is_text
         self.statistics.counters["sessions"] += 1
         for message in (session.hello, session.welcome):
             if message:
@@ -606,8 +601,7 @@ class Server:
         """
         data = text.encode(message) if session.is_text else binary.encode(message, session.layout)
         session.move(Way.SENT, type(message))
-        if self.tap:
-            self._record(slot, message, data, session)
+        self._record(slot, message, data, session)
         session.reply = reply = self._transfer(data, session)
         self._put(reply.start(), session.peer, session.key)
 

@@ -27,23 +27,16 @@ from ..protocol.statistics import Statistics
 
 LONGEST_WAIT: Final = 0.1
 """Longest wait in one go, s: flags that other threads and signals set are looked at as often."""
-
 PAUSE: Final = 1.0
 """A wait that took so much longer than it should, s: this process was stopped meanwhile."""
-_LOOK: Final = 200e-6
-"""A wait looks for so long before it sleeps, s: a step of one drone takes less."""
-_LOST: Final = 60e-6
-"""Two looks are so far apart if another process had the core in between, s; else 2e-6."""
-_MOST_ASLEEP: Final = 64
-"""Waits at most that sleep at once before one looks again."""
 
 _log: Final = logging.getLogger("rotorgram.udp")
-_STRANGERS_EVERY: Final = 0.01
-"""While every slot is taken, a datagram of a stranger is looked at so often, s."""
-_BUFFER: Final = 1 << 22
-"""Bytes of datagrams that a socket may hold until they are looked at."""
-_MAX_DATAGRAM: Final = 65507
-"""Largest payload of a UDP datagram over IPv4, bytes."""
+_LOOK: Final = 200e-6  # look of a wait before it sleeps, s: a step of one drone takes less
+_LOST: Final = 60e-6  # time between two looks if another process had the core, s; else 2e-6
+_MOST_ASLEEP: Final = 64  # waits at most that sleep at once before one looks again
+_STRANGERS_EVERY: Final = 0.01  # time between two looks at strangers while no slot is free, s
+_BUFFER: Final = 1 << 22  # bytes of datagrams that a socket may hold until they are looked at
+_MAX_DATAGRAM: Final = 65507  # largest payload of a UDP datagram over IPv4, bytes
 _WAY_OUT: Final = (
     "a key that both sides share (key_file, --key-file), or insecure=True (--insecure) where "
     "everybody who reaches this port may fly the drone"
