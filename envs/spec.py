@@ -221,7 +221,7 @@ class EnvSpec(_Part):
 
     def __post_init__(self) -> None:
         _check_text("env_id", self.env_id)
-        object.__setattr__(self, "options", _json_values(self.options))
+        object.__setattr__(self, "options", json_values(self.options))
         period, digits, agents = self.control_period, self.vehicle_hash, self.agents
         right = _is_number(period) and 1e-6 <= period <= 1e3
         _expect(right, "control_period", "1e-6 to 1e3 s", period)
@@ -321,7 +321,7 @@ def _plain(value: Any) -> Any:
     return None if value in (math.inf, -math.inf) else value
 
 
-def _json_values(options: Any) -> dict[str, Any]:
+def json_values(options: Any) -> dict[str, Any]:
     """Options as JSON gives them back: tuples become lists. Raises `SpecError`."""
     try:
         text = json.dumps(dict(options), allow_nan=False, ensure_ascii=False)

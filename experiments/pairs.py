@@ -53,9 +53,9 @@ def socket_pair(
         env = RemoteEnv(here, **settings)
     else:
         env = RemoteVectorEnv(here, num_envs=num_envs, autoreset_mode="Disabled", **settings)
-    name = f"{config.module}:{env_id}" if config.module else env_id
-    arguments = {"server": env.address, "bind": here, "num_envs": num_envs, "env": name}
+    arguments = {"server": env.address, "bind": here, "num_envs": num_envs, "env": env_id}
     arguments |= {"vehicle": file, "options": config.options}
+    arguments |= {"module": config.module} if config.module else {}
     # -P: no folder of the working directory stands for the package.
     command = [sys.executable, "-P", "-m", "rotorgram.udp", json.dumps(arguments)]
     with TemporaryFile("w+") as said:

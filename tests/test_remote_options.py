@@ -73,7 +73,7 @@ def test_wrong_arguments(make: Any, sentence: str) -> None:
         (['{"env": 5}'], "env: expected an id, got 5"),
         (['{"insecure": "false"}'], "insecure: expected true or false, got 'false'"),
         (['{"config": {"timeout": 1}}'], "config: expected one of"),
-        (['{"env": "no.such:My/Task-v0"}'], "env: expected a module no.such here, got none"),
+        (['{"module": "no.such"}'], "env: expected a module no.such here, got none"),
     ],
 )
 def test_wrong_arguments_of_the_simulator_program(words: list[str], sentence: str) -> None:

@@ -1,9 +1,9 @@
 """A simulator process for programs: `python -m rotorgram.udp JSON [--until-stdin-closes]`.
 
 The JSON object holds the keyword arguments of `Simulator`, but for `config`: the options of the env
-as `options`. The env `module:id` of a user is registered by its module, which is imported first.
-With the flag the process ends with the program that holds its standard input, however that ends.
-People use `rotorgram sim`.
+as `options`. `module`, which only our own command line gives, is imported first: it registers the
+env of a user. An id is never imported: it may be one of a file. With the flag the process ends with
+the program that holds its standard input, however that ends. People use `rotorgram sim`.
 """
 
 import json
@@ -14,6 +14,7 @@ from threading import Thread
 from typing import Any, Final
 
 from ..envs import registry
+from ..envs.spec import canonical_id
 from ..models.errors import InputError, MissingPackage, expect
 from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
@@ -22,6 +23,7 @@ from .transport.simulator import Simulator
 _FOR_EVER: Final = 30 * 86_400.0  # s
 _KINDS: Final[dict[str, tuple[Any, str]]] = {
     "env": (str, "an id"),
+    "module": (str, "the name of a module"),
     "options": (dict, "an object"),
     "num_envs": (int, "a number"),
     **dict.fromkeys(("backend", "codec"), (str, "a name")),
@@ -78,8 +80,8 @@ def parse_arguments(words: list[str]) -> dict[str, Any]:
         expect(name in _KINDS, name, f"one of {', '.join(_KINDS)}")
         kind, expected = _KINDS[name]
         expect(isinstance(value, kind), name, expected, f"{value!r}")
-    if "env" in arguments:
-        arguments["env"] = registry.load(arguments["env"])
+    if module := arguments.pop("module", None):
+        registry.load(f"{module}:{canonical_id(arguments.get('env', ''))}")
     return {**arguments.pop("options", {}), **arguments}
 
 

@@ -195,17 +195,15 @@ class Verification(Recording):
 
 def _difference(recorded: State, loop: Loop) -> Difference | None:
     """The first number of the first drone that differs in any bit; None if none does."""
-    pairs = list(_arrays(recorded, loop))
-    if all(was.tobytes() == now.tobytes() for _, was, now in pairs):
-        return None
-    drone, name, old, new = next(
-        (drone, name, old, new)
+    pairs = [pair for pair in _arrays(recorded, loop) if pair[1].tobytes() != pair[2].tobytes()]
+    differences = (
+        Difference(recorded.sequence, drone, name, _digits(old), _digits(new))
         for drone in range(loop.num_envs)
         for names, was, now in pairs
         for name, old, new in zip(names, was[drone].flat, now[drone].flat, strict=True)
         if old.tobytes() != new.tobytes()
     )
-    return Difference(recorded.sequence, drone, name, _digits(old), _digits(new))
+    return next(differences, None)
 
 
 def _arrays(recorded: State, loop: Loop) -> Iterator[tuple[list[str], np.ndarray, np.ndarray]]:

@@ -1,6 +1,5 @@
 """The agent's port, and the simulators that have a slot at it."""
 
-import json
 import logging
 import math
 import os
@@ -17,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 from ...envs import registry
-from ...envs.spec import EnvSpec, canonical_id
+from ...envs.spec import EnvSpec, canonical_id, json_values
 from ...models.errors import InputError, expect
 from ..layouts import layout_of
 from ..protocol import text
@@ -111,16 +110,12 @@ class AgentConfig:
     def _expected_options(self, env_id: str) -> dict[str, Any]:
         """The options that a simulator of this env must have, as JSON values.
 
-        Raises `InputError` if the env is known here and has no such options.
+        Raises `InputError` if they are none, or the env is known here and has no such options.
         """
         options = dict(self.options or {})
         if self.options is not None and registry.is_known(env_id):
             options = asdict(registry.options_type(env_id).from_options(options))
-        try:
-            plain: dict[str, Any] = json.loads(json.dumps(options))
-        except (TypeError, ValueError) as error:
-            raise InputError(f"options: expected JSON values, got {options!r}: {error}") from None
-        return plain
+        return json_values(options)
 
     @cached_property
     def text_spec(self) -> EnvSpec | None:

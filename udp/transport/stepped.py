@@ -1,6 +1,5 @@
 """Envs of a simulator: the loop of a registered task, or Gymnasium envs one after the other."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
@@ -136,10 +135,6 @@ def spec_of_gymnasium(env: gym.Env[Any, Any], options: Mapping[str, Any]) -> Env
     spec, ours = getattr(base, "env_spec", None), (env.observation_space, env.action_space)
     if isinstance(spec, EnvSpec) and ours == (observation_space(spec), action_space(spec)):
         return spec
-    try:
-        json.dumps(dict(options))
-    except (TypeError, ValueError):
-        raise InputError(f"options: expected JSON values, got {options!r:.80}") from None
     fps = env.metadata.get("render_fps") or 50
     return EnvSpec(
         env_id=canonical_id(env.spec.id) if env.spec else type(base).__name__,
