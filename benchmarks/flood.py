@@ -20,7 +20,8 @@ from typing import Any
 
 from rotorgram.agents import preset
 from rotorgram.experiments.pairs import socket_pair
-from rotorgram.experiments.training import Run, Training
+from rotorgram.experiments.settings import Run
+from rotorgram.experiments.training import Training
 from rotorgram.udp.journal import software
 
 FLOOD = """

@@ -210,6 +210,7 @@ class _Keeper:
         self._scalars = ScalarWriter(folder / "tensorboard", total, behind=behind)
 
     def keep(self, *, now: bool, last: bool = False) -> None:
+        from ..agents import store
         from ._env import CHECKPOINT
 
         at = self._training.log.env_steps
@@ -219,7 +220,7 @@ class _Keeper:
             # First the rest: a checkpoint takes the curves that end before it.
             self._write_episodes()
             self._scalars.flush()
-            self._training.store(self._folder / CHECKPOINT)
+            store(self._training.checkpoint(), self._folder / CHECKPOINT)
             self._due = time.monotonic() + self._every
 
     def close(self) -> None:

@@ -46,7 +46,7 @@ class View(EnvFlags):
         check_count("episodes", self.episodes)
         trajectories = islice(self._trajectories(), self.episodes)
         first = next(trajectories)
-        pace = Pace(first.control_period, self.speed)
+        pace = Pace(first.spec.control_period, self.speed)
         stage = Stage(self.world, vehicle=self.vehicle)
         surface = open_surface("web" if self.web else "window", stage, pace, self.port)
         with LiveView(stage, surface, pace) as live:

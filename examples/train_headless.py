@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from rotorgram.agents import NetworkPolicy, preset
+from rotorgram.agents import NetworkPolicy, preset, store
 from rotorgram.experiments.metrics import steady_state
 from rotorgram.experiments.pairs import socket_pair
 from rotorgram.experiments.settings import Run
@@ -37,11 +37,11 @@ run = Run(
 with socket_pair(**run.env, num_envs=run.num_envs) as drones:  # agent here, simulator beside it
     training = Training(run, drones)
     training.train()
-training.store(args.out)
+store(training.checkpoint(), args.out)
 print(f"{training.log.env_steps:,} env steps in {training.log.seconds:.1f} s: {args.out}")
 
 with socket_pair(**run.env) as drone:
     policy = NetworkPolicy(training.agent.actor(), drone.env_spec)
     trajectories = fly_episodes(drone, policy, episodes=5)
-errors = [abs(one.values("elevation_error")[1:]) for one in trajectories]
+errors = [abs(one.headline[1:]) for one in trajectories]
 print(f"steady-state |E|: {np.mean([steady_state(error) for error in errors]):.3f} m")

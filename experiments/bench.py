@@ -43,8 +43,6 @@ from .results import machine
 from .settings import Run
 from .training import Training
 
-__all__ = ["PARTS", "RATIOS", "Layer", "Ratio", "bench", "parts_of"]
-
 ENV_ID: Final = "rotorgram/Elevation-v0"
 _PERIOD: Final = 0.02  # s, of a control step
 _FINER_TIMESTEP: Final = 0.005  # s, for comparison

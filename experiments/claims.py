@@ -23,9 +23,6 @@ import pandas as pd
 from . import metrics
 from .metrics import Headline
 
-__all__ = ["MIN_SEEDS", "OURS", "Verdict", "convergence_step", "fluctuation", "judge_claims",
-           "judge_no_worse", "long_run_return"]  # fmt: skip
-
 MIN_SEEDS: Final = 30
 """Seeds with a value that each agent needs before a claim is decided.
 

@@ -28,8 +28,6 @@ from .training import Snapshot, train_run
 from .trajectories import Trajectory, evaluation_seed, fly_episodes
 from .workers import OnProgress, Tell, open_workers
 
-__all__ = ["PARTS", "compare", "evaluation_pair", "read_compare_config"]
-
 PARTS: Final = "parts"
 """Folder with the parts of an unfinished comparison, one for each run."""
 MAX_BATCH: Final = 64

@@ -24,8 +24,6 @@ from .trajectories import Trajectory, flown_trajectories
 if TYPE_CHECKING:
     from .results import Results
 
-__all__ = ["Film", "OnFrame", "Shot", "film", "film_comparison", "grid", "moments"]
-
 OnFrame = Callable[[int, int], object]
 """Called with frames drawn, and frames in all."""
 
@@ -196,7 +194,7 @@ def _pane(
     """
     overlay = Overlay(
         canvas.width, canvas.height, title=shot.name, color=shot.color, like=shot.moments[0][0],
-        vehicle=stage.vehicle, period=shot.trajectories[0].control_period,
+        vehicle=stage.vehicle, period=shot.trajectories[0].spec.control_period,
         seconds=max(one.seconds for one in flown), scale=_scale(flown), numbers=config.overlay,
     )  # fmt: skip
     picture, shown = np.empty(0, np.uint8), (-1, -1)  # episode and step

@@ -23,13 +23,6 @@ from ..envs.spec import EnvSpec, Metric
 from ..models.errors import InputError
 from .palette import sort_agents
 
-__all__ = [
-    "Curve", "Headline", "Spread", "average_return", "bootstrap_difference", "bootstrap_interval",
-    "episode_ends", "extent", "final_evaluations", "final_per_run", "first_lasting_snapshot", "iqm",
-    "overshoot", "results_table", "settling_time", "spread_over_seeds", "steady_state",
-    "training_runs", "trimmed_mean",
-]  # fmt: skip
-
 _RESAMPLES: Final = 2000
 _MEASURES: Final = ("steady", "settling_time", "overshoot", "return")
 _COUNTS: Final = ("seeds", "episodes", "settled", "crashed")

@@ -14,8 +14,6 @@ from typing import Any, Final
 from ..udp import PeerClosed, PeerSilent, RemoteEnv, RemoteVectorEnv
 from .settings import EnvConfig
 
-__all__ = ["close_shared_pairs", "shared_pair", "socket_pair"]
-
 _START_TIMEOUT: Final = 60.0
 _ANSWER_TIMEOUT: Final = 10.0
 _STOP_TIMEOUT: Final = 5.0

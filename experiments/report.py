@@ -31,10 +31,6 @@ from .metrics import Headline, Spread, results_table
 from .palette import agent_color, agent_label, sort_agents
 from .results import Results, read_results
 
-__all__ = ["MAX_POINTS", "VIDEO_FILE", "Chart", "chart_data", "make_charts", "table_of",
-           "write_report"]  # fmt: skip
-
-
 VIDEO_FILE: Final = "video.mp4"
 """The agents side by side; the page has it in itself where it lies in the folder."""
 

@@ -40,14 +40,6 @@ from ..models.errors import InputError, require
 from .metrics import Headline, overshoot, settling_time, steady_state
 from .trajectories import Trajectory
 
-__all__ = [
-    "CONFIG_FILE", "CONFIG_KEYS", "EPISODES_FILE", "EPISODE_COLUMNS", "EVALUATIONS_FILE",
-    "EVALUATION_COLUMNS", "RUNS_FILE", "RUN_COLUMNS", "STEPS_FILE", "Results", "ResultsError",
-    "Rows", "episode_row", "evaluation_row", "evaluation_steps", "join_parts", "machine",
-    "read_config", "read_results", "read_spec", "read_steps", "step_table", "write_config",
-    "write_part",
-]  # fmt: skip
-
 CONFIG_FILE: Final = "config.json"
 EPISODES_FILE: Final = "episodes.csv"
 STEPS_FILE: Final = "steps.parquet"
@@ -224,7 +216,7 @@ def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]
     values = trajectory.headline
     settled = np.nan
     if headline.settles and not trajectory.terminated:  # what crashes has not settled
-        settled = settling_time(values, trajectory.control_period, headline.settled or 0.0)
+        settled = settling_time(values, trajectory.spec.control_period, headline.settled or 0.0)
     return {
         "episode": trajectory.episode,
         "length": len(trajectory),

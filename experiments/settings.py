@@ -11,9 +11,7 @@ from typing import Any, Literal
 
 from ..agents.presets import A2CConfig, PresetName, VPGConfig, preset
 from ..envs.registry import env_spec, is_known, options_type, task_type
-from ..models.errors import InputError
-
-__all__ = ["CompareConfig", "EnvConfig", "Run", "SweepConfig", "SweepRun", "WorkersConfig"]
+from ..models.errors import expect
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,16 +57,14 @@ class Run(EnvConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, least in (("seed", 0), ("num_envs", 1)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+        expect(self.seed >= 0, "seed", "0 or more", str(self.seed))
+        expect(self.num_envs >= 1, "num_envs", "1 or more", str(self.num_envs))
         least = 1
         if isinstance(self.config, A2CConfig):
             least = self.config.rollout_size(self.num_envs)
         elif self.num_envs > 1:  # a whole episode of each
             least = self.num_envs * int(self.options.get("episode_length", 1))
-        if self.env_steps < least:
-            raise InputError(f"env_steps: expected at least {least}, got {self.env_steps}")
+        expect(self.env_steps >= least, "env_steps", f"at least {least}", str(self.env_steps))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,10 +80,9 @@ class WorkersConfig:
     one of its machines."""
 
     def __post_init__(self) -> None:
-        if self.jobs is not None and self.jobs < 1:
-            raise InputError(f"jobs: expected at least 1, got {self.jobs}")
-        if self.address is not None and self.backend != "ray":
-            raise InputError(f"address: expected it with backend ray, got it with {self.backend}")
+        expect(self.jobs is None or self.jobs >= 1, "jobs", "at least 1", str(self.jobs))
+        right = self.address is None or self.backend == "ray"
+        expect(right, "address", "it with backend ray", f"it with {self.backend}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,15 +112,13 @@ class _ManyRuns(RunsConfig, EnvConfig):
         super().__post_init__()
         EnvConfig.__post_init__(self)
         self._check_counts("seeds", "env_steps", "episodes")
-        if self.first_seed < 0:
-            raise InputError(f"first_seed: expected 0 or more, got {self.first_seed}")
-        if env_spec(**self.env).headline is None:
-            raise InputError(f"env: expected one that names a metric, got {self.env_id}")
+        expect(self.first_seed >= 0, "first_seed", "0 or more", str(self.first_seed))
+        expect(env_spec(**self.env).headline, "env", "one that names a metric", self.env_id)
 
     def _check_counts(self, *names: str) -> None:
         for name in names:
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
+            value = getattr(self, name)
+            expect(value >= 1, name, "at least 1", str(value))
 
     @property
     def all_seeds(self) -> range:
@@ -147,14 +140,9 @@ class _ManyRuns(RunsConfig, EnvConfig):
         return kept | {"seeds": len(seeds), "first_seed": seeds[0]}
 
     def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:
-        return Run(
-            algorithm=algorithm,
-            config=preset(algorithm, self.preset, **changes),
-            seed=seed,
-            env_steps=self.env_steps,
-            num_envs=self.num_envs,
-            **self.env,
-        )
+        shared = {"env_steps": self.env_steps, "num_envs": self.num_envs, **self.env}
+        config = preset(algorithm, self.preset, **changes)
+        return Run(algorithm=algorithm, config=config, seed=seed, **shared)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,10 +159,9 @@ class CompareConfig(_ManyRuns):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_counts("snapshots", "curve_episodes")
-        if not self.agents:
-            raise InputError("agents: expected at least one")
-        if len(set(self.agents)) != len(self.agents):
-            raise InputError(f"agents: expected each once, got {', '.join(self.agents)}")
+        expect(self.agents, "agents", "at least one")
+        once = len(set(self.agents)) == len(self.agents)
+        expect(once, "agents", "each once", ", ".join(self.agents))
         self.runs()  # wrong names and numbers are told before anything is trained
 
     def runs(self) -> list[Run]:
@@ -214,14 +201,12 @@ class SweepConfig(_ManyRuns):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.grid:
-            raise InputError("grid: expected at least one hyperparameter, got none")
+        expect(self.grid, "grid", "at least one hyperparameter", "none")
         self.runs()  # wrong names and numbers are told before anything is trained
         for name, values in self.grid.items():
-            if not values:
-                raise InputError(f"grid: expected at least one value of {name}, got none")
-            if twice := [value for place, value in enumerate(values) if value in values[:place]]:
-                raise InputError(f"grid: expected each {name} once, got {twice[0]!r} twice")
+            expect(values, "grid", f"at least one value of {name}", "none")
+            for place, value in enumerate(values):
+                expect(value not in values[:place], "grid", f"each {name} once", f"{value!r} twice")
 
     def points(self) -> list[dict[str, Any]]:
         """Settings of every point; the value that is named last changes fastest."""

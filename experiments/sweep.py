@@ -30,9 +30,6 @@ from .training import train_run
 from .trajectories import fly_episodes
 from .workers import OnProgress, Tell, open_workers
 
-__all__ = ["SWEEP_FILE", "is_sweep", "missing_runs", "read_sweep_config", "read_sweep_runs",
-           "sweep", "sweep_table", "write_sweep_table"]  # fmt: skip
-
 SWEEP_FILE: Final = "sweep.csv"
 
 RUN_COLUMNS: Final[Mapping[str, str]] = {

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
 import gymnasium as gym
@@ -13,11 +12,9 @@ import torch
 from .. import agents
 from ..agents import A2CConfig, Checkpoint, CheckpointError
 from ..envs.autoreset import AdvancingVectorEnv
-from ..models.errors import InputError
+from ..models.errors import InputError, expect
 from .settings import Run
 from .workers import Tell
-
-__all__ = ["AnyEnv", "Run", "Snapshot", "Training", "is_finished", "train_run"]
 
 AnyEnv = gym.Env[Any, Any] | AdvancingVectorEnv
 
@@ -43,7 +40,7 @@ def is_finished(kept: Checkpoint) -> bool:
 
 @dataclass
 class Training:
-    """A run on an env, to be started, stopped, stored and resumed at update boundaries.
+    """A run on an env, to be started, stopped and resumed at update boundaries.
 
     The env is local or remote, a vector env where the run has many drones, and not closed here.
     Besides the untrained policy, so many `snapshots` are kept in `taken` for later evaluation,
@@ -61,9 +58,8 @@ class Training:
     def __post_init__(self) -> None:
         # Networks of 16 units: a second thread costs more than it brings.
         torch.set_num_threads(1)
-        drones = getattr(self.env, "num_envs", 1)
-        if drones != self.run.num_envs:
-            raise InputError(f"env: expected one of {self.run.num_envs} drones, got {drones}")
+        drones, wanted = getattr(self.env, "num_envs", 1), self.run.num_envs
+        expect(drones == wanted, "env", f"one of {wanted} drones", str(drones))
         self.log = agents.EpisodeLog(self.env, self.run.seed, keep_steps=self.keep_steps)
         self.agent: agents.Agent = (
             agents.resume_agent(self.kept, self.log)
@@ -110,8 +106,7 @@ class Training:
 
     def words(self) -> str:
         """Recent return and size of the headline metric, for a progress bar."""
-        recent = self._recent_means(20)  # it tells how it goes now
-        if not recent:
+        if not (recent := self._recent_means(20)):
             return ""
         text, headline = f"return {recent['rew']:.0f}", self.log.spec.headline
         if headline is None:
@@ -150,10 +145,6 @@ class Training:
             position=self.log.position(),
         )
 
-    def store(self, path: Path) -> None:
-        """Write a checkpoint."""
-        agents.store(self.checkpoint(), path)
-
     def _recent_means(self, count: int) -> dict[str, float]:
         """Over so many episodes, or as many as there are drones, if that is more: of those that
         began together the shortest end first, and the last few to end are those that flew longest.
@@ -174,10 +165,8 @@ class Training:
 def train_run(
     run: Run, env: AnyEnv, tell: Tell, snapshots: int = 0, keep_steps: bool = False
 ) -> tuple[Training, dict[str, Any]]:
-    """Train to the end, and tell the progress, as comparisons and sweeps do.
-
-    Returns:
-        The training, and how long it took: `env_steps`, `seconds` and `steps_per_second`.
+    """Train to the end as comparisons and sweeps do: the training, and how long it took, as
+    `env_steps`, `seconds` and `steps_per_second`.
     """
     training = Training(run, env, snapshots=snapshots, keep_steps=keep_steps)
     training.train(tell=tell)

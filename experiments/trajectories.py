@@ -13,10 +13,7 @@ import numpy as np
 from ..agents.policies import Policy
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.spec import Discrete, EnvSpec, canonical_id, component_names
-from ..models.errors import InputError
-
-__all__ = ["Ending", "EpisodeSet", "Trajectory", "evaluation_seed", "flown_trajectories", "fly",
-           "fly_episodes", "recorded_trajectories"]  # fmt: skip
+from ..models.errors import InputError, expect
 
 _EVALUATION: Final = 20230324  # the day the paper appeared
 
@@ -57,23 +54,14 @@ class Trajectory:
         return len(self.rewards)
 
     @property
-    def control_period(self) -> float:
-        """Between two rows, s."""
-        return self.spec.control_period
-
-    @property
     def seconds(self) -> float:
         """From its start to its end."""
-        return len(self) * self.control_period
+        return len(self) * self.spec.control_period
 
     @property
     def terminated(self) -> bool:
         """Whether it ended by a crash or the like, not by the clock."""
         return self.ending == "terminated"
-
-    def values(self, metric: str) -> np.ndarray:
-        """A metric by name, float64, shape (T + 1,)."""
-        return self._rows("metrics")[:, [one.name for one in self.spec.metrics].index(metric)]
 
     @property
     def headline(self) -> np.ndarray:
@@ -93,7 +81,7 @@ class Trajectory:
     def step_at(self, seconds: float) -> int:
         """Number of the row that is seen at that time; the last, from its end on."""
         # A time that is a whole number of periods but for its last bits belongs to that step.
-        return min(max(int(seconds / self.control_period + 1e-6), 0), len(self))
+        return min(max(int(seconds / self.spec.control_period + 1e-6), 0), len(self))
 
 
 # ---- flown
@@ -235,30 +223,25 @@ def recorded_trajectories(
     """
     from ..udp.journal.reader import Recording
 
-    if not path.is_file():
-        raise InputError(f"{path}: expected a journal (.mcap), got no such file")
+    expect(path.is_file(), str(path), "a journal (.mcap)", "no such file")
     readers: dict[int, _Reader] = {}
     for item in Recording(path):
         found = item.session
         reader = readers.setdefault(found.index, _Reader(found.spec, found.num_envs, drone))
         if session in (None, found.index):
             reader.take(item.message)
-    if session is not None and session not in readers:
-        known = f"1 to {len(readers)}" if readers else "a journal with sessions"
-        raise InputError(f"session: expected {known}, got {session} for {path}")
+    known = f"1 to {len(readers)}" if readers else "a journal with sessions"
+    expect(session is None or session in readers, "session", known, f"{session} for {path}")
     flown = next((readers[index] for index in sorted(readers) if readers[index].has_steps), None)
     if flown is None:
         raise InputError(f"{path}: expected an episode with a step in it, got none")
-    if not 0 <= drone < flown.num_envs:
-        last = flown.num_envs - 1
-        raise InputError(f"drone: expected 0 to {last} in {path}, got {drone}")
+    last = flown.num_envs - 1
+    expect(0 <= drone <= last, "drone", f"0 to {last} in {path}", str(drone))
     flown.keep("cut off")
-    if not flown.found:
-        raise InputError(f"{path}: expected an episode of drone {drone}, got none")
+    expect(flown.found, str(path), f"an episode of drone {drone}", "none")
     last = len(flown.found) - 1
     for episode in episodes or ():
-        if not 0 <= episode <= last:
-            raise InputError(f"episode: expected 0 to {last} in {path}, got {episode}")
+        expect(0 <= episode <= last, "episode", f"0 to {last} in {path}", str(episode))
     return flown.found if episodes is None else [flown.found[episode] for episode in episodes]
 
 

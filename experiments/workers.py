@@ -30,8 +30,6 @@ from ..models.errors import InputError, require
 from .pairs import close_shared_pairs
 from .settings import EnvConfig, WorkersConfig
 
-__all__ = ["OnProgress", "Result", "RunsFailed", "Tell", "Workers", "WorkersConfig", "open_workers"]
-
 _LISTENING_TIMEOUT: Final = 5.0  # s
 _WATCH_EVERY: Final = 0.5  # s
 

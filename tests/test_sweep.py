@@ -23,7 +23,7 @@ from rotorgram.experiments.compare import compare, read_compare_config
 from rotorgram.experiments.folders import locked
 from rotorgram.experiments.metrics import Headline
 from rotorgram.experiments.results import CONFIG_KEYS, ResultsError
-from rotorgram.experiments.settings import CompareConfig, SweepConfig
+from rotorgram.experiments.settings import CompareConfig, Run, SweepConfig, WorkersConfig
 from rotorgram.experiments.sweep import (
     RUN_COLUMNS,
     missing_runs,
@@ -33,9 +33,9 @@ from rotorgram.experiments.sweep import (
     sweep_table,
     write_sweep_table,
 )
-from rotorgram.experiments.training import Run, Training
+from rotorgram.experiments.training import Training
 from rotorgram.experiments.trajectories import evaluation_seed
-from rotorgram.experiments.workers import RunsFailed, WorkersConfig, open_workers
+from rotorgram.experiments.workers import RunsFailed, open_workers
 
 OPTIONS: dict[str, Any] = {"episode_length": 40, "flight_band": 1.2}
 CONFIG = SweepConfig(

@@ -16,6 +16,7 @@ from rotorgram.agents import (
     load,
     make_agent,
     preset,
+    store,
 )
 from rotorgram.agents.episodes import EpisodeLog
 from rotorgram.cli import main
@@ -121,7 +122,7 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not(
     stopped = Training(run, env_of(run))
     updates = iter(range(3))
     assert not stopped.train(lambda: next(updates, None) != 2)
-    stopped.store(path)
+    store(stopped.checkpoint(), path)
     kept = load(path)
     assert kept.num_envs == drones
     assert not is_finished(kept)
