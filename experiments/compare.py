@@ -54,7 +54,7 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
     parts = folder / PARTS
     with open_workers(config, on_progress) as workers, locked(folder):
         parts.mkdir(exist_ok=True)
-        if not (folder / CONFIG_FILE).exists():
+        if not (folder / CONFIG_FILE).exists():  # a resumed comparison keeps its settings
             content = config.content(*config.agents)
             content["evaluation"] = {name: getattr(config, name) for name in _SETTINGS}
             content["bounds"] = _bounds(config)
@@ -108,9 +108,8 @@ def _fly(config: CompareConfig, run: Run | None, tell: Tell) -> _Done:
         results.EPISODES_FILE: [label | episode for episode in episodes],
         results.RUNS_FILE: [label | times],
     }
-    steps = log.steps()
-    steps["step"] = np.arange(1, len(steps["episode"]) + 1)
-    trained = results.step_table(Headline.of(log.spec).name, **label, phase="train", **steps)
+    metric = Headline.of(log.spec).name
+    trained = results.step_table(metric, **label, phase="train", **log.steps())
     return _Done(rows, [trained, *evaluated.steps], checkpoint)
 
 
@@ -139,8 +138,14 @@ def _evaluate(
             steps, seconds = (snapshot.env_steps, snapshot.seconds) if snapshot else (0, 0.0)
             label = {"agent": agent, "seed": seed, "env_steps": steps, "seconds": seconds}
             rows += [label | results.evaluation_row(one, headline) for one in flown]
-    steps_flown = results.evaluation_steps(agent, seed, headline, flown)
-    return _Done({results.EVALUATIONS_FILE: rows}, steps_flown)
+    tables = [
+        results.step_table(
+            headline.name, agent=agent, seed=seed, phase="evaluation", episode=one.episode,
+            value=one.headline[1:], reward=one.rewards, thrust=one.mean_thrust[1:],
+        )
+        for one in flown
+    ]  # fmt: skip
+    return _Done({results.EVALUATIONS_FILE: rows}, tables)
 
 
 def _bounds(config: CompareConfig) -> dict[str, float]:

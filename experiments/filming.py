@@ -15,7 +15,7 @@ from ..agents.checkpoints import load
 from ..agents.pid import PID
 from ..agents.policies import Policy
 from ..envs.rendering import moment
-from ..models.errors import InputError
+from ..models.errors import InputError, expect
 from ..rendering import Camera, Canvas, Moment, NoOpenGL, Stage, World
 from ..rendering.film import QUALITY, Overlay, check_film, graph_scale, write_film
 from .palette import agent_color, agent_label, sort_agents
@@ -32,9 +32,7 @@ MOST_FRAMES: Final = 1_000_000
 _SPACE: Final = 2  # pixels between panes
 _DARK: Final = (13, 18, 26)
 _ASPECT: Final = 1.2  # of a pane that shows a craft and its graph well
-_COMPARISON: Final[dict[str, Any]] = {
-    "width": 1280, "height": 400, "camera": "front", "fast": True, "quality": 27,
-}  # fmt: skip
+_COMPARISON: Final[dict[str, Any]] = {"height": 400, "camera": "front", "fast": True, "quality": 27}
 """Small enough for a page that holds the film in itself."""
 
 
@@ -43,18 +41,14 @@ def moments(trajectory: Trajectory) -> list[Moment]:
 
     Raises `InputError` if its telemetry does not tell where the craft is.
     """
-    told = trajectory.telemetry
-    if missing := {"position", "attitude", "thrust"} - set(told):
-        raise InputError(
-            f"pictures: expected telemetry of {', '.join(sorted(missing))}, "
-            f"{trajectory.spec.env_id} tells none"
-        )
+    told, spec = trajectory.telemetry, trajectory.spec
+    if missing := ", ".join(sorted({"position", "attitude", "thrust"} - set(told))):
+        raise InputError(f"pictures: expected telemetry of {missing}, {spec.env_id} tells none")
+    rewards = [0.0, *trajectory.rewards.tolist()]
     return [
-        moment(
-            trajectory.spec, {name: array[step] for name, array in told.items()}, step=step,
-            reward=float(trajectory.rewards[step - 1]) if step else 0.0, episode=trajectory.episode,
-        )
-        for step in range(len(trajectory) + 1)
+        moment(spec, {name: array[step] for name, array in told.items()}, step=step,
+               reward=reward, episode=trajectory.episode)
+        for step, reward in enumerate(rewards)
     ]  # fmt: skip
 
 
@@ -98,10 +92,9 @@ class Film:
     """As of `write_film`."""
 
     def __post_init__(self) -> None:
-        if not 0.001 <= self.speed <= 1000:
-            raise InputError(f"speed: expected 0.001 to 1000, got {self.speed:g}")
-        if self.at is not None and not (math.isfinite(self.at) and self.at >= 0):
-            raise InputError(f"at: expected a time of 0 s or more, got {self.at:g}")
+        expect(0.001 <= self.speed <= 1000, "speed", "0.001 to 1000", f"{self.speed:g}")
+        right = self.at is None or 0 <= self.at < math.inf
+        expect(right, "at", "a time of 0 s or more", f"{self.at or 0:g}")
 
 
 def film(
@@ -129,21 +122,17 @@ def film(
 def _times(shots: Sequence[Shot], config: Film, *, still: bool) -> list[tuple[int, float]]:
     """Episode and time of flight of every frame, from its start to its end."""
     counts = {len(shot.trajectories) for shot in shots}
-    if len(counts) != 1 or not shots[0].trajectories:
-        raise InputError("shots: expected one or more, with as many episodes each")
+    right = len(counts) == 1 and 0 not in counts
+    expect(right, "shots", "one or more, with as many episodes each")
     episodes = zip(*(shot.trajectories for shot in shots), strict=True)
     lengths = [max(one.seconds for one in flown) for flown in episodes]
     if config.at is not None:
         return [(0, config.at)]
     if still:
         return [(len(lengths) - 1, lengths[-1])]
-    step = config.speed / config.fps
-    frames = sum(lengths) / step
-    if frames > MOST_FRAMES:
-        raise InputError(
-            f"film: expected at most {MOST_FRAMES:,} frames, got {frames:,.0f} for "
-            f"{sum(lengths):,.0f} s of flight; choose a higher speed"
-        )
+    step, seconds = config.speed / config.fps, sum(lengths)
+    got = f"{seconds / step:,.0f} for {seconds:,.0f} s of flight; choose a higher speed"
+    expect(seconds / step <= MOST_FRAMES, "film", f"at most {MOST_FRAMES:,} frames", got)
     return [
         (episode, number * step)
         for episode, length in enumerate(lengths)
@@ -221,12 +210,10 @@ def _scale(flown: Sequence[Trajectory]) -> tuple[float, float]:
 
     Of a crash it holds the start only, for the others to be seen, unless all crashed.
     """
-    all_crashed = all(one.terminated for one in flown)
-    return graph_scale(
-        value
-        for one in flown
-        for value in one.headline[: 1 if one.terminated and not all_crashed else None].tolist()
-    )
+    crashed = [one.terminated for one in flown]
+    ends = [1 if crash and not all(crashed) else None for crash in crashed]
+    shown = [one.headline[:end] for one, end in zip(flown, ends, strict=True)]
+    return graph_scale(np.concatenate(shown).tolist())
 
 
 # ---- the film of a comparison
@@ -264,12 +251,11 @@ def film_comparison(
 
 
 def _comparison_shots(folder: Path, results: "Results") -> list[Shot]:
-    from .metrics import final_per_run
+    from .metrics import final_evaluations, final_per_run
 
     spec, vehicle = results.spec, results.config["vehicle"]
     final = final_per_run(results.evaluations, results.headline)
-    last = results.evaluations.groupby("agent")["env_steps"].transform("max")
-    shown = results.evaluations[results.evaluations["env_steps"] == last]
+    shown = final_evaluations(results.evaluations)
     starts = results.headline.size(shown["start"].to_numpy())
     episode = int(shown["episode"].iloc[int(np.argmax(starts))])
     shots = []

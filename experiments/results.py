@@ -21,7 +21,7 @@ stands in `config.json`. In data frames its name says what it is: `steady`
 import json
 import platform
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -91,8 +91,6 @@ _TABLES: Final = {
     EVALUATIONS_FILE: EVALUATION_COLUMNS,
     RUNS_FILE: RUN_COLUMNS,
 }
-_OWN_NAMES: Final = ("mean_size", "steady", "value")
-"""Columns that have the headline metric's name in the files."""
 
 
 class ResultsError(InputError):
@@ -100,23 +98,22 @@ class ResultsError(InputError):
 
 
 def _in_file(column: str, metric: str) -> str:
-    return metric if column in _OWN_NAMES else column
+    return metric if column in ("mean_size", "steady", "value") else column
 
 
 def step_schema(metric: str) -> pa.Schema:
     """Columns of `steps.parquet`, the headline metric by its name."""
-    return pa.schema(
-        [
-            ("agent", pa.dictionary(pa.int32(), pa.string())),
-            ("seed", pa.int32()),
-            ("phase", pa.dictionary(pa.int32(), pa.string())),  # "train" or "evaluation"
-            ("episode", pa.int32()),  # within the run; -1: one that the end of training cut
-            ("step", pa.int32()),  # of the run for train, of the episode for evaluation; from 1
-            (metric, pa.float32()),
-            ("reward", pa.float32()),
-            ("thrust", pa.float32()),  # mean over the rotors, N
-        ]
-    )
+    columns = {
+        "agent": pa.dictionary(pa.int32(), pa.string()),
+        "seed": pa.int32(),
+        "phase": pa.dictionary(pa.int32(), pa.string()),  # "train" or "evaluation"
+        "episode": pa.int32(),  # within the run; -1: one that the end of training cut
+        "step": pa.int32(),  # of the run for train, of the episode for evaluation; from 1
+        metric: pa.float32(),
+        "reward": pa.float32(),
+        "thrust": pa.float32(),  # mean over the rotors, N
+    }
+    return pa.schema(columns)
 
 
 # ---- config.json
@@ -125,14 +122,11 @@ def step_schema(metric: str) -> pa.Schema:
 def write_config(
     folder: Path, command: str, spec: EnvSpec, vehicle: str | None, content: Mapping[str, Any]
 ) -> None:
-    """Write `config.json`; one that exists stays: a resumed run keeps its settings.
+    """Write `config.json`.
 
     Besides the user's command, the env's spec and the path of its vehicle it has the content:
     settings of the comparison or the sweep, with which all of `CONFIG_KEYS` are there.
     """
-    path = folder / CONFIG_FILE
-    if path.exists():
-        return
     whole = {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": command,
@@ -142,7 +136,7 @@ def write_config(
         "versions": software_versions(),
         "machine": machine(),
     }
-    write_whole(path, (json.dumps(whole, indent=2) + "\n").encode())
+    write_whole(folder / CONFIG_FILE, (json.dumps(whole, indent=2) + "\n").encode())
 
 
 def machine() -> dict[str, Any]:
@@ -229,22 +223,11 @@ def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]
     }
 
 
-def evaluation_steps(
-    agent: str, seed: int, headline: Headline, trajectories: Sequence[Trajectory]
-) -> list[pa.Table]:
-    """Every env step of evaluation trajectories."""
-    return [
-        step_table(
-            headline.name, agent=agent, seed=seed, phase="evaluation", episode=one.episode,
-            step=np.arange(1, len(one) + 1), value=one.headline[1:], reward=one.rewards,
-            thrust=one.mean_thrust[1:],
-        )
-        for one in trajectories
-    ]  # fmt: skip
-
-
 def step_table(metric: str, **columns: Any) -> pa.Table:
-    """Rows of `steps.parquet`: its columns, the metric's as `value`; one value or (T,) each."""
+    """Rows of `steps.parquet`: its columns but `step`, the metric's as `value`; one value or (T,)
+    each.
+    """
+    columns["step"] = np.arange(1, len(columns["reward"]) + 1)
     frame = pd.DataFrame({_in_file(name, metric): column for name, column in columns.items()})
     table = pa.Table.from_pandas(frame, step_schema(metric), preserve_index=False)
     return table.replace_schema_metadata()
@@ -315,20 +298,16 @@ def _existing(folder: Path | str, name: str) -> Path:
 
 def _check_names(path: Path, kind: str, wanted: Iterable[str], present: Iterable[str]) -> None:
     if missing := [name for name in wanted if name not in set(present)]:
-        raise ResultsError(
-            f"{path} lacks the {kind}{'s' if len(missing) > 1 else ''} {', '.join(missing)}; "
-            f"it has {', '.join(present) or 'none'}"
-        )
+        lacks = f"{kind}{'s' * (len(missing) > 1)} {', '.join(missing)}"
+        raise ResultsError(f"{path} lacks the {lacks}; it has {', '.join(present) or 'none'}")
 
 
 def _read_csv(folder: Path | str, name: str, metric: str) -> pd.DataFrame:
     path, columns = _existing(folder, name), _TABLES[name]
     types = {_in_file(column, metric): kind for column, kind in columns.items()}
     try:
-        _check_names(path, "column", types, list(pd.read_csv(path, nrows=0).columns))
-        frame = pd.read_csv(path, usecols=list(types), dtype=types)[list(types)]
-    except ResultsError:
-        raise
+        frame = pd.read_csv(path, dtype=types)
     except ValueError as error:  # an empty file, or a value that is not of the column's type
         raise ResultsError(f"{path} cannot be read: {error}") from error
-    return frame.set_axis(list(columns), axis=1)
+    _check_names(path, "column", types, list(frame.columns))
+    return frame[list(types)].set_axis(list(columns), axis=1)

@@ -57,9 +57,10 @@ def sweep(config: SweepConfig, folder: Path, command: str, on_progress: OnProgre
     """
     spec = env_spec(**config.env)
     with open_workers(config, on_progress) as workers, locked(folder):
-        content = config.content(config.algorithm)
-        content["sweep"] = {"grid": dict(config.grid), "episodes": config.episodes}
-        results.write_config(folder, command, spec, config.vehicle, content)
+        if not (folder / CONFIG_FILE).exists():  # a resumed sweep keeps its settings
+            content = config.content(config.algorithm)
+            content["sweep"] = {"grid": dict(config.grid), "episodes": config.episodes}
+            results.write_config(folder, command, spec, config.vehicle, content)
         done = read_sweep_runs(folder, config)
         rows = done.to_dict("records")
 

@@ -19,14 +19,13 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
-from functools import partial
 from itertools import islice
 from threading import Lock, Thread
 from typing import Any, Final, NamedTuple, TypeVar
 
 from ..agents.checkpoints import software_versions
 from ..envs.registry import load
-from ..models.errors import InputError, require
+from ..models.errors import InputError, expect, require
 from .pairs import close_shared_pairs
 from .settings import EnvConfig, WorkersConfig
 
@@ -73,10 +72,10 @@ class Workers:
     def fly(
         self, function: _Function[_Job, Any], jobs: Mapping[str, _Job], env: EnvConfig | None = None
     ) -> Generator[Result, None, None]:
-        """Call a function in workers, with each job and what tells its progress: its result, as it
-        comes. Jobs are given by name. To be closed: what still flies then is ended.
+        """Call a function in workers, with each job and what tells its progress: the results, as
+        they come. To be closed: what still flies then is ended.
 
-        If the jobs fly an env, a worker imports the module of the user's task.
+        If the jobs, given by name, fly an env, a worker imports the module of the user's task.
         """
         shared = {
             "function": function,
@@ -170,36 +169,34 @@ def _telling(name: str, home: _Home) -> Tell:
 
 @contextmanager
 def _loky(config: WorkersConfig) -> Iterator[_Do]:
-    joblib = require("joblib", "train", "running several trainings")
-    try:
-        yield partial(_do_by_loky, joblib=joblib, workers=config.jobs or joblib.cpu_count())
-    finally:
-        close_shared_pairs()  # of a single worker, which is this process
-
-
-def _do_by_loky(
-    jobs: Mapping[str, Any], shared: Mapping[str, Any], joblib: Any, workers: int
-) -> Generator[Result, None, None]:
+    joblib: Any = require("joblib", "train", "running several trainings")
     from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    parallel = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")
-    results = parallel(joblib.delayed(_done)(name, job, **shared) for name, job in jobs.items())
+    def do(jobs: Mapping[str, Any], shared: Mapping[str, Any]) -> Generator[Result, None, None]:
+        workers = config.jobs or joblib.cpu_count()
+        parallel = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")
+        results = parallel(joblib.delayed(_done)(name, job, **shared) for name, job in jobs.items())
+        try:
+            # `yield from` would close it without the care below.
+            for result in results:  # noqa: UP028
+                yield result
+        except BaseException as error:
+            # Their simulators end with the workers.
+            get_reusable_executor().shutdown(wait=False, kill_workers=True)
+            with warnings.catch_warnings(action="ignore"):  # that runs are cut short is wanted
+                results.close()
+            if isinstance(error, TerminatedWorkerError):
+                raise RunsFailed(
+                    "a worker was killed, perhaps for want of memory (try fewer --jobs); "
+                    "what was done before is kept"
+                ) from None
+            raise
+
     try:
-        # `yield from` would close it without the care below.
-        for result in results:  # noqa: UP028
-            yield result
-    except BaseException as error:
-        # Their simulators end with the workers.
-        get_reusable_executor().shutdown(wait=False, kill_workers=True)
-        with warnings.catch_warnings(action="ignore"):  # that runs are cut short is what we want
-            results.close()
-        if isinstance(error, TerminatedWorkerError):
-            raise RunsFailed(
-                "a worker was killed, perhaps for want of memory (try fewer --jobs); "
-                "what was done before is kept"
-            ) from None
-        raise
+        yield do
+    finally:
+        close_shared_pairs()  # of a single worker, which is this process
 
 
 @contextmanager
@@ -216,38 +213,37 @@ def _ray(config: WorkersConfig) -> Iterator[_Do]:
         words = str(getattr(error, "strerror", None) or error).rpartition("Error: ")[2]
         reason = " ".join(words.split())  # without the traceback of the client server
         raise InputError(f"address: expected a Ray cluster at {address}, got: {reason}") from None
-    try:
-        cores = int(ray.cluster_resources().get("CPU", 0))  # 0: it starts machines when asked to
-        yield partial(_do_by_ray, ray=ray, workers=config.jobs or max(cores, 1))
-    finally:
-        ray.shutdown()
 
-
-def _do_by_ray(
-    jobs: Mapping[str, Any], shared: Mapping[str, Any], ray: Any, workers: int
-) -> Generator[Result, None, None]:
     # Ray's own backend for joblib gives results when all are there, so that an interrupt
     # would lose every run; and it deals runs out in turn, to workers that are busy.
-    remote = ray.remote(num_cpus=1)(_done)
-    waiting = iter(jobs.items())
-    flying: dict[Any, str] = {}
+    def do(jobs: Mapping[str, Any], shared: Mapping[str, Any]) -> Generator[Result, None, None]:
+        cores = int(ray.cluster_resources().get("CPU", 0))  # 0: it starts machines when asked to
+        workers = config.jobs or max(cores, 1)
+        remote = ray.remote(num_cpus=1)(_done)
+        waiting = iter(jobs.items())
+        flying: dict[Any, str] = {}
+        try:
+            while True:
+                more = islice(waiting, workers - len(flying))
+                flying |= {remote.remote(name, job, **shared): name for name, job in more}
+                if not flying:
+                    return
+                (landed,), _ = ray.wait(list(flying))
+                name = flying.pop(landed)
+                try:
+                    result = ray.get(landed)
+                except ray.exceptions.RayError as error:  # its machine is lost, or lacks rotorgram
+                    reason = str(error).strip().splitlines()[-1]
+                    result = Result(name, f"{name}: {reason}", None)
+                yield result
+        finally:
+            for reference in flying:  # their simulators end with them
+                ray.cancel(reference, force=True)
+
     try:
-        while True:
-            more = islice(waiting, workers - len(flying))
-            flying |= {remote.remote(name, job, **shared): name for name, job in more}
-            if not flying:
-                return
-            (landed,), _ = ray.wait(list(flying))
-            name = flying.pop(landed)
-            try:
-                result = ray.get(landed)
-            except ray.exceptions.RayError as error:  # its machine is lost, or has no rotorgram
-                reason = str(error).strip().splitlines()[-1]
-                result = Result(name, f"{name}: {reason}", None)
-            yield result
+        yield do
     finally:
-        for reference in flying:  # their simulators end with them
-            ray.cancel(reference, force=True)
+        ray.shutdown()
 
 
 def _done(
@@ -265,11 +261,8 @@ def _done(
         _watch(parent)
     try:
         for package, here in software_versions().items():
-            if here != versions[package]:
-                raise InputError(
-                    f"{package}: expected version {versions[package]} as on the machine of the "
-                    f"command, got {here} on {socket.gethostname()}"
-                )
+            wanted = f"version {versions[package]} as on the machine of the command"
+            expect(here == versions[package], package, wanted, f"{here} on {socket.gethostname()}")
         if task:
             load(task)
         return Result(name, "", function(job, _telling(name, home)))
