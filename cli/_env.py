@@ -3,97 +3,84 @@
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from ..models.errors import InputError
+from ..agents import PID, Checkpoint, Policy, load
+from ..envs.registry import env_spec, is_known
+from ..envs.spec import EnvSpec
+from ..experiments.pairs import socket_pair
+from ..experiments.trajectories import Trajectory
+from ..models.errors import expect
+from ..udp import RemoteEnv, RemoteVectorEnv
 from ._flags import AgentFlags, EnvFlags, parse_address
-
-if TYPE_CHECKING:
-    from ..agents.checkpoints import Checkpoint
-    from ..agents.policies import Policy
-    from ..envs.spec import EnvSpec
-    from ..experiments.trajectories import Trajectory
-    from ..udp import RemoteEnv, RemoteVectorEnv
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 _CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
 
 
-def load_checkpoint(name: str) -> "Checkpoint | None":
+def load_checkpoint(name: str) -> Checkpoint | None:
     """The checkpoint of a policy by its file or its training's folder; None for `pid`.
 
     Raises `InputError` if there is none.
     """
     if name == "pid":
         return None
-    from ..agents.checkpoints import load
-
     path = Path(name)
-    file = path / CHECKPOINT if path.is_dir() else path
-    if not file.is_file():
-        inside = f": look into {path / 'checkpoints'}" if (path / "checkpoints").is_dir() else ""
-        raise InputError(
-            f"policy: expected pid, a checkpoint or the folder of a training, got {name}, where "
-            f"there is no file {file}{inside}"
-        )
+    file, others = path / CHECKPOINT if path.is_dir() else path, path / "checkpoints"
+    got = f"{name}, where there is no file {file}"
+    got += f": look into {others}" if others.is_dir() else ""
+    expect(file.is_file(), "policy", "pid, a checkpoint or the folder of a training", got)
     return load(file)
 
 
 def chosen_env(
-    command: EnvFlags, checkpoint: "Checkpoint | None" = None
+    command: EnvFlags, checkpoint: Checkpoint | None = None
 ) -> tuple[str, dict[str, Any]]:
     """Id of the task, and its options that are not the default.
 
     A checkpoint brings those that it was trained with; options that the user set win. Raises
     `InputError` if they are of another task than the checkpoint's.
     """
-    if checkpoint is None or ("env" in command.given and command.env_id != checkpoint.env_id):
-        return command.env_id, command.options
-    if command.options and command.env_id != checkpoint.env_id:
-        raise InputError(
-            f"env: expected --env {checkpoint.env_id} with options of the task that the policy "
-            f"was trained on, got options of {command.env_id}"
-        )
-    return checkpoint.env_id, {**checkpoint.options, **command.options}
+    env_id, options = command.env_id, command.options
+    if checkpoint is None or ("env" in command.given and env_id != checkpoint.env_id):
+        return env_id, options
+    wanted = f"--env {checkpoint.env_id} with options of the task that the policy was trained on"
+    right = not options or env_id == checkpoint.env_id
+    expect(right, "env", wanted, f"options of {env_id}")
+    return checkpoint.env_id, {**checkpoint.options, **options}
 
 
-def policy_for(command: EnvFlags, checkpoint: "Checkpoint | None", spec: "EnvSpec") -> "Policy":
+def policy_for(command: EnvFlags, checkpoint: Checkpoint | None, spec: EnvSpec) -> Policy:
     """The policy of a checkpoint, or the PID. Raises `InputError` if it does not fit the env, or
     was trained on another vehicle and the user has not named one.
     """
     if checkpoint is None:
-        from ..agents import PID
-
         return PID(spec)
     trained = checkpoint.spec
     same_drag = trained.options.get("linear_drag") == spec.options.get("linear_drag")
     other = trained.vehicle_hash != spec.vehicle_hash and same_drag
-    if other and "vehicle" not in command.given:
-        raise InputError(
-            f"vehicle: expected {trained.vehicle} (model {trained.vehicle_hash[:8]}), on which the "
-            f"policy was trained, got {spec.vehicle} (model {spec.vehicle_hash[:8]}); name one "
-            "with --vehicle"
-        )
+    right = not other or "vehicle" in command.given
+    then, now = (f"{one.vehicle} (model {one.vehicle_hash[:8]})" for one in (trained, spec))
+    wanted = f"{then}, on which the policy was trained"
+    expect(right, "vehicle", wanted, f"{now}; name one with --vehicle")
     return checkpoint.policy(spec)
 
 
 def pilot_of(
     command: EnvFlags, what: str
-) -> "tuple[Checkpoint | None, Policy | None, tuple[str, dict[str, Any]]]":
+) -> tuple[Checkpoint | None, Policy | None, tuple[str, dict[str, Any]]]:
     """Checkpoint, policy and chosen env of what flies here; `random` has no policy, `pid` no
     checkpoint. Raises `InputError`.
     """
     if what == "random":
         return None, None, chosen_env(command)
-    from ..envs import registry
-
     checkpoint = load_checkpoint(what)
     env = chosen_env(command, checkpoint)
-    spec = registry.env_spec(*env, vehicle=command.vehicle)
+    spec = env_spec(*env, vehicle=command.vehicle)
     return checkpoint, policy_for(command, checkpoint, spec), env
 
 
-def words_of(trajectory: "Trajectory") -> str:
+def words_of(trajectory: Trajectory) -> str:
     """Return of an episode, and the headline metric at its end."""
     words = f"return {trajectory.rewards.sum():.1f}"
     if (metric := trajectory.spec.headline) is None:
@@ -124,21 +111,12 @@ def remote_env(
         settings = {"env_id": env_id, "options": options or None} if required else {}
         opened = _waiting(command, command.listen, num_envs, num_simulators, **settings)
     else:
-        from ..envs.registry import is_known
-        from ..experiments.pairs import socket_pair
-
-        if num_simulators > 1:
-            raise InputError(f"num-simulators: expected 1 without --listen, got {num_simulators}")
-        if command.key_file or command.insecure:
-            raise InputError(
-                "key-file, insecure: expected them with --listen, got them for a simulator of "
-                "our own on this machine"
-            )
-        if not is_known(env_id):
-            raise InputError(
-                f"env: expected --env MODULE:{env_id}, for the task is not known here without the "
-                "module that registers it"
-            )
+        alone, local = num_simulators == 1, not (command.key_file or command.insecure)
+        expect(alone, "num-simulators", "1 without --listen", str(num_simulators))
+        own = "them for a simulator of our own on this machine"
+        expect(local, "key-file, insecure", "them with --listen", own)
+        reason = "the task is not known here without the module that registers it"
+        expect(is_known(env_id), "env", f"--env MODULE:{env_id}, for {reason}")
         opened = socket_pair(
             env_id, options, num_envs=num_envs or 1, vehicle=command.vehicle, record=command.record
         )
@@ -152,9 +130,7 @@ def remote_env(
 @contextmanager
 def _waiting(
     command: AgentFlags, listen: str, num_envs: int | None, num_simulators: int, **settings: Any
-) -> "Iterator[RemoteEnv | RemoteVectorEnv]":
-    from ..udp import RemoteEnv, RemoteVectorEnv
-
+) -> Iterator[RemoteEnv | RemoteVectorEnv]:
     if command.vehicle is not None:
         from ..models.vehicle import Vehicle  # an agent needs no MuJoCo otherwise
 

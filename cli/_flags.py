@@ -13,7 +13,8 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union, cast, get_arg
 import tyro
 from tyro.conf import Fixed, Suppress, arg
 
-from ..models.errors import InputError
+from ..experiments.folders import new_folder
+from ..models.errors import InputError, expect
 
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
 
@@ -169,15 +170,14 @@ def _without_requirements(words: Sequence[str]) -> tuple[list[str], dict[str, An
 def parse_address(text: str) -> tuple[str, int]:
     """HOST:PORT as a pair. Raises `InputError`."""
     host, _, port = text.rpartition(":")
-    if not (host and port.isascii() and port.isdecimal() and int(port) <= 65535):
-        raise InputError(f"address: expected HOST:PORT with a port up to 65535, got {text!r}")
+    right = host and port.isascii() and port.isdecimal() and int(port) <= 65535
+    expect(right, "address", "HOST:PORT with a port up to 65535", repr(text))
     return host, int(port)
 
 
 def check_count(name: str, value: int | None) -> None:
     """Raises `InputError` for a number that is given and less than 1."""
-    if value is not None and value < 1:
-        raise InputError(f"{name}: expected at least 1, got {value}")
+    expect(value is None or value >= 1, name, "at least 1", str(value))
 
 
 @contextmanager
@@ -185,8 +185,6 @@ def folder_to_write(out: Path | None, name: str) -> Iterator[Path]:
     """A new folder for the block, by default named by the time. A block that fails before it has
     written anything leaves none. Raises `InputError` if `out` exists.
     """
-    from ..experiments.folders import new_folder
-
     folder = new_folder(out, name)
     try:
         yield folder
@@ -200,9 +198,8 @@ def refuse_settings(command: Command, folder: Path, *, free: tuple[str, ...]) ->
     """Raises `InputError` if a setting but the free ones was given, if only its default: the run in
     the folder that the command resumes keeps its own.
     """
-    if changed := sorted(name for name in command.given if name not in free):
-        flags = ", ".join("--" + name.replace("_", "-") for name in changed)
-        raise InputError(f"resume: expected the settings of {folder}, got others by {flags}")
+    flags = ["--" + name.replace("_", "-") for name in sorted(command.given.difference(free))]
+    expect(not flags, "resume", f"the settings of {folder}", f"others by {', '.join(flags)}")
 
 
 def go_on_with(command: Command, words: str, folder: Path, *flags: str) -> str:

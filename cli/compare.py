@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass, replace
 
-from ..models.errors import InputError, require
+from ..experiments.settings import CompareConfig, WorkersConfig
+from ..models.errors import expect, require
 from ._flags import AlgorithmName, refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_comparison, runs_folder
 
@@ -29,17 +30,14 @@ class Compare(RunsFlags):
         for module in ("matplotlib", "jinja2"):  # before hours of training
             require(module, "report", "a comparison's report")
         from ..experiments.compare import PARTS, compare, read_compare_config
-        from ..experiments.settings import CompareConfig, WorkersConfig
 
         if self.resume:
             refuse_settings(self, self.resume, free=("film", *RESUMED))
             config = read_compare_config(self.resume)
             config = replace(config, **self.settings(WorkersConfig))
-            if not (self.resume / PARTS).is_dir():
-                raise InputError(
-                    f"resume: expected an interrupted comparison, {self.resume} is finished; "
-                    f"draw its report with: rotorgram report {self.resume}"
-                )
+            advice = f"draw its report with: rotorgram report {self.resume}"
+            wanted = f"an interrupted comparison, {self.resume} is finished; {advice}"
+            expect((self.resume / PARTS).is_dir(), "resume", wanted)
         else:
             config = CompareConfig(**self.settings(CompareConfig))
         with runs_folder("compare", self) as (folder, progress):

@@ -4,16 +4,14 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 from tyro.conf import Positional
 
-from ..models.errors import InputError
+from ..experiments.palette import DARK_COLORS, agent_color, agent_label
+from ..experiments.trajectories import Trajectory, flown_trajectories, recorded_trajectories
+from ..models.errors import expect
 from ._flags import EnvFlags, check_count
-
-if TYPE_CHECKING:
-    from ..experiments.filming import Shot
-    from ..experiments.trajectories import Trajectory
 
 _ALIKE: Final = ("pid", "random")  # their words tell no two of them apart
 
@@ -61,7 +59,7 @@ class Render(EnvFlags):
 
     def run(self) -> int:
         """Fly or read, draw, and say where."""
-        from ..experiments.filming import Film, film
+        from ..experiments.filming import Film, Shot, film
         from ..rendering.film import check_film
         from ..rendering.gl import offscreen_context
         from ._progress import frame_bar
@@ -69,48 +67,40 @@ class Render(EnvFlags):
         width, height = parse_size(self.size)
         config = Film(width=width, height=height, **self.settings(Film))
         check_film(self.out, width, height, self.fps)
-        if self.at is not None and self.out.suffix.lower() != ".png":
-            raise InputError(f"at: expected it with a picture, --out NAME.png, got {self.out}")
+        self._check()
         offscreen_context(16, 16).free()  # flying takes longer than finding no OpenGL
-        shots = self._shots()
+        found = [self._find(what) for what in self.what]
+        names = self.names or _told_apart([name for _, name, _ in found], self.what)
+        colors = _colors([agent for agent, _, _ in found])
+        shots = [
+            Shot(name=name, color=color, trajectories=flown)
+            for name, color, (_, _, flown) in zip(names, colors, found, strict=True)
+        ]
         longest = max(shot.trajectories[0].seconds for shot in shots)
-        if self.at is not None and self.at > longest:
-            raise InputError(f"at: expected 0 to {longest:g} s, the flight's end, got {self.at:g}")
+        right, end = self.at is None or self.at <= longest, f"{longest:g} s, the flight's end"
+        expect(right, "at", f"0 to {end}", f"{self.at or 0:g}")
         with frame_bar(self.out.name) as on_frame:
             frames = film(self.out, shots, config, on_frame)
         pictures = "1 picture" if frames == 1 else f"{frames} pictures"
         print(f"film: {self.out} ({pictures} of {width}x{height})")
         return 0
 
-    def _shots(self) -> "list[Shot]":
-        from ..experiments.filming import Shot
-
-        if not self.what:
-            raise InputError("what: expected a checkpoint, pid, random or a journal, got nothing")
-        if self.names and len(self.names) != len(self.what):
-            raise InputError(
-                f"names: expected one for each of {len(self.what)} flights, got {len(self.names)}"
-            )
-        if self.episode < 0:
-            raise InputError(f"episode: expected 0 or more, got {self.episode}")
+    def _check(self) -> None:
+        right, flights = self.at is None or self.out.suffix.lower() == ".png", len(self.what)
+        expect(right, "at", "it with a picture, --out NAME.png", str(self.out))
+        expect(self.what, "what", "a checkpoint, pid, random or a journal", "nothing")
+        right = len(self.names) in (0, flights)
+        expect(right, "names", f"one for each of {flights} flights", str(len(self.names)))
+        expect(self.episode >= 0, "episode", "0 or more", str(self.episode))
         check_count("episodes", self.episodes)
         journals = [Path(words).suffix == ".mcap" for words in self.what]
-        if not any(journals) and (self.session is not None or self.drone):
-            raise InputError("session, drone: expected them with a journal (.mcap), got none")
-        if self.options and all(journals):
-            raise InputError("env: expected no options with a journal, which has its own")
-        found = [self._find(what) for what in self.what]
-        names = self.names or _told_apart([name for _, name, _ in found], self.what)
-        colors = _colors([agent for agent, _, _ in found])
-        return [
-            Shot(name=name, color=color, trajectories=trajectories)
-            for name, color, (_, _, trajectories) in zip(names, colors, found, strict=True)
-        ]
+        right = any(journals) or (self.session is None and not self.drone)
+        expect(right, "session, drone", "them with a journal (.mcap)", "none")
+        right = not (self.options and all(journals))
+        expect(right, "env", "no options with a journal, which has its own")
 
-    def _find(self, what: str) -> "tuple[str, str, list[Trajectory]]":
+    def _find(self, what: str) -> tuple[str, str, list[Trajectory]]:
         """Agent, name and trajectories of a policy or journal."""
-        from ..experiments.palette import agent_label
-        from ..experiments.trajectories import flown_trajectories, recorded_trajectories
         from ._env import pilot_of
 
         episodes = range(self.episode, self.episode + self.episodes)
@@ -127,9 +117,10 @@ class Render(EnvFlags):
 def parse_size(text: str) -> tuple[int, int]:
     """WIDTHxHEIGHT as a pair. Raises `InputError`."""
     match = re.fullmatch(r"([0-9]{2,4})x([0-9]{2,4})", text)
-    if not match or not all(16 <= int(pixels) <= 8192 for pixels in match.groups()):
-        raise InputError(f"size: expected WIDTHxHEIGHT of 16 to 8192 pixels each, got {text!r}")
-    return int(match[1]), int(match[2])
+    width, height = map(int, match.groups()) if match else (0, 0)
+    right = min(width, height) >= 16 and max(width, height) <= 8192
+    expect(right, "size", "WIDTHxHEIGHT of 16 to 8192 pixels each", repr(text))
+    return width, height
 
 
 def _told_apart(names: Sequence[str], what: Sequence[str]) -> list[str]:
@@ -146,8 +137,6 @@ def _told_apart(names: Sequence[str], what: Sequence[str]) -> list[str]:
 
 def _colors(agents: Sequence[str]) -> list[str]:
     """Each agent's own; where that is taken, one that is free."""
-    from ..experiments.palette import DARK_COLORS, agent_color
-
     colors: list[str] = []
     for agent in agents:
         own = agent_color(agent, dark=True)

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..models.errors import InputError
+from ..experiments.settings import SweepConfig, WorkersConfig
+from ..models.errors import expect
 from ._flags import AlgorithmName, parse_value, refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_sweep, runs_folder
 
@@ -34,7 +35,6 @@ class Sweep(RunsFlags):
 
     def run(self) -> int:
         """Sweep, and print the table."""
-        from ..experiments.settings import SweepConfig
         from ..experiments.sweep import sweep
         from ..experiments.workers import RunsFailed
 
@@ -53,22 +53,16 @@ class Sweep(RunsFlags):
         report_sweep(folder)
         return 0
 
-    def _resumed(self, folder: Path) -> Any:
-        from ..experiments.settings import WorkersConfig
+    def _resumed(self, folder: Path) -> SweepConfig:
         from ..experiments.sweep import missing_runs, read_sweep_config, read_sweep_runs
 
         config = replace(read_sweep_config(folder), **self.settings(WorkersConfig))
-        if config.algorithm != self.algorithm:
-            raise InputError(
-                f"resume: expected a sweep of {self.algorithm}, "
-                f"{folder} holds one of {config.algorithm}"
-            )
+        others = f"a sweep of {self.algorithm}, {folder} holds one of {config.algorithm}"
+        expect(config.algorithm == self.algorithm, "resume", others)
         refuse_settings(self, folder, free=RESUMED)
-        if not missing_runs(config, read_sweep_runs(folder, config)):
-            raise InputError(
-                f"resume: expected an interrupted sweep, {folder} is finished; "
-                f"show it with: rotorgram report {folder}"
-            )
+        advice = f"show it with: rotorgram report {folder}"
+        wanted = f"an interrupted sweep, {folder} is finished; {advice}"
+        expect(missing_runs(config, read_sweep_runs(folder, config)), "resume", wanted)
         return config
 
 
@@ -77,9 +71,7 @@ def parse_grid(words: Iterable[str]) -> dict[str, tuple[Any, ...]]:
     grid: dict[str, tuple[Any, ...]] = {}
     for word in words:
         name, equals, values = word.partition("=")
-        if not equals:
-            raise InputError(f"grid: expected NAME=VALUE,VALUE,…, got {word!r}")
-        if name in grid:
-            raise InputError(f"grid: expected each name once, got {name} twice")
+        expect(equals, "grid", "NAME=VALUE,VALUE,…", repr(word))
+        expect(name not in grid, "grid", "each name once", f"{name} twice")
         grid[name] = tuple(map(parse_value, values.split(",")))
     return grid

@@ -12,12 +12,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..models.errors import InputError, require
-from . import _flags
-from ._flags import AgentFlags, AlgorithmName, PresetName
+from ..agents import A2CConfig, Episode, load, preset, store
+from ..agents.checkpoints import software_versions, write_whole
+from ..experiments.folders import locked
+from ..experiments.settings import Run
+from ..models.errors import expect, require
+from ._flags import (
+    AgentFlags,
+    AlgorithmName,
+    PresetName,
+    folder_to_write,
+    go_on_with,
+    parse_value,
+    refuse_settings,
+)
 
 if TYPE_CHECKING:
-    from ..experiments.settings import Run
     from ..experiments.training import Training
 
 EPISODES: Final = "episodes.csv"
@@ -62,15 +72,11 @@ class Train(AgentFlags):
         """Train by these settings, or by those of the folder to resume."""
         require("torch", "train", "training")
         require("tensorboard", "train", "training")
-        if not (math.isfinite(self.store_every) and self.store_every > 0):
-            raise InputError(f"store-every: expected seconds > 0, got {self.store_every}")
+        right = 0 < self.store_every < math.inf
+        expect(right, "store-every", "seconds > 0", str(self.store_every))
         return self._resume(self.resume) if self.resume else self._begin()
 
     def _begin(self) -> int:
-        from ..agents import preset
-        from ..agents.checkpoints import software_versions, write_whole
-        from ..experiments.folders import locked
-        from ..experiments.settings import Run
         from ..experiments.training import Training
         from ._env import remote_env
 
@@ -81,7 +87,7 @@ class Train(AgentFlags):
             print(f"note: {advice}", flush=True)
         required = bool(self.options) or "env" in self.given
         with (
-            _flags.folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
+            folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
             remote_env(self, self.env_id, self.options, required=required, num_envs=run.num_envs,
                        num_simulators=self.num_simulators) as env,
             locked(folder),
@@ -95,21 +101,16 @@ class Train(AgentFlags):
             return self._train(training, folder)
 
     def _resume(self, folder: Path) -> int:
-        from ..agents import load
-        from ..experiments.folders import locked
         from ..experiments.training import Training, is_finished
         from ._env import CHECKPOINT, remote_env
 
         with locked(folder):
             kept = load(folder / CHECKPOINT)
-            if kept.algorithm != self.algorithm:
-                raise InputError(
-                    f"resume: expected a training of {self.algorithm}, "
-                    f"{folder} holds one of {kept.algorithm}"
-                )
-            _flags.refuse_settings(self, folder, free=("algorithm", *_FREE))
-            if "env" in self.given and self.env_id != kept.env_id:
-                raise InputError(f"resume: expected --env {kept.env_id}, got {self.env}")
+            others = f"a training of {self.algorithm}, {folder} holds one of {kept.algorithm}"
+            expect(kept.algorithm == self.algorithm, "resume", others)
+            refuse_settings(self, folder, free=("algorithm", *_FREE))
+            right = "env" not in self.given or self.env_id == kept.env_id
+            expect(right, "resume", f"--env {kept.env_id}", self.env)
             if is_finished(kept):
                 flown = kept.position.env_steps
                 print(f"already trained {flown:,} of {kept.env_steps:,} env steps")
@@ -127,7 +128,7 @@ class Train(AgentFlags):
 
         before = training.log.env_steps
         flags = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
-        go_on = _flags.go_on_with(self, f"train {self.algorithm}", folder, *flags)
+        go_on = go_on_with(self, f"train {self.algorithm}", folder, *flags)
         keeper = _Keeper(training, folder, self.store_every)
         try:
             with _stop_at_update() as stop_is_asked, bars() as progress:
@@ -161,15 +162,12 @@ class Train(AgentFlags):
 def _change(word: str) -> tuple[str, Any]:
     """NAME=VALUE of a hyperparameter. Raises `InputError`."""
     name, equals, value = word.partition("=")
-    if not equals:
-        raise InputError(f"set: expected NAME=VALUE, got {word!r}")
-    return name, _flags.parse_value(value)
+    expect(equals, "set", "NAME=VALUE", repr(word))
+    return name, parse_value(value)
 
 
-def _advice(run: "Run") -> str:
+def _advice(run: Run) -> str:
     """Advice if an update has too little data of so many drones; empty if not."""
-    from ..agents import A2CConfig
-
     drones, config = run.num_envs, run.config
     if drones == 1 or "episode_length" not in run.options:
         return ""
@@ -210,7 +208,6 @@ class _Keeper:
         self._scalars = ScalarWriter(folder / "tensorboard", total, behind=behind)
 
     def keep(self, *, now: bool, last: bool = False) -> None:
-        from ..agents import store
         from ._env import CHECKPOINT
 
         at = self._training.log.env_steps
@@ -230,9 +227,6 @@ class _Keeper:
 
     def _write_episodes(self) -> None:
         import pandas as pd
-
-        from ..agents.checkpoints import write_whole
-        from ..agents.episodes import Episode
 
         columns = [field.name for field in fields(Episode)]
         table = pd.DataFrame(map(asdict, self._training.log.episodes), columns=columns)

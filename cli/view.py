@@ -5,15 +5,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain, count, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from tyro.conf import Positional
 
-from ..models.errors import InputError
+from ..experiments.trajectories import Trajectory, flown_trajectories, recorded_trajectories
+from ..models.errors import expect
 from ._flags import EnvFlags, check_count
-
-if TYPE_CHECKING:
-    from ..experiments.trajectories import Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,14 +59,12 @@ class View(EnvFlags):
                 time.sleep(0.02)
         return 0
 
-    def _trajectories(self) -> "Iterator[Trajectory]":
+    def _trajectories(self) -> Iterator[Trajectory]:
         """Episode after episode, as long as there are any."""
-        from ..experiments.trajectories import flown_trajectories, recorded_trajectories
         from ._env import pilot_of
 
         if (path := Path(self.what)).suffix == ".mcap":
-            if self.options:
-                raise InputError("env: expected no options with a journal, which has its own")
+            expect(not self.options, "env", "no options with a journal, which has its own")
             yield from recorded_trajectories(path)
             return
         _, policy, env = pilot_of(self, self.what)
