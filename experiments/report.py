@@ -8,10 +8,10 @@ import base64
 import json
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from itertools import chain
+from itertools import chain, compress
 from pathlib import Path
 from typing import Any, Final, NamedTuple, get_args
 
@@ -82,12 +82,18 @@ def write_report(folder: Path | str, results: Results | None = None) -> Path:
     claims = json.dumps([asdict(verdict) for verdict in verdicts], indent=2, ensure_ascii=False)
     (folder / "claims.json").write_text(claims + "\n", encoding="utf-8")
     video, report = folder / VIDEO_FILE, folder / "report.html"
-    film = video.read_bytes() if video.is_file() else None
-    picture = b""
-    with suppress(MissingPackage, OSError):  # where FFmpeg is missing, the film has no poster
-        picture = poster(video) if film else b""
-    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
-    report.write_text(_page(results, table, verdicts, curves, film, picture, files), "utf-8")
+    film = picture = b""
+    if video.is_file():
+        film = video.read_bytes()
+        with suppress(MissingPackage, OSError):  # where FFmpeg is missing, the film has no poster
+            picture = poster(video)
+    page = _page(
+        results, table, verdicts, curves,
+        video=base64.b64encode(film).decode("ascii"),
+        poster=base64.b64encode(picture).decode("ascii"),
+        files={path.relative_to(folder).as_posix() for path in folder.rglob("*")},
+    )  # fmt: skip
+    report.write_text(page, encoding="utf-8")
     return report
 
 
@@ -95,23 +101,14 @@ def write_report(folder: Path | str, results: Results | None = None) -> Path:
 
 
 def _page(
-    results: Results,
-    table: pd.DataFrame,
-    verdicts: Sequence[Verdict],
-    curves: Curves,
-    video: bytes | None,
-    picture: bytes,
-    files: Collection[str],
+    results: Results, table: pd.DataFrame, verdicts: Sequence[Verdict], curves: Curves, **media: Any
 ) -> str:
-    """The page, with an MP4 where there is one and its poster, and the names of the files beside
-    it.
-    """
+    """The page, with names in the template of the film, its poster and the files beside it."""
     config, headline = results.config, results.headline
     agents = sort_agents(table.index[table["seeds"] > 0])
     bounds = [name for name in table.index if name not in agents]
     trained = sort_agents(config["agents"])
     charts = make_charts(curves, headline)
-    data = {"agents": [agent_label(one) for one in agents], "charts": chart_data(charts, agents)}
     settings = config["agents"]
     annealed = [name for name in ("vpg", "a2c") if settings.get(name, {}).get("anneal")]
     environment = jinja2.Environment(
@@ -135,12 +132,10 @@ def _page(
         annealed=[agent_label(name) for name in annealed],
         charts=charts,
         averaging_share=AVERAGING_SHARE,
-        data=data,
-        video=base64.b64encode(video).decode("ascii") if video else None,
-        poster=base64.b64encode(picture).decode("ascii"),
+        data={"agents": list(map(agent_label, agents)), "charts": chart_data(charts, agents)},
         trained=trained,
         hyperparameters=dict.fromkeys(chain(*(settings[agent] for agent in trained))),
-        files=files,
+        **media,
     )
 
 
@@ -153,8 +148,10 @@ def _outcome(
 ) -> str:
     """The result in one sentence."""
     seen = table[table["steady"].notna()]
-    trained = _ends(seen[seen["steps_per_second"].notna()], headline)
-    others = _ends(seen[seen["steps_per_second"].isna()], headline)
+    ends = seen["steady"].map(tables.number_text).map(headline.amount)
+    labels = [f"{amount} ({agent_label(str(name))})" for name, amount in ends.items()]
+    learns = seen["steps_per_second"].notna()
+    trained, others = (_listed(list(compress(labels, one))) for one in (learns, ~learns))
     parts = []
     if trained:
         parts.append(
@@ -163,22 +160,16 @@ def _outcome(
         )
     if others:
         parts.append(f"without training, with {others}")
-    paper = [verdict for verdict in verdicts if verdict.source != OURS]
-    counts = Counter(verdict.verdict for verdict in paper)
-    found = [f"{counts[name]} {'is' if counts[name] == 1 else 'are'} {name}"
-             for name in get_args(Outcome) if counts[name]]  # fmt: skip
-    if paper:
+    if paper := [verdict for verdict in verdicts if verdict.source != OURS]:
+        counts = Counter(verdict.verdict for verdict in paper)
+        found = [f"{counts[name]} {'is' if counts[name] == 1 else 'are'} {name}"
+                 for name in get_args(Outcome) if counts[name]]  # fmt: skip
         parts.append(f"of the paper's {len(paper)} claims, {_listed(found)}")
-    most = int(table["seeds"].max())
-    if paper and most < MIN_SEEDS:
-        parts.append(f"{most} seed{'s' * (most != 1)} decide no claim, that takes {MIN_SEEDS}")
+        most = int(table["seeds"].max())
+        if most < MIN_SEEDS:
+            parts.append(f"{most} seed{'s' * (most != 1)} decide no claim, that takes {MIN_SEEDS}")
     text = "; ".join(parts) + "."
     return text[0].upper() + text[1:]
-
-
-def _ends(table: pd.DataFrame, headline: Headline) -> str:
-    ends = table["steady"].map(tables.number_text).map(headline.amount).items()
-    return _listed([f"{amount} ({agent_label(str(name))})" for name, amount in ends])
 
 
 def _listed(words: Sequence[str]) -> str:

@@ -174,21 +174,6 @@ class CompareConfig(_ManyRuns):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepRun:
-    """A training of the sweep: its point of the grid, with that one's changes to the preset."""
-
-    point: int
-    settings: dict[str, Any]
-    run: Run
-
-    @property
-    def name(self) -> str:
-        """For progress and errors."""
-        words = " ".join(f"{name}={value}" for name, value in self.settings.items())
-        return f"{words} seed {self.run.seed}"
-
-
-@dataclass(frozen=True, kw_only=True)
 class SweepConfig(_ManyRuns):
     """Settings of a sweep and its workers. Its seeds are not those of a comparison."""
 
@@ -213,14 +198,16 @@ class SweepConfig(_ManyRuns):
         names, values = self.grid.keys(), product(*self.grid.values())
         return [dict(zip(names, chosen, strict=True)) for chosen in values]
 
-    def runs(self) -> list[SweepRun]:
-        """Every training, in the order in which they start.
+    def runs(self) -> dict[str, tuple[int, Run]]:
+        """Every training by name, with its point, in the order in which they start.
 
         All points with the first seed, then all with the second: a sweep that is stopped has seen
         every point.
         """
-        return [
-            SweepRun(point=point, settings=chosen, run=self._run(self.algorithm, seed, **chosen))
+        points = self.points()
+        words = [" ".join(f"{name}={value}" for name, value in one.items()) for one in points]
+        return {
+            f"{words[point]} seed {seed}": (point, self._run(self.algorithm, seed, **chosen))
             for seed in self.all_seeds
-            for point, chosen in enumerate(self.points())
-        ]
+            for point, chosen in enumerate(points)
+        }

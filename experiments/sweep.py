@@ -25,7 +25,7 @@ from .folders import locked
 from .metrics import Headline, final_per_run
 from .pairs import shared_pair
 from .results import CONFIG_FILE, ResultsError
-from .settings import SweepConfig, SweepRun
+from .settings import Run, SweepConfig
 from .training import train_run
 from .trajectories import fly_episodes
 from .workers import OnProgress, Tell, open_workers
@@ -46,6 +46,9 @@ RUN_COLUMNS: Final[Mapping[str, str]] = {
 }
 """Columns of `runs.csv`, besides the settings of the grid, which stand after `point`."""
 
+Job = tuple[int, Run]
+"""A training, with its point of the grid."""
+
 
 def sweep(config: SweepConfig, folder: Path, command: str, on_progress: OnProgress) -> None:
     """Train and evaluate every point with every seed; each run is a row of `runs.csv` when done.
@@ -64,24 +67,23 @@ def sweep(config: SweepConfig, folder: Path, command: str, on_progress: OnProgre
         done = read_sweep_runs(folder, config)
         rows = done.to_dict("records")
 
-        def keep(_: SweepRun, row: dict[str, Any]) -> None:
+        def keep(_: Job, row: dict[str, Any]) -> None:
             rows.append(row)
             table = _with_settings(pd.DataFrame(rows, columns=list(RUN_COLUMNS)), config)
             write_whole(folder / results.RUNS_FILE, table.to_csv(index=False).encode())
 
-        jobs = {job.name: job for job in missing_runs(config, done)}
-        workers.fly_all(partial(_fly, config), jobs, keep, config)
+        workers.fly_all(partial(_fly, config), missing_runs(config, done), keep, config)
 
 
-def missing_runs(config: SweepConfig, rows: pd.DataFrame) -> list[SweepRun]:
-    """The runs that are not among the rows of `read_sweep_runs`."""
+def missing_runs(config: SweepConfig, rows: pd.DataFrame) -> dict[str, Job]:
+    """The runs by name that are not among the rows of `read_sweep_runs`."""
     done = set(zip(rows["point"], rows["seed"], strict=True))
-    return [job for job in config.runs() if (job.point, job.run.seed) not in done]
+    return {name: job for name, job in config.runs().items() if (job[0], job[1].seed) not in done}
 
 
-def _fly(config: SweepConfig, job: SweepRun, tell: Tell) -> dict[str, Any]:
+def _fly(config: SweepConfig, job: Job, tell: Tell) -> dict[str, Any]:
     """Train and evaluate (in a worker process); the row of the run."""
-    run = job.run
+    point, run = job
     with shared_pair(**run.env, num_envs=run.num_envs) as env:
         training, times = train_run(run, env, tell)
     policy = NetworkPolicy(training.agent.actor(), training.log.spec)
@@ -91,7 +93,7 @@ def _fly(config: SweepConfig, job: SweepRun, tell: Tell) -> dict[str, Any]:
     frame = pd.DataFrame([results.evaluation_row(one, headline) for one in trajectories])
     frame = frame.assign(agent=run.algorithm, seed=run.seed, env_steps=times["env_steps"])
     (row,) = final_per_run(frame, headline).to_dict("records")
-    whole = {"point": job.point, **row, **times}
+    whole = {"point": point, **row, **times}
     return {column: whole[column] for column in RUN_COLUMNS}
 
 
@@ -134,7 +136,7 @@ def read_sweep_runs(folder: Path, config: SweepConfig) -> pd.DataFrame:
         rows = text[list(RUN_COLUMNS)].astype(dict(RUN_COLUMNS))
     except ValueError as error:  # an empty file, a missing column, or a value of another type
         raise ResultsError(f"{path}: expected the runs of a sweep: {error}") from None
-    wanted = {(job.point, job.run.seed) for job in config.runs()}
+    wanted = {(point, run.seed) for point, run in config.runs().values()}
     got = list(zip(rows["point"], rows["seed"], strict=True))
     if len(set(got)) < len(got) or not wanted.issuperset(got):
         raise ResultsError(f"{path}: expected each run of the sweep once, got others")

@@ -129,7 +129,7 @@ def test_what_is_missing_is_flown_to_the_same_numbers(folder: Path, tmp_path: Pa
     (broken / "config.json").write_bytes((folder / "config.json").read_bytes())
     (broken / "runs.csv").write_text("".join(lines[:-2]))
     config = replace(read_sweep_config(broken), jobs=1)
-    lost = {job.name for job in missing_runs(config, read_sweep_runs(broken, config))}
+    lost = set(missing_runs(config, read_sweep_runs(broken, config)))
     assert len(lost) == 2
     told = set()
     sweep(config, broken, "", lambda name, *_: told.add(name))
@@ -232,11 +232,12 @@ def test_points_are_all_combinations_and_every_one_flies_before_the_next_seed() 
     points = [(0.003, 64), (0.003, 100), (0.05, 64), (0.05, 100)]
     assert config.points() == [dict(zip(names, point, strict=True)) for point in points]
     runs = config.runs()
-    assert [(job.run.seed, job.point) for job in runs] == [
+    assert [(run.seed, point) for point, run in runs.values()] == [
         (seed, point) for seed in (1000, 1001) for point in range(4)
     ]
-    assert runs[5].name == "learning_rate=0.003 steps_per_update=100 seed 1001"
-    assert runs[5].run.config == preset("a2c", "tuned", learning_rate=0.003, steps_per_update=100)
+    point, run = runs["learning_rate=0.003 steps_per_update=100 seed 1001"]
+    assert (point, run.seed) == (1, 1001)
+    assert run.config == preset("a2c", "tuned", learning_rate=0.003, steps_per_update=100)
 
 
 def rows_of(*runs: tuple[int, int, float, float, int]) -> pd.DataFrame:
