@@ -151,42 +151,34 @@ def trimmed_mean(values: Values, axis: int = -1) -> Floats:
 
 
 def iqm(values: Values) -> float:
-    """Interquartile mean: the mean without the lowest and the highest quarter of the values.
-
-    Below four values nothing is cut. Missing values are left out; nan if none is left.
-    """
+    """Interquartile mean: `trimmed_mean` of the values that are not missing; nan if all are."""
     finite = _finite(values)
     return float(trimmed_mean(finite)) if finite.size else math.nan
 
 
-def bootstrap_interval(values: Values) -> tuple[float, float]:
-    """95 % percentile-bootstrap interval of the interquartile mean over seeds, always the same.
+def bootstrap_interval(*samples: Values) -> tuple[float, float]:
+    """95 % percentile-bootstrap interval of the interquartile mean over seeds, always the same; of
+    two samples, of the difference between theirs.
 
     Missing values are left out. Fewer than two give (nan, nan): one seed shows no spread, which is
     not the same as a spread of zero. With few seeds the interval is narrower than it should be.
     """
-    return _interval(np.random.default_rng(0), values)
-
-
-def bootstrap_difference(first: Values, second: Values) -> tuple[float, float, float]:
-    """iqm(first) - iqm(second) over seeds, and the ends of its 95 % bootstrap interval, nan where
-    either side has fewer than two values.
-
-    The runs of the two agents are resampled independently, although runs of one seed share their
-    starting states, and VPG's and A2C's also the actor's first weights and the stream of noise. As
-    far as this makes the runs of a seed alike, the interval is wider than it need be.
-    """
-    return iqm(first) - iqm(second), *_interval(np.random.default_rng(0), first, second)
-
-
-def _interval(rng: np.random.Generator, *samples: Values) -> tuple[float, float]:
-    """Interval of the first sample's interquartile mean, minus the second's if there is one."""
-    finite = [_finite(values) for values in samples]
+    rng, finite = np.random.default_rng(0), [_finite(values) for values in samples]
     if min(one.size for one in finite) < 2:
         return math.nan, math.nan
     means = [trimmed_mean(rng.choice(one, size=(_RESAMPLES, one.size))) for one in finite]
     low, high = np.quantile(np.subtract(*means) if len(means) > 1 else means[0], [0.025, 0.975])
     return float(low), float(high)
+
+
+def bootstrap_difference(first: Values, second: Values) -> tuple[float, float, float]:
+    """iqm(first) - iqm(second) over seeds, and the ends of its `bootstrap_interval`.
+
+    The runs of the two agents are resampled independently, although runs of one seed share their
+    starting states, and VPG's and A2C's also the actor's first weights and the stream of noise. As
+    far as this makes the runs of a seed alike, the interval is wider than it need be.
+    """
+    return iqm(first) - iqm(second), *bootstrap_interval(first, second)
 
 
 def training_runs(episodes: pd.DataFrame, agent: str) -> list[pd.DataFrame]:
@@ -305,18 +297,16 @@ def results_table(
         for name in _MEASURES:
             row[name] = iqm(own[name])
             row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(own[name])
-        row["held"] = math.nan if headline.held is None else int(own["held"].sum())
+        row["held"] = math.nan if headline.held is None else own["held"].sum()
         row["worst"] = headline.worst(own["steady"])
-        row |= {name: int(own[name].sum()) for name in _COUNTS[1:]}
+        row |= own[["episodes", "settled", "crashed"]].sum().to_dict()
         trained = runs[(runs["agent"] == agent) & (runs["env_steps"] > 0)]
-        reached, steps, seconds = math.nan, np.empty(0), np.empty(0)
+        row["reached"], steps, seconds = math.nan, np.empty(0), np.empty(0)
         if len(trained) and headline.held is not None:
             seeds = evaluations[evaluations["agent"] == agent].groupby("seed")
-            first = [first_lasting_snapshot(run, headline) for _, run in seeds]
-            steps, seconds = np.array(first).T
-            reached = int(np.isfinite(steps).sum())
-        row |= {"reached": reached, "env_steps_to_reach": iqm(steps)}
-        row["seconds_to_reach"] = iqm(seconds)
+            steps, seconds = np.array([first_lasting_snapshot(run, headline) for _, run in seeds]).T
+            row["reached"] = np.isfinite(steps).sum()
+        row |= {"env_steps_to_reach": iqm(steps), "seconds_to_reach": iqm(seconds)}
         row["steps_per_second"] = iqm(trained["steps_per_second"])
         rows[agent] = row
     for name, value in (bounds or {}).items():
