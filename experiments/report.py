@@ -25,8 +25,7 @@ from ..models.errors import MissingPackage
 from ..rendering.film import poster
 from . import tables
 from .claims import MIN_SEEDS, OURS, Outcome, Verdict, judge_claims, judge_no_worse
-from .curves import AVERAGING_SHARE, Curves, make_curves
-from .figures import draw_figures
+from .figures import AVERAGING_SHARE, Curves, draw_figures, make_curves
 from .metrics import Headline, Spread, results_table
 from .palette import agent_color, agent_label, sort_agents
 from .results import Results, read_results

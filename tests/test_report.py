@@ -11,8 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from comparisons import GATES, HEADLINE, spec_of, synthetic_folder
 from rich.console import Console
-from rotorgram.experiments.curves import make_curves
-from rotorgram.experiments.figures import FIGURE_FILES, draw_figures
+from rotorgram.experiments.figures import FIGURE_FILES, draw_figures, make_curves
 from rotorgram.experiments.metrics import Headline
 from rotorgram.experiments.palette import agent_color, agent_label, sort_agents
 from rotorgram.experiments.report import VIDEO_FILE, table_of, write_report

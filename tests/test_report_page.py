@@ -15,7 +15,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from comparisons import HEADLINE, synthetic_folder
-from rotorgram.experiments.curves import (
+from rotorgram.experiments.figures import (
+    FIGURE_FILES,
     cumulative_returns,
     flown_sizes,
     learning_curves,
@@ -23,7 +24,6 @@ from rotorgram.experiments.curves import (
     return_curves,
     value_fan,
 )
-from rotorgram.experiments.figures import FIGURE_FILES
 from rotorgram.experiments.metrics import Spread
 from rotorgram.experiments.palette import agent_color
 from rotorgram.experiments.report import (
