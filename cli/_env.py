@@ -19,10 +19,7 @@ _CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simu
 
 
 def load_checkpoint(name: str) -> Checkpoint | None:
-    """The checkpoint of a policy by its file or its training's folder; None for `pid`.
-
-    Raises `InputError` if there is none.
-    """
+    """The checkpoint of a file or a training's folder; None for `pid`. Raises `InputError`."""
     if name == "pid":
         return None
     path = Path(name)
@@ -69,9 +66,7 @@ def policy_for(command: EnvFlags, checkpoint: Checkpoint | None, spec: EnvSpec) 
 def pilot_of(
     command: EnvFlags, what: str
 ) -> tuple[Checkpoint | None, Policy | None, tuple[str, dict[str, Any]]]:
-    """Checkpoint, policy and chosen env of what flies here; `random` has no policy, `pid` no
-    checkpoint. Raises `InputError`.
-    """
+    """Checkpoint (None for `pid`), policy (None for `random`) and env of what flies here."""
     if what == "random":
         return None, None, chosen_env(command)
     checkpoint = load_checkpoint(what)

@@ -113,9 +113,9 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
 
 
 def _for_tyro(kind: type[Any], **namespace: Any) -> Any:
-    """A dataclass without checks: wrong values are refused later, as every other wrong input. Has
-    `Union[X, Y]` for `X | Y`, for which tyro, before Python 3.14, imports typeguard: that takes as
-    long as all else.
+    """A dataclass without checks: wrong values are refused later, as every other wrong input.
+
+    It has `Union[X, Y]` for `X | Y`: before Python 3.14 tyro imports typeguard for that, slowly.
     """
     hints = get_type_hints(kind, include_extras=True)
     changed = {}
@@ -182,9 +182,7 @@ def check_count(name: str, value: int | None) -> None:
 
 @contextmanager
 def folder_to_write(out: Path | None, name: str) -> Iterator[Path]:
-    """A new folder for the block, by default named by the time. A block that fails before it has
-    written anything leaves none. Raises `InputError` if `out` exists.
-    """
+    """A new folder, by default named by the time; removed if the block fails before it writes."""
     folder = new_folder(out, name)
     try:
         yield folder
@@ -195,9 +193,7 @@ def folder_to_write(out: Path | None, name: str) -> Iterator[Path]:
 
 
 def refuse_settings(command: Command, folder: Path, *, free: tuple[str, ...]) -> None:
-    """Raises `InputError` if a setting but the free ones was given, if only its default: the run in
-    the folder that the command resumes keeps its own.
-    """
+    """Raises `InputError` if a setting but the free ones was given: a resumed run keeps its own."""
     flags = ["--" + name.replace("_", "-") for name in sorted(command.given.difference(free))]
     expect(not flags, "resume", f"the settings of {folder}", f"others by {', '.join(flags)}")
 

@@ -42,9 +42,7 @@ def frame_bar(name: str) -> Iterator[Callable[[int, int], None]]:
 
 
 class Bars:
-    """Shows runs by a bar each, with done and total, rate, elapsed and remaining time, and words.
-    The clock tells seconds.
-    """
+    """Shows each run by a bar, with its figures and words. The clock tells seconds."""
 
     def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
         self.progress = Progress(

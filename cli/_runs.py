@@ -41,9 +41,7 @@ def command_line() -> str:
 
 @contextmanager
 def runs_folder(name: str, command: RunsFlags) -> "Iterator[tuple[Path, OnProgress]]":
-    """The folder to write to, and what shows the progress. If the runs fail, it says how to resume:
-    `name` is the command with its positional arguments.
-    """
+    """The folder to write to, and what shows progress; says how to resume if the runs fail."""
     from ._progress import bars
 
     new = folder_to_write(command.out, name.replace(" ", "-"))

@@ -18,9 +18,8 @@ class ScalarWriter:
     """Writes numbers by name at the first update, then at the first after so many env steps.
 
     So many are a two hundredth of the run, and at least 100: curves of agents that update at
-    different times have points near the same env steps. The folder gets an event file each time
-    that the training is begun or resumed. What it holds from beyond the env steps that were flown
-    before was lost with a process that was killed: TensorBoard is told to forget it.
+    different times have points near the same env steps. Each begin or resume makes an event file.
+    TensorBoard is told to forget points beyond `behind`: a process that was killed has lost them.
     """
 
     def __init__(self, folder: Path, env_steps: int, *, behind: int = 0) -> None:
@@ -39,10 +38,7 @@ class ScalarWriter:
         self._add(Event(session_log=SessionLog(status=SessionLog.START)), behind + 1)
 
     def due(self, env_steps: int, *, last: bool = False) -> bool:
-        """Whether the update at so many env steps is one to write; of the last, if it is not yet.
-
-        To be asked at every update.
-        """
+        """Asked at every update: whether to write at it; at the last, if it is not written yet."""
         due = self._begins or env_steps // self._every > self._last // self._every
         self._begins, self._last = False, env_steps
         return due or (last and self._written != env_steps)

@@ -195,8 +195,8 @@ def _advice(run: Run) -> str:
 class _Keeper:
     """Stores a training at its first update, then every so many seconds, and when told to.
 
-    The numbers for TensorBoard are written by env steps, not by the clock, so that those of a
-    training that was stopped and resumed stand at the same steps as those of an unbroken one.
+    Numbers for TensorBoard are written by env steps, not by the clock: a training that was resumed
+    has them at the same steps as an unbroken one.
     """
 
     def __init__(self, training: "Training", folder: Path, every: float) -> None:
@@ -237,8 +237,7 @@ class _Keeper:
 def _stop_at_update() -> Iterator[Callable[[], bool]]:
     """Ctrl-C and termination ask to stop at an update: a function that tells there whether to.
 
-    If no update comes soon, since no simulator answers for example, or if asked again, it stops at
-    once.
+    Asked again, or if no update comes soon (no simulator answers), it stops at once.
     """
     asked, timers = False, hasattr(signal, "setitimer")
 

@@ -81,9 +81,7 @@ class Verdict:
 
 
 def _late_returns(run: pd.DataFrame, returns: pd.Series) -> pd.Series:
-    """Those of the episodes that ended in the last quarter of a run's training; none of a run of
-    fewer than `MIN_EPISODES` episodes.
-    """
+    """Returns of the episodes that ended in the last quarter; none of a run of too few episodes."""
     ends = metrics.episode_ends(run)
     return returns[(ends > 0.75 * ends.max(initial=0.0)) & (len(run) >= MIN_EPISODES)]
 
@@ -191,9 +189,9 @@ def _compare(
     episodes: pd.DataFrame, measure: Callable[[pd.DataFrame], float], larger: bool,
     unit: str = "", without: str = "",
 ) -> tuple[Outcome, str]:  # fmt: skip
-    """Judge a claim that A2C's measure of a run is larger (or smaller) than VPG's: outcome and the
-    numbers, with a unit behind a space. `without` says what it means that a run which is long
-    enough has no number.
+    """Judge a claim that A2C's measure of a run is larger (or smaller) than VPG's; tell numbers.
+
+    `unit` follows a space; `without` says of a run that is long enough why it has no number.
     """
     runs = {name: metrics.training_runs(episodes, name.lower()) for name in ("A2C", "VPG")}
     if missing := [name for name, own in runs.items() if not own]:

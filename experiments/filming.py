@@ -103,13 +103,12 @@ def film(
     """Film trajectories side by side, into a path as of `write_film`; the number of frames written.
 
     A `.png` is the picture at `config.at`, or the last. There are one or more shots, each with as
-    many trajectories. An episode lasts until the longest trajectory of it has ended; one that ended
+    many trajectories. An episode lasts until its longest trajectory has ended; one that ended
     before stays on its last picture.
 
     Raises:
         NoOpenGL: No OpenGL works here.
-        InputError: The name, the size or the rate is not what it should be, or the film would be
-            longer than any film.
+        InputError: A wrong name, size or rate, or a film that is too long.
         OSError: It cannot be written.
     """
     check_film(path, config.width, config.height, config.fps)
@@ -141,9 +140,7 @@ def _times(shots: Sequence[Shot], config: Film, *, still: bool) -> list[tuple[in
 
 
 def grid(count: int, width: int, height: int) -> tuple[int, int]:
-    """Columns and rows of so many panes in a picture of so many pixels: panes a little wider than
-    high, and few places empty.
-    """
+    """Columns and rows of so many panes in a picture of so many pixels, with few empty places."""
 
     def badness(shape: tuple[int, int]) -> float:
         columns, rows = shape
@@ -178,9 +175,7 @@ def _frames(
 def _pane(
     shot: Shot, config: Film, canvas: Canvas, stage: Stage, flown: Sequence[Trajectory], named: bool
 ) -> Generator[np.ndarray, tuple[int, float], None]:
-    """Pictures of one flight, each for the episode and the time that are sent; drawn again only
-    where they change.
-    """
+    """Pictures of one flight, for each episode and time that are sent; drawn where they change."""
     overlay = Overlay(
         canvas.width, canvas.height, title=shot.name, color=shot.color, like=shot.moments[0][0],
         vehicle=stage.vehicle, period=shot.trajectories[0].spec.control_period,
@@ -206,10 +201,7 @@ def _pane(
 
 
 def _scale(flown: Sequence[Trajectory]) -> tuple[float, float]:
-    """Ends of the graph that hold the headline metric.
-
-    Of a crash it holds the start only, for the others to be seen, unless all crashed.
-    """
+    """Ends of the graph of the headline metric; of a crash its start, unless all crashed."""
     crashed = [one.terminated for one in flown]
     ends = [1 if crash and not all(crashed) else None for crash in crashed]
     shown = [one.headline[:end] for one, end in zip(flown, ends, strict=True)]

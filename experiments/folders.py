@@ -11,11 +11,10 @@ from ..models.errors import InputError
 
 
 def new_folder(out: Path | None, name: str, runs: Path = Path("runs")) -> Path:
-    """Make the folder to write to: `out`, or one in `runs`, named by the command and the time. Of
-    two processes that ask for one of the same second, the second gets a number behind it.
+    """Make the folder to write to: `out`, or one in `runs`, named by the command and the time; a
+    second one of the same second gets a number.
 
-    Raises:
-        InputError: `out` exists, or the place allows no folder.
+    Raises `InputError` if `out` exists, or the place allows no folder.
     """
     stem = f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
     for number in count(1):
@@ -37,8 +36,7 @@ def new_folder(out: Path | None, name: str, runs: Path = Path("runs")) -> Path:
 def locked(folder: Path) -> Iterator[None]:
     """Hold a folder's lock, a file in it that stays; the lock ends with its process.
 
-    Raises:
-        InputError: Another process holds it, or the folder cannot be written.
+    Raises `InputError` if another process holds it, or the folder cannot be written.
     """
     try:
         file = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)

@@ -128,8 +128,7 @@ def settling_time(errors: Values, control_period: float, tolerance: float) -> fl
 def overshoot(errors: Values) -> float:
     """How far the craft passed its target: the largest -sign(E_0)·E of shape (T,), at least 0.
 
-    An episode that begins exactly on its target has no side to pass to: its largest |E| counts. An
-    episode without steps has nan.
+    An episode that begins on its target has the largest |E|; one without steps has nan.
     """
     values = np.asarray(errors, float)
     if not values.size:
@@ -225,12 +224,10 @@ def extent(count: int) -> tuple[float, float]:
 
 
 def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tuple[float, float]:
-    """Env steps and seconds of training after which one run holds its goal for good, by its
-    evaluation episodes: of the first snapshot from which on every snapshot holds without a crash;
-    nan if there is none.
+    """Env steps and seconds of training after which one run holds its goal for good; nan if never.
 
-    A snapshot is judged by few episodes, in which even an untrained network can pass by luck:
-    hence a snapshot counts only if none after it fails.
+    They are those of the first snapshot from which on every snapshot holds without a crash. Few
+    episodes judge a snapshot, and even an untrained network can pass them by luck.
     """
     # A crash, or a value that is missing, must not vanish in a mean that skips it.
     never = -np.inf if headline.high else np.inf

@@ -100,8 +100,8 @@ _shared: dict[str, tuple[Any, ExitStack]] = {}
 def shared_pair(**settings: Any) -> Iterator[Any]:
     """As `socket_pair` by keyword, but the pair stays open for the next run of this process.
 
-    To start a simulator takes as long as a short training. A pair whose block fails is closed. The
-    others are closed by `close_shared_pairs`, or with the process.
+    To start a simulator takes as long as a short training. A pair whose block fails is closed, the
+    others by `close_shared_pairs`, or with the process.
     """
     key = json.dumps(settings, sort_keys=True)
     if key not in _shared:

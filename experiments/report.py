@@ -220,10 +220,7 @@ def make_charts(curves: Curves, headline: Headline) -> list[Chart]:
 
 
 def chart_data(charts: Sequence[Chart], agents: Sequence[str]) -> list[dict[str, Any]]:
-    """Give the charts as what JSON can hold: rounded, thinned, missing values as None.
-
-    A series names its agent by the place in `agents`.
-    """
+    """Charts for JSON: rounded, thinned, without a value None; agents by their place."""
     return [
         {
             "key": chart.key,

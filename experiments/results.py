@@ -122,10 +122,8 @@ def step_schema(metric: str) -> pa.Schema:
 def write_config(
     folder: Path, command: str, spec: EnvSpec, vehicle: str | None, content: Mapping[str, Any]
 ) -> None:
-    """Write `config.json`.
-
-    Besides the user's command, the env's spec and the path of its vehicle it has the content:
-    settings of the comparison or the sweep, with which all of `CONFIG_KEYS` are there.
+    """Write `config.json`: the user's command, the env's spec, the path of its vehicle, and
+    the settings of the comparison or the sweep, with which all of `CONFIG_KEYS` are there.
     """
     whole = {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -224,9 +222,7 @@ def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]
 
 
 def step_table(metric: str, **columns: Any) -> pa.Table:
-    """Rows of `steps.parquet`: its columns but `step`, the metric's as `value`; one value or (T,)
-    each.
-    """
+    """Rows of `steps.parquet`: columns but `step`, the metric's as `value`; one value or (T,)."""
     columns["step"] = np.arange(1, len(columns["reward"]) + 1)
     frame = pd.DataFrame({_in_file(name, metric): column for name, column in columns.items()})
     table = pa.Table.from_pandas(frame, step_schema(metric), preserve_index=False)

@@ -199,10 +199,9 @@ class SweepConfig(_ManyRuns):
         return [dict(zip(names, chosen, strict=True)) for chosen in values]
 
     def runs(self) -> dict[str, tuple[int, Run]]:
-        """Every training by name, with its point, in the order in which they start.
+        """Every training by name, with its point: all points with one seed, then with the next.
 
-        All points with the first seed, then all with the second: a sweep that is stopped has seen
-        every point.
+        So a sweep that is stopped has seen every point.
         """
         points = self.points()
         words = [" ".join(f"{name}={value}" for name, value in one.items()) for one in points]

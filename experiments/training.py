@@ -146,8 +146,8 @@ class Training:
         )
 
     def _recent_means(self, count: int) -> dict[str, float]:
-        """Over so many episodes, or as many as there are drones, if that is more: of those that
-        began together the shortest end first, and the last few to end are those that flew longest.
+        """Over so many episodes, at least as many as drones: of those that began together the
+        shortest end first.
         """
         recent = self.log.episodes[-max(count, self.run.num_envs) :]
         if not recent:
@@ -165,9 +165,7 @@ class Training:
 def train_run(
     run: Run, env: AnyEnv, tell: Tell, snapshots: int = 0, keep_steps: bool = False
 ) -> tuple[Training, dict[str, Any]]:
-    """Train to the end as comparisons and sweeps do: the training, and how long it took, as
-    `env_steps`, `seconds` and `steps_per_second`.
-    """
+    """Train to the end: the training, and its `env_steps`, `seconds` and `steps_per_second`."""
     training = Training(run, env, snapshots=snapshots, keep_steps=keep_steps)
     training.train(tell=tell)
     steps, seconds = training.log.env_steps, training.log.seconds

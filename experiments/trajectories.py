@@ -28,9 +28,7 @@ Ending = Literal["terminated", "truncated", "cut off"]
 
 
 def evaluation_seed(episode: int, of: EpisodeSet = "curve") -> int:
-    """Seed of an evaluation episode: the same for every agent, and of no training, whose seeds are
-    spawned by another key from another number.
-    """
+    """Seed of an evaluation episode: the same for every agent, and of no training."""
     sequence = np.random.SeedSequence(_EVALUATION, spawn_key=(_SETS.index(of), episode))
     return int(sequence.generate_state(1, np.uint64)[0])
 

@@ -93,10 +93,7 @@ class Workers:
         keep: Callable[[_Job, _Value], None],
         env: EnvConfig | None = None,
     ) -> None:
-        """Do all jobs, and hand each with its result to `keep` (in this process).
-
-        Raises `RunsFailed` if some failed; the others were kept.
-        """
+        """Do all jobs, and hand each with its result to `keep`. Raises `RunsFailed` at the end."""
         failures = []
         # Of jobs on other machines this is all the progress told.
         self._tell("all runs", 0, len(jobs), "")
@@ -125,9 +122,7 @@ def open_workers(config: WorkersConfig, on_progress: OnProgress) -> Iterator[Wor
 
 @contextmanager
 def _listening(on_progress: OnProgress) -> Iterator[tuple[_Home, OnProgress]]:
-    """Pass on the progress of runs, from a thread of its own, to the end of the block: the home
-    of the listener, and a function that passes on progress of this process.
-    """
+    """Pass on progress from a thread: the home of the listener, and what tells progress here."""
     lock = Lock()
 
     def tell(name: str, done: int, total: int, words: str) -> None:
@@ -252,9 +247,9 @@ def _done(
 ) -> Result:  # fmt: skip
     """Do a job, by its name, as of `Workers.fly` (in a worker process).
 
-    A `task` of the user's own, `module:id`, is imported. Progress is told at `home`. The versions
-    of software have to be the main process's: `config.json` tells one of each. The worker ends with
-    the process `parent`; None is another machine's.
+    It imports a `task` of the user's own, `module:id`, tells progress at `home`, and ends with the
+    process `parent` (None: another machine's). The versions of software have to be the main
+    process's: `config.json` tells one of each.
     """
     if parent is not None and os.getpid() != parent:  # one of loky's
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's affair
