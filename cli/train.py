@@ -126,7 +126,6 @@ class Train(AgentFlags):
         from ._env import CHECKPOINT
         from ._progress import bars
 
-        before = training.log.env_steps
         flags = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
         go_on = go_on_with(self, f"train {self.algorithm}", folder, *flags)
         keeper = _Keeper(training, folder, self.store_every)
@@ -150,11 +149,9 @@ class Train(AgentFlags):
                 print(go_on)
             raise
         keeper.close()
-        flown = training.log.env_steps - before
-        what = ("trained" if flown else "already trained") if finished else "stopped after"
-        print(f"{what} {training.log.env_steps:,} of {training.run.env_steps:,} env steps")
-        if flown:
-            print(f"{training.log.env_steps / training.log.seconds:,.0f} env steps per second")
+        flown, what = training.log.env_steps, "trained" if finished else "stopped after"
+        print(f"{what} {flown:,} of {training.run.env_steps:,} env steps")
+        print(f"{flown / training.log.seconds:,.0f} env steps per second")
         print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)
         return 0 if finished else 128 + signal.SIGINT
 

@@ -33,7 +33,7 @@ from ..agents.checkpoints import software_versions, write_whole
 from ..agents.policies import NetworkPolicy
 from ..envs.loop import Loop
 from ..envs.registry import env_spec
-from ..models.errors import InputError
+from ..models.errors import expect
 from ..models.vehicle import Vehicle
 from ..udp.layouts import layout_of
 from ..udp.protocol import binary
@@ -77,9 +77,8 @@ class Ratio:
 
     def reached(self, value: float) -> bool:
         """Whether a value is on the right side of the target."""
-        if self.target is None:
-            return True
-        return value <= self.target if self.at_most else value >= self.target
+        target = value if self.target is None else self.target
+        return value <= target if self.at_most else value >= target
 
 
 def _over(above: str, below: str, target: float | None = None) -> Ratio:
@@ -119,8 +118,7 @@ while True:
         break
     sock.sendto(answer, address)
 """
-_STEPS_AT_ONCE: Final = 64
-"""Single steps between two looks at the clock."""
+_STEPS_AT_ONCE: Final = 64  # between two looks at the clock
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,10 +144,8 @@ def bench(
 
     Told before each turn: name of the layer, turns done, turns in all. Raises `InputError`.
     """
-    if rounds < 1:
-        raise InputError(f"rounds: expected at least 1, got {rounds}")
-    if not 0 < seconds <= 60:
-        raise InputError(f"seconds: expected more than 0 and at most 60, got {seconds}")
+    expect(rounds >= 1, "rounds", "at least 1", str(rounds))
+    expect(0 < seconds <= 60, "seconds", "more than 0 and at most 60", str(seconds))
     rates: dict[str, list[float]] = {name: [] for name, *_ in _LAYERS}
     turns, done = (rounds + 1) * len(_LAYERS), 0
     for group in _GROUPS:
@@ -171,15 +167,16 @@ def bench(
         Layer(name=name, about=about, drones=drones, rates=tuple(rates[name]))
         for name, about, drones, _ in _LAYERS
     ]
+    values = {
+        ratio.name: {"value": round(ratio.value(layers), 3), "target": ratio.target_text}
+        for ratio in RATIOS
+    }
     content = {
         "rounds": rounds,
         "seconds": seconds,
         "layers": [asdict(layer) for layer in layers],
         "medians": {layer.name: layer.rate for layer in layers},
-        "ratios": {
-            ratio.name: {"value": round(ratio.value(layers), 3), "target": ratio.target_text}
-            for ratio in RATIOS
-        },
+        "ratios": values,
         "microseconds": {name: round(1e6 * seconds, 2) for name, seconds in parts_of(layers)},
         "machine": machine(),
         "versions": software_versions(),
@@ -263,10 +260,6 @@ def _local(stack: ExitStack, drones: int) -> Slice:
     one = drones == 1
     made: Any = gym.make(ENV_ID, disable_env_checker=True) if one else gym.make_vec(ENV_ID, drones)
     return _env(stack.enter_context(closing(made.unwrapped)))
-
-
-def _remote(stack: ExitStack, drones: int) -> Slice:
-    return _env(stack.enter_context(socket_pair(ENV_ID, num_envs=drones)))
 
 
 def _env(env: Any) -> Slice:
@@ -390,7 +383,7 @@ _LAYERS: Final[list[tuple[str, str, int, Callable[[ExitStack], Slice]]]] = [
     *((f"vector env, {n}", "the vector env", n, lambda s, n=n: _local(s, n)) for n in _MANY),
     ("UDP echo", "blocking sockets in Python, datagrams of the same sizes", 1, _echo),
     *((f"UDP, {n}", f"Remote{'Vector' * (n > 1)}Env and a simulator", n,
-       lambda s, n=n: _remote(s, n)) for n in (1, *_MANY)),
+       lambda s, n=n: _env(s.enter_context(socket_pair(ENV_ID, num_envs=n)))) for n in (1, *_MANY)),
     ("simulate", "physics, task and telemetry of one drone", 1, _simulate),
     *((name, "of one drone, binary", 1, lambda _, name=name: _codec(name)) for name in _CODEC),
     ("decide", "16 units, sampled", 1, lambda _: _policy(1)),

@@ -7,7 +7,7 @@ from datetime import datetime
 from itertools import count
 from pathlib import Path
 
-from ..models.errors import InputError
+from ..models.errors import InputError, expect
 
 
 def new_folder(out: Path | None, name: str, runs: Path = Path("runs")) -> Path:
@@ -45,8 +45,7 @@ def locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
     try:
-        if not _try_lock(file):
-            raise InputError(f"{folder}: expected a folder that no other process writes to")
+        expect(_try_lock(file), str(folder), "a folder that no other process writes to")
         yield
     finally:
         os.close(file)

@@ -109,8 +109,8 @@ class Headline(Metric):
 
 def steady_state(sizes: Values) -> float:
     """Mean of the last quarter of an episode's sizes, (T,), at least of the last; nan if T = 0."""
-    values = np.asarray(sizes, float)
-    return float(values[-max(1, values.size // 4) :].mean()) if values.size else math.nan
+    last = np.asarray(sizes, float)[-max(1, len(sizes) // 4) :]
+    return float(last.mean()) if last.size else math.nan
 
 
 def settling_time(errors: Values, control_period: float, tolerance: float) -> float:
