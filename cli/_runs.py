@@ -59,9 +59,8 @@ def report_comparison(folder: Path, *, film: bool = True) -> None:
     """Write figures, film and report from the folder's files, and print the table."""
     from rich.console import Console
 
-    from ..experiments.report import VIDEO_FILE, table_of, write_report
+    from ..experiments.report import VIDEO_FILE, table_of, terminal_table, write_report
     from ..experiments.results import read_results
-    from ..experiments.tables import terminal_table
     from ..models.errors import InputError
     from ._progress import frame_bar
 

@@ -14,7 +14,15 @@ from rich.console import Console
 from rotorgram.experiments.figures import FIGURE_FILES, draw_figures, make_curves
 from rotorgram.experiments.metrics import Headline
 from rotorgram.experiments.palette import agent_color, agent_label, sort_agents
-from rotorgram.experiments.report import VIDEO_FILE, table_of, write_report
+from rotorgram.experiments.report import (
+    VIDEO_FILE,
+    headings,
+    result_rows,
+    table_note,
+    table_of,
+    terminal_table,
+    write_report,
+)
 from rotorgram.experiments.results import (
     EVALUATION_COLUMNS,
     ResultsError,
@@ -22,7 +30,6 @@ from rotorgram.experiments.results import (
     read_results,
     read_steps,
 )
-from rotorgram.experiments.tables import headings, result_rows, table_note, terminal_table
 
 
 @pytest.fixture(scope="module")
