@@ -4,13 +4,13 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..envs.rendering import moment
+from ..envs.rendering import moments
 from ..rendering.live import MOST_DRONES, LiveView, Pace, open_surface
-from ..rendering.stage import Moment, Stage
+from ..rendering.stage import Stage
 from ..udp.protocol.messages import Command, Message, State
 from ..udp.transport.simulator import Observer, Simulator
 
@@ -29,42 +29,22 @@ class Watcher:
 
     def __init__(self, live: LiveView, simulator: Simulator) -> None:
         self._live: LiveView | None = live
-        self._spec, self._stepped = simulator.spec, simulator.stepped
-        self._count = live.stage.drones
-        self._steps = np.zeros(self._count, np.int64)
-        self._episodes = np.zeros(self._count, np.int64)
+        self._loop: Any = simulator.stepped  # the command flies registered tasks alone
+        self._steps = np.zeros(live.stage.drones, np.int64)
+        self._episodes = np.zeros(live.stage.drones, np.int64)
 
     def __call__(self, cause: Message | None, state: State) -> None:
-        """See one State, and what led to it."""
-        self._count_steps(cause)
-        live = self._live
+        """See one State, and what led to it; episodes count in which something was flown."""
+        count, live = len(self._steps), self._live
+        resets = cause.resets[:count] if isinstance(cause, Command) else True
+        self._episodes += resets & (self._steps > 0)
+        self._steps = self._loop.steps[:count]
         if live is None or not live.wants or not self._is_open(live):
             return
         now = time.monotonic()
         if live.pace.wait(now) is not None:
-            live.draw(*self._moments())
+            live.draw(*moments(self._loop, self._episodes.tolist()))
             live.pace.stepped(now)
-
-    def _count_steps(self, cause: Message | None) -> None:
-        """Steps since each drone's reset; episodes in which something was flown."""
-        steps, resets = self._steps, np.ones(self._count, bool)
-        if isinstance(cause, Command):
-            resets = cause.resets[: self._count]
-            steps += ~(resets | cause.frozen[: self._count])
-        self._episodes += resets & (steps > 0)
-        steps[resets] = 0
-
-    def _moments(self) -> Iterator[Moment]:
-        telemetry, rewards = self._stepped.telemetry, self._stepped.rewards
-        for drone in range(self._count):
-            step = int(self._steps[drone])
-            yield moment(
-                self._spec,
-                {name: array[drone] for name, array in telemetry.items()},
-                reward=float(rewards[drone]) if step else 0.0,
-                step=step,
-                episode=int(self._episodes[drone]),
-            )
 
     def _is_open(self, live: LiveView) -> bool:
         try:

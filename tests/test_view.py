@@ -323,7 +323,10 @@ def test_a_watched_simulator_flies_the_same_bits_and_does_not_wait(stage: Stage)
 
 
 def simulator_of(*heights: float, rotors: int = 4) -> Any:
-    """What a watcher reads of a simulator: drones at these heights, 0.5 m below their goals."""
+    """What a watcher reads of a simulator: drones at these heights, 0.5 m below their goals.
+
+    `advance` flies what led to a State, before the watcher sees it.
+    """
     drones = len(heights)
     position, goal = np.zeros((drones, 3)), np.zeros((drones, 3))
     position[:, 1], goal[:, 1] = heights, np.add(heights, 0.5)
@@ -334,9 +337,20 @@ def simulator_of(*heights: float, rotors: int = 4) -> Any:
         "goal": goal,
         "metrics": np.full((drones, 1), 0.5),
     }
-    stepped = SimpleNamespace(num_envs=drones, telemetry=telemetry, rewards=np.full(drones, 0.25))
     spec = env_spec(ELEVATION, {}, HEXA if rotors == 6 else None)
-    return SimpleNamespace(spec=spec, stepped=stepped)
+    loop = SimpleNamespace(spec=spec, telemetry=telemetry)
+
+    def advance(cause: Message | None = None) -> Message | None:
+        """Steps and rewards as `Loop` has them after a Command; otherwise as after a reset."""
+        flies = cause.orders == 0 if isinstance(cause, Command) else np.zeros(drones, bool)
+        keeps = ~cause.resets if isinstance(cause, Command) else flies
+        loop.steps = np.where(keeps, loop.steps + flies, 0)
+        loop.rewards = np.where(flies, 0.25, 0.0)
+        return cause
+
+    loop.steps = np.zeros(drones, int)
+    advance()
+    return SimpleNamespace(spec=spec, stepped=loop, advance=advance)
 
 
 def state(drones: int = 1) -> State:
@@ -376,7 +390,8 @@ class RecordingView:
 
 def test_a_watcher_counts_steps_and_episodes_of_each_drone() -> None:
     view = RecordingView(Stage("plain", 2))
-    watcher = Watcher(view, simulator_of(4.0, 6.0, 8.0))  # type: ignore[arg-type]
+    simulator = simulator_of(4.0, 6.0, 8.0)
+    watcher = Watcher(view, simulator)  # type: ignore[arg-type]
     causes: list[Message] = [
         Welcome(session=1, nonce=1),
         command("r", "r", "r"),  # as an agent begins: nothing was flown yet
@@ -386,7 +401,7 @@ def test_a_watcher_counts_steps_and_episodes_of_each_drone() -> None:
         command("s", "r", "s"),
     ]
     for cause in causes:
-        watcher(cause, state(3))
+        watcher(simulator.advance(cause), state(3))
     counted = [[(m.step, m.episode) for m in moments] for moments in view.drawn]
     assert counted == [
         [(0, 0), (0, 0)],
@@ -410,14 +425,15 @@ def test_a_watcher_shows_the_rotors_that_there_are() -> None:
 
 def test_a_pause_freezes_the_picture_alone() -> None:
     view = RecordingView(Stage("plain"))
-    watcher = Watcher(view, simulator_of(5.0))  # type: ignore[arg-type]
+    simulator = simulator_of(5.0)
+    watcher = Watcher(view, simulator)  # type: ignore[arg-type]
     watcher(None, state())
     view.pace.press("pause")
     for _ in range(3):
-        watcher(command("s"), state())  # returns: lock-step goes on
+        watcher(simulator.advance(command("s")), state())  # returns: lock-step goes on
     view.pace.press("step")
     for _ in range(3):
-        watcher(command("s"), state())
+        watcher(simulator.advance(command("s")), state())
     assert [moments[0].step for moments in view.drawn] == [0, 4]
 
 
