@@ -224,7 +224,23 @@ def judge_no_worse(
     """
     margin = MARGIN_SHARE * (headline.held or np.nan)
     final = metrics.final_per_run(evaluations, headline)
-    outcome, evidence = _no_worse(final, agents, margin, headline)
+    names = ("a2c", "sb3-a2c")
+    ours, theirs = (final.loc[final["agent"] == name, "steady"].to_numpy() for name in names)
+    difference, low, high = metrics.bootstrap_difference(ours, theirs)
+    best, worst = (-high, -low) if headline.high else (low, high)
+    evidence = (
+        f"A2C {_number(metrics.iqm(ours))}, SB3 A2C {_number(metrics.iqm(theirs))}; difference "
+        f"{headline.amount(_number(difference))}"
+    )
+    outcome: Outcome
+    if missing := [name for name in names if name not in agents]:
+        outcome, evidence = "not tested", _untrained(missing)
+    elif min(np.isfinite(ours).sum(), np.isfinite(theirs).sum()) < MIN_SEEDS:
+        outcome, evidence = "undecided", f"{evidence}; {_TOO_FEW}."
+    else:
+        outcome = "borne out" if worst < margin else "undecided"
+        outcome = "not borne out" if best > margin else outcome
+        evidence += f", 95 % interval {headline.amount(_range(low, high))}."
     return Verdict(
         claim="Our A2C is no worse than Stable-Baselines3's after as many env steps.",
         source=OURS,
@@ -238,39 +254,18 @@ def judge_no_worse(
     )
 
 
-def _no_worse(
-    final: pd.DataFrame, agents: Collection[str], margin: float, headline: Headline
-) -> tuple[Outcome, str]:
-    names = ("a2c", "sb3-a2c")
-    if missing := [name for name in names if name not in agents]:
-        return "not tested", _untrained(missing)
-    ours, theirs = (final.loc[final["agent"] == name, "steady"].to_numpy() for name in names)
-    difference, low, high = metrics.bootstrap_difference(ours, theirs)
-    evidence = (
-        f"A2C {_number(metrics.iqm(ours))}, SB3 A2C {_number(metrics.iqm(theirs))}; difference "
-        f"{headline.amount(_number(difference))}"
-    )
-    if min(np.isfinite(ours).sum(), np.isfinite(theirs).sum()) < MIN_SEEDS:
-        return "undecided", f"{evidence}; {_TOO_FEW}."
-    evidence += f", 95 % interval {headline.amount(_range(low, high))}."
-    best, worst = (-high, -low) if headline.high else (low, high)
-    if worst < margin:
-        return "borne out", evidence
-    return ("not borne out" if best > margin else "undecided"), evidence
-
-
 def _holds(runs: pd.DataFrame, headline: Headline) -> tuple[Outcome, str]:
     """Whether one agent holds its goal in its final evaluations, and the numbers."""
     if runs.empty:
         return "not tested", "not trained"
-    values = runs["steady"].to_numpy()
+    values, total = runs["steady"].to_numpy(), runs[["crashed", "held", "episodes"]].sum()
     low, high = metrics.bootstrap_interval(values)
-    count, crashed = int(np.isfinite(values).sum()), int(runs["crashed"].sum())
-    text = f"{headline.amount(_number(metrics.iqm(values)))} ({_seeds(count, len(values))}"
+    count, crashed = int(np.isfinite(values).sum()), total["crashed"]
     interval = f"95 % interval {headline.amount(_range(low, high))}"
-    text += f", {interval if np.isfinite(low) else 'no interval'}"
-    text += f", {int(runs['held'].sum())} hold)"
-    text += f", {crashed} of {int(runs['episodes'].sum())} episodes crashed" if crashed else ""
+    interval = interval if np.isfinite(low) else "no interval"
+    text = f"{headline.amount(_number(metrics.iqm(values)))} ({_seeds(count, len(values))}"
+    text += f", {interval}, {total['held']} hold)"
+    text += f", {crashed} of {total['episodes']} episodes crashed" if crashed else ""
     if count < MIN_SEEDS:
         return "undecided", text
     near, far = (high, low) if headline.high else (low, high)
