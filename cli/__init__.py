@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from errno import ENOSPC, EPIPE
 from importlib import import_module
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Final, TypeGuard, cast
 
 if TYPE_CHECKING:
@@ -103,27 +104,23 @@ def _run(words: list[str]) -> int:
         known = ", ".join(COMMANDS)
         print(f"rotorgram: expected a command of {known}, got {name}", file=sys.stderr)
         return 2
-    from shutil import get_terminal_size
-
     from ..rendering.gl import hidden_gl_setting
     from ._flags import parse
 
     if get_terminal_size().columns < 40:  # tyro does not end on narrower terminals
         os.environ["COLUMNS"] = "40"
     with hidden_gl_setting():  # importing OpenGL takes time, also for a command that draws nothing
-        kind: type[Command] = getattr(import_module(f".{_module(name)}", __name__), COMMANDS[name])
+        module = import_module("." + name.replace("-", "_"), __name__)
+        kind: type[Command] = getattr(module, COMMANDS[name])
         return parse(kind, f"rotorgram {name}", words[1:]).run()
-
-
-def _module(command: str) -> str:
-    return command.replace("-", "_")
 
 
 def _help() -> str:
     lines = ["usage: rotorgram [-h] [--version] COMMAND ...", "", _ABOUT, "", "commands:"]
     for name, kind in COMMANDS.items():
-        source = Path(__file__).with_name(f"{_module(name)}.py")  # read, not imported: for speed
-        (node,) = (n for n in ast.parse(source.read_bytes()).body if getattr(n, "name", "") == kind)
+        file = name.replace("-", "_") + ".py"  # read, not imported: for speed
+        body = ast.parse(Path(__file__).with_name(file).read_bytes()).body
+        (node,) = (one for one in body if getattr(one, "name", "") == kind)
         summary = ast.get_docstring(cast(ast.ClassDef, node)) or ""
         lines.append(f"  {name:12} {summary.partition(chr(10))[0]}")
     return "\n".join([*lines, "", "rotorgram COMMAND --help lists the flags of a command."])

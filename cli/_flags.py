@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Final, Literal, TypeVar, Union, cast, get_args, get_type_hints
+from typing import Annotated, Any, Final, TypeVar, Union, cast, get_args, get_type_hints
 
 import tyro
 from tyro.conf import Fixed, Suppress, arg
@@ -17,10 +17,6 @@ from ..experiments.folders import new_folder
 from ..models.errors import InputError, expect
 
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
-
-# As in agents/presets.py, which is not imported for them before the flags are checked.
-AlgorithmName = Literal["vpg", "a2c", "sb3-a2c"]
-PresetName = Literal["paper", "tuned"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass, replace
 
+from ..agents import AlgorithmName
 from ..experiments.settings import CompareConfig, WorkersConfig
 from ..models.errors import expect, require
-from ._flags import AlgorithmName, refuse_settings
+from ._flags import refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_comparison, runs_folder
 
 

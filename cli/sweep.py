@@ -7,9 +7,10 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from ..agents import AlgorithmName
 from ..experiments.settings import SweepConfig, WorkersConfig
 from ..models.errors import expect
-from ._flags import AlgorithmName, parse_value, refuse_settings
+from ._flags import parse_value, refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_sweep, runs_folder
 
 

@@ -12,20 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..agents import A2CConfig, Episode, load, preset, store
+from ..agents import A2CConfig, AlgorithmName, Episode, load, preset, store
 from ..agents.checkpoints import software_versions, write_whole
+from ..agents.presets import PresetName
 from ..experiments.folders import locked
 from ..experiments.settings import Run
 from ..models.errors import expect, require
-from ._flags import (
-    AgentFlags,
-    AlgorithmName,
-    PresetName,
-    folder_to_write,
-    go_on_with,
-    parse_value,
-    refuse_settings,
-)
+from ._flags import AgentFlags, folder_to_write, go_on_with, parse_value, refuse_settings
 
 if TYPE_CHECKING:
     from ..experiments.training import Training

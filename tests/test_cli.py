@@ -22,7 +22,7 @@ from rotorgram.agents import load
 from rotorgram.agents.checkpoints import store
 from rotorgram.cli import COMMANDS, main
 from rotorgram.cli._env import chosen_env
-from rotorgram.cli._flags import AlgorithmName, PresetName, parse
+from rotorgram.cli._flags import parse
 from rotorgram.cli._scalars import ScalarWriter
 from rotorgram.cli.serve import Serve
 from rotorgram.cli.sim import Sim
@@ -165,13 +165,6 @@ def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Sim, "run", broken)
     with pytest.raises(ValueError, match="broadcast"):
         main(["sim"])
-
-
-def test_algorithms_and_presets_are_those_of_the_agents() -> None:
-    from rotorgram.agents import presets
-
-    assert AlgorithmName == presets.AlgorithmName
-    assert PresetName == presets.PresetName
 
 
 def test_flags_that_are_set_to_their_default_are_set() -> None:
