@@ -19,7 +19,7 @@ class Evaluate(AgentFlags):
 
     def run(self) -> int:
         """Fly and print the means."""
-        import numpy as np
+        import pandas as pd
 
         from ..experiments.metrics import Headline
         from ..experiments.results import evaluation_row
@@ -32,23 +32,19 @@ class Evaluate(AgentFlags):
             headline = Headline.of(env.env_spec)
             policy = policy_for(self, checkpoint, env.env_spec)
             trajectories = fly_episodes(env, policy, self.episodes, "final")
-        rows = [evaluation_row(trajectory, headline) for trajectory in trajectories]
-
-        def mean(name: str) -> float:
-            return float(np.nanmean([row[name] for row in rows]))
-
-        def amount(name: str) -> str:
-            return headline.amount(f"{mean(name):.4f}")
-
+        rows = pd.DataFrame([evaluation_row(trajectory, headline) for trajectory in trajectories])
+        mean = rows.mean()
+        measures = [f"{mean[name]:.4f}" for name in ("steady", "overshoot")]
+        steady, overshoot = map(headline.amount, measures)
         print(f"policy     {self.policy} on {trajectories[0].spec.env_id}")
-        print(f"episodes   {len(rows)}, {sum(row['terminated'] for row in rows)} terminated")
-        print(f"return     {mean('return'):.1f}")
-        print(f"steady     {headline.size_symbol} {amount('steady')}")
+        print(f"episodes   {len(rows)}, {rows['terminated'].sum()} terminated")
+        print(f"return     {mean['return']:.1f}")
+        print(f"steady     {headline.size_symbol} {steady}")
         if headline.settles:
-            count = sum(not np.isnan(row["settling_time"]) for row in rows)
-            when = f"{mean('settling_time'):.2f} s" if count else "never"
+            count = rows["settling_time"].count()
+            when = f"{mean['settling_time']:.2f} s" if count else "never"
             bound = headline.amount(f"{headline.settled:g}")
             print(f"settling   to {bound}: {when} ({count} of {len(rows)} episodes)")
         if headline.signed:
-            print(f"overshoot  {amount('overshoot')}")
+            print(f"overshoot  {overshoot}")
         return 0

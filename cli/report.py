@@ -19,10 +19,10 @@ class Report(Command):
 
     def run(self) -> int:
         """Write figures and report from the files, and print the table."""
-        from ..experiments.sweep import is_sweep
+        from ..experiments.results import read_config
         from ._runs import report_comparison, report_sweep
 
-        if is_sweep(self.folder):
+        if "sweep" in read_config(self.folder):
             report_sweep(self.folder)
         else:
             report_comparison(self.folder, film=self.film)

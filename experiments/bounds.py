@@ -31,7 +31,13 @@ def elevation_bounds(
 ) -> dict[str, float]:
     """Mean returns of the two flights by name, over episodes that start at E in m, shape (n,)."""
     steps, period = options.episode_length, options.control_period
-    up, down, change = _limits(options, vehicle)
+    # Largest accelerations up and down, m/s², and the largest change of one in a control step.
+    up = float(vehicle.thrust_high.sum()) / vehicle.mass - vehicle.gravity
+    down = vehicle.gravity - float(vehicle.thrust_low.sum()) / vehicle.mass
+    newtons = options.thrust_scale or SHARES[options.action_mode] * float(vehicle.thrust_high.max())
+    change = vehicle.num_rotors * newtons / vehicle.mass
+    if options.action_mode == "offset":
+        up, down, change = min(up, change), min(down, change), np.inf
     rising = starts > 0
     towards, against = np.where(rising, up, down), np.where(rising, down, up)
     drag = options.linear_drag
@@ -40,17 +46,6 @@ def elevation_bounds(
         "time-optimal": float(elevation_reward(left).sum(axis=1).mean()),
         "hover": float(steps * elevation_reward(starts).mean()),
     }
-
-
-def _limits(options: ElevationOptions, vehicle: Vehicle) -> tuple[float, float, float]:
-    """Largest accelerations up and down, m/s², and the largest change of one in a control step."""
-    up = float(vehicle.thrust_high.sum()) / vehicle.mass - vehicle.gravity
-    down = vehicle.gravity - float(vehicle.thrust_low.sum()) / vehicle.mass
-    newtons = options.thrust_scale or SHARES[options.action_mode] * float(vehicle.thrust_high.max())
-    scale = vehicle.num_rotors * newtons / vehicle.mass
-    if options.action_mode == "increment":
-        return up, down, scale
-    return min(up, scale), min(down, scale), np.inf
 
 
 def elevation_reward(errors: Floats) -> Floats:

@@ -73,10 +73,8 @@ def socket_pair(
             raise PeerClosed(sentence if own else ended + words) from error
         finally:
             env.close()
-            assert process.stdin is not None
-            process.stdin.close()
             try:
-                process.wait(_STOP_TIMEOUT)
+                process.communicate(timeout=_STOP_TIMEOUT)  # closes its standard input
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()

@@ -143,11 +143,6 @@ def read_sweep_runs(folder: Path, config: SweepConfig) -> pd.DataFrame:
     return rows
 
 
-def is_sweep(folder: Path) -> bool:
-    """Whether a folder is a sweep's, not a comparison's. Raises `ResultsError` if neither's."""
-    return "sweep" in results.read_config(folder)
-
-
 def read_sweep_config(folder: Path) -> SweepConfig:
     """Settings of a sweep, from its `config.json`. Raises `ResultsError`."""
     content = results.read_config(folder)

@@ -10,10 +10,12 @@ from typing import Any, Final, Literal
 import gymnasium as gym
 import numpy as np
 
+from ..agents.episodes import LOST
 from ..agents.policies import Policy
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.spec import Discrete, EnvSpec, canonical_id, component_names
 from ..models.errors import InputError, expect
+from ..udp.protocol.messages import Command, State
 
 _EVALUATION: Final = 20230324  # the day the paper appeared
 
@@ -89,8 +91,6 @@ def fly(env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int =
     """One episode of a policy in an env of one drone, local or remote; once more, if its simulator
     was lost. Without a policy, actions are drawn at random, the same for the same seed.
     """
-    from ..udp import LOST
-
     lost = True
     while lost:
         observation, info = env.reset(seed=seed)
@@ -258,8 +258,6 @@ class _Reader:
 
     def take(self, message: Any) -> None:
         """The next message of the session."""
-        from ..udp.protocol.messages import Command, State
-
         command, drone = self._command, self._drone
         if isinstance(message, Command):
             self._command = message
