@@ -140,6 +140,6 @@ def _colors(agents: Sequence[str]) -> list[str]:
     colors: list[str] = []
     for agent in agents:
         own = agent_color(agent, dark=True)
-        free = [color for color in DARK_COLORS.values() if color not in colors]
+        free = [color for color in DARK_COLORS if color not in colors]
         colors.append(own if own not in colors or not free else free[-1])
     return colors

@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -32,8 +32,6 @@ MOST_FRAMES: Final = 1_000_000
 _SPACE: Final = 2  # pixels between panes
 _DARK: Final = (13, 18, 26)
 _ASPECT: Final = 1.2  # of a pane that shows a craft and its graph well
-_COMPARISON: Final[dict[str, Any]] = {"height": 400, "camera": "front", "fast": True, "quality": 27}
-"""Small enough for a page that holds the film in itself."""
 
 
 def moments(trajectory: Trajectory) -> list[Moment]:
@@ -230,7 +228,9 @@ def film_comparison(
     from .results import read_results
 
     results = read_results(folder)
-    config = Film(**_COMPARISON, world=world, vehicle=results.config["vehicle"])
+    vehicle = results.config["vehicle"]
+    # Small enough for a page that holds the film in itself.
+    config = Film(height=400, camera="front", fast=True, quality=27, world=world, vehicle=vehicle)
     fresh = out.with_name(f".fresh-{out.name}")
     fresh.unlink(missing_ok=True)
     try:

@@ -101,11 +101,6 @@ class Headline(Metric):
         bound = np.nan if self.held is None else self.held  # no number is above or below nan
         return np.asarray(array >= bound if self.high else array < bound)
 
-    def worst(self, sizes: Values) -> float:
-        """The worst of the values that are not missing; nan if there is none."""
-        worst = np.fmin if self.high else np.fmax  # nan only if all are
-        return float(worst.reduce(np.asarray(sizes, float), initial=math.nan))
-
 
 def steady_state(sizes: Values) -> float:
     """Mean of the last quarter of an episode's sizes, (T,), at least of the last; nan if T = 0."""
@@ -295,7 +290,7 @@ def results_table(
             row[name] = iqm(own[name])
             row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(own[name])
         row["held"] = math.nan if headline.held is None else own["held"].sum()
-        row["worst"] = headline.worst(own["steady"])
+        row["worst"] = own["steady"].agg("min" if headline.high else "max")
         row |= own[["episodes", "settled", "crashed"]].sum().to_dict()
         trained = runs[(runs["agent"] == agent) & (runs["env_steps"] > 0)]
         row["reached"], steps, seconds = math.nan, np.empty(0), np.empty(0)

@@ -4,20 +4,21 @@ from collections.abc import Iterable
 from typing import Final
 
 _LABELS: Final = {"vpg": "VPG", "a2c": "A2C", "sb3-a2c": "SB3 A2C", "pid": "PID"}
-# Okabe and Ito's palette: told apart by readers with colour-blindness.
-_COLORS: Final = {"vpg": "#D55E00", "a2c": "#0072B2", "sb3-a2c": "#009E73", "pid": "#555555"}
-_SPARE_COLORS: Final = ("#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
-DARK_COLORS: Final = {
-    "#D55E00": "#F58A3C",
-    "#0072B2": "#55B0F0",
-    "#009E73": "#2CC998",
-    "#555555": "#B4BCC4",
-    "#CC79A7": "#E29AC3",
-    "#E69F00": "#F0B840",
-    "#56B4E9": "#7CC8F2",
-    "#8C564B": "#C9938A",
+# Okabe and Ito's palette: told apart by readers with colour-blindness. The second of a pair is the
+# same hue, lighter, for a dark ground.
+_COLORS: Final = {
+    "vpg": ("#D55E00", "#F58A3C"),
+    "a2c": ("#0072B2", "#55B0F0"),
+    "sb3-a2c": ("#009E73", "#2CC998"),
+    "pid": ("#555555", "#B4BCC4"),
 }
-"""The same hues, lighter, for a dark ground."""
+_SPARE: Final = (
+    ("#CC79A7", "#E29AC3"),
+    ("#E69F00", "#F0B840"),
+    ("#56B4E9", "#7CC8F2"),
+    ("#8C564B", "#C9938A"),
+)
+DARK_COLORS: Final = [dark for _, dark in (*_COLORS.values(), *_SPARE)]
 
 
 def agent_label(agent: str) -> str:
@@ -27,9 +28,8 @@ def agent_label(agent: str) -> str:
 
 def agent_color(agent: str, dark: bool = False) -> str:
     """Give an agent's colour, the same in every figure and report; lighter for a dark ground."""
-    spare = _SPARE_COLORS[sum(agent.encode()) % len(_SPARE_COLORS)]
-    color = _COLORS.get(agent, spare)
-    return DARK_COLORS[color] if dark else color
+    spare = _SPARE[sum(agent.encode()) % len(_SPARE)]
+    return _COLORS.get(agent, spare)[dark]
 
 
 def sort_agents(names: Iterable[str]) -> list[str]:

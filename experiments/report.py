@@ -92,13 +92,12 @@ def write_report(folder: Path | str, results: Results | None = None) -> Path:
         film = video.read_bytes()
         with suppress(MissingPackage, OSError):  # where FFmpeg is missing, the film has no poster
             picture = poster(video)
-    page = _page(
-        results, table, verdicts, curves,
-        video=base64.b64encode(film).decode("ascii"),
-        poster=base64.b64encode(picture).decode("ascii"),
-        files={path.relative_to(folder).as_posix() for path in folder.rglob("*")},
-    )  # fmt: skip
-    report.write_text(page, encoding="utf-8")
+    media: dict[str, Any] = {
+        "video": base64.b64encode(film).decode("ascii"),
+        "poster": base64.b64encode(picture).decode("ascii"),
+        "files": {path.relative_to(folder).as_posix() for path in folder.rglob("*")},
+    }
+    report.write_text(_page(results, table, verdicts, curves, **media), encoding="utf-8")
     return report
 
 
