@@ -1,8 +1,6 @@
 """`rotorgram serve`: a policy as a UDP server, for simulators that come."""
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -28,6 +26,7 @@ class Serve(AgentFlags):
     def run(self) -> int:
         """Fly episode after episode."""
         from ..experiments.trajectories import fly_episodes
+        from ..udp import LinkError
         from ._env import chosen_env, load_checkpoint, policy_for, remote_env, words_of
 
         check_count("episodes", self.episodes)
@@ -38,19 +37,10 @@ class Serve(AgentFlags):
             drones = getattr(env, "num_envs", 1)
             while self.episodes is None or episode < self.episodes:
                 count = min(drones, (self.episodes or math.inf) - episode)
-                with _next_simulator():
+                try:
                     for flown in fly_episodes(env, policy, int(count), first=episode):
                         print(f"episode {episode}: {words_of(flown)}", flush=True)
                         episode += 1
+                except LinkError as error:  # one that leaves is no error: another may come
+                    print(error, flush=True)
         return 0
-
-
-@contextmanager
-def _next_simulator() -> Iterator[None]:
-    """A simulator that leaves is no error to an agent that waits for the next."""
-    from ..udp import LinkError
-
-    try:
-        yield
-    except LinkError as error:
-        print(error, flush=True)

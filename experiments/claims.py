@@ -30,32 +30,25 @@ Fewer are too few for what differs between seeds: one seed in ten on which an ag
 from ten seeds in a third of the cases, from thirty in a twenty-fifth; and a claim decided on ten
 seeds became undecided on ten fresh ones.
 """
-
 MARGIN_SHARE: Final = 0.2
 """Margin of non-inferiority, as a share of the bound below which a goal counts as held. Ours: for
 the elevation task 0.02 m, a hundredth of the craft's width and far above what its agents differ by.
 """
-
 OURS: Final = "A claim of this software, not of the paper"
 
 MIN_EPISODES: Final = 10
 """Training episodes below which a run's curve says nothing."""
-
 CONVERGENCE_BAND: Final = 0.1
 """Share of the smoothed curve's range within which it counts as converged."""
-
 SMOOTHING_SHARE: Final = 0.1
 """Share of training over which the episode return is averaged."""
-
 LEARNING_RISE: Final = 3.0
 """Rise, in standard deviations of the late level, above which a curve counts as learning.
 
 About 7 % of curves of uncorrelated noise without any trend exceed it (simulated).
 """
-
 FLUCTUATION_WINDOW: Final = 11
 """Episodes in the centred moving average around which the fluctuation is measured."""
-
 _GRID: Final = 100
 
 _TOO_FEW: Final = f"fewer than {MIN_SEEDS} seeds with a value decide nothing"

@@ -35,13 +35,10 @@ from .results import Results, read_results
 
 VIDEO_FILE: Final = "video.mp4"
 """The agents side by side; the page has it in itself where it lies in the folder."""
-
 MAX_POINTS: Final = 500
 """Points of a series above which it is thinned."""
-
 NOTHING: Final = "–"
 """Shown where there is no value."""
-
 _X_DIGITS: Final = 7
 _Y_DIGITS: Final = 4
 

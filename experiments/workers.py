@@ -19,6 +19,7 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
+from functools import cache
 from itertools import islice
 from threading import Lock, Thread
 from typing import Any, Final, NamedTuple, TypeVar
@@ -34,13 +35,10 @@ _WATCH_EVERY: Final = 0.5  # s
 
 OnProgress = Callable[[str, int, int, str], None]
 """Called with a run's name, the amounts done and in total, and a status text."""
-
 Tell = Callable[[int, int, str], None]
 """The same for one run, without its name."""
-
 _Home = tuple[str, int]
 """Where progress is told: the name of the machine, and a port."""
-
 _Job = TypeVar("_Job")
 _Value = TypeVar("_Value")
 _Function = Callable[[_Job, Tell], _Value]
@@ -265,14 +263,11 @@ def _done(
         return Result(name, f"{name}: {type(error).__name__}: {error}", None)
 
 
-_watched: set[int] = set()
-
-
+@cache
 def _watch(parent: int) -> None:
-    """End this process as soon as its parent has ended, by whatever signal."""
-    if parent in _watched or os.getppid() != parent:
+    """End this process as soon as its parent has ended, by whatever signal; once is enough."""
+    if os.getppid() != parent:
         return
-    _watched.add(parent)
 
     def watch() -> None:
         while os.getppid() == parent:
