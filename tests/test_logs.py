@@ -17,7 +17,7 @@ import torch
 from rich.console import Console
 from rotorgram.agents import A2CConfig, VPGConfig, make_agent, preset
 from rotorgram.agents.a2c import A2C
-from rotorgram.agents.checkpoints import load
+from rotorgram.agents.checkpoints import Checkpoint, load, store
 from rotorgram.agents.episodes import EpisodeLog
 from rotorgram.agents.sb3 import SB3VecEnv
 from rotorgram.agents.vpg import VPG
@@ -295,14 +295,13 @@ def test_the_curves_of_a_killed_training_go_on_as_if_it_had_not_been(
 ) -> None:
     """Killed where it hurts most: the curves are written, the checkpoint is the one before."""
     folder, broken = tmp_path / "whole", tmp_path / "broken"
-    store = Training.store
 
-    def copy_before(training: Training, path: Path) -> None:
-        if path.exists() and training.log.env_steps >= 800 and not broken.exists():
+    def copy_before(checkpoint: Checkpoint, path: Path) -> None:
+        if path.exists() and checkpoint.position.env_steps >= 800 and not broken.exists():
             shutil.copytree(folder, broken)
-        store(training, path)
+        store(checkpoint, path)
 
-    monkeypatch.setattr(Training, "store", copy_before)
+    monkeypatch.setattr("rotorgram.cli.train.store", copy_before)
     settings = ("--env-steps", 2400, *sized(algorithm), "--store-every", 0.05)
     whole = train(algorithm, folder, *settings)
     behind = load(broken / "checkpoint.safetensors").position.env_steps
