@@ -261,7 +261,7 @@ class EnvSpec(_Part):
     def from_json(cls, text: str) -> Self:
         """The reverse of `to_json`. Raises `SpecError`, and nothing else, for any other text."""
         try:
-            content = json.loads(text)
+            content = json.loads(text, parse_float=_finite, parse_constant=_finite)
         except (ValueError, RecursionError) as error:
             raise SpecError(f"spec: expected JSON, got {text[:80]!r}: {error}") from None
         given = cls._fields(content)
@@ -312,6 +312,13 @@ def _is_number(value: Any) -> bool:
     return type(value) in (int, float)
 
 
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"expected a finite number, got {text:.80}")
+    return value
+
+
 def _plain(value: Any) -> Any:
     """A field's value for JSON."""
     if isinstance(value, _Part):
@@ -324,7 +331,7 @@ def _plain(value: Any) -> Any:
 def json_values(options: Any) -> dict[str, Any]:
     """Options as JSON gives them back: tuples become lists. Raises `SpecError`."""
     try:
-        text = json.dumps(dict(options), allow_nan=False, ensure_ascii=False)
+        text = json.dumps({**options}, allow_nan=False, ensure_ascii=False)
         text.encode()  # half a surrogate pair cannot be sent
         plain: dict[str, Any] = json.loads(text)
     except (TypeError, ValueError, RecursionError) as error:

@@ -1,5 +1,6 @@
 """Both state machines, with a clock of their own: who says what, when, and what changes nothing."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -33,6 +34,7 @@ from rotorgram.udp import LinkConfig
 from rotorgram.udp.protocol import binary, text
 from rotorgram.udp.protocol.auth import Key
 from rotorgram.udp.protocol.client import Client, RoundTrips
+from rotorgram.udp.protocol.fragments import Transfer, Window
 from rotorgram.udp.protocol.messages import (
     Alive,
     Close,
@@ -147,7 +149,9 @@ def test_an_agent_takes_what_its_table_says(where: AgentState, sealed: bool) -> 
         event = server.receive(wire(message), HERE, 0.0)
         then = AGENT.get((where, Way.RECEIVED, type(message)))
         session = server.slots[0]
-        if where is AgentState.CLOSED or (where is AgentState.WELCOMED and then is None):
+        if where is AgentState.CLOSED or (
+            where is AgentState.WELCOMED and then is not AgentState.DECIDING
+        ):
             assert session is None
             assert event is None
         elif then is AgentState.CLOSED:
@@ -452,10 +456,45 @@ def test_a_session_that_has_ended_is_not_taken_up() -> None:
     assert server.take_outgoing() == []
 
 
+@BOTH
+def test_a_simulator_that_closes_before_its_first_state_is_answered(sealed: bool) -> None:
+    wire = Wire("simulator", sealed)
+    server = agent_at(AgentState.WELCOMED, wire, sealed)
+    server.receive(wire(close(0)), HERE, 0.0)
+    ((reply, _),) = server.take_outgoing()
+    link = to(simulator(sealed=sealed), SimulatorState.READY, Wire("agent", sealed))
+    link.close("bye", 0.0)
+    link.receive(reply, 0.0)
+    assert link.state is SimulatorState.CLOSED
+    assert not server._openings
+
+
+def test_a_state_0_is_not_answered() -> None:
+    server = agent()
+    server.receive(binary.encode(replace(state(1), sequence=0), ONE), HERE, 0.0)
+    assert server.take_outgoing() == []
+    assert dropped(server) == {"malformed": 1}
+
+
+def test_the_longest_hello_comes_in_fragments() -> None:
+    server = agent()
+    extensions = (Extension(number=1, value=bytes(512)),) * 64
+    longest = hello(spec="x" * (1 << 22), extensions=extensions)
+    transfer = Transfer(binary.encode(longest), 65_483, Window())
+    fragments, answer = transfer.start(), None
+    while fragments:
+        for fragment in fragments:
+            server.receive(fragment, HERE, 0.0)
+        ((data, _),) = server.take_outgoing()
+        answer = plain(data)
+        fragments = transfer.resend(answer) if isinstance(answer, Missing) else []
+    assert isinstance(answer, Welcome)
+
+
 def test_what_is_remembered_of_strangers_is_bounded() -> None:
     server = agent(max_datagram=1200)
     long = hello(spec='{"x":"' + "y" * 5000 + '"}')
-    for number in range(3000):
+    for number in range(1, 3001):
         server.receive(binary.encode(hello(session=number)), ("127.0.0.1", number), 0.0)
         data = binary.frame(129, number, 0, b"\0\0\5\0\0\0\0\0" + binary.encode(long)[:1000])
         server.receive(data, ("127.0.0.2", number), 0.0)

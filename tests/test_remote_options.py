@@ -25,6 +25,7 @@ from rotorgram.udp import LinkError, PeerClosed, Refused, RemoteEnv, RemoteVecto
 from rotorgram.udp.__main__ import parse_arguments
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.messages import Hello, Refuse
+from rotorgram.udp.transport.agent import AgentConfig
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and forks")
 
@@ -454,3 +455,12 @@ def test_the_spec_over_the_wire_is_that_of_the_env(tmp_path: Path) -> None:
         assert pair.remote.env_spec == env_spec(ENV_ID, {"target": 3.0})
         assert pair.remote.control_period == 0.02
         assert threading.active_count() < 20
+
+
+def test_a_world_of_two_drones_is_more_than_one_drone() -> None:
+    two = replace(env_spec(ENV_ID), agents=("first", "second"))
+    hello = Hello(session=1, spec=two.to_json())
+    assert AgentConfig(drones=1).accept(hello) == "expected a simulator of one drone, got one of 2"
+    layout = AgentConfig(drones=2).accept(hello)
+    assert not isinstance(layout, str)
+    assert layout.drones == 2

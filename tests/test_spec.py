@@ -290,6 +290,16 @@ def test_a_spec_of_which_one_part_is_something_else(path: tuple[Any, ...], value
         '{"a":' * 100_000,
         '{"env_id": NaN}',
         "\ud800",
+        *(
+            spec_of().to_json().replace('"control_period":0.02', f'"control_period":{value}')
+            for value in (
+                "Infinity",
+                "1e400",
+                '0.02,"later":NaN',
+                '0.02,"options":[["a",1]]',
+                '0.02,"options":null',
+            )
+        ),
         "1" * 5000,
     ],
 )

@@ -104,7 +104,7 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
     ) -> None:
         self.render_mode = None
         self._flying = False
-        self._agent = Agent(address, AgentConfig(worlds=1, slots=1, **settings))
+        self._agent = Agent(address, AgentConfig(drones=1, slots=1, **settings))
         if connect:
             _connect(self)
 
@@ -235,8 +235,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         self._broken: tuple[np.ndarray, np.ndarray] | None = None
         self._flying = False
         self.metadata = {"render_modes": [], "autoreset_mode": checked_mode(autoreset_mode)}
-        worlds = num_envs // num_simulators if num_envs else None
-        self._agent = Agent(address, AgentConfig(worlds=worlds, slots=num_simulators, **settings))
+        drones = num_envs // num_simulators if num_envs else None
+        self._agent = Agent(address, AgentConfig(drones=drones, slots=num_simulators, **settings))
         self.closed = False
         if connect:
             _connect(self)
@@ -244,7 +244,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
     def connect(self) -> None:
         """Wait until every slot is taken."""
         spec = self._agent.connect()
-        num_envs = self.num_simulators * (self._agent.config.worlds or 1) * len(spec.agents)
+        num_envs = self.num_simulators * (self._agent.config.drones or 1)
         self._take_spec(spec, num_envs, self.metadata["autoreset_mode"])
         self._take_actions(spec.action, num_envs)
         self._shape = self.num_simulators, num_envs // self.num_simulators

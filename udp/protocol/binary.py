@@ -50,6 +50,9 @@ _EXTENSION: Final = struct.Struct("<HH")
 _LENGTH: Final = struct.Struct("<H")
 _CRITICAL: Final = 1 << 15
 _MOST_EXTENSIONS: Final = 64
+LONGEST_HELLO: Final = (
+    HEADER_SIZE + _HELLO_BODY.size + MAX_SPEC + _MOST_EXTENSIONS * (_EXTENSION.size + MAX_TEXT)
+)  # bytes
 
 
 def encode(message: Message, layout: Layout | None = None) -> bytes:

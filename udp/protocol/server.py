@@ -23,7 +23,7 @@ from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address, Tap, largest_datagram
 from .errors import DecodeError, Forged, VersionMismatch
 from .fragments import Assembler, Transfer, Window, asks, check_size, is_fragment
 from .layout import Layout
-from .messages import MAX_SPEC, Command, Message, State, one_line
+from .messages import Command, Message, State, one_line
 from .statistics import Statistics
 from .transitions import AGENT, AgentState, Way
 
@@ -185,6 +185,11 @@ class Server:
             return self._receive_known(slot, session, message, plain, arrival)
         if isinstance(message, State):
             return self._join(holder, message, plain, arrival)
+        if isinstance(message, m.Close):  # before its first State
+            self._forget(holder)
+            holder.move(Way.RECEIVED, m.Close)
+            self._put([binary.encode(_goodbye(holder, ""))], address, self._session_key(holder))
+            return None
         self._drop("foreign", type(message).__name__, arrival)
         return None
 
@@ -425,6 +430,9 @@ class Server:
         _, number, sequence = binary.peek(plain)
         if is_fragment(plain) and not asks(plain):
             return  # one answer will do
+        if not sequence:
+            self._drop("malformed", "expected a State from 1 on, got 0", arrival)
+            return
         if self.closed or self._seated(number, elsewhere=address):
             # Another address has it: no answer of ours may end it.
             self._drop("foreign", f"session {number:016x}", arrival)
@@ -535,7 +543,7 @@ class Server:
         kind, number, sequence = binary.check(fragment)
         kind &= ~binary.FRAGMENT
         if kind == binary.HELLO and holder is None:
-            assembler = self._assembler((arrival.address, number), MAX_SPEC + 4096)
+            assembler = self._assembler((arrival.address, number), binary.LONGEST_HELLO)
         elif kind == binary.HELLO and holder and holder.state is AgentState.WELCOMED:
             if asks(fragment):
                 self._repeat(holder)

@@ -78,6 +78,7 @@ AGENT: Final[dict[tuple[AgentState, Way, type[m.Message]], AgentState]] = {
     (_A.WELCOMED, _SENT, m.Welcome): _A.WELCOMED,
     (_A.WELCOMED, _SENT, m.Missing): _A.WELCOMED,
     (_A.WELCOMED, _RECEIVED, m.State): _A.DECIDING,
+    (_A.WELCOMED, _RECEIVED, m.Close): _A.CLOSED,
     (_A.WELCOMED, _SENT, m.Unknown): _A.CLOSED,
     (_A.WELCOMED, _SENT, m.Close): _A.CLOSED,
     (_A.DECIDING, _SENT, m.Alive): _A.DECIDING,

@@ -68,8 +68,8 @@ class AgentConfig:
     record: Path | str | None = None
     slots: int = 1
     """Simulators to fly at the same time."""
-    worlds: int | None = None
-    """Worlds of each simulator; None: as many as the first has."""
+    drones: int | None = None
+    """Drones of each simulator; None: as many as the first has."""
     spec: EnvSpec | None = None
     """Of the simulator that joined last; None before the first."""
 
@@ -86,17 +86,18 @@ class AgentConfig:
         """The layout of a simulator, or why it is refused."""
         try:
             spec = _spec(hello.spec)
-            return self._difference(spec, hello.worlds) or layout_of(spec, hello.worlds)
+            drones = hello.worlds * len(spec.agents)
+            return self._difference(spec, drones) or layout_of(spec, hello.worlds)
         except InputError as error:
             return str(error)
 
-    def _difference(self, spec: EnvSpec, worlds: int) -> str:
+    def _difference(self, spec: EnvSpec, drones: int) -> str:
         env_id = canonical_id(spec.env_id)
         if self.env_id is not None and env_id != self.env_id:
             return f"expected a simulator of {self.env_id}, got one of {env_id}"
-        if self.worlds is not None and worlds != self.worlds:
-            drones = "one drone" if self.worlds == 1 else f"{self.worlds} drones"
-            return f"expected a simulator of {drones}, got one of {worlds}"
+        if self.drones is not None and drones != self.drones:
+            wanted = "one drone" if self.drones == 1 else f"{self.drones} drones"
+            return f"expected a simulator of {wanted}, got one of {drones}"
         if self.vehicle_hash is not None and spec.vehicle_hash != self.vehicle_hash:
             got = f"{spec.vehicle} of {spec.vehicle_hash}"
             return f"expected a vehicle of hash {self.vehicle_hash}, got {got}"
@@ -124,7 +125,7 @@ class AgentConfig:
         It is the env with the paper's vehicle, made here: text is not flown where that cannot be.
         """
         env_id = self.env_id
-        if env_id is None or not registry.is_known(env_id) or self.worlds not in (None, 1):
+        if env_id is None or not registry.is_known(env_id) or self.drones not in (None, 1):
             return None
         try:
             spec = registry.env_spec(env_id, dict(self.options or {}))
@@ -274,9 +275,9 @@ class Agent:
         self._keep_sockets()
         if session.hello:
             self.server.takes_text = False
-            config.spec, config.worlds = _spec(session.hello.spec), session.hello.worlds
+            config.spec, config.drones = _spec(session.hello.spec), session.layout.drones
         else:
-            config.spec, config.worlds = config.text_spec, 1
+            config.spec, config.drones = config.text_spec, 1
         if slot in self.states and not self.lost[slot]:
             self._lose(slot, f"the simulator at {address_text(address)} was started anew")
             _log.warning("%s", self.lost[slot])
