@@ -1,4 +1,4 @@
-"""Bounds of the elevation task: the largest return, and that of hovering in place.
+"""Bounds of the elevation task: nearly the largest return, and that of hovering in place.
 
 **Time-optimal.** From rest at the start to rest on the target in the least time that
 gravity and the action's limits allow. For a double integrator, and for one whose acceleration has a

@@ -199,6 +199,7 @@ def test_one_agent_that_fails_refutes_both_even_if_the_other_was_not_trained():
         ([0.2, 0.3, 0.4, 0.5, 0.6] * 6, "not borne out"),
         ([0.02] * 20 + [0.4] * 10, "undecided"),  # the interval reaches beyond 0.1
         ([0.02] * 30 + [math.nan], "undecided"),  # a seed without a value proves nothing
+        ([0.02] * 28 + [0.9] * 2, "undecided"),  # two seeds do not hold, and the mean hides them
     ],
 )
 def test_holding_the_target(vpg, expected):
@@ -245,6 +246,7 @@ def test_verdicts_are_frozen_and_state_their_source_and_preset():
         # Alike on average, but the interval reaches beyond the margin: overlap shows nothing.
         ([0.0, 0.3] * 15, [0.0, 0.3] * 15, "undecided"),
         ([0.01] * 29, [0.02] * 29, "undecided"),
+        ([0.01] * 28 + [3.0] * 2, [0.02] * 30, "undecided"),  # two seeds hold no more
     ],
 )
 def test_no_worse_is_shown_by_a_margin(ours, theirs, expected):
