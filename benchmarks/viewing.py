@@ -3,9 +3,10 @@
     xvfb-run -a -s "-screen 0 1280x800x24" python benchmarks/viewing.py [--rounds 5] [--seconds 3]
 
 Every turn starts a simulator of its own (`rotorgram sim`) for an agent here, waits until both fly,
-and counts control steps. The turns alternate; medians count, of rates and of their ratios within a
-round. Where chromium is installed a page is also watched by one, without a screen: it draws on the
-same processors, as no remote browser would.
+and counts control steps, and pictures that are handed to the window or the page. The turns
+alternate; medians count, of rates and of their ratios within a round. Where chromium is installed a
+page is also watched by one, without a screen: it draws on the same processors, as no remote browser
+would.
 """
 
 import argparse
@@ -40,19 +41,43 @@ glfw.make_context_current(glfw.create_window(16, 16, "", None, None))
 print(glGetString(GL_RENDERER).decode())
 """
 
+SIM = """
+import json, sys, time
+from rotorgram.cli import main
+from rotorgram.rendering.web import WebPage
+from rotorgram.rendering.window import Window
+
+shown = []
+
+def counted(show):
+    def note(*arguments):
+        shown.append(time.monotonic())
+        show(*arguments)
+    return note
+
+for surface in (WebPage, Window):
+    surface.show = counted(surface.show)
+sys.argv[0] = "rotorgram"
+status = main()
+print(json.dumps(shown))
+sys.exit(status)
+"""
+"""`rotorgram sim`, which writes when it handed pictures on."""
+
 
 @contextmanager
-def simulator(drones: int, kind: str, address: tuple[str, int]) -> Iterator[None]:
-    """A simulator in a process of its own, watched in one way."""
+def simulator(drones: int, kind: str, address: tuple[str, int]) -> Iterator[list[float]]:
+    """A simulator in a process of its own, watched in one way: afterwards when it was drawn."""
     view = {"none": [], "window": ["--view", "window"]}.get(
         kind, ["--view", "web", "--view-port", str(PORT)]
     )
     server = "{}:{}".format(*address)
     words = ["--server", server, "--bind", "127.0.0.1:0", "--num-envs", str(drones), *view]
-    command = [sys.executable, "-m", "rotorgram.cli", "sim", *words]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        yield
-        process.wait()
+    command, shown = [sys.executable, "-c", SIM, "sim", *words], list[float]()
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        yield shown
+        told, _ = process.communicate()
+        shown += json.loads(told.splitlines()[-1])
 
 
 @contextmanager
@@ -85,23 +110,27 @@ def fly(env: Any, drones: int, seconds: float) -> float:
     return steps / (time.perf_counter() - start)
 
 
-def turn(drones: int, kind: str, seconds: float) -> float:
+def turn(drones: int, kind: str, seconds: float) -> tuple[float, float]:
+    """Control steps and pictures per second."""
     here = ("127.0.0.1", 0)
     env: Any = (
         RemoteEnv(here, connect=False)
         if drones == 1
         else RemoteVectorEnv(here, num_envs=drones, connect=False)
     )
-    with simulator(drones, kind, env.address):
+    with simulator(drones, kind, env.address) as shown:
         try:
             env.reset(seed=0)
             with browser() if kind == "page and browser" else nullcontext():
                 if kind != "none":
                     fly(env, drones, SETTLE)
                 fly(env, drones, 0.5)
-                return fly(env, drones, seconds)
+                start = time.monotonic()
+                rate = fly(env, drones, seconds)
+                end = time.monotonic()
         finally:
             env.close()
+    return rate, sum(start < moment <= end for moment in shown) / (end - start)
 
 
 def ratio(watched: list[float], alone: list[float]) -> float:
@@ -120,24 +149,28 @@ def main() -> None:
     renderer = subprocess.run(
         [sys.executable, "-c", RENDERER], capture_output=True, text=True, check=True
     ).stdout.strip()
-    rates: dict[str, dict[str, list[float]]] = {
-        str(drones): {kind: [] for kind in kinds} for drones in (1, 64)
-    }
+    rates, pictures = (
+        {str(drones): {kind: list[float]() for kind in kinds} for drones in (1, 64)} for _ in "12"
+    )
     for number in range(args.rounds):
         order = kinds[number % len(kinds) :] + kinds[: number % len(kinds)]
         for drones in (1, 64):
             for kind in order:
-                rate = turn(drones, kind, args.seconds)
+                rate, drawn = turn(drones, kind, args.seconds)
                 rates[str(drones)][kind].append(round(rate, 1))
-                print(f"{drones:3} drones, {kind}: {rate:,.0f} control steps/s", flush=True)
-    medians = {
-        drones: {kind: statistics.median(many) for kind, many in of.items()}
-        for drones, of in rates.items()
-    }
+                pictures[str(drones)][kind].append(round(drawn, 1))
+                told = f"{rate:,.0f} control steps/s, {drawn:.1f} pictures/s"
+                print(f"{drones:3} drones, {kind}: {told}", flush=True)
+    medians, drawn_medians = (
+        {drones: {kind: statistics.median(many) for kind, many in of.items()}
+         for drones, of in measured.items()}
+        for measured in (rates, pictures)
+    )  # fmt: skip
     result = {
         "rounds": args.rounds,
         "seconds": args.seconds,
         "control_steps_per_second": medians,
+        "pictures_per_second": drawn_medians,
         "of_that_without": {
             drones: {kind: ratio(many, of["none"]) for kind, many in of.items()}
             for drones, of in rates.items()
