@@ -8,10 +8,10 @@ PACKAGES := models sim envs udp agents rendering experiments cli
 # What trains, draws, reports and records; Ray, Warp and the tools of `make test` are left out.
 install: .venv/.train,record,render,report
 
-# A short comparison: three agents, three seeds, four drones; two and a half minutes on two cores. Too short
+# A short comparison: three agents, three seeds, eight drones; a minute and a half on two cores. Too short
 # and too few seeds to decide the paper's claims: docs/results.md has the long one.
 demo: .venv/.train,render,report
-	$(BIN)/rotorgram compare --seeds 3 --env-steps 80000 --num-envs 4 --episodes 10
+	$(BIN)/rotorgram compare --seeds 3 --env-steps 80000 --num-envs 8 --episodes 10
 
 # First what may share the two cores, then what measures time, by itself.
 test: lint types docs

@@ -13,7 +13,7 @@ from typing import Any, Final
 import gymnasium as gym
 import numpy as np
 
-from ..models.errors import InputError, NotCopied
+from ..models.errors import InputError, NotCopied, expect
 from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..models.vehicle import Vehicle
 from ..sim import Array, Backend, Draw, PhysicsError, Pose, World, make_world, on_host
@@ -35,6 +35,9 @@ def make_task(
 ) -> Task:
     """The task of an env id with options by name, for W worlds of A drones. Raises `InputError`."""
     kind = registry.task_type(env_id)
+    for name in ("setup", "begin", "observe", "outcome"):
+        own = getattr(kind, name) is not getattr(Task, name)
+        expect(own, env_id, f"a task with a method {name}()", f"{kind.__name__} without one")
     checked = kind.Options.from_options(options)
     craft = Vehicle.load(vehicle, linear_drag=checked.linear_drag)
     craft.substeps(checked.control_period)  # raises where they do not go together
@@ -177,6 +180,7 @@ class Loop(NotCopied):
         ]
         none = self.world.state.touching != self.world.state.touching  # all False, on its device
         self._none, self._nobody = none, none.reshape(num_envs)
+        self._everybody: Array = ~none
         self.terminated = self.truncated = self.done = self._nobody
         self.rewards: Array = 0.0 * self._nobody
         self.observations: dict[str, Array] = {}
@@ -242,14 +246,14 @@ class Loop(NotCopied):
             self._anyone_waits = True
             raise
         self._steps = self._steps + (1 if some is None else some)
+        self.task.remember(world.state, self._everybody if some is None else some)
 
     def _begin(self, mask: Array, seeds: Any, chosen: Mapping[str, np.ndarray]) -> None:
         """Begin the episodes of the drones of a mask, bool, shape (N,)."""
         world, lead = self.world, self.world.shape
-        if not self._begun:  # the first time a task wants all of them
-            everybody = (~self._nobody).reshape(lead)[()]
-            if not mask.all():
-                world.reset(everybody, self._start(everybody, world.draw(everybody)))
+        if not (self._begun or mask.all()):  # the first time a task wants all of them
+            everybody = self._everybody
+            world.reset(everybody, self._start(everybody, world.draw(everybody)))
         some = mask.reshape(lead)[()]
         if seeds is not None:
             world.seed(some, seeds)

@@ -295,7 +295,8 @@ def _existing(folder: Path | str, name: str) -> Path:
 def _check_names(path: Path, kind: str, wanted: Iterable[str], present: Iterable[str]) -> None:
     if missing := [name for name in wanted if name not in set(present)]:
         lacks = f"{kind}{'s' * (len(missing) > 1)} {', '.join(missing)}"
-        raise ResultsError(f"{path} lacks the {lacks}; it has {', '.join(present) or 'none'}")
+        has = ", ".join(present) or "none"
+        raise ResultsError(f"{path} lacks the {lacks}; it has {has}. Is it of a comparison?")
 
 
 def _read_csv(folder: Path | str, name: str, metric: str) -> pd.DataFrame:

@@ -227,7 +227,8 @@ def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
     force, torque = model.actuator_gear[index, :3], model.actuator_gear[index, 3:]
     size = math.hypot(*force)
     newtons = size * float(model.actuator_gainprm[index, 0])
-    limited = model.actuator_ctrllimited[index] and newtons != 0.0
+    expect(newtons != 0.0, "vehicle", f"{rotor} to have a force (gear times gain)", "0 N")
+    limited = model.actuator_ctrllimited[index]
     expect(limited, "vehicle", f"{rotor} to have a thrust with limits (ctrlrange)")
     turn = data.site_xmat[site].reshape(3, 3)
     low, high = sorted((model.actuator_ctrlrange[index] * abs(newtons)).tolist())

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal, NamedTuple, Self, get_args
 import mujoco
 import numpy as np
 
-from ..models.errors import expect
+from ..models.errors import InputError, expect
 from ..models.frames import pose_in_mujoco_frame
 from ..models.scene import SCENE_PREFIX, World, build_scene
 from ..models.vehicle import Vehicle
@@ -159,8 +159,14 @@ class Stage:
     ) -> None:
         expect(drones >= 1, "drones", "1 or more", f"{drones}")
         self.drones, self.vehicle = drones, Vehicle.load(vehicle)
-        spec = build_scene(self.vehicle.path, world)
-        self.radius, top = _size(spec.compile())
+        try:
+            spec = build_scene(self.vehicle.path, world)
+            self.radius, top = _size(spec.compile())
+        except InputError:
+            raise
+        except ValueError as error:  # a texture is missing, which the physics does not need
+            reason = " ".join(str(error).split())
+            raise InputError(f"vehicle: expected a file that can be drawn, got: {reason}") from None
         self._offsets = _grid(drones, _SPACING * self.radius)
         self._spread = float(np.ptp(self._offsets, axis=0).max())
         _free_body(spec).add_camera(  # sees nose, front rotors and horizon

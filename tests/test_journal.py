@@ -32,6 +32,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from peers import ANY, ENV_ID, Running
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rotorgram.cli.replay import Replay
 from rotorgram.envs.loop import Loop
 from rotorgram.envs.spec import EnvSpec
 from rotorgram.models.errors import InputError
@@ -786,6 +787,7 @@ def test_a_damaged_file_is_read_up_to_the_damage(flight: SimpleNamespace, tmp_pa
     assert not summary.complete
     assert summary.ending.startswith("damaged (")
     assert all(session.identical for session in Verification(path).sessions)
+    assert Replay(file=path, verify=True).run() == 1, "a script must not take it for verified"
 
 
 RECORD = """

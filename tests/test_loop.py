@@ -163,6 +163,51 @@ class Careless(Task):
         return Outcome(reward={"climb": climb}, terminated=False, metrics={"climb": climb})
 
 
+class Counting(Careless):
+    """Counts the steps of an episode, in its memory."""
+
+    count: Any = 0.0
+
+    def begin(self, mask: Any, draw: Any) -> Pose:
+        self.count = self.xp.where(mask, 0.0, self.count)
+        return super().begin(mask, draw)
+
+    def remember(self, state: Any, mask: Any) -> None:
+        self.count = self.count + self.xp.where(mask, 1.0, 0.0)
+
+    def outcome(self, state: Any) -> Outcome:
+        climb = 0.0 * state.velocity[..., 2]
+        return Outcome(reward={"none": climb}, terminated=False, metrics={"climb": self.count})
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_a_tasks_memory_is_that_of_the_drones_that_flew(num_envs: int) -> None:
+    register("counting-v0", Counting)
+    try:
+        loop = Loop("counting-v0", num_envs)
+    finally:
+        gym.registry.pop("counting-v0")
+    actions, everyone = np.zeros((num_envs, 1), np.float32), np.ones(num_envs, bool)
+    first = np.arange(num_envs) == 0
+    loop.advance(actions, everyone, range(num_envs))
+    assert loop.metrics["climb"].tolist() == [0.0] * num_envs
+    loop.advance(actions)
+    loop.advance(actions, frozen=first)
+    loop.advance(actions)
+    assert loop.metrics["climb"].tolist() == np.where(first, 2.0, 3.0).tolist()
+    loop.advance(actions, first, range(num_envs))
+    assert loop.metrics["climb"].tolist() == np.where(first, 0.0, 4.0).tolist()
+
+
+def test_a_task_without_a_method_is_told_which() -> None:
+    register("unfinished-v0", type("Unfinished", (Task,), {"setup": Careless.setup}))
+    try:
+        with pytest.raises(InputError, match=r"a task with a method begin\(\), got Unfinished"):
+            Loop("unfinished-v0")
+    finally:
+        gym.registry.pop("unfinished-v0")
+
+
 @pytest.fixture
 def careless() -> Iterator[str]:
     register("careless-v0", Careless)

@@ -239,6 +239,15 @@ def test_craft_side_by_side_stand_as_far_apart_as_their_size_asks(opengl: None) 
                 assert 0 < rows.min() <= rows.max() < HEIGHT - 1
 
 
+def test_a_vehicle_without_its_texture_is_one_sentence(tmp_path: Path) -> None:
+    file = tmp_path / "hexa.xml"
+    texture = '<asset><texture name="t" type="2d" file="no.png"/><material name="m" texture="t"/>'
+    file.write_text(HEXA.read_text().replace("<worldbody>", f"{texture}</asset><worldbody>", 1))
+    for world in ("plain", "airport"):
+        with pytest.raises(InputError, match=r"vehicle: expected a file that can be drawn, got: "):
+            Stage(world, vehicle=file)  # type: ignore[arg-type]
+
+
 def test_a_moment_of_another_vehicle_is_one_sentence() -> None:
     with pytest.raises(InputError, match=r"vehicle: expected a file with 4 rotors.*hexa\.xml"):
         Stage("plain", vehicle=HEXA).show(at(5.0))

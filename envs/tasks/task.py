@@ -123,11 +123,19 @@ class Task:
         """
         raise NotImplementedError
 
+    def remember(self, state: WorldState, mask: Array) -> None:
+        """Change the memory of episodes, such as gates that were passed. Optional.
+
+        Called after a step, before `observe`. The mask, bool, shape (W, A), has the drones that
+        flew; keep the values of the others: `self.xp.where(mask, new, self.old)`.
+        """
+
     def observe(self, state: WorldState) -> dict[str, Array]:
         """Observations: an array (W, A, *shape) for each of `observation`, by its name.
 
-        Called after every step and reset. The loop copies the arrays and gives them their dtype;
-        they have to lie within the bounds of their specs.
+        Called after every step and reset, and for frozen drones too: change nothing here or in
+        `outcome`, which is called next. The loop copies the arrays and gives them their dtype; they
+        have to lie within the bounds of their specs.
         """
         raise NotImplementedError
 
