@@ -565,7 +565,11 @@ def test_the_page_of_the_docs_tells_what_the_benchmark_wrote() -> None:
     page = (docs / "viewing.md").read_text()
     result = json.loads((docs / "results" / "performance" / "viewing.json").read_text())
     rates, ratios = result["control_steps_per_second"], result["of_that_without"]
+    pictures = result["pictures_per_second"]
     for kind in rates["1"]:
-        one, many = (f"{rates[n][kind]:,.0f} | {ratios[n][kind]:.2f}" for n in ("1", "64"))
+        one, many = (
+            f"{rates[n][kind]:,.0f} | {ratios[n][kind]:.2f} | {pictures[n][kind] or '–'}"
+            for n in ("1", "64")
+        )
         assert f" | {one} | {many} |" in page
     assert result["opengl"] in page
