@@ -322,7 +322,11 @@ HEIGHTS = '<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>
             "rotor rotor1",
         ),
         (ROTOR1, ROTOR1.replace("gear", 'refsite="imu" gear'), "rotor1 to act without a reference"),
-        (ROTOR1, ROTOR1.replace("0 0 1 0", "0 0 0 0"), "rotor1 to have a force .gear times gain., got 0 N"),
+        (
+            ROTOR1,
+            ROTOR1.replace("0 0 1 0", "0 0 0 0"),
+            "rotor1 to have a force .gear times gain., got 0 N",
+        ),
         ('ctrllimited="true"', 'ctrllimited="false"', "rotor1 to have a thrust with limits"),
         ('ctrlrange="0 100"', 'ctrlrange="0 40"', r"49 N, within its limits, got 0 to 40 N"),
         ('gear="0 0 1', 'gear="0.2 0 1', "without a torque or a sideways force, got ones"),
