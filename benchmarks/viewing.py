@@ -149,9 +149,12 @@ def main() -> None:
     renderer = subprocess.run(
         [sys.executable, "-c", RENDERER], capture_output=True, text=True, check=True
     ).stdout.strip()
-    rates, pictures = (
-        {str(drones): {kind: list[float]() for kind in kinds} for drones in (1, 64)} for _ in "12"
-    )
+    rates: dict[str, dict[str, list[float]]] = {
+        str(drones): {kind: [] for kind in kinds} for drones in (1, 64)
+    }
+    pictures: dict[str, dict[str, list[float]]] = {
+        drones: {kind: [] for kind in kinds} for drones in rates
+    }
     for number in range(args.rounds):
         order = kinds[number % len(kinds) :] + kinds[: number % len(kinds)]
         for drones in (1, 64):

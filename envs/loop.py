@@ -52,35 +52,33 @@ def _check_returned(
     spec: EnvSpec, observed: Any, outcome: Any, num_envs: int, *, alone: bool
 ) -> None:
     """Tell the author of a task what its methods have to return. Raises `InputError`."""
-
-    def expect(ok: bool, sentence: str) -> None:
-        if not ok:
-            raise InputError(f"{spec.env_id}: expected {sentence}")
-
-    names = [array.name for array in spec.observation]
+    env_id, names = spec.env_id, [array.name for array in spec.observation]
     mapping = isinstance(observed, Mapping)
     got = list(observed) if mapping else type(observed).__name__
     right = mapping and observed.keys() >= set(names)
-    expect(right, f"observe() to return a dict of {names}, got {got}")
+    expect(right, env_id, f"observe() to return a dict of {names}", f"{got}")
     for array in spec.observation:
         shape = tuple(getattr(observed[array.name], "shape", ()))
         expect(
             prod(shape) == num_envs * array.size,
+            env_id,
             f"observe() to return {array.name} of shape {array.shape} for each of {num_envs} "
-            f"drones, got an array of shape {shape}",
+            "drones",
+            f"an array of shape {shape}",
         )
     returned = type(outcome).__name__
-    expect(isinstance(outcome, Outcome), f"outcome() to return an Outcome, got {returned}")
+    expect(isinstance(outcome, Outcome), env_id, "outcome() to return an Outcome", returned)
     for metric in spec.metrics:
         told = list(outcome.metrics)
-        expect(metric.name in told, f"the metric {metric.name!r}, got {told}")
+        expect(metric.name in told, env_id, f"the metric {metric.name!r}", f"{told}")
     expect(
         alone or any(getattr(term, "shape", ()) for term in outcome.reward.values()),
-        f"a reward for each drone, got {outcome.reward}: make an array of it, as "
-        "1.0 + 0.0 * state.position[..., 2]",
+        env_id,
+        "a reward for each drone",
+        f"{outcome.reward}: make an array of it, as 1.0 + 0.0 * state.position[..., 2]",
     )
     kind = getattr(outcome.terminated, "dtype", type(outcome.terminated).__name__)
-    expect("bool" in str(kind), f"terminated as truth values, got {kind}")
+    expect("bool" in str(kind), env_id, "terminated as truth values", f"{kind}")
 
 
 def spec_of(env_id: str, task: Task) -> EnvSpec:

@@ -54,7 +54,7 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         self.observation_space = observation_space(loop.spec)
         self.action_space = action_space(loop.spec)
         self._usual = self.action_space.dtype, self.action_space.shape
-        self._names = dict.fromkeys(telemetry_names(loop.spec), 0.0)
+        self._blank = dict.fromkeys(telemetry_names(loop.spec), 0.0)
         arrays = loop.spec.observation
         self._only = arrays[0].name if len(arrays) == 1 else ""
         self._all = np.ones(1, bool)
@@ -127,8 +127,8 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
 
     def _info(self) -> dict[str, Any]:
         loop = self._loop
-        info = self._names.copy()  # faster than to insert one name after the other
-        info |= zip(self._names, loop.row(), strict=False)
+        info = self._blank.copy()  # faster than to insert one name after the other
+        info |= zip(self._blank, loop.row(), strict=False)
         for name, term in loop.terms.items():
             info["reward_" + name] = float(term)
         return info

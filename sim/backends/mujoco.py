@@ -95,7 +95,8 @@ class MujocoWorld:
         """As `World.step`."""
         self._check_process()
         ids = None if mask is None else self._ids(mask)
-        here, some = ... if ids is None or not self.shape else ids, ... if ids is None else ids
+        some = ... if ids is None else ids
+        here = some if self.shape else ...
         self.state.thrust[here] = thrust if here is ... else thrust[here]
         self._apply_thrust()
         touching = self._touching
