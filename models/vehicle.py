@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from . import MOST_DRAG, QUAD_XML
+from .coefficients import PREFIX, Coefficients
 from .errors import InputError, expect
 from .scene import build_scene
 
@@ -74,6 +75,8 @@ class Vehicle:
     """Thrusts at which the level craft neither moves nor turns, all above 0, shape (R,), N."""
     rest_height: float
     """Height of the body's origin when it touches level ground, m."""
+    coefficients: Coefficients
+    """What effects and sensors need."""
 
     @classmethod
     def load(cls, path: Path | str | None = None, *, linear_drag: float = 0.0) -> "Vehicle":
@@ -206,7 +209,15 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
         allocation=allocation,
         hover_thrust=_hover(rotors, allocation, mass * gravity),
         rest_height=_rest_height(model, data),
+        coefficients=_coefficients(model),
     )
+
+
+def _coefficients(model: mujoco.MjModel) -> Coefficients:
+    """Those among the custom numerics of a model. Raises `InputError` for a wrong one."""
+    numerics = [model.numeric(index) for index in range(model.nnumeric)]
+    ours = [one for one in numerics if one.name.startswith(PREFIX)]
+    return Coefficients.read({one.name.removeprefix(PREFIX): one.data for one in ours})
 
 
 def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
