@@ -5,7 +5,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, get_args
 
 from ..models.errors import InputError, require
-from .random import Draw
+from .random import Draw, Noise
 from .state import Array, Pose, WorldState
 
 if TYPE_CHECKING:
@@ -67,6 +67,12 @@ class World(Protocol):
 
     def draw(self, mask: Array, chosen: Any = None) -> Draw:
         """A `Draw` for the worlds of the mask; `chosen` as in `random.NumpyDraw`."""
+
+    def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
+        """So many normal numbers of each drone in every step; `seed` seeds their streams too.
+
+        `use` as of `random.Streams`.
+        """
 
     def close(self) -> None:
         """Release threads and memory. The state keeps its numbers; nothing else can be called."""

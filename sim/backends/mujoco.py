@@ -14,7 +14,7 @@ from mujoco.batch import Batch, SimulationError
 
 from ...models.errors import InputError
 from ...models.vehicle import Vehicle
-from ..random import Draw, NumpyDraw, Streams
+from ..random import Draw, Noise, NumpyDraw, NumpyNoise, Streams
 from ..state import Array, Pose, WorldState
 from ..world import PhysicsError, contact_check
 
@@ -41,6 +41,7 @@ class MujocoWorld:
         self.vehicle = vehicle
         self.shape: tuple[int, ...] = (num_worlds, 1) if num_worlds > 1 else ()
         self._streams = Streams(num_worlds)
+        self._noises: list[Noise] = []
         self._check = contact_check(vehicle.timestep)
         threads = 1 if num_worlds == 1 else num_threads
         self._batch = batch = Batch(vehicle.model, num_worlds, threads)
@@ -116,11 +117,19 @@ class MujocoWorld:
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """As `World.seed`."""
         ids = self._ids(mask).tolist()
-        self._streams.seed(ids, [seeds[i] for i in ids])
+        given = [seeds[i] for i in ids]
+        self._streams.seed(ids, given)
+        for noise in self._noises:
+            noise.seed(ids, given)
 
     def draw(self, mask: Array, chosen: Mapping[str, Any] | None = None) -> Draw:
         """As `World.draw`."""
         return NumpyDraw(self._streams, self._ids(mask).tolist(), self.shape, chosen)
+
+    def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
+        """As `World.noise`."""
+        self._noises.append(NumpyNoise(self.shape, size, use))
+        return self._noises[-1]
 
     def close(self) -> None:
         """As `World.close`."""

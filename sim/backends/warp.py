@@ -14,7 +14,7 @@ from torch.utils.dlpack import from_dlpack
 
 from ...models.errors import InputError
 from ...models.vehicle import Vehicle
-from ..random import START, Draw
+from ..random import START, Draw, Noise
 from ..state import Array, Pose, WorldState, constant
 from ..world import PhysicsError, contact_check
 
@@ -45,6 +45,7 @@ class WarpWorld:
         self._check = contact_check(vehicle.timestep)
         self._generator = torch.Generator(self.device)
         self._generator.seed()
+        self._noises: list[TorchNoise] = []
         model = copy.copy(vehicle.model)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nothing reads them
         solid = (model.geom_contype | model.geom_conaffinity) != 0
@@ -130,10 +131,9 @@ class WarpWorld:
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """Seed the one generator of all worlds with the seeds of the mask together."""
         ids = mask.flatten().nonzero().flatten().tolist()
-        given = [int(seed) for seed in (seeds[i] for i in ids) if seed is not None]
-        if given:
-            sequence = np.random.SeedSequence(given, spawn_key=(START,))
-            self._generator.manual_seed(int(sequence.generate_state(1, np.uint64)[0]))
+        _seed(self._generator, START, [seeds[i] for i in ids])
+        for noise in self._noises:
+            noise.seed(ids, [seeds[i] for i in ids])
 
     def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
         """As `World.draw`; a seed does not give the numbers that it gives the other backends."""
@@ -170,6 +170,11 @@ class WarpWorld:
             got = values[first].tolist()
             raise InputError(f"actions: expected {expected}, got {got} for env {first}")
         return torch.where(right, values, 0.0)
+
+    def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
+        """As `World.noise`; one generator of the use gives the numbers of all worlds."""
+        self._noises.append(TorchNoise((*self.shape, size), use, self.device))
+        return self._noises[-1]
 
     def close(self) -> None:
         """Release the graphs."""
@@ -214,6 +219,36 @@ class TorchDraw(Draw):
             numbers = second * torch.randn(shape, generator=self._generator, device=device)
         mask = self._mask.reshape(*self._mask.shape, *[1] * len(size))
         return torch.where(mask, numbers, 0.0)
+
+
+class TorchNoise:
+    """A `Noise` in float32 from one generator for all worlds, which every call moves on."""
+
+    def __init__(
+        self, shape: tuple[int, ...], use: int | tuple[int, ...], device: torch.device
+    ) -> None:
+        self._shape, self._use, self._generator = shape, use, torch.Generator(device)
+        self._generator.seed()
+
+    def seed(self, ids: Sequence[int], seeds: Sequence[int | None]) -> None:
+        """As `WarpWorld.seed`."""
+        _seed(self._generator, self._use, seeds)
+
+    def normal(self, mask: Array | None = None) -> Array:
+        """As `Noise.normal`."""
+        device = self._generator.device
+        numbers = torch.randn(self._shape, generator=self._generator, device=device)
+        return numbers if mask is None else torch.where(mask[..., None], numbers, 0.0)
+
+
+def _seed(
+    generator: torch.Generator, use: int | tuple[int, ...], seeds: Sequence[int | None]
+) -> None:
+    """Seed a use's generator with all the seeds together; with none it goes on."""
+    if given := [int(seed) for seed in seeds if seed is not None]:
+        key = use if isinstance(use, tuple) else (use,)
+        state = np.random.SeedSequence(given, spawn_key=key).generate_state(1, np.uint64)
+        generator.manual_seed(int(state[0]))
 
 
 def _device(name: str | None) -> tuple[torch.device, str]:
