@@ -5,7 +5,6 @@ flies the others for one control period: `advance` is that step, the step of the
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from math import isfinite, prod
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +15,18 @@ import numpy as np
 from ..models.errors import InputError, NotCopied, expect
 from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..models.vehicle import Vehicle
-from ..sim import Array, Backend, Draw, PhysicsError, Pose, World, make_world, on_host
+from ..sim import (
+    Array,
+    Backend,
+    Draw,
+    EffectOptions,
+    PhysicsError,
+    Pose,
+    Randomization,
+    World,
+    make_world,
+    on_host,
+)  # fmt: skip
 from ..sim.state import plain
 from . import registry
 from .autoreset import Seeds, checked_seeds
@@ -92,7 +102,7 @@ def spec_of(env_id: str, task: Task) -> EnvSpec:
     )
     return EnvSpec(
         env_id=env_id,
-        options=asdict(task.options),
+        options=task.options.to_options(),
         control_period=task.options.control_period,
         vehicle=vehicle.name,
         vehicle_hash=vehicle.hash,
@@ -163,7 +173,12 @@ class Loop(NotCopied):
         **settings: Any,
     ) -> None:
         draft = make_task(env_id, options or {}, vehicle)
-        self.world: World = make_world(draft.vehicle, num_envs, backend, **settings)
+        effects = EffectOptions.from_options(draft.options.effects)
+        drawn = draft.options.randomize
+        randomize = Randomization(drawn, effects) if drawn else None
+        self.world: World = make_world(
+            draft.vehicle, num_envs, backend, effects=effects, randomize=randomize, **settings
+        )
         self._xp, lead = self.world.xp, self.world.shape
         self.task = type(draft)(draft.options, draft.vehicle, lead, self._xp)
         self.spec = spec_of(canonical_id(env_id), self.task)

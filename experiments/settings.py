@@ -28,7 +28,7 @@ class EnvConfig:
     def __post_init__(self) -> None:
         options: dict[str, Any] = dict(self.options)
         if is_known(self.env_id):
-            options = asdict(options_type(self.env_id).from_options(options))
+            options = options_type(self.env_id).from_options(options).to_options()
         object.__setattr__(self, "options", json.loads(json.dumps(options)))
 
     @property

@@ -134,6 +134,28 @@ class Vehicle:
         expect(right, "control_period", expected, f"{period!r}")
         return round(ratio)
 
+    def with_payload(self, mass: float, cable: float) -> mujoco.MjModel:
+        """The model with a ball of a mass, kg, on a cable of a length, m, from the body's origin.
+
+        The cable is a tendon that is slack below its length, and as stiff as MuJoCo's limits. The
+        ball has the density of water, and a free joint: `qpos` and `qvel` have it after the craft.
+        """
+        spec = build_scene(self.path, visual=False)
+        craft = next(body for body in spec.bodies if any(_is_free(j) for j in body.joints))
+        radius = (3 * mass / (4 * math.pi * 1000.0)) ** (1 / 3)
+        hook = craft.add_site(name="rotorgram/hook")
+        ball = spec.worldbody.add_body(name="rotorgram/payload")
+        ball.pos = craft.pos - (0.0, 0.0, cable)
+        ball.add_freejoint()
+        ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], mass=mass)
+        end = ball.add_site(name="rotorgram/payload")
+        tendon = spec.add_tendon(name="rotorgram/cable", limited=True, range=[0.0, cable])
+        tendon.wrap_site(hook.name)
+        tendon.wrap_site(end.name)
+        model = spec.compile()
+        model.dof_damping[0:3] = self.model.dof_damping[0:3]
+        return model
+
     def __deepcopy__(self, memo: Any) -> Self:
         """Itself: it never changes."""
         return self
@@ -160,6 +182,24 @@ def _compiled(path: Path) -> tuple[mujoco.MjSpec, str, mujoco.MjModel, mujoco.Mj
         reason = " ".join(str(error).split())
         raise InputError(f"vehicle: expected an MJCF file, got {path.name}: {reason}") from None
     return spec, text, model, data
+
+
+def craft_bodies(model: mujoco.MjModel) -> np.ndarray:
+    """Ids of the free body, which has the first joint, and of what is welded to it."""
+    return np.flatnonzero(model.body_rootid == model.jnt_bodyid[0])
+
+
+def body_axes(model: mujoco.MjModel) -> np.ndarray:
+    """Axes of each of `craft_bodies` in the craft's body frame, as columns, shape (B, 3, 3)."""
+    data = mujoco.MjData(model)
+    data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
+    mujoco.mj_kinematics(model, data)
+    axes: np.ndarray = data.xmat[craft_bodies(model)].reshape(-1, 3, 3)
+    return axes
+
+
+def _is_free(joint: mujoco.MjsJoint) -> bool:
+    return bool(joint.type == mujoco.mjtJoint.mjJNT_FREE)
 
 
 def _check(model: mujoco.MjModel) -> None:

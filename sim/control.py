@@ -64,14 +64,14 @@ class CollectiveThrust:
         share = component(action, 0)
         share = share - 1.0 if self.choices else clip(share, -1.0, 1.0)
         if self._alike:
-            present = component(state.thrust, 0) if self._increment else self._hover
+            present = component(state.command, 0) if self._increment else self._hover
             thrust = clip(present + self._per_action * share, self._low, self._high)
             return thrust if isinstance(thrust, float) else stack((thrust,))
         per_action, hover, low, high = (
             constant(x, state.thrust)
             for x in (self._per_action, self._hover, self._low, self._high)
         )
-        present = state.thrust if self._increment else hover
+        present = state.command if self._increment else hover
         return clip(present + per_action * stack((share,)), low, high)
 
 

@@ -34,8 +34,11 @@ class WorldState:
     """Of each body's origin, world frame, m/s, shape (W, A, 3)."""
     body_rates: Array
     """Angular velocity, body frame, rad/s, shape (W, A, 3)."""
+    command: Array
+    """Thrust that the controller last asked of each rotor, N, shape (W, A, R)."""
     thrust: Array
-    """Of each rotor during the last step, N, shape (W, A, R)."""
+    """Of each rotor at the end of the last step, N, shape (W, A, R). Without effects on rotors it
+    is the command."""
     touching: Array
     """Whether any part was in contact since the last step or reset, bool, shape (W, A)."""
 
@@ -74,6 +77,11 @@ def clip(array: Array, low: Any, high: Any) -> Array:
 def component(array: Array, index: int) -> Array:
     """`array[..., index]`; of a single drone a Python number, twenty times faster than an array."""
     return array.item(index) if array.ndim == 1 else array[..., index]
+
+
+def each(values: Array) -> Array:
+    """A drone's number for each of several: with a last axis of one; of a single drone as it is."""
+    return values if isinstance(values, float) else values[..., None]
 
 
 def plain(array: Array) -> Array:

@@ -5,7 +5,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, get_args
 
 from ..models.errors import InputError, require
+from .effects import EffectOptions
 from .random import Draw, Noise
+from .randomize import Randomization
 from .state import Array, Pose, WorldState
 
 if TYPE_CHECKING:
@@ -37,12 +39,14 @@ class World(Protocol):
         vehicle: The vehicle of every drone.
         shape: (W, A), the leading axes of all arrays; () for a single drone.
         state: As the last step or reset left it.
+        parameters: What was drawn for each drone's episode, by name, shape (W, A).
         xp: Namespace of the array API standard for the state's arrays.
     """
 
     vehicle: "Vehicle"
     shape: tuple[int, ...]
     state: WorldState
+    parameters: dict[str, Array]
     xp: Any
 
     def reset(self, mask: Array, pose: Pose) -> None:
@@ -84,7 +88,13 @@ def contact_check(timestep: float) -> int:
 
 
 def make_world(
-    vehicle: "Vehicle", num_worlds: int, backend: Backend = "mujoco", **settings: Any
+    vehicle: "Vehicle",
+    num_worlds: int,
+    backend: Backend = "mujoco",
+    *,
+    effects: EffectOptions | None = None,
+    randomize: Randomization | None = None,
+    **settings: Any,
 ) -> World:
     """W worlds of one drone each; the backend's setting is `num_threads`, or `device`.
 
@@ -105,5 +115,7 @@ def make_world(
     for package in _PACKAGES[backend]:
         require(package, "gpu", f"the backend {backend}")
     module = import_module(f".backends.{backend}", __package__)
-    world: World = getattr(module, _WORLDS[backend])(vehicle, num_worlds, **settings)
+    world: World = getattr(module, _WORLDS[backend])(
+        vehicle, num_worlds, effects=effects, randomize=randomize, **settings
+    )
     return world

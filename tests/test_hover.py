@@ -28,7 +28,8 @@ def state_of(rotors: int = 4, **arrays: Any) -> WorldState:
         "thrust": (49.0,) * rotors,
         "touching": False,
     }
-    return WorldState(**{name: np.array(value) for name, value in {**fields, **arrays}.items()})
+    given = {name: np.array(value) for name, value in {**fields, **arrays}.items()}
+    return WorldState(**given, command=given["thrust"])
 
 
 def about(axis: tuple[float, float, float], degrees: float) -> tuple[float, ...]:

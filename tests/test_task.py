@@ -31,7 +31,7 @@ def state_of(n: int, **arrays: Any) -> WorldState:
     }
     for name, values in arrays.items():
         fields[name] = np.asarray(values, fields[name].dtype).reshape(fields[name].shape)
-    return WorldState(**fields)
+    return WorldState(**fields, command=fields["thrust"])
 
 
 def task_of(n: int, target: float = 5.0, **options: Any) -> Any:
@@ -48,6 +48,8 @@ def test_defaults() -> None:
         "episode_length": 250,
         "control_period": 0.02,
         "linear_drag": 0.0,
+        "effects": {},
+        "randomize": {},
         "target": 5.0,
         "start_band": 1.0,
         "flight_band": 3.0,

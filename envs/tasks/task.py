@@ -9,7 +9,7 @@ array in place.
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from ...models import MOST_DRAG
 from ...models.errors import expect
-from ...sim import Array, Controller, Draw, Pose, WorldState
+from ...sim import Array, Controller, Draw, EffectOptions, Pose, Randomization, WorldState
 from ..spec import ArraySpec, Metric
 
 if TYPE_CHECKING:
@@ -42,6 +42,10 @@ class TaskOptions:
     of Unity's `FixedUpdate`."""
     linear_drag: float = 0.0
     """Acceleration of -linear_drag · velocity, 1/s, as Unity's `Rigidbody.drag`; at most 100."""
+    effects: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """Effects by name, as `sim.EffectOptions` has them; none are on by default."""
+    randomize: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """What is drawn for each episode: names of `sim.PARAMETERS` to distributions, as texts."""
 
     def __post_init__(self) -> None:
         length = finite(self.episode_length)
@@ -51,10 +55,24 @@ class TaskOptions:
         object.__setattr__(self, "episode_length", int(self.episode_length))
         check_number(self, "control_period", 1e-6, LONGEST_CONTROL_PERIOD, "s")
         check_number(self, "linear_drag", 0.0, MOST_DRAG, "/s")
+        effects = EffectOptions.from_options(self.effects)
+        object.__setattr__(self, "effects", effects.to_options())
+        Randomization(self.randomize, effects)  # raises
+        object.__setattr__(self, "randomize", dict(self.randomize))
         self.check()
 
     def check(self) -> None:
         """Check the options of a derived class; raise `InputError`."""
+
+    @property
+    def ideal(self) -> bool:
+        """Whether the vehicle flies as its model alone: no effects, nothing drawn."""
+        return not (self.effects or self.randomize)
+
+    def to_options(self) -> dict[str, Any]:
+        """Every option by its name, as a spec has them; of mappings those that are not empty."""
+        told = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {name: value for name, value in told.items() if value != {}}
 
     @classmethod
     def from_options(cls, options: Mapping[str, Any]) -> Self:

@@ -4,6 +4,7 @@
 of threads.
 """
 
+import copy
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -13,9 +14,11 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from ...models.errors import InputError
-from ...models.vehicle import Vehicle
-from ..random import Draw, Noise, NumpyDraw, NumpyNoise, Streams
-from ..state import Array, Pose, WorldState
+from ...models.vehicle import Vehicle, body_axes, craft_bodies
+from ..effects import EffectOptions, Effects
+from ..random import RANDOMIZATION, Draw, Noise, NumpyDraw, NumpyNoise, Streams
+from ..randomize import MODEL, Randomization
+from ..state import Array, Pose, WorldState, plain
 from ..world import PhysicsError, contact_check
 
 _FEW: Final = 8
@@ -35,16 +38,31 @@ class MujocoWorld:
 
     xp: Any = np
 
-    def __init__(self, vehicle: Vehicle, num_worlds: int, *, num_threads: int = 0) -> None:
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        num_worlds: int,
+        *,
+        effects: EffectOptions | None = None,
+        randomize: Randomization | None = None,
+        num_threads: int = 0,
+    ) -> None:
         if type(num_threads) is not int or num_threads < 0:
             raise InputError(f"num_threads: expected 0 or more, got {num_threads!r}")
         self.vehicle = vehicle
         self.shape: tuple[int, ...] = (num_worlds, 1) if num_worlds > 1 else ()
         self._streams = Streams(num_worlds)
         self._noises: list[Noise] = []
+        self._randomize, self.parameters = randomize, dict[str, Array]()
+        self._draws = Streams(num_worlds, RANDOMIZATION)
+        drawn = () if randomize is None else randomize.names
+        acting = Effects(vehicle, effects or EffectOptions(), self.noise, np, drawn)
+        self.effects = acting if acting.works else None
         self._check = contact_check(vehicle.timestep)
         threads = 1 if num_worlds == 1 else num_threads
-        self._batch = batch = Batch(vehicle.model, num_worlds, threads)
+        self._batch = batch = Batch(self._model(effects), num_worlds, threads)
+        self._cable = effects.cable if effects is not None and effects.payload else None
+        self._varied = None if randomize is None else _Varied(batch, randomize.names)
         self._owner = None if threads == 1 else os.getpid()
         self._initial = batch.state[0].copy()
         # Live views of simulator memory, made once.
@@ -56,15 +74,20 @@ class MujocoWorld:
         self._no_warnings, self._no_contacts = self._warnings.tobytes(), self._contacts.tobytes()
         newtons = np.array([rotor.newtons for rotor in vehicle.rotors])
         self._newtons = None if (newtons == 1.0).all() else newtons
-        # Where controls are newtons, they are the thrusts.
-        self._thrust = self._ctrl if self._newtons is None else np.zeros_like(self._ctrl)
+        # Where controls are newtons, they are the thrusts, and without effects the commands too.
+        alike = self._newtons is None and self.effects is None
+        self._command = self._ctrl if alike else np.zeros_like(self._ctrl)
+        differ = self.effects is not None and self.effects.on_rotors
+        self._thrust = np.zeros_like(self._ctrl) if differ else self._command
+        self._applied: np.ndarray = batch.bind("qfrc_applied")
         self._touching = np.zeros(num_worlds, bool)
         lead = self.shape
         self.state = WorldState(
             position=qpos[:, :3].reshape((*lead, 3)),
-            quaternion=qpos[:, 3:].reshape((*lead, 4)),
+            quaternion=qpos[:, 3:7].reshape((*lead, 4)),
             velocity=qvel[:, :3].reshape((*lead, 3)),
-            body_rates=qvel[:, 3:].reshape((*lead, 3)),
+            body_rates=qvel[:, 3:6].reshape((*lead, 3)),
+            command=self._command.reshape((*lead, -1)),
             thrust=self._thrust.reshape((*lead, -1)),
             touching=self._touching.reshape(lead),
         )
@@ -78,15 +101,26 @@ class MujocoWorld:
         self._warnings[ids] = 0
         state, here = self.state, () if self.shape == () else ids
         state.position[here] = pose.position[here]
-        for name, plain in (
+        for name, default in (
             ("quaternion", (1, 0, 0, 0)),
             ("velocity", 0),
             ("body_rates", 0),
             ("thrust", self.vehicle.hover_thrust),
         ):
             given = getattr(pose, name)
-            getattr(state, name)[here] = plain if given is None else given[here]
-        self._apply_thrust()
+            getattr(state, name)[here] = default if given is None else given[here]
+        state.command[here] = state.thrust[here]
+        if self._randomize is not None and self._varied is not None:
+            draw = NumpyDraw(self._draws, ids.tolist(), self.shape)
+            for name, values in self._randomize.draw(draw, np).items():
+                old = self.parameters.get(name)
+                kept = values if old is None else np.where(mask, values, old)
+                self.parameters[name] = plain(kept)
+            self._varied.apply(ids, self.parameters)
+        if self.effects is not None:
+            self.effects.begin(mask, state, self.parameters)
+        self._place_payload(ids)
+        self._apply_thrust(self._thrust)
         # To wake the threads takes longer than a few worlds.
         for some in (ids,) if len(ids) > _FEW else ids[:, None]:
             self._batch.forward(some if self.shape else None)
@@ -98,13 +132,20 @@ class MujocoWorld:
         ids = None if mask is None else self._ids(mask)
         some = ... if ids is None else ids
         here = some if self.shape else ...
-        self.state.thrust[here] = thrust if here is ... else thrust[here]
-        self._apply_thrust()
+        self.state.command[here] = thrust if here is ... else thrust[here]
+        if self.effects is None:
+            self._apply_thrust(self._command)
         touching = self._touching
         touching[some] = False
         while substeps > 0:
+            steps = min(substeps, self._check)
             try:
-                self._batch.step(ids, nstep=min(substeps, self._check))
+                if self.effects is None:
+                    self._batch.step(ids, nstep=steps)
+                else:
+                    for _ in range(steps):
+                        self._act(self.effects, mask, some)
+                        self._batch.step(ids)
             except SimulationError as error:
                 self._warnings.fill(0)  # of the other worlds: a reset is due all the same
                 raise PhysicsError(f"{error}: reset the env") from None
@@ -114,11 +155,24 @@ class MujocoWorld:
         if self._warnings.tobytes() != self._no_warnings:
             raise PhysicsError(self._describe_warnings())
 
+    def _act(self, effects: Effects, mask: Array | None, some: Any) -> None:
+        """Let the effects act on some worlds before a physics step."""
+        mean, end, wrench = effects.step(self.state, mask)
+        if self._thrust is not self._command:
+            here = some if self.shape else ...
+            self.state.thrust[here] = end[here]
+        thrust = np.reshape(mean, self._ctrl.shape)
+        self._ctrl[some] = (thrust if self._newtons is None else thrust / self._newtons)[some]
+        if wrench is not None:
+            self._applied[some, :3] = wrench[0].reshape(-1, 3)[some]
+            self._applied[some, 3:6] = wrench[1].reshape(-1, 3)[some]
+
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """As `World.seed`."""
         ids = self._ids(mask).tolist()
         given = [seeds[i] for i in ids]
         self._streams.seed(ids, given)
+        self._draws.seed(ids, given)
         for noise in self._noises:
             noise.seed(ids, given)
 
@@ -137,7 +191,8 @@ class MujocoWorld:
             return  # a fork has none of the threads
         state = {name: getattr(self.state, name).copy() for name in WorldState.__slots__}
         self.state = WorldState(**state)
-        for view in ("_batch", "_ctrl", "_contacts", "_warnings", "_thrust"):
+        views = "_batch _ctrl _command _thrust _applied _contacts _warnings _varied"
+        for view in views.split():
             vars(self).pop(view, None)
 
     def _ids(self, mask: Array) -> np.ndarray:
@@ -148,9 +203,31 @@ class MujocoWorld:
         if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
             raise RuntimeError("the threads of an env do not follow into a fork: make another env")
 
-    def _apply_thrust(self) -> None:
+    def _model(self, effects: EffectOptions | None) -> mujoco.MjModel:
+        """The model that flies: the vehicle's, or a copy with what the effects change."""
+        model = self.vehicle.model
+        if effects is not None and effects.payload:
+            model = self.vehicle.with_payload(effects.payload, effects.cable)
+        if self.effects is not None and self.effects.on_rotors:
+            model = copy.copy(model)  # commands are within their limits; thrusts need not be
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+        return model
+
+    def _place_payload(self, ids: np.ndarray) -> None:
+        """Hang the payload straight below the craft, moving along with it."""
+        if self._cable is None:
+            return
+        qpos, qvel = (self._batch.bind(name) for name in ("qpos", "qvel"))
+        qpos[ids, 7:10] = qpos[ids, :3] - (0.0, 0.0, self._cable)
+        qpos[ids, 10:14] = (1.0, 0.0, 0.0, 0.0)
+        qvel[ids, 6:9] = qvel[ids, :3]
+        qvel[ids, 9:12] = 0.0
+
+    def _apply_thrust(self, thrust: np.ndarray) -> None:
         if self._newtons is not None:
-            np.divide(self._thrust, self._newtons, out=self._ctrl)
+            np.divide(thrust, self._newtons, out=self._ctrl)
+        elif thrust is not self._ctrl:
+            self._ctrl[:] = thrust
 
     def _describe_warnings(self) -> str:
         counts = self._warnings[:, :, 1]
@@ -159,3 +236,36 @@ class MujocoWorld:
         names = ", ".join(mujoco.mjtWarning(kind).name for kind in kinds)
         self._warnings.fill(0)  # so that a reset gives usable worlds again
         return f"MuJoCo warned of {names} in envs {ids[:5]}: reset the env"
+
+
+class _Varied:
+    """Values of the model that differ between worlds: mass, inertia, center of mass."""
+
+    def __init__(self, batch: Batch, names: Sequence[str]) -> None:
+        self._batch, model = batch, batch.model
+        self._names = [name for name in MODEL if name in names]
+        self._bodies, self._axes = craft_bodies(model), body_axes(model)
+        self._base = {
+            name: getattr(model, name).copy()
+            for name in ("body_mass", "body_inertia", "body_ipos", "dof_damping")
+        }
+
+    def apply(self, ids: np.ndarray, parameters: Mapping[str, Array]) -> None:
+        """Give the worlds `ids` the values that were drawn for them."""
+        if not self._names:
+            return
+        given = {name: np.reshape(parameters[name], -1)[ids] for name in self._names}
+        place, ones = np.ix_(ids, self._bodies), np.ones(len(ids))
+        mass, inertia = given.get("mass", ones), given.get("inertia", ones)
+        base, expand = self._base, self._batch.expand
+        expand("body_mass")[place] = mass[:, None] * base["body_mass"][self._bodies]
+        expand("body_inertia")[place] = (mass * inertia)[:, None, None] * (
+            base["body_inertia"][self._bodies]
+        )
+        if base["dof_damping"].any():  # the drag of Unity's bodies goes with their mass
+            expand("dof_damping")[ids, :3] = mass[:, None] * base["dof_damping"][:3]
+        shift = np.stack([given.get(name, 0.0 * ones) for name in MODEL[2:]], axis=-1)
+        if shift.any():
+            turned = np.einsum("bji,wj->wbi", self._axes, shift)
+            expand("body_ipos")[place] = base["body_ipos"][self._bodies] + turned
+        self._batch.set_const(ids)

@@ -13,8 +13,10 @@ import warp
 from torch.utils.dlpack import from_dlpack
 
 from ...models.errors import InputError
-from ...models.vehicle import Vehicle
-from ..random import START, Draw, Noise
+from ...models.vehicle import Vehicle, body_axes, craft_bodies
+from ..effects import EffectOptions, Effects
+from ..random import RANDOMIZATION, START, Draw, Noise
+from ..randomize import MODEL, Randomization
 from ..state import Array, Pose, WorldState, constant
 from ..world import PhysicsError, contact_check
 
@@ -39,43 +41,71 @@ class WarpWorld:
 
     xp: Any = torch_api
 
-    def __init__(self, vehicle: Vehicle, num_worlds: int, *, device: str | None = None) -> None:
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        num_worlds: int,
+        *,
+        effects: EffectOptions | None = None,
+        randomize: Randomization | None = None,
+        device: str | None = None,
+    ) -> None:
         self.vehicle, self.shape = vehicle, (num_worlds, 1)
         self.device, self._name = _device(device)
         self._check = contact_check(vehicle.timestep)
         self._generator = torch.Generator(self.device)
         self._generator.seed()
         self._noises: list[TorchNoise] = []
+        options = effects or EffectOptions()
+        self._randomize, self.parameters = randomize, dict[str, Array]()
+        self._draws = torch.Generator(self.device)
+        self._draws.seed()
+        drawn = () if randomize is None else randomize.names
+        acting = Effects(vehicle, options, self.noise, torch_api, drawn)
+        self.effects = acting if acting.works else None
+        self._cable = options.cable if options.payload else None
         model = copy.copy(vehicle.model)
+        if self._cable is not None:
+            model = vehicle.with_payload(options.payload, options.cable)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nothing reads them
+        if acting.on_rotors:  # commands are within their limits; thrusts need not be
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         solid = (model.geom_contype | model.geom_conaffinity) != 0
         contacts = CONTACTS_PER_GEOM * int(solid.sum())
         rows = max(1, 2 * (int(model.geom_condim.max(initial=1)) - 1))
         with wp.ScopedDevice(self._name):
             self._data = data = mjw.make_data(
-                model, num_worlds, nconmax=contacts, njmax=contacts * rows + model.neq * 6 + 6
+                model, num_worlds, nconmax=contacts, njmax=contacts * rows + model.neq * 6 + 7
             )
             self._model = mjw.put_model(model)
             # DLPack shares the memory: these are made once, and nothing is copied.
             self.qpos, self.qvel = from_dlpack(data.qpos), from_dlpack(data.qvel)
             self.ctrl, self._rows = from_dlpack(data.ctrl), from_dlpack(data.nefc)
             self._warmstart = from_dlpack(data.qacc_warmstart)
+            self._applied = from_dlpack(data.qfrc_applied)
+            self._varied = _Varied(vehicle, model, self._model, data, drawn)
             self.qpos[:, 2] = vehicle.rest_height + 1.0
+            if self._cable is not None:  # slack, and off the ground
+                self.qpos[:, 2] += self._cable
+                self.qpos[:, 9] = self.qpos[:, 2] - 0.5 * self._cable
             mjw.step(self._model, data)  # compiles what is not yet in Warp's cache
             wp.synchronize()
             self._forward = self._captured(mjw.forward, 1)
-        self._rows_in_air = int(self._rows.max())
+        self._rows_in_air = int(self._rows.max()) + (self._cable is not None)  # a taut cable's
         self._steps: dict[int, Any] = {}
         newtons = np.array([rotor.newtons for rotor in vehicle.rotors])
         self._newtons = constant(newtons, self.ctrl)
         self._hover = constant(vehicle.hover_thrust, self.ctrl)
         self._level = constant(np.array((1.0, 0.0, 0.0, 0.0)), self.ctrl)
+        command = torch.zeros((num_worlds, 1, vehicle.num_rotors), device=self.device)
+        differ = acting.on_rotors
         self.state = WorldState(
             position=self.qpos[:, None, :3],
-            quaternion=self.qpos[:, None, 3:],
+            quaternion=self.qpos[:, None, 3:7],
             velocity=self.qvel[:, None, :3],
-            body_rates=self.qvel[:, None, 3:],
-            thrust=torch.zeros((num_worlds, 1, vehicle.num_rotors), device=self.device),
+            body_rates=self.qvel[:, None, 3:6],
+            command=command,
+            thrust=torch.zeros_like(command) if differ else command,
             touching=torch.zeros(self.shape, dtype=torch.bool, device=self.device),
         )
 
@@ -97,8 +127,20 @@ class WarpWorld:
             (state.thrust, pose.thrust, self._hover),
         ):
             array.copy_(torch.where(rows, default if values is None else values, array))
+        state.command.copy_(torch.where(rows, state.thrust, state.command))
         self._warmstart.masked_fill_(mask, 0.0)
-        self._apply_thrust()
+        self._applied.masked_fill_(mask, 0.0)
+        if self._randomize is not None:
+            draw = TorchDraw(self._draws, mask, {})
+            for name, new in self._randomize.draw(draw, self.xp).items():
+                old = self.parameters.get(name)
+                self.parameters[name] = new if old is None else torch.where(mask, new, old)
+            self._varied.apply(self.parameters)
+        if self.effects is not None:
+            self.effects.begin(mask, state, self.parameters)
+        if self._cable is not None:
+            self._place_payload(mask, self._cable)
+        self._apply_thrust(state.thrust)
         self._launch(self._forward)
         state.touching.copy_(torch.where(mask, self._contact(), state.touching))
 
@@ -106,16 +148,21 @@ class WarpWorld:
         """As `World.step`."""
         state, before = self.state, []
         if mask is not None:
-            thrust = torch.where(mask[..., None], thrust, state.thrust)
+            thrust = torch.where(mask[..., None], thrust, state.command)
             before = [(array, array.clone()) for array in (self.qpos, self.qvel, self._warmstart)]
-        state.thrust.copy_(thrust)
-        self._apply_thrust()
+        state.command.copy_(thrust)
+        if self.effects is None:
+            self._apply_thrust(state.command)
         touching = torch.zeros_like(state.touching)
         while substeps > 0:
             steps = min(substeps, self._check)
-            if steps not in self._steps:
-                self._steps[steps] = self._captured(mjw.step, steps)
-            self._launch(self._steps[steps])
+            at_once = steps if self.effects is None else 1
+            if at_once not in self._steps:
+                self._steps[at_once] = self._captured(mjw.step, at_once)
+            for _ in range(steps // at_once):
+                if self.effects is not None:
+                    self._act(self.effects, mask)
+                self._launch(self._steps[at_once])
             touching = touching | self._contact()
             substeps -= self._check
         for array, values in before:
@@ -132,6 +179,7 @@ class WarpWorld:
         """Seed the one generator of all worlds with the seeds of the mask together."""
         ids = mask.flatten().nonzero().flatten().tolist()
         _seed(self._generator, START, [seeds[i] for i in ids])
+        _seed(self._draws, RANDOMIZATION, [seeds[i] for i in ids])
         for noise in self._noises:
             noise.seed(ids, [seeds[i] for i in ids])
 
@@ -180,8 +228,28 @@ class WarpWorld:
         """Release the graphs."""
         self._steps.clear()
 
-    def _apply_thrust(self) -> None:
-        self.ctrl.copy_(self.state.thrust[:, 0] / self._newtons)
+    def _apply_thrust(self, thrust: torch.Tensor) -> None:
+        self.ctrl.copy_(thrust[:, 0] / self._newtons)
+
+    def _act(self, effects: Effects, mask: torch.Tensor | None) -> None:
+        """Let the effects act on some worlds before a physics step."""
+        mean, end, wrench = effects.step(self.state, mask)
+        if effects.on_rotors:
+            kept = end if mask is None else torch.where(mask[..., None], end, self.state.thrust)
+            self.state.thrust.copy_(kept)
+        self._apply_thrust(mean)
+        if wrench is not None:
+            self._applied[:, :6] = torch.cat(wrench, dim=-1)[:, 0]
+
+    def _place_payload(self, mask: torch.Tensor, cable: float) -> None:
+        """Hang the payload straight below the craft, moving along with it."""
+        below = self.qpos[:, :3] - torch.tensor((0.0, 0.0, cable), device=self.device)
+        turn = self._level.expand(len(below), 4)
+        hung = torch.cat((self.qpos[:, :7], below, turn), dim=1)
+        still = torch.zeros_like(below)
+        moved = torch.cat((self.qvel[:, :6], self.qvel[:, :3], still), dim=1)
+        self.qpos.copy_(torch.where(mask, hung, self.qpos))
+        self.qvel.copy_(torch.where(mask, moved, self.qvel))
 
     def _contact(self) -> torch.Tensor:
         return (self._rows > self._rows_in_air)[:, None]
@@ -198,6 +266,47 @@ class WarpWorld:
         if self.qpos.is_cuda:  # in turn with what torch does before and after
             stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
         wp.capture_launch(graph, stream=stream)
+
+
+class _Varied:
+    """Values of the model that differ between worlds: mass, inertia, center of mass."""
+
+    def __init__(
+        self, vehicle: Vehicle, plain: mujoco.MjModel, model: Any, data: Any, names: tuple[str, ...]
+    ) -> None:
+        self._names = [name for name in MODEL if name in names]
+        if not self._names:
+            return
+        self._model, self._data = model, data
+        self._bodies = torch.from_numpy(craft_bodies(plain))
+        self._axes = body_axes(plain)
+        fields = ("body_mass", "body_inertia", "body_ipos", "dof_damping")
+        self._base, self._live = {}, {}
+        for name in fields:
+            value = np.repeat(getattr(plain, name)[None], data.nworld, axis=0)
+            kind = wp.vec3 if value.ndim == 3 else float
+            array = wp.array(value, dtype=kind)
+            setattr(model, name, array)
+            self._live[name] = wp.to_torch(array)
+            self._base[name] = self._live[name].clone()
+
+    def apply(self, parameters: Mapping[str, Array]) -> None:
+        """Give all worlds the values that were drawn for them."""
+        if not self._names:
+            return
+        ones = torch.ones_like(next(iter(parameters.values())))[:, 0]
+        given = {name: parameters[name][:, 0] for name in self._names}
+        mass, inertia = given.get("mass", ones), given.get("inertia", ones)
+        base, live, bodies = self._base, self._live, self._bodies
+        live["body_mass"][:, bodies] = mass[:, None] * base["body_mass"][:, bodies]
+        both = (mass * inertia)[:, None, None]
+        live["body_inertia"][:, bodies] = both * base["body_inertia"][:, bodies]
+        live["dof_damping"][:, :3] = mass[:, None] * base["dof_damping"][:, :3]
+        shift = torch.stack([given.get(name, 0.0 * ones) for name in MODEL[2:]], dim=-1)
+        axes = constant(self._axes, shift)
+        turned = torch.einsum("bji,wj->wbi", axes, shift)
+        live["body_ipos"][:, bodies] = base["body_ipos"][:, bodies] + turned
+        mjw.set_const(self._model, self._data)
 
 
 class TorchDraw(Draw):

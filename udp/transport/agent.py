@@ -7,7 +7,7 @@ import time
 import weakref
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Final, TypedDict
@@ -115,7 +115,7 @@ class AgentConfig:
         """
         options = dict(self.options or {})
         if self.options is not None and registry.is_known(env_id):
-            options = asdict(registry.options_type(env_id).from_options(options))
+            options = registry.options_type(env_id).from_options(options).to_options()
         return json_values(options)
 
     @cached_property

@@ -1,0 +1,105 @@
+"""Effects: what acts on a drone besides gravity, contact, and rotors that obey at once.
+
+Each is off by default, and a world without effects computes the same bits as if there were none.
+They act once in every physics step: from a command they give the thrust of each rotor, and from the
+motion through the air a force and a torque, all as means over the step. Coefficients are those of
+the vehicle's file (`Vehicle.coefficients`).
+
+Where the air is concerned, the motion is extrapolated to the middle of the step, so that the error
+is of second order in the step. Sums over rotors and axes are written out, since a drone has to get
+the same bits alone and in a batch.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from ...models.errors import expect
+from ..random import GUSTS, Noise
+from ..state import Array, WorldState, component, constant, stack
+from .air import AirEffects
+from .gusts import NUMBERS, Gusts
+from .options import EffectOptions
+from .rotors import RotorEffects
+
+if TYPE_CHECKING:
+    from ...models.vehicle import Vehicle
+
+__all__ = ["EffectOptions", "Effects"]
+
+WINDS: Final = ("wind_x", "wind_y", "wind_z")
+
+
+class Effects:
+    """The effects on W worlds, in the order in which they act.
+
+    Attributes:
+        on_rotors: Whether the thrust of a rotor may differ from its command.
+        on_body: Whether there is a force or a torque besides the rotors'.
+        works: Whether there is anything to do in a physics step.
+    """
+
+    def __init__(
+        self,
+        vehicle: "Vehicle",
+        options: EffectOptions,
+        noise: Callable[[int, int], Noise],
+        xp: Any,
+        drawn: tuple[str, ...] = (),
+    ) -> None:
+        """`noise` is that of the world; `drawn` has the names of what `begin` gets."""
+        rotors = options.motor_lag or options.thrust_curve or options.battery
+        self.on_rotors = bool(rotors or options.efficiency or "thrust" in drawn)
+        moved = options.body_drag or options.rotor_drag
+        self.on_body = moved or options.ground_effect
+        self.works = self.on_rotors or self.on_body
+        self._rotors = RotorEffects(vehicle, options, xp)
+        self._air = AirEffects(vehicle, options, xp)
+        self._drawn_winds = [name for name in WINDS if name in drawn]
+        self._mean_wind = np.array(options.wind)
+        self._blows = any(options.wind) or bool(self._drawn_winds)
+        self._wind: Array = None
+        needed = not options.wind_blows or moved
+        expect(needed, "effects", "body_drag or rotor_drag, on which wind acts", "neither")
+        self._gusts: Gusts | None = None
+        if options.gusts:
+            self._gusts = Gusts(options.gusts, options.wind, vehicle.timestep, xp)
+            self._noise = noise(NUMBERS, GUSTS)
+
+    def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> None:
+        """Begin episodes of the worlds of a mask, bool, (W, A), at their rows of `state`.
+
+        Factors of the drawn parameters by name, (W, A), for all worlds.
+        """
+        if self.on_rotors:
+            self._rotors.begin(mask, state.thrust, factors)
+        if self.on_body:
+            self._air.begin(mask, state, factors)
+        if self._gusts is not None:
+            self._gusts.begin(mask, component(state.position, 2), self._noise.normal(mask))
+        if self._blows:
+            wind = constant(self._mean_wind, state.velocity) + 0.0 * state.velocity
+            if self._drawn_winds:
+                wind = wind + stack([factors.get(name, 0.0) for name in WINDS])
+            self._wind = wind
+
+    def step(
+        self, state: WorldState, mask: Array | None
+    ) -> tuple[Array, Array, tuple[Array, Array] | None]:
+        """Advance the worlds of a mask, None for all, by a physics step, from `state` on.
+
+        Gives the mean thrust of each rotor over the step and that at its end, N, (W, A, R), and
+        the force (world frame, N) with the torque about the body's origin (body frame, N·m), both
+        (W, A, 3), or None.
+        """
+        mean = end = state.command
+        if self.on_rotors:
+            mean, end = self._rotors.step(state.command, mask)
+        if not self.on_body:
+            return mean, end, None
+        wind = self._wind
+        if self._gusts is not None:
+            gust = self._gusts.step(mask, self._noise.normal(mask))
+            wind = gust if wind is None else wind + gust
+        return mean, end, self._air.step(state, mean, wind, mask)

@@ -1,0 +1,88 @@
+"""Which effects are on."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Final, Self
+
+from ...models.errors import expect
+
+MOST_WIND: Final = 100.0  # m/s
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectOptions:
+    """Which effects are on. A wrong option raises `InputError` with one sentence.
+
+    Numbers and lists of numbers may be of any real type; they are kept as floats and tuples.
+    """
+
+    motor_lag: bool = False
+    """Rotor speed follows its command with a time constant (`rotors.time_constant`)."""
+    thrust_curve: bool = False
+    """Thrust over throttle is the polynomial `rotors.curve`; otherwise it is proportional."""
+    battery: bool = False
+    """Thrust falls with the square of the voltage, which sags under load and with the charge."""
+    body_drag: bool = False
+    """Linear and quadratic drag of the body (`drag.linear`, `drag.quadratic`)."""
+    rotor_drag: bool = False
+    """Drag, inflow and lift of rotors in moving air (`rotors.drag`, `inflow` and `lift`)."""
+    ground_effect: bool = False
+    """More thrust near the ground, after Cheeseman and Bennett (`rotors.radius`)."""
+    wind: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """Velocity of the air: x, y, z in MuJoCo's world frame, m/s."""
+    gusts: float = 0.0
+    """Dryden turbulence for this wind speed at a height of 20 feet (6 m), m/s."""
+    efficiency: tuple[float, ...] = ()
+    """Share of its thrust that each rotor gives, 0 to 1; empty: all of it."""
+    payload: float = 0.0
+    """Mass that hangs on a cable from the body's origin, kg."""
+    cable: float = 1.0
+    """Length of that cable, m."""
+
+    def __post_init__(self) -> None:
+        for name in ("motor_lag", "thrust_curve", "battery", "body_drag", "rotor_drag"):
+            self._check(name, "true or false", type(getattr(self, name)) is bool)
+        self._check("ground_effect", "true or false", type(self.ground_effect) is bool)
+        self._keep("wind", -MOST_WIND, MOST_WIND, "m/s", 3)
+        self._keep("efficiency", 0.0, 1.0, "for each rotor")
+        self._keep("gusts", 0.0, MOST_WIND, "m/s", 1)
+        self._keep("payload", 0.0, 1e4, "kg", 1)
+        self._keep("cable", 0.05, 100.0, "m", 1)
+
+    def _keep(self, name: str, low: float, high: float, unit: str, count: int = 0) -> None:
+        given = getattr(self, name)
+        number = "a number" if count == 1 else f"{count or ''} numbers".strip()
+        try:
+            listed = [float(x) for x in ([given] if count == 1 else list(given))]
+        except (TypeError, ValueError, OverflowError):
+            listed = [float("nan")]
+        right = count in (0, len(listed)) and all(low <= value <= high for value in listed)
+        right = right and not isinstance(given, str | bool)
+        self._check(name, f"{number} from {low:g} to {high:g} {unit}", right)
+        object.__setattr__(self, name, listed[0] if count == 1 else tuple(listed))
+
+    def _check(self, name: str, expected: str, right: bool) -> None:
+        expect(right, f"effects: {name}", expected, f"{getattr(self, name)!r:.80}")
+
+    @classmethod
+    def from_options(cls, options: Any) -> Self:
+        """Options by name. An unknown name raises `InputError`, which names those there are."""
+        known = ", ".join(one.name for one in fields(cls))
+        right = isinstance(options, Mapping)
+        expect(right, "effects", "a mapping from names to values", f"{options!r:.80}")
+        for name in options:
+            expect(name in known.split(", "), "effects", f"some of {known}", repr(name))
+        return cls(**options)
+
+    def to_options(self) -> dict[str, Any]:
+        """The reverse of `from_options`: those that differ from their default."""
+        return {
+            one.name: getattr(self, one.name)
+            for one in fields(self)
+            if getattr(self, one.name) != one.default
+        }
+
+    @property
+    def wind_blows(self) -> bool:
+        """Whether the air moves."""
+        return self.gusts > 0 or any(self.wind)

@@ -1,0 +1,129 @@
+"""Domain randomisation: parameters of a vehicle and its effects, drawn for each episode.
+
+A parameter is a factor of the vehicle's own value, 1 being that value, or a number in its unit.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from ..models.errors import expect
+from .effects import EffectOptions
+from .random import Draw
+from .state import Array, clip
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter that can be drawn."""
+
+    low: float
+    """Least value; a draw below it counts as it."""
+    high: float
+    """Largest value."""
+    unit: str
+    """Empty for a factor."""
+    meaning: str
+    needs: tuple[str, ...] = ()
+    """Effects of which one has to be on."""
+
+
+_AIR: Final = ("body_drag", "rotor_drag")
+PARAMETERS: Final = {
+    "mass": Parameter(0.1, 10.0, "", "mass of the vehicle; its inertia goes with it"),
+    "inertia": Parameter(0.1, 10.0, "", "inertia of the vehicle, besides what its mass does"),
+    "center_x": Parameter(-10.0, 10.0, "m", "shift of the center of mass, forward"),
+    "center_y": Parameter(-10.0, 10.0, "m", "shift of the center of mass, to the left"),
+    "center_z": Parameter(-10.0, 10.0, "m", "shift of the center of mass, up"),
+    "thrust": Parameter(0.0, 10.0, "", "thrust of every rotor at the same command"),
+    "time_constant": Parameter(0.01, 100.0, "", "time constant of the rotors", ("motor_lag",)),
+    "battery_charge": Parameter(0.0, 1.0, "1", "charge at the start", ("battery",)),
+    "body_drag": Parameter(0.0, 10.0, "", "drag of the body", ("body_drag",)),
+    "rotor_drag": Parameter(0.0, 10.0, "", "drag and inflow of the rotors", ("rotor_drag",)),
+    "wind_x": Parameter(-100.0, 100.0, "m/s", "wind along x, besides the option's", _AIR),
+    "wind_y": Parameter(-100.0, 100.0, "m/s", "wind along y, besides the option's", _AIR),
+    "wind_z": Parameter(-100.0, 100.0, "m/s", "wind upwards, besides the option's", _AIR),
+    "action_delay": Parameter(0, 100, "steps", "control steps before an action takes effect"),
+    "observation_delay": Parameter(0, 100, "steps", "age of an observation, control steps"),
+}
+MODEL: Final = ("mass", "inertia", "center_x", "center_y", "center_z")
+"""Parameters of the compiled model."""
+WHOLE: Final = ("action_delay", "observation_delay")
+"""Parameters that are whole numbers: a draw is rounded."""
+_KINDS: Final = {"uniform": 2, "loguniform": 2, "normal": 2, "choice": 0}
+_TEXT: Final = re.compile(r"\s*([a-z]+)\s*\(([^()]*)\)\s*")
+
+
+class Randomization:
+    """Distributions by the parameter's name, as texts: "uniform(0.8, 1.2)", or a number.
+
+    `uniform(low, high)`, `loguniform(low, high)`, `normal(mean, deviation)` and `choice(a, b, ...)`
+    with equal chances; a number is drawn as itself. Raises `InputError` for anything else.
+    """
+
+    def __init__(self, texts: Any, effects: EffectOptions) -> None:
+        right = isinstance(texts, Mapping)
+        expect(right, "randomize", "a mapping from names to distributions", f"{texts!r:.80}")
+        self._kinds: dict[str, tuple[str, tuple[float, ...]]] = {}
+        for name, text in texts.items():
+            known = ", ".join(PARAMETERS)
+            expect(name in PARAMETERS, "randomize", f"some of {known}", repr(name))
+            needs = PARAMETERS[name].needs
+            on = not needs or any(getattr(effects, effect) for effect in needs)
+            expect(on, f"randomize: {name}", f"the effect {' or '.join(needs)}", "it switched off")
+            self._kinds[name] = _distribution(name, text)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of what is drawn, in the order of `PARAMETERS`."""
+        return tuple(name for name in PARAMETERS if name in self._kinds)
+
+    def largest(self, name: str) -> float:
+        """No draw of this parameter is larger."""
+        kind, numbers = self._kinds[name]
+        return PARAMETERS[name].high if kind == "normal" else max(numbers)
+
+    def draw(self, draw: Draw, xp: Any) -> dict[str, Array]:
+        """Values by name, shape (W, A)."""
+        drawn = {}
+        for name in self.names:
+            kind, numbers = self._kinds[name]
+            limits = PARAMETERS[name]
+            if kind == "normal":
+                values = numbers[0] + draw.normal(numbers[1])
+            elif kind == "uniform":
+                values = draw.uniform(numbers[0], numbers[1])
+            elif kind == "loguniform":
+                low, high = (xp.log(xp.asarray(x)) for x in numbers)
+                values = xp.exp(draw.uniform(float(low), float(high)))
+            else:
+                share = draw.uniform(0.0, 1.0)
+                values = numbers[0] + 0.0 * share
+                for index in range(1, len(numbers)):
+                    values = xp.where(share >= index / len(numbers), numbers[index], values)
+            values = clip(values, limits.low, limits.high)
+            drawn[name] = xp.round(values) if name in WHOLE else values
+        return drawn
+
+
+def _distribution(name: str, text: Any) -> tuple[str, tuple[float, ...]]:
+    limits = PARAMETERS[name]
+    within = f"numbers from {limits.low:g} to {limits.high:g} {limits.unit}".rstrip()
+    expected = f"{', '.join(f'{k}(...)' for k in _KINDS)} or a number, with {within}"
+    match = _TEXT.fullmatch(text) if isinstance(text, str) else None
+    kind, inside = match.groups() if match else ("choice", str(text))
+    try:
+        numbers = tuple(float(word) for word in inside.split(","))
+    except ValueError:
+        numbers = ()
+    right = kind in _KINDS and len(numbers) == (_KINDS.get(kind) or max(1, len(numbers)))
+    bounded = numbers[:1] if kind == "normal" else numbers
+    right = right and type(text) is not bool
+    right = right and all(limits.low <= number <= limits.high for number in bounded)
+    if right and kind in ("uniform", "loguniform"):
+        right = numbers[0] <= numbers[1] and (kind == "uniform" or numbers[0] > 0)
+    if right and kind == "normal":
+        right = 0 <= numbers[1] < float("inf")
+    expect(right, f"randomize: {name}", expected, f"{text!r:.80}")
+    return kind, numbers
