@@ -200,6 +200,7 @@ def test_hover_observes_and_judges_as_in_numpy(file: Path | None) -> None:
         task = type(loop.task)(loop.task.options, loop.vehicle, (N, 1))
         state = type(loop.world.state)(
             **{name: getattr(loop.world.state, name).double().numpy() for name in TUMBLING},
+            command=loop.world.state.command.double().numpy(),
             thrust=loop.world.state.thrust.double().numpy(),
             touching=loop.world.state.touching.numpy(),
         )
