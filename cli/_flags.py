@@ -1,14 +1,15 @@
 """Base of all commands, and the parser of their flags: tyro, plus the options of any task."""
 
 import json
+import re
 import shlex
 from argparse import ArgumentParser
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Final, TypeVar, Union, cast, get_args, get_type_hints
+from typing import Annotated, Any, Final, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.conf import Fixed, Suppress, arg
@@ -17,6 +18,8 @@ from ..experiments.folders import new_folder
 from ..models.errors import InputError, expect
 
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
+_WORLD_FLAGS: Final = ("effects", "randomize")
+_NO_FLAG: Any = Suppress[Fixed[dict]]  # type: ignore[type-arg]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +48,11 @@ class EnvFlags(Command):
     Its options are flags --env.NAME."""
     vehicle: Annotated[str | None, arg(metavar="FILE.xml")] = None
     """MJCF file of a multirotor. Default: the paper's quadcopter."""
+    effects: tuple[str, ...] = ()
+    """Effects on the vehicle, each NAME or NAME=VALUE: motor_lag wind=3,0,0. `none` switches off
+    those of a checkpoint. docs/effects.md lists them."""
+    randomize: tuple[str, ...] = ()
+    """Parameters that are drawn for each episode, each NAME=DISTRIBUTION: mass=uniform(0.8,1.2)."""
     options: Suppress[Fixed[dict]] = field(default_factory=dict)  # type: ignore[type-arg]
     """Options of the task. A checkpoint brings those that it was trained with."""
 
@@ -88,7 +96,8 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     if listens and ":" not in env_id and not registry.is_known(env_id):
         words, required = _without_requirements(words)
         command = tyro.cli(plain, prog=prog, args=words)
-        return cast(C, replace(command, given=given, options=required))
+        options = required | _world_options(command, given)
+        return cast(C, replace(command, given=given, options=options))
     env_id = registry.load(env_id)
     options_type = registry.options_type(env_id)
     raw = _for_tyro(options_type, __doc__=f"Options of {env_id}.")
@@ -103,9 +112,25 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     command = tyro.cli(typed, prog=prog, args=words)
     names = sorted(name.removeprefix("env.") for name in given if name.startswith("env."))
     options = {name: getattr(command.options, name) for name in names}
+    options |= _world_options(command, given)
     checked = options_type.from_options(options)
-    chosen = json.loads(json.dumps({name: getattr(checked, name) for name in names}))
+    chosen = json.loads(json.dumps({name: getattr(checked, name) for name in options}))
     return cast(C, replace(command, given=given, options=chosen))
+
+
+def _world_options(command: Any, given: frozenset[str]) -> dict[str, Any]:
+    """Options by name of the flags whose words are NAME or NAME=VALUE. Raises `InputError`."""
+    options: dict[str, Any] = {}
+    for flag in given.intersection(_WORLD_FLAGS):
+        words = getattr(command, flag)
+        values: dict[str, Any] = {}
+        for word in () if words == ("none",) else words:
+            name, equals, text = word.partition("=")
+            several = re.fullmatch(r"[-+.\deE]+(,[-+.\deE]+)+", text)
+            value = parse_value(f"[{text}]" if several else text)
+            values[name.replace("-", "_")] = value if equals else True
+        options[flag] = values
+    return options
 
 
 def _for_tyro(kind: type[Any], **namespace: Any) -> Any:
@@ -119,6 +144,9 @@ def _for_tyro(kind: type[Any], **namespace: Any) -> Any:
         hint = hints[one.name]
         extras = getattr(hint, "__metadata__", ())  # of Annotated
         hint = hint.__origin__ if extras else hint
+        if get_origin(hint) is Mapping:  # of words, which flags of their own give
+            changed[one.name] = _NO_FLAG
+            namespace[one.name] = field(default_factory=dict)
         if isinstance(hint, UnionType):
             union: Any = Union[get_args(hint)]  # noqa: UP007
             changed[one.name] = Annotated[union, *extras] if extras else union

@@ -16,6 +16,7 @@ from ..models.errors import InputError, NotCopied, expect
 from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..models.vehicle import Vehicle
 from ..sim import (
+    PARAMETERS,
     Array,
     Backend,
     Draw,
@@ -27,9 +28,10 @@ from ..sim import (
     make_world,
     on_host,
 )  # fmt: skip
-from ..sim.state import plain
+from ..sim.state import constant, each, plain
 from . import registry
 from .autoreset import Seeds, checked_seeds
+from .delay import Delay
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
 
@@ -130,6 +132,9 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
             high=tuple(vehicle.thrust_high.tolist()),
         ),
     ]
+    if drawn := Randomization(task.options.randomize, None).names:
+        units = tuple(PARAMETERS[name].unit for name in drawn)
+        specs.append(numbers("drawn", [f"drawn_{name}" for name in drawn], unit=units))
     if type(task).goal is not Task.goal:
         names = ("X_goal", "Y_goal", "Z_goal")
         specs.append(numbers("goal", names, unit="m", frame="paper"))
@@ -208,6 +213,14 @@ class Loop(NotCopied):
             array.name: slice(*ends[i : i + 2]) for i, array in enumerate(self.spec.telemetry)
         }
         self._has_goal = "goal" in self._columns
+        names = () if randomize is None else randomize.names
+        self._drawn = names
+        self._late_actions = self._late_observations = None
+        if randomize is not None and "action_delay" in names:
+            self._late_actions = Delay(randomize.most_steps("action_delay"), self._xp)
+        if randomize is not None and "observation_delay" in names:
+            most = randomize.most_steps("observation_delay")
+            self._late_observations = {name: Delay(most, self._xp) for name, *_ in self._arrays}
 
     def advance(
         self,
@@ -241,7 +254,7 @@ class Loop(NotCopied):
             self._fly(actions, flown)
         if begins:
             self._begin(resets, seeds, chosen or {})
-        self._look(flown)
+        self._look(flown, resets if begins else None)
 
     def _fly(self, actions: Array, flown: Array | None) -> None:
         world = self.world
@@ -250,8 +263,11 @@ class Loop(NotCopied):
         else:
             values = world.checked(actions, self._width, self._choices, flown)
             values = values.reshape(self._action_shape)
-        thrust = self.task.controller.thrust(values, world.state)
         some = None if flown is None else flown.reshape(world.shape)[()]
+        if self._late_actions is not None:
+            self._late_actions.push(None if some is None else some[..., None], values)
+            values = self._late_actions.get(each(world.parameters["action_delay"]))
+        thrust = self.task.controller.thrust(values, world.state)
         try:
             world.step(thrust, self._substeps, some)
         except PhysicsError:
@@ -273,6 +289,11 @@ class Loop(NotCopied):
         draws = {name: values.reshape(lead)[()] for name, values in chosen.items()}
         world.reset(some, self._start(some, world.draw(some, draws)))
         self._begun = True
+        if self._late_actions is not None:  # on their way are actions that change nothing
+            like = world.state.thrust
+            neutral = np.full(self._width, float((self._choices - 1) // 2 if self._choices else 0))
+            rest = constant(neutral, like) + 0.0 * like[..., :1]
+            self._late_actions.begin(some[..., None], rest)
         self._steps = plain(self._xp.where(some, 0, self._steps))
         self._waiting = self._waiting & ~mask
         self._anyone_waits = bool(self._waiting.any())
@@ -290,8 +311,8 @@ class Loop(NotCopied):
             )
         return pose
 
-    def _look(self, flown: Array | None) -> None:
-        """Observations, rewards and ends after a step."""
+    def _look(self, flown: Array | None, begun: Array | None = None) -> None:
+        """Observations, rewards and ends after a step; `begun` as the mask of `_begin`."""
         task, state, n = self.task, self.world.state, self.num_envs
         self._telemetry = None
         observed, outcome = task.observe(state), task.outcome(state)
@@ -300,6 +321,8 @@ class Loop(NotCopied):
         self.observations = {}
         for name, shape, dtype in self._arrays:
             self.observations[name] = _as_type(observed[name].reshape(shape), dtype)
+        if self._late_observations is not None:
+            self._delay(self._late_observations, flown, begun)
         self._outcome, self.terms = outcome, outcome.reward
         ended: Array = outcome.terminated
         late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b
@@ -333,6 +356,17 @@ class Loop(NotCopied):
             if ends.any():
                 self._waiting, self._anyone_waits = self._waiting | ends, True
                 self.done = self.done | ends
+
+    def _delay(self, late: dict[str, Delay], flown: Array | None, begun: Array | None) -> None:
+        """Put observations of earlier steps in place of those of now; a reset's are of now."""
+        age = self._per_drone(self.world.parameters["observation_delay"])
+        for name, shape, _ in self._arrays:
+            ones = (self.num_envs,) + (1,) * (len(shape) - 1)
+            if begun is not None:
+                late[name].begin(begun.reshape(ones), self.observations[name])
+            moved = None if flown is None else flown.reshape(ones)
+            late[name].push(moved, self.observations[name])
+            self.observations[name] = late[name].get(age.reshape(ones))
 
     def _refuse_not_finite(self) -> None:
         """Raise `InputError` for the NaN or infinity that a task gave."""
@@ -404,6 +438,9 @@ class Loop(NotCopied):
             "attitude": attitudes_in_paper_frame(on_host(state.quaternion).reshape(n, 4)),
             "thrust": on_host(state.thrust).reshape(n, -1).astype(np.float64),
         }
+        if self._drawn:
+            columns = [on_host(self.world.parameters[name]) for name in self._drawn]
+            told["drawn"] = np.stack(columns, axis=-1, dtype=np.float64).reshape(n, -1)
         if self._has_goal:
             goal = on_host(self.task.goal(state))
             told["goal"] = positions_in_paper_frame(goal.reshape(n, 3))
@@ -419,6 +456,8 @@ class Loop(NotCopied):
         level = not any(state.quaternion.tolist()[1:])
         angles = (0.0, 0.0, 0.0) if level else attitudes_in_paper_frame(state.quaternion).tolist()
         row = [0.0 - y, z, x, *angles, *state.thrust.tolist()]
+        for name in self._drawn:
+            row.append(float(self.world.parameters[name]))
         if self._has_goal:
             x, y, z = self.task.goal(state).tolist()
             row += (0.0 - y, z, x)

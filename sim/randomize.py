@@ -59,10 +59,11 @@ class Randomization:
     """Distributions by the parameter's name, as texts: "uniform(0.8, 1.2)", or a number.
 
     `uniform(low, high)`, `loguniform(low, high)`, `normal(mean, deviation)` and `choice(a, b, ...)`
-    with equal chances; a number is drawn as itself. Raises `InputError` for anything else.
+    with equal chances; a number is drawn as itself. Raises `InputError` for anything else, and for
+    a parameter whose effect is off; with None for the effects nothing is said of them.
     """
 
-    def __init__(self, texts: Any, effects: EffectOptions) -> None:
+    def __init__(self, texts: Any, effects: EffectOptions | None) -> None:
         right = isinstance(texts, Mapping)
         expect(right, "randomize", "a mapping from names to distributions", f"{texts!r:.80}")
         self._kinds: dict[str, tuple[str, tuple[float, ...]]] = {}
@@ -70,7 +71,7 @@ class Randomization:
             known = ", ".join(PARAMETERS)
             expect(name in PARAMETERS, "randomize", f"some of {known}", repr(name))
             needs = PARAMETERS[name].needs
-            on = not needs or any(getattr(effects, effect) for effect in needs)
+            on = not needs or effects is None or any(getattr(effects, name) for name in needs)
             expect(on, f"randomize: {name}", f"the effect {' or '.join(needs)}", "it switched off")
             self._kinds[name] = _distribution(name, text)
 
@@ -79,10 +80,10 @@ class Randomization:
         """Names of what is drawn, in the order of `PARAMETERS`."""
         return tuple(name for name in PARAMETERS if name in self._kinds)
 
-    def largest(self, name: str) -> float:
-        """No draw of this parameter is larger."""
+    def most_steps(self, name: str) -> int:
+        """No draw of a delay is longer, control steps."""
         kind, numbers = self._kinds[name]
-        return PARAMETERS[name].high if kind == "normal" else max(numbers)
+        return round(PARAMETERS[name].high if kind == "normal" else max(numbers))
 
     def draw(self, draw: Draw, xp: Any) -> dict[str, Array]:
         """Values by name, shape (W, A)."""

@@ -7,7 +7,18 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 
 from ...models.errors import InputError, expect
-from ...sim import Array, CollectiveThrust, Draw, Pose, WorldState, component, plain, stack
+from ...sim import (
+    Array,
+    CollectiveThrust,
+    Draw,
+    Pose,
+    WorldState,
+    clip,
+    component,
+    constant,
+    plain,
+    stack,
+)  # fmt: skip
 from ..spec import ArraySpec, Metric
 from .task import Outcome, Task, TaskOptions, check_choice, check_number, finite
 
@@ -88,7 +99,7 @@ class Elevation(Task):
     | 2 | thrust relative to hover: F / 49 N - 1 | 1 | -1 ... 1.041 |
 
     `observation="error"` keeps index 0 alone, as in the paper. The bounds follow from vehicle and
-    options and cannot be left.
+    options and cannot be left; with effects, or with a vehicle that is drawn, numbers are clipped.
 
     ## Action
 
@@ -142,7 +153,8 @@ class Elevation(Task):
             vehicle, scale, increment=increment, discrete=options.action_type == "discrete"
         )
         self._hover = float(vehicle.hover_thrust[0])
-        self.observation = (self._observation_spec(),)
+        self.observation = (spec := self._observation_spec(),)
+        self._bounds = None if options.ideal else spec.bounds()
         self.target: Array = 0.0
 
     def begin(self, mask: Array, draw: Draw) -> Pose:
@@ -161,10 +173,16 @@ class Elevation(Task):
         """E, its rate and the thrust; or E alone."""
         error = self.target - component(state.position, 2)
         if self.options.observation == "error":
-            return {"observation": stack((error,))}
+            return {"observation": self._within(stack((error,)))}
         rate = 0.0 - component(state.velocity, 2)
         thrust = component(state.thrust, 0) / self._hover - 1.0
-        return {"observation": stack((error, rate, thrust))}
+        return {"observation": self._within(stack((error, rate, thrust)))}
+
+    def _within(self, values: Array) -> Array:
+        """Values within the bounds, which only effects or a vehicle that was drawn could leave."""
+        if self._bounds is None:
+            return values
+        return clip(values, *(constant(bound, values) for bound in self._bounds))
 
     def outcome(self, state: WorldState) -> Outcome:
         """Nearness to the target; the end at a crash, a flip-over, or outside the band."""
