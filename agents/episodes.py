@@ -87,6 +87,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Attributes:
         env_steps: Control steps of all drones together.
         episodes: Ended episodes, in the order of their ends.
+        drawn: For each that ended since the log was made, what was drawn for it, by name.
     """
 
     def __init__(
@@ -97,6 +98,9 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = count = self.env.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.actions = actions = ActionMap(self.spec.action)
+        self.drawn: dict[int, dict[str, float]] = {}
+        told = [array.components for array in self.spec.telemetry if array.name == "drawn"]
+        self._drawn = told[0] if told else ()
         low, high = (
             np.concatenate([a.bounds()[side].ravel() for a in self.spec.observation]).astype("f")
             for side in (0, 1)
@@ -310,6 +314,10 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                     simulator_lost=bool(env.lost[drone]),
                 )
             )
+            if self._drawn:
+                values = env.telemetry["drawn"][drone].tolist()
+                number = int(self._numbers[drone])
+                self.drawn[number] = dict(zip(self._drawn, values, strict=True))
         running = self._lengths[~ended]
         keep = int(running.max()) if running.size else 0
         self._flown = self._flown[len(self._flown) - keep :]
@@ -328,7 +336,7 @@ class _OneDrone:
         self._env = env
         self.env_spec: EnvSpec = env.get_wrapper_attr("env_spec")
         self._shape = getattr(self.env_spec.action, "shape", None)
-        arrays = [a for a in self.env_spec.telemetry if a.name in ("metrics", "thrust")]
+        arrays = [a for a in self.env_spec.telemetry if a.name in ("metrics", "thrust", "drawn")]
         self._told = [(array.name, component_names(array)) for array in arrays]
         self.observations: Any = None
         self._rest()

@@ -102,7 +102,10 @@ def _fly(config: CompareConfig, run: Run | None, tell: Tell) -> _Done:
         checkpoint, log = training.checkpoint(), training.log
     evaluated = _evaluate(run.algorithm, run.seed, config, training.taken)
     label = {"agent": run.algorithm, "seed": run.seed}
-    episodes = [results.episode_row(one, run.num_envs, log.env_steps) for one in log.episodes]
+    episodes = [
+        results.episode_row(one, run.num_envs, log.env_steps) | log.drawn.get(one.episode, {})
+        for one in log.episodes
+    ]
     rows = {
         **evaluated.rows,
         results.EPISODES_FILE: [label | episode for episode in episodes],

@@ -174,8 +174,10 @@ def write_part(part: Path, metric: str, rows: Rows, steps: list[pa.Table]) -> No
     unfinished = part.with_name(f".{part.name}")
     unfinished.mkdir(parents=True)
     for name, columns in _TABLES.items():
-        table = pd.DataFrame(rows.get(name, []), columns=list(columns))
-        table.columns = [_in_file(column, metric) for column in columns]
+        given = rows.get(name, [])
+        drawn = [key for key in (given[0] if given else ()) if key.startswith("drawn_")]
+        table = pd.DataFrame(given, columns=[*columns, *drawn])
+        table.columns = [*(_in_file(column, metric) for column in columns), *drawn]
         table.to_csv(unfinished / name, index=False)
     pq.write_table(pa.concat_tables(steps), unfinished / STEPS_FILE, compression="zstd")
     unfinished.rename(part)
@@ -187,7 +189,8 @@ def join_parts(parts: Path, folder: Path, metric: str) -> None:
     for table in _TABLES:
         lines = [(parts / name / table).read_text().splitlines(keepends=True) for name in names]
         body = [line for part in lines for line in part[1:]]
-        (folder / table).write_text("".join([lines[0][0], *body]))
+        header = max((part[0] for part in lines), key=len)  # one without rows lacks what was drawn
+        (folder / table).write_text("".join([header, *body]))
     schema = step_schema(metric)
     with pq.ParquetWriter(folder / STEPS_FILE, schema, compression="zstd") as writer:
         for name in names:
@@ -204,11 +207,17 @@ def episode_row(episode: Episode, num_envs: int, env_steps: int) -> dict[str, An
 
 
 def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]:
-    """A trajectory as a row of `evaluations.csv`, but for the columns that name the run."""
+    """A trajectory as a row of `evaluations.csv`, but for the columns that name the run.
+
+    What was drawn for the episode follows in columns of its own.
+    """
     values = trajectory.headline
     settled = np.nan
     if headline.settles and not trajectory.terminated:  # what crashes has not settled
         settled = settling_time(values, trajectory.spec.control_period, headline.settled or 0.0)
+    specs = [array for array in trajectory.spec.telemetry if array.name == "drawn"]
+    told = [trajectory.telemetry[array.name][0].tolist() for array in specs]
+    drawn = dict(zip(specs[0].components, told[0], strict=True)) if specs else {}
     return {
         "episode": trajectory.episode,
         "length": len(trajectory),
@@ -218,6 +227,7 @@ def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]
         "settling_time": settled,
         "overshoot": overshoot(values) if headline.signed else np.nan,
         "terminated": trajectory.terminated,
+        **drawn,
     }
 
 

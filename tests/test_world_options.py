@@ -5,8 +5,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 import rotorgram.envs  # noqa: F401
+from rotorgram.cli import main
 from rotorgram.envs.delay import Delay
 from rotorgram.envs.registry import env_spec
 from rotorgram.experiments.pairs import socket_pair
@@ -147,6 +149,18 @@ def test_observations_of_a_stronger_craft_stay_within_their_bounds() -> None:
         if ended:
             break
     assert info["elevation_error"] < -40  # it was fast: three times the thrust
+
+
+def test_files_of_a_comparison_tell_what_was_drawn(tmp_path: Path) -> None:
+    words = ["--agents", "vpg", "--seeds", "1", "--env-steps", "1500", "--episodes", "2"]
+    words += ["--jobs", "1", "--env.episode-length", "50", "--no-film"]
+    words += ["--randomize", "mass=uniform(0.9,1.1)", "--out", str(tmp_path / "c")]
+    assert main(["compare", *words]) == 0
+    for name in ("episodes.csv", "evaluations.csv"):
+        drawn = pd.read_csv(tmp_path / "c" / name)["drawn_mass"]
+        assert len(drawn) > 3
+        assert drawn.between(0.9, 1.1).all()
+        assert drawn.nunique() > 1
 
 
 @pytest.mark.parametrize(
