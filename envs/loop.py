@@ -135,6 +135,9 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
     if drawn := Randomization(task.options.randomize, None).names:
         units = tuple(PARAMETERS[name].unit for name in drawn)
         specs.append(numbers("drawn", [f"drawn_{name}" for name in drawn], unit=units))
+    if task.options.effects.get("payload"):
+        names = ("X_payload", "Y_payload", "Z_payload")
+        specs.append(numbers("payload", names, unit="m", frame="paper"))
     if type(task).goal is not Task.goal:
         names = ("X_goal", "Y_goal", "Z_goal")
         specs.append(numbers("goal", names, unit="m", frame="paper"))
@@ -441,6 +444,9 @@ class Loop(NotCopied):
         if self._drawn:
             columns = [on_host(self.world.parameters[name]) for name in self._drawn]
             told["drawn"] = np.stack(columns, axis=-1, dtype=np.float64).reshape(n, -1)
+        if state.payload is not None:
+            payload = on_host(state.payload).reshape(n, 3)
+            told["payload"] = positions_in_paper_frame(payload)
         if self._has_goal:
             goal = on_host(self.task.goal(state))
             told["goal"] = positions_in_paper_frame(goal.reshape(n, 3))
@@ -458,6 +464,9 @@ class Loop(NotCopied):
         row = [0.0 - y, z, x, *angles, *state.thrust.tolist()]
         for name in self._drawn:
             row.append(float(self.world.parameters[name]))
+        if state.payload is not None:
+            x, y, z = state.payload.tolist()
+            row += (0.0 - y, z, x)
         if self._has_goal:
             x, y, z = self.task.goal(state).tolist()
             row += (0.0 - y, z, x)

@@ -26,6 +26,8 @@ WORLDS: Final[tuple[World, ...]] = get_args(World)
 _MOST_METRICS = 4  # with a line of their own
 _MOST_THRUSTS = 4  # rotors with a number of their own
 _TRAIL, _EVERY = 150, 3  # control steps of a path, and of one piece of it
+_PAYLOAD = (0.96, 0.42, 0.08, 1.0)
+_CABLE = (0.13, 0.14, 0.16, 1.0)
 _DISC = (0.13, 0.78, 0.52, 0.30)
 _PATH = (1.0, 0.85, 0.25)
 _ONBOARD: Final = "stage/onboard"
@@ -86,6 +88,8 @@ class Moment:
     """F1 to FR, N."""
     goal: _Vector | None = None
     """Position to reach or hold, X, Y, Z, m; None if the task has no goal."""
+    payload: _Vector | None = None
+    """Position of what hangs below it on a cable, X, Y, Z, m; None if nothing does."""
     metrics: tuple[MetricValue, ...] = ()
     """The headline first."""
     reward: float = 0.0
@@ -102,7 +106,8 @@ class Moment:
         """From a drone's telemetry, and `reward`, `step` and `episode`, which it does not have.
 
         Telemetry is arrays by name: `position` (3,), `attitude` (3,), `thrust` (R,), `metrics` (M,)
-        and, if the task has one, `goal` (3,). The M metrics are told by name, unit and symbol.
+        and, if there are any, `goal` (3,) and `payload` (3,). The M metrics are told by name, unit
+        and symbol.
         """
 
         def told(name: str) -> tuple[Any, ...]:
@@ -114,6 +119,7 @@ class Moment:
             attitude=told("attitude"),
             thrusts=told("thrust"),
             goal=told("goal") if "goal" in telemetry else None,
+            payload=told("payload") if "payload" in telemetry else None,
             metrics=tuple(
                 MetricValue(name, value, unit, symbol)
                 for (name, unit, symbol), value in zip(metrics, values, strict=True)
@@ -189,6 +195,7 @@ class Stage:
         self.moments: tuple[Moment, ...] = ()
         self._paths: list[deque[np.ndarray]] = [deque(maxlen=self._length) for _ in self._offsets]
         self._goals: list[np.ndarray | None] = [None] * self.drones
+        self._payloads: list[np.ndarray | None] = [None] * self.drones
         # Distance between each craft and its goal for which a camera makes room, m.
         self._reach = np.zeros(self.drones)
         mujoco.mj_forward(self.model, self.data)
@@ -215,6 +222,9 @@ class Stage:
             if moment.goal is not None:
                 goal = pose_in_mujoco_frame(moment.goal, (0, 0, 0))[:3] + self._offsets[i]
             self._goals[i] = goal
+            if moment.payload is not None:
+                hung = pose_in_mujoco_frame(moment.payload, (0, 0, 0))[:3]
+                self._payloads[i] = hung + self._offsets[i]
             if moment.step == 0 or moment.step < last.step or moment.episode != last.episode:
                 path.clear()
                 self._reach[i] = 0.0
@@ -258,7 +268,15 @@ class Stage:
         return np.asarray((np.array(goals) if goals else self._points()).mean(axis=0))
 
     def decorate(self, scene: mujoco.MjvScene, *, goals: bool = True) -> None:
-        """Add the fading paths to a scene, and the discs that mark the goals if they are wanted."""
+        """Add the fading paths to a scene, the payloads, and discs at the goals if wanted."""
+        for payload, here in zip(self._payloads, self._points(), strict=True):
+            if payload is not None:
+                size = (0.12 * self.radius,) * 3
+                _decoration(scene, mujoco.mjtGeom.mjGEOM_SPHERE, size, payload, _PAYLOAD)
+                kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+                cable = _decoration(scene, kind, (1.0, 1.0, 1.0), here, _CABLE)
+                if cable is not None:
+                    mujoco.mjv_connector(cable, kind, 0.012 * self.radius, here, payload)
         for path, goal, here in zip(self._paths, self._goals, self._points(), strict=True):
             if goals and goal is not None:
                 size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height

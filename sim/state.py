@@ -41,6 +41,8 @@ class WorldState:
     is the command."""
     touching: Array
     """Whether any part was in contact since the last step or reset, bool, shape (W, A)."""
+    payload: Array = None
+    """Position of each payload, world frame, m, shape (W, A, 3); None without payloads."""
 
     @property
     def tilt_cosine(self) -> Array:

@@ -90,6 +90,7 @@ class MujocoWorld:
             command=self._command.reshape((*lead, -1)),
             thrust=self._thrust.reshape((*lead, -1)),
             touching=self._touching.reshape(lead),
+            payload=None if self._cable is None else qpos[:, 7:10].reshape((*lead, 3)),
         )
         assert np.shares_memory(self.state.position, qpos)
 
@@ -189,7 +190,7 @@ class MujocoWorld:
         """As `World.close`."""
         if self._owner not in (None, os.getpid()):
             return  # a fork has none of the threads
-        state = {name: getattr(self.state, name).copy() for name in WorldState.__slots__}
+        state = {name: copy.copy(getattr(self.state, name)) for name in WorldState.__slots__}
         self.state = WorldState(**state)
         views = "_batch _ctrl _command _thrust _applied _contacts _warnings _varied"
         for view in views.split():
@@ -217,7 +218,7 @@ class MujocoWorld:
         """Hang the payload straight below the craft, moving along with it."""
         if self._cable is None:
             return
-        qpos, qvel = (self._batch.bind(name) for name in ("qpos", "qvel"))
+        qpos, qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         qpos[ids, 7:10] = qpos[ids, :3] - (0.0, 0.0, self._cable)
         qpos[ids, 10:14] = (1.0, 0.0, 0.0, 0.0)
         qvel[ids, 6:9] = qvel[ids, :3]

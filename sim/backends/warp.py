@@ -107,6 +107,7 @@ class WarpWorld:
             command=command,
             thrust=torch.zeros_like(command) if differ else command,
             touching=torch.zeros(self.shape, dtype=torch.bool, device=self.device),
+            payload=None if self._cable is None else self.qpos[:, None, 7:10],
         )
 
     def reset(self, mask: Array, pose: Pose) -> None:
