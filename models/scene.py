@@ -10,6 +10,7 @@ import numpy as np
 
 from . import AIRPORT_XML, QUAD_XML, SCENE_XML
 from .errors import expect
+from .vehicle_file import read_vehicle_file
 
 World = Literal["plain", "airport"]
 """Surroundings of the vehicle."""
@@ -41,10 +42,7 @@ def build_scene(
     there is no such world, or a height field is too large; `ValueError` if the file is no MJCF.
     """
     expect(world in ("plain", "airport"), "world", "'plain' or 'airport'", f"{world!r}")
-    path = Path(vehicle if vehicle is not None else QUAD_XML)
-    _check_size(path)
-    switch_off_log_file()
-    spec = mujoco.MjSpec.from_file(str(path))
+    spec = read_spec(Path(vehicle if vehicle is not None else QUAD_XML))
     has_ground = any(geom.type in _GROUNDS for geom in spec.worldbody.geoms)
     if visual or not has_ground:
         _attach_scene(spec, ground=not has_ground)
@@ -52,6 +50,16 @@ def build_scene(
         attach_airport(spec)
     spec.compiler.discardvisual = not visual
     return spec
+
+
+def read_spec(path: Path) -> mujoco.MjSpec:
+    """The spec of a vehicle's file alone. Raises `InputError`, or `ValueError` if it is no MJCF."""
+    if path.suffix.lower() == ".toml":
+        file = read_vehicle_file(path)
+        return file.build(None if file.model is None else read_spec(file.model))
+    _check_size(path)
+    switch_off_log_file()
+    return mujoco.MjSpec.from_file(str(path))
 
 
 def _attach_scene(spec: mujoco.MjSpec, *, ground: bool) -> None:

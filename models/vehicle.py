@@ -1,4 +1,4 @@
-"""A vehicle: one free body with rotors, of an MJCF file; all else is derived from its model.
+"""A vehicle: one free body with rotors, of a file; all else is derived from its compiled model.
 
 Rotors are actuators that push at a site of the body, along an axis and with a reaction about it.
 Body frame: that of the free body, x forward, y left, z up; SI units.
@@ -15,10 +15,12 @@ from typing import Any, Final, Self
 import mujoco
 import numpy as np
 
-from . import MOST_DRAG, QUAD_XML
+from . import MOST_DRAG
 from .coefficients import PREFIX, Coefficients
 from .errors import InputError, expect
+from .library import find_vehicle
 from .scene import build_scene
+from .vehicle_file import read_vehicle_file
 
 _LEAST_TIMESTEP: Final = 1e-5  # s: a control step of 0.02 s then takes a hundredth of a second
 _MOST_TIMESTEP: Final = 1.0  # s: that of the longest control step
@@ -80,17 +82,17 @@ class Vehicle:
 
     @classmethod
     def load(cls, path: Path | str | None = None, *, linear_drag: float = 0.0) -> "Vehicle":
-        """The vehicle of an MJCF file; None is the paper's. Raises `InputError` if there is none.
+        """The vehicle of a file, MJCF or TOML, or of the library by its name; None is the paper's.
 
-        The same path and drag (1/s, as Unity's `Rigidbody.drag`, 0 to 100) give the same object
-        until the file changes.
+        Raises `InputError` if there is none. The same path and drag (1/s, as Unity's
+        `Rigidbody.drag`, 0 to 100) give the same object until the file changes.
 
         Its `hash` is BLAKE2b over the MJCF of vehicle and scene with includes resolved, as
-        `MjSpec.to_xml()` writes it, the bytes of mesh and height field files, and the drag as a
-        little-endian float64. Comments, layout and folder do not enter; numbers do, to the six
-        digits that MuJoCo writes.
+        `MjSpec.to_xml()` writes it, the drag as a little-endian float64, the bytes of mesh and
+        height field files, and what a TOML file tells. Comments, sources, layout and folder do not
+        enter; numbers do, those of TOML with all digits, others to the six that MuJoCo writes.
         """
-        file = Path(path if path is not None else QUAD_XML).resolve()
+        file = find_vehicle(path)
         right = isinstance(linear_drag, int | float | np.floating) and 0 <= linear_drag <= MOST_DRAG
         expect(right, "linear_drag", f"a number from 0 to {MOST_DRAG:g} /s", f"{linear_drag!r}")
         try:
@@ -180,7 +182,8 @@ def _compiled(path: Path) -> tuple[mujoco.MjSpec, str, mujoco.MjModel, mujoco.Mj
         raise
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"vehicle: expected an MJCF file, got {path.name}: {reason}") from None
+        kind = "a vehicle" if _is_toml(path) else "an MJCF file"
+        raise InputError(f"vehicle: expected {kind}, got {path.name}: {reason}") from None
     return spec, text, model, data
 
 
@@ -350,8 +353,17 @@ def _touches(model: mujoco.MjModel, data: Any, height: float) -> bool:
 
 def _hash(spec: mujoco.MjSpec, text: str, path: Path, drag: float) -> str:
     digest = blake2b(text.encode() + b"\0" + struct.pack("<d", drag), digest_size=16)
+    folder = path.parent
+    if _is_toml(path):
+        told = read_vehicle_file(path)
+        digest.update(told.content.encode())
+        folder = folder if told.model is None else told.model.parent
     for asset in (*spec.meshes, *spec.hfields):
-        file = path.parent / spec.meshdir / asset.file
+        file = folder / spec.meshdir / asset.file
         if asset.file and file.is_file():
             digest.update(file.read_bytes())
     return digest.hexdigest()
+
+
+def _is_toml(path: Path) -> bool:
+    return path.suffix.lower() == ".toml"

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..models.errors import InputError, expect
 from ..models.frames import pose_in_mujoco_frame
-from ..models.scene import SCENE_PREFIX, World, build_scene
+from ..models.scene import SCENE_PREFIX, World, build_scene, read_spec
 from ..models.vehicle import Vehicle
 from .gl import NoOpenGL, offscreen_context
 
@@ -183,7 +183,7 @@ class Stage:
         )
         for number, offset in enumerate(self._offsets[1:], 1):
             frame = spec.worldbody.add_frame(pos=offset)
-            craft = mujoco.MjSpec.from_file(str(self.vehicle.path))  # must outlive its body
+            craft = read_spec(self.vehicle.path)  # must outlive its body
             frame.attach_body(_free_body(craft), f"{number}/", "")
         self.model = spec.compile()
         _scale_drawing(self.model, self.radius, self._spread)

@@ -30,7 +30,7 @@ PAGES = [
     ROOT / "models" / "README.md",
 ]
 FENCE = re.compile(r"^```(.*?)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-LANGUAGES = {"python", "python continued", "sh", "text", "mermaid"}
+LANGUAGES = {"python", "python continued", "sh", "text", "toml", "mermaid"}
 
 
 class Block(NamedTuple):

@@ -1,0 +1,33 @@
+"""Where a vehicle's file is: a path, or the bare name of a vehicle that comes with the package."""
+
+from pathlib import Path
+from typing import Final
+
+from . import QUAD_XML
+from .errors import InputError, expect
+
+__all__ = ["LIBRARY", "find_vehicle", "vehicle_names"]
+
+LIBRARY: Final = Path(__file__).parent / "vehicles"
+"""One folder for each vehicle: `NAME/vehicle.toml`."""
+
+
+def vehicle_names() -> list[str]:
+    """Bare names of the vehicles that come with the package, sorted."""
+    return sorted(file.parent.name for file in LIBRARY.glob("*/vehicle.toml"))
+
+
+def find_vehicle(vehicle: Path | str | None) -> Path:
+    """The absolute path of a vehicle's file; None is the paper's. Raises `InputError`."""
+    if vehicle is None:
+        return QUAD_XML.resolve()
+    path, word = Path(vehicle), str(vehicle)
+    if word in vehicle_names() and not path.is_file():
+        return (LIBRARY / word / "vehicle.toml").resolve()
+    if path.suffix == "" and path.name == word and not path.exists():
+        known = ", ".join(["a file", *vehicle_names()])
+        raise InputError(f"vehicle: expected one of {known}, got {word!r}")
+    urdf = path.suffix.lower() == ".urdf"
+    wanted = f"a TOML file that names the rotors, with [model] and file = {path.name!r}"
+    expect(not urdf, "vehicle", wanted, "the URDF file itself")
+    return path.resolve()

@@ -1,0 +1,685 @@
+"""A vehicle's TOML file: read, checked, and built as a MuJoCo model. docs/vehicles.md has it all.
+
+Body frame: x forward, y left, z up; SI units.
+"""
+
+import json
+import math
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import Field, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+from xml.etree import ElementTree
+
+import mujoco
+
+from .coefficients import PREFIX, Limits, checked, coefficient_fields
+from .errors import InputError, expect
+
+_Vector = tuple[float, float, float]
+
+
+def _entry(unit: str, low: float, high: float, count: int | None = 1) -> Field[Any]:
+    one: Field[Any] = field(metadata={"limits": Limits(unit, low, high, count)})
+    return one
+
+
+ENTRIES: Final[Mapping[str, Field[Any]]] = {
+    "timestep": _entry("s", 1e-5, 1.0),
+    "gravity": _entry("m/s²", 1e-3, 1e3),
+    "body.mass": _entry("kg", 1e-6, 1e6),
+    "body.inertia": _entry("kg m²", -1e9, 1e9, None),
+    "body.center_of_mass": _entry("m", -100.0, 100.0, 3),
+    "body.size": _entry("m", 1e-4, 100.0, 3),
+    "body.ground_clearance": _entry("m", 1e-4, 100.0),
+    "body.parts.mass": _entry("kg", 1e-6, 1e6),
+    "body.parts.position": _entry("m", -100.0, 100.0, 3),
+    "body.parts.size": _entry("m", 1e-5, 100.0, 3),
+    "body.parts.yaw": _entry("rad", -2 * math.pi, 2 * math.pi),
+    "body.parts.radius": _entry("m", 1e-5, 100.0),
+    "body.parts.length": _entry("m", 1e-5, 100.0),
+    "body.parts.axis": _entry("1", -1e3, 1e3, 3),
+    "rotors.arm": _entry("m", 1e-3, 100.0),
+    "rotors.height": _entry("m", -100.0, 100.0),
+    "rotors.thrust": _entry("N", -1e6, 1e6, 2),
+    "rotors.speed": _entry("rad/s", 0.0, 1e6, 2),
+    "rotors.reaction": _entry("N m/N", 0.0, 10.0),
+    "rotors.torque_coefficient": _entry("N m s²/rad²", 0.0, 1.0),
+    "rotors.list.position": _entry("m", -100.0, 100.0, 3),
+    "rotors.list.axis": _entry("1", -1e3, 1e3, 3),
+    **dict(coefficient_fields()),
+}
+"""Every number of a file by its dotted name; `metadata["limits"]` has its `Limits`."""
+
+FRAMES: Final[Mapping[str, tuple[int, float]]] = {
+    "plus": (4, 0.0),
+    "cross": (4, math.pi / 4),
+    "hexa": (6, math.pi / 6),
+    "octo": (8, math.pi / 8),
+}
+"""Number of rotors, and angle of the first one to the left of forward, rad. The others follow
+clockwise seen from above. The first turns clockwise, the next counterclockwise, and so on."""
+
+_WORDS: Final[Mapping[str, tuple[str, ...]]] = {
+    "vehicle": ("name", "model", "body", "rotors", "drag", "battery", "sensors"),
+    "model": ("file",),
+    "body": ("parts",),
+    "body.parts": ("shape",),
+    "rotors": ("frame", "list"),
+    "rotors.list": ("name", "turn", "link", "body", "site"),
+}
+"""Keys of each table besides its numbers."""
+_SHAPES: Final[Mapping[str, tuple[str, ...]]] = {"box": ("size",), "cylinder": ("radius", "length")}
+_UP: Final = (0.0, 0.0, 1.0)
+DEFAULT_TIMESTEP: Final = 0.01
+"""Physics step of a file that tells none, s."""
+DEFAULT_GRAVITY: Final = 9.81
+"""Downward acceleration of a file that tells none, m/s²."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Number:
+    """A number of a vehicle's file, and where it comes from."""
+
+    name: str
+    """Dotted, as in "body.mass" or "rotors.list[1].position": the first rotor."""
+    value: float | tuple[float, ...]
+    unit: str
+    source: str = ""
+    why: str = ""
+    """Why this value, if there are others."""
+    others: tuple[tuple[float | tuple[float, ...], str], ...] = ()
+    """Values of other sources, each with its source."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """A box or a cylinder of a body."""
+
+    mass: float
+    position: _Vector
+    """Of its center, m."""
+    size: tuple[float, ...]
+    """Sides of a box along its x, y and z; radius and length of a cylinder, m."""
+    turn: float | _Vector
+    """Angle of a box about z, rad; direction of a cylinder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedRotor:
+    """Where a rotor is and how it turns."""
+
+    name: str
+    position: _Vector
+    """In the body frame, or in that of what `on` names, m."""
+    axis: _Vector
+    """Direction of its thrust, of any length, in the same frame."""
+    clockwise: bool
+    """Seen from where its thrust points to."""
+    on: tuple[str, str] | None = None
+    """A "body" or a "site" of the model's file, and its name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleFile:
+    """A vehicle's TOML file, read and checked by `read_vehicle_file`."""
+
+    name: str
+    numbers: tuple[Number, ...]
+    """In the order of the tables on the page."""
+    content: str
+    """All that the file says of the vehicle, with all digits and without sources, to be hashed."""
+    model: Path | None
+    """File of the model, URDF or MJCF; None: it is built from the tables."""
+    rotors: tuple[PlacedRotor, ...]
+    parts: tuple[Part, ...]
+
+    def value(self, name: str, default: Any = None) -> Any:
+        """A number by its name: a float or a tuple of floats; `default` if the file has none."""
+        return next((one.value for one in self.numbers if one.name == name), default)
+
+    @property
+    def thrust(self) -> tuple[float, float]:
+        """Least and largest thrust of a rotor, N."""
+        low, high = self.value("rotors.thrust") or (
+            self.value("rotors.thrust_coefficient") * speed**2
+            for speed in self.value("rotors.speed")
+        )
+        return low, high
+
+    @property
+    def reaction(self) -> float:
+        """Torque about its axis per thrust of a rotor, N·m/N."""
+        given: float | None = self.value("rotors.reaction")
+        if given is not None:
+            return given
+        torque: float = self.value("rotors.torque_coefficient")
+        return torque / float(self.value("rotors.thrust_coefficient"))
+
+    @property
+    def coefficients(self) -> dict[str, tuple[float, ...]]:
+        """Those of effects and sensors, by "group.name"."""
+        known = dict(coefficient_fields())
+        return {one.name: _floats(one.value) for one in self.numbers if one.name in known}
+
+    def build(self, base: mujoco.MjSpec | None = None) -> mujoco.MjSpec:
+        """The vehicle alone, without ground; `base` is the spec of `model`, changed in place."""
+        if base is None:
+            return mujoco.MjSpec.from_string(self.mjcf())
+        _complete(base, self)
+        return base
+
+    def mjcf(self) -> str:
+        """MJCF of a vehicle without a model's file. Every number has all its digits."""
+        root = _Mjcf(self).root
+        ElementTree.indent(root)
+        return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+# ---- reading
+
+
+def read_vehicle_file(path: Path) -> VehicleFile:
+    """Read a TOML file. Raises `InputError` with the name and the range of the first wrong field,
+    `OSError` if the file cannot be read.
+    """
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"vehicle: expected a TOML file, got {path.name}: {error}") from None
+    return _Reader(path, tree).result
+
+
+class _Reader:
+    """Numbers of a tree, table by table."""
+
+    def __init__(self, path: Path, tree: dict[str, Any]) -> None:
+        self.numbers: list[Number] = []
+        self._read(tree, "vehicle")
+        name = tree.get("name", path.parent.name if path.stem == "vehicle" else path.stem)
+        expect(isinstance(name, str) and name, "name", "a text", repr(name))
+        model = self._model(path, tree.get("model"))
+        parts = self._body(tree.get("body"), model)
+        rotors = self._rotors(tree.get("rotors"), model)
+        for group in ("drag", "battery", "sensors"):
+            self._read(tree.get(group, {}), group)
+        self.result = VehicleFile(
+            name=name,
+            numbers=tuple(self.numbers),
+            content=json.dumps(_plain(tree), sort_keys=True),
+            model=model,
+            rotors=rotors,
+            parts=parts,
+        )
+
+    def _read(self, table: Any, kind: str, name: str = "") -> dict[str, Any]:
+        """Numbers of a table of some kind, by key; its other keys must be known, too."""
+        name = name or kind
+        start = "" if kind == "vehicle" else kind + "."
+        entries = {
+            key.removeprefix(start): one
+            for key, one in ENTRIES.items()
+            if key.startswith(start) and "." not in key.removeprefix(start)
+        }
+        _check_keys(name, table, [*_WORDS.get(kind, ()), *entries], "source")
+        source = table.get("source", "")
+        expect(isinstance(source, str), f"{name}.source", "a text", repr(source))
+        values = {}
+        for key, one in entries.items():
+            if key in table:
+                full = key if kind == "vehicle" else f"{name}.{key}"
+                self.numbers.append(_number(full, one, table[key], source))
+                values[key] = self.numbers[-1].value
+        return values
+
+    def _model(self, path: Path, table: Any) -> Path | None:
+        if table is None:
+            return None
+        self._read(table, "model")
+        file = table.get("file")
+        right = isinstance(file, str) and Path(file).suffix.lower() in (".urdf", ".xml")
+        expect(right, "model.file", "a URDF file (.urdf) or an MJCF file (.xml)", repr(file))
+        model = path.parent / str(file)
+        expect(model.is_file(), "model.file", "a file that is there", repr(file))
+        return model
+
+    def _body(self, table: Any, model: Path | None) -> tuple[Part, ...]:
+        if model is not None:
+            expect(table is None, "body", "none beside a model's file, which has it", "a table")
+            return ()
+        expect(table is not None, "vehicle", "a table [body], or [model] with a file", "neither")
+        given = self._read(table, "body")
+        own = [key for key in ("mass", "inertia", "center_of_mass") if key in given]
+        if "parts" in table:
+            got = f"{', '.join(own)} too"
+            expect(not own, "body", "parts, or mass and inertia", got)
+            listed = _tables("body.parts", table["parts"])
+            return tuple(self._part(one, f"body.parts[{i}]") for i, one in enumerate(listed, 1))
+        for key in ("mass", "inertia"):
+            expect(key in given, "body", "mass and inertia, or parts", f"no {key}")
+        _check_inertia(given["inertia"])
+        return ()
+
+    def _part(self, table: Any, name: str) -> Part:
+        given = self._read(table, "body.parts", name)
+        shape = table.get("shape")
+        expect(shape in _SHAPES, f"{name}.shape", "'box' or 'cylinder'", repr(shape))
+        turn, other = ("yaw", "axis") if shape == "box" else ("axis", "yaw")
+        for key in ("mass", *_SHAPES[shape]):
+            expect(key in given, name, f"{key} of a {shape}", "none")
+        foreign = ({"size", "radius", "length", other} - set(_SHAPES[shape])) & set(given)
+        for key in sorted(foreign):
+            expect(False, name, f"no {key} for a {shape}", repr(given[key]))
+        if "axis" in given:
+            _check_axis(f"{name}.axis", given["axis"])
+        size = (value for key in _SHAPES[shape] for value in _floats(given[key]))
+        return Part(
+            mass=given["mass"],
+            position=given.get("position", (0.0, 0.0, 0.0)),
+            size=tuple(size),
+            turn=given.get(turn, 0.0 if shape == "box" else _UP),
+        )
+
+    def _rotors(self, table: Any, model: Path | None) -> tuple[PlacedRotor, ...]:
+        if table is None and model is not None and model.suffix.lower() == ".xml":
+            return ()  # those of the file
+        expect(table is not None, "vehicle", "a table [rotors]", "none")
+        given = self._read(table, "rotors")
+        frame, listed = table.get("frame"), table.get("list")
+        if listed is None and frame is None and model is not None and model.suffix == ".xml":
+            self._only_coefficients(given)
+            return ()
+        both = "a frame or a list" if model is None else "a list"
+        right = (frame is None) != (listed is None) and (frame is None or model is None)
+        got = "both" if frame is not None and listed is not None else "neither"
+        expect(right, "rotors", both, got if model is None else f"frame = {frame!r}")
+        self._check_thrust(given)
+        if frame is None:
+            for key in ("arm", "height"):
+                expect(key not in given, "rotors", f"no {key} with a list", repr(given.get(key)))
+            tables = enumerate(_tables("rotors.list", listed), 1)
+            rotors = [self._rotor(one, i, model) for i, one in tables]
+            names = [rotor.name for rotor in rotors]
+            twice = next((name for name in names if names.count(name) > 1), None)
+            expect(twice is None, "rotors.list", "a name of its own for each", f"{twice!r} twice")
+            return tuple(rotors)
+        right = isinstance(frame, str) and frame in FRAMES
+        expect(right, "rotors.frame", " or ".join(map(repr, FRAMES)), repr(frame))
+        expect("arm" in given, "rotors", f"arm of the frame {frame!r}", "none")
+        return frame_rotors(frame, given["arm"], given.get("height", 0.0))
+
+    def _only_coefficients(self, given: Mapping[str, Any]) -> None:
+        known = dict(coefficient_fields())
+        for key in given:
+            wanted = f"no {key} for rotors of the model's file"
+            expect(f"rotors.{key}" in known, "rotors", wanted, repr(given[key]))
+
+    def _check_thrust(self, given: Mapping[str, Any]) -> None:
+        """Thrust and reaction are told once each."""
+        two = [key for key in ("thrust", "speed") if key in given]
+        got = " and ".join(two) or "neither"
+        expect(len(two) == 1, "rotors", "thrust, or speed with thrust_coefficient", got)
+        low, high = given[two[0]]
+        expect(low < high, f"rotors.{two[0]}", "a lower and a higher number", f"{low:g}, {high:g}")
+        two = [key for key in ("reaction", "torque_coefficient") if key in given]
+        wanted = "reaction, or torque_coefficient with thrust_coefficient"
+        expect(len(two) == 1, "rotors", wanted, " and ".join(two) or "neither")
+        for key in ("speed", "torque_coefficient"):
+            right = key not in given or "thrust_coefficient" in given
+            expect(right, "rotors", f"thrust_coefficient with {key}", "none")
+
+    def _rotor(self, table: Any, number: int, model: Path | None) -> PlacedRotor:
+        name = f"rotors.list[{number}]"
+        given = self._read(table, "rotors.list", name)
+        axis, turn = given.get("axis", _UP), table.get("turn")
+        _check_axis(f"{name}.axis", axis)
+        expect(turn in ("cw", "ccw"), f"{name}.turn", "'cw' or 'ccw'", repr(turn))
+        own = table.get("name", f"rotor{number}")
+        expect(isinstance(own, str) and own, f"{name}.name", "a text", repr(own))
+        places = [key for key in ("link", "body", "site") if key in table]
+        if model is None:
+            expect(not places, name, "a position", "".join(places[:1]))
+            expect("position" in given, name, "a position", "none")
+            on = None
+        else:
+            got = " and ".join(places) or "none"
+            expect(len(places) == 1, name, "one of link, body and site of the model's file", got)
+            place = table[places[0]]
+            expect(isinstance(place, str), f"{name}.{places[0]}", "a name", repr(place))
+            at_site = places == ["site"]
+            right = not (at_site and "position" in given)
+            expect(right, name, "no position besides a site, which has it", "both")
+            on = ("site" if at_site else "body", place)
+        return PlacedRotor(
+            name=own,
+            position=given.get("position", (0.0, 0.0, 0.0)),
+            axis=axis,
+            clockwise=turn == "cw",
+            on=on,
+        )
+
+
+def frame_rotors(frame: str, arm: float, height: float = 0.0) -> tuple[PlacedRotor, ...]:
+    """Rotors of a frame of `FRAMES`, `arm` from the body's origin and `height` above it, m."""
+    count, first = FRAMES[frame]
+    angles = [first - 2 * math.pi * i / count for i in range(count)]
+    return tuple(
+        PlacedRotor(
+            name=f"rotor{i + 1}",
+            position=(_round(arm * math.cos(angle)), _round(arm * math.sin(angle)), height),
+            axis=_UP,
+            clockwise=i % 2 == 0,
+        )
+        for i, angle in enumerate(angles)
+    )
+
+
+def _round(length: float) -> float:
+    """So that a rotor on an axis is exactly there: 15 digits after the point are enough."""
+    return round(length, 15) + 0.0
+
+
+def _number(name: str, one: Field[Any], given: Any, source: str) -> Number:
+    """A number that is given plainly or with its provenance. Raises `InputError`."""
+    told = given if isinstance(given, dict) else {"value": given}
+    _check_keys(name, told, ("value", "source", "why", "others"))
+    expect("value" in told, name, "a value", "none")
+    texts = {key: told.get(key, "") for key in ("source", "why")}
+    for key, text in texts.items():
+        expect(isinstance(text, str), f"{name}.{key}", "a text", repr(text))
+    others = []
+    for i, other in enumerate(_tables(f"{name}.others", told.get("others", [])), 1):
+        _check_keys(f"{name}.others[{i}]", other, ("value", "source"))
+        expect("value" in other, f"{name}.others[{i}]", "a value", "none")
+        where = other.get("source", "")
+        expect(isinstance(where, str), f"{name}.others[{i}].source", "a text", repr(where))
+        others.append((checked(f"{name}.others[{i}]", one, other["value"]), where))
+    return Number(
+        name=name,
+        value=checked(name, one, told["value"]),
+        unit=one.metadata["limits"].unit,
+        source=texts["source"] or source,
+        why=texts["why"],
+        others=tuple(others),
+    )
+
+
+def _check_keys(name: str, table: Any, known: Sequence[str], *silent: str) -> None:
+    expect(isinstance(table, dict), name, "a table", f"{table!r:.80}")
+    for key in table:
+        right = key in known or key in silent
+        expect(right, name, f"some of {', '.join(known)}", repr(key))
+
+
+def _tables(name: str, given: Any) -> list[Any]:
+    expect(isinstance(given, list), name, "a list of tables", f"{given!r:.80}")
+    return list(given)
+
+
+def _check_axis(name: str, axis: Sequence[float]) -> None:
+    got = ", ".join(f"{one:g}" for one in axis)
+    expect(math.hypot(*axis) > 1e-6, name, "a direction: three numbers, not all 0", got)
+
+
+def _check_inertia(values: tuple[float, ...]) -> None:
+    """Raise `InputError` unless a body of some masses can have it."""
+    import numpy as np
+
+    got = ", ".join(f"{one:g}" for one in values)
+    counts = "3 numbers: Ixx, Iyy, Izz, or 6: Ixx, Iyy, Izz, Ixy, Ixz, Iyz"
+    expect(len(values) in (3, 6), "body.inertia", counts, got)
+    xx, yy, zz, xy, xz, yz = (*values, 0.0, 0.0, 0.0)[:6]
+    low, middle, high = np.linalg.eigvalsh(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))).tolist()
+    expect(low > 0, "body.inertia", "principal moments above 0 kg m²", got)
+    wanted = "principal moments of which none is larger than the sum of the others"
+    right = high <= (low + middle) * (1 + 1e-9)
+    expect(right, "body.inertia", wanted, f"{low:.4g}, {middle:.4g} and {high:.4g} kg m²")
+
+
+def _floats(value: float | Iterable[float]) -> tuple[float, ...]:
+    return tuple(value) if isinstance(value, Iterable) else (value,)
+
+
+def _plain(tree: Any) -> Any:
+    """What a tree says without provenance, with every number as a float."""
+    if isinstance(tree, dict):
+        if "value" in tree:
+            return _plain(tree["value"])
+        return {key: _plain(one) for key, one in tree.items() if key != "source"}
+    if isinstance(tree, list):
+        return [_plain(one) for one in tree]
+    return float(tree) if isinstance(tree, int) else tree
+
+
+# ---- building: a model from the tables
+
+
+def _text(*values: float) -> str:
+    """Numbers as MJCF has them, with all digits."""
+    return " ".join(repr(float(value)) for value in values)
+
+
+_MATERIALS: Final = {
+    "carbon": "0.13 0.14 0.16 1",
+    "shell": "0.93 0.94 0.95 1",
+    "silver": "0.62 0.65 0.69 1",
+    "front": "0.96 0.42 0.08 1",
+    "front disc": "0.98 0.50 0.12 0.42",
+    "rear disc": "0.20 0.46 0.78 0.42",
+}
+
+
+class _Mjcf:
+    """The MJCF of a vehicle: what weighs, what touches, what is drawn, and the rotors.
+
+    Lengths that the file does not tell are those of quad.xml, in the proportion of the spans.
+    """
+
+    def __init__(self, file: VehicleFile) -> None:
+        self.file, self.rotors = file, file.rotors
+        reach = max(math.hypot(*rotor.position) for rotor in self.rotors)
+        self.reach = max(reach, file.value("rotors.radius", 0.0), 1e-2)
+        self.unit = self.reach / math.sqrt(2)  # 1 m of quad.xml
+        sides = file.value("body.size", _scaled((0.44, 0.44, 0.14), self.unit))
+        self.half = _scaled(sides, 0.5)
+        self.root = ElementTree.Element("mujoco", model=file.name)
+        ElementTree.SubElement(self.root, "compiler", angle="radian")
+        self._options()
+        assets = ElementTree.SubElement(self.root, "asset")
+        for name, color in _MATERIALS.items():
+            ElementTree.SubElement(assets, "material", name=name, rgba=color)
+        world = ElementTree.SubElement(self.root, "worldbody")
+        clearance = self._clearance()
+        self.body = ElementTree.SubElement(world, "body", name="craft", pos=_text(0, 0, clearance))
+        ElementTree.SubElement(self.body, "freejoint", name="free")
+        self._mass()
+        self._hull(clearance)
+        self._looks()
+        self._actuators()
+
+    def _options(self) -> None:
+        value = self.file.value
+        ElementTree.SubElement(
+            self.root,
+            "option",
+            timestep=_text(value("timestep", DEFAULT_TIMESTEP)),
+            integrator="RK4",
+            gravity=_text(0, 0, -value("gravity", DEFAULT_GRAVITY)),
+        )
+        numbers = ElementTree.SubElement(self.root, "custom")
+        for name, values in self.file.coefficients.items():
+            ElementTree.SubElement(numbers, "numeric", name=PREFIX + name, data=_text(*values))
+
+    def _clearance(self) -> float:
+        """Of the body's origin above the ground, m. Raises `InputError` if its parts need more."""
+        motor = 0.06 * self.unit
+        lowest = max(self.half[2], *(motor - rotor.position[2] for rotor in self.rotors))
+        given: float = self.file.value("body.ground_clearance", lowest + 0.33 * self.unit)
+        wanted = f"more than {lowest:.4g} m, which hub and rotors need"
+        expect(given > lowest, "body.ground_clearance", wanted, f"{given:g}")
+        return given
+
+    def _geom(self, name: str, kind: str, material: str, **more: str) -> None:
+        """A massless geom that is drawn and collides, unless `more` tells otherwise."""
+        told = {"mass": "0", "group": "1", **more}
+        kinds = {"name": name, "type": kind, "material": material}
+        ElementTree.SubElement(
+            self.body, "geom", {key: v for key, v in (kinds | told).items() if v}
+        )
+
+    def _mass(self) -> None:
+        """Mass and inertia as given, or parts that have them."""
+        file = self.file
+        for number, part in enumerate(file.parts, 1):
+            ghost = {"contype": "0", "conaffinity": "0", "mass": _text(part.mass)}
+            ghost["pos"] = _text(*part.position)
+            if isinstance(part.turn, tuple):
+                radius, length = part.size
+                turn = {} if part.turn == _UP else {"zaxis": _text(*part.turn)}
+                ghost |= {"size": _text(radius, length / 2), **turn}
+            else:
+                turn = {"euler": _text(0, 0, part.turn)} if part.turn else {}
+                ghost |= {"size": _text(*_scaled(part.size, 0.5)), **turn}
+            kind = "cylinder" if isinstance(part.turn, tuple) else "box"
+            self._geom(f"part{number}", kind, "carbon", **ghost)
+        if file.parts:
+            return
+        inertia = file.value("body.inertia")
+        ElementTree.SubElement(
+            self.body,
+            "inertial",
+            {"diaginertia" if len(inertia) == 3 else "fullinertia": _text(*inertia)},
+            pos=_text(*file.value("body.center_of_mass", (0.0, 0.0, 0.0))),
+            mass=_text(file.value("body.mass")),
+        )
+
+    def _hull(self, clearance: float) -> None:
+        """What touches: hub, motors and two skids. If parts are drawn, hub and motors are not."""
+        seen = {"group": "3"} if self.file.parts else {}
+        self._geom("hub", "box", "carbon", size=_text(*self.half), **seen)
+        motor = _text(0.09 * self.unit, 0.06 * self.unit)
+        for rotor in self.rotors:
+            where = {"pos": _text(*rotor.position), "size": motor} | _turned(rotor)
+            self._geom(f"motor {rotor.name}", "cylinder", "silver", **where, **seen)
+        thick = min(0.03 * self.unit, (clearance - self.half[2]) / 2)
+        long, wide = 0.5 * self.unit, 0.45 * self.unit
+        for side, y in (("left", wide), ("right", -wide)):
+            ends = _text(-long, y, thick - clearance, long, y, thick - clearance)
+            self._geom(f"skid {side}", "capsule", "silver", size=_text(thick), fromto=ends)
+            for x in (-0.6 * long, 0.6 * long):
+                top = (math.copysign(0.7 * self.half[0], x), math.copysign(0.8 * self.half[1], y))
+                ends = _text(*top, -self.half[2] / 2, x, y, thick - clearance)
+                self._ghost("", "capsule", "silver", size=_text(0.7 * thick), fromto=ends)
+
+    def _ghost(self, name: str, kind: str, material: str, **more: str) -> None:
+        """A geom that is only drawn."""
+        self._geom(name, kind, material, contype="0", conaffinity="0", group="2", **more)
+
+    def _looks(self) -> None:
+        x, y, z = self.half
+        shell, mark = _text(1.2 * x, 0.9 * y, 1.7 * z), _text(0.6 * x, 0.55 * y, 1.1 * z)
+        self._ghost("canopy", "ellipsoid", "shell", pos=_text(0, 0, 0.7 * z), size=shell)
+        self._ghost("front mark", "ellipsoid", "front", pos=_text(0.9 * x, 0, 0.6 * z), size=mark)
+        radius = self.file.value("rotors.radius") or 0.4 * _nearest(self.rotors, self.reach)
+        for number, rotor in enumerate(self.rotors, 1):
+            if not self.file.parts and math.hypot(*rotor.position[:2]) > x:
+                ends = _text(0, 0, 0, *rotor.position)
+                thick = _text(0.035 * self.unit)
+                self._ghost(f"arm{number}", "cylinder", "carbon", fromto=ends, size=thick)
+            size = math.hypot(*rotor.axis)
+            above = _scaled(rotor.axis, 0.09 * self.unit / size)
+            pos = {"pos": _text(*(p + a for p, a in zip(rotor.position, above, strict=True)))}
+            front = rotor.position[0] > 1e-6 * self.reach
+            disc = _text(radius, 0.01 * radius)
+            material = "front disc" if front else "rear disc"
+            turned = _turned(rotor)
+            self._ghost(f"disc{number}", "cylinder", material, size=disc, **pos, **turned)
+            blade = _scaled((0.97, 0.09, 0.018), radius)
+            turned = turned or {"euler": _text(0, 0, 0.4 + 1.5 * number)}
+            self._ghost("", "ellipsoid", "carbon", size=_text(*blade), **pos, **turned)
+
+    def _actuators(self) -> None:
+        motors, reaction = ElementTree.SubElement(self.root, "actuator"), self.file.reaction
+        for rotor in self.rotors:
+            place = {"name": rotor.name, "pos": _text(*rotor.position)} | _turned(rotor)
+            looks = {"group": "4", "size": _text(0.02 * self.unit)}
+            ElementTree.SubElement(self.body, "site", place | looks)
+            ElementTree.SubElement(
+                motors,
+                "motor",
+                name=rotor.name,
+                site=rotor.name,
+                gear=_text(0, 0, 1, 0, 0, reaction if rotor.clockwise else -reaction),
+                ctrllimited="true",
+                ctrlrange=_text(*self.file.thrust),
+            )
+
+
+def _scaled(vector: Sequence[float], factor: float) -> tuple[float, ...]:
+    return tuple(factor * one for one in vector)
+
+
+def _turned(rotor: PlacedRotor) -> dict[str, str]:
+    return {} if rotor.axis == _UP else {"zaxis": _text(*rotor.axis)}
+
+
+def _nearest(rotors: Sequence[PlacedRotor], reach: float) -> float:
+    """Shortest distance between two rotors that are not above each other, m."""
+    places = [rotor.position[:2] for rotor in rotors]
+    distances = [math.dist(a, b) for i, a in enumerate(places) for b in places[:i]]
+    return min((one for one in distances if one > 0.1 * reach), default=reach)
+
+
+# ---- building: a model from a file of its own
+
+
+def _complete(spec: mujoco.MjSpec, file: VehicleFile) -> None:
+    """Add to the spec of a model's file what the TOML file tells of it."""
+    urdf = file.model is not None and file.model.suffix.lower() == ".urdf"
+    spec.modelname = file.name
+    if urdf:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        spec.compiler.fusestatic = False  # it would fuse the root with the world
+        root = spec.worldbody.first_body()
+        if not list(root.joints):
+            root.add_freejoint()
+    if urdf or file.value("timestep"):
+        spec.option.timestep = file.value("timestep", DEFAULT_TIMESTEP)
+    if urdf or file.value("gravity"):
+        spec.option.gravity = (0.0, 0.0, -file.value("gravity", DEFAULT_GRAVITY))
+    expect(
+        not file.rotors or not list(spec.actuators),
+        "rotors.list",
+        "none for a model's file with actuators, which are its rotors",
+        f"{len(file.rotors)} of them",
+    )
+    for number, rotor in enumerate(file.rotors, 1):
+        _add_rotor(spec, file, rotor, number)
+    for name, values in file.coefficients.items():
+        numeric = spec.numeric(PREFIX + name) or spec.add_numeric(name=PREFIX + name)
+        numeric.size, numeric.data = len(values), values
+
+
+def _add_rotor(spec: mujoco.MjSpec, file: VehicleFile, rotor: PlacedRotor, number: int) -> None:
+    assert rotor.on is not None  # the reader has seen to it
+    kind, name = rotor.on
+    known = [one.name for one in (spec.sites if kind == "site" else spec.bodies)]
+    found = getattr(spec, kind)(name)
+    wanted = f"a {kind} of the model's file: {', '.join(one for one in known if one != 'world')}"
+    expect(found is not None and name != "world", f"rotors.list[{number}]", wanted, repr(name))
+    if kind == "body":
+        for joint in list(found.joints):  # a propeller that turns is welded on
+            if joint.type != mujoco.mjtJoint.mjJNT_FREE:
+                spec.delete(joint)
+        found = found.add_site(name=f"rotor/{rotor.name}", pos=rotor.position, group=4)
+    axis = _scaled(rotor.axis, 1 / math.hypot(*rotor.axis))
+    reaction = file.reaction if rotor.clockwise else -file.reaction
+    spec.add_actuator(
+        name=rotor.name,
+        target=found.name,
+        trntype=mujoco.mjtTrn.mjTRN_SITE,
+        gear=(*axis, *_scaled(axis, reaction)),
+        ctrllimited=True,
+        ctrlrange=file.thrust,
+    )
