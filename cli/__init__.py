@@ -37,6 +37,7 @@ COMMANDS: Final = {
     "render": "Render",
     "bench": "Bench",
     "check-model": "CheckModel",
+    "vehicle": "Vehicle",
     "key": "Key",
     "relay": "Relay",
     "replay": "Replay",

@@ -16,7 +16,7 @@ class CheckModel(Command):
     """
 
     xml: Positional[Path | None] = None
-    """MJCF file. Default: the paper's quadcopter."""
+    """MJCF or TOML file, or the name of a vehicle. Default: the paper's quadcopter."""
 
     def run(self) -> int:
         """Print every check."""

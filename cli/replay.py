@@ -21,7 +21,7 @@ class Replay(Command):
     """module:Name-v0 to import a module of the working directory that registers the journal's
     task. An id in a journal is never imported."""
     vehicle: str | None = None
-    """MJCF file that was flown. Default: the paper's quadcopter."""
+    """TOML or MJCF file that was flown, or its name. Default: the paper's quadcopter."""
 
     def run(self) -> int:
         """Print the summary and the verdict."""

@@ -150,7 +150,7 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
 class Loop(NotCopied):
     """N drones of one env, each in a world of its own.
 
-    The vehicle is an MJCF file, None the paper's; options are the task's, by name; settings the
+    The vehicle is a file, None the paper's; options are the task's, by name; settings the
     backend's: `num_threads`, or `device`.
 
     Attributes:

@@ -83,7 +83,7 @@ def options_type(env_id: str) -> "type[TaskOptions]":
 
 
 def env_spec(env_id: str, options: Any = None, vehicle: Any = None) -> EnvSpec:
-    """The spec of an env with these options and this MJCF file. Raises `InputError`."""
+    """The spec of an env with these options and this vehicle. Raises `InputError`."""
     from .loop import make_task, spec_of
 
     return spec_of(canonical_id(env_id), make_task(env_id, options or {}, vehicle))

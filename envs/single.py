@@ -23,7 +23,7 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
     Render modes: with `rgb_array`, `render()` gives a picture, uint8, shape (360, 480, 3); with
     `human` a window shows the flight in real time. The physics is the same with either.
 
-    The vehicle is an MJCF file, None the paper's; options are the task's, by name.
+    The vehicle is a file, None the paper's; options are the task's, by name.
 
     Attributes:
         control_period: Time of a step, s.

@@ -35,7 +35,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         num_envs: N.
         render_mode: None, `rgb_array` (N pictures) or `human` (a window shows sixteen of them).
         autoreset_mode: `AutoresetMode`, or its value.
-        vehicle: MJCF file; None is the paper's.
+        vehicle: As of `Vehicle.load`: a file or a name; None is the paper's.
         backend: `mujoco`, or `warp`.
         num_threads: Threads that step `mujoco`; 0 takes one for each processor.
         device: Of `warp`; None takes a GPU if there is one.

@@ -79,7 +79,7 @@ class Film:
     """Seconds of flight per second of film."""
     world: World = "airport"
     vehicle: str | None = None
-    """MJCF file of the vehicle; None: the paper's."""
+    """File or name of the vehicle; None: the paper's."""
     overlay: bool = True
     """Whether numbers and graphs are drawn. Of several panes the names always are."""
     at: float | None = None

@@ -30,7 +30,7 @@ def socket_pair(
     record: Path | None = None,
 ) -> Iterator[Any]:
     """A connected remote env, on free ports of the loopback interface: of a task that is registered
-    here, with a vehicle from an MJCF file, or the paper's. One drone makes a `RemoteEnv`, more make
+    here, with a vehicle by file or name, or the paper's. One drone makes a `RemoteEnv`, more make
     a `RemoteVectorEnv` without autoreset. `record` is the MCAP file of the agent's journal.
 
     The simulator ends with this process, however this one ends.

@@ -23,7 +23,7 @@ class EnvConfig:
     options: Mapping[str, Any] = field(default_factory=dict)
     """Options of the env by name. Those that are not given have their defaults."""
     vehicle: str | None = None
-    """MJCF file of the vehicle; None: the paper's."""
+    """File or name of the vehicle; None: the paper's."""
 
     def __post_init__(self) -> None:
         options: dict[str, Any] = dict(self.options)

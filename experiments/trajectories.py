@@ -193,8 +193,8 @@ def flown_trajectories(
     vehicle: str | Path | None = None,
     of: EpisodeSet = "curve",
 ) -> list[Trajectory]:
-    """Evaluation episodes of a set by number, flown in process: see `fly`. The vehicle is an MJCF
-    file, None the paper's.
+    """Evaluation episodes of a set by number, flown in process: see `fly`. The vehicle is a
+    file or a name, None the paper's.
     """
     name = canonical_id(env_id)  # a checkpoint may name a module, which is not to be imported
     made = gym.make(name, disable_env_checker=True, vehicle=vehicle, **options)

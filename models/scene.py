@@ -36,10 +36,11 @@ _HAZE_COLOUR: Final = (0.80, 0.88, 0.96, 1.0)  # the sky's colour where it meets
 def build_scene(
     vehicle: Path | str | None = None, world: World = "plain", *, visual: bool = True
 ) -> mujoco.MjSpec:
-    """A vehicle, None for the paper's, with ground, sky and light, to be compiled.
+    """A vehicle's file, None for the paper's, with ground, sky and light, to be compiled.
 
     Without visual elements the physics is faster and the same, bit for bit. Raises `InputError` if
-    there is no such world, or a height field is too large; `ValueError` if the file is no MJCF.
+    there is no such world, a height field is too large or a TOML file is wrong; `ValueError` if an
+    MJCF file is.
     """
     expect(world in ("plain", "airport"), "world", "'plain' or 'airport'", f"{world!r}")
     spec = read_spec(Path(vehicle if vehicle is not None else QUAD_XML))

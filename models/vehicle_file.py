@@ -207,7 +207,7 @@ class _Reader:
         self.result = VehicleFile(
             name=name,
             numbers=tuple(self.numbers),
-            content=json.dumps(_plain(tree), sort_keys=True),
+            content=json.dumps(_plain(tree | {"name": name}), sort_keys=True),
             model=model,
             rotors=rotors,
             parts=parts,
@@ -507,8 +507,9 @@ class _Mjcf:
             integrator="RK4",
             gravity=_text(0, 0, -value("gravity", DEFAULT_GRAVITY)),
         )
-        numbers = ElementTree.SubElement(self.root, "custom")
-        for name, values in self.file.coefficients.items():
+        told = self.file.coefficients
+        numbers = ElementTree.SubElement(self.root, "custom") if told else self.root
+        for name, values in told.items():
             ElementTree.SubElement(numbers, "numeric", name=PREFIX + name, data=_text(*values))
 
     def _clearance(self) -> float:

@@ -39,7 +39,7 @@ class SessionVerdict:
 
     session: Session
     vehicle: Path | str | None = None
-    """MJCF of the vehicle that was flown; None: the paper's."""
+    """File or name of the vehicle that was flown; None: the paper's."""
     same: int = 0
     """States that are the same in every bit."""
     unchecked: int = 0
@@ -144,7 +144,7 @@ class Verification(Recording):
 
     Args:
         path: The journal.
-        vehicle: MJCF of the vehicle that was flown; None: the paper's.
+        vehicle: File or name of the vehicle that was flown; None: the paper's.
 
     Attributes:
         notes: Versions that have changed.

@@ -36,7 +36,7 @@ def make_stepped(
     Args:
         env: Id of a registered task, of an env of Gymnasium, or one env itself.
         num_envs: N.
-        vehicle: MJCF file, for a registered task; None is the paper's.
+        vehicle: File or name, for a registered task; None is the paper's.
         backend: `mujoco` or `warp`, for a registered task.
         options: Of the env, by name.
     """

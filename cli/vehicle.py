@@ -1,0 +1,192 @@
+"""`rotorgram vehicle`: a vehicle's file, from a first one to MJCF for others."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, Literal
+
+from tyro.conf import Positional, arg
+
+from ..models.errors import expect
+from ._flags import Command
+
+if TYPE_CHECKING:
+    from ..models import Rotor
+    from ..models import Vehicle as Craft
+    from ..models.vehicle_file import VehicleFile
+
+_FRAME: Final = """\
+frame = "{frame}"{space}# docs/vehicles.md has pictures of the frames
+arm = 0.25                        # m, from the body's origin to each rotor
+"""
+_LIST: Final = """
+[[rotors.list]]                   # one for each rotor, in the order of actions
+position = [0.2, 0.2, 0.0]        # m, where its thrust acts
+axis = [0.0, 0.0, 1.0]            # of its thrust
+turn = "cw"                       # seen from above; it pushes the craft counterclockwise
+
+[[rotors.list]]
+position = [0.2, -0.2, 0.0]
+turn = "ccw"
+
+[[rotors.list]]
+position = [-0.2, -0.2, 0.0]
+turn = "cw"
+
+[[rotors.list]]
+position = [-0.2, 0.2, 0.0]
+turn = "ccw"
+"""
+_NEW: Final = """\
+# A vehicle for rotorgram. It flies as it is; replace the numbers by those of your craft.
+# SI units; body axes x forward, y left, z up. docs/vehicles.md has every field.
+# For any number you may write where it is from: {{ value = 1.5, source = "scales" }}.
+
+[body]
+mass = 1.5                        # kg, with battery
+inertia = [0.02, 0.02, 0.035]     # kg m²: Ixx, Iyy, Izz about the centre of mass
+center_of_mass = [0.0, 0.0, 0.0]  # m
+
+[rotors]
+{frame}thrust = {thrust:25}# N, least and largest of each rotor
+reaction = 0.016                  # N m of torque per N of thrust
+# What effects and sensors need begins with #: take it away where you know the number.
+# radius = 0.11                   # m
+# time_constant = 0.05            # s, of the speed's first-order answer
+{listed}
+# [drag]
+# linear = [0.1, 0.1, 0.2]        # N s/m
+# quadratic = [0.02, 0.02, 0.04]  # N s²/m²
+
+# [sensors]
+# gyro_noise = 1e-4               # rad/s/√Hz
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vehicle(Command):
+    """Write, show, examine or export the file of a vehicle.
+
+    new: write a commented file that flies. show: print derived values, and each number with its
+    source. check: examine the model, as check-model. export: write MJCF for MuJoCo alone.
+    """
+
+    action: Positional[Literal["new", "show", "check", "export"]]
+    """What to do."""
+    file: Annotated[Positional[str], arg(metavar="FILE")]
+    """TOML or MJCF file, or the name of a vehicle of the library."""
+    out: Annotated[Positional[Path | None], arg(metavar="OUT.xml")] = None
+    """MJCF file that `export` writes."""
+    frame: Literal["plus", "cross", "hexa", "octo", "list"] = "cross"
+    """Arrangement of the rotors of `new`."""
+
+    def run(self) -> int:
+        """Do it."""
+        other = self.action != "export"
+        expect(other == (self.out is None), "vehicle", *_out_words(self.action, self.out))
+        right = "frame" not in self.given or self.action == "new"
+        expect(right, "frame", "no --frame but with new", self.frame)
+        match self.action:
+            case "new":
+                self._new()
+            case "show":
+                self._show()
+            case "export":
+                self._export()
+            case "check":
+                from .check_model import CheckModel
+
+                return CheckModel(xml=Path(self.file)).run()
+        return 0
+
+    def _new(self) -> None:
+        path = Path(self.file)
+        right = path.suffix.lower() == ".toml"
+        expect(right, "file", "a name that ends in .toml", self.file)
+        count = {"hexa": 6, "octo": 8}.get(self.frame, 4)
+        listed, space = self.frame == "list", " " * (24 - len(self.frame))
+        text = _NEW.format(
+            frame="" if listed else _FRAME.format(frame=self.frame, space=space),
+            thrust=f"[0.0, {30.0 / count}]",  # twice the weight
+            listed=_LIST if listed else "",
+        )
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+        print(f"vehicle: {path} (rotorgram vehicle check {path} examines it)")
+
+    def _show(self) -> None:
+        from ..models.vehicle import Vehicle as Craft
+        from ..models.vehicle_file import read_vehicle_file
+
+        craft = Craft.load(self.file)
+        print(f"{craft.name} ({craft.path})\n")
+        for name, value in _derived(craft):
+            print(f"{name:17} {value}")
+        print("\nrotors: position, direction, torque besides that of the position per thrust")
+        for rotor in craft.rotors:
+            print(f"{rotor.name:17} {_rotor_words(rotor)}")
+        if craft.path.suffix.lower() == ".toml":
+            print(f"\nnumbers of {craft.path.name}")
+            for line in _provenance(read_vehicle_file(craft.path)):
+                print(line)
+            return
+        print("\ncoefficients")
+        for name, values in craft.coefficients.numbers().items():
+            print(f"{name} = {_listed(values)}")
+
+    def _export(self) -> None:
+        from ..models.export import export_mjcf
+
+        assert self.out is not None
+        digits = export_mjcf(self.file, self.out)
+        print(f"vehicle: {self.out} ({digits})")
+
+
+def _out_words(action: str, out: Path | None) -> tuple[str, str]:
+    """Expected and got of a wrong number of files."""
+    if action == "export":
+        return "two files, that of the vehicle and that to write", "one"
+    return f"one file for {action}", f"{out} too"
+
+
+def _derived(craft: "Craft") -> Iterator[tuple[str, str]]:
+    """Names and values of what follows from the model."""
+    weight = craft.mass * craft.gravity
+    most = float(craft.allocation[0] @ craft.thrust_high)
+    shares = craft.hover_thrust / craft.thrust_high
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = craft.inertia
+    yield "mass", f"{craft.mass:.6g} kg"
+    yield "centre of mass", f"{_listed(craft.center_of_mass)} m"
+    yield "Ixx, Iyy, Izz", f"{_listed((xx, yy, zz))} kg m²"
+    yield "Ixy, Ixz, Iyz", f"{_listed((xy, xz, yz))} kg m²"
+    yield "gravity", f"{craft.gravity:.6g} m/s²"
+    yield "rest height", f"{craft.rest_height:.6g} m"
+    yield "physics step", f"{craft.timestep:.6g} s"
+    yield "hover thrust", f"{_listed(dict.fromkeys(craft.hover_thrust.round(9)))} N"
+    yield "hover throttle", f"{_listed(dict.fromkeys((100 * shares).round(2)))} %"
+    yield "thrust to weight", f"{most / weight:.4g}"
+    yield "hash", craft.hash
+
+
+def _rotor_words(rotor: "Rotor") -> str:
+    words = f"{_listed(rotor.position)} m; {_listed(rotor.axis)}; {_listed(rotor.reaction)} N m/N"
+    return f"{words}; {rotor.low:.6g} to {rotor.high:.6g} N"
+
+
+def _provenance(file: "VehicleFile") -> Iterator[str]:
+    """Each number, and below it where it comes from."""
+    for one in file.numbers:
+        unit = "" if one.unit == "1" else f" {one.unit}"
+        yield f"{one.name} = {_listed(one.value)}{unit}"
+        for words in (one.source, one.why and f"why: {one.why}"):
+            if words:
+                yield f"    {words}"
+        for value, source in one.others:
+            yield f"    also {_listed(value)}{unit}: {source or 'no source'}"
+
+
+def _listed(values: float | Iterable[float]) -> str:
+    """Numbers with six digits; negative zeros and what rounding leaves are zeros."""
+    numbers = list(values) if isinstance(values, Iterable) else [values]
+    most = max(map(abs, numbers), default=0.0)
+    return ", ".join(f"{0.0 if abs(one) <= 1e-12 * most else one:.6g}" for one in numbers)

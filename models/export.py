@@ -1,0 +1,38 @@
+"""A vehicle's file as MJCF for MuJoCo alone."""
+
+import os
+from pathlib import Path
+
+from .errors import InputError, expect
+from .library import find_vehicle
+from .scene import read_spec
+from .vehicle import Vehicle
+from .vehicle_file import read_vehicle_file
+
+
+def export_mjcf(vehicle: Path | str, out: Path) -> str:
+    """Write a vehicle's MJCF; returns how exact its numbers are, in words.
+
+    What a TOML file tells by itself is written with all its digits, and moves bit for bit as the
+    vehicle. Other models are written by MuJoCo, with six digits. Raises `InputError`.
+    """
+    expect(out.suffix.lower() == ".xml", "out", "a name that ends in .xml", str(out))
+    path = find_vehicle(vehicle)
+    Vehicle.load(path)  # refuses what cannot fly
+    if path.suffix.lower() == ".toml":
+        file = read_vehicle_file(path)
+        if file.model is None:
+            out.write_text(file.mjcf(), encoding="utf-8")
+            return "every number with all its digits"
+        path = file.model
+    spec = read_spec(find_vehicle(vehicle))
+    folders = (spec.meshdir, spec.texturedir)
+    spec.meshdir, spec.texturedir = (
+        os.path.relpath(path.parent / folder, out.resolve().parent) for folder in folders
+    )
+    try:
+        text = spec.to_xml()
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"vehicle: expected a model that MuJoCo can write, got {error}") from None
+    out.write_text(text, encoding="utf-8")
+    return "numbers with the six digits that MuJoCo writes"
