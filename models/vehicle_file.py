@@ -264,7 +264,8 @@ class _Reader:
     def _part(self, table: Any, name: str) -> Part:
         given = self._read(table, "body.parts", name)
         shape = table.get("shape")
-        expect(shape in _SHAPES, f"{name}.shape", "'box' or 'cylinder'", repr(shape))
+        right = isinstance(shape, str) and shape in _SHAPES
+        expect(right, f"{name}.shape", "'box' or 'cylinder'", repr(shape))
         turn, other = ("yaw", "axis") if shape == "box" else ("axis", "yaw")
         for key in ("mass", *_SHAPES[shape]):
             expect(key in given, name, f"{key} of a {shape}", "none")
@@ -481,8 +482,7 @@ class _Mjcf:
         reach = max(math.hypot(*rotor.position) for rotor in self.rotors)
         self.reach = max(reach, file.value("rotors.radius", 0.0), 1e-2)
         self.unit = self.reach / math.sqrt(2)  # 1 m of quad.xml
-        sides = file.value("body.size", _scaled((0.44, 0.44, 0.14), self.unit))
-        self.half = _scaled(sides, 0.5)
+        self.half = _scaled(file.value("body.size") or self._sides(), 0.5)
         self.root = ElementTree.Element("mujoco", model=file.name)
         ElementTree.SubElement(self.root, "compiler", angle="radian")
         self._options()
@@ -497,6 +497,12 @@ class _Mjcf:
         self._hull(clearance)
         self._looks()
         self._actuators()
+
+    def _sides(self) -> tuple[float, ...]:
+        """Of the hub if the file does not tell: of the heaviest box, if there are any."""
+        boxes = [part for part in self.file.parts if not isinstance(part.turn, tuple)]
+        heaviest = max(boxes, key=lambda part: part.mass, default=None)
+        return heaviest.size if heaviest else _scaled((0.44, 0.44, 0.14), self.unit)
 
     def _options(self) -> None:
         value = self.file.value
@@ -673,6 +679,7 @@ def _add_rotor(spec: mujoco.MjSpec, file: VehicleFile, rotor: PlacedRotor, numbe
         for joint in list(found.joints):  # a propeller that turns is welded on
             if joint.type != mujoco.mjtJoint.mjJNT_FREE:
                 spec.delete(joint)
+        _add_disc(found, file, rotor)
         found = found.add_site(name=f"rotor/{rotor.name}", pos=rotor.position, group=4)
     axis = _scaled(rotor.axis, 1 / math.hypot(*rotor.axis))
     reaction = file.reaction if rotor.clockwise else -file.reaction
@@ -684,3 +691,14 @@ def _add_rotor(spec: mujoco.MjSpec, file: VehicleFile, rotor: PlacedRotor, numbe
         ctrllimited=True,
         ctrlrange=file.thrust,
     )
+
+
+def _add_disc(body: Any, file: VehicleFile, rotor: PlacedRotor) -> None:
+    """Draw the disc of a rotor, if its radius is told."""
+    if (radius := file.value("rotors.radius")) is None:
+        return
+    disc = body.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, pos=rotor.position, group=2)
+    disc.size, disc.rgba = (radius, 0.01 * radius, 0), (0.20, 0.46, 0.78, 0.42)
+    disc.mass, disc.contype, disc.conaffinity = 0, 0, 0
+    if rotor.axis != _UP:
+        disc.alt.type, disc.alt.zaxis = mujoco.mjtOrientation.mjORIENTATION_ZAXIS, rotor.axis
