@@ -141,10 +141,11 @@ class Vehicle:
 
         The cable is a tendon that is slack below its length, and as stiff as MuJoCo's limits. The
         ball has the density of water, and a free joint: `qpos` and `qvel` have it after the craft.
+        Raises `InputError` if it touches the craft when it hangs straight below.
         """
         spec = build_scene(self.path, visual=False)
         craft = next(body for body in spec.bodies if any(_is_free(j) for j in body.joints))
-        radius = (3 * mass / (4 * math.pi * 1000.0)) ** (1 / 3)
+        radius = payload_radius(mass)
         hook = craft.add_site(name="rotorgram/hook")
         ball = spec.worldbody.add_body(name="rotorgram/payload")
         ball.pos = craft.pos - (0.0, 0.0, cable)
@@ -156,6 +157,12 @@ class Vehicle:
         tendon.wrap_site(end.name)
         model = spec.compile()
         model.dof_damping[0:3] = self.model.dof_damping[0:3]
+        data = mujoco.MjData(model)
+        data.qpos[2] = high = self.rest_height + 2 * (cable + radius)
+        data.qpos[7:10] = (0.0, 0.0, high - cable)
+        clear = not _touches(model, data, high)
+        expected = f"a length at which a payload with a radius of {radius:.3g} m hangs clear"
+        expect(clear, "effects: cable", expected, f"{cable:g} m")
         return model
 
     def __deepcopy__(self, memo: Any) -> Self:
@@ -185,6 +192,11 @@ def _compiled(path: Path) -> tuple[mujoco.MjSpec, str, mujoco.MjModel, mujoco.Mj
         kind = "a vehicle" if _is_toml(path) else "an MJCF file"
         raise InputError(f"vehicle: expected {kind}, got {path.name}: {reason}") from None
     return spec, text, model, data
+
+
+def payload_radius(mass: float) -> float:
+    """Radius of a ball of water of such a mass, m."""
+    return float((3 * mass / (4 * math.pi * 1000.0)) ** (1 / 3))
 
 
 def craft_bodies(model: mujoco.MjModel) -> np.ndarray:

@@ -118,7 +118,8 @@ def _distribution(name: str, text: Any) -> tuple[str, tuple[float, ...]]:
         numbers = tuple(float(word) for word in inside.split(","))
     except ValueError:
         numbers = ()
-    right = kind in _KINDS and len(numbers) == (_KINDS.get(kind) or max(1, len(numbers)))
+    most = max(1, len(numbers)) if match else 1
+    right = kind in _KINDS and len(numbers) == (_KINDS.get(kind) or most)
     bounded = numbers[:1] if kind == "normal" else numbers
     right = right and type(text) is not bool
     right = right and all(limits.low <= number <= limits.high for number in bounded)

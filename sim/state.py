@@ -7,6 +7,7 @@ Frames: world x, y, z with z up, right-handed; body x forward, y left, z up. SI 
 scalar first. Arrays are NumPy's, or torch's where the backend runs on another device.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -86,9 +87,26 @@ def each(values: Array) -> Array:
     return values if isinstance(values, float) else values[..., None]
 
 
+def kept(mask: Array, new: Any, old: Any, xp: Any) -> Any:
+    """Lists of arrays: the new for the worlds of a mask, None for all, and the old for the others.
+
+    Of a single drone, whose numbers are Python's, all are new; so they are where there is no old.
+    """
+    if mask is None or old is None or old[0] is None or isinstance(new[0], float):
+        return new
+    return [xp.where(mask, a, b) for a, b in zip(new, old, strict=True)]
+
+
 def plain(array: Array) -> Array:
     """A single drone's number as Python's own; other arrays as they are."""
-    return array.item() if array.ndim == 0 else array
+    return array.item() if getattr(array, "ndim", 1) == 0 else array
+
+
+def square_root(array: Array, xp: Any) -> Array:
+    """Of numbers; of one below 0, as rounding may leave it, 0."""
+    if isinstance(array, float):
+        return math.sqrt(array) if array > 0.0 else 0.0
+    return xp.sqrt(clip(array, 0.0, math.inf))
 
 
 def stack(parts: Sequence[Any]) -> Array:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, get_args
 
-from ..models.errors import InputError, require
+from ..models.errors import InputError, expect, require
 from .effects import EffectOptions
 from .random import Draw, Noise
 from .randomize import Randomization
@@ -85,6 +85,12 @@ class World(Protocol):
 def contact_check(timestep: float) -> int:
     """Physics steps between two checks for contact."""
     return max(1, round(CONTACT_CHECK / timestep))
+
+
+def check_hung(height: float, least: float) -> None:
+    """Refuse a start at which the payload would hang in the ground. Raises `InputError`."""
+    expected = f"a height over {least:.4g} m, for the payload on its cable"
+    expect(height > least, "start", expected, f"{height:.4g} m")
 
 
 def make_world(

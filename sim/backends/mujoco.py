@@ -14,12 +14,12 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from ...models.errors import InputError
-from ...models.vehicle import Vehicle, body_axes, craft_bodies
+from ...models.vehicle import Vehicle, body_axes, craft_bodies, payload_radius
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, Draw, Noise, NumpyDraw, NumpyNoise, Streams
 from ..randomize import MODEL, Randomization
 from ..state import Array, Pose, WorldState, plain
-from ..world import PhysicsError, contact_check
+from ..world import PhysicsError, check_hung, contact_check
 
 _FEW: Final = 8
 _ONLY: Final = np.zeros(1, int)
@@ -61,7 +61,10 @@ class MujocoWorld:
         self._check = contact_check(vehicle.timestep)
         threads = 1 if num_worlds == 1 else num_threads
         self._batch = batch = Batch(self._model(effects), num_worlds, threads)
-        self._cable = effects.cable if effects is not None and effects.payload else None
+        self._cable, self._least_height = None, 0.0
+        if effects is not None and effects.payload:
+            self._cable = effects.cable
+            self._least_height = effects.cable + payload_radius(effects.payload)
         self._varied = None if randomize is None else _Varied(batch, randomize.names)
         self._owner = None if threads == 1 else os.getpid()
         self._initial = batch.state[0].copy()
@@ -95,9 +98,11 @@ class MujocoWorld:
         assert np.shares_memory(self.state.position, qpos)
 
     def reset(self, mask: Array, pose: Pose) -> None:
-        """As `World.reset`."""
+        """As `World.reset`. Raises `InputError` for a payload that would hang in the ground."""
         self._check_process()
         ids = self._ids(mask)
+        if self._cable is not None and len(ids):
+            check_hung(pose.position.reshape(-1, 3)[ids, 2].min(), self._least_height)
         self._batch.state[ids] = self._initial
         self._warnings[ids] = 0
         state, here = self.state, () if self.shape == () else ids
@@ -165,8 +170,7 @@ class MujocoWorld:
         thrust = np.reshape(mean, self._ctrl.shape)
         self._ctrl[some] = (thrust if self._newtons is None else thrust / self._newtons)[some]
         if wrench is not None:
-            self._applied[some, :3] = wrench[0].reshape(-1, 3)[some]
-            self._applied[some, 3:6] = wrench[1].reshape(-1, 3)[some]
+            self._applied[some, :6] = wrench.reshape(-1, 6)[some]
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """As `World.seed`."""
@@ -266,7 +270,7 @@ class _Varied:
         if base["dof_damping"].any():  # the drag of Unity's bodies goes with their mass
             expand("dof_damping")[ids, :3] = mass[:, None] * base["dof_damping"][:3]
         shift = np.stack([given.get(name, 0.0 * ones) for name in MODEL[2:]], axis=-1)
-        if shift.any():
+        if given.keys() & set(MODEL[2:]):
             turned = np.einsum("bji,wj->wbi", self._axes, shift)
             expand("body_ipos")[place] = base["body_ipos"][self._bodies] + turned
         self._batch.set_const(ids)

@@ -13,12 +13,12 @@ import warp
 from torch.utils.dlpack import from_dlpack
 
 from ...models.errors import InputError
-from ...models.vehicle import Vehicle, body_axes, craft_bodies
+from ...models.vehicle import Vehicle, body_axes, craft_bodies, payload_radius
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, START, Draw, Noise
 from ..randomize import MODEL, Randomization
 from ..state import Array, Pose, WorldState, constant
-from ..world import PhysicsError, contact_check
+from ..world import PhysicsError, check_hung, contact_check
 
 wp: Any = warp  # its types have gaps
 mjw: Any = mujoco_warp
@@ -64,6 +64,7 @@ class WarpWorld:
         acting = Effects(vehicle, options, self.noise, torch_api, drawn)
         self.effects = acting if acting.works else None
         self._cable = options.cable if options.payload else None
+        self._least_height = options.cable + payload_radius(options.payload)
         model = copy.copy(vehicle.model)
         if self._cable is not None:
             model = vehicle.with_payload(options.payload, options.cable)
@@ -86,8 +87,8 @@ class WarpWorld:
             self._varied = _Varied(vehicle, model, self._model, data, drawn)
             self.qpos[:, 2] = vehicle.rest_height + 1.0
             if self._cable is not None:  # slack, and off the ground
-                self.qpos[:, 2] += self._cable
-                self.qpos[:, 9] = self.qpos[:, 2] - 0.5 * self._cable
+                self.qpos[:, 2] += 2 * self._least_height
+                self.qpos[:, 9] = self.qpos[:, 2] - 0.999 * self._cable
             mjw.step(self._model, data)  # compiles what is not yet in Warp's cache
             wp.synchronize()
             self._forward = self._captured(mjw.forward, 1)
@@ -111,7 +112,11 @@ class WarpWorld:
         )
 
     def reset(self, mask: Array, pose: Pose) -> None:
-        """As `World.reset`. Raises `InputError` for a position beyond `FURTHEST`."""
+        """As `World.reset`.
+
+        Raises `InputError` for a position beyond `FURTHEST`, or a payload that would hang in the
+        ground.
+        """
         state, rows = self.state, mask[..., None]
         far = (pose.position.abs() > FURTHEST).any(dim=-1) & mask
         if far.any():
@@ -120,6 +125,8 @@ class WarpWorld:
                 f"start: expected coordinates within {FURTHEST:g} m for the float32 of the "
                 f"backend warp, got {got}"
             )
+        if self._cable is not None and mask.any():
+            check_hung(float(pose.position[mask][:, 2].min()), self._least_height)
         for array, values, default in (
             (state.position, pose.position, 0.0),
             (state.quaternion, pose.quaternion, self._level),
@@ -240,7 +247,7 @@ class WarpWorld:
             self.state.thrust.copy_(kept)
         self._apply_thrust(mean)
         if wrench is not None:
-            self._applied[:, :6] = torch.cat(wrench, dim=-1)[:, 0]
+            self._applied[:, :6] = wrench[:, 0]
 
     def _place_payload(self, mask: torch.Tensor, cable: float) -> None:
         """Hang the payload straight below the craft, moving along with it."""

@@ -13,11 +13,9 @@ the same bits alone and in a batch.
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from ...models.errors import expect
 from ..random import GUSTS, Noise
-from ..state import Array, WorldState, component, constant, stack
+from ..state import Array, WorldState, component
 from .air import AirEffects
 from .gusts import NUMBERS, Gusts
 from .options import EffectOptions
@@ -56,10 +54,8 @@ class Effects:
         self.works = self.on_rotors or self.on_body
         self._rotors = RotorEffects(vehicle, options, xp)
         self._air = AirEffects(vehicle, options, xp)
-        self._drawn_winds = [name for name in WINDS if name in drawn]
-        self._mean_wind = np.array(options.wind)
-        self._blows = any(options.wind) or bool(self._drawn_winds)
-        self._wind: Array = None
+        self._mean_wind = options.wind
+        self._wind: list[Array] = [0.0, 0.0, 0.0]
         needed = not options.wind_blows or moved
         expect(needed, "effects", "body_drag or rotor_drag, on which wind acts", "neither")
         self._gusts: Gusts | None = None
@@ -78,20 +74,15 @@ class Effects:
             self._air.begin(mask, state, factors)
         if self._gusts is not None:
             self._gusts.begin(mask, component(state.position, 2), self._noise.normal(mask))
-        if self._blows:
-            wind = constant(self._mean_wind, state.velocity) + 0.0 * state.velocity
-            if self._drawn_winds:
-                wind = wind + stack([factors.get(name, 0.0) for name in WINDS])
-            self._wind = wind
+        both = zip(self._mean_wind, WINDS, strict=True)
+        self._wind = [mean + factors.get(name, 0.0) for mean, name in both]
 
-    def step(
-        self, state: WorldState, mask: Array | None
-    ) -> tuple[Array, Array, tuple[Array, Array] | None]:
+    def step(self, state: WorldState, mask: Array | None) -> tuple[Array, Array, Array | None]:
         """Advance the worlds of a mask, None for all, by a physics step, from `state` on.
 
-        Gives the mean thrust of each rotor over the step and that at its end, N, (W, A, R), and
-        the force (world frame, N) with the torque about the body's origin (body frame, N·m), both
-        (W, A, 3), or None.
+        Gives the mean thrust of each rotor over the step and that at its end, N, (W, A, R), and,
+        or None, the force (world frame, N) with the torque about the body's origin (body frame,
+        N·m), (W, A, 6).
         """
         mean = end = state.command
         if self.on_rotors:
@@ -101,5 +92,5 @@ class Effects:
         wind = self._wind
         if self._gusts is not None:
             gust = self._gusts.step(mask, self._noise.normal(mask))
-            wind = gust if wind is None else wind + gust
+            wind = [a + b for a, b in zip(wind, gust, strict=True)]
         return mean, end, self._air.step(state, mean, wind, mask)

@@ -1,20 +1,21 @@
 """Force and torque of the air: drag of the body, drag, inflow and lift of rotors, ground effect."""
 
+import math
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from ...models.errors import expect
-from ..state import Array, WorldState, clip, component, constant, each, stack
+from ..state import Array, WorldState, clip, component, constant, each, kept, square_root, stack
 from .options import EffectOptions
-from .rotors import total
+from .rotors import split, total
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
 
 LEAST_HEIGHT: Final = 0.5
-"""Height of a rotor over the ground, in radii, below which the ground effect grows no further. The
-measurements in Cheeseman and Bennett (ARC R&M 3021, 1955) end there."""
+"""Height of a rotor over the ground, in radii, below which the ground effect grows no further: our
+choice, since the formula has a pole at a quarter of a radius."""
 
 Vector = tuple[Array, Array, Array]
 
@@ -26,26 +27,28 @@ class AirEffects:
 
     * body, at the center of mass: -(linear + quadratic |v|) v, axis by axis;
     * each rotor, with speed Ω = sqrt(thrust / k), v_a its velocity along its axis and v_p in its
-      plane: -drag Ω v_p, and along its axis -inflow Ω v_a + lift |v_p|² (as RotorPy, arXiv
-      2306.04485, equations 4 to 6, models them);
+      plane: -drag Ω v_p, and along its axis -inflow Ω v_a + lift |v_p|² (rotor drag and
+      translational lift of RotorPy, arXiv 2306.04485, whose moment of flapping is left out);
     * each rotor at height z over the ground, with radius R: thrust / (1 - (R / 4z)²) in place of
       its thrust (Cheeseman and Bennett, ARC R&M 3021, 1955).
     """
 
     def __init__(self, vehicle: "Vehicle", options: EffectOptions, xp: Any) -> None:
-        self._xp, self._options, self._step = xp, options, vehicle.timestep
+        self._xp, self._options, self._half = xp, options, 0.5 * vehicle.timestep
         told, rotors = vehicle.coefficients, vehicle.rotors
-        self._center = vehicle.center_of_mass.tolist()
-        self._place = tuple(np.array([r.position for r in rotors]).T)
-        self._axis = tuple(np.array([r.axis for r in rotors]).T)
+        self._center: Vector = tuple(vehicle.center_of_mass.tolist())
+        self._geometry = np.array([(*rotor.position, *rotor.axis) for rotor in rotors])
         if options.body_drag:
-            drag = told.drag
-            given = drag.linear is not None or drag.quadratic is not None
+            linear, quadratic = told.drag.linear, told.drag.quadratic
+            given = linear is not None or quadratic is not None
             expected = "drag.linear or drag.quadratic in the vehicle's file, which body_drag needs"
             expect(given, "vehicle", expected, "none")
             none = (0.0, 0.0, 0.0)
-            self._linear, self._quadratic = drag.linear or none, drag.quadratic or none
-            self._check_stiffness(vehicle, max(self._linear))
+            self._linear, self._quadratic = linear or none, quadratic or none
+            # Of a fall at its terminal velocity, sqrt(weight / quadratic), the slope of the drag.
+            weight = vehicle.mass * vehicle.gravity
+            slope = max(self._linear) + 2 * math.sqrt(max(self._quadratic) * weight)
+            _check_stiffness(vehicle, slope, "drag of the body")
         if options.rotor_drag:
             (self._coefficient,) = told.need("rotors.thrust_coefficient", "rotor_drag")
             three = (told.rotors.drag, told.rotors.inflow, told.rotors.lift)
@@ -54,115 +57,123 @@ class AirEffects:
             expect(some, "vehicle", expected, "none")
             self._drag, self._inflow, self._lift = (value or 0.0 for value in three)
             speeds = np.sqrt(np.maximum(vehicle.thrust_high, 0.0) / self._coefficient)
-            self._check_stiffness(vehicle, max(self._drag, self._inflow) * float(speeds.sum()))
+            slope = max(self._drag, self._inflow) * float(speeds.sum())
+            # Of a turn: about the least moment of inertia, at the longest arm.
+            arm = float(((self._geometry[:, :3] - vehicle.center_of_mass) ** 2).sum(axis=1).max())
+            turning = vehicle.mass * arm / float(np.linalg.eigvalsh(vehicle.inertia)[0])
+            _check_stiffness(vehicle, slope * max(1.0, turning), "drag of the rotors")
         if options.ground_effect:
             (self._radius,) = told.need("rotors.radius", "ground_effect")
         self._factors: dict[str, Array] = {}
-        self._before: tuple[Array, Array] | None = None
-
-    def _check_stiffness(self, vehicle: "Vehicle", drag: float) -> None:
-        """Refuse drag that the extrapolation over a physics step cannot follow."""
-        most = 0.5 * vehicle.mass / vehicle.timestep
-        expected = f"at most {most:.4g} N s/m of drag, half its mass over the physics step"
-        expect(drag <= most, "vehicle", expected, f"{drag:.4g}")
+        self._rotors: list[Any] = []
+        self._before: Any = None
 
     def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> None:
         """Begin at the motion of a state; factors (W, A) by parameter."""
         self._factors = factors
-        now = (state.velocity + 0.0, state.body_rates + 0.0)
-        if self._before is not None:
-            where, chosen = self._xp.where, mask[..., None]
-            now = tuple(where(chosen, a, b) for a, b in zip(now, self._before, strict=True))
-        self._before = now
+        self._before = kept(mask, _motion(state), self._before, self._xp)
+        if state.position.ndim == 1:
+            self._rotors = self._geometry.tolist()
+        else:
+            self._rotors = [[constant(x, state.position) for x in self._geometry.T]]
 
     def step(
-        self, state: WorldState, thrust: Array, wind: Array | None, mask: Array | None
-    ) -> tuple[Array, Array]:
+        self, state: WorldState, thrust: Array, wind: list[Array], mask: Array | None
+    ) -> Array:
         """Mean force, world frame, N, and torque about the body's origin, body frame, N·m.
 
-        Both (W, A, 3); thrust (W, A, R), N; wind: velocity of the air, world frame, m/s.
+        Shape (W, A, 6); thrust (W, A, R), N; wind: the velocity of the air, world frame, m/s,
+        three of shape (W, A) or numbers for all.
         """
-        xp, options = self._xp, self._options
-        assert self._before is not None
+        now = _motion(state)
         # The middle of the step: half of the last step's change further.
-        velocity = 1.5 * state.velocity - 0.5 * self._before[0]
-        rates = 1.5 * state.body_rates - 0.5 * self._before[1]
-        if mask is None:
-            self._before = (state.velocity + 0.0, state.body_rates + 0.0)
-        else:
-            chosen, old = mask[..., None], self._before
-            self._before = (
-                xp.where(chosen, state.velocity, old[0]),
-                xp.where(chosen, state.body_rates, old[1]),
-            )
-        turn = _turned(state.quaternion, rates, 0.5 * self._step, xp)
-        through = velocity if wind is None else velocity - wind
-        v = _to_body(turn, _parts(through))
-        w = _parts(rates)
-        force: Vector = (0.0 * v[0],) * 3
-        torque = force
-        if options.body_drag:
-            c = self._center
-            u = tuple(a + b for a, b in zip(v, _cross(w, c), strict=True))
-            size = xp.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
-            factor = self._factors.get("body_drag", 1.0)
-            drag = [
-                -factor * (linear + quadratic * size) * x
-                for linear, quadratic, x in zip(self._linear, self._quadratic, u, strict=True)
-            ]
-            force, torque = _add(force, drag), _add(torque, _cross(c, drag))
-        if options.rotor_drag or options.ground_effect:
-            push = self._rotors(state, turn, thrust, v, w)
-            place = tuple(constant(x, thrust) for x in self._place)
-            force = _add(force, [total(x) for x in push])
-            torque = _add(torque, [total(x) for x in _cross(place, push)])
-        return stack(_to_world(turn, force)), stack(torque)
+        ahead = [1.5 * new - 0.5 * old for new, old in zip(now, self._before, strict=True)]
+        self._before = kept(mask, now, self._before, self._xp)
+        w: Vector = (ahead[3], ahead[4], ahead[5])
+        turn = _turned(state.quaternion, w, self._half)
+        through = (ahead[0] - wind[0], ahead[1] - wind[1], ahead[2] - wind[2])
+        v = _to_body(turn, through)
+        force = torque = (0.0, 0.0, 0.0)
+        if self._options.body_drag:
+            force = self._body(v, w)
+            torque = _cross(self._center, force)
+        if self._options.rotor_drag or self._options.ground_effect:
+            height = component(state.position, 2) + self._half * ahead[2]
+            pushes, twists = [], []
+            for rotor, part in zip(self._rotors, split(thrust), strict=True):
+                pushes.append(self._push(rotor, part, v, w, (*turn[6:], height)))
+                twists.append(_cross(rotor[:3], pushes[-1]))
+            force = _add(force, [total(list(x)) for x in zip(*pushes, strict=True)])
+            torque = _add(torque, [total(list(x)) for x in zip(*twists, strict=True)])
+        return stack((*_to_world(turn, force), *torque))
 
-    def _rotors(
-        self, state: WorldState, turn: Any, thrust: Array, v: Vector, w: Vector
-    ) -> list[Array]:
-        """Force of each rotor besides its thrust, body axes: three of shape (W, A, R)."""
-        xp, factors = self._xp, self._factors
-        place = [constant(x, thrust) for x in self._place]
-        axis = [constant(x, thrust) for x in self._axis]
-        push = [0.0 * thrust] * 3
+    def _body(self, v: Vector, w: Vector) -> Vector:
+        """Drag of the body, body axes."""
+        v = _add(v, _cross(w, self._center))
+        speed = square_root(v[0] * v[0] + v[1] * v[1] + v[2] * v[2], self._xp)
+        factor = self._factors.get("body_drag", 1.0)
+        both = zip(self._linear, self._quadratic, v, strict=True)
+        x, y, z = (-factor * (linear + quadratic * speed) * u for linear, quadratic, u in both)
+        return x, y, z
+
+    def _push(self, rotor: Any, thrust: Array, v: Vector, w: Vector, ground: Any) -> Any:
+        """Force of a part of the rotors besides their thrust, body axes.
+
+        `ground` is, of each body axis, its part upwards, and the height of the body's origin.
+        """
+        place, axis = rotor[:3], rotor[3:]
+        thrust, up, push = clip(thrust, 0.0, math.inf), 0.0, (0.0, 0.0, 0.0)
         if self._options.rotor_drag:
-            turning = _cross([each(rate) for rate in w], place)
-            hub = [each(x) + y for x, y in zip(v, turning, strict=True)]
-            along = hub[0] * axis[0] + hub[1] * axis[1] + hub[2] * axis[2]
-            plane = [x - along * n for x, n in zip(hub, axis, strict=True)]
-            speed = xp.sqrt(clip(thrust, 0.0, np.inf) / self._coefficient)
-            if "rotor_drag" in factors:
-                speed = speed * each(factors["rotor_drag"])
+            x, y, z = _add(_each(v), _cross(_each(w), place))
+            along = x * axis[0] + y * axis[1] + z * axis[2]
+            plane = (x - along * axis[0], y - along * axis[1], z - along * axis[2])
+            speed = square_root(thrust / self._coefficient, self._xp)
+            if "rotor_drag" in self._factors:
+                speed = speed * each(self._factors["rotor_drag"])
             sideways = plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2]
             up = self._lift * sideways - self._inflow * speed * along
-            push = [up * n - self._drag * speed * x for n, x in zip(axis, plane, strict=True)]
+            drag = -self._drag * speed
+            push = (drag * plane[0], drag * plane[1], drag * plane[2])
         if self._options.ground_effect:
-            x, y, z = (each(cosine) for cosine in turn[6:])  # of each body axis: its part upwards
-            height = each(component(state.position, 2)) + x * place[0] + y * place[1]
-            height = height + z * place[2]
-            ratio = self._radius / (4 * clip(height, LEAST_HEIGHT * self._radius, np.inf))
-            more = thrust * (1 / (1 - ratio * ratio) - 1)
-            push = [x + more * n for x, n in zip(push, axis, strict=True)]
-        return push
+            x, y, z, origin = _each(ground)
+            height = origin + (x * place[0] + y * place[1] + z * place[2])
+            ratio = self._radius / (4 * clip(height, LEAST_HEIGHT * self._radius, math.inf))
+            share = ratio * ratio
+            up = up + thrust * (share / (1 - share))
+        return push[0] + up * axis[0], push[1] + up * axis[1], push[2] + up * axis[2]
 
 
-def _parts(vectors: Array) -> Vector:
-    return component(vectors, 0), component(vectors, 1), component(vectors, 2)
+def _check_stiffness(vehicle: "Vehicle", slope: float, what: str) -> None:
+    """Refuse drag that the extrapolation over a physics step cannot follow."""
+    most = 0.5 * vehicle.mass / vehicle.timestep
+    expected = f"{what} of at most {most:.4g} N s/m, half its mass over the physics step"
+    expect(slope <= most, "vehicle", expected, f"{slope:.4g}")
+
+
+def _motion(state: WorldState) -> list[Array]:
+    """Velocity and body rates, of a batch copies: six of shape (W, A)."""
+    both = (state.velocity, state.body_rates)
+    if state.velocity.ndim == 1:
+        return [number for array in both for number in array.tolist()]
+    return [array[..., axis] + 0.0 for array in both for axis in range(3)]
+
+
+def _each(values: Any) -> Any:
+    return [each(value) for value in values]
 
 
 def _add(a: Any, b: Any) -> Any:
-    return tuple(x + y for x, y in zip(a, b, strict=True))
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def _cross(a: Any, b: Any) -> Vector:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-def _turned(quaternion: Array, rates: Array, time: float, xp: Any) -> tuple[Array, ...]:
+def _turned(quaternion: Array, rates: Vector, time: float) -> tuple[Array, ...]:
     """Rotation matrix, row by row, after such a time of turning at these body rates."""
     w, x, y, z = (component(quaternion, i) for i in range(4))
-    a, b, c = (0.5 * time * rate for rate in _parts(rates))
+    a, b, c = (0.5 * time * rate for rate in rates)
     w, x, y, z = (
         w - a * x - b * y - c * z,
         x + a * w + c * y - b * z,

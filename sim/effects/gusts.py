@@ -1,4 +1,4 @@
-"""Dryden turbulence, low-altitude model of MIL-F-8785C, section 3.7.
+"""Dryden turbulence of MIL-F-8785C: spectra of 3.7.1.2, scales and intensities of 3.7.3.4.
 
 Three velocities of the air: u along the mean wind, v across it and w vertical. Each is white noise
 through a filter, whose spectrum over the angular frequency ω, one-sided, (m/s)²/(rad/s), is
@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..state import Array, on_host, stack
+from ..state import Array, kept, on_host
 
 FOOT: Final = 0.3048  # m
 LOWEST, HIGHEST = 10 * FOOT, 1000 * FOOT  # m: where the low-altitude model is defined
@@ -23,6 +23,8 @@ LEAST_SPEED: Final = 1.0
 """Least speed at which the field passes a drone, m/s. The specification is for aircraft, which do
 not stand in the air; this is our choice."""
 NUMBERS: Final = 5  # Normal numbers that a step takes
+
+Vector = tuple[Array, Array, Array]
 
 
 class Gusts:
@@ -42,59 +44,65 @@ class Gusts:
         self._along = (1.0, 0.0) if across == 0 else (mean_wind[0] / across, mean_wind[1] / across)
         self._speed = max(LEAST_SPEED, math.hypot(*mean_wind))
         self._step, self._xp = timestep, xp
-        self._filters: Array = None
-        self._state: Array = None
+        self._filters: Any = None
+        self._state: Any = None
 
     def begin(self, mask: Array, height: Array, normal: Array) -> None:
         """Begin in the stationary state; height in m, shape (W, A), normal (W, A, 5)."""
-        feet = np.clip(on_host(height).astype(np.float64), LOWEST, HIGHEST) / FOOT
+        feet = np.clip(np.ravel(on_host(height)).astype(np.float64), LOWEST, HIGHEST) / FOOT
         shape = 0.177 + 0.000823 * feet
         sigmas = self._sigma / shape**0.4, self._sigma + 0.0 * feet
         lengths = FOOT * feet / shape**1.2, FOOT * feet
-        first = np.exp(-self._step * self._speed / lengths[0])
-        filters = [first, sigmas[0] * np.sqrt(1 - first * first)]
+        r = self._step * self._speed / lengths[0]
+        filters = [np.exp(-r), sigmas[0] * np.sqrt(-np.expm1(-2 * r)), *sigmas]
         # Of a filter of second order, with z₁' = (noise - z₁) / T and z₂' = (z₁ - z₂) / T, the
         # stationary covariance is σ²/2 · ((1, 1/2), (1/2, 1/2)): v = √3 z₁ + (1 - √3) z₂ has σ².
         # The noise of a step has the covariance ((q11, q12), (q12, q22)).
         for sigma, length in zip(sigmas, lengths, strict=True):
             r = self._step * self._speed / length
             e, half = np.exp(-r), 0.5 * sigma * sigma
-            q11 = half * (1 - e * e)
+            q11 = -half * np.expm1(-2 * r)
             q12 = half / 2 * (1 - e * e * (1 + 2 * r))
             q22 = half / 2 * (1 - e * e * (1 + 2 * r + 2 * r * r))
             a = np.sqrt(q11)
-            filters += [e, r, a, q12 / a, np.sqrt(q22 - q12 * q12 / q11)]
-        put = {"dtype": normal.dtype, "device": normal.device}
-        table = self._xp.asarray(np.stack(filters, axis=-1), **put)
-        along, up = (self._xp.asarray(np.asarray(sigma), **put) for sigma in sigmas)
-        start = [along * normal[..., 0]]
+            # In a short step the last is less than what rounding leaves of the difference.
+            filters += [e, r, a, q12 / a, np.sqrt(np.maximum(q22 - q12 * q12 / q11, 0.0))]
+        self._filters = kept(mask, self._ours(filters, normal), self._filters, self._xp)
+        along, up = self._filters[2:4]
+        n = _parts(normal)
+        start = [along * n[0]]
         for index, sigma in ((1, along), (3, up)):
-            z1, z2 = normal[..., index], normal[..., index + 1]
+            z1, z2 = n[index], n[index + 1]
             start += [math.sqrt(0.5) * sigma * z1, math.sqrt(0.125) * sigma * (z1 + z2)]
-        chosen = mask[..., None]
-        self._filters = self._kept(chosen, table, self._filters)
-        self._state = self._kept(chosen, stack(start), self._state)
+        self._state = kept(mask, start, self._state, self._xp)
 
-    def step(self, mask: Array | None, normal: Array) -> Array:
-        """Advance by a physics step; normal (W, A, 5). The gust, world frame, m/s, (W, A, 3)."""
-        f, z = self._filters, self._state
-        new = [f[..., 0] * z[..., 0] + f[..., 1] * normal[..., 0]]
-        for axis in range(2):
-            e, r, a, b, c = (f[..., 2 + 5 * axis + i] for i in range(5))
-            z1, z2 = z[..., 1 + 2 * axis], z[..., 2 + 2 * axis]
-            n1, n2 = normal[..., 1 + 2 * axis], normal[..., 2 + 2 * axis]
-            new += [e * z1 + a * n1, e * (z2 + r * z1) + b * n1 + c * n2]
-        state = stack(new)
-        self._state = state if mask is None else self._kept(mask[..., None], state, z)
-        return self.now
+    def step(self, mask: Array | None, normal: Array) -> Vector:
+        """Advance by a physics step; normal (W, A, 5).
 
-    @property
-    def now(self) -> Array:
-        """The gust, world frame, m/s, shape (W, A, 3)."""
-        z, (x, y), root = self._state, self._along, math.sqrt(3)
-        u = z[..., 0]
-        v, w = (root * z[..., i] + (1 - root) * z[..., i + 1] for i in (1, 3))
-        return stack((x * u - y * v, y * u + x * v, w))
+        Gives the gust, world frame, m/s, three of shape (W, A).
+        """
+        f, z, n = self._filters, self._state, _parts(normal)
+        new = [f[0] * z[0] + f[1] * n[0]]
+        for i, (e, r, a, b, c) in ((1, f[4:9]), (3, f[9:])):
+            new += [
+                e * z[i] + a * n[i],
+                e * (z[i + 1] + r * z[i]) + b * n[i] + c * n[i + 1],
+            ]
+        self._state = z = kept(mask, new, z, self._xp)
+        (x, y), root, u = self._along, math.sqrt(3), z[0]
+        v, w = (root * z[i] + (1 - root) * z[i + 1] for i in (1, 3))
+        return x * u - y * v, y * u + x * v, w
 
-    def _kept(self, chosen: Array, new: Array, old: Array) -> Array:
-        return new if old is None else self._xp.where(chosen, new, old)
+    def _ours(self, values: list[np.ndarray], like: Array) -> list[Array]:
+        """Numbers of each drone, as arrays of the same kind as `like`."""
+        if like.ndim == 1:
+            return [value.item() for value in values]
+        put = {"dtype": like.dtype, "device": like.device}
+        lead = like.shape[:-1]
+        return [self._xp.asarray(value.reshape(lead), **put) for value in values]
+
+
+def _parts(normal: Array) -> list[Array]:
+    if normal.ndim == 1:
+        return normal.tolist()  # type: ignore[no-any-return]
+    return [normal[..., index] for index in range(NUMBERS)]

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from numbers import Real
 from typing import Any, Final, Self
 
 from ...models.errors import expect
@@ -53,13 +54,13 @@ class EffectOptions:
         given = getattr(self, name)
         number = "a number" if count == 1 else f"{count or ''} numbers".strip()
         try:
-            listed = [float(x) for x in ([given] if count == 1 else list(given))]
-        except (TypeError, ValueError, OverflowError):
-            listed = [float("nan")]
-        right = count in (0, len(listed)) and all(low <= value <= high for value in listed)
-        right = right and not isinstance(given, str | bool)
+            listed = [given] if count == 1 else list(given)
+        except TypeError:
+            listed = [None]
+        right = count in (0, len(listed)) and all(_is_number(x, low, high) for x in listed)
         self._check(name, f"{number} from {low:g} to {high:g} {unit}", right)
-        object.__setattr__(self, name, listed[0] if count == 1 else tuple(listed))
+        numbers = tuple(float(x) for x in listed)
+        object.__setattr__(self, name, numbers[0] if count == 1 else numbers)
 
     def _check(self, name: str, expected: str, right: bool) -> None:
         expect(right, f"effects: {name}", expected, f"{getattr(self, name)!r:.80}")
@@ -86,3 +87,8 @@ class EffectOptions:
     def wind_blows(self) -> bool:
         """Whether the air moves."""
         return self.gusts > 0 or any(self.wind)
+
+
+def _is_number(value: Any, low: float, high: float) -> bool:
+    real = isinstance(value, Real) and not isinstance(value, bool)
+    return real and low <= value <= high

@@ -1,16 +1,20 @@
-"""From the command of a rotor to its thrust: throttle, curve, battery, lag, efficiency."""
+"""From the command of a rotor to its thrust: throttle, curve, battery, lag, efficiency.
 
-import math
+Rotors are a list of parts: of a single drone a number for each, of a batch one array (W, A, R).
+"""
+
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...models.errors import expect
-from ..state import Array, clip, component, constant, each
+from ..state import Array, clip, component, constant, each, kept, square_root
 from .options import EffectOptions
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
+
+Parts = list[Any]
 
 
 class RotorEffects:
@@ -22,20 +26,23 @@ class RotorEffects:
     proportional to the rotor's speed, follows with the time constant, exactly over the step; the
     efficiency scales what the rotor then gives.
 
+    The terminal voltage V = E - resistance · power / V, with E the open-circuit voltage. With lag
+    the power is that of the rotors' speeds. Without it the power is that at V, power · (V / full)³,
+    and V solves both equations. An empty battery stays at its empty voltage.
+
     Attributes:
         charge: Of the battery, share, shape (W, A).
         voltage: At its terminals, V, shape (W, A).
     """
 
     def __init__(self, vehicle: "Vehicle", options: EffectOptions, xp: Any) -> None:
-        self._vehicle, self._options, self._xp = vehicle, options, xp
-        self._step = vehicle.timestep
+        self._options, self._xp, self._step = options, xp, vehicle.timestep
         told = vehicle.coefficients
-        self._low, self._high = vehicle.thrust_low, vehicle.thrust_high
+        self._limits = vehicle.thrust_low, vehicle.thrust_high
         if options.motor_lag:
             (rise,) = told.need("rotors.time_constant", "motor_lag")
             fall = told.rotors.time_constant_down
-            self._times = rise, rise if fall is None else fall
+            self._times = [rise] if fall in (None, rise) else [rise, fall]
         if options.thrust_curve:
             (self._curve,) = told.need("rotors.curve", "thrust_curve")
             most = max(_polynomial(self._curve, i / 100) for i in range(101))
@@ -47,8 +54,11 @@ class RotorEffects:
             expect(right, "rotors.curve", expected, f"an end of {ends:.4g}, and up to {most:.4g}")
         if options.battery:
             names = "battery.full battery.empty battery.capacity battery.resistance rotors.power"
-            self._battery = told.need(names, "battery")
-            expect(self._battery[1] <= self._battery[0], "battery", "empty at most full")
+            full, empty, capacity, self._resistance, self._watts = told.need(names, "battery")
+            expected, got = f"at most battery.full, {full:g} V", f"{empty:g} V"
+            expect(empty <= full, "battery.empty", expected, got)
+            self._full, self._empty = full, empty
+            self._coulombs = 3600 * capacity
         if options.motor_lag or options.thrust_curve or options.battery:
             pushes = bool((vehicle.thrust_low >= 0).all())
             expected = "rotors that push one way only, for motor_lag, thrust_curve and battery"
@@ -56,95 +66,140 @@ class RotorEffects:
         share, count = options.efficiency, vehicle.num_rotors
         right = len(share) in (0, count)
         expect(right, "effects: efficiency", f"{count} numbers, one for each rotor", f"{share}")
-        self._factors: dict[str, Array] = {}
-        self._root: Array = None  # of the thrust, proportional to the rotor's speed
+        self._scales: list[Parts] = []
+        self._roots: Any = None  # of the thrusts, proportional to the rotors' speeds
         self.charge: Array = None
         self.voltage: Array = None
 
     def begin(self, mask: Array, thrust: Array, factors: dict[str, Array]) -> None:
         """Begin with rotors that give such thrusts, (W, A, R); factors (W, A) by parameter."""
-        xp, chosen = self._xp, mask[..., None]
-        self._factors = factors
-        root = xp.sqrt(clip(thrust, 0.0, math.inf))
-        self._root = root if self._root is None else xp.where(chosen, root, self._root)
-        if self._options.battery:
+        xp, options = self._xp, self._options
+        self._low, self._high = (_of_rotors(x, thrust) for x in self._limits)
+        self._scales = []
+        if options.efficiency:
+            self._scales.append(_of_rotors(np.array(options.efficiency), thrust))
+        if "thrust" in factors:
+            self._scales.append([each(factors["thrust"])] * len(self._low))
+        if options.motor_lag:
+            scale = each(factors["time_constant"]) if "time_constant" in factors else 1.0
+            self._answers = [self._answer(time * scale) for time in self._times]
+        roots = [square_root(part, xp) for part in split(thrust)]
+        self._roots = kept(mask[..., None], roots, self._roots, xp)
+        if options.battery:
             charge = factors.get("battery_charge", 1.0) + 0.0 * component(thrust, 0)
-            self.charge = charge if self.charge is None else xp.where(mask, charge, self.charge)
-            self.voltage = self._terminal(self._open_voltage(), self._root)
+            (self.charge,) = kept(mask, [charge], [self.charge], xp)
+            self.voltage = self._terminal()
 
     def step(self, command: Array, mask: Array | None) -> tuple[Array, Array]:
         """Advance by a physics step: mean thrusts over it, and those at its end, (W, A, R), N."""
-        xp, options, factors = self._xp, self._options, self._factors
-        low, high = (constant(x, command) for x in (self._low, self._high))
-        target = clip(command, low, high)
+        xp, options = self._xp, self._options
+        limits = zip(split(command), self._low, self._high, strict=True)
+        target = [clip(part, low, high) for part, low, high in limits]
         if options.thrust_curve:
-            target = high * clip(_polynomial(self._curve, target / high), 0.0, 1.0)
+            both = zip(target, self._high, strict=True)
+            target = [h * clip(_polynomial(self._curve, part / h), 0.0, 1.0) for part, h in both]
         if options.battery:
-            full, capacity = self._battery[0], self._battery[2]
-            share = self.voltage / full
-            target = target * each(share * share)
+            if not options.motor_lag:
+                (self.voltage,) = kept(mask, [self._loaded(target)], [self.voltage], xp)
+            share = self.voltage / self._full
+            scale = each(share * share)
+            target = [part * scale for part in target]
         mean = end = target
         if options.motor_lag:
-            root, wanted = self._root, xp.sqrt(target)
-            off, h = root - wanted, self._step
-            time = xp.where(off < 0, self._times[0], self._times[1])
-            if "time_constant" in factors:
-                time = time * each(factors["time_constant"])
-            ratio = h / time
-            decay = xp.exp(-ratio)
-            # Of w² with w = wanted + off · exp(-t / time), over the step.
-            first, second = (1 - decay) / ratio, (1 - decay * decay) / (2 * ratio)
-            mean = wanted * wanted + off * (2 * wanted * first + off * second)
-            root = wanted + off * decay
-            end = root * root
-        else:
-            root = xp.sqrt(target) if options.battery else None
+            both = zip(self._roots, target, strict=True)
+            followed = [self._follow(root, square_root(part, xp)) for root, part in both]
+            mean = [one[0] for one in followed]
+            roots = [one[1] for one in followed]
+            end = [root * root for root in roots]
+            self._roots = kept(None if mask is None else mask[..., None], roots, self._roots, xp)
         if options.battery:
-            power = self._power(mean)
-            charge = self.charge - power / self.voltage * (self._step / (3600 * capacity))
-            charge = clip(charge, 0.0, 1.0)
-            self.charge = charge if mask is None else xp.where(mask, charge, self.charge)
-        if root is not None:
-            keep = self._root if mask is not None else None
-            self._root = root if mask is None else xp.where(mask[..., None], root, keep)
-        if options.battery:
-            self.voltage = self._terminal(self._open_voltage(), self._root)
-        for factor in self._scales(command):
-            mean, end = mean * factor, end * factor
-        return mean, end
+            used = self._power(mean) / self.voltage * (self._step / self._coulombs)
+            left = clip(self.charge - used, 0.0, 1.0)
+            (self.charge,) = kept(mask, [left], [self.charge], xp)
+            if options.motor_lag:
+                self.voltage = self._terminal()
+        for scales in self._scales:
+            mean, end = (
+                [part * scale for part, scale in zip(parts, scales, strict=True)]
+                for parts in (mean, end)
+            )
+        return _join(mean), _join(end)
 
-    def _scales(self, like: Array) -> list[Array]:
-        scales = []
-        if self._options.efficiency:
-            scales.append(constant(np.array(self._options.efficiency), like))
-        if "thrust" in self._factors:
-            scales.append(each(self._factors["thrust"]))
-        return scales
+    def _answer(self, time: Array) -> tuple[Array, Array, Array]:
+        """Of a speed that follows with a time constant: what a physics step changes.
+
+        With exp(-t / time) over the step: 1 less its end, its mean, and the mean of its square.
+        """
+        ratio = self._step / time
+        number = isinstance(ratio, float)
+        gone = -(float(np.expm1(-ratio)) if number else self._xp.expm1(-ratio))
+        return gone, gone / ratio, gone * (2 - gone) / (2 * ratio)
+
+    def _follow(self, root: Any, wanted: Any) -> tuple[Any, Any]:
+        """Mean square over a step of what begins at `root` and follows `wanted`, and its end."""
+        off = root - wanted
+        answer = self._answers[0]
+        if len(self._answers) == 2:
+            rises = off < 0
+            if isinstance(off, float):
+                answer = self._answers[not rises]
+            else:
+                pairs = zip(*self._answers, strict=True)
+                answer = tuple(self._xp.where(rises, up, down) for up, down in pairs)
+        gone, first, second = answer
+        # The square of: wanted + off · exp(-t / time).
+        mean = wanted * wanted + off * (2 * wanted * first + off * second)
+        return mean, root - off * gone
 
     def _open_voltage(self) -> Array:
-        full, empty = self._battery[:2]
-        return empty + (full - empty) * self.charge
+        return self._empty + (self._full - self._empty) * self.charge
 
-    def _terminal(self, opened: Array, root: Array) -> Array:
-        """V of: V = opened - resistance · power / V; half of `opened` where there is none."""
-        rest = opened * opened - 4 * self._battery[3] * self._power(root * root)
-        return 0.5 * (opened + self._xp.sqrt(clip(rest, 0.0, math.inf)))
+    def _loaded(self, target: Parts) -> Array:
+        """Voltage where the rotors give `target` · (voltage / full)² at once."""
+        opened = self._open_voltage()
+        drop = self._resistance * self._power(target) / self._full**3
+        return 2 * opened / (1 + square_root(1 + 4 * drop * opened, self._xp))
 
-    def _power(self, thrust: Array) -> Array:
+    def _terminal(self) -> Array:
+        """Voltage at the rotors' speeds; where they need more than there is, half the open one."""
+        opened = self._open_voltage()
+        power = self._power([root * root for root in self._roots])
+        rest = opened * opened - 4 * self._resistance * power
+        return 0.5 * (opened + square_root(rest, self._xp))
+
+    def _power(self, thrusts: Parts) -> Array:
         """Electrical power of all rotors, W, shape (W, A)."""
-        return self._battery[4] * total(thrust * self._xp.sqrt(clip(thrust, 0.0, math.inf)))
+        return self._watts * total([part * square_root(part, self._xp) for part in thrusts])
 
 
-def total(values: Array) -> Array:
-    """Sum over the last axis, one after the other: the same bits alone and in a batch."""
-    result = component(values, 0)
-    for index in range(1, values.shape[-1]):
-        result = result + component(values, index)
+def split(values: Array) -> Parts:
+    """Rotors' numbers, (W, A, R), as parts."""
+    return values.tolist() if values.ndim == 1 else [values]
+
+
+def total(parts: Parts) -> Array:
+    """Sum over the rotors, one after the other: the same bits alone and in a batch."""
+    if not isinstance(parts[0], float):
+        values = parts[0]
+        parts = [values[..., index] for index in range(values.shape[-1])]
+    result = parts[0]
+    for part in parts[1:]:
+        result = result + part
     return result
 
 
+def _join(parts: Parts) -> Array:
+    """The reverse of `split`."""
+    return np.array(parts) if isinstance(parts[0], float) else parts[0]
+
+
+def _of_rotors(values: np.ndarray, like: Array) -> Parts:
+    """Numbers of the vehicle's rotors, shape (R,), as parts like those of an array."""
+    return values.tolist() if like.ndim == 1 else [constant(values, like)]
+
+
 def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
-    result = coefficients[-1]
+    result = coefficients[-1] + 0.0 * x
     for c in coefficients[-2::-1]:
         result = result * x + c
     return result

@@ -1,0 +1,97 @@
+"""Control steps per second of a world with each effect, as a ratio to none.
+
+    python benchmarks/effects_cost.py [--seconds 0.5] [--repeats 7] [--out FILE.json]
+
+A control step is 0.02 s of the vehicle in `tests/data/racer.xml`, which has every coefficient: four
+physics steps, without a task. The cases take turns within a repeat, so that a machine that slows
+down slows all of them; the medians over the repeats are compared.
+"""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from rotorgram.agents.checkpoints import software_versions
+from rotorgram.models import Vehicle
+from rotorgram.sim import EffectOptions, Pose, Randomization, World, make_world
+
+ROOT = Path(__file__).parent.parent
+CASES: dict[str, dict[str, Any]] = {
+    "none": {},
+    "motor_lag": {"motor_lag": True},
+    "thrust_curve": {"thrust_curve": True},
+    "battery": {"battery": True},
+    "efficiency": {"efficiency": (1.0, 0.9, 1.0, 1.0)},
+    "body_drag": {"body_drag": True},
+    "rotor_drag": {"rotor_drag": True},
+    "ground_effect": {"ground_effect": True},
+    "body_drag, wind": {"body_drag": True, "wind": (3.0, 0.0, 0.0)},
+    "body_drag, gusts": {"body_drag": True, "gusts": 5.0},
+    "payload": {"payload": 0.1, "cable": 0.5},
+}
+CASES["all"] = {name: value for case in CASES.values() for name, value in case.items()}
+DRAWN = {"mass": "uniform(0.9, 1.1)", "thrust": "uniform(0.9, 1.1)"}
+EPISODE = 50  # control steps: within them a drone does not reach the ground
+
+
+def steps_per_second(world: World, commands: np.ndarray, seconds: float) -> float:
+    """Control steps of all drones per second, resets not counted."""
+    every = np.ones(world.shape, bool)[()]
+    pose = Pose(position=np.broadcast_to((0.0, 0.0, 30.0), (*world.shape, 3)))
+    substeps, taken, steps = world.vehicle.substeps(0.02), 0.0, 0
+    while taken < seconds:
+        world.reset(every, pose)
+        begun = perf_counter()
+        for _ in range(EPISODE):
+            world.step(commands, substeps)
+        taken += perf_counter() - begun
+        steps += EPISODE
+    return steps * max(1, every.size) / taken
+
+
+def measure(num_drones: int, seconds: float, repeats: int) -> dict[str, Any]:
+    vehicle = Vehicle.load(ROOT / "tests" / "data" / "racer.xml")
+    worlds = {}
+    for name, case in [*CASES.items(), ("randomize", {})]:
+        effects = EffectOptions(**case)
+        drawn = Randomization(DRAWN, effects) if name == "randomize" else None
+        worlds[name] = make_world(vehicle, num_drones, effects=effects, randomize=drawn)
+    rates: dict[str, list[float]] = {name: [] for name in worlds}
+    for _ in range(repeats):
+        for name, world in worlds.items():
+            commands = np.broadcast_to(vehicle.hover_thrust, (*world.shape, vehicle.num_rotors))
+            rates[name].append(round(steps_per_second(world, commands, seconds), 1))
+    medians = {name: statistics.median(values) for name, values in rates.items()}
+    ratios = {name: round(median / medians["none"], 3) for name, median in medians.items()}
+    for name, median in medians.items():
+        print(f"{num_drones:5} {name:18} {median:10,.0f} steps/s {ratios[name]:6.2f}", flush=True)
+    for world in worlds.values():
+        world.close()
+    return {"steps_per_second": medians, "ratio_to_none": ratios, "repeats": rates}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=0.5)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--out", type=Path, default=ROOT / "docs/results/effects/cost.json")
+    args = parser.parse_args()
+    drones = {str(n): measure(n, args.seconds, args.repeats) for n in (1, 1024)}
+    result = {
+        "seconds": args.seconds,
+        "drones": drones,
+        "versions": software_versions(),
+        "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
+    }
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(result, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
