@@ -25,10 +25,14 @@ from ..sim import (
     Pose,
     Randomization,
     World,
+    WorldState,
+    clip,
+    constant,
     make_world,
     on_host,
 )  # fmt: skip
-from ..sim.state import constant, each, plain
+from ..sim.sensors import Sensors, readings_of
+from ..sim.state import each, plain
 from . import registry
 from .autoreset import Seeds, checked_seeds
 from .delay import Delay
@@ -108,11 +112,17 @@ def spec_of(env_id: str, task: Task) -> EnvSpec:
         control_period=task.options.control_period,
         vehicle=vehicle.name,
         vehicle_hash=vehicle.hash,
-        observation=task.observation,
+        observation=task.observation + _reading_specs(task),
         action=action,
         telemetry=_telemetry_specs(task),
         metrics=task.metrics,
     )
+
+
+def _reading_specs(task: Task) -> tuple[ArraySpec, ...]:
+    options = task.options
+    readings = readings_of(options.sensors, task.vehicle, options.control_period)
+    return tuple(ArraySpec(**reading._asdict()) for reading in readings)
 
 
 def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
@@ -197,8 +207,13 @@ class Loop(NotCopied):
         self._width = len(self.task.controller.low)
         self._action_shape = (*lead, self._width)
         self._arrays = [
-            (a.name, (num_envs, *a.shape), getattr(self._xp, a.dtype)) for a in draft.observation
+            (a.name, (num_envs, *a.shape), getattr(self._xp, a.dtype))
+            for a in self.spec.observation
         ]
+        period, sensors = self.spec.control_period, draft.options.sensors
+        self._sensors = Sensors(sensors, self.world, period) if sensors else None
+        estimated = sensors.get("observe") == "estimate"  # it may leave the task's bounds
+        self._limits = {a.name: a.bounds() for a in self.spec.observation if estimated}
         none = self.world.state.touching != self.world.state.touching  # all False, on its device
         self._none, self._nobody = none, none.reshape(num_envs)
         self._everybody: Array = ~none
@@ -270,7 +285,7 @@ class Loop(NotCopied):
         if self._late_actions is not None:
             self._late_actions.push(None if some is None else some[..., None], values)
             values = self._late_actions.get(each(world.parameters["action_delay"]))
-        thrust = self.task.controller.thrust(values, world.state)
+        thrust = self.task.controller.thrust(values, self._seen())
         try:
             world.step(thrust, self._substeps, some)
         except PhysicsError:
@@ -278,19 +293,22 @@ class Loop(NotCopied):
             self._anyone_waits = True
             raise
         self._steps = self._steps + (1 if some is None else some)
-        self.task.remember(world.state, self._everybody if some is None else some)
+        flying = self._everybody if some is None else some
+        if self._sensors is not None:
+            self._sensors.sample(flying)
+        self.task.remember(world.state, flying)
 
     def _begin(self, mask: Array, seeds: Any, chosen: Mapping[str, np.ndarray]) -> None:
         """Begin the episodes of the drones of a mask, bool, shape (N,)."""
         world, lead = self.world, self.world.shape
         if not (self._begun or mask.all()):  # the first time a task wants all of them
             everybody = self._everybody
-            world.reset(everybody, self._start(everybody, world.draw(everybody)))
+            self._reset(everybody, self._start(everybody, world.draw(everybody)))
         some = mask.reshape(lead)[()]
         if seeds is not None:
             world.seed(some, seeds)
         draws = {name: values.reshape(lead)[()] for name, values in chosen.items()}
-        world.reset(some, self._start(some, world.draw(some, draws)))
+        self._reset(some, self._start(some, world.draw(some, draws)))
         self._begun = True
         if self._late_actions is not None:  # on their way are actions that change nothing
             like = world.state.thrust
@@ -301,6 +319,15 @@ class Loop(NotCopied):
         self._waiting = self._waiting & ~mask
         self._anyone_waits = bool(self._waiting.any())
         self.done = self.done & ~mask
+
+    def _reset(self, mask: Array, pose: Pose) -> None:
+        self.world.reset(mask, pose)
+        if self._sensors is not None:
+            self._sensors.begin(mask)
+
+    def _seen(self) -> WorldState:
+        """The state that controller and observation see."""
+        return self.world.state if self._sensors is None else self._sensors.seen()
 
     def _start(self, mask: Array, draw: Draw) -> Pose:
         """Starts of the drones of a mask. Raises `InputError` if a task gives another thing."""
@@ -318,7 +345,12 @@ class Loop(NotCopied):
         """Observations, rewards and ends after a step; `begun` as the mask of `_begin`."""
         task, state, n = self.task, self.world.state, self.num_envs
         self._telemetry = None
-        observed, outcome = task.observe(state), task.outcome(state)
+        observed, outcome = task.observe(self._seen()), task.outcome(state)
+        if self._sensors is not None and isinstance(observed, Mapping):
+            observed = {**observed, **self._sensors.readings}
+            for name, limits in self._limits.items():
+                low, high = (constant(end, observed[name]) for end in limits)
+                observed[name] = clip(observed[name], low, high)
         if self._outcome is None:
             _check_returned(self.spec, observed, outcome, n, alone=not self.world.shape)
         self.observations = {}

@@ -102,6 +102,18 @@ class Sensors:
     range_noise: float | None = _number("m", 0.0, 10.0)
     range_limit: float | None = _number("m", 0.01, 1e4)
     """Longest distance that the rangefinder sees."""
+    gyro_range: float | None = _number("rad/s", 0.1, 1e3)
+    """Largest rate that the gyroscope reads, along each axis."""
+    accelerometer_range: float | None = _number("m/s²", 1.0, 1e4)
+    gps_noise: float | None = _number("m", 0.0, 1e3)
+    """Standard deviation of a horizontal coordinate."""
+    gps_vertical_noise: float | None = _number("m", 0.0, 1e3)
+    gps_velocity_noise: float | None = _number("m/s", 0.0, 100.0)
+    """Standard deviation along each axis."""
+    mocap_noise: float | None = _number("m", 0.0, 10.0)
+    """Standard deviation of a coordinate that motion capture measures."""
+    mocap_angle_noise: float | None = _number("rad", 0.0, 1.0)
+    """Standard deviation of the attitude that it measures, about each axis."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,11 +7,12 @@ from .control import CollectiveThrust, Controller, RotorThrust
 from .effects import EffectOptions
 from .random import Draw
 from .randomize import PARAMETERS, Randomization
+from .sensors import checked_sensors
 from .state import Array, Pose, WorldState, clip, component, constant, on_host, plain, stack
 from .world import BACKENDS, Backend, PhysicsError, World, make_world
 
 __all__ = [
     "BACKENDS", "PARAMETERS", "Array", "Backend", "CollectiveThrust", "Controller", "Draw",
     "EffectOptions", "PhysicsError", "Pose", "Randomization", "RotorThrust", "World", "WorldState",
-    "clip", "component", "constant", "make_world", "on_host", "plain", "stack",
+    "checked_sensors", "clip", "component", "constant", "make_world", "on_host", "plain", "stack",
 ]  # fmt: skip

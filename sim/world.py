@@ -72,6 +72,15 @@ class World(Protocol):
     def draw(self, mask: Array, chosen: Any = None) -> Draw:
         """A `Draw` for the worlds of the mask; `chosen` as in `random.NumpyDraw`."""
 
+    def acceleration(self) -> Array:
+        """Of each body's origin at the present state and thrusts, world frame, m/s², (W, A, 3)."""
+
+    def below(self) -> Array:
+        """Distance from each body's origin along its -z axis to the first surface, m, (W, A).
+
+        Infinite where there is none. Geoms of the free body itself do not count.
+        """
+
     def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
         """So many normal numbers of each drone in every step; `seed` seeds their streams too.
 

@@ -17,7 +17,16 @@ import numpy as np
 
 from ...models import MOST_DRAG
 from ...models.errors import expect
-from ...sim import Array, Controller, Draw, EffectOptions, Pose, Randomization, WorldState
+from ...sim import (
+    Array,
+    Controller,
+    Draw,
+    EffectOptions,
+    Pose,
+    Randomization,
+    WorldState,
+    checked_sensors,
+)
 from ..spec import ArraySpec, Metric
 
 if TYPE_CHECKING:
@@ -46,6 +55,8 @@ class TaskOptions:
     """Effects by name, as `sim.EffectOptions` has them; none are on by default."""
     randomize: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """What is drawn for each episode: names of `sim.PARAMETERS` to distributions, as texts."""
+    sensors: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """What the drone measures: by sensor its settings, or true. See `sim/sensors.py`."""
 
     def __post_init__(self) -> None:
         length = finite(self.episode_length)
@@ -59,6 +70,7 @@ class TaskOptions:
         object.__setattr__(self, "effects", effects.to_options())
         Randomization(self.randomize, effects)  # raises
         object.__setattr__(self, "randomize", dict(self.randomize))
+        object.__setattr__(self, "sensors", checked_sensors(self.sensors))
         self.check()
 
     def check(self) -> None:

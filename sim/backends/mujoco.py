@@ -18,6 +18,7 @@ from ...models.vehicle import Vehicle, body_axes, craft_bodies, payload_radius
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, Draw, Noise, NumpyDraw, NumpyNoise, Streams
 from ..randomize import MODEL, Randomization
+from ..rotations import body_z
 from ..state import Array, Pose, WorldState, plain
 from ..world import PhysicsError, check_hung, contact_check
 
@@ -84,6 +85,7 @@ class MujocoWorld:
         self._thrust = np.zeros_like(self._ctrl) if differ else self._command
         self._applied: np.ndarray = batch.bind("qfrc_applied")
         self._touching = np.zeros(num_worlds, bool)
+        self._qacc: np.ndarray | None = None  # bound by what first asks for it
         lead = self.shape
         self.state = WorldState(
             position=qpos[:, :3].reshape((*lead, 3)),
@@ -185,6 +187,26 @@ class MujocoWorld:
         """As `World.draw`."""
         return NumpyDraw(self._streams, self._ids(mask).tolist(), self.shape, chosen)
 
+    def acceleration(self) -> Array:
+        """As `World.acceleration`: of a `mj_forward` that leaves the state as it was."""
+        if self._qacc is None:
+            self._qacc = self._batch.bind("qacc")
+            self._warmstart = self._batch.bind("qacc_warmstart")
+        before = self._warmstart.copy()
+        self._batch.forward()
+        self._warmstart[:] = before
+        return self._qacc[:, :3].reshape((*self.shape, 3)).copy()
+
+    def below(self) -> Array:
+        """As `World.below`, by `mj_ray`."""
+        state = self.state
+        origin, down = (
+            array.reshape(-1, 1, 3) for array in (state.position, -body_z(state.quaternion))
+        )
+        body = int(self.vehicle.model.jnt_bodyid[0])
+        distance = self._batch.ray(origin, down, bodyexclude=body)[0]
+        return np.where(distance < 0, np.inf, distance).reshape(self.shape)[()]
+
     def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
         """As `World.noise`."""
         self._noises.append(NumpyNoise(self.shape, size, use))
@@ -196,7 +218,9 @@ class MujocoWorld:
             return  # a fork has none of the threads
         state = {name: copy.copy(getattr(self.state, name)) for name in WorldState.__slots__}
         self.state = WorldState(**state)
-        views = "_batch _ctrl _command _thrust _applied _contacts _warnings _varied"
+        views = (
+            "_batch _ctrl _command _thrust _applied _contacts _warnings _varied _qacc _warmstart"
+        )
         for view in views.split():
             vars(self).pop(view, None)
 

@@ -17,6 +17,7 @@ from ...models.vehicle import Vehicle, body_axes, craft_bodies, payload_radius
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, START, Draw, Noise
 from ..randomize import MODEL, Randomization
+from ..rotations import body_z
 from ..state import Array, Pose, WorldState, constant
 from ..world import PhysicsError, check_hung, contact_check
 
@@ -92,6 +93,8 @@ class WarpWorld:
             mjw.step(self._model, data)  # compiles what is not yet in Warp's cache
             wp.synchronize()
             self._forward = self._captured(mjw.forward, 1)
+            self._qacc = from_dlpack(data.qacc)
+        self._ray: Any = None  # made by what first asks for it
         self._rows_in_air = int(self._rows.max()) + (self._cable is not None)  # a taut cable's
         self._steps: dict[int, Any] = {}
         newtons = np.array([rotor.newtons for rotor in vehicle.rotors])
@@ -227,6 +230,23 @@ class WarpWorld:
             raise InputError(f"actions: expected {expected}, got {got} for env {first}")
         return torch.where(right, values, 0.0)
 
+    def acceleration(self) -> Array:
+        """As `World.acceleration`."""
+        before = self._warmstart.clone()
+        self._launch(self._forward)
+        self._warmstart.copy_(before)
+        return self._qacc[:, None, :3].clone()
+
+    def below(self) -> Array:
+        """As `World.below`, by the rays of MuJoCo Warp."""
+        if self._ray is None:
+            self._ray = self._captured_ray()
+        graph, origin, down, distance, *_ = self._ray
+        origin.copy_(self.state.position)
+        down.copy_(-body_z(self.state.quaternion))
+        self._launch(graph)
+        return torch.where(distance < 0, torch.inf, distance)
+
     def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
         """As `World.noise`; one generator of the use gives the numbers of all worlds."""
         self._noises.append(TorchNoise((*self.shape, size), use, self.device))
@@ -268,6 +288,24 @@ class WarpWorld:
             for _ in range(times):
                 function(self._model, self._data)
         return capture.graph
+
+    def _captured_ray(self) -> Any:
+        """A graph; its tensors of origins, directions and distances; what else it holds."""
+        worlds, model = self.shape[0], self._model
+        with wp.ScopedDevice(self._name):
+            rays = [wp.zeros((worlds, 1), dtype=wp.vec3) for _ in range(3)]
+            distance, geom = wp.zeros((worlds, 1), dtype=float), wp.zeros((worlds, 1), dtype=int)
+            body = wp.array([int(self.vehicle.model.jnt_bodyid[0])], dtype=int)
+            every = wp.types.vector(6, float)(-1.0)
+
+            def cast(model: Any, data: Any) -> None:
+                mjw.kinematics(model, data)
+                mjw.rays(model, data, *rays[:2], every, True, body, distance, geom, rays[2])
+
+            cast(model, self._data)
+            wp.synchronize()
+            graph = self._captured(cast, 1)
+        return graph, *(wp.to_torch(array) for array in (*rays[:2], distance)), *rays, geom, body
 
     def _launch(self, graph: Any) -> None:
         stream = None

@@ -1,0 +1,724 @@
+"""Sensors and an onboard estimate, as options of every task; `docs/sensors.md` is their page.
+
+A sensor is sampled at the end of a control step, from the exact state there: one with a rate below
+the control rate holds its last reading in between. A reset gives a first reading, which a delay
+holds too. Each sensor draws from a stream of its own, so that none moves the numbers of another.
+
+World frame: x east, y north, z up. Arrays have the leading axes of the world, none for one drone.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
+
+import numpy as np
+
+from ..models.coefficients import Limits, checked, coefficient_fields
+from ..models.errors import InputError, expect
+from .random import SENSORS
+from .rotations import advanced, between, cross, to_body, to_world, world_z
+from .state import Array, WorldState, clip, component, constant, stack
+
+if TYPE_CHECKING:
+    from ..models.vehicle import Vehicle
+    from .world import World
+
+FIELD: Final = (1.287, 21.532, -43.231)
+"""Earth's magnetic field at Zurich (47.377° N, 8.542° E, 408 m) on 2025-01-01: east, north and up,
+µT. World Magnetic Model WMM2025, NOAA NCEI and British Geological Survey."""
+
+SEA_LEVEL_PRESSURE: Final = 101_325.0  # Pa. These four: ISO 2533:1975, tables 1 and 4
+SEA_LEVEL_TEMPERATURE: Final = 288.15  # K
+LAPSE_RATE: Final = 0.0065  # K/m, up to 11 km
+_EXPONENT: Final = 9.80665 / (287.052_87 * LAPSE_RATE)
+LOWEST, HIGHEST = -5_000.0, 11_000.0  # Heights that the barometer tells, m
+
+FURTHEST: Final = 1e5  # Largest coordinate of a reading, m
+MOST_SPEED: Final = 1e3  # Largest speed of a reading along an axis, m/s
+GYRO_RANGE: Final = math.radians(2000.0)  # rad/s: the largest setting of the BMI088
+ACCELEROMETER_RANGE: Final = 24 * 9.80665  # m/s²: the same
+
+_UNIT: Final = 1.001  # Bound of a unit quaternion's components
+_ESTIMATE: Final = "estimate"
+
+
+def isa_pressure(height: Array) -> Array:
+    """Pressure of the International Standard Atmosphere, Pa, at a geopotential height in m.
+
+    p = p₀ (1 - L h / T₀)^(g₀ / R L), ISO 2533:1975, equation 12; up to 11 km.
+    """
+    return SEA_LEVEL_PRESSURE * (1 - LAPSE_RATE / SEA_LEVEL_TEMPERATURE * height) ** _EXPONENT
+
+
+def isa_height(pressure: Array) -> Array:
+    """The reverse of `isa_pressure`: the pressure altitude, m."""
+    share = (pressure / SEA_LEVEL_PRESSURE) ** (1 / _EXPONENT)
+    return SEA_LEVEL_TEMPERATURE / LAPSE_RATE * (1 - share)
+
+
+class Reading(NamedTuple):
+    """What a sensor adds to an observation; the names are those of an `ArraySpec`."""
+
+    name: str
+    shape: tuple[int, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    unit: tuple[str, ...]
+    frame: str
+    components: tuple[str, ...]
+
+
+# ---- settings
+
+
+def _setting(default: Any, *limits: Any) -> Any:
+    return field(default=default, metadata={"limits": Limits(*limits)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Settings that are no coefficients of a vehicle."""
+
+    rate: float | None = _setting(None, "Hz", 1e-3, 1e6)
+    """Readings per second: the control rate over a whole number. None: the control rate."""
+    delay: float = _setting(0.0, "s", 0.0, 10.0)
+    """Age of a reading when it is told: a whole number of control periods."""
+    dropout: float = _setting(0.0, "1", 0.0, 0.99)
+    """Probability that a reading is lost: the one before stays."""
+    field: tuple[float, ...] = _setting(FIELD, "µT", -100.0, 100.0, 3)
+    """Magnetic field in the world frame."""
+    altitude: float = _setting(0.0, "m", -1e3, 9e3)
+    """Height of the ground above sea level."""
+    attitude_time: float = _setting(1.0, "s", 1e-3, 1e4)
+    """Time constant with which the estimated attitude follows what measures it."""
+    height_time: float = _setting(1.0, "s", 1e-3, 1e4)
+    """The same of height and climb rate, which follow the barometer."""
+    position_time: float = _setting(1.0, "s", 1e-3, 1e4)
+    """The same of position and velocity, which follow motion capture and GPS."""
+
+
+_SETTINGS: Final = {one.name: one for one in fields(Settings)}
+_COEFFICIENTS: Final = {
+    name.removeprefix("sensors."): one
+    for name, one in coefficient_fields()
+    if name.startswith("sensors.")
+}
+_SAMPLING: Final = ("rate", "delay", "dropout")
+
+
+def checked_sensors(given: Any) -> dict[str, Any]:
+    """The option `sensors` of a task as plain values in one order. Raises `InputError`.
+
+    By sensor its settings by name, or True for none; False leaves it out. `observe` is "added" or
+    "estimate".
+    """
+    known = [*SENSOR_TYPES, _ESTIMATE, "observe"]
+    expect(isinstance(given, Mapping), "sensors", "settings by sensor", f"{given!r:.80}")
+    for name in given:
+        expect(name in known, "sensors", f"some of {', '.join(known)}", f"{name!r}")
+    sensors: dict[str, Any] = {}
+    for name in known[:-1]:
+        if (settings := given.get(name, False)) in (False, None):
+            continue
+        right = settings is True or isinstance(settings, Mapping)
+        expect(right, f"sensors.{name}", "true, or settings by name", f"{settings!r:.80}")
+        sensors[name] = {} if settings is True else _checked_settings(name, settings)
+    observe = given.get("observe", "added")
+    right = observe in ("added", _ESTIMATE)
+    expect(right, "sensors.observe", "'added' or 'estimate'", f"{observe!r}")
+    if observe == _ESTIMATE:
+        expect(_ESTIMATE in sensors, "sensors", "estimate, which is to be observed", "none")
+        sensors["observe"] = observe
+    right = _ESTIMATE not in sensors or "imu" in sensors
+    expect(right, "sensors", "imu, which estimate needs", "none")
+    return sensors
+
+
+def _fields(name: str) -> dict[str, Any]:
+    """Fields of all settings of a sensor, by their names."""
+    if name == _ESTIMATE:
+        names = ("attitude_time", "height_time", "position_time")
+        return {one: _SETTINGS[one] for one in names}
+    kind = SENSOR_TYPES[name]
+    numbers = {one: _COEFFICIENTS[kind.prefix + one] for one in (*kind.needs, *kind.defaults)}
+    return numbers | {one: _SETTINGS[one] for one in (*kind.settings, *_SAMPLING)}
+
+
+def _checked_settings(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    known, settings = _fields(name), {}
+    for key, value in given.items():
+        expect(key in known, f"sensors.{name}", f"some of {', '.join(known)}", f"{key!r}")
+        number = checked(f"sensors.{name}.{key}", known[key], value)
+        settings[key] = list(number) if isinstance(number, tuple) else number
+    return settings
+
+
+def _resolved(
+    name: str, given: Mapping[str, Any], vehicle: "Vehicle", period: float
+) -> dict[str, Any]:
+    """All settings of a sensor: those given, else the vehicle's, else the defaults.
+
+    With `every` and `lag`, control steps between readings and of the delay. Raises `InputError`.
+    """
+    values: dict[str, Any] = {
+        one: _SETTINGS[one].default for one in _fields(name) if one in _SETTINGS
+    }
+    if name == _ESTIMATE:
+        return values | dict(given)
+    kind = SENSOR_TYPES[name]
+    for one in (*kind.needs, *kind.defaults):
+        told = getattr(vehicle.coefficients.sensors, kind.prefix + one)
+        if one in kind.needs and one not in given and told is None:
+            raise InputError(
+                f"sensors.{name}: expected {one} here, or sensors.{kind.prefix}{one} in the "
+                "vehicle's file, got none"
+            )
+        values[one] = kind.defaults.get(one) if told is None else told
+    values |= given
+    values["every"] = _steps(f"{name}.rate", values["rate"], period) if values["rate"] else 1
+    values["lag"] = _steps(f"{name}.delay", values["delay"], period)
+    return values
+
+
+def _steps(name: str, value: float, period: float) -> int:
+    """A rate or delay in control steps. Raises `InputError` if they are no whole number."""
+    is_rate = name.endswith("rate")
+    steps = 1 / (value * period) if is_rate else value / period
+    right = abs(steps - round(steps)) < 1e-6 * max(steps, 1.0) and round(steps) >= is_rate
+    what = f"the control rate of {1 / period:g} Hz over a whole number"
+    what = what if is_rate else f"a whole number of control periods of {period:g} s"
+    expect(right, f"sensors.{name}", what, f"{value:g} {'Hz' if is_rate else 's'}")
+    return round(steps)
+
+
+def readings_of(
+    sensors: Mapping[str, Any], vehicle: "Vehicle", period: float
+) -> tuple[Reading, ...]:
+    """What sensors add to an observation, from `checked_sensors`. Raises `InputError`."""
+    settings = {
+        name: _resolved(name, given, vehicle, period)
+        for name, given in sensors.items()
+        if name != "observe"
+    }
+    if sensors.get("observe") == _ESTIMATE:
+        return ()
+    return tuple(
+        _ESTIMATE_READING if name == _ESTIMATE else SENSOR_TYPES[name](values, 1.0).reading
+        for name, values in settings.items()
+    )
+
+
+# ---- what is measured
+
+
+class Truth:
+    """The exact state of a moment; what costs time is computed when it is first asked for."""
+
+    def __init__(self, world: "World") -> None:
+        self._world, self.state, self.xp = world, world.state, world.xp
+
+    @property
+    def specific_force(self) -> Array:
+        """Acceleration less that of gravity at the body's origin, body frame, m/s², (W, A, 3).
+
+        R^T (a - g), with the attitude R and the acceleration a at the end of the control step, under
+        the thrusts and the forces of the air of its last physics step.
+        """
+        gravity = constant(np.array((0.0, 0.0, self._world.vehicle.gravity)), self.state.position)
+        return to_body(self.state.quaternion, self._world.acceleration() + gravity)
+
+    @property
+    def below(self) -> Array:
+        """As `World.below`."""
+        return self._world.below()
+
+
+class Sensor:
+    """Base of sensors: a model of errors. `values` are all settings, `interval` is in s.
+
+    Class attributes:
+        name: In the option, and of the observation's array.
+        prefix: What its coefficients' names begin with in a vehicle's file.
+        needs: Coefficients that the vehicle or the option has to give.
+        defaults: Coefficients that nobody has to give.
+        settings: Names in `Settings`, besides those that every sensor has.
+        columns: Normal numbers that a reading takes, and a reset.
+        frame, components, units: Of the reading.
+    """
+
+    name: ClassVar[str]
+    prefix: ClassVar[str]
+    needs: ClassVar[tuple[str, ...]] = ("noise",)
+    defaults: ClassVar[Mapping[str, float]] = {}
+    settings: ClassVar[tuple[str, ...]] = ()
+    columns: ClassVar[int]
+    frame: ClassVar[str] = ""
+    components: ClassVar[tuple[str, ...]]
+    units: ClassVar[tuple[str, ...]]
+
+    def __init__(self, values: Mapping[str, Any], interval: float) -> None:
+        self.values, self.interval = values, interval
+
+    def bounds(self) -> tuple[list[float], list[float]]:
+        """(low, high) of each component."""
+        raise NotImplementedError
+
+    @property
+    def reading(self) -> Reading:
+        """Spec of a reading."""
+        low, high = (tuple(end) for end in self.bounds())
+        names = self.components
+        return Reading(self.name, (len(names),), low, high, self.units, self.frame, names)
+
+    def begin(self, mask: Array, normal: Array) -> None:
+        """Draw an episode's errors for the drones of a mask."""
+
+    def read(self, truth: Truth, normal: Array) -> Array:
+        """A reading, shape (W, A, k). The normals of drones that are not read are 0."""
+        raise NotImplementedError
+
+
+class Imu(Sensor):
+    """Gyroscope and accelerometer at the body's origin.
+
+    reading = (1 + scale) · exact + bias + white noise, for each axis. White noise of density N read
+    every T has σ = N / √T; the bias walks by K √T between readings. (IEEE Std 952-1997, annex C.)
+    """
+
+    name, prefix = "imu", ""
+    needs = ("gyro_noise", "accelerometer_noise")
+    defaults: ClassVar[Mapping[str, float]] = {
+        "gyro_walk": 0.0, "gyro_bias": 0.0, "gyro_scale": 0.0, "gyro_range": GYRO_RANGE,
+        "accelerometer_walk": 0.0, "accelerometer_bias": 0.0, "accelerometer_scale": 0.0,
+        "accelerometer_range": ACCELEROMETER_RANGE,
+    }  # fmt: skip
+    columns = 12
+    frame = "body"
+    components = tuple(f"{what} {axis}" for what in ("gyro", "accelerometer") for axis in "xyz")
+    units = ("rad/s",) * 3 + ("m/s²",) * 3
+
+    def __init__(self, values: Mapping[str, Any], interval: float) -> None:
+        super().__init__(values, interval)
+        self._white = self._both("noise") / math.sqrt(interval)
+        self._step = self._both("walk") * math.sqrt(interval)
+        self._bias: Array = 0.0
+        self._scale: Array = 0.0
+
+    def _both(self, what: str) -> np.ndarray:
+        return np.repeat([self.values[f"gyro_{what}"], self.values[f"accelerometer_{what}"]], 3)
+
+    def bounds(self) -> tuple[list[float], list[float]]:
+        """Plus and minus the ranges."""
+        high = self._both("range")
+        return (-high).tolist(), high.tolist()
+
+    def begin(self, mask: Array, normal: Array) -> None:
+        """Bias and error of scale."""
+        for name, numbers in (("bias", normal[..., :6]), ("scale", normal[..., 6:])):
+            drawn = constant(self._both(name), normal) * numbers
+            old = getattr(self, f"_{name}")
+            setattr(self, f"_{name}", _chosen(mask, drawn, old))
+
+    def read(self, truth: Truth, normal: Array) -> Array:
+        """Rates and specific force, as the class has them."""
+        exact = truth.xp.concat((truth.state.body_rates, truth.specific_force), axis=-1)
+        white, step, high = (
+            constant(x, normal) for x in (self._white, self._step, self._both("range"))
+        )
+        reading = clip(
+            (1 + self._scale) * exact + self._bias + white * normal[..., :6], -high, high
+        )
+        self._bias = self._bias + step * normal[..., 6:]
+        return clip(reading, -high, high)
+
+
+class Magnetometer(Sensor):
+    """Earth's field in the body frame; white noise, in T in the vehicle's file."""
+
+    name, prefix, columns = "magnetometer", "magnetometer_", 3
+    settings = ("field",)
+    frame = "body"
+    components, units = ("field x", "field y", "field z"), ("µT",) * 3
+
+    def bounds(self) -> tuple[list[float], list[float]]:
+        """Plus and minus 1 mT, far from any reading but for a wrong noise."""
+        return [-1e3] * 3, [1e3] * 3
+
+    def read(self, truth: Truth, normal: Array) -> Array:
+        """Field and noise."""
+        field = constant(np.array(self.values["field"]), normal)
+        noise = 1e6 * self.values["noise"] * normal
+        return clip(to_body(truth.state.quaternion, field) + noise, -1e3, 1e3)
+
+
+class Barometer(Sensor):
+    """Pressure altitude: the height at which the standard atmosphere has the pressure it reads.
+
+    White noise and a walk from 0 on act on the pressure, that of the standard atmosphere at the
+    body's origin.
+    """
+
+    name, prefix, columns = "barometer", "barometer_", 2
+    defaults: ClassVar[Mapping[str, float]] = {"walk": 0.0}
+    settings = ("altitude",)
+    frame = "above sea level"
+    components, units = ("pressure altitude",), ("m",)
+
+    def __init__(self, values: Mapping[str, Any], interval: float) -> None:
+        super().__init__(values, interval)
+        self._step = values["walk"] * math.sqrt(interval)
+        self._bias: Array = 0.0
+        self._ends = isa_pressure(HIGHEST), isa_pressure(LOWEST)
+
+    def bounds(self) -> tuple[list[float], list[float]]:
+        """Of the troposphere, and below the sea."""
+        return [LOWEST - 1], [HIGHEST + 1]
+
+    def begin(self, mask: Array, normal: Array) -> None:
+        """No walk yet."""
+        self._bias = _chosen(mask, 0.0 * normal[..., :1], self._bias)
+
+    def read(self, truth: Truth, normal: Array) -> Array:
+        """Height by the pressure."""
+        # An array of a single drone too: a power of Python's numbers may differ by a bit.
+        height = truth.state.position[..., 2:] + self.values["altitude"]
+        exact = isa_pressure(clip(height, LOWEST, HIGHEST))
+        pressure = exact + self._bias + self.values["noise"] * normal[..., :1]
+        self._bias = self._bias + self._step * normal[..., 1:]
+        return isa_height(clip(pressure, *self._ends))
+
+
+class Rangefinder(Sensor):
+    """Distance from the body's origin along its -z axis, by a ray; white noise."""
+
+    name, prefix, columns = "rangefinder", "range_", 1
+    needs = ("noise", "limit")
+    frame = "body, along -z"
+    components, units = ("distance",), ("m",)
+
+    def bounds(self) -> tuple[list[float], list[float]]:
+        """0 to the limit, which it reads where there is nothing."""
+        return [0.0], [self.values["limit"]]
+
+    def read(self, truth: Truth, normal: Array) -> Array:
+        """Distance, 0 to the limit."""
+        distance = clip(truth.below, 0.0, self.values["limit"])
+        return clip(stack((distance,)) + self.values["noise"] * normal, 0.0, self.values["limit"])
+
+
+class Gps(Sensor):
+    """Position and velocity; white noise."""
+
+    name, prefix, columns = "gps", "gps_", 6
+    needs = ("noise", "vertical_noise", "velocity_noise")
+    frame = "world"
+    components = ("x", "y", "z", "vx", "vy", "vz")
+    units = ("m",) * 3 + ("m/s",) * 3
+
+    def bounds(self) -> tuple[list[float], list[float]]:
+        """Far beyond any flight."""
+        high = [FURTHEST] * 3 + [MOST_SPEED] * 3
+        return [-x for x in high], high
+
+    def read(self, truth: Truth, normal: Array) -> Array:
+        """Position and velocity of the body's origin."""
+        level, vertical, speed = (self.values[name] for name in self.needs)
+        sigma = constant(np.array((level, level, vertical, speed, speed, speed)), normal)
+        exact = truth.xp.concat((truth.state.position, truth.state.velocity), axis=-1)
+        low, high = (constant(np.array(end), normal) for end in self.bounds())
+        return clip(exact + sigma * normal, low, high)
+
+
+class MotionCapture(Sensor):
+    """Position and attitude; white noise, of the attitude about the body's axes."""
+
+    name, prefix, columns = "motion_capture", "mocap_", 6
+    needs = ("noise", "angle_noise")
+    frame = "world; quaternion: body to world"
+    components = ("x", "y", "z", "qw", "qx", "qy", "qz")
+    units = ("m",) * 3 + ("1",) * 4
+
+    def bounds(self) -> tuple[list[float], list[float]]:
+        """Far beyond any flight; a unit quaternion."""
+        high = [FURTHEST] * 3 + [_UNIT] * 4
+        return [-x for x in high], high
+
+    def read(self, truth: Truth, normal: Array) -> Array:
+        """Position and quaternion of the body."""
+        state, xp = truth.state, truth.xp
+        position = state.position + self.values["noise"] * normal[..., :3]
+        angle = self.values["angle_noise"] * normal[..., 3:]
+        turned = advanced(xp, state.quaternion, angle)
+        return xp.concat((clip(position, -FURTHEST, FURTHEST), turned), axis=-1)
+
+
+SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
+    kind.name: kind for kind in (Imu, Magnetometer, Barometer, Rangefinder, Gps, MotionCapture)
+}
+"""In this order they are observed; the place is also the number of a sensor's stream."""
+
+_ESTIMATE_READING: Final = Reading(
+    _ESTIMATE,
+    (13,),
+    (-FURTHEST,) * 3 + (-MOST_SPEED,) * 3 + (-_UNIT,) * 4 + (-2 * MOST_SPEED,) * 3,
+    (FURTHEST,) * 3 + (MOST_SPEED,) * 3 + (_UNIT,) * 4 + (2 * MOST_SPEED,) * 3,
+    ("m",) * 3 + ("m/s",) * 3 + ("1",) * 4 + ("rad/s",) * 3,
+    "world; body rates: body",
+    ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz"),
+)
+
+
+# ---- sampling
+
+
+class _Channel:
+    """A sensor as it is sampled: rate, delay and dropout.
+
+    Attributes:
+        value: What is told now, shape (W, A, k).
+        fresh: Whether it was not told before, bool, shape (W, A).
+    """
+
+    def __init__(self, name: str, values: Mapping[str, Any], world: "World", period: float) -> None:
+        self._every, self._lag = values["every"], values["lag"]
+        self.interval = self._every * period
+        self.sensor = SENSOR_TYPES[name](values, self.interval)
+        # One number more than the sensor takes decides whether a reading is lost.
+        use = SENSORS, list(SENSOR_TYPES).index(name)
+        self._noise = world.noise(self.sensor.columns + 1, use)
+        dropout = values["dropout"]
+        self._lost = NormalDist().inv_cdf(dropout) if dropout else -math.inf
+        self.value: Array = 0.0
+        self.fresh: Array = False
+        self._held: Array = 0.0
+        self._queue: list[tuple[Array, Array]] = []
+
+    def begin(self, mask: Array, truth: Truth) -> None:
+        """First reading of the drones of a mask."""
+        self.sensor.begin(mask, self._noise.normal(mask)[..., :-1])
+        first = self.sensor.read(truth, self._noise.normal(mask)[..., :-1])
+        self.value = _chosen(mask, first, self.value)
+        self._held = _chosen(mask, first, self._held)
+        self.fresh = mask | (self.fresh & ~mask)
+        old = self._queue or [(self.value, self.fresh)] * self._lag
+        self._queue = [(_chosen(mask, first, value), fresh & ~mask) for value, fresh in old]
+
+    def sample(self, mask: Array, steps: Array, truth: Truth) -> None:
+        """After a control step of the drones of a mask; so many steps are behind each drone."""
+        due = mask if self._every == 1 else mask & (steps % self._every == 0)
+        fresh = due
+        if truth.xp is not np or np.any(due):
+            normal = self._noise.normal(due)
+            reading = self.sensor.read(truth, normal[..., :-1])
+            fresh = due & (component(normal, -1) >= self._lost)
+            self._held = _chosen(fresh, reading, self._held)
+        if not self._lag:
+            self.value, self.fresh = self._held, _chosen(mask, fresh, self.fresh)
+            return
+        value, told = self._queue[0]
+        self.value, self.fresh = _chosen(mask, value, self.value), _chosen(mask, told, self.fresh)
+        later = [*self._queue[1:], (self._held, fresh)]
+        self._queue = [
+            (_chosen(mask, new, old), _chosen(mask, flag, was))
+            for (new, flag), (old, was) in zip(later, self._queue, strict=True)
+        ]
+
+
+class Sensors:
+    """The sensors of a world's drones, from `checked_sensors`, at so many s between two samples.
+
+    Raises `InputError`.
+    """
+
+    def __init__(self, sensors: Mapping[str, Any], world: "World", period: float) -> None:
+        self._world, xp = world, world.xp
+        settings = {
+            name: _resolved(name, given, world.vehicle, period)
+            for name, given in sensors.items()
+            if name != "observe"
+        }
+        estimate = settings.pop(_ESTIMATE, None)
+        self._channels = {
+            name: _Channel(name, values, world, period) for name, values in settings.items()
+        }
+        self._estimator = None
+        if estimate is not None:
+            altitude = settings.get("barometer", {}).get("altitude", 0.0)
+            field = settings.get("magnetometer", {}).get("field", FIELD)
+            gravity = world.vehicle.gravity
+            self._estimator = Estimator(estimate, xp, period, gravity, altitude, field)
+        self._replaces = sensors.get("observe") == _ESTIMATE
+        self._steps: Array = 0
+
+    def begin(self, mask: Array) -> None:
+        """Begin episodes of the drones of a mask, bool, shape (W, A), after a reset of theirs."""
+        truth = Truth(self._world)
+        self._steps = self._steps + 0 * mask if self._world.shape else 0
+        self._steps = _chosen(mask, 0 * self._steps, self._steps)
+        for channel in self._channels.values():
+            channel.begin(mask, truth)
+        if self._estimator is not None:
+            self._estimator.begin(mask, truth.state, self._channels["imu"].value)
+
+    def sample(self, mask: Array) -> None:
+        """After a control step of the drones of a mask; the others keep their readings."""
+        truth = Truth(self._world)
+        self._steps = self._steps + mask
+        for channel in self._channels.values():
+            channel.sample(mask, self._steps, truth)
+        if self._estimator is not None:
+            self._estimator.update(mask, self._channels)
+
+    @property
+    def readings(self) -> dict[str, Array]:
+        """What the observation gets, by name, shapes (W, A, k)."""
+        if self._replaces:
+            return {}
+        readings = {name: channel.value for name, channel in self._channels.items()}
+        if self._estimator is not None:
+            readings[_ESTIMATE] = self._estimator.reading()
+        return readings
+
+    def seen(self) -> WorldState:
+        """The state that task and controller see: the exact one, or the estimate."""
+        state = self._world.state
+        return self._estimator.seen(state) if self._estimator and self._replaces else state
+
+
+# ---- the estimate
+
+
+class Estimator:
+    """Complementary filter: what the IMU gives is integrated, and pulled to what measures it.
+
+    Attitude: R. Mahony, T. Hamel, J.-M. Pflimlin, "Nonlinear Complementary Filters on the Special
+    Orthogonal Group", IEEE TAC 53(5), 2008, equation 32, without its bias; the accelerometer's
+    direction counts in proportion to its size over g, the magnetometer turns about the vertical
+    alone. Position and velocity: a g-h filter with two equal poles (E. Brookner, "Tracking and
+    Kalman Filtering Made Easy", 1998, section 1.2.6). The filter begins at the exact state, and
+    takes a late reading for one of now.
+
+    Args:
+        times: Time constants, by the names of `Settings`, s.
+        xp: Namespace of the arrays.
+        period: Time of a step, s.
+        gravity: m/s².
+        altitude: Of the ground above sea level, m.
+        field: Earth's, world frame, shape (3,).
+    """
+
+    def __init__(
+        self,
+        times: Mapping[str, float],
+        xp: Any,
+        period: float,
+        gravity: float,
+        altitude: float,
+        field: Any,
+    ) -> None:
+        self._times, self._xp, self._period, self._gravity = times, xp, period, gravity
+        self._altitude, self._north = altitude, math.atan2(field[1], field[0])
+        self.position: Array = 0.0
+        self.velocity: Array = 0.0
+        self.quaternion: Array = 0.0
+        self.body_rates: Array = 0.0
+
+    def begin(self, mask: Array, state: WorldState, imu: Array) -> None:
+        """Take over the exact state of the drones of a mask."""
+        for name in ("position", "velocity", "quaternion"):
+            exact = getattr(state, name) + 0.0  # its own memory
+            setattr(self, name, _chosen(mask, exact, getattr(self, name)))
+        self.body_rates = imu[..., :3]
+
+    def update(self, mask: Array, channels: Mapping[str, _Channel]) -> None:
+        """A control step of the drones of a mask."""
+        imu, period = channels["imu"].value, self._period
+        rates, force = imu[..., :3], imu[..., 3:]
+        turned = advanced(
+            self._xp, self.quaternion, rates * period + self._correction(force, channels)
+        )
+        gravity = constant(np.array((0.0, 0.0, self._gravity)), force)
+        acceleration = to_world(turned, force) - gravity
+        position = self.position + period * self.velocity + 0.5 * period**2 * acceleration
+        velocity = self.velocity + period * acceleration
+        position, velocity = self._followed(position, velocity, channels)
+        self.quaternion = _chosen(mask, turned, self.quaternion)
+        self.position = _chosen(mask, clip(position, -FURTHEST, FURTHEST), self.position)
+        self.velocity = _chosen(mask, clip(velocity, -MOST_SPEED, MOST_SPEED), self.velocity)
+        self.body_rates = _chosen(mask, rates, self.body_rates)
+
+    def _correction(self, force: Array, channels: Mapping[str, _Channel]) -> Array:
+        """Rotation vector in the body frame that pulls the attitude to what measures it, rad."""
+        xp, up, time = self._xp, world_z(self.quaternion), self._times["attitude_time"]
+        angle = (1 - math.exp(-self._period / time)) / self._gravity * cross(force, up)
+        if channel := channels.get("magnetometer"):
+            field = to_world(self.quaternion, channel.value)
+            off = self._north - xp.atan2(component(field, 1), component(field, 0))
+            off = xp.atan2(xp.sin(off), xp.cos(off)) * self._gain(channel, "attitude_time")
+            angle = angle + stack((off,)) * up
+        if channel := channels.get("motion_capture"):
+            error = between(self.quaternion, channel.value[..., 3:])
+            sign = 2.0 * self._gain(channel, "attitude_time") * xp.sign(component(error, 0))
+            angle = angle + stack((sign,)) * error[..., 1:]
+        return angle
+
+    def _followed(
+        self, position: Array, velocity: Array, channels: Mapping[str, _Channel]
+    ) -> tuple[Array, Array]:
+        """Position and velocity, pulled to what measures them."""
+        if channel := channels.get("barometer"):
+            zero = 0.0 * component(position, 2)
+            off = component(channel.value, 0) - self._altitude - component(position, 2)
+            g, h = self._gains(channel, "height_time")
+            position = position + stack((zero, zero, g * off))
+            velocity = velocity + stack((zero, zero, h * off))
+        if channel := channels.get("motion_capture"):
+            g, h = self._gains(channel, "position_time")
+            off = channel.value[..., :3] - position
+            position, velocity = position + stack((g,)) * off, velocity + stack((h,)) * off
+        if channel := channels.get("gps"):
+            gain = stack((self._gain(channel, "position_time"),))
+            position = position + gain * (channel.value[..., :3] - position)
+            velocity = velocity + gain * (channel.value[..., 3:] - velocity)
+        return position, velocity
+
+    def _gain(self, channel: _Channel, time: str) -> Array:
+        """Share of an error that a fresh reading takes away; 0 where there is none."""
+        share = 1 - math.exp(-channel.interval / self._times[time])
+        return share * channel.fresh + 0.0 * component(self.position, 0)
+
+    def _gains(self, channel: _Channel, time: str) -> tuple[Array, Array]:
+        """g, and h over the interval: 1 - ξ² and (1 - ξ)² for two poles at ξ."""
+        pole = math.exp(-channel.interval / self._times[time])
+        fresh = channel.fresh + 0.0 * component(self.position, 0)
+        return (1 - pole**2) * fresh, (1 - pole) ** 2 / channel.interval * fresh
+
+    def reading(self) -> Array:
+        """Position, velocity, quaternion and rates, shape (W, A, 13)."""
+        parts = (self.position, self.velocity, self.quaternion, self.body_rates)
+        return self._xp.concat(parts, axis=-1)
+
+    def seen(self, state: WorldState) -> WorldState:
+        """A state with the estimate in place of what is estimated."""
+        return replace(
+            state,
+            position=self.position,
+            velocity=self.velocity,
+            quaternion=self.quaternion,
+            body_rates=self.body_rates,
+        )
+
+
+def _chosen(mask: Array, new: Array, old: Array) -> Array:
+    """`new`, (W, A) or (W, A, k), where the mask is true; elsewhere `old`, a number at first."""
+    if not getattr(mask, "ndim", 0):  # a single drone's
+        return new if mask else old
+    if getattr(new, "ndim", 0) > mask.ndim:
+        mask = mask[..., None]
+    if isinstance(mask, np.ndarray):
+        return np.where(mask, new, old)
+    import torch
+
+    return torch.where(mask, new, old)

@@ -1,0 +1,59 @@
+"""Rotations against values worked out by hand."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from rotorgram.sim import rotations
+
+HALF = math.sqrt(0.5)
+LEFT = np.array((HALF, 0.0, 0.0, HALF))  # 90° about z: the nose along y
+ROLLED = np.array((HALF, HALF, 0.0, 0.0))  # 90° about x: body y up, body z along -y
+V = np.array((1.0, 2.0, 3.0))
+
+
+def both(*arrays: np.ndarray) -> list[list[Any]]:
+    """As a single drone has them, and as a batch of two."""
+    return [list(arrays), [np.broadcast_to(a, (2, 1, a.shape[-1])) for a in arrays]]
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "expected"),
+    [
+        (rotations.to_world, (LEFT, V), (-2.0, 1.0, 3.0)),
+        (rotations.to_body, (LEFT, V), (2.0, -1.0, 3.0)),
+        (rotations.to_world, (ROLLED, V), (1.0, -3.0, 2.0)),
+        (rotations.to_body, (ROLLED, V), (1.0, 3.0, -2.0)),
+        (rotations.body_z, (ROLLED,), (0.0, -1.0, 0.0)),
+        (rotations.world_z, (ROLLED,), (0.0, 1.0, 0.0)),
+        (rotations.cross, (V, np.array((4.0, 5.0, 6.0))), (-3.0, 6.0, -3.0)),
+        # First to the left, then rolled about the new nose: body z points along world x.
+        (rotations.multiplied, (LEFT, ROLLED), (0.5, 0.5, 0.5, 0.5)),
+        (rotations.between, (LEFT, np.array((0.5, 0.5, 0.5, 0.5))), (HALF, HALF, 0.0, 0.0)),
+    ],
+)
+def test_by_hand(function: Any, arguments: Any, expected: Any) -> None:
+    for given in both(*arguments):
+        turned = function(*given)
+        np.testing.assert_allclose(turned, np.broadcast_to(expected, turned.shape), atol=1e-15)
+
+
+def test_a_rotation_vector_turns_the_body() -> None:
+    for attitude, angle in both(LEFT, np.array((math.pi / 2, 0.0, 0.0))):
+        turned = rotations.advanced(np, attitude, angle)
+        np.testing.assert_allclose(turned, np.full(turned.shape, 0.5), atol=1e-15)
+    still = rotations.advanced(np, 2 * LEFT, np.zeros(3))
+    np.testing.assert_allclose(still, LEFT, atol=1e-15)  # normalised
+    many = np.array((1.0, 0.0, 0.0, 0.0))
+    for _ in range(90):
+        many = rotations.advanced(np, many, np.radians((0.0, 0.0, 1.0)))
+    np.testing.assert_allclose(many, LEFT, atol=1e-13)
+
+
+def test_a_device_of_torch_has_the_same() -> None:
+    torch = pytest.importorskip("torch")
+    q, v = torch.tensor(ROLLED)[None, None], torch.tensor(V)[None, None]
+    np.testing.assert_allclose(rotations.to_world(q, v)[0, 0], (1.0, -3.0, 2.0), atol=1e-15)
+    turned = rotations.advanced(torch, q, torch.zeros(1, 1, 3, dtype=torch.float64))
+    np.testing.assert_allclose(turned[0, 0], ROLLED, atol=1e-15)
