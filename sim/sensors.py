@@ -223,8 +223,8 @@ class Truth:
     def specific_force(self) -> Array:
         """Acceleration less that of gravity at the body's origin, body frame, m/s², (W, A, 3).
 
-        R^T (a - g), with the attitude R and the acceleration a at the end of the control step, under
-        the thrusts and the forces of the air of its last physics step.
+        R^T (a - g), with the attitude R and the acceleration a at the end of the control step,
+        under the thrusts and the forces of the air of its last physics step.
         """
         gravity = constant(np.array((0.0, 0.0, self._world.vehicle.gravity)), self.state.position)
         return to_body(self.state.quaternion, self._world.acceleration() + gravity)
@@ -348,7 +348,7 @@ class Magnetometer(Sensor):
 
     def read(self, truth: Truth, normal: Array) -> Array:
         """Field and noise."""
-        field = constant(np.array(self.values["field"]), normal)
+        field = constant(np.array(self.values["field"]), normal) + 0.0 * normal
         noise = 1e6 * self.values["noise"] * normal
         return clip(to_body(truth.state.quaternion, field) + noise, -1e3, 1e3)
 
