@@ -29,7 +29,7 @@ FIELD: Final = (1.287, 21.532, -43.231)
 """Earth's magnetic field at Zurich (47.377° N, 8.542° E, 408 m) on 2025-01-01: east, north and up,
 µT. World Magnetic Model WMM2025, NOAA NCEI and British Geological Survey."""
 
-SEA_LEVEL_PRESSURE: Final = 101_325.0  # Pa. These four: ISO 2533:1975, tables 1 and 4
+SEA_LEVEL_PRESSURE: Final = 101_325.0  # Pa. These are those of ISO 2533:1975
 SEA_LEVEL_TEMPERATURE: Final = 288.15  # K
 LAPSE_RATE: Final = 0.0065  # K/m, up to 11 km
 _EXPONENT: Final = 9.80665 / (287.052_87 * LAPSE_RATE)
@@ -47,7 +47,7 @@ _ESTIMATE: Final = "estimate"
 def isa_pressure(height: Array) -> Array:
     """Pressure of the International Standard Atmosphere, Pa, at a geopotential height in m.
 
-    p = p₀ (1 - L h / T₀)^(g₀ / R L), ISO 2533:1975, equation 12; up to 11 km.
+    p = p₀ (1 - L h / T₀)^(g₀ / R L), ISO 2533:1975, in the troposphere: up to 11 km.
     """
     return SEA_LEVEL_PRESSURE * (1 - LAPSE_RATE / SEA_LEVEL_TEMPERATURE * height) ** _EXPONENT
 
@@ -213,26 +213,15 @@ def readings_of(
 # ---- what is measured
 
 
-class Truth:
-    """The exact state of a moment; what costs time is computed when it is first asked for."""
+def specific_force(world: "World") -> Array:
+    """Acceleration less that of gravity at the body's origin, body frame, m/s², shape (W, A, 3).
 
-    def __init__(self, world: "World") -> None:
-        self._world, self.state, self.xp = world, world.state, world.xp
-
-    @property
-    def specific_force(self) -> Array:
-        """Acceleration less that of gravity at the body's origin, body frame, m/s², (W, A, 3).
-
-        R^T (a - g), with the attitude R and the acceleration a at the end of the control step,
-        under the thrusts and the forces of the air of its last physics step.
-        """
-        gravity = constant(np.array((0.0, 0.0, self._world.vehicle.gravity)), self.state.position)
-        return to_body(self.state.quaternion, self._world.acceleration() + gravity)
-
-    @property
-    def below(self) -> Array:
-        """As `World.below`."""
-        return self._world.below()
+    R^T (a - g), with the attitude R and the acceleration a at the end of the control step, under
+    the thrusts and the forces of the air of its last physics step.
+    """
+    state = world.state
+    gravity = constant(np.array((0.0, 0.0, world.vehicle.gravity)), state.position)
+    return to_body(state.quaternion, world.acceleration() + gravity)
 
 
 class Sensor:
@@ -275,7 +264,7 @@ class Sensor:
     def begin(self, mask: Array, normal: Array) -> None:
         """Draw an episode's errors for the drones of a mask."""
 
-    def read(self, truth: Truth, normal: Array) -> Array:
+    def read(self, world: "World", normal: Array) -> Array:
         """A reading, shape (W, A, k). The normals of drones that are not read are 0."""
         raise NotImplementedError
 
@@ -321,9 +310,9 @@ class Imu(Sensor):
             old = getattr(self, f"_{name}")
             setattr(self, f"_{name}", _chosen(mask, drawn, old))
 
-    def read(self, truth: Truth, normal: Array) -> Array:
+    def read(self, world: "World", normal: Array) -> Array:
         """Rates and specific force, as the class has them."""
-        exact = truth.xp.concat((truth.state.body_rates, truth.specific_force), axis=-1)
+        exact = world.xp.concat((world.state.body_rates, specific_force(world)), axis=-1)
         white, step, high = (
             constant(x, normal) for x in (self._white, self._step, self._both("range"))
         )
@@ -346,11 +335,11 @@ class Magnetometer(Sensor):
         """Plus and minus 1 mT, far from any reading but for a wrong noise."""
         return [-1e3] * 3, [1e3] * 3
 
-    def read(self, truth: Truth, normal: Array) -> Array:
+    def read(self, world: "World", normal: Array) -> Array:
         """Field and noise."""
         field = constant(np.array(self.values["field"]), normal) + 0.0 * normal
         noise = 1e6 * self.values["noise"] * normal
-        return clip(to_body(truth.state.quaternion, field) + noise, -1e3, 1e3)
+        return clip(to_body(world.state.quaternion, field) + noise, -1e3, 1e3)
 
 
 class Barometer(Sensor):
@@ -380,10 +369,10 @@ class Barometer(Sensor):
         """No walk yet."""
         self._bias = _chosen(mask, 0.0 * normal[..., :1], self._bias)
 
-    def read(self, truth: Truth, normal: Array) -> Array:
+    def read(self, world: "World", normal: Array) -> Array:
         """Height by the pressure."""
         # An array of a single drone too: a power of Python's numbers may differ by a bit.
-        height = truth.state.position[..., 2:] + self.values["altitude"]
+        height = world.state.position[..., 2:] + self.values["altitude"]
         exact = isa_pressure(clip(height, LOWEST, HIGHEST))
         pressure = exact + self._bias + self.values["noise"] * normal[..., :1]
         self._bias = self._bias + self._step * normal[..., 1:]
@@ -402,9 +391,9 @@ class Rangefinder(Sensor):
         """0 to the limit, which it reads where there is nothing."""
         return [0.0], [self.values["limit"]]
 
-    def read(self, truth: Truth, normal: Array) -> Array:
+    def read(self, world: "World", normal: Array) -> Array:
         """Distance, 0 to the limit."""
-        distance = clip(truth.below, 0.0, self.values["limit"])
+        distance = clip(world.below(), 0.0, self.values["limit"])
         return clip(stack((distance,)) + self.values["noise"] * normal, 0.0, self.values["limit"])
 
 
@@ -422,11 +411,11 @@ class Gps(Sensor):
         high = [FURTHEST] * 3 + [MOST_SPEED] * 3
         return [-x for x in high], high
 
-    def read(self, truth: Truth, normal: Array) -> Array:
+    def read(self, world: "World", normal: Array) -> Array:
         """Position and velocity of the body's origin."""
         level, vertical, speed = (self.values[name] for name in self.needs)
         sigma = constant(np.array((level, level, vertical, speed, speed, speed)), normal)
-        exact = truth.xp.concat((truth.state.position, truth.state.velocity), axis=-1)
+        exact = world.xp.concat((world.state.position, world.state.velocity), axis=-1)
         low, high = (constant(np.array(end), normal) for end in self.bounds())
         return clip(exact + sigma * normal, low, high)
 
@@ -445,9 +434,9 @@ class MotionCapture(Sensor):
         high = [FURTHEST] * 3 + [_UNIT] * 4
         return [-x for x in high], high
 
-    def read(self, truth: Truth, normal: Array) -> Array:
+    def read(self, world: "World", normal: Array) -> Array:
         """Position and quaternion of the body."""
-        state, xp = truth.state, truth.xp
+        state, xp = world.state, world.xp
         position = state.position + self.values["noise"] * normal[..., :3]
         angle = self.values["angle_noise"] * normal[..., 3:]
         turned = advanced(xp, state.quaternion, angle)
@@ -485,6 +474,7 @@ class _Channel:
         self._every, self._lag = values["every"], values["lag"]
         self.interval = self._every * period
         self.sensor = SENSOR_TYPES[name](values, self.interval)
+        self._world = world
         # One number more than the sensor takes decides whether a reading is lost.
         use = SENSORS, list(SENSOR_TYPES).index(name)
         self._noise = world.noise(self.sensor.columns + 1, use)
@@ -495,23 +485,23 @@ class _Channel:
         self._held: Array = 0.0
         self._queue: list[tuple[Array, Array]] = []
 
-    def begin(self, mask: Array, truth: Truth) -> None:
+    def begin(self, mask: Array) -> None:
         """First reading of the drones of a mask."""
         self.sensor.begin(mask, self._noise.normal(mask)[..., :-1])
-        first = self.sensor.read(truth, self._noise.normal(mask)[..., :-1])
+        first = self.sensor.read(self._world, self._noise.normal(mask)[..., :-1])
         self.value = _chosen(mask, first, self.value)
         self._held = _chosen(mask, first, self._held)
         self.fresh = mask | (self.fresh & ~mask)
         old = self._queue or [(self.value, self.fresh)] * self._lag
         self._queue = [(_chosen(mask, first, value), fresh & ~mask) for value, fresh in old]
 
-    def sample(self, mask: Array, steps: Array, truth: Truth) -> None:
+    def sample(self, mask: Array, steps: Array) -> None:
         """After a control step of the drones of a mask; so many steps are behind each drone."""
         due = mask if self._every == 1 else mask & (steps % self._every == 0)
         fresh = due
-        if truth.xp is not np or np.any(due):
+        if self._world.xp is not np or np.any(due):
             normal = self._noise.normal(due)
-            reading = self.sensor.read(truth, normal[..., :-1])
+            reading = self.sensor.read(self._world, normal[..., :-1])
             fresh = due & (component(normal, -1) >= self._lost)
             self._held = _chosen(fresh, reading, self._held)
         if not self._lag:
@@ -554,20 +544,18 @@ class Sensors:
 
     def begin(self, mask: Array) -> None:
         """Begin episodes of the drones of a mask, bool, shape (W, A), after a reset of theirs."""
-        truth = Truth(self._world)
         self._steps = self._steps + 0 * mask if self._world.shape else 0
         self._steps = _chosen(mask, 0 * self._steps, self._steps)
         for channel in self._channels.values():
-            channel.begin(mask, truth)
+            channel.begin(mask)
         if self._estimator is not None:
-            self._estimator.begin(mask, truth.state, self._channels["imu"].value)
+            self._estimator.begin(mask, self._world.state, self._channels["imu"].value)
 
     def sample(self, mask: Array) -> None:
         """After a control step of the drones of a mask; the others keep their readings."""
-        truth = Truth(self._world)
         self._steps = self._steps + mask
         for channel in self._channels.values():
-            channel.sample(mask, self._steps, truth)
+            channel.sample(mask, self._steps)
         if self._estimator is not None:
             self._estimator.update(mask, self._channels)
 
@@ -597,7 +585,7 @@ class Estimator:
     Orthogonal Group", IEEE TAC 53(5), 2008, equation 32, without its bias; the accelerometer's
     direction counts in proportion to its size over g, the magnetometer turns about the vertical
     alone. Position and velocity: a g-h filter with two equal poles (E. Brookner, "Tracking and
-    Kalman Filtering Made Easy", 1998, section 1.2.6). The filter begins at the exact state, and
+    Kalman Filtering Made Easy", 1998, section 1.2). The filter begins at the exact state, and
     takes a late reading for one of now.
 
     Args:

@@ -16,7 +16,7 @@ from rotorgram.envs import Loop
 from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.sim import Pose, World, checked_sensors, make_world
+from rotorgram.sim import EffectOptions, Pose, World, checked_sensors, make_world
 from rotorgram.sim.sensors import Estimator, Sensors, isa_height, isa_pressure
 
 ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
@@ -113,6 +113,22 @@ def test_imu_off_the_center_of_mass(tmp_path: Path) -> None:
     assert reading == pytest.approx((0, 0, 2.0, 0.12, 0, 9.8), abs=1e-9)
 
 
+def test_imu_feels_the_air(tmp_path: Path) -> None:
+    """Drag of 2 N s/m in a wind of 5 m/s from behind: 10 N on 20 kg, as long as it stands still."""
+    drag = '<custom><numeric name="rotorgram/drag.linear" data="2 2 2"/></custom>'
+    file = tmp_path / "draggy.xml"
+    text = Vehicle.load().path.read_text()
+    file.write_text(text.replace("<worldbody>", f"{drag}<worldbody>"))
+    vehicle, every = Vehicle.load(file), np.True_
+    world = make_world(vehicle, 1, effects=EffectOptions(body_drag=True, wind=(5.0, 0.0, 0.0)))
+    sensors = Sensors(checked_sensors({"imu": IMU}), world, PERIOD)
+    world.reset(every, Pose(position=np.array((0.0, 0.0, 5.0))))
+    sensors.begin(every)
+    world.step(vehicle.hover_thrust, 1)
+    sensors.sample(every)
+    assert sensors.readings["imu"][3:].tolist() == pytest.approx((0.5, 0.0, 9.8), abs=1e-3)
+
+
 def test_imu_within_its_range() -> None:
     settings = IMU | {"gyro_range": 2.0, "accelerometer_range": 5.0}
     assert first("imu", settings, body_rates=(3.0, -3.0, 0.0)) == [2.0, -2.0, 0.0, 0.0, 0.0, 5.0]
@@ -149,7 +165,7 @@ def test_imu_bias_and_scale() -> None:
     ],
 )
 def test_the_standard_atmosphere(height: float, pressure: float) -> None:
-    """Table 5 of ISO 2533:1975."""
+    """ISO 2533:1975, at geopotential heights."""
     assert isa_pressure(height) == pytest.approx(pressure, rel=5e-6)
     assert isa_height(isa_pressure(height)) == pytest.approx(height, abs=1e-8)
 
