@@ -1,5 +1,7 @@
 """Sensors and the onboard estimate against closed forms, and as a part of every env."""
 
+import csv
+import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -681,3 +683,22 @@ def test_on_the_backend_warp() -> None:
             seen.append(noisy.observations["gps"].numpy().copy())
     np.testing.assert_array_equal(first, again)
     assert (np.array(first) != np.array(other)).any()
+
+
+# --- the page -------------------------------------------------------------------------------------
+
+
+def test_the_page_tells_what_the_benchmark_wrote() -> None:
+    docs = Path(__file__).parent.parent / "docs"
+    page, results = (docs / "sensors.md").read_text(), docs / "results" / "sensors"
+    one, many = json.loads((results / "cost.json").read_text()).values()
+    for name, time in one.items():
+        assert f"| {name} | {time:.0f} | {many[name]:,.0f} |" in page
+    with (results / "allan.csv").open(newline="") as file:
+        _, *rows = csv.reader(file)
+    told = 0
+    for row in rows:
+        time, found, expected, ratio = map(float, row)
+        told += f"| {time:g} | {found:.3e} | {expected:.3e} |" in page
+        assert abs(ratio - 1) < 0.05
+    assert told == page.split("| τ, s")[1].split("\n\n")[0].count("\n") - 1
