@@ -50,6 +50,7 @@ def test_defaults() -> None:
         "linear_drag": 0.0,
         "effects": {},
         "randomize": {},
+        "sensors": {},
         "target": 5.0,
         "start_band": 1.0,
         "flight_band": 3.0,
