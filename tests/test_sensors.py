@@ -616,6 +616,27 @@ def test_a_gyroscopes_bias_tilts_the_estimate_by_so_much() -> None:
     assert math.sin(angles_of(made.quaternion)[0]) == pytest.approx(2 * bias * PERIOD)
 
 
+def test_errors_of_a_long_hover_are_those_of_the_biases() -> None:
+    """With a time constant of τ steps: tilt by b τ and a / g, height by a τ². The heading drifts."""
+    gyro, force, drones = 0.01, 0.1, 400
+    biases = IMU | {"gyro_bias": gyro, "accelerometer_bias": force}
+    sensors = {"imu": biases, "barometer": {"noise": 0.0}, "estimate": True}
+    _, made, every = sensing(sensors, drones)
+    for _ in range(600):  # 12 s: a filter of 1 s has settled
+        made.sample(every)
+    estimate = made.readings["estimate"][:, 0]
+    turned = 2 * estimate[:, 7:10]  # small angles, about x, y, z
+    pole = math.exp(-PERIOD)
+    tilt = math.hypot(gyro * PERIOD / (1 - pole), force / 9.8)
+    # A step's rise of a T² is made up by h times what the barometer tells before the pull.
+    height = force * (pole * PERIOD / (1 - pole)) ** 2
+    error = 4 / math.sqrt(2 * drones)
+    assert turned[:, :2].std() == pytest.approx(tilt, rel=error / math.sqrt(2) + 0.01)
+    assert (estimate[:, 2] - 5.0).std() == pytest.approx(height, rel=error + 0.01)
+    assert turned[:, 2].std() == pytest.approx(12 * gyro, rel=error + 0.01)
+    assert estimate[:, :2].std() > 10 * height  # nothing measures it
+
+
 def test_an_exact_estimate_of_a_steady_climb() -> None:
     """Constant thrust, level: the integral is exact, and nothing pulls it away."""
     sensors = {"imu": IMU, "barometer": {"noise": 0.0}, "magnetometer": {"noise": 0.0}}
