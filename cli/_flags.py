@@ -18,7 +18,7 @@ from ..experiments.folders import new_folder
 from ..models.errors import InputError, expect
 
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
-_WORLD_FLAGS: Final = ("effects", "randomize")
+_WORLD_FLAGS: Final = ("effects", "randomize", "sensors")
 _NO_FLAG: Any = Suppress[Fixed[dict]]  # type: ignore[type-arg]
 
 
@@ -54,6 +54,9 @@ class EnvFlags(Command):
     those of a checkpoint. docs/effects.md lists them."""
     randomize: tuple[str, ...] = ()
     """Parameters that are drawn for each episode, each NAME=DISTRIBUTION: mass=uniform(0.8,1.2)."""
+    sensors: tuple[str, ...] = ()
+    """Sensors whose readings are observed, each NAME or NAME=SETTINGS: imu gps={"rate":10}, and
+    observe=estimate. docs/sensors.md lists them."""
     options: Suppress[Fixed[dict]] = field(default_factory=dict)  # type: ignore[type-arg]
     """Options of the task. A checkpoint brings those that it was trained with."""
 

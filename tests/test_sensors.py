@@ -617,7 +617,7 @@ def test_a_gyroscopes_bias_tilts_the_estimate_by_so_much() -> None:
 
 
 def test_errors_of_a_long_hover_are_those_of_the_biases() -> None:
-    """With a time constant of τ steps: tilt by b τ and a / g, height by a τ². The heading drifts."""
+    """With a time constant of τ steps: tilt by b τ and a / g, height by a τ²."""
     gyro, force, drones = 0.01, 0.1, 400
     biases = IMU | {"gyro_bias": gyro, "accelerometer_bias": force}
     sensors = {"imu": biases, "barometer": {"noise": 0.0}, "estimate": True}

@@ -151,6 +151,23 @@ def test_observations_of_a_stronger_craft_stay_within_their_bounds() -> None:
     assert info["elevation_error"] < -40  # it was fast: three times the thrust
 
 
+def test_flags(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["evaluate", "pid", "--episodes", "1", "--vehicle", str(RACER)]
+    words += ["--env.episode-length", "20"]
+    flags = ["--effects", "motor-lag", "wind=0.5,0,0", "body_drag"]
+    assert main([*words, *flags, "--randomize", "mass=uniform(0.9,1.1)"]) == 0
+    assert "episodes   1, 0 terminated" in capsys.readouterr().out
+    for flag, sentence in (
+        (["--effects", "lag"], "effects: expected some of motor_lag, "),
+        (["--effects", "wind=3"], "effects: wind: expected 3 numbers"),
+        (["--randomize", "mass=heavy"], "randomize: mass: expected uniform(...)"),
+        (["--sensors", "imu"], "sensors.imu: expected gyro_noise here, or "),
+        (["--sensors", 'gps={"rat":10}'], "sensors.gps: expected some of noise, "),
+    ):
+        assert main([*words, *flag]) != 0
+        assert sentence in capsys.readouterr().err
+
+
 def test_files_of_a_comparison_tell_what_was_drawn(tmp_path: Path) -> None:
     words = ["--agents", "vpg", "--seeds", "1", "--env-steps", "1500", "--episodes", "2"]
     words += ["--jobs", "1", "--env.episode-length", "50", "--no-film"]
