@@ -30,7 +30,7 @@ IRIS: Final = {
 COSTS: Final = {
     "none": {},
     "imu": {"imu": IRIS},
-    "magnetometer": {"magnetometer": {"noise": 3e-7}},
+    "magnetometer": {"magnetometer": {"noise": 0.3}},
     "barometer": {"barometer": {"noise": 0.78}},
     "rangefinder": {"rangefinder": {"noise": 0.02, "limit": 10.0}},
     "gps, 10 Hz, 0.1 s late": {

@@ -94,7 +94,7 @@ class Sensors:
     accelerometer_walk: float | None = _number("m/s³/√Hz", 0.0, 10.0)
     accelerometer_bias: float | None = _number("m/s²", 0.0, 10.0)
     accelerometer_scale: float | None = _number("1", 0.0, 0.5)
-    magnetometer_noise: float | None = _number("T", 0.0, 1e-3)
+    magnetometer_noise: float | None = _number("µT", 0.0, 1e3)
     """Standard deviation of a reading."""
     barometer_noise: float | None = _number("Pa", 0.0, 1e4)
     """Standard deviation of a reading."""

@@ -37,6 +37,7 @@ LOWEST, HIGHEST = -5_000.0, 11_000.0  # Heights that the barometer tells, m
 
 FURTHEST: Final = 1e5  # Largest coordinate of a reading, m
 MOST_SPEED: Final = 1e3  # Largest speed of a reading along an axis, m/s
+MOST_DELAY: Final = 1000  # Longest delay, control steps
 GYRO_RANGE: Final = math.radians(2000.0)  # rad/s: the largest setting of the BMI088
 ACCELEROMETER_RANGE: Final = 24 * 9.80665  # m/s²: the same
 
@@ -120,7 +121,8 @@ def checked_sensors(given: Any) -> dict[str, Any]:
         expect(name in known, "sensors", f"some of {', '.join(known)}", f"{name!r}")
     sensors: dict[str, Any] = {}
     for name in known[:-1]:
-        if (settings := given.get(name, False)) in (False, None):
+        settings = given.get(name)
+        if settings is None or settings is False:
             continue
         right = settings is True or isinstance(settings, Mapping)
         expect(right, f"sensors.{name}", "true, or settings by name", f"{settings!r:.80}")
@@ -187,8 +189,10 @@ def _steps(name: str, value: float, period: float) -> int:
     is_rate = name.endswith("rate")
     steps = 1 / (value * period) if is_rate else value / period
     right = abs(steps - round(steps)) < 1e-6 * max(steps, 1.0) and round(steps) >= is_rate
+    right = right and (is_rate or steps < MOST_DELAY + 0.5)
     what = f"the control rate of {1 / period:g} Hz over a whole number"
-    what = what if is_rate else f"a whole number of control periods of {period:g} s"
+    late = f"a whole number of control periods of {period:g} s, at most {MOST_DELAY}"
+    what = what if is_rate else late
     expect(right, f"sensors.{name}", what, f"{value:g} {'Hz' if is_rate else 's'}")
     return round(steps)
 
@@ -324,7 +328,7 @@ class Imu(Sensor):
 
 
 class Magnetometer(Sensor):
-    """Earth's field in the body frame; white noise, in T in the vehicle's file."""
+    """Earth's field in the body frame; white noise."""
 
     name, prefix, columns = "magnetometer", "magnetometer_", 3
     settings = ("field",)
@@ -338,7 +342,7 @@ class Magnetometer(Sensor):
     def read(self, world: "World", normal: Array) -> Array:
         """Field and noise."""
         field = constant(np.array(self.values["field"]), normal) + 0.0 * normal
-        noise = 1e6 * self.values["noise"] * normal
+        noise = self.values["noise"] * normal
         return clip(to_body(world.state.quaternion, field) + noise, -1e3, 1e3)
 
 

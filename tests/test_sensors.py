@@ -32,7 +32,7 @@ NOISY = {
         "accelerometer_noise": 0.01, "accelerometer_walk": 1e-3, "accelerometer_bias": 0.1,
         "accelerometer_scale": 0.01,
     },
-    "magnetometer": {"noise": 3e-7},
+    "magnetometer": {"noise": 0.3},
     "barometer": {"noise": 1.0, "walk": 0.1, "rate": 25, "altitude": 400.0},
     "rangefinder": {"noise": 0.02, "limit": 6.0},
     "gps": {
@@ -198,7 +198,7 @@ def test_magnetometer() -> None:
     turned = first("magnetometer", {"noise": 0.0}, quaternion=LEFT)
     assert turned == pytest.approx((21.532, -1.287, -43.231))
     assert first("magnetometer", {"noise": 0.0, "field": [0, 30, 0]}) == pytest.approx((0, 30, 0))
-    _, sensors, _ = sensing({"magnetometer": {"noise": 3e-7, "field": [0, 0, 0]}}, 2000)
+    _, sensors, _ = sensing({"magnetometer": {"noise": 0.3, "field": [0, 0, 0]}}, 2000)
     noise = sensors.readings["magnetometer"]
     assert noise.std() == pytest.approx(0.3, abs=4 * 0.3 / math.sqrt(12_000))
 
@@ -373,8 +373,13 @@ def test_options_are_plain_values_in_one_order() -> None:
         ({"gps": GPS | {"rate": 100}}, "sensors.gps.rate: expected the control rate of 50 Hz"),
         (
             {"gps": GPS | {"delay": 0.03}},
-            "sensors.gps.delay: expected a whole number of control periods of 0.02 s, got 0.03 s",
+            "sensors.gps.delay: expected a whole number of control periods of 0.02 s, at most 1000, got 0.03 s",
         ),
+        (
+            {"gps": GPS | {"delay": 11}},
+            "sensors.gps.delay: expected a number from 0 to 10 s, got 11",
+        ),
+        ({"imu": 0}, "sensors.imu: expected true, or settings by name, got 0"),
         ({"estimate": True}, "sensors: expected imu, which estimate needs, got none"),
         ({"observe": "estimate"}, "sensors: expected estimate, which is to be observed, got none"),
         ({"observe": "all"}, "sensors.observe: expected 'added' or 'estimate', got 'all'"),
