@@ -373,7 +373,8 @@ def test_options_are_plain_values_in_one_order() -> None:
         ({"gps": GPS | {"rate": 100}}, "sensors.gps.rate: expected the control rate of 50 Hz"),
         (
             {"gps": GPS | {"delay": 0.03}},
-            "sensors.gps.delay: expected a whole number of control periods of 0.02 s, at most 1000, got 0.03 s",
+            "sensors.gps.delay: expected a whole number of control periods of 0.02 s, at most "
+            "1000, got 0.03 s",
         ),
         (
             {"gps": GPS | {"delay": 11}},
