@@ -309,10 +309,9 @@ class Imu(Sensor):
 
     def begin(self, mask: Array, normal: Array) -> None:
         """Bias and error of scale."""
-        for name, numbers in (("bias", normal[..., :6]), ("scale", normal[..., 6:])):
-            drawn = constant(self._both(name), normal) * numbers
-            old = getattr(self, f"_{name}")
-            setattr(self, f"_{name}", _chosen(mask, drawn, old))
+        bias, scale = (constant(self._both(name), normal) for name in ("bias", "scale"))
+        self._bias = _chosen(mask, bias * normal[..., :6], self._bias)
+        self._scale = _chosen(mask, scale * normal[..., 6:], self._scale)
 
     def read(self, world: "World", normal: Array) -> Array:
         """Rates and specific force, as the class has them."""
@@ -320,9 +319,7 @@ class Imu(Sensor):
         white, step, high = (
             constant(x, normal) for x in (self._white, self._step, self._both("range"))
         )
-        reading = clip(
-            (1 + self._scale) * exact + self._bias + white * normal[..., :6], -high, high
-        )
+        reading = (1 + self._scale) * exact + self._bias + white * normal[..., :6]
         self._bias = self._bias + step * normal[..., 6:]
         return clip(reading, -high, high)
 
