@@ -6,6 +6,7 @@ Body frame: that of the free body, x forward, y left, z up; SI units.
 
 import math
 import struct
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from hashlib import blake2b
@@ -174,14 +175,21 @@ class Vehicle:
         return partial(Vehicle.load, linear_drag=self.linear_drag), (str(self.path),)
 
 
-def _compiled(path: Path) -> tuple[mujoco.MjSpec, str, mujoco.MjModel, mujoco.MjData]:
-    """A file's spec, its text, its model, and the vehicle level at the origin."""
+def compile_vehicle(
+    path: Path, repair: Callable[[mujoco.MjSpec], None] = lambda spec: None
+) -> tuple[mujoco.MjSpec, str, mujoco.MjModel, mujoco.MjData]:
+    """A file's spec, its text, its model, and the vehicle level at the origin.
+
+    `repair` may change the spec in place. Raises `InputError` if there is no free body with
+    actuators.
+    """
     try:
         spec = build_scene(path, visual=False)
+        repair(spec)
         spec.comment = ""
         text = spec.to_xml()
         model = spec.compile()
-        _check(model)
+        _check_structure(model)
         data = mujoco.MjData(model)
         data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
         mujoco.mj_forward(model, data)
@@ -217,8 +225,8 @@ def _is_free(joint: mujoco.MjsJoint) -> bool:
     return bool(joint.type == mujoco.mjtJoint.mjJNT_FREE)
 
 
-def _check(model: mujoco.MjModel) -> None:
-    """Raise `InputError` for a model that is no multirotor, or that cannot be stepped."""
+def _check_structure(model: mujoco.MjModel) -> None:
+    """Raise `InputError` for a model that is no free body with actuators."""
     for name in dir(model):
         array = getattr(model, name)
         finite = getattr(array, "dtype", None) != np.float64 or np.isfinite(array).all()
@@ -227,6 +235,10 @@ def _check(model: mujoco.MjModel) -> None:
     got = f"{free} free of {model.njnt} joints"
     expect((free, model.njnt) == (1, 1), "vehicle", "one free body and no other joints", got)
     expect(model.nu, "vehicle", "at least one rotor, an actuator at a site", "none")
+
+
+def _check_flyable(model: mujoco.MjModel) -> None:
+    """Raise `InputError` for a vehicle's model that does not fall, or that cannot be stepped."""
     mass, gravity = float(model.body_subtreemass[model.jnt_bodyid[0]]), model.opt.gravity
     right = mass > 0 and gravity[2] < 0 and not gravity[:2].any()
     got = f"{mass:g} kg and {gravity.tolist()} m/s²"
@@ -240,15 +252,15 @@ def _check(model: mujoco.MjModel) -> None:
 @lru_cache(maxsize=32)
 def _load(path: Path, drag: float, changed: int) -> Vehicle:
     del changed  # a file that was written anew is another key
-    spec, text, model, data = _compiled(path)
-    body = int(model.jnt_bodyid[0])
-    mass, gravity = float(model.body_subtreemass[body]), -float(model.opt.gravity[2])
-    center = data.subtree_com[body].copy()
-    xx, yy, zz, xy, xz, yz = data.crb[body, :6]  # of the free body and what is welded to it
-    rotors = tuple(_rotor(model, data, i, body) for i in range(model.nu))
-    arms = [np.array(rotor.position) - center for rotor in rotors]
-    torques = [np.cross(a, r.axis) + r.reaction for a, r in zip(arms, rotors, strict=True)]
-    allocation = np.array([(r.axis[2], *t) for r, t in zip(rotors, torques, strict=True)]).T
+    spec, text, model, data = compile_vehicle(path)
+    _check_flyable(model)
+    gravity = -float(model.opt.gravity[2])
+    mass, center, inertia = mass_properties(model, data)
+    for index in range(model.nu):
+        for expected, got in rotor_faults(model, index):
+            expect(False, "vehicle", expected, got)
+    rotors = tuple(read_rotor(model, data, index) for index in range(model.nu))
+    allocation = allocate(rotors, center)
     model.dof_damping[0:3] = drag * mass
     return Vehicle(
         path=path,
@@ -259,48 +271,78 @@ def _load(path: Path, drag: float, changed: int) -> Vehicle:
         mass=mass,
         gravity=gravity,
         center_of_mass=center,
-        inertia=np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))),
+        inertia=inertia,
         rotors=rotors,
         allocation=allocation,
         hover_thrust=_hover(rotors, allocation, mass * gravity),
-        rest_height=_rest_height(model, data),
-        coefficients=_coefficients(model),
+        rest_height=find_rest_height(model, data),
+        coefficients=read_coefficients(model),
     )
 
 
-def _coefficients(model: mujoco.MjModel) -> Coefficients:
+def mass_properties(model: mujoco.MjModel, data: Any) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, center of mass and inertia about it of the free body and what is welded to it.
+
+    `data` is at the origin and level. Units and shapes as of `Vehicle`.
+    """
+    body = int(model.jnt_bodyid[0])
+    xx, yy, zz, xy, xz, yz = data.crb[body, :6]
+    inertia = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+    return float(model.body_subtreemass[body]), data.subtree_com[body].copy(), inertia
+
+
+def allocate(rotors: Sequence[Rotor], center: np.ndarray) -> np.ndarray:
+    """`Vehicle.allocation` of rotors about a center of mass."""
+    arms = [np.array(rotor.position) - center for rotor in rotors]
+    torques = [np.cross(a, r.axis) + r.reaction for a, r in zip(arms, rotors, strict=True)]
+    return np.array([(r.axis[2], *t) for r, t in zip(rotors, torques, strict=True)]).T
+
+
+def read_coefficients(model: mujoco.MjModel) -> Coefficients:
     """Those among the custom numerics of a model. Raises `InputError` for a wrong one."""
     numerics = [model.numeric(index) for index in range(model.nnumeric)]
     ours = [one for one in numerics if one.name.startswith(PREFIX)]
     return Coefficients.read({one.name.removeprefix(PREFIX): one.data for one in ours})
 
 
-def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
-    """The rotor of an actuator; `data` is at the origin and level. Raises `InputError`."""
-    name = model.actuator(index).name or f"rotor{index + 1}"
-    rotor = f"rotor {name}"
+def rotor_name(model: mujoco.MjModel, index: int) -> str:
+    """Name of an actuator, or its number from 1."""
+    return model.actuator(index).name or f"rotor{index + 1}"
+
+
+def rotor_faults(model: mujoco.MjModel, index: int) -> Iterator[tuple[str, str]]:
+    """(What is expected, what came) of an actuator that is no rotor."""
+    body, rotor = int(model.jnt_bodyid[0]), f"rotor {rotor_name(model, index)}"
     site, reference = model.actuator_trnid[index].tolist()
     at_site = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_SITE
-    ours = at_site and model.body_rootid[model.site_bodyid[site]] == body
-    expect(ours, "vehicle", f"{rotor} to be an actuator at a site of the body")
-    expect(reference < 0, "vehicle", f"{rotor} to act without a reference site")
+    if not at_site or model.body_rootid[model.site_bodyid[site]] != body:
+        yield f"{rotor} to be an actuator at a site of the body", ""
+    if reference >= 0:
+        yield f"{rotor} to act without a reference site", ""
     plain = (
         model.actuator_gaintype[index] == mujoco.mjtGain.mjGAIN_FIXED
         and model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
         and model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_NONE
     )
-    expect(plain, "vehicle", f"the thrust of {rotor} to be gain times control")
+    if not plain:
+        yield f"the thrust of {rotor} to be gain times control", ""
+    if math.hypot(*model.actuator_gear[index, :3]) * model.actuator_gainprm[index, 0] == 0.0:
+        yield f"{rotor} to have a force (gear times gain)", "0 N"
+    if not model.actuator_ctrllimited[index]:
+        yield f"{rotor} to have a thrust with limits (ctrlrange)", ""
+
+
+def read_rotor(model: mujoco.MjModel, data: Any, index: int) -> Rotor:
+    """The rotor of an actuator without faults; `data` is at the origin and level."""
+    site = int(model.actuator_trnid[index, 0])
     force, torque = model.actuator_gear[index, :3], model.actuator_gear[index, 3:]
     size = math.hypot(*force)
     newtons = size * float(model.actuator_gainprm[index, 0])
-    expect(newtons != 0.0, "vehicle", f"{rotor} to have a force (gear times gain)", "0 N")
-    limited = model.actuator_ctrllimited[index]
-    expect(limited, "vehicle", f"{rotor} to have a thrust with limits (ctrlrange)")
     turn = data.site_xmat[site].reshape(3, 3)
     low, high = sorted((model.actuator_ctrlrange[index] * abs(newtons)).tolist())
     sign = math.copysign(1.0, newtons)
     return Rotor(
-        name=name,
+        name=rotor_name(model, index),
         position=tuple(data.site_xpos[site].tolist()),
         axis=tuple((turn @ force * (sign / size)).tolist()),
         reaction=tuple((turn @ torque * (sign / size)).tolist()),
@@ -310,23 +352,37 @@ def _rotor(model: mujoco.MjModel, data: Any, index: int, body: int) -> Rotor:
     )
 
 
-def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> np.ndarray:
-    """Thrusts that carry the weight, turn nothing and push nowhere else: equal, or the least.
+def trim_thrust(rotors: Sequence[Rotor], allocation: np.ndarray, weight: float) -> np.ndarray:
+    """Thrusts that carry the weight best without a torque or a sideways force, shape (R,), N.
 
-    Raises `InputError` if there are none above 0 and within the rotors' limits.
+    Equal, or the least that do. Limits of the rotors are not looked at.
     """
-    wanted, drift = np.array((weight, 0.0, 0.0, 0.0)), _ROUNDED * weight
+    wanted = np.array((weight, 0.0, 0.0, 0.0))
     sideways = np.array([rotor.axis[:2] for rotor in rotors]).T
     total = float(allocation[0].sum())
     thrust = np.full(len(rotors), weight / total if total > 0 else 0.0)
-    scale = weight * max(1e-3, float(np.abs(allocation[1:]).max()))
-    if np.abs(allocation @ thrust - wanted).max() > _RELATIVE * scale:
+    if np.abs(allocation @ thrust - wanted).max() > _RELATIVE * _torque_scale(allocation, weight):
         thrust = np.linalg.lstsq(allocation, wanted, rcond=None)[0]
-    if np.abs(sideways @ thrust).max() > drift:
+    if np.abs(sideways @ thrust).max() > _ROUNDED * weight:
         every = np.vstack((allocation, sideways))
         thrust = np.linalg.lstsq(every, np.append(wanted, (0.0, 0.0)), rcond=None)[0]
-    steady = np.abs(allocation @ thrust - wanted).max() <= 1e-6 * scale
-    hovers = steady and np.abs(sideways @ thrust).max() <= drift
+    return thrust
+
+
+def _torque_scale(allocation: np.ndarray, weight: float) -> float:
+    return weight * max(1e-3, float(np.abs(allocation[1:]).max()))
+
+
+def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> np.ndarray:
+    """`trim_thrust` of a vehicle that hovers with it.
+
+    Raises `InputError` if there are none above 0 and within the rotors' limits.
+    """
+    thrust = trim_thrust(rotors, allocation, weight)
+    left = np.abs(allocation @ thrust - (weight, 0.0, 0.0, 0.0)).max()
+    sideways = np.array([rotor.axis[:2] for rotor in rotors]).T @ thrust
+    hovers = left <= 1e-6 * _torque_scale(allocation, weight)
+    hovers = hovers and np.abs(sideways).max() <= _ROUNDED * weight
     able = "rotors that can carry the level craft without a torque or a sideways force"
     expect(hovers, "vehicle", able, "ones that cannot")
     for rotor, newtons in zip(rotors, thrust.tolist(), strict=True):
@@ -339,7 +395,7 @@ def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> 
     return thrust
 
 
-def _rest_height(model: mujoco.MjModel, data: Any) -> float:
+def find_rest_height(model: mujoco.MjModel, data: Any) -> float:
     """Height at which the level body first touches anything, by bisection; 0 if it never does.
 
     Raises `InputError` if it touches something at any height, like a wall.
