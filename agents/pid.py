@@ -5,10 +5,10 @@ from typing import Any, Final
 import numpy as np
 
 from ..envs.spec import EnvSpec
-from ..models.constants import GRAVITY
 from ..models.errors import expect
 
 ENV_ID: Final = "rotorgram/Elevation-v0"
+GRAVITY: Final = 9.8  # m/s²: the paper's
 PROPORTIONAL: Final = 9.0  # 1/s²: closed-loop natural frequency of 3 rad/s
 DERIVATIVE: Final = 5.4  # 1/s: damping ratio 0.9
 INTEGRAL: Final = 1.0  # 1/s³: there is no steady load to remove here; an unknown mass would be one

@@ -1,7 +1,8 @@
 """The command `rotorgram`: one module for each command, imported when it is chosen.
 
 Exit statuses: 0 done; 1 an error of the user, the other side or the system, in one sentence, or a
-check that failed; 2 a wrong flag, or no OpenGL for a command that draws; 130 Ctrl-C;
+check that failed; 2 a wrong flag, no OpenGL for a command that draws, or a file to examine that is
+no vehicle; 130 Ctrl-C;
 141 standard output is closed; 143 SIGTERM. A bug of ours keeps its traceback.
 """
 

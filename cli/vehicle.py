@@ -96,7 +96,7 @@ class Vehicle(Command):
             case "check":
                 from .check_model import CheckModel
 
-                return CheckModel(xml=Path(self.file)).run()
+                return CheckModel(file=Path(self.file)).run()
         return 0
 
     def _new(self) -> None:

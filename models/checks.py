@@ -1,132 +1,308 @@
-"""The physical examination: simulated motions of a vehicle, compared with closed forms.
+"""The physical examination of anyone's multirotor: flights and numbers against mechanics.
 
-Any vehicle is held to mechanics and to what `Vehicle` derives from its compiled model; the paper's
-is held to the paper's numbers too, and to ours where it gives none.
+Nothing is compared with a vehicle that we know. A check holds a measured value to a closed form, or
+to a plausible range whose source it names. `examine` runs them all; each `check_...` is one group
+of them and takes a `Vehicle`, the path of a vehicle's file, or a `Craft`, which is a file read
+once. A file that flying refuses is examined all the same, as long as it is a free body with
+actuators: a fault becomes a check that fails, and every reason is told at once.
 
 World frame: z up. Body frame: x forward, y left, z up. SI units and radians throughout.
 """
 
 import copy
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property, wraps
+from pathlib import Path
 from typing import Any, Final
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import QUAD_XML
-from .constants import GRAVITY, MASS, MAX_THRUST, NUM_ROTORS, SIDE
-from .errors import expect
-from .vehicle import Vehicle
+from .coefficients import Coefficients
+from .errors import InputError
+from .library import find_vehicle
+from .vehicle import (
+    Rotor,
+    Vehicle,
+    allocate,
+    compile_vehicle,
+    find_rest_height,
+    mass_properties,
+    read_coefficients,
+    read_rotor,
+    rotor_faults,
+    rotor_name,
+    trim_thrust,
+)
 
 Array = NDArray[np.float64]
 
-_LEAST_TIMESTEP: Final = 1e-4  # s: 20 s of flights take seconds
+_MOST_STEPS: Final = 4000  # of a flight: tiny physics steps shorten it
+_MOST_STEP: Final = 10.0  # s: every flight diverges there, but no number overflows
 _STEPS_AT_ONCE: Final = 1000  # Ctrl-C waits for no more
 _HEIGHT: Final = 1000.0  # m: flights begin here, and none reaches the floor
+_CONTROL: Final = 0.02  # s: period of the random thrusts
 _SPIN: Final = (1.0, 2.0, 3.0)  # rad/s: tumbling begins about no axis of symmetry
+_SPEED: Final = (2.0, -1.0, 3.0)  # m/s
+_FASTEST_TURN: Final = math.radians(2000)  # rad/s: the range of common gyroscopes (Bosch BMI088)
 
-_EXACT: Final = 1e-9  # Tolerance where the integrator is exact: the rounding errors of a flight
-# Tolerance for tumbling flight, where RK4 truncates: 4e-7 rad/s in ten seconds at 10 ms for the
-# paper's vehicle. MuJoCo's Euler misses by 1 rad/s.
-_TRUNCATION: Final = 1e-6
+_EXACT: Final = 1e-9  # tolerance where the integrator is exact: the rounding errors of a flight
+_TRUNCATION: Final = 1e-6  # where RK4 truncates: 2e-9 for the paper's vehicle, 1e-2 for Euler
+_ROUNDED: Final = 1e-5  # what the six digits of a file leave
+_ATTITUDE: Final = math.radians(0.01)  # rad: error of a second that a physics step may make
+_TURN, _COARSE = 8.0, 0.05  # rad: a tumbling flight, and a step of the coarsest of three
+_DEPTH: Final = 1e-3  # m: error of a free fall of a second that a physics step may make
+_SETTLED: Final = 0.01  # relative: drag that acts once a step, against its closed form
 
-# Sources of expected values.
-_MODEL: Final = "compiled model"
 _MECHANICS: Final = "rigid-body mechanics"
-_DRAG: Final = "Unity's Rigidbody.drag, in the limit of small steps"
-_PAPER: Final = "paper, section 2.2"
-_GEOMETRY: Final = "closed form of our geometry"
-
-# The paper's drone has a mass "concentrated in the centre", so it would have no inertia: the parts
-# below are ours, as are numbering and reaction of the rotors.
-_HUB_MASS, _HUB_WIDTH, _HUB_HEIGHT = 12.0, 0.44, 0.14  # kg, m: a box
-_ARM_MASS, _ARM_RADIUS = 1.2, 0.035  # kg, m: a cylinder from the centre to its motor
-_MOTOR_MASS, _MOTOR_RADIUS, _MOTOR_HEIGHT = 0.8, 0.09, 0.12  # kg, m: an upright cylinder
-_REST_HEIGHT = 0.4  # m: the centre above the floor
-_REACTION = 0.05  # N·m per newton
-_ROTORS: Final = {  # (x, y) in half sides of the square, and sign of the reaction
-    "front left": (1, 1, 1),
-    "front right": (1, -1, -1),
-    "rear right": (-1, -1, 1),
-    "rear left": (-1, 1, -1),
-}
+_MODEL: Final = "compiled model"
 
 
 @dataclass(frozen=True)
+class Range:
+    """Plausible values of a number that tells wrong units."""
+
+    low: float
+    high: float
+    unit: str
+    source: str
+
+
+# docs/physics.md has the vehicles behind the published values.
+RANGES: Final = {
+    "mass / arm³": Range(1, 2000, "kg/m³", "published vehicles: 7 to 432"),
+    "arm": Range(0.02, 5, "m", "published vehicles: 0.04 to 1.41"),
+    "smallest moment / (mass arm²)": Range(0.02, 5, "", "published vehicles: 0.13 to 0.49"),
+    "largest moment / (mass arm²)": Range(0.02, 5, "", "published vehicles: 0.25 to 1.38"),
+    "reaction / arm": Range(0.005, 2, "", "published vehicles: 0.035 to 0.79"),
+    "reaction / rotor radius": Range(0.02, 3, "", "published vehicles: 0.12 to 1.09"),
+    "rotor radius / arm": Range(0.05, 1.5, "", "published vehicles: 0.28 to 0.59"),
+    "tip speed": Range(10, 340, "m/s", "below the speed of sound; published: 53 to 150"),
+    "terminal velocity": Range(
+        2, 200, "m/s", "0.25 to 2,500 kg per m² of front, drag coefficient 1"
+    ),
+}
+"""Plausible values by the name of the check."""
+THRUST_TO_WEIGHT: Final = Range(1.2, 20, "", "published vehicles: 1.95 to 10.2")
+GRAVITY: Final = Range(1.3, 25, "m/s²", "NASA's fact sheets: Titan 1.35, Earth 9.8, Jupiter 24.8")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Check:
     """One line of the examination."""
 
     name: str
-    expected: float
     measured: float
+    """NaN where it could not be measured: such a check fails."""
+    low: float
+    """Least value that passes."""
+    high: float
+    """Largest value that passes."""
     unit: str
-    """Of the three numbers; empty for pure numbers."""
+    """Of the numbers; empty for pure numbers."""
     source: str
-    """Of the expected value."""
-    tolerance: float = _EXACT
+    """Of the expected value or of the limits."""
+    meaning: str
+    """A sentence: what it means if the check fails."""
+    expected: float | None = None
+    """Closed form that `measured` is compared with; None for a range."""
+    note: str = ""
+    """What else was found, to print with the measured value."""
+
+    @property
+    def tolerance(self) -> float | None:
+        """Half the width of the limits around `expected`; None for a range."""
+        return None if self.expected is None else (self.high - self.low) / 2
 
     @property
     def passed(self) -> bool:
-        """Whether measured and expected agree; NaN never does."""
-        return abs(self.measured - self.expected) <= self.tolerance
+        """Whether the measured value is within its limits; NaN never is."""
+        return self.low <= self.measured <= self.high
+
+    def report(self) -> dict[str, Any]:
+        """For JSON: the fields by name, `tolerance` and `passed`; None for what is not finite."""
+        told = vars(self) | {"tolerance": self.tolerance, "passed": self.passed}
+        return {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in told.items()
+        }
 
 
-def examine(vehicle: Vehicle, *, paper: bool | None = None) -> list[Check]:
-    """Run the whole examination on a vehicle; its model does not change.
-
-    With `paper` it is compared with the paper's numbers too; None: if it is the vehicle of this
-    package. Raises `InputError` if MuJoCo warns in flight, or the physics step is below 0.1 ms.
-    """
-    expected = f"a physics step of at least {_LEAST_TIMESTEP:g} s to be examined"
-    long = vehicle.timestep >= _LEAST_TIMESTEP
-    expect(long, "vehicle", expected, f"{vehicle.timestep:g}")
-    model = copy.copy(vehicle.model)  # without air and drag
-    model.opt.density = model.opt.viscosity = 0.0
-    model.opt.wind = model.dof_damping[:3] = 0.0
-    craft = _Craft(vehicle, model)
-    parts = [_mass, _rotors, _free_fall, _hover, _climb, _tumbling, _resting, _linear_drag]
-    checks = [check for part in parts for check in part(craft)]
-    if paper if paper is not None else vehicle.path == QUAD_XML.resolve():
-        expected, rotors = f"the {NUM_ROTORS} rotors of the paper", vehicle.num_rotors
-        expect(rotors == NUM_ROTORS, "vehicle", expected, f"{rotors}")
-        craft = _Craft(vehicle, vehicle.model)  # with air and drag, if any, for the paper has none
-        parts = [_paper_numbers, _paper_rotors, _paper_flights, _spinning_top, _paper_drag]
-        checks += [check for part in parts for check in part(craft)]
-    return checks
+def _near(
+    name: str, measured: float, expected: float, unit: str, source: str, meaning: str,
+    tolerance: float = _EXACT, **more: Any,
+) -> Check:  # fmt: skip
+    """A check that compares."""
+    low, high = float(expected - tolerance), float(expected + tolerance)
+    return Check(name=name, measured=float(measured), low=low, high=high, unit=unit,
+                 source=source, meaning=meaning, expected=float(expected), **more)  # fmt: skip
 
 
-class _Craft:
-    """A vehicle as one of its models flies, and as it answers to known forces and torques."""
+def _within(name: str, measured: float, limits: Range, meaning: str, **more: Any) -> Check:
+    """A check that wants a range."""
+    return Check(name=name, measured=float(measured), low=float(limits.low),
+                 high=float(limits.high), unit=limits.unit, source=limits.source,
+                 meaning=meaning, **more)  # fmt: skip
 
-    def __init__(self, vehicle: Vehicle, model: mujoco.MjModel) -> None:
-        self.vehicle, self.model = vehicle, model
+
+def failed(checks: Iterable[Check]) -> list[Check]:
+    """Those that failed: `assert not failed(check_hover("my_drone.xml"))`."""
+    return [check for check in checks if not check.passed]
+
+
+# ---- what a file says ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Craft:
+    """A vehicle's file, read for the examination; flying may refuse it."""
+
+    path: Path
+    refusal: str
+    """Why `Vehicle.load` refuses it; empty if it does not."""
+    model: mujoco.MjModel
+    """Without air, in which there is no closed form, and with a physics step of 10 s at most."""
+    mass: float
+    """kg."""
+    center: Array
+    """Center of mass, body frame, shape (3,), m."""
+    inertia: Array
+    """About the center of mass, body axes, shape (3, 3), kg·m²."""
+    written: tuple[tuple[str, Array], ...]
+    """Body and principal moments (3,), kg·m², of each inertia that the file writes out."""
+    gravity: float
+    """Size of the gravitational acceleration, m/s²."""
+    rotors: tuple[Rotor, ...]
+    """Empty if an actuator is no rotor."""
+    faults: tuple[tuple[str, str], ...]
+    """Name of an actuator, and why it is no rotor."""
+    trim: Array
+    """Thrusts that would carry the level craft, whatever the rotors' limits are, (R,), N."""
+    linear_drag: float
+    """1/s."""
+    timestep: float
+    """Physics step of the file, s."""
+    coefficients: Coefficients | str
+    """Or why they cannot be read."""
+    rest_height: float
+    """As `Vehicle.rest_height`; NaN if it touches something at any height."""
+
+    @classmethod
+    def read(cls, vehicle: "Subject" = None) -> "Craft":
+        """Read a vehicle's file, None for the paper's; a vehicle does not change.
+
+        Raises `InputError` for a file that is no free body with actuators.
+        """
+        if isinstance(vehicle, Craft):
+            return vehicle
+        drag = vehicle.linear_drag if isinstance(vehicle, Vehicle) else 0.0
+        given = vehicle.path if isinstance(vehicle, Vehicle) else vehicle
+        path, refusal = find_vehicle(given), ""
+        try:
+            Vehicle.load(given)
+        except InputError as error:
+            refusal = str(error)
+        written: list[tuple[str, Array]] = []
+        if not path.is_file():
+            raise InputError(refusal)
+        _, _, model, data = compile_vehicle(path, lambda spec: written.extend(_mend(spec)))
+        mass, center, inertia = mass_properties(model, data)
+        names = [rotor_name(model, index) for index in range(model.nu)]
+        faults = [
+            (name, f"expected {expected}" + (f", got {got}" if got else ""))
+            for index, name in enumerate(names)
+            for expected, got in rotor_faults(model, index)
+        ]
+        rotors = () if faults else tuple(read_rotor(model, data, i) for i in range(model.nu))
+        gravity = max(float(np.linalg.norm(model.opt.gravity)), 1e-9)  # it divides
+        trim = np.zeros(0)
+        if rotors:
+            trim = trim_thrust(rotors, allocate(rotors, center), mass * gravity)
+        coefficients: Coefficients | str
+        try:
+            coefficients = read_coefficients(model)
+        except InputError as error:
+            coefficients = str(error)
+        try:
+            rest = find_rest_height(model, data)
+        except InputError:
+            rest = math.nan
+        model.opt.density = model.opt.viscosity = 0.0
+        model.opt.wind = 0.0
+        timestep = float(model.opt.timestep)
+        model.opt.timestep = min(timestep, _MOST_STEP)
+        return cls(
+            path=path, refusal=refusal, model=model, mass=mass, center=center, inertia=inertia,
+            written=tuple(written), gravity=gravity, rotors=rotors, faults=tuple(faults),
+            trim=trim, linear_drag=drag, coefficients=coefficients, timestep=timestep,
+            rest_height=rest,
+        )  # fmt: skip
+
+    @cached_property
+    def mass_matrix(self) -> Array:
+        """Of the free joint, at rest and level, from its answers to forces and torques, (6, 6)."""
         data = self.ready()
-        rest = self.acceleration(data)
-        answers = []
+        rest, answers = self.acceleration(data), []
         for wrench in np.eye(6):
             data.qfrc_applied[:] = wrench
             answers.append(self.acceleration(data) - rest)
-        # Of the free joint, at rest and level: (6, 6), kg, kg·m, kg·m².
-        self.mass_matrix = m = np.asarray(np.linalg.inv(np.array(answers).T), np.float64)
-        self.mass = float(m[2, 2])
-        self.center_of_mass = c = np.array((m[1, 5], m[2, 3], m[0, 4])) / self.mass
-        # About the centre of mass, body axes, (3, 3), kg·m².
-        self.inertia = m[3:, 3:] - self.mass * (c @ c * np.eye(3) - np.outer(c, c))
+        return np.asarray(np.linalg.pinv(np.array(answers).T))
 
-    def unpowered(self) -> "_Craft":
-        """The same with rotors that give no thrust, not even their least."""
+    @cached_property
+    def convergence(self) -> "Convergence":
+        """How the error of its attitude falls with the physics step."""
+        return _converge(self)
+
+    @property
+    def allocation(self) -> Array:
+        """As `Vehicle.allocation`, (4, R)."""
+        return allocate(self.rotors, self.center)
+
+    @property
+    def thrust_low(self) -> Array:
+        """Least thrust of each rotor, (R,), N."""
+        return np.array([rotor.low for rotor in self.rotors])
+
+    @property
+    def thrust_high(self) -> Array:
+        """Largest thrust of each rotor, (R,), N."""
+        return np.array([rotor.high for rotor in self.rotors])
+
+    @property
+    def weight(self) -> float:
+        """N."""
+        return self.mass * self.gravity
+
+    @property
+    def arm(self) -> float:
+        """Mean horizontal distance of the rotors from the center of mass, m."""
+        places = [np.array(rotor.position)[:2] - self.center[:2] for rotor in self.rotors]
+        return max(float(np.mean([np.hypot(*place) for place in places])), 1e-12)
+
+    @property
+    def moments(self) -> Array:
+        """Principal moments of inertia, ascending, (3,), kg·m²."""
+        return np.asarray(np.linalg.eigvalsh(self.inertia))
+
+    def falling(self, contact: bool = False, **options: Any) -> mujoco.MjModel:
+        """A copy of the model without thrusts, not even the least, and with other `opt` fields."""
         model = copy.copy(self.model)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
-        return _Craft(self.vehicle, model)
+        if not contact:
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        for name, value in options.items():
+            setattr(model.opt, name, value)
+        return model
 
-    def ready(self, thrust: ArrayLike = 0.0) -> Any:
+    def ready(self, thrust: ArrayLike = 0.0, model: mujoco.MjModel = None) -> Any:
         """New `MjData`: level, at rest, at `_HEIGHT`; thrusts in N, one for all rotors or (R,)."""
-        data = mujoco.MjData(self.model)
+        data = mujoco.MjData(self.model if model is None else model)
         data.qpos[:] = (0.0, 0.0, _HEIGHT, 1.0, 0.0, 0.0, 0.0)
-        data.ctrl[:] = np.asarray(thrust) / [rotor.newtons for rotor in self.vehicle.rotors]
+        if self.rotors:
+            data.ctrl[:] = np.asarray(thrust) / [rotor.newtons for rotor in self.rotors]
         return data
 
     def acceleration(self, data: Any) -> Array:
@@ -134,33 +310,321 @@ class _Craft:
         mujoco.mj_forward(self.model, data)
         return np.array(data.qacc)
 
-    def forces(self, thrust: ArrayLike = 0.0, velocity: ArrayLike = 0.0) -> Array:
-        """Force and torque about its origin, level, less its weight: (6,), N, N·m.
 
-        `thrust` as of `ready`; `velocity` in the world frame, (3,), m/s.
-        """
-        data = self.ready(thrust)
-        data.qvel[:3] = velocity
-        fall = (0, 0, -self.vehicle.gravity, 0, 0, 0)
-        return self.mass_matrix @ (self.acceleration(data) - fall)
+Subject = Vehicle | Craft | Path | str | None
+"""A vehicle, a file read once, what `Vehicle.load` takes, or None for the paper's vehicle."""
 
-    def fly(self, data: Any, seconds: float) -> float:
-        """Step for `seconds`, as a whole number of steps; returns the time flown, s.
 
-        Raises `InputError` if MuJoCo warned of anything. It resets bad states silently otherwise.
-        """
-        steps = left = max(1, round(seconds / self.model.opt.timestep))
-        while left > 0:
-            mujoco.mj_step(self.model, data, nstep=min(left, _STEPS_AT_ONCE))
-            left -= _STEPS_AT_ONCE
-        for kind, warning in zip(mujoco.mjtWarning.__members__, data.warning, strict=False):
-            expect(not warning.number, "vehicle", "a flight without warnings", f"{kind} of MuJoCo")
-        return float(steps * self.model.opt.timestep)
+def _mend(spec: mujoco.MjSpec) -> Iterator[tuple[str, Array]]:
+    """Principal moments that the file writes out, by body; impossible ones become possible.
 
-    def climb(self, thrust: ArrayLike) -> float:
-        """Mean acceleration of a vertical flight of two seconds from rest, m/s²."""
-        data = self.ready(thrust)
-        return 2 / self.fly(data, 2.0) ** 2 * (float(data.qpos[2]) - _HEIGHT)
+    MuJoCo refuses some of them, and sets negative ones to zero. The moments of a sphere take their
+    place, so that what else is wrong can be found.
+    """
+    if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        return
+    for body in spec.bodies:
+        if not body.explicitinertial:
+            continue
+        moments = np.sort(np.array(body.inertia, np.float64))
+        if np.isfinite(body.fullinertia[0]):
+            xx, yy, zz, xy, xz, yz = body.fullinertia
+            full = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+            moments = np.asarray(np.linalg.eigvalsh(full))
+        yield body.name, moments
+        if not (moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - _TRUNCATION)):
+            body.fullinertia = [math.nan, 0, 0, 0, 0, 0]
+            body.inertia = np.full(3, max(float(np.abs(moments).mean()), 1e-12))
+
+
+class _Warned(Exception):
+    """MuJoCo warned of something in a flight."""
+
+
+def _fly(model: mujoco.MjModel, data: Any, seconds: float, most: int = _MOST_STEPS) -> float:
+    """Step for `seconds`, as a whole number of steps and not more than `most`; the time flown, s.
+
+    Raises `_Warned`: MuJoCo resets bad states silently otherwise.
+    """
+    steps = left = round(min(max(seconds / model.opt.timestep, 1), most))
+    while left > 0:
+        mujoco.mj_step(model, data, nstep=min(left, _STEPS_AT_ONCE))
+        left -= _STEPS_AT_ONCE
+        _expect_no_warning(data)
+    return float(steps * model.opt.timestep)
+
+
+def _expect_no_warning(data: Any) -> None:
+    kinds = zip(mujoco.mjtWarning.__members__, data.warning, strict=False)
+    told = [kind.removeprefix("mjWARN_") for kind, warning in kinds if warning.number]
+    if told:
+        raise _Warned(", ".join(told))
+
+
+CHECKS: Final[list[Callable[[Subject], list[Check]]]] = []
+"""Every group of checks, in the order of the table."""
+
+
+def _group(part: Callable[[Craft], Iterator[Check]]) -> Callable[[Subject], list[Check]]:
+    """A public group of checks. A warning of MuJoCo in its flights ends it, as a failed check."""
+
+    @wraps(part)
+    def group(vehicle: Subject = None) -> list[Check]:
+        checks, config, quiet = [], mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+        quiet.logto_console = False  # a warning becomes a check
+        quiet.set()
+        try:
+            for check in part(Craft.read(vehicle)):
+                checks.append(check)
+        except _Warned as warning:
+            name = part.__name__.removeprefix("check_").replace("_", " ")
+            meaning = f"MuJoCo warned of {warning}: the flight diverged and measures nothing"
+            checks.append(_near(f"{name}: warnings", math.nan, 0, "", "MuJoCo", meaning))
+        finally:
+            config.set()
+        return checks
+
+    group.__annotations__ = {"vehicle": Subject, "return": list[Check]}
+    CHECKS.append(group)
+    return group
+
+
+def examine(vehicle: Subject = None) -> list[Check]:
+    """Run every check on a vehicle or the path of its file; nothing changes.
+
+    Checks that need rotors are left out if an actuator is no rotor, and those of drag if the file
+    has none. Raises `InputError` for a file that is no free body with actuators.
+    """
+    craft = Craft.read(vehicle)
+    return [check for group in CHECKS for check in group(craft)]
+
+
+# ---- what a file may say -------------------------------------------------------------------------
+
+
+@_group
+def check_accepted(craft: Craft) -> Iterator[Check]:
+    """Whether `--vehicle` takes the file, and its coefficients can be read."""
+    name, source = "accepted by --vehicle", "rotorgram.models.Vehicle.load"
+    yield _near(name, not craft.refusal, 1, "", source,
+                craft.refusal or "it cannot fly here", 0)  # fmt: skip
+    wrong = craft.coefficients if isinstance(craft.coefficients, str) else ""
+    yield _near("coefficients: faults", bool(wrong), 0, "", "limits in models/coefficients.py",
+                wrong or "effects and sensors cannot read them", 0)  # fmt: skip
+
+
+@_group
+def check_actuators(craft: Craft) -> Iterator[Check]:
+    """Every actuator is a rotor: a limited thrust at a site of the body, gain times control."""
+    for index in range(craft.model.nu):
+        name = rotor_name(craft.model, index)
+        faults = [fault for actuator, fault in craft.faults if actuator == name]
+        meaning = "; ".join(faults) or "it is no rotor: checks of rotors were left out"
+        yield _near(f"actuator {name}: faults", len(faults), 0, "", _MODEL, meaning, 0)
+
+
+@_group
+def check_gravity(craft: Craft) -> Iterator[Check]:
+    """Gravity points down and has the size of a world with an atmosphere."""
+    down = -float(craft.model.opt.gravity[2]) / craft.gravity
+    yield _near("gravity: part along -z", down, 1, "", "world frame: z up",
+                "gravity does not point down: check its sign and axis")  # fmt: skip
+    yield _within("gravity: size", craft.gravity, GRAVITY,
+                  "no world with an atmosphere has it: in cm/s², or in units of g?")  # fmt: skip
+
+
+@_group
+def check_inertia(craft: Craft) -> Iterator[Check]:
+    """Inertia of a body that can exist, and mass and inertia as forces and torques meet them."""
+    bodies = [*craft.written, ("the whole craft", craft.moments)]
+    name, moments = min(bodies, key=lambda one: one[1][0] / max(abs(one[1][2]), 1e-300))
+    ratio = moments[0] / max(abs(moments[2]), 1e-300)
+    yield _within("inertia: smallest / largest moment", ratio,
+                  Range(1e-6, 1, "", "a body with an extent has positive moments"),
+                  f"the inertia of {name} is not positive definite: no body has it")  # fmt: skip
+    name, moments = min(bodies, key=lambda one: (one[1][0] + one[1][1]) / max(one[1][2], 1e-300))
+    ratio = (moments[0] + moments[1]) / max(moments[2], 1e-300)
+    yield _within("inertia: triangle inequality", ratio,
+                  Range(1 - _TRUNCATION, math.inf, "", "two moments sum up to the third or more"),
+                  f"the moments of {name} belong to no body: the largest exceeds the sum of the "
+                  "others")  # fmt: skip
+    matrix, mass, center = craft.mass_matrix, craft.mass, craft.center
+    answer = float(np.trace(matrix[:3, :3])) / 3
+    yield _near("mass against a force of 1 N", answer, mass, "kg", _MODEL,
+                "a force moves it like another mass: armature of the free joint",
+                _TRUNCATION * mass)  # fmt: skip
+    about = craft.inertia + mass * (center @ center * np.eye(3) - np.outer(center, center))
+    off = float(np.abs(matrix[3:, 3:] - about).max())
+    yield _near("inertia against torques of 1 N·m: error", off, 0, "kg·m²", _MODEL,
+                "a torque turns it like another inertia: armature of the free joint",
+                _TRUNCATION * float(np.abs(about).max()))  # fmt: skip
+
+
+_MEANINGS: Final = {
+    "mass / arm³": "mass in grams, or lengths not in metres?",
+    "arm": "lengths in millimetres or centimetres?",
+    "smallest moment / (mass arm²)": "inertia in other units, or the arm's?",
+    "largest moment / (mass arm²)": "inertia in kg·mm² or g·m², or the arm's unit?",
+    "reaction / arm": "reaction not in N·m per newton, or none?",
+    "reaction / rotor radius": "reaction not in N·m per newton, or the radius not in metres?",
+    "rotor radius / arm": "radius not in metres, or a diameter?",
+    "tip speed": "thrust coefficient of revolutions per minute or per second?",
+}
+
+
+@_group
+def check_units(craft: Craft) -> Iterator[Check]:
+    """Ratios that no multirotor has unless a unit is wrong."""
+    if not craft.rotors:
+        return
+    arm, inertia = craft.arm, craft.mass * craft.arm**2
+    reaction = float(np.mean([np.linalg.norm(rotor.reaction) for rotor in craft.rotors]))
+    values = {
+        "mass / arm³": craft.mass / arm**3,
+        "arm": arm,
+        "smallest moment / (mass arm²)": craft.moments[0] / inertia,
+        "largest moment / (mass arm²)": craft.moments[2] / inertia,
+        "reaction / arm": reaction / arm,
+    }
+    if isinstance(craft.coefficients, Coefficients):
+        rotors = craft.coefficients.rotors
+        if rotors.radius is not None:
+            values["reaction / rotor radius"] = reaction / rotors.radius
+            values["rotor radius / arm"] = rotors.radius / arm
+            if rotors.thrust_coefficient is not None:
+                fastest = math.sqrt(float(craft.thrust_high.max()) / rotors.thrust_coefficient)
+                values["tip speed"] = rotors.radius * fastest
+    for name, value in values.items():
+        meaning = f"no published vehicle comes near: {_MEANINGS[name]}"
+        yield _within(f"units: {name}", value, RANGES[name], meaning)
+
+
+# ---- rotors --------------------------------------------------------------------------------------
+
+
+@_group
+def check_rotors(craft: Craft) -> Iterator[Check]:
+    """Each rotor pushes where its site and gear say, and upwards."""
+    if not craft.rotors:
+        return
+    rest = craft.acceleration(craft.ready(craft.thrust_low))
+    for index, rotor in enumerate(craft.rotors):
+        thrust = np.where(np.arange(len(craft.rotors)) == index, rotor.high, craft.thrust_low)
+        answer = craft.acceleration(craft.ready(thrust)) - rest
+        pushed = craft.mass_matrix @ answer / (rotor.high - rotor.low)
+        expected = np.append(rotor.axis, np.cross(rotor.position, rotor.axis) + rotor.reaction)
+        off = float(np.abs(pushed - expected).max())
+        yield _near(f"effect of {rotor.name}: error per newton", off, 0, "", _MODEL,
+                    "it gives another force or torque than its site and gear: force limits?",
+                    _TRUNCATION * float(np.abs(expected).max()))  # fmt: skip
+        how = "pushes the craft down, as if upside down" if rotor.axis[2] < 0 else "is tilted"
+        limits = Range(0.5, 1 + _EXACT, "", "60° of tilt: ours; Neo of RotorS: 5°")
+        yield _within(f"lift of {rotor.name}", rotor.axis[2], limits,
+                      f"{rotor.name} {how}: are its angles in the compiler's unit?")  # fmt: skip
+
+
+@_group
+def check_allocation(craft: Craft) -> Iterator[Check]:
+    """Thrust and the torques about x, y and z can be commanded, each without the others."""
+    if not craft.rotors:
+        return
+    allocation = craft.allocation
+    sizes = np.linalg.norm(allocation, axis=1)
+    arm = max(craft.arm, float(sizes[1:3].max()) / max(sizes[0], 1e-300))
+    absent = sizes < _TRUNCATION * np.array((1, arm, arm, arm)) * max(sizes[0], 1e-300)
+    rows = np.where(absent[:, None], 0.0, allocation / np.where(sizes > 0, sizes, 1)[:, None])
+    values = np.linalg.svd(rows, compute_uv=False)
+    rank = int((values > 1e-6).sum())
+    source = "thrust and three torques, each without the others"
+    yield _near("allocation: rank", rank, 4, "", source,
+                "thrust and torques cannot be commanded apart from each other", 0)  # fmt: skip
+    apart = rows - np.outer(rows @ rows[0], rows[0])  # each torque without a change of thrust
+    lengths = np.linalg.norm(apart, axis=1)
+    names = ("thrust", "roll", "pitch", "yaw")
+    for one, other in ((3, 1), (3, 2), (1, 2)):
+        both = lengths[one] * lengths[other]
+        shared = abs(float(apart[one] @ apart[other])) / both if both > 1e-9 else math.nan
+        lack = [names[axis] for axis in (one, other) if lengths[axis] <= 1e-9]
+        meaning = f"{names[one]} signs follow the pattern of {names[other]}: none without the other"
+        if lack:
+            meaning = f"no rotor gives a torque of {' or '.join(lack)} at constant thrust"
+        yield _within(f"allocation: {names[one]} apart from {names[other]}", shared,
+                      Range(0, 0.9, "", "|cosine| between their rows: ours"), meaning)  # fmt: skip
+    condition = float(values[0] / values[3]) if len(values) == 4 and values[3] > 1e-9 else math.inf
+    yield _within("allocation: condition", condition,
+                  Range(1, 20, "", "of rows of length 1: ours; 1 for a symmetric quadcopter"),
+                  "some torque takes far more thrust than the others")  # fmt: skip
+
+
+@_group
+def check_turns(craft: Craft) -> Iterator[Check]:
+    """Reactions cancel at equal thrusts; a rotor that turns like both its neighbours is named."""
+    if not craft.rotors:
+        return
+    reactions = np.array([np.dot(rotor.reaction, rotor.axis) for rotor in craft.rotors])
+    number, total = len(reactions), float(np.abs(reactions).sum())
+    share = float(reactions.sum()) / total if total > 0 else math.nan
+    most = 1.5 / number if number % 2 else 1 / number  # a wrong sign of R rotors gives 2 / R more
+    yield _near("turns: yaw of equal thrusts", share, 0, "", "half of what one wrong sign gives",
+                "more rotors turn one way than the other: check the signs of the reactions"
+                if total > 0 else "no rotor has a reaction",
+                most)  # fmt: skip
+    surplus = np.sign(share) if abs(share) > most else 0.0
+    places = np.array([rotor.position for rotor in craft.rotors]) - craft.center
+    around = np.argsort(np.arctan2(places[:, 1], places[:, 0]), kind="stable").tolist()
+    for index, rotor in enumerate(craft.rotors):
+        at = around.index(index)
+        beside = {around[at - 1], around[(at + 1) % number]} - {index}
+        alike = sum(bool(reactions[one] * reactions[index] > 0) for one in beside)
+        most_alike = 1 if np.sign(reactions[index]) == surplus else 2
+        yield _within(f"turns: neighbours like {rotor.name}", alike,
+                      Range(0, most_alike, "", "neighbours turn against each other"),
+                      f"{rotor.name} turns like both its neighbours, and the turns do not cancel: "
+                      "the sign of its reaction is wrong")  # fmt: skip
+
+
+@_group
+def check_hover(craft: Craft) -> Iterator[Check]:
+    """The rotors can carry the level craft, with a margin, each within its limits."""
+    if not craft.rotors:
+        return
+    most = float(craft.allocation[0] @ craft.thrust_high) / craft.weight
+    yield _within("hover: thrust to weight", most, THRUST_TO_WEIGHT,
+                  "too weak to hover and climb" if most < THRUST_TO_WEIGHT.low else
+                  "no vehicle is so strong: thrust in millinewtons or grams?")  # fmt: skip
+    for rotor, newtons in zip(craft.rotors, craft.trim.tolist(), strict=True):
+        share = 100 * newtons * rotor.axis[2] / craft.weight
+        limits = Range(max(rotor.low, _EXACT * craft.weight), rotor.high, "N", "limits of the file")
+        yield _within(f"hover: thrust of {rotor.name}", newtons, limits,
+                      f"{rotor.name} would carry {newtons:.4g} N and has {rotor.low:g} to "
+                      f"{rotor.high:g} N: too weak, a center of mass off the rotors' center, or "
+                      "a wrong sign", note=f"{share:.3g} % of weight")  # fmt: skip
+    margin = float(np.min(craft.thrust_high / np.maximum(craft.trim, 1e-300)))
+    yield _within("hover: margin of the tightest rotor", margin,
+                  Range(1.1, math.inf, "", "ours: largest thrust over that of hover"),
+                  "a rotor has nothing left to control with while the craft hovers")  # fmt: skip
+
+
+@_group
+def check_trim(craft: Craft) -> Iterator[Check]:
+    """With the thrusts of the hover, within limits, the craft neither accelerates nor turns."""
+    if not craft.rotors:
+        return
+    thrust = np.clip(craft.trim, craft.thrust_low, craft.thrust_high)
+    answer = craft.acceleration(craft.ready(thrust))
+    torque = craft.mass_matrix[3:, 3:] @ answer[3:] / (craft.weight * craft.arm)
+    for name, value, meaning in (
+        ("sideways", np.hypot(*answer[:2]) / craft.gravity, "it drifts sideways: rotors lean"),
+        ("vertical", abs(answer[2]) / craft.gravity, "it sinks or climbs: thrusts are limited"),
+    ):
+        yield _near(f"trim: {name} acceleration / g", value, 0, "", _MECHANICS, meaning,
+                    _ROUNDED)  # fmt: skip
+    yield _near("trim: torque / (weight arm)", float(np.linalg.norm(torque)), 0, "",
+                _MECHANICS, "it turns in level hover: the thrusts that balance it do not exist "
+                "within the limits", _ROUNDED)  # fmt: skip
+
+
+# ---- flights -------------------------------------------------------------------------------------
 
 
 def _turned(data: Any, vector: Array) -> Array:
@@ -170,207 +634,234 @@ def _turned(data: Any, vector: Array) -> Array:
     return turned
 
 
-def _size(values: np.ndarray) -> float:
-    """Euclidean length of all elements."""
-    return float(np.linalg.norm(values))
+@_group
+def check_free_fall(craft: Craft) -> Iterator[Check]:
+    """Depth of a fall of two seconds without thrust: g t² / 2."""
+    model = craft.falling()
+    data = craft.ready(model=model)
+    seconds = _fly(model, data, 2.0)
+    expected = craft.gravity * seconds**2 / 2
+    yield _near("free fall: depth", _HEIGHT - float(data.qpos[2]), expected, "m", _MECHANICS,
+                "it does not fall as a body does: gravity, damping of the joint, or an integrator "
+                "that is not exact for a constant force (use RK4)",
+                _EXACT * max(1.0, expected))  # fmt: skip
 
 
-def _mass(craft: _Craft) -> Iterator[Check]:
-    """Mass, centre of mass and inertia, from the answers to known forces and torques."""
-    vehicle = craft.vehicle
-    yield Check("mass", vehicle.mass, craft.mass, "kg", _MODEL, _EXACT * vehicle.mass)
-    off = _size(craft.center_of_mass - vehicle.center_of_mass)
-    yield Check("centre of mass: difference", 0.0, off, "m", _MODEL)
-    off, size = _size(craft.inertia - vehicle.inertia), _size(vehicle.inertia)
-    yield Check("inertia: difference of the matrices", 0.0, off, "kg·m²", _MODEL, _EXACT * size)
+@_group
+def check_momentum(craft: Craft) -> Iterator[Check]:
+    """Five seconds of tumbling without forces: momenta and energy are conserved."""
+    model = craft.falling(gravity=np.zeros(3))
+    before, after = craft.ready(model=model), craft.ready(model=model)
+    for data in (before, after):
+        data.qvel[:] = (*_SPEED, *_SPIN)
+    _fly(model, after, 5.0)
+    velocity, spin, energy = [], [], []
+    for data in (before, after):
+        rates = np.array(data.qvel[3:])
+        velocity.append(data.qvel[:3] + _turned(data, np.cross(rates, craft.center)))
+        spin.append(_turned(data, craft.inertia @ rates))
+        energy.append(craft.mass * velocity[-1] @ velocity[-1] + rates @ craft.inertia @ rates)
+    cause = "damping, friction or armature of the joint, or the integrator (use RK4)"
+    for name, pair in (("linear", velocity), ("angular", spin)):
+        change = float(np.linalg.norm(pair[1] - pair[0]) / np.linalg.norm(pair[0]))
+        yield _near(f"{name} momentum: change in 5 s", change, 0, "", _MECHANICS,
+                    f"{name} momentum is not conserved: {cause}", _TRUNCATION)  # fmt: skip
+    yield _near("energy: change in 5 s", energy[1] / energy[0] - 1, 0, "", _MECHANICS,
+                f"energy is not conserved: {cause}", _TRUNCATION)  # fmt: skip
 
 
-def _rotors(craft: _Craft) -> Iterator[Check]:
-    """Effect and limits of each rotor, and of all rotors together."""
-    vehicle, columns = craft.vehicle, []
-    low, high = vehicle.thrust_low, vehicle.thrust_high
-    idle = craft.forces(low)
-    for i, rotor in enumerate(vehicle.rotors):
-        one = np.where(np.arange(vehicle.num_rotors) == i, high, low)
-        pushed = (craft.forces(one) - idle) / (rotor.high - rotor.low)
-        torque = pushed[3:] - np.cross(craft.center_of_mass, pushed[:3])
-        columns.append(np.append(pushed[2], torque))
-        off = _size(columns[i] - vehicle.allocation[:, i])
-        name = f"{rotor.name}: difference of thrust and torques per newton"
-        yield Check(name, 0.0, off, "", _MODEL)
-    vertical, weight = vehicle.allocation[0], vehicle.mass * vehicle.gravity
-    for more_or_less, asked, given in (
-        ("more than they have", high + 50.0, high),
-        ("less", low - 50.0, low),
-    ):
-        name = f"thrust of all when asked for {more_or_less}"
-        measured = float(craft.forces(asked)[2])
-        yield Check(name, float(vertical @ given), measured, "N", _MODEL, _EXACT * weight)
-    rank = float(np.linalg.matrix_rank(np.array(columns), rtol=1e-6))
-    source = "thrust and three torques, each without the others"
-    yield Check("rank of the allocation matrix", 4.0, rank, "", source, 0.0)
+@dataclass(frozen=True)
+class Convergence:
+    """Error of the attitude in tumbling flight, over the physics step."""
+
+    turn: float
+    """Rate at which it tumbles, rad/s."""
+    order: float
+    """Power of the step to which the error is proportional."""
+    error: float
+    """Error of a second at a step that turns it by `_COARSE`, rad."""
+    fall: float
+    """Error of the depth of a free fall of a second, in proportion to the step, m per s of step."""
+
+    def at(self, step: float) -> float:
+        """Error of a second at a step (s), rad."""
+        return float(self.error * (step * self.turn / _COARSE) ** max(self.order, 0.1))
+
+    def step(self, error: float) -> float:
+        """Step that makes an error (rad) in a second, s."""
+        return _COARSE / self.turn * float((error / self.error) ** (1 / max(self.order, 0.1)))
 
 
-def _free_fall(craft: _Craft) -> Iterator[Check]:
-    """Depth of a fall: g t² / 2. Semi-implicit Euler misses by g h t / 2."""
-    craft = craft.unpowered()
-    data = craft.ready()
-    depth = craft.vehicle.gravity * craft.fly(data, 2.0) ** 2 / 2
-    yield Check("free fall in 2 s", depth, _HEIGHT - float(data.qpos[2]), "m", _MECHANICS)
+def _converge(craft: Craft) -> Convergence:
+    """Fly one tumbling turn at a step, at its half and at its quarter."""
+    turn = float(np.linalg.norm(_SPIN))
+    if craft.rotors:
+        ends = craft.allocation[1:3] * np.stack((craft.thrust_low, craft.thrust_high))[:, None]
+        torque = ends.max(axis=0).sum(axis=1)  # of roll and of pitch
+        fastest = float((torque / np.diag(craft.inertia)[:2]).max())
+        turn = min(max(0.1 * fastest, 1.0), _FASTEST_TURN)
+    spin = turn * np.array(_SPIN) / np.linalg.norm(_SPIN)
+    reached = []
+    for half in range(3):
+        step = _COARSE / turn / 2**half
+        model = craft.falling(gravity=np.zeros(3), timestep=step)
+        data = craft.ready(model=model)
+        data.qvel[3:] = spin
+        data.qfrc_applied[3] = 0.05 * craft.moments[0] * turn**2  # a sphere turns exactly without
+        _fly(model, data, _TURN / turn)
+        reached.append(np.array(data.qpos[3:]))
+    coarse, fine = (
+        4 * math.asin(min(math.dist(a, b), math.dist(a, -b), 2) / 2)
+        for a, b in (reached[:2], reached[1:])
+    )
+    order = math.log2(coarse / fine) if coarse > 0 and fine > 0 else 0.0
+    whole = coarse / (1 - 0.5 ** max(order, 0.1)) / (_TURN / turn)
+    depths = []
+    for step in (0.01, 0.005):
+        model = craft.falling(timestep=step)
+        data = craft.ready(model=model)
+        _fly(model, data, 1.0)
+        depths.append(float(data.qpos[2]))
+    fall = 2 * abs(depths[0] - depths[1]) / 0.01
+    return Convergence(turn, order, max(whole, 1e-300), fall)
 
 
-def _hover(craft: _Craft) -> Iterator[Check]:
-    """With hover thrusts the craft neither accelerates nor turns, and keeps its position."""
-    data = craft.ready(craft.vehicle.hover_thrust)
-    answer = craft.acceleration(data)
-    craft.fly(data, 5.0)
-    for name, value, unit in (
-        ("acceleration", answer[:3], "m/s²"),
-        ("angular acceleration", answer[3:], "rad/s²"),
-        ("drift in 5 s", data.qpos[:3] - (0.0, 0.0, _HEIGHT), "m"),
-    ):
-        yield Check(f"hover: {name}", 0.0, _size(value), unit, _MECHANICS)
+@_group
+def check_integrator(craft: Craft) -> Iterator[Check]:
+    """Observed order of the integrator: how fast its error falls with the step."""
+    found = craft.convergence
+    yield _within("integrator: observed order", found.order,
+                  Range(3.5, 5, "", "steps that turn it by 0.05, 0.025 and 0.0125 rad"),
+                  "its error falls slowly with the step: Euler and the implicit ones have order 1; "
+                  "use RK4", note=str(mujoco.mjtIntegrator(craft.model.opt.integrator).name)
+                  .removeprefix("mjINT_"))  # fmt: skip
 
 
-def _climb(craft: _Craft) -> Iterator[Check]:
-    """Acceleration of a climb at the largest multiple of the hover's thrusts, from the height."""
-    vehicle, name = craft.vehicle, "climb at the largest balanced thrust"
-    most = float(np.min(vehicle.thrust_high / vehicle.hover_thrust))
-    expected, measured = vehicle.gravity * (most - 1), craft.climb(most * vehicle.hover_thrust)
-    yield Check(name, expected, measured, "m/s²", _MECHANICS, _EXACT * max(1.0, most))
+def recommended_step(vehicle: Subject = None) -> tuple[float, str]:
+    """Physics step, s, and what bounds it.
 
-
-def _tumbling(craft: _Craft) -> Iterator[Check]:
-    """Ten seconds of torque-free tumbling: conserved quantities, and the path of the fall."""
-    craft = craft.unpowered()
-    before, after = craft.ready(), craft.ready()
-    before.qvel[3:] = after.qvel[3:] = _SPIN
-    seconds = craft.fly(after, 10.0)
-    inertia, center = craft.inertia, craft.center_of_mass
-    spins = [np.array(data.qvel[3:]) for data in (before, after)]
-    start, end = (_turned(d, inertia @ s) for d, s in zip((before, after), spins, strict=True))
-    # The path of the centre of mass: from its first place and velocity on, and where it is.
-    place, there = (data.qpos[:3] + _turned(data, center) for data in (before, after))
-    velocity = before.qvel[:3] + _turned(before, np.cross(spins[0], center))
-    fallen = place + velocity * seconds - (0, 0, craft.vehicle.gravity * seconds**2 / 2)
-    first, last = (float(spin @ inertia @ spin) for spin in spins)
-    for name, value, unit in (
-        ("relative change of angular momentum", _size(end - start) / _size(start), ""),
-        ("relative change of energy", last / first - 1, ""),
-        ("centre of mass off its path", _size(there - fallen), "m"),
-    ):
-        yield Check(f"tumbling 10 s: {name}", 0.0, value, unit, _MECHANICS, _TRUNCATION)
-
-
-def _resting(craft: _Craft) -> Iterator[Check]:
-    """Dropped by 5 cm, the craft settles; soft contact lets it sink in by some 0.1 mm."""
-    craft = _Craft(craft.vehicle, craft.vehicle.model)  # with air and drag, if there are any
-    data, rest = craft.ready(), craft.vehicle.rest_height
-    data.qpos[2] = rest + 0.05
-    craft.fly(data, 5.0)
-    height = float(data.qpos[2])
-    yield Check("at rest on the floor: height", rest, height, "m", _MODEL, 1e-3)
-    for name, value, unit in (("speed", data.qvel[:3], "m/s"), ("turning", data.qvel[3:], "rad/s")):
-        yield Check(f"at rest on the floor: {name}", 0.0, _size(value), unit, _MECHANICS, 1e-6)
-
-
-def _linear_drag(craft: _Craft) -> Iterator[Check]:
-    """With the option `linear_drag` d, speed v is met by a force of −d m v and by no torque."""
-    vehicle, drag, velocity = craft.vehicle, 0.5, np.array((6.0, -8.0, 10.0))
-    model = copy.copy(craft.model)
-    model.dof_damping[:] = Vehicle.load(vehicle.path, linear_drag=drag).model.dof_damping
-    added = _Craft(vehicle, model).forces(velocity=velocity) - craft.forces()
-    tolerance = _EXACT * vehicle.mass * vehicle.gravity
-    for name, value, unit in (
-        ("force", added[:3] + drag * vehicle.mass * velocity, "N"),
-        ("torque about the body's origin", added[3:], "N·m"),
-    ):
-        yield Check(f"linear drag: difference of {name}", 0.0, _size(value), unit, _DRAG, tolerance)
-
-
-def closed_form_inertia() -> tuple[float, float]:
-    """(Ixx = Iyy, Izz) of the paper's vehicle about the centre, kg·m², from our geometry.
-
-    Hub: a box. Each arm: a cylinder whose centre lies half its length out along a diagonal; of its
-    moments along (a) and across (c) itself, x sees (a + c) / 2 and z sees c, and the products of
-    inertia of the four cancel. Each motor: an upright cylinder, moved by Steiner's theorem.
+    The cost of a second falls with the step, so it is the largest of 1, 2 and 5 times a power of
+    ten that is at most each of: the step whose error of attitude is 0.01° in a second of tumbling,
+    from the measured error and order (the craft turns as fast as full torque turns it in 0.1 s, at
+    most 2000 °/s); the step at which a free fall of a second is 1 mm off; half the time constant
+    of its contacts; the time constant of its motors.
     """
-    length = SIDE / math.sqrt(2)
-    hub_x = _HUB_MASS * (_HUB_WIDTH**2 + _HUB_HEIGHT**2) / 12
-    hub_z = _HUB_MASS * _HUB_WIDTH**2 / 6
-    arm_along = _ARM_MASS * _ARM_RADIUS**2 / 2
-    arm_across = _ARM_MASS * ((3 * _ARM_RADIUS**2 + length**2) / 12 + (length / 2) ** 2)
-    motor_x = _MOTOR_MASS * ((3 * _MOTOR_RADIUS**2 + _MOTOR_HEIGHT**2) / 12 + length**2 / 2)
-    motor_z = _MOTOR_MASS * (_MOTOR_RADIUS**2 / 2 + length**2)
-    ixx = hub_x + NUM_ROTORS * ((arm_along + arm_across) / 2 + motor_x)
-    return ixx, hub_z + NUM_ROTORS * (arm_across + motor_z)
+    craft = Craft.read(vehicle)
+    bounds = {"error of attitude of 0.01° a second": craft.convergence.step(_ATTITUDE)}
+    if craft.convergence.fall > _TRUNCATION:
+        bounds["error of a free fall of 1 mm a second"] = _DEPTH / craft.convergence.fall
+    colliding = (craft.model.geom_contype | craft.model.geom_conaffinity) != 0
+    times = craft.model.geom_solref[colliding, 0]
+    if (times > 0).any():
+        bounds["half the time constant of contacts"] = float(times[times > 0].min()) / 2
+    if isinstance(craft.coefficients, Coefficients) and craft.coefficients.rotors.time_constant:
+        lags = (craft.coefficients.rotors.time_constant,
+                craft.coefficients.rotors.time_constant_down or math.inf)  # fmt: skip
+        bounds["time constant of the motors"] = min(lags)
+    why, most = min(bounds.items(), key=lambda bound: bound[1])
+    most = min(max(most, 1e-9), 1.0) * (1 + _EXACT)
+    power = 10.0 ** math.floor(math.log10(most))
+    best = max(digit * power for digit in (1, 2, 5) if digit * power <= most)
+    return float(f"{best:.6g}"), why
 
 
-def _paper_numbers(craft: _Craft) -> Iterator[Check]:
-    """Mass, inertia, centre of mass and height of rest."""
-    yield Check("mass of the paper", MASS, craft.mass, "kg", _PAPER)
-    off = _size(craft.center_of_mass)
-    yield Check("centre of mass off the geometrical centre", 0.0, off, "m", _PAPER)
-    (ixx, izz), inertia = closed_form_inertia(), craft.inertia
-    for name, expected, value in (
-        ("inertia Ixx", ixx, inertia[0, 0]),
-        ("inertia Iyy", ixx, inertia[1, 1]),
-        ("inertia Izz", izz, inertia[2, 2]),
-        ("largest product of inertia", 0.0, np.abs(inertia - np.diag(np.diag(inertia))).max()),
-    ):
-        yield Check(name, expected, float(value), "kg·m²", _GEOMETRY)
-    yield Check("height of rest", _REST_HEIGHT, craft.vehicle.rest_height, "m", _GEOMETRY)
+@_group
+def check_physics_step(craft: Craft) -> Iterator[Check]:
+    """The physics step is at most the recommended one, and long enough to be flown."""
+    step, why = recommended_step(craft)
+    error = math.degrees(craft.convergence.at(min(craft.timestep, _MOST_STEP)))
+    yield _within("physics step", craft.timestep,
+                  Range(1e-5, step * (1 + _EXACT), "s", f"recommended: {why}"),
+                  f"too long for this craft, or shorter than any flight needs: {step:g} s is the "
+                  "longest that is accurate", note=f"{error:.2g}° a second")  # fmt: skip
 
 
-def _paper_rotors(craft: _Craft) -> Iterator[Check]:
-    """Total thrust at the limits, and the torques of each rotor: y, −x and ±k per newton."""
-    for asked, expected in ((150.0, NUM_ROTORS * MAX_THRUST), (-50.0, 0.0)):
-        thrust = float(craft.forces(asked)[2])
-        name = f"thrust of all four when asked for {asked:g} N each"
-        yield Check(name, expected, thrust, "N", f"{_PAPER}: 0 to 100 N")
-    square = f"{_PAPER}: square; numbering ours"
-    for i, (name, (x, y, sign)) in enumerate(_ROTORS.items()):
-        torque = craft.forces(MAX_THRUST * np.eye(NUM_ROTORS)[i])[3:] / MAX_THRUST
-        for axis, expected, measured, source in (
-            ("roll", y * SIDE / 2, torque[0], square),
-            ("pitch", -x * SIDE / 2, torque[1], square),
-            ("yaw", sign * _REACTION, torque[2], "assumption of ours"),
-        ):
-            line = f"{name} rotor: {axis} torque per newton"
-            yield Check(line, expected, float(measured), "m", source)
+@_group
+def check_terminal_velocity(craft: Craft) -> Iterator[Check]:
+    """A level fall with the drag of the file, against its closed form; nothing without drag.
+
+    m v' = m g - c₁ v - c₂ v² ends at the v where the right side is 0.
+    """
+    if isinstance(craft.coefficients, str):
+        return
+    drag = craft.coefficients.drag
+    linear = craft.linear_drag + (drag.linear[2] if drag.linear else 0.0) / craft.mass
+    square = (drag.quadratic[2] if drag.quadratic else 0.0) / craft.mass
+    if linear == square == 0.0:
+        return
+    root = math.sqrt(linear**2 + 4 * square * craft.gravity)
+    final = 2 * craft.gravity / (linear + root)
+    model = craft.falling(gravity=np.array((0.0, 0.0, -craft.gravity)))
+    data = craft.ready(model=model)
+    data.qvel[2] = -final / 2
+    step = float(model.opt.timestep)
+    for _ in range(round(min(10 * final / craft.gravity / step, _MOST_STEPS))):
+        speed = -float(data.qvel[2])
+        force = craft.mass * (linear + square * abs(speed)) * speed
+        data.qfrc_applied[2] = force
+        mujoco.mj_step(model, data)
+    _expect_no_warning(data)
+    # Closed form from half the final speed on: u = v + a / 2b, u' = r² / 4b - b u².
+    seconds = float(data.time)
+    if square > 0:
+        shift, scale = linear / (2 * square), root / (2 * square)
+        phase = math.atanh((final / 2 + shift) / scale)
+        expected = scale * math.tanh(root * seconds / 2 + phase) - shift
+    else:
+        expected = final * (1 - math.exp(-linear * seconds) / 2)
+    yield _near("terminal velocity: long fall", -float(data.qvel[2]), expected, "m/s",
+                "closed form of linear and quadratic drag", "drag does not settle: the physics "
+                "step is too long for it", _SETTLED * expected,
+                note=f"{final:.4g} m/s in the end")  # fmt: skip
+    yield _within("units: terminal velocity", final, RANGES["terminal velocity"],
+                  "no craft falls at this speed: drag not in N s/m or N s²/m²?")  # fmt: skip
 
 
-def _paper_flights(craft: _Craft) -> Iterator[Check]:
-    """Acceleration of two seconds without thrust, at 49 N each and at 100 N each."""
-    hover = MASS * GRAVITY / NUM_ROTORS
-    for how, thrust, expected, source in (
-        ("no thrust", 0.0, -GRAVITY, "g = 9.8 m/s²"),
-        (f"{hover:g} N each", hover, 0.0, "m g / 4 = 49 N"),
-        ("100 N each", MAX_THRUST, NUM_ROTORS * MAX_THRUST / MASS - GRAVITY, "4 · 100 N / m − g"),
-    ):
-        name, measured = f"2 s at {how}: acceleration", craft.climb(thrust)
-        yield Check(name, expected, measured, "m/s²", f"{_PAPER}: {source}")
+# ---- the ground, and random thrusts --------------------------------------------------------------
 
 
-def _spinning_top(craft: _Craft) -> Iterator[Check]:
-    """With Ixx = Iyy the rates about x and y turn about body z at (Izz − Ixx) / Ixx · ωz."""
+@_group
+def check_floor(craft: Craft) -> Iterator[Check]:
+    """In the air it touches nothing; dropped by 5 cm it comes to rest on the floor."""
     data = craft.ready()
-    data.qvel[3:] = _SPIN
-    seconds = craft.fly(data, 10.0)
-    ixx, izz = closed_form_inertia()
-    turned = complex(*_SPIN[:2]) * np.exp(1j * (izz - ixx) / ixx * _SPIN[2] * seconds)
-    miss = math.dist(data.qvel[3:], (turned.real, turned.imag, _SPIN[2]))
-    name = "tumbling 10 s: body rates against the symmetric top"
-    yield Check(name, 0.0, miss, "rad/s", _MECHANICS, _TRUNCATION)
+    mujoco.mj_forward(craft.model, data)
+    yield _near("contacts in free flight", data.ncon, 0, "", "level, 1000 m above the floor",
+                "it touches itself or something that reaches up there", 0)  # fmt: skip
+    rest, model = craft.rest_height, craft.falling(contact=True)
+    if math.isnan(rest):
+        yield _near("floor: height at rest", rest, 0, "m", _MODEL,
+                    "it touches something at any height: itself, or a wall")  # fmt: skip
+        return
+    data = craft.ready(model=model)
+    data.qpos[2] = rest + 0.05
+    _fly(model, data, 2.0)
+    falls = "it falls through the floor: no geom of it collides" if rest == 0.0 else ""
+    yield _near("floor: height at rest", float(data.qpos[2]), rest, "m", _MODEL,
+                falls or "it sinks into the floor, tips over, or does not fall", 1e-3)  # fmt: skip
+    for name, values, unit, most in (
+        ("speed", data.qvel[:3], "m/s", 1e-3), ("turning", data.qvel[3:], "rad/s", 1e-2),
+    ):  # fmt: skip
+        yield _near(f"floor: {name} at rest", float(np.linalg.norm(values)), 0, unit, _MECHANICS,
+                    falls or "it does not come to rest on the floor in 2 s", most)  # fmt: skip
 
 
-def _paper_drag(craft: _Craft) -> Iterator[Check]:
-    """With drag d, hovering at 10 m/s: v(t) = 10 exp(−d t), and a turn about z goes on."""
-    vehicle = Vehicle.load(craft.vehicle.path, linear_drag=0.5)
-    craft = _Craft(vehicle, vehicle.model)
-    data = craft.ready(vehicle.hover_thrust)
-    data.qvel[:] = (10.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    expected = 10 * math.exp(-0.5 * craft.fly(data, 2.0))
-    speed, turn = float(data.qvel[0]), float(data.qvel[5])
-    yield Check("speed after 2 s of drag 0.5 /s from 10 m/s", expected, speed, "m/s", _DRAG)
-    yield Check("turn of 1 rad/s after 2 s of linear drag", 1.0, turn, "rad/s", _DRAG)
+@_group
+def check_random_control(craft: Craft) -> Iterator[Check]:
+    """Two seconds of random thrusts within the limits, from 1 m above the floor: no warning."""
+    if not craft.rotors:
+        return
+    dice = np.random.default_rng(0)
+    data = craft.ready()
+    data.qpos[2] = 1.0 + (0.0 if math.isnan(craft.rest_height) else craft.rest_height)
+    step = float(craft.model.opt.timestep)
+    substeps = max(1, min(round(_CONTROL / step), _MOST_STEPS // 100))
+    newtons = np.array([rotor.newtons for rotor in craft.rotors])
+    told = ""
+    try:
+        for _ in range(round(2.0 / _CONTROL)):
+            data.ctrl[:] = dice.uniform(craft.thrust_low, craft.thrust_high) / newtons
+            _fly(craft.model, data, substeps * step)
+    except _Warned as warning:
+        told = str(warning)
+    yield _near("random thrusts: warnings", bool(told), 0, "", "MuJoCo, seed 0",
+                f"MuJoCo warned of {told or 'something'}: the simulation diverges", 0)  # fmt: skip

@@ -112,7 +112,6 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["compare", "--agents", "vpg", "vpg"], "agents: expected each once"),
         (["compare", "--out", "."], "expected a new folder"),
         (["report", "nowhere"], "nowhere"),
-        (["check-model", "nowhere.xml"], "vehicle: cannot read nowhere.xml"),
         (["sim", "--num-envs", "0", "--bind", "127.0.0.1:0"], "num_envs: expected 1 to 65536"),
         (["sim", "--num-envs", "2", "--codec", "text"], "text codec: expected one drone, got 2"),
         (["sim", "--key-file", "nowhere"], "key file: cannot read nowhere"),
@@ -305,9 +304,9 @@ def test_a_folder_of_that_name_in_the_working_directory(tmp_path: Path) -> None:
 def test_a_model_with_a_tiny_time_step(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = QUAD_XML.read_text(encoding="utf-8").replace('timestep="0.01"', 'timestep="1e-8"')
     (tmp_path / "quad.xml").write_text(model)
-    status, _, err = run(capsys, "check-model", tmp_path / "quad.xml")
+    status, out, _ = run(capsys, "check-model", tmp_path / "quad.xml")
     assert status == 1
-    assert "expected a physics step of at least" in err
+    assert "expected a physics step of at least" in out
 
 
 def test_a_key_on_a_full_disk(capsys: pytest.CaptureFixture[str]) -> None:
@@ -386,6 +385,38 @@ def test_check_model(capsys: pytest.CaptureFixture[str]) -> None:
     assert status == 0
     passed, checks = re.search(r"(\d+) of (\d+) checks passed", out).groups()  # type: ignore[union-attr]
     assert passed == checks
+    assert run(capsys, "check-model", Path(__file__).parent / "data" / "hexa.xml")[0] == 0
+
+
+def test_check_model_prints_json_and_exits_with_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = QUAD_XML.read_text(encoding="utf-8").replace('ctrlrange="0 100"', 'ctrlrange="0 50"')
+    (tmp_path / "weak.xml").write_text(text)
+    status, out, err = run(capsys, "check-model", tmp_path / "weak.xml", "--json")
+    report = json.loads(out)
+    failed = {check["name"]: check for check in report["checks"] if not check["passed"]}
+    assert (status, err, report["passed"]) == (1, "", False)
+    assert set(failed) == {"hover: thrust to weight", "hover: margin of the tightest rotor"}
+    assert failed["hover: thrust to weight"]["measured"] == pytest.approx(200 / 196)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (None, "vehicle: cannot read "),
+        ("nonsense", "vehicle: expected an MJCF file, got drone.xml: "),
+        ("<mujoco/>", "vehicle: expected one free body and no other joints, got 0 free of 0"),
+    ],
+)
+def test_check_model_of_what_is_no_vehicle(
+    text: str | None, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if text is not None:
+        (tmp_path / "drone.xml").write_text(text)
+    status, out, err = run(capsys, "check-model", tmp_path / "drone.xml")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"rotorgram: {sentence}")
 
 
 def test_train_with_many_drones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
