@@ -331,7 +331,7 @@ def _mend(spec: mujoco.MjSpec) -> Iterator[tuple[str, Array]]:
             xx, yy, zz, xy, xz, yz = body.fullinertia
             full = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
             moments = np.asarray(np.linalg.eigvalsh(full))
-        yield body.name, moments
+        yield body.name or "a body without a name", moments
         if not (moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - _TRUNCATION)):
             body.fullinertia = [math.nan, 0, 0, 0, 0, 0]
             body.inertia = np.full(3, max(float(np.abs(moments).mean()), 1e-12))
@@ -549,7 +549,7 @@ def check_allocation(craft: Craft) -> Iterator[Check]:
         if lack:
             meaning = f"no rotor gives a torque of {' or '.join(lack)} at constant thrust"
         yield _within(f"allocation: {names[one]} apart from {names[other]}", shared,
-                      Range(0, 0.9, "", "|cosine| between their rows: ours"), meaning)  # fmt: skip
+                      Range(0, 0.9, "", "size of the cosine of their rows: ours"), meaning)  # fmt: skip
     condition = float(values[0] / values[3]) if len(values) == 4 and values[3] > 1e-9 else math.inf
     yield _within("allocation: condition", condition,
                   Range(1, 20, "", "of rows of length 1: ours; 1 for a symmetric quadcopter"),
@@ -773,7 +773,7 @@ def check_physics_step(craft: Craft) -> Iterator[Check]:
     yield _within("physics step", craft.timestep,
                   Range(1e-5, step * (1 + _EXACT), "s", f"recommended: {why}"),
                   f"too long for this craft, or shorter than any flight needs: {step:g} s is the "
-                  "longest that is accurate", note=f"{error:.2g}° a second")  # fmt: skip
+                  "longest that is accurate", note=f"{error:.3g}° a second")  # fmt: skip
 
 
 @_group
