@@ -56,6 +56,9 @@ def _places() -> dict[str, str]:
         written_by_a_command = name.startswith("results/") and name.endswith(".md")
         if path.is_file() and path.suffix not in (".py", ".pyc") and not written_by_a_command:
             places[f"docs/{name}"] = name
+    for path in sorted((ROOT / "models" / "vehicles").glob("*/*")):
+        place = f"vehicles/{path.parent.name}/{path.name.replace('README', 'index')}"
+        places[path.relative_to(ROOT).as_posix()] = place
     for path in sorted((ROOT / "examples").glob("*.py")):
         places[f"examples/{path.name}"] = f"examples/{path.stem}.md"
     del places["docs/assets/mermaid/README.md"]
