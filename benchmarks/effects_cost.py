@@ -1,10 +1,10 @@
 """Control steps per second of a world with each effect, as a ratio to none.
 
-    python benchmarks/effects_cost.py [--seconds 0.5] [--repeats 7] [--out FILE.json]
+    python benchmarks/effects_cost.py [--seconds 0.1] [--repeats 25] [--out FILE.json]
 
 A control step is 0.02 s of the vehicle in `tests/data/racer.xml`, which has every coefficient: four
-physics steps, without a task. The cases take turns within a repeat, so that a machine that slows
-down slows all of them; the medians over the repeats are compared.
+physics steps, without a task. The cases take turns within a repeat, in an order that changes, so
+that a machine that slows down slows all of them; the medians over the repeats are compared.
 """
 
 import argparse
@@ -37,7 +37,7 @@ CASES: dict[str, dict[str, Any]] = {
 }
 CASES["all"] = {name: value for case in CASES.values() for name, value in case.items()}
 DRAWN = {"mass": "uniform(0.9, 1.1)", "thrust": "uniform(0.9, 1.1)"}
-EPISODE = 50  # control steps: within them a drone does not reach the ground
+EPISODE = 2  # control steps between two resets: short, so that the cases take turns often
 
 
 def steps_per_second(world: World, commands: np.ndarray, seconds: float) -> float:
@@ -63,8 +63,10 @@ def measure(num_drones: int, seconds: float, repeats: int) -> dict[str, Any]:
         drawn = Randomization(DRAWN, effects) if name == "randomize" else None
         worlds[name] = make_world(vehicle, num_drones, effects=effects, randomize=drawn)
     rates: dict[str, list[float]] = {name: [] for name in worlds}
+    dice = np.random.default_rng(0)
     for _ in range(repeats):
-        for name, world in worlds.items():
+        for name in dice.permutation(list(worlds)).tolist():
+            world = worlds[name]
             commands = np.broadcast_to(vehicle.hover_thrust, (*world.shape, vehicle.num_rotors))
             rates[name].append(round(steps_per_second(world, commands, seconds), 1))
     medians = {name: statistics.median(values) for name, values in rates.items()}
@@ -78,8 +80,8 @@ def measure(num_drones: int, seconds: float, repeats: int) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=0.5)
-    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--seconds", type=float, default=0.1)
+    parser.add_argument("--repeats", type=int, default=25)
     parser.add_argument("--out", type=Path, default=ROOT / "docs/results/effects/cost.json")
     args = parser.parse_args()
     drones = {str(n): measure(n, args.seconds, args.repeats) for n in (1, 1024)}

@@ -63,6 +63,9 @@ PROGRAMS = programs()
 INSTEAD = {
     # page: (what the page says, what is run, why)
     "README.md": [("10_000", "1_000", "the same, ten times")],
+    "docs/effects.md": [
+        ("tests/data/racer.xml", (ROOT / "tests/data/racer.xml").as_posix(), "seen from a clone"),
+    ],
     "docs/gpu.md": [
         ('4096, backend="warp", device="cuda"', '8, backend="warp", device="cpu"', "no GPU here"),
         ("range(250)", "range(2)", "Warp's CPU device is slow"),
