@@ -1,5 +1,6 @@
 """Effects against their closed forms, alone, in a batch, frozen, reset, and on either backend."""
 
+import json
 import math
 import re
 import xml.etree.ElementTree as ET
@@ -1063,3 +1064,16 @@ def test_the_page_has_every_effect_and_every_parameter() -> None:
         needs = " or ".join(f"`{effect}`" for effect in one.needs) or "–"
         assert f"| `{name}` | {one.meaning} | {unit} | {limits} | {needs} |" in page
     assert not re.search(r"\bNaN\b|TODO", page)
+
+
+def test_the_costs_on_the_page_are_those_that_were_measured() -> None:
+    page = (ROOT / "docs" / "effects.md").read_text()
+    cost = json.loads((ROOT / "docs" / "results" / "effects" / "cost.json").read_text())
+    one, many = cost["drones"]["1"], cost["drones"]["1024"]
+    assert one["ratio_to_none"]["none"] == many["ratio_to_none"]["none"] == 1.0
+    for name in one["ratio_to_none"]:
+        columns = [name.replace("_", " ")]
+        for drones in (one, many):
+            columns.append(f"{drones['steps_per_second'][name]:,.0f}")
+            columns.append(f"{drones['ratio_to_none'][name]:.2f}")
+        assert f"| {' | '.join(columns)} |" in page

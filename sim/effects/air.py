@@ -72,10 +72,10 @@ class AirEffects:
         """Begin at the motion of a state; factors (W, A) by parameter."""
         self._factors = factors
         self._before = kept(mask, _motion(state), self._before, self._xp)
-        if state.position.ndim == 1:
-            self._rotors = self._geometry.tolist()
-        else:
-            self._rotors = [[constant(x, state.position) for x in self._geometry.T]]
+        rows = self._geometry.tolist()
+        if state.position.ndim > 1:
+            rows = [[constant(x, state.position) for x in self._geometry.T]]
+        self._rotors = [(row[:3], row[3:]) for row in rows]
 
     def step(
         self, state: WorldState, thrust: Array, wind: list[Array], mask: Array | None
@@ -99,12 +99,16 @@ class AirEffects:
             torque = _cross(self._center, force)
         if self._options.rotor_drag or self._options.ground_effect:
             height = component(state.position, 2) + self._half * ahead[2]
-            pushes, twists = [], []
+            around = [each(number) for number in (*v, *w, *turn[6:], height)]
+            push: Any = None
+            twist: Any = None
             for rotor, part in zip(self._rotors, split(thrust), strict=True):
-                pushes.append(self._push(rotor, part, v, w, (*turn[6:], height)))
-                twists.append(_cross(rotor[:3], pushes[-1]))
-            force = _add(force, [total(list(x)) for x in zip(*pushes, strict=True)])
-            torque = _add(torque, [total(list(x)) for x in zip(*twists, strict=True)])
+                one = self._push(rotor, part, around)
+                turned = _cross(rotor[0], one)
+                push = one if push is None else _add(push, one)
+                twist = turned if twist is None else _add(twist, turned)
+            force = _add(force, [total([x]) for x in push])
+            torque = _add(torque, [total([x]) for x in twist])
         return stack((*_to_world(turn, force), *torque))
 
     def _body(self, v: Vector, w: Vector) -> Vector:
@@ -116,15 +120,16 @@ class AirEffects:
         x, y, z = (-factor * (linear + quadratic * speed) * u for linear, quadratic, u in both)
         return x, y, z
 
-    def _push(self, rotor: Any, thrust: Array, v: Vector, w: Vector, ground: Any) -> Any:
+    def _push(self, rotor: Any, thrust: Array, around: list[Array]) -> Vector:
         """Force of a part of the rotors besides their thrust, body axes.
 
-        `ground` is, of each body axis, its part upwards, and the height of the body's origin.
+        `around` has velocity and body rates, of each body axis its part upwards, and the height of
+        the body's origin.
         """
-        place, axis = rotor[:3], rotor[3:]
+        place, axis = rotor
         thrust, up, push = clip(thrust, 0.0, math.inf), 0.0, (0.0, 0.0, 0.0)
         if self._options.rotor_drag:
-            x, y, z = _add(_each(v), _cross(_each(w), place))
+            x, y, z = _add(around, _cross(around[3:6], place))
             along = x * axis[0] + y * axis[1] + z * axis[2]
             plane = (x - along * axis[0], y - along * axis[1], z - along * axis[2])
             speed = square_root(thrust / self._coefficient, self._xp)
@@ -135,7 +140,7 @@ class AirEffects:
             drag = -self._drag * speed
             push = (drag * plane[0], drag * plane[1], drag * plane[2])
         if self._options.ground_effect:
-            x, y, z, origin = _each(ground)
+            x, y, z, origin = around[6:]
             height = origin + (x * place[0] + y * place[1] + z * place[2])
             ratio = self._radius / (4 * clip(height, LEAST_HEIGHT * self._radius, math.inf))
             share = ratio * ratio
@@ -156,10 +161,6 @@ def _motion(state: WorldState) -> list[Array]:
     if state.velocity.ndim == 1:
         return [number for array in both for number in array.tolist()]
     return [array[..., axis] + 0.0 for array in both for axis in range(3)]
-
-
-def _each(values: Any) -> Any:
-    return [each(value) for value in values]
 
 
 def _add(a: Any, b: Any) -> Any:
