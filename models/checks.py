@@ -548,8 +548,8 @@ def check_allocation(craft: Craft) -> Iterator[Check]:
         meaning = f"{names[one]} signs follow the pattern of {names[other]}: none without the other"
         if lack:
             meaning = f"no rotor gives a torque of {' or '.join(lack)} at constant thrust"
-        yield _within(f"allocation: {names[one]} apart from {names[other]}", shared,
-                      Range(0, 0.9, "", "size of the cosine of their rows: ours"), meaning)  # fmt: skip
+        limit = Range(0, 0.9, "", "size of the cosine of their rows: ours")
+        yield _within(f"allocation: {names[one]} apart from {names[other]}", shared, limit, meaning)
     condition = float(values[0] / values[3]) if len(values) == 4 and values[3] > 1e-9 else math.inf
     yield _within("allocation: condition", condition,
                   Range(1, 20, "", "of rows of length 1: ours; 1 for a symmetric quadcopter"),
