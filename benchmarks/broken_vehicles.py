@@ -102,6 +102,8 @@ BROKEN: Final[dict[str, tuple[Edit, str]]] = {
     "no reactions": (reactions(0, 0, 0, 0), "allocation: rank"),
     "one reaction of the wrong sign": (
         reactions(0.05, -0.05, 0.05, 0.05), "turns: neighbours like rotor4"),
+    "one reaction ten times too large": (
+        reactions(0.05, -0.5, 0.05, -0.05), "turns: reaction of rotor2 / median"),
     "reaction a hundred times too large": (
         reactions(5, -5, 5, -5), "units: reaction / arm"),
     "mass in grams": (scaled(" mass", 1000), "units: mass / arm³"),

@@ -569,6 +569,7 @@ def check_turns(craft: Craft) -> Iterator[Check]:
                 "more rotors turn one way than the other: check the signs of the reactions"
                 if total > 0 else "no rotor has a reaction",
                 most)  # fmt: skip
+    sizes = np.abs(reactions) / (float(np.median(np.abs(reactions))) or math.nan)
     surplus = np.sign(share) if abs(share) > most else 0.0
     places = np.array([rotor.position for rotor in craft.rotors]) - craft.center
     around = np.argsort(np.arctan2(places[:, 1], places[:, 0]), kind="stable").tolist()
@@ -581,6 +582,9 @@ def check_turns(craft: Craft) -> Iterator[Check]:
                       Range(0, most_alike, "", "neighbours turn against each other"),
                       f"{rotor.name} turns like both its neighbours, and the turns do not cancel: "
                       "the sign of its reaction is wrong")  # fmt: skip
+        yield _within(f"turns: reaction of {rotor.name} / median", sizes[index],
+                      Range(0.2, 5, "", "ours: rotors of one craft are alike"),
+                      f"{rotor.name} has another reaction than the others")  # fmt: skip
 
 
 @_group
