@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from xml.etree import ElementTree
 
 from .errors import InputError, expect
 from .library import find_vehicle
@@ -25,14 +26,14 @@ def export_mjcf(vehicle: Path | str, out: Path) -> str:
             out.write_text(file.mjcf(), encoding="utf-8")
             return "every number with all its digits"
         path = file.model
-    spec = read_spec(find_vehicle(vehicle))
-    folders = (spec.meshdir, spec.texturedir)
-    spec.meshdir, spec.texturedir = (
-        os.path.relpath(path.parent / folder, out.resolve().parent) for folder in folders
-    )
     try:
-        text = spec.to_xml()
+        root = ElementTree.fromstring(read_spec(find_vehicle(vehicle)).to_xml())
     except (ValueError, RuntimeError) as error:
         raise InputError(f"vehicle: expected a model that MuJoCo can write, got {error}") from None
+    for compiler in root.iter("compiler"):  # folders of meshes and textures, as seen from `out`
+        for key in ("meshdir", "texturedir"):
+            folder = path.parent / compiler.get(key, "")
+            compiler.set(key, os.path.relpath(folder, out.resolve().parent))
+    text = ElementTree.tostring(root, encoding="unicode") + "\n"
     out.write_text(text, encoding="utf-8")
     return "numbers with the six digits that MuJoCo writes"

@@ -97,7 +97,7 @@ class Vehicle:
         right = isinstance(linear_drag, int | float | np.floating) and 0 <= linear_drag <= MOST_DRAG
         expect(right, "linear_drag", f"a number from 0 to {MOST_DRAG:g} /s", f"{linear_drag!r}")
         try:
-            changed = file.stat().st_mtime_ns
+            changed = tuple(one.stat().st_mtime_ns for one in _files(file))
         except OSError as error:
             raise InputError(f"vehicle: cannot read {path}: {error.strerror}") from None
         return _load(file, float(linear_drag) + 0.0, changed)  # no negative zero
@@ -250,7 +250,7 @@ def _check_flyable(model: mujoco.MjModel) -> None:
 
 
 @lru_cache(maxsize=32)
-def _load(path: Path, drag: float, changed: int) -> Vehicle:
+def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
     del changed  # a file that was written anew is another key
     spec, text, model, data = compile_vehicle(path)
     _check_flyable(model)
@@ -431,6 +431,12 @@ def _hash(spec: mujoco.MjSpec, text: str, path: Path, drag: float) -> str:
         if asset.file and file.is_file():
             digest.update(file.read_bytes())
     return digest.hexdigest()
+
+
+def _files(path: Path) -> tuple[Path, ...]:
+    """A vehicle's file, and that of its model if it names one."""
+    model = read_vehicle_file(path).model if _is_toml(path) else None
+    return (path,) if model is None else (path, model)
 
 
 def _is_toml(path: Path) -> bool:

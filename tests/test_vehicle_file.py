@@ -4,6 +4,7 @@ Expected values are written out: geometry, moments of inertia of boxes and cylin
 """
 
 import math
+import os
 import pickle
 import re
 from pathlib import Path
@@ -276,8 +277,6 @@ def test_the_hash_is_of_numbers_to_the_last_digit(tmp_path: Path) -> None:
 
 
 def test_a_file_that_was_written_anew_is_read_anew(tmp_path: Path) -> None:
-    import os
-
     first = load(tmp_path, CRAFT)
     assert Vehicle.load(first.path) is first
     write(tmp_path, CRAFT.replace("1.5", "1.6"))
@@ -534,6 +533,36 @@ def test_exported_mjcf_flies_bit_for_bit_in_mujoco_alone(tmp_path: Path) -> None
     assert again.coefficients == vehicle.coefficients
     assert again.coefficients.rotors.radius == 0.0987654321
     assert (again.allocation == vehicle.allocation).all()
+
+
+def test_meshes_of_a_models_file(tmp_path: Path) -> None:
+    def shape(size: float) -> None:  # a tetrahedron, as binary STL
+        a, b, c, d = size * np.array(((-1, -1, -1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)))
+        faces = np.array(((a, b, c), (a, d, b), (a, c, d), (b, d, c)), "<f4").reshape(4, 9)
+        rows = [bytes(12) + face.tobytes() + bytes(2) for face in faces]
+        (tmp_path / "shapes" / "hull.stl").write_bytes(bytes(80) + b"\4\0\0\0" + b"".join(rows))
+
+    for folder in ("shapes", "out"):
+        (tmp_path / folder).mkdir()
+    shape(0.05)
+    tiny = (ROOT / "tests" / "data" / "tiny.xml").read_text()
+    text = tiny.replace("<option", '<compiler meshdir="shapes"/><option', 1).replace(
+        "<worldbody>", '<asset><mesh name="hull" file="hull.stl"/></asset><worldbody>'
+    )
+    hull = '<freejoint/><geom type="mesh" mesh="hull" mass="0.01" contype="1" conaffinity="1"/>'
+    write(tmp_path, text.replace("<freejoint/>", hull), "model.xml")
+    vehicle = load(tmp_path, '[model]\nfile = "model.xml"\n')
+    assert vehicle.rest_height == pytest.approx(0.05, abs=1e-4)
+    export_mjcf(vehicle.path, tmp_path / "out" / "craft.xml")
+    assert Vehicle.load(tmp_path / "out" / "craft.xml").rest_height == pytest.approx(
+        vehicle.rest_height, abs=1e-6
+    )
+    shape(0.06)
+    os.utime(tmp_path / "shapes" / "hull.stl", (1, 1))  # MuJoCo keeps meshes by the second
+    os.utime(tmp_path / "model.xml", (1, 1))
+    again = Vehicle.load(vehicle.path)
+    assert again.rest_height == pytest.approx(0.06, abs=1e-4)
+    assert again.hash != vehicle.hash
 
 
 def test_export_of_a_models_file_keeps_six_digits(tmp_path: Path) -> None:
