@@ -390,7 +390,7 @@ def _number(name: str, one: Field[Any], given: Any, source: str) -> Number:
     for key, text in texts.items():
         expect(isinstance(text, str), f"{name}.{key}", "a text", repr(text))
     others = []
-    for i, other in enumerate(_tables(f"{name}.others", told.get("others", [])), 1):
+    for i, other in enumerate(_tables(f"{name}.others", told.get("others", []), least=0), 1):
         _check_keys(f"{name}.others[{i}]", other, ("value", "source"))
         expect("value" in other, f"{name}.others[{i}]", "a value", "none")
         where = other.get("source", "")
@@ -413,8 +413,10 @@ def _check_keys(name: str, table: Any, known: Sequence[str], *silent: str) -> No
         expect(right, name, f"some of {', '.join(known)}", repr(key))
 
 
-def _tables(name: str, given: Any) -> list[Any]:
-    expect(isinstance(given, list), name, "a list of tables", f"{given!r:.80}")
+def _tables(name: str, given: Any, least: int = 1) -> list[Any]:
+    right = isinstance(given, list) and len(given) >= least
+    wanted = "a list of tables" + ", at least one" * least
+    expect(right, name, wanted, f"{given!r:.80}")
     return list(given)
 
 

@@ -316,6 +316,7 @@ def test_a_file_that_was_written_anew_is_read_anew(tmp_path: Path) -> None:
         ("[body]", "[bdoy]", "vehicle: expected some of .*body, rotors.*, got 'bdoy'"),
         ("[body]", "[[body]]", r"body: expected a table, got \[\{'mass"),
         (BODY, "", r"vehicle: expected a table \[body\], or \[model\] with a file, got neither"),
+        (BODY, "body.parts = []", r"body.parts: expected a list of tables, at least one, got \[\]"),
         (
             "mass = 1.5",
             "mass = 1.5\nparts = [ { shape = 'box' } ]",
