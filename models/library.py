@@ -25,8 +25,8 @@ def find_vehicle(vehicle: Path | str | None) -> Path:
     if word in vehicle_names() and not path.is_file():
         return (LIBRARY / word / "vehicle.toml").resolve()
     if path.suffix == "" and path.name == word and not path.exists():
-        known = ", ".join(["a file", *vehicle_names()])
-        raise InputError(f"vehicle: expected one of {known}, got {word!r}")
+        known = ", ".join(vehicle_names())
+        raise InputError(f"vehicle: expected a file, or one of {known}, got {word!r}")
     urdf = path.suffix.lower() == ".urdf"
     wanted = f"a TOML file that names the rotors, with [model] and file = {path.name!r}"
     expect(not urdf, "vehicle", wanted, "the URDF file itself")

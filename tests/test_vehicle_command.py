@@ -108,7 +108,7 @@ def test_export(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (["export", "there.toml", "x.txt"], "out: expected a name that ends in .xml, got x.txt"),
         (["show", "there.toml", "x.xml"], "vehicle: expected one file for show, got x.xml too"),
         (["show", "there.toml", "--frame", "cross"], "frame: expected no --frame but with new"),
-        (["show", "nobodys"], "vehicle: expected one of a file.*, got 'nobodys'"),
+        (["show", "nobodys"], "vehicle: expected a file, or one of .*paper.*, got 'nobodys'"),
         (["check", "nowhere.toml"], "vehicle: cannot read nowhere.toml: No such file"),
         (["check", "there.toml"], "vehicle: expected a table .body., or .model. .*, got neither"),
     ],
