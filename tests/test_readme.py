@@ -48,7 +48,10 @@ def test_the_navigation_has_every_page_once(stage: dict[str, Any]) -> None:
     listed = pages_of(site()["nav"])
     scripts = {f"examples/{path.stem}.md" for path in (ROOT / "examples").glob("*.py")}
     pages = {place for place in stage["_places"]().values() if place.endswith(".md")}
-    assert sorted(listed) == sorted(pages - scripts)
+    vehicles = {page for page in pages if page.startswith("vehicles/")}  # the library links to them
+    library = (ROOT / "docs" / "library.md").read_text(encoding="utf-8")
+    assert all(f"/{page.split('/')[1]}/README.md)" in library for page in vehicles)
+    assert sorted(listed) == sorted(pages - scripts - vehicles)
 
 
 def test_the_readme_lists_what_the_navigation_has(stage: dict[str, Any]) -> None:
