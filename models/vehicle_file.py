@@ -5,6 +5,7 @@ Body frame: x forward, y left, z up; SI units.
 
 import json
 import math
+import os
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import Field, dataclass, field
@@ -645,12 +646,15 @@ def _nearest(rotors: Sequence[PlacedRotor], reach: float) -> float:
 
 def _complete(spec: mujoco.MjSpec, file: VehicleFile) -> None:
     """Add to the spec of a model's file what the TOML file tells of it."""
-    urdf = file.model is not None and file.model.suffix.lower() == ".urdf"
+    assert file.model is not None  # `build` has seen to it
+    urdf = file.model.suffix.lower() == ".urdf"
     spec.modelname = file.name
     if urdf:
+        _find_meshes(spec, file.model.parent)
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
         spec.compiler.fusestatic = False  # it would fuse the root with the world
         root = spec.worldbody.first_body()
+        expect(root is not None, "model.file", "a URDF file with links", "none")
         if not list(root.joints):
             root.add_freejoint()
     if urdf or file.value("timestep"):
@@ -668,6 +672,20 @@ def _complete(spec: mujoco.MjSpec, file: VehicleFile) -> None:
     for name, values in file.coefficients.items():
         numeric = spec.numeric(PREFIX + name) or spec.add_numeric(name=PREFIX + name)
         numeric.size, numeric.data = len(values), values
+
+
+def _find_meshes(spec: mujoco.MjSpec, folder: Path) -> None:
+    """Meshes of a package are looked for in the folder of a URDF file, and in those above it."""
+    for mesh in spec.meshes:
+        if not mesh.file.startswith("package:"):
+            continue
+        inside = Path(mesh.file.removeprefix("package:").lstrip("/"))
+        ways = inside, inside.relative_to(inside.parts[0])  # with the package's name, or without
+        places = (up / way for up in (folder, *folder.parents) for way in ways)
+        found = next((place for place in places if place.is_file()), None)
+        got = f"no file for {mesh.file}"
+        expect(found, "model.file", "its meshes in its folder or one above", got)
+        mesh.file = os.path.relpath(str(found), folder)
 
 
 def _add_rotor(spec: mujoco.MjSpec, file: VehicleFile, rotor: PlacedRotor, number: int) -> None:

@@ -464,6 +464,28 @@ def test_urdf(tmp_path: Path) -> None:
     assert env.action_space.shape == (4,)
 
 
+@pytest.mark.parametrize("place", ["hull.stl", "meshes/hull.stl"])
+def test_meshes_of_a_package_are_found_above_a_urdf_file(place: str, tmp_path: Path) -> None:
+    (tmp_path / "urdf").mkdir()
+    mesh = f'<mesh filename="package://{tmp_path.name}/{place}"/>'
+    urdf = URDF.format(links=LINKS).replace('<box size="0.2 0.2 0.1"/>', mesh)
+    write(tmp_path / "urdf", urdf, "quad.urdf")
+    with pytest.raises(
+        InputError, match=r"^model.file: expected its meshes .*, got no file for pack"
+    ):
+        load(tmp_path / "urdf", OF_URDF)
+    tetrahedron(tmp_path / place, 0.07)
+    vehicle = load(tmp_path / "urdf", OF_URDF)
+    assert vehicle.rest_height == pytest.approx(0.07, abs=1e-4)
+    assert vehicle.mass == pytest.approx(1.0)
+
+
+def test_a_urdf_file_without_links(tmp_path: Path) -> None:
+    write(tmp_path, '<robot name="nothing"/>', "quad.urdf")
+    with pytest.raises(InputError, match=r"^model.file: expected a URDF file with links, got none"):
+        load(tmp_path, OF_URDF)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
@@ -536,16 +558,19 @@ def test_exported_mjcf_flies_bit_for_bit_in_mujoco_alone(tmp_path: Path) -> None
     assert (again.allocation == vehicle.allocation).all()
 
 
-def test_meshes_of_a_models_file(tmp_path: Path) -> None:
-    def shape(size: float) -> None:  # a tetrahedron, as binary STL
-        a, b, c, d = size * np.array(((-1, -1, -1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)))
-        faces = np.array(((a, b, c), (a, d, b), (a, c, d), (b, d, c)), "<f4").reshape(4, 9)
-        rows = [bytes(12) + face.tobytes() + bytes(2) for face in faces]
-        (tmp_path / "shapes" / "hull.stl").write_bytes(bytes(80) + b"\4\0\0\0" + b"".join(rows))
+def tetrahedron(file: Path, size: float) -> None:
+    """Binary STL of a tetrahedron in a cube of twice the size, m."""
+    a, b, c, d = size * np.array(((-1, -1, -1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)))
+    faces = np.array(((a, b, c), (a, d, b), (a, c, d), (b, d, c)), "<f4").reshape(4, 9)
+    rows = [bytes(12) + face.tobytes() + bytes(2) for face in faces]
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(bytes(80) + b"\4\0\0\0" + b"".join(rows))
 
-    for folder in ("shapes", "out"):
-        (tmp_path / folder).mkdir()
-    shape(0.05)
+
+def test_meshes_of_a_models_file(tmp_path: Path) -> None:
+    mesh = tmp_path / "shapes" / "hull.stl"
+    (tmp_path / "out").mkdir()
+    tetrahedron(mesh, 0.05)
     tiny = (ROOT / "tests" / "data" / "tiny.xml").read_text()
     text = tiny.replace("<option", '<compiler meshdir="shapes"/><option', 1).replace(
         "<worldbody>", '<asset><mesh name="hull" file="hull.stl"/></asset><worldbody>'
@@ -558,8 +583,8 @@ def test_meshes_of_a_models_file(tmp_path: Path) -> None:
     assert Vehicle.load(tmp_path / "out" / "craft.xml").rest_height == pytest.approx(
         vehicle.rest_height, abs=1e-6
     )
-    shape(0.06)
-    os.utime(tmp_path / "shapes" / "hull.stl", (1, 1))  # MuJoCo keeps meshes by the second
+    tetrahedron(mesh, 0.06)
+    os.utime(mesh, (1, 1))  # MuJoCo keeps meshes by the second
     os.utime(tmp_path / "model.xml", (1, 1))
     again = Vehicle.load(vehicle.path)
     assert again.rest_height == pytest.approx(0.06, abs=1e-4)
