@@ -85,12 +85,13 @@ class Effects:
         N·m), (W, A, 6).
         """
         mean = end = state.command
+        root = None
         if self.on_rotors:
-            mean, end = self._rotors.step(state.command, mask)
+            mean, end, root = self._rotors.step(state.command, mask)
         if not self.on_body:
             return mean, end, None
         wind = self._wind
         if self._gusts is not None:
             gust = self._gusts.step(mask, self._noise.normal(mask))
             wind = [a + b for a, b in zip(wind, gust, strict=True)]
-        return mean, end, self._air.step(state, mean, wind, mask)
+        return mean, end, self._air.step(state, mean, root, wind, mask)

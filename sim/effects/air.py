@@ -50,13 +50,14 @@ class AirEffects:
             slope = max(self._linear) + 2 * math.sqrt(max(self._quadratic) * weight)
             _check_stiffness(vehicle, slope, "drag of the body")
         if options.rotor_drag:
-            (self._coefficient,) = told.need("rotors.thrust_coefficient", "rotor_drag")
+            (coefficient,) = told.need("rotors.thrust_coefficient", "rotor_drag")
+            self._slope = math.sqrt(coefficient)  # of the square root of a thrust over the speed
             three = (told.rotors.drag, told.rotors.inflow, told.rotors.lift)
             some = any(value is not None for value in three)
             expected = "rotors.drag, inflow or lift in the vehicle's file, which rotor_drag needs"
             expect(some, "vehicle", expected, "none")
             self._drag, self._inflow, self._lift = (value or 0.0 for value in three)
-            speeds = np.sqrt(np.maximum(vehicle.thrust_high, 0.0) / self._coefficient)
+            speeds = np.sqrt(np.maximum(vehicle.thrust_high, 0.0)) / self._slope
             slope = max(self._drag, self._inflow) * float(speeds.sum())
             # Of a turn: about the least moment of inertia, at the longest arm.
             arm = float(((self._geometry[:, :3] - vehicle.center_of_mass) ** 2).sum(axis=1).max())
@@ -78,12 +79,18 @@ class AirEffects:
         self._rotors = [(row[:3], row[3:]) for row in rows]
 
     def step(
-        self, state: WorldState, thrust: Array, wind: list[Array], mask: Array | None
+        self,
+        state: WorldState,
+        thrust: Array,
+        root: Array | None,
+        wind: list[Array],
+        mask: Array | None,
     ) -> Array:
         """Mean force, world frame, N, and torque about the body's origin, body frame, N·m.
 
-        Shape (W, A, 6); thrust (W, A, R), N; wind: the velocity of the air, world frame, m/s,
-        three of shape (W, A) or numbers for all.
+        Shape (W, A, 6); mean thrust (W, A, R), N, and mean of its square root, None where it does
+        not change over the step; wind: the velocity of the air, world frame, m/s, three of shape
+        (W, A) or numbers for all.
         """
         now = _motion(state)
         # The middle of the step: half of the last step's change further.
@@ -102,8 +109,10 @@ class AirEffects:
             around = [each(number) for number in (*v, *w, *turn[6:], height)]
             push: Any = None
             twist: Any = None
-            for rotor, part in zip(self._rotors, split(thrust), strict=True):
-                one = self._push(rotor, part, around)
+            parts = split(thrust)
+            roots = [None] * len(parts) if root is None else split(root)
+            for rotor, part, mean_root in zip(self._rotors, parts, roots, strict=True):
+                one = self._push(rotor, part, mean_root, around)
                 turned = _cross(rotor[0], one)
                 push = one if push is None else _add(push, one)
                 twist = turned if twist is None else _add(twist, turned)
@@ -120,8 +129,8 @@ class AirEffects:
         x, y, z = (-factor * (linear + quadratic * speed) * u for linear, quadratic, u in both)
         return x, y, z
 
-    def _push(self, rotor: Any, thrust: Array, around: list[Array]) -> Vector:
-        """Force of a part of the rotors besides their thrust, body axes.
+    def _push(self, rotor: Any, thrust: Array, root: Array | None, around: list[Array]) -> Vector:
+        """Force of a part of the rotors besides their thrust, body axes; the root as of `step`.
 
         `around` has velocity and body rates, of each body axis its part upwards, and the height of
         the body's origin.
@@ -132,7 +141,8 @@ class AirEffects:
             x, y, z = _add(around, _cross(around[3:6], place))
             along = x * axis[0] + y * axis[1] + z * axis[2]
             plane = (x - along * axis[0], y - along * axis[1], z - along * axis[2])
-            speed = square_root(thrust / self._coefficient, self._xp)
+            root = square_root(thrust, self._xp) if root is None else root
+            speed = root / self._slope
             if "rotor_drag" in self._factors:
                 speed = speed * each(self._factors["rotor_drag"])
             sideways = plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2]

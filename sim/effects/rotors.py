@@ -90,8 +90,12 @@ class RotorEffects:
             (self.charge,) = kept(mask, [charge], [self.charge], xp)
             self.voltage = self._terminal()
 
-    def step(self, command: Array, mask: Array | None) -> tuple[Array, Array]:
-        """Advance by a physics step: mean thrusts over it, and those at its end, (W, A, R), N."""
+    def step(self, command: Array, mask: Array | None) -> tuple[Array, Array, Array | None]:
+        """Advance by a physics step: mean thrusts over it, and those at its end, (W, A, R), N.
+
+        Third, the mean of their square roots over it, which is proportional to the mean speed; None
+        where the thrusts do not change over it.
+        """
         xp, options = self._xp, self._options
         limits = zip(split(command), self._low, self._high, strict=True)
         target = [clip(part, low, high) for part, low, high in limits]
@@ -105,11 +109,13 @@ class RotorEffects:
             scale = each(share * share)
             target = [part * scale for part in target]
         mean = end = target
+        middle: Parts | None = None
         if options.motor_lag:
             both = zip(self._roots, target, strict=True)
             followed = [self._follow(root, square_root(part, xp)) for root, part in both]
             mean = [one[0] for one in followed]
             roots = [one[1] for one in followed]
+            middle = [one[2] for one in followed]
             end = [root * root for root in roots]
             self._roots = kept(None if mask is None else mask[..., None], roots, self._roots, xp)
         if options.battery:
@@ -123,7 +129,10 @@ class RotorEffects:
                 [part * scale for part, scale in zip(parts, scales, strict=True)]
                 for parts in (mean, end)
             )
-        return _join(mean), _join(end)
+            if middle is not None:
+                both = zip(middle, scales, strict=True)
+                middle = [part * square_root(scale, xp) for part, scale in both]
+        return _join(mean), _join(end), None if middle is None else _join(middle)
 
     def _answer(self, time: Array) -> tuple[Array, Array, Array]:
         """Of a speed that follows with a time constant: what a physics step changes.
@@ -135,8 +144,8 @@ class RotorEffects:
         gone = -(float(np.expm1(-ratio)) if number else self._xp.expm1(-ratio))
         return gone, gone / ratio, gone * (2 - gone) / (2 * ratio)
 
-    def _follow(self, root: Any, wanted: Any) -> tuple[Any, Any]:
-        """Mean square over a step of what begins at `root` and follows `wanted`, and its end."""
+    def _follow(self, root: Any, wanted: Any) -> tuple[Any, Any, Any]:
+        """Of what begins at `root` and follows `wanted` over a step: mean square, end and mean."""
         off = root - wanted
         answer = self._answers[0]
         if len(self._answers) == 2:
@@ -149,7 +158,7 @@ class RotorEffects:
         gone, first, second = answer
         # The square of: wanted + off · exp(-t / time).
         mean = wanted * wanted + off * (2 * wanted * first + off * second)
-        return mean, root - off * gone
+        return mean, root - off * gone, wanted + off * first
 
     def _open_voltage(self) -> Array:
         return self._empty + (self._full - self._empty) * self.charge
