@@ -223,6 +223,8 @@ def test_rotors_that_need_more_than_the_battery_gives(tmp_path: Path) -> None:
 
 def test_efficiency_of_one_rotor_turns_the_craft() -> None:
     world = begin(world_of(efficiency=(1, 0.5, 1, 1)))
+    np.testing.assert_allclose(world.state.thrust, (HOVER, HOVER / 2, HOVER, HOVER))
+    np.testing.assert_allclose(world.state.command, HOVER)
     acceleration, turn = pushed(world)
     # Rotor 2, at (-0.14, -0.12) m, lacks HOVER / 2 and its reaction of -0.02 N·m/N.
     lost = HOVER / 2

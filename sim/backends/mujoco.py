@@ -126,7 +126,7 @@ class MujocoWorld:
                 self.parameters[name] = plain(kept)
             self._varied.apply(ids, self.parameters)
         if self.effects is not None:
-            self.effects.begin(mask, state, self.parameters)
+            state.thrust[here] = self.effects.begin(mask, state, self.parameters)[here]
         self._place_payload(ids)
         self._apply_thrust(self._thrust)
         # To wake the threads takes longer than a few worlds.

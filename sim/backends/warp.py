@@ -148,7 +148,8 @@ class WarpWorld:
                 self.parameters[name] = new if old is None else torch.where(mask, new, old)
             self._varied.apply(self.parameters)
         if self.effects is not None:
-            self.effects.begin(mask, state, self.parameters)
+            thrust = self.effects.begin(mask, state, self.parameters)
+            state.thrust.copy_(torch.where(rows, thrust, state.thrust))
         if self._cable is not None:
             self._place_payload(mask, self._cable)
         self._apply_thrust(state.thrust)

@@ -63,19 +63,22 @@ class Effects:
             self._gusts = Gusts(options.gusts, options.wind, vehicle.timestep, xp)
             self._noise = noise(NUMBERS, GUSTS)
 
-    def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> None:
+    def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> Array:
         """Begin episodes of the worlds of a mask, bool, (W, A), at their rows of `state`.
 
-        Factors of the drawn parameters by name, (W, A), for all worlds.
+        Factors of the drawn parameters by name, (W, A), for all worlds. Gives the thrusts of those
+        that begin, (W, A, R), N.
         """
+        thrust = state.thrust
         if self.on_rotors:
-            self._rotors.begin(mask, state.thrust, factors)
+            thrust = self._rotors.begin(mask, thrust, factors)
         if self.on_body:
             self._air.begin(mask, state, factors)
         if self._gusts is not None:
             self._gusts.begin(mask, component(state.position, 2), self._noise.normal(mask))
         both = zip(self._mean_wind, WINDS, strict=True)
         self._wind = [mean + factors.get(name, 0.0) for mean, name in both]
+        return thrust
 
     def step(self, state: WorldState, mask: Array | None) -> tuple[Array, Array, Array | None]:
         """Advance the worlds of a mask, None for all, by a physics step, from `state` on.

@@ -71,8 +71,11 @@ class RotorEffects:
         self.charge: Array = None
         self.voltage: Array = None
 
-    def begin(self, mask: Array, thrust: Array, factors: dict[str, Array]) -> None:
-        """Begin with rotors that give such thrusts, (W, A, R); factors (W, A) by parameter."""
+    def begin(self, mask: Array, thrust: Array, factors: dict[str, Array]) -> Array:
+        """Begin at the speeds of rotors that would give such thrusts; factors (W, A) by parameter.
+
+        Gives the thrusts that they do give, (W, A, R), N.
+        """
         xp, options = self._xp, self._options
         self._low, self._high = (_of_rotors(x, thrust) for x in self._limits)
         self._scales = []
@@ -89,6 +92,7 @@ class RotorEffects:
             charge = factors.get("battery_charge", 1.0) + 0.0 * component(thrust, 0)
             (self.charge,) = kept(mask, [charge], [self.charge], xp)
             self.voltage = self._terminal()
+        return _join(self._scaled(split(thrust)))
 
     def step(self, command: Array, mask: Array | None) -> tuple[Array, Array, Array | None]:
         """Advance by a physics step: mean thrusts over it, and those at its end, (W, A, R), N.
@@ -124,15 +128,18 @@ class RotorEffects:
             (self.charge,) = kept(mask, [left], [self.charge], xp)
             if options.motor_lag:
                 self.voltage = self._terminal()
-        for scales in self._scales:
-            mean, end = (
-                [part * scale for part, scale in zip(parts, scales, strict=True)]
-                for parts in (mean, end)
-            )
-            if middle is not None:
+        if middle is not None:
+            for scales in self._scales:
                 both = zip(middle, scales, strict=True)
                 middle = [part * square_root(scale, xp) for part, scale in both]
-        return _join(mean), _join(end), None if middle is None else _join(middle)
+        speed = None if middle is None else _join(middle)
+        return _join(self._scaled(mean)), _join(self._scaled(end)), speed
+
+    def _scaled(self, parts: Parts) -> Parts:
+        """What rotors with their efficiency and the drawn factor give."""
+        for scales in self._scales:
+            parts = [part * scale for part, scale in zip(parts, scales, strict=True)]
+        return parts
 
     def _answer(self, time: Array) -> tuple[Array, Array, Array]:
         """Of a speed that follows with a time constant: what a physics step changes.
