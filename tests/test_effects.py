@@ -304,6 +304,47 @@ def test_rotors_of_a_turning_craft(tmp_path: Path) -> None:
     np.testing.assert_allclose(turn, (roll / 4e-3, 0, 0), rtol=1e-3, atol=1e-6)
 
 
+def test_rotors_with_tilted_axes(tmp_path: Path) -> None:
+    """Rotors 1 and 2, on the right, lean outwards by 0.3 rad, and the others to the left."""
+    lean = {-1: math.sin(-0.3), 1: math.sin(0.3)}
+    text = RACER.read_text().replace('timestep="0.005"', 'timestep="1e-4"')
+    for index, side in ((1, -1), (2, -1), (3, 1), (4, 1)):
+        before = f'site="r{index}" gear="0 0 1'
+        text = text.replace(before, f'site="r{index}" gear="0 {lean[side]} {math.cos(0.3)}')
+    file = tmp_path / "tilted.xml"
+    file.write_text(text)
+    vehicle = Vehicle.load(file)
+    thrust = vehicle.hover_thrust[0]
+    assert thrust == pytest.approx(HOVER / math.cos(0.3), rel=1e-6)
+    world = world_of(vehicle, rotor_drag=True, ground_effect=True)
+    velocity, height = np.array((3.0, 2.0, 1.0)), 0.2
+    acceleration, turn = pushed(begin(world, height, velocity=velocity), vehicle.hover_thrust)
+    force, torque, speed = np.zeros(3), np.zeros(3), math.sqrt(thrust / K)
+    more = thrust * (1 / (1 - (0.1 / (4 * (height + 0.02))) ** 2) - 1)
+    for x, y in ((0.14, -0.12), (-0.14, -0.12), (-0.14, 0.12), (0.14, 0.12)):
+        axis = np.array((0, lean[1 if y > 0 else -1], math.cos(0.3)))
+        along = velocity @ axis
+        plane = velocity - along * axis
+        push = -1e-4 * speed * plane
+        push = push + (more - 2e-4 * speed * along + 3e-3 * plane @ plane) * axis
+        force += push
+        torque += np.cross((x, y, 0.01), push)  # about the center of mass
+    expected = torque / (4e-3, 5e-3, 8e-3)
+    np.testing.assert_allclose(turn, expected, rtol=2e-3, atol=1e-3)
+    origin = force / M + np.cross(expected, (0, 0, -0.01))
+    np.testing.assert_allclose(acceleration, origin, rtol=2e-3, atol=1e-3)
+
+
+def test_drag_at_its_limit_is_stable(tmp_path: Path) -> None:
+    """Half of the mass over the physics step, 60 N s/m; the rotors' as a turn's."""
+    vehicle = racer(tmp_path, drag_linear="60 60 60", drag_quadratic=None)
+    world = fly(begin(world_of(vehicle, body_drag=True), velocity=[5.0, -5.0, 0.0]), HOVER, 100)
+    np.testing.assert_allclose(world.state.velocity, 0.0, atol=1e-9)
+    vehicle = racer(tmp_path, rotors_inflow="0.003", rotors_drag="0", rotors_lift="0")
+    world = fly(begin(world_of(vehicle, rotor_drag=True), body_rates=[3.0, 0.0, 0.0]), HOVER, 400)
+    np.testing.assert_allclose(world.state.body_rates, 0.0, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("radii", "ratio"),
     [(0.3, 4 / 3), (0.5, 4 / 3), (1.0, 16 / 15), (2.0, 64 / 63), (50.0, 40000 / 39999)],
