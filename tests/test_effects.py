@@ -393,13 +393,31 @@ def test_linear_drag_of_the_option_is_against_the_ground_in_any_wind(tmp_path: P
     np.testing.assert_allclose(world.state.velocity, (0, 0, 1.5), rtol=1e-6, atol=1e-9)
 
 
-def test_the_order_of_the_air_forces_is_two(tmp_path: Path) -> None:
-    options = {**EVERYTHING, "battery": False}
+def test_drag_of_a_turning_craft_is_that_of_its_center(tmp_path: Path) -> None:
+    vehicle = racer(tmp_path, timestep=1e-4, drag_linear="0.3 0.3 0.3", drag_quadratic=None)
+    world = begin(world_of(vehicle, body_drag=True), body_rates=[5.0, 0, 0])
+    acceleration, turn = pushed(world, 0.0)
+    # The center of mass, 1 cm over the origin, moves at -0.05 m/s along y, and about the origin.
+    np.testing.assert_allclose(acceleration, (0, 0.3 * 0.05 / M, 25 * 0.01 - G), rtol=1e-2)
+    np.testing.assert_allclose(turn, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "height", "rates"),
+    [
+        ({**EVERYTHING, "battery": False}, 0.6, [2.0, -1.0, 3.0]),
+        ({"ground_effect": True}, 0.07, [0] * 3),
+    ],
+    ids=["all", "ground_effect"],
+)
+def test_the_order_of_the_air_forces_is_two(
+    tmp_path: Path, options: dict[str, Any], height: float, rates: list[float]
+) -> None:
     ends = []
-    for step in (0.01, 0.005, 0.0025, 0.00125):
+    for step in (0.005, 0.0025, 0.00125, 0.000625):
         world = world_of(racer(tmp_path, timestep=step), **options)
-        begin(world, 0.6, velocity=[4.0, -3.0, 1.0], body_rates=[2.0, -1.0, 3.0])
-        fly(world, (3.0, 3.1, 3.2, 3.0), round(0.3 / step))
+        begin(world, height, velocity=[4.0, -3.0, 1.0], body_rates=rates)
+        fly(world, (3.0, 3.1, 3.2, 3.0), round(0.2 / step))
         ends.append(np.concatenate((world.state.position, world.state.velocity)))
     gaps = [float(np.linalg.norm(a - b)) for a, b in pairwise(ends)]
     orders = [math.log2(a / b) for a, b in pairwise(gaps)]
