@@ -212,6 +212,11 @@ def craft_bodies(model: mujoco.MjModel) -> np.ndarray:
     return np.flatnonzero(model.body_rootid == model.jnt_bodyid[0])
 
 
+def payload_body(model: mujoco.MjModel) -> int:
+    """Id of the payload of a model from `Vehicle.with_payload`."""
+    return int(model.body("rotorgram/payload").id)
+
+
 def body_axes(model: mujoco.MjModel) -> np.ndarray:
     """Axes of each of `craft_bodies` in the craft's body frame, as columns, shape (B, 3, 3)."""
     data = mujoco.MjData(model)

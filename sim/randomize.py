@@ -29,6 +29,7 @@ class Parameter:
     """Effects of which one has to be on."""
 
 
+MOST_ROTORS: Final = 8  # Rotors whose thrust can be drawn on its own
 _AIR: Final = ("body_drag", "rotor_drag")
 PARAMETERS: Final = {
     "mass": Parameter(0.1, 10.0, "", "mass of the vehicle; its inertia goes with it"),
@@ -36,7 +37,13 @@ PARAMETERS: Final = {
     "center_x": Parameter(-10.0, 10.0, "m", "shift of the center of mass, forward"),
     "center_y": Parameter(-10.0, 10.0, "m", "shift of the center of mass, to the left"),
     "center_z": Parameter(-10.0, 10.0, "m", "shift of the center of mass, up"),
+    "reaction": Parameter(0.0, 10.0, "", "torque of every rotor about its axis, per thrust"),
+    "payload": Parameter(0.1, 10.0, "", "mass of the payload", ("payload",)),
     "thrust": Parameter(0.0, 10.0, "", "thrust of every rotor at the same command"),
+    **{
+        f"thrust_{n}": Parameter(0.0, 10.0, "", f"thrust of rotor {n} at the same command")
+        for n in range(1, MOST_ROTORS + 1)
+    },
     "time_constant": Parameter(0.01, 100.0, "", "time constant of the rotors", ("motor_lag",)),
     "battery_charge": Parameter(0.0, 1.0, "1", "charge at the start", ("battery",)),
     "body_drag": Parameter(0.0, 10.0, "", "drag of the body", ("body_drag",)),
@@ -44,13 +51,17 @@ PARAMETERS: Final = {
     "wind_x": Parameter(-100.0, 100.0, "m/s", "wind along x, besides the option's", _AIR),
     "wind_y": Parameter(-100.0, 100.0, "m/s", "wind along y, besides the option's", _AIR),
     "wind_z": Parameter(-100.0, 100.0, "m/s", "wind upwards, besides the option's", _AIR),
+    "gusts": Parameter(0.0, 10.0, "", "speed of the gusts", ("gusts",)),
     "action_delay": Parameter(0, 100, "steps", "control steps before an action takes effect"),
     "observation_delay": Parameter(0, 100, "steps", "age of an observation, control steps"),
 }
-MODEL: Final = ("mass", "inertia", "center_x", "center_y", "center_z")
+CENTER: Final = ("center_x", "center_y", "center_z")
+MODEL: Final = ("mass", "inertia", *CENTER, "reaction", "payload")
 """Parameters of the compiled model."""
+VARIED: Final = ("body_mass", "body_inertia", "body_ipos", "dof_damping", "actuator_gear")
+"""Fields of the compiled model that these change."""
 WHOLE: Final = ("action_delay", "observation_delay")
-"""Parameters that are whole numbers: a draw is rounded."""
+"""Parameters that are whole numbers: of a uniform draw each has the same chance."""
 _KINDS: Final = {"uniform": 2, "loguniform": 2, "normal": 2, "choice": 0}
 _TEXT: Final = re.compile(r"\s*([a-z]+)\s*\(([^()]*)\)\s*")
 
@@ -94,7 +105,8 @@ class Randomization:
             if kind == "normal":
                 values = numbers[0] + draw.normal(numbers[1])
             elif kind == "uniform":
-                values = draw.uniform(numbers[0], numbers[1])
+                spare = 0.5 if name in WHOLE else 0.0  # what is rounded to the ends
+                values = clip(draw.uniform(numbers[0] - spare, numbers[1] + spare), *numbers)
             elif kind == "loguniform":
                 low, high = (xp.log(xp.asarray(x)) for x in numbers)
                 values = xp.exp(draw.uniform(float(low), float(high)))

@@ -778,6 +778,49 @@ def test_drawn_drag_thrust_and_mass_scale_what_they_name(tmp_path: Path) -> None
     )
 
 
+@pytest.mark.parametrize("num_worlds", [1, 3])
+@pytest.mark.parametrize("backend", ["mujoco", "warp"])
+def test_a_drawn_reaction_one_rotor_and_a_payload(backend: str, num_worlds: int) -> None:
+    if backend == "warp":
+        pytest.importorskip("mujoco_warp")
+    tolerance = 1e-9 if backend == "mujoco" else 2e-5
+    drawn = {"reaction": 2.0, "thrust_2": 0.5}
+    world = fly(begin(world_of(None, num_worlds, backend, drawn)), HOVER, 1)
+    rates = on_host(world.state.body_rates).reshape(-1, 3)
+    # Rotor 2 at (-0.14, -0.12) lacks half of its thrust; of the turns it lacks -0.02 twice.
+    lost = 0.5 * HOVER * H
+    expected = (lost * 0.12 / 4e-3, -lost * 0.14 / 5e-3, lost * 0.04 / 8e-3)
+    np.testing.assert_allclose(rates, [expected] * num_worlds, rtol=1e-3 + tolerance)
+    given = world_of(None, num_worlds, backend, {"payload": 2.0}, payload=0.1, cable=0.5)
+    heavy = world_of(None, num_worlds, backend, payload=0.2, cable=0.5)
+    for one in (given, heavy):
+        fly(begin(one), HOVER, 10, 4)
+    np.testing.assert_allclose(
+        on_host(given.state.position), on_host(heavy.state.position), atol=tolerance
+    )
+
+
+def test_a_drawn_strength_of_gusts() -> None:
+    ours = begin(world_of(randomize={"gusts": 2.0}, gusts=2.0, body_drag=True))
+    theirs = begin(world_of(gusts=4.0, body_drag=True))
+    for world in (ours, theirs):
+        world.seed(np.True_, [3])
+        fly(begin(world), HOVER, 20)
+    assert ours.state.velocity.tolist() == theirs.state.velocity.tolist() != [0.0, 0.0, 0.0]
+
+
+def test_a_rotor_that_the_vehicle_lacks_is_refused() -> None:
+    with pytest.raises(InputError, match="randomize: expected one of the 4 rotors, got thrust_5"):
+        world_of(randomize={"thrust_5": 0.5})
+
+
+def test_whole_numbers_have_equal_chances() -> None:
+    world = begin(world_of(None, 3000, randomize={"action_delay": "uniform(0, 2)"}))
+    values, counts = np.unique(world.parameters["action_delay"], return_counts=True)
+    assert values.tolist() == [0.0, 1.0, 2.0]
+    assert (abs(counts - 1000) < 4 * math.sqrt(3000 * 2 / 9)).all()
+
+
 THIRD = math.sqrt(((0.5 - 7 / 6) ** 2 + (1 - 7 / 6) ** 2 + (2 - 7 / 6) ** 2) / 3)
 
 

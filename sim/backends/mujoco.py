@@ -14,10 +14,10 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from ...models.errors import InputError
-from ...models.vehicle import Vehicle, body_axes, craft_bodies, payload_radius
+from ...models.vehicle import Vehicle, body_axes, craft_bodies, payload_body, payload_radius
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, Draw, Noise, NumpyDraw, NumpyNoise, Streams
-from ..randomize import MODEL, Randomization
+from ..randomize import CENTER, MODEL, VARIED, Randomization
 from ..rotations import body_z
 from ..state import Array, Pose, WorldState, plain
 from ..world import PhysicsError, check_hung, contact_check
@@ -268,16 +268,13 @@ class MujocoWorld:
 
 
 class _Varied:
-    """Values of the model that differ between worlds: mass, inertia, center of mass."""
+    """Values of the model that differ between worlds: those of `MODEL`."""
 
     def __init__(self, batch: Batch, names: Sequence[str]) -> None:
         self._batch, model = batch, batch.model
         self._names = [name for name in MODEL if name in names]
         self._bodies, self._axes = craft_bodies(model), body_axes(model)
-        self._base = {
-            name: getattr(model, name).copy()
-            for name in ("body_mass", "body_inertia", "body_ipos", "dof_damping")
-        }
+        self._base = {name: getattr(model, name).copy() for name in VARIED}
 
     def apply(self, ids: np.ndarray, parameters: Mapping[str, Array]) -> None:
         """Give the worlds `ids` the values that were drawn for them."""
@@ -293,8 +290,15 @@ class _Varied:
         )
         if base["dof_damping"].any():  # the drag of Unity's bodies goes with their mass
             expand("dof_damping")[ids, :3] = mass[:, None] * base["dof_damping"][:3]
-        shift = np.stack([given.get(name, 0.0 * ones) for name in MODEL[2:]], axis=-1)
-        if given.keys() & set(MODEL[2:]):
+        if "payload" in given:
+            hung = payload_body(self._batch.model)
+            for name, axes in (("body_mass", ...), ("body_inertia", (..., None))):
+                expand(name)[ids, hung] = given["payload"][axes] * base[name][hung]
+        if "reaction" in given:
+            gear = given["reaction"][:, None, None] * base["actuator_gear"][:, 3:]
+            expand("actuator_gear")[ids, :, 3:] = gear
+        shift = np.stack([given.get(name, 0.0 * ones) for name in CENTER], axis=-1)
+        if given.keys() & set(CENTER):
             turned = np.einsum("bji,wj->wbi", self._axes, shift)
             expand("body_ipos")[place] = base["body_ipos"][self._bodies] + turned
         self._batch.set_const(ids)

@@ -13,10 +13,10 @@ import warp
 from torch.utils.dlpack import from_dlpack
 
 from ...models.errors import InputError
-from ...models.vehicle import Vehicle, body_axes, craft_bodies, payload_radius
+from ...models.vehicle import Vehicle, body_axes, craft_bodies, payload_body, payload_radius
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, START, Draw, Noise
-from ..randomize import MODEL, Randomization
+from ..randomize import CENTER, MODEL, VARIED, Randomization
 from ..rotations import body_z
 from ..state import Array, Pose, WorldState, constant
 from ..world import PhysicsError, check_hung, contact_check
@@ -316,7 +316,7 @@ class WarpWorld:
 
 
 class _Varied:
-    """Values of the model that differ between worlds: mass, inertia, center of mass."""
+    """Values of the model that differ between worlds: those of `MODEL`."""
 
     def __init__(
         self, vehicle: Vehicle, plain: mujoco.MjModel, model: Any, data: Any, names: tuple[str, ...]
@@ -327,11 +327,12 @@ class _Varied:
         self._model, self._data = model, data
         self._bodies = torch.from_numpy(craft_bodies(plain))
         self._axes = body_axes(plain)
-        fields = ("body_mass", "body_inertia", "body_ipos", "dof_damping")
+        self._hung = payload_body(plain) if "payload" in self._names else None
         self._base, self._live = {}, {}
-        for name in fields:
+        for name in VARIED:
             value = np.repeat(getattr(plain, name)[None], data.nworld, axis=0)
-            kind = wp.vec3 if value.ndim == 3 else float
+            kind = {2: float, 3: wp.vec3}[value.ndim]
+            kind = wp.spatial_vector if name == "actuator_gear" else kind
             array = wp.array(value, dtype=kind)
             setattr(model, name, array)
             self._live[name] = wp.to_torch(array)
@@ -349,7 +350,14 @@ class _Varied:
         both = (mass * inertia)[:, None, None]
         live["body_inertia"][:, bodies] = both * base["body_inertia"][:, bodies]
         live["dof_damping"][:, :3] = mass[:, None] * base["dof_damping"][:, :3]
-        shift = torch.stack([given.get(name, 0.0 * ones) for name in MODEL[2:]], dim=-1)
+        if self._hung is not None:
+            payload = given["payload"]
+            live["body_mass"][:, self._hung] = payload * base["body_mass"][:, self._hung]
+            both = payload[:, None] * base["body_inertia"][:, self._hung]
+            live["body_inertia"][:, self._hung] = both
+        reaction = given.get("reaction", ones)[:, None, None]
+        live["actuator_gear"][:, :, 3:] = reaction * base["actuator_gear"][:, :, 3:]
+        shift = torch.stack([given.get(name, 0.0 * ones) for name in CENTER], dim=-1)
         axes = constant(self._axes, shift)
         turned = torch.einsum("bji,wj->wbi", axes, shift)
         live["body_ipos"][:, bodies] = base["body_ipos"][:, bodies] + turned

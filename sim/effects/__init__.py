@@ -48,7 +48,11 @@ class Effects:
     ) -> None:
         """`noise` is that of the world; `drawn` has the names of what `begin` gets."""
         rotors = options.motor_lag or options.thrust_curve or options.battery
-        self.on_rotors = bool(rotors or options.efficiency or "thrust" in drawn)
+        scaled = [name for name in drawn if name.startswith("thrust")]
+        rotor = max((int(name.partition("_")[2] or 0) for name in scaled), default=0)
+        count = vehicle.num_rotors
+        expect(rotor <= count, "randomize", f"one of the {count} rotors", f"thrust_{rotor}")
+        self.on_rotors = bool(rotors or options.efficiency or scaled)
         moved = options.body_drag or options.rotor_drag
         self.on_body = moved or options.ground_effect
         self.works = self.on_rotors or self.on_body
@@ -75,7 +79,8 @@ class Effects:
         if self.on_body:
             self._air.begin(mask, state, factors)
         if self._gusts is not None:
-            self._gusts.begin(mask, component(state.position, 2), self._noise.normal(mask))
+            height, normal = component(state.position, 2), self._noise.normal(mask)
+            self._gusts.begin(mask, height, normal, factors.get("gusts", 1.0))
         both = zip(self._mean_wind, WINDS, strict=True)
         self._wind = [mean + factors.get(name, 0.0) for mean, name in both]
         return thrust

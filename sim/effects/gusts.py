@@ -47,11 +47,15 @@ class Gusts:
         self._filters: Any = None
         self._state: Any = None
 
-    def begin(self, mask: Array, height: Array, normal: Array) -> None:
-        """Begin in the stationary state; height in m, shape (W, A), normal (W, A, 5)."""
+    def begin(self, mask: Array, height: Array, normal: Array, factor: Array = 1.0) -> None:
+        """Begin in the stationary state; height in m, shape (W, A), normal (W, A, 5).
+
+        The factor scales the gusts, one for all or (W, A).
+        """
         feet = np.clip(np.ravel(on_host(height)).astype(np.float64), LOWEST, HIGHEST) / FOOT
         shape = 0.177 + 0.000823 * feet
-        sigmas = self._sigma / shape**0.4, self._sigma + 0.0 * feet
+        sigma = self._sigma * np.ravel(on_host(factor)).astype(np.float64)
+        sigmas = sigma / shape**0.4, sigma + 0.0 * feet
         lengths = FOOT * feet / shape**1.2, FOOT * feet
         r = self._step * self._speed / lengths[0]
         filters = [np.exp(-r), sigmas[0] * np.sqrt(-np.expm1(-2 * r)), *sigmas]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...models.errors import expect
-from ..state import Array, clip, component, constant, each, kept, square_root
+from ..state import Array, clip, component, constant, each, kept, square_root, stack
 from .options import EffectOptions
 
 if TYPE_CHECKING:
@@ -83,6 +83,9 @@ class RotorEffects:
             self._scales.append(_of_rotors(np.array(options.efficiency), thrust))
         if "thrust" in factors:
             self._scales.append([each(factors["thrust"])] * len(self._low))
+        names = [f"thrust_{number}" for number in range(1, thrust.shape[-1] + 1)]
+        if factors.keys() & set(names):
+            self._scales.append(split(stack([factors.get(name, 1.0) for name in names])))
         if options.motor_lag:
             scale = each(factors["time_constant"]) if "time_constant" in factors else 1.0
             self._answers = [self._answer(time * scale) for time in self._times]
