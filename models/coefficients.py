@@ -63,6 +63,11 @@ class Drag:
     """c in: force = -c · velocity of the air past it."""
     quadratic: tuple[float, ...] | None = _number("N s²/m²", 0.0, 1e4, 3)
     """c in: force = -c · speed · velocity, both of the air past it."""
+    angular: tuple[float, ...] | None = _number("N m s", 0.0, 1e4, 3)
+    """c in: torque = -c · body rates."""
+    moment: tuple[float, ...] | None = _number("N s", -1e4, 1e4, 2)
+    """c in: torque = (c₁ v_y, -c₂ v_x, 0), v the velocity through the air: rotors that flap, and
+    drag above the center of mass."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,8 @@ class AirEffects:
 
     Forces, in body axes, with v the velocity of a point through the air:
 
-    * body, at the center of mass: -(linear + quadratic |v|) v, axis by axis;
+    * body, at the center of mass: -(linear + quadratic |v|) v, axis by axis, and the torque
+      -angular ω + moment × (v_y, -v_x), the latter about x and y;
     * each rotor, with speed Ω = sqrt(thrust / k), v_a its velocity along its axis and v_p in its
       plane: -drag Ω v_p, and along its axis -inflow Ω v_a + lift |v_p|² (rotor drag and
       translational lift of RotorPy, arXiv 2306.04485, whose moment of flapping is left out);
@@ -40,7 +41,9 @@ class AirEffects:
         self._geometry = np.array([(*rotor.position, *rotor.axis) for rotor in rotors])
         if options.body_drag:
             linear, quadratic = told.drag.linear, told.drag.quadratic
-            given = linear is not None or quadratic is not None
+            self._angular, self._moment = told.drag.angular, told.drag.moment
+            known = (linear, quadratic, self._angular, self._moment)
+            given = any(value is not None for value in known)
             expected = "drag.linear or drag.quadratic in the vehicle's file, which body_drag needs"
             expect(given, "vehicle", expected, "none")
             none = (0.0, 0.0, 0.0)
@@ -49,6 +52,10 @@ class AirEffects:
             weight = vehicle.mass * vehicle.gravity
             slope = max(self._linear) + 2 * math.sqrt(max(self._quadratic) * weight)
             _check_stiffness(vehicle, slope, "drag of the body")
+            most = 0.5 * float(np.linalg.eigvalsh(vehicle.inertia)[0]) / vehicle.timestep
+            stiffest = max(self._angular or none)
+            expected = f"at most {most:.4g} N m s, half the least inertia over the physics step"
+            expect(stiffest <= most, "drag.angular", expected, f"{stiffest:.4g}")
         if options.rotor_drag:
             (coefficient,) = told.need("rotors.thrust_coefficient", "rotor_drag")
             self._slope = math.sqrt(coefficient)  # of the square root of a thrust over the speed
@@ -102,8 +109,7 @@ class AirEffects:
         v = _to_body(turn, through)
         force = torque = (0.0, 0.0, 0.0)
         if self._options.body_drag:
-            force = self._body(v, w)
-            torque = _cross(self._center, force)
+            force, torque = self._body(v, w)
         if self._options.rotor_drag or self._options.ground_effect:
             height = component(state.position, 2) + self._half * ahead[2]
             around = [each(number) for number in (*v, *w, *turn[6:], height)]
@@ -120,14 +126,22 @@ class AirEffects:
             torque = _add(torque, [total([x]) for x in twist])
         return stack((*_to_world(turn, force), *torque))
 
-    def _body(self, v: Vector, w: Vector) -> Vector:
-        """Drag of the body, body axes."""
+    def _body(self, v: Vector, w: Vector) -> tuple[Vector, Vector]:
+        """Drag of the body, body axes: force, and torque about the body's origin."""
         v = _add(v, _cross(w, self._center))
         speed = square_root(v[0] * v[0] + v[1] * v[1] + v[2] * v[2], self._xp)
         factor = self._factors.get("body_drag", 1.0)
         both = zip(self._linear, self._quadratic, v, strict=True)
         x, y, z = (-factor * (linear + quadratic * speed) * u for linear, quadratic, u in both)
-        return x, y, z
+        torque = _cross(self._center, (x, y, z))
+        if self._angular is not None:
+            pairs = zip(torque, self._angular, w, strict=True)
+            roll, pitch, yaw = (t - factor * k * rate for t, k, rate in pairs)
+            torque = roll, pitch, yaw
+        if self._moment is not None:
+            roll, pitch = (factor * k for k in self._moment)
+            torque = torque[0] + roll * v[1], torque[1] - pitch * v[0], torque[2]
+        return (x, y, z), torque
 
     def _push(self, rotor: Any, thrust: Array, root: Array | None, around: list[Array]) -> Vector:
         """Force of a part of the rotors besides their thrust, body axes; the root as of `step`.
