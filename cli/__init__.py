@@ -39,6 +39,7 @@ COMMANDS: Final = {
     "bench": "Bench",
     "check-model": "CheckModel",
     "vehicle": "Vehicle",
+    "identify": "Identify",
     "key": "Key",
     "relay": "Relay",
     "replay": "Replay",
@@ -52,6 +53,7 @@ EXTRAS: Final = {
     "render": ("PIL", "imageio_ffmpeg"),
     "report": ("matplotlib", "jinja2"),
     "ray": ("ray",),
+    "identify": ("pyulog", "pandas", "pyarrow", "scipy"),
     "gpu": ("torch", "mujoco_warp", "warp"),
 }  # fmt: skip
 """Import names of the packages of each extra, as pyproject.toml lists them."""

@@ -1,8 +1,8 @@
 """Open-loop prediction of recorded flights: thousands of starts at once, in NumPy.
 
 A start is a measured state of a flight. From there the rotor speeds that were measured, and nothing
-else, move a rigid body with the equations of `sim/effects/air.py`; after each horizon the prediction
-is compared with what was measured. System identification fits the numbers of an `Airframe` to that.
+else, move a rigid body with the equations of `sim/effects/air.py`; after each horizon the result is
+compared with what was measured. System identification fits the numbers of an `Airframe` to that.
 
 Vectors have their component as the first axis and the start as the last, as (3, M): sums over
 components are then sums of contiguous rows. World x, y, z with z up; body x forward, y left, z up;
@@ -125,29 +125,6 @@ class Airframe:
                 changed.setdefault(field, getattr(self, field).copy())[where] = value
         return replace(self, **changed)
 
-    def accelerations(self, speeds: Floats, v: Floats, w: Floats) -> tuple[Floats, Floats]:
-        """Of the center of mass without gravity, body axes, and of the body rates, (3, M) each.
-
-        `speeds` (R, M); `v`: velocity of the center of mass, body axes; `w`: body rates.
-        """
-        arm = self.place - self.center[:, None]
-        force = -self.linear[:, None] * v
-        torque = -self.angular[:, None] * w
-        torque[0] += self.moment[0] * v[1]
-        torque[1] -= self.moment[1] * v[0]
-        for i, speed in enumerate(speeds):
-            n, r = self.axis[:, i, None], arm[:, i, None]
-            hub = v + cross(w, r)
-            along = (hub * n).sum(axis=0)
-            plane = hub - along * n
-            thrust = self.thrust_coefficient * speed * speed
-            up = thrust + self.lift * (plane * plane).sum(axis=0) - self.inflow * speed * along
-            push = up * n - self.drag * speed * plane
-            force += push
-            torque += cross(r, push) + self.turn[i] * self.reaction * thrust * n
-        torque -= cross(w, self.inertia @ w)
-        return force / self.mass, np.linalg.solve(self.inertia, torque)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Windows:
@@ -202,28 +179,38 @@ class Windows:
         Past the last sample that a prediction may know, those of that one.
         """
         after = self.speeds[min(step + 1, len(self.speeds) - 1)]
-        return 0.5 * (self.speeds[step] + after)
+        between: Floats = 0.5 * (self.speeds[step] + after)
+        return between
 
 
-def predict(airframe: Airframe, windows: Windows) -> Iterator[tuple[int, tuple[Floats, ...]]]:
+def predict(
+    airframes: Airframe | Sequence[Airframe], windows: Windows, speeds: Floats | None = None
+) -> Iterator[tuple[int, tuple[Floats, ...]]]:
     """Each horizon, and position, quaternion, velocity and body rates there, (K, M) each.
 
-    The midpoint rule over each sample's period: of second order, as the effects of the simulator.
+    Of P airframes they are (K, P M), one after the other: much faster than one call for each.
+    `speeds`, (H, R, P M), takes the place of those of the windows. The midpoint rule over each
+    sample's period: of second order, as the effects of the simulator.
     """
-    position, q, velocity, w = windows.start
-    h, center = windows.period, airframe.center[:, None]
-    down = np.array([0.0, 0.0, -airframe.gravity])[:, None]
+    several = [airframes] if isinstance(airframes, Airframe) else list(airframes)
+    numbers = _Numbers(several, windows.start[0].shape[-1])
+    position, q, velocity, w = (np.tile(array, len(several)) for array in windows.start)
+    h, center, count = windows.period, numbers.center, len(windows.speeds)
+    down = np.array([0.0, 0.0, -several[0].gravity])[:, None]
     # The center of mass is what moves without regard to the turning.
     p = position + rotated(q, center + 0 * position)
     v = velocity + rotated(q, cross(w, center))
-    for step in range(len(windows.speeds)):
-        speeds = windows.inputs(step)
-        pull, turn = airframe.accelerations(speeds, rotated(conjugate(q), v), w)
+    for step in range(count):
+        if speeds is None:
+            inputs = np.tile(windows.inputs(step), len(several))
+        else:
+            inputs = 0.5 * (speeds[step] + speeds[min(step + 1, count - 1)])
+        pull, turn = numbers.accelerations(inputs, rotated(conjugate(q), v), w)
         middle_q = product(q, from_rotation_vector(0.5 * h * w))
         middle_v = v + 0.5 * h * (rotated(q, pull) + down)
         middle_w = w + 0.5 * h * turn
         body_v = rotated(conjugate(middle_q), middle_v)
-        pull, turn = airframe.accelerations(speeds, body_v, middle_w)
+        pull, turn = numbers.accelerations(inputs, body_v, middle_w)
         p = p + h * middle_v
         v = v + h * (rotated(middle_q, pull) + down)
         q = product(q, from_rotation_vector(h * middle_w))
@@ -231,6 +218,52 @@ def predict(airframe: Airframe, windows: Windows) -> Iterator[tuple[int, tuple[F
         if step + 1 in windows.horizons:
             shift, swing = rotated(q, center + 0 * p), rotated(q, cross(w, center))
             yield step + 1, (p - shift, q, v - swing, w)
+
+
+class _Numbers:
+    """Those of airframes that differ in the numbers of `ENTRIES`, a column for each start."""
+
+    def __init__(self, airframes: Sequence[Airframe], starts: int) -> None:
+        first = airframes[0]
+        self._mass, self.center = first.mass, first.center[:, None]
+        self._axis, self._arm = first.axis, first.place - self.center
+        self._lever = np.cross(self._arm.T, first.axis.T).T
+        self._spin = first.turn * first.axis
+
+        def columns(field: str) -> Floats:
+            return np.repeat(np.stack([getattr(a, field) for a in airframes], -1), starts, -1)
+
+        self._coefficient, self._reaction = columns("thrust_coefficient"), columns("reaction")
+        self._linear, self._angular = columns("linear"), columns("angular")
+        self._moment, self._inertia = columns("moment"), columns("inertia")
+        inverse = np.stack([np.linalg.inv(one.inertia) for one in airframes], -1)
+        self._inverse = np.repeat(inverse, starts, -1)
+        self._drag, self._inflow, self._lift = (columns(f) for f in ("drag", "inflow", "lift"))
+        self._in_air = any(np.any(x) for x in (self._drag, self._inflow, self._lift))
+
+    def accelerations(self, speeds: Floats, v: Floats, w: Floats) -> tuple[Floats, Floats]:
+        """Of the center of mass without gravity, body axes, and of the body rates, (3, N) each.
+
+        `speeds` (R, N); `v`: velocity of the center of mass, body axes; `w`: body rates.
+        """
+        force = -self._linear * v
+        torque = -self._angular * w
+        torque[0] += self._moment[0] * v[1]
+        torque[1] -= self._moment[1] * v[0]
+        thrust = self._coefficient * speeds * speeds
+        force += self._axis @ thrust
+        torque += self._lever @ thrust + self._reaction * (self._spin @ thrust)
+        if self._in_air:
+            n, r = self._axis[:, :, None], self._arm[:, :, None]
+            hub = v[:, None] + cross(w[:, None], r)  # (3, R, N)
+            along = (hub * n).sum(axis=0)
+            plane = hub - along * n
+            up = self._lift * (plane * plane).sum(axis=0) - self._inflow * speeds * along
+            push = up * n - self._drag * speeds * plane
+            force += push.sum(axis=1)
+            torque += cross(r, push).sum(axis=1)
+        torque -= cross(w, np.einsum("ijn,jn->in", self._inertia, w))
+        return force / self._mass, np.einsum("ijn,jn->in", self._inverse, torque)
 
 
 def differences(predicted: Sequence[Floats], truth: Sequence[Floats]) -> tuple[Floats, ...]:
@@ -253,9 +286,11 @@ def differences(predicted: Sequence[Floats], truth: Sequence[Floats]) -> tuple[F
 
 def cross(a: Floats, b: Floats) -> Floats:
     """Cross product."""
-    return np.stack(
-        (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-    )
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    np.subtract(a[1] * b[2], a[2] * b[1], out=out[0])
+    np.subtract(a[2] * b[0], a[0] * b[2], out=out[1])
+    np.subtract(a[0] * b[1], a[1] * b[0], out=out[2])
+    return out
 
 
 def conjugate(q: Floats) -> Floats:
@@ -278,7 +313,8 @@ def product(a: Floats, b: Floats) -> Floats:
 def rotated(q: Floats, v: Floats) -> Floats:
     """A vector turned by a quaternion."""
     t = 2 * cross(q[1:], v)
-    return v + q[0] * t + cross(q[1:], t)
+    turned: Floats = v + q[0] * t + cross(q[1:], t)
+    return turned
 
 
 def from_rotation_vector(r: Floats) -> Floats:

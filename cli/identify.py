@@ -1,0 +1,73 @@
+"""`rotorgram identify`: numbers of a vehicle from logs of its flights, as a vehicle file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from ._flags import Command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identify(Command):
+    """Identify thrust coefficient, rotor lag, inertia, drag and reaction from logs of flights.
+
+    A number that the logs do not tell keeps the value of the vehicle's file, and is named. Exit
+    status 0 as well in that case.
+    """
+
+    logs: Positional[tuple[Path, ...]]
+    """CSV, Parquet or ULog files of the same vehicle."""
+    vehicle: Annotated[str, arg(metavar="FILE")]
+    """File of the vehicle, TOML or MJCF, with a thrust coefficient, or a name of the library."""
+    out: Annotated[Path, arg(metavar="NEW.toml")]
+    """File to write: the vehicle with what was identified, and intervals."""
+    columns: tuple[str, ...] = ()
+    """Names in the logs, as OURS=THEIRS or OURS=THEIRS*FACTOR: m1_rads=rpm1*0.10472."""
+    fit: tuple[str, ...] = ()
+    """What to identify. Default: the five of above; besides them there are rotors.drag,
+    rotors.inflow, rotors.lift, drag.angular.x, y, z and drag.moment.x, y."""
+    window: float = 0.5
+    """Length of a prediction, s."""
+    period: float = 0.01
+    """Logs are resampled to this period, s."""
+
+    def run(self) -> int:
+        """Print every estimate, write the file."""
+        from rich.console import Console
+        from rich.table import Table
+
+        from ..experiments.flight_logs import read_log
+        from ..experiments.identified_vehicle import identified_toml
+        from ..experiments.identify import DEFAULT, SEGMENT, identify
+        from ..models.errors import expect, require
+        from ..models.vehicle import Vehicle
+
+        require("scipy", "identify", "system identification")
+        expect(self.logs, "logs", "at least one file", "none")
+        right = self.out.suffix.lower() == ".toml" and not self.out.exists()
+        expect(right, "out", "a new file that ends in .toml", str(self.out))
+        expect(1e-4 <= self.period <= 0.1, "period", "0.0001 to 0.1 s", f"{self.period:g}")
+        columns = {}
+        for text in self.columns:
+            ours, equals, theirs = text.partition("=")
+            expect(ours and equals and theirs, "columns", "OURS=THEIRS", repr(text))
+            columns[ours] = theirs
+        vehicle = Vehicle.load(self.vehicle)
+        logs = [read_log(path, vehicle, columns, self.period) for path in self.logs]
+        found = identify(vehicle, logs, window=self.window, names=self.fit or DEFAULT)
+        table = Table("number", "value", "95 % interval", "")
+        for one in found.estimates:
+            told = f"[yellow]kept: {one.kept}" if one.kept else ""
+            interval = "" if one.kept else f"{one.low:.4g} to {one.high:.4g}"
+            table.add_row(one.name, f"{one.value:.5g}", interval, told)
+        Console().print(table)
+        names = ("position", "m"), ("attitude", "rad"), ("velocity", "m/s"), ("rates", "rad/s")
+        pairs = zip(names, found.before, found.after, strict=True)
+        errors = ", ".join(f"{name} {b:.3g} -> {a:.3g} {unit}" for (name, unit), b, a in pairs)
+        print(f"mean error of {found.windows} predictions over {self.window:g} s: {errors}")
+        print(f"intervals: sandwich, clustered over {found.segments} segments of {SEGMENT:g} s")
+        self.out.write_text(identified_toml(vehicle, found), encoding="utf-8")
+        print(self.out)
+        return 0
