@@ -262,6 +262,29 @@ def test_quadratic_drag_falls_as_a_hyperbolic_tangent(tmp_path: Path) -> None:
     assert world.state.velocity[2] == pytest.approx(-terminal, rel=1e-5)
 
 
+def test_angular_drag_is_exponential(tmp_path: Path) -> None:
+    none = {"drag_linear": None, "drag_quadratic": None}
+    vehicle = racer(tmp_path, drag_angular="0.01 0.01 0.02", **none)
+    world = fly(begin(world_of(vehicle, body_drag=True), body_rates=[0, 0, 5.0]), HOVER, 100)
+    # Izz is 8e-3 kg m².
+    left = 5 * math.exp(-0.02 / 8e-3 * 0.5)
+    np.testing.assert_allclose(world.state.body_rates, (0, 0, left), rtol=1e-3, atol=1e-12)
+    vehicle = racer(tmp_path, drag_angular="0.5 0.5 0.5", **none)
+    with pytest.raises(InputError, match=r"^drag\.angular: expected at most 0\.4 N m s"):
+        world_of(vehicle, body_drag=True)
+
+
+def test_the_moment_of_the_air_is_in_proportion_to_the_velocity(tmp_path: Path) -> None:
+    none = {"drag_linear": None, "drag_quadratic": None}
+    vehicle = racer(tmp_path, timestep=1e-4, drag_moment="3e-4 5e-4", **none)
+    world = begin(world_of(vehicle, body_drag=True, wind=(0.5, 0, 0)), velocity=[2.5, -1.0, 3.0])
+    acceleration, turn = pushed(world, 0.0)
+    # 3e-4 · -1 over 4e-3 kg m², and -5e-4 · 2 over 5e-3 kg m².
+    np.testing.assert_allclose(turn, (-0.075, -0.2, 0.0), rtol=1e-6, atol=1e-9)
+    # The origin is 1 cm below the center of mass, which only falls.
+    np.testing.assert_allclose(acceleration, (0.002, -0.00075, -G), rtol=1e-3)
+
+
 def test_body_drag_in_body_axes(tmp_path: Path) -> None:
     vehicle = racer(tmp_path, timestep=1e-4)
     nose_down = [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0]  # body x is the world's -z

@@ -1,5 +1,6 @@
 """System identification: known values come back, and what a log does not tell is named."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -276,3 +277,56 @@ def test_a_short_log_and_an_unknown_number_are_refused(short: Path) -> None:
         identify(vehicle, [log])
     with pytest.raises(InputError, match=r"^fit: expected some of rotors\.thrust_coefficient"):
         identify(vehicle, [log], names=["mass"])
+
+
+def ulog(path: Path) -> Path:
+    """A PX4 log of 2 s: a climb at 1 m/s past 3 m north and 2 m east, rolled by 0.2 rad."""
+    topics = {
+        "vehicle_local_position": (["x", "y", "z", "vx", "vy", "vz"], "float"),
+        "vehicle_attitude": (["q[4]"], "float"),
+        "vehicle_angular_velocity": (["xyz[3]"], "float"),
+        "actuator_motors": (["control[12]"], "float"),
+    }
+
+    def message(kind: str, content: bytes) -> bytes:
+        return struct.pack("<HB", len(content), ord(kind)) + content
+
+    parts = [b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + struct.pack("<Q", 0)]
+    parts.append(message("B", bytes(40)))
+    for topic, (names, kind) in topics.items():
+        fields = ["uint64_t timestamp"]
+        for name in names:
+            word, bracket, size = name.partition("[")
+            fields.append(f"{kind}{bracket}{size} {word}")
+        parts.append(message("F", f"{topic}:{';'.join(fields)};".encode()))
+    for index, topic in enumerate(topics):
+        parts.append(message("A", struct.pack("<BH", 0, index) + topic.encode()))
+    for step in range(201):
+        time = step * 0.01
+        rows = (
+            (3.0, 2.0, -5.0 - time, 0.0, 0.0, -1.0),
+            (np.cos(0.1), np.sin(0.1), 0.0, 0.0),
+            (0.1, 0.2, 0.3),
+            (0.25, 0.5, 0.75, 1.0, *[np.nan] * 8),
+        )
+        for index, row in enumerate(rows):
+            head = struct.pack("<HQ", index, 1_000_000 + step * 10_000)
+            parts.append(message("D", head + struct.pack(f"<{len(row)}f", *row)))
+    path.write_bytes(b"".join(parts))
+    return path
+
+
+def test_a_ulog_file_comes_in_our_frames(tmp_path: Path) -> None:
+    pytest.importorskip("pyulog")
+    log = read_log(ulog(tmp_path / "flight.ulg"), Vehicle.load(LIVELY))
+    flight = log.flight
+    assert not log.measured
+    # North east down becomes north, west, up; forward right down becomes forward, left, up.
+    np.testing.assert_allclose(flight.position[100], (3.0, -2.0, 6.0), atol=1e-6)
+    np.testing.assert_allclose(flight.velocity[50], (0.0, 0.0, 1.0), atol=1e-6)
+    expected = (np.cos(0.1), np.sin(0.1), 0.0, 0.0)
+    np.testing.assert_allclose(flight.quaternion[7], expected, atol=1e-6)
+    np.testing.assert_allclose(flight.body_rates[7], (0.1, -0.2, -0.3), atol=1e-6)
+    # A quarter of the largest thrust, 3 N, at 3e-6 N s²/rad², is 500 rad/s.
+    assert flight.speeds[7, 0] == pytest.approx(500.0)
+    assert flight.speeds[7, 3] == pytest.approx(1000.0)
