@@ -1,12 +1,13 @@
 """Open-loop prediction error on recorded flights of a real drone, beside published rows.
 
-`python benchmarks/real_flights.py FOLDER [--out docs/results/real_flights]`
+`python benchmarks/real_flights.py FOLDER [--vehicle FILE] [--out docs/results/real_flights]`
 
 FOLDER has `train/*.csv` and `test/*.csv` of the IDSIA nano-drone benchmark (arXiv 2512.14450;
 `docs/real-flights.md` says how to get them). Every sample of a test flight is a start: its measured
 state flies on in the simulator with the rotor speeds that were measured, and the error after 1, 10
 and 50 steps of 10 ms is the Euclidean distance (attitude: the angle), mean over all starts. What is
-fitted is fitted on the training flights alone.
+fitted is fitted on the training flights alone. With `--vehicle` that vehicle flies as its file has
+it, with drag of its body and nothing fitted.
 """
 
 import argparse
@@ -94,8 +95,11 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, default=Path("docs/results/real_flights"))
     parser.add_argument("--stride", type=int, default=1, help="of the starts on test flights")
+    parser.add_argument("--vehicle", help="a file, or a name of the library: fit nothing")
     given = parser.parse_args()
     base = Vehicle.load(START)
+    if given.vehicle:
+        return _measure(given, Vehicle.load(given.vehicle))
     train, test = (_flights(given.folder / kind, base) for kind in ("train", "test"))
     windows = Windows.cut(test, HORIZONS[-1], given.stride, HORIZONS)
     print(f"{len(train)} training flights; {len(test)} test flights, {len(windows.index)} starts")
@@ -129,12 +133,33 @@ def main() -> int:
     return 0
 
 
-def simulated(vehicle: Vehicle, windows: Windows) -> dict[int, tuple[Floats, ...]]:
+def _measure(given: argparse.Namespace, vehicle: Vehicle) -> int:
+    """Print and write the errors of a vehicle as its file has it."""
+    test = _flights(given.folder / "test", vehicle)
+    windows = Windows.cut(test, HORIZONS[-1], given.stride, HORIZONS)
+    row = _row(vehicle.name, simulated(vehicle, windows, rotors=False), windows, test)
+    result = {
+        "vehicle": vehicle.name,
+        "vehicle_hash": vehicle.hash,
+        "starts": len(windows.index),
+        "measures": MEASURES,
+        "errors": row["errors"],
+    }
+    text = json.dumps(result, indent=1, ensure_ascii=False)
+    given.out.mkdir(parents=True, exist_ok=True)
+    (given.out / f"{Path(given.vehicle).stem}.json").write_text(text + "\n", encoding="utf-8")
+    print(text)
+    return 0
+
+
+def simulated(
+    vehicle: Vehicle, windows: Windows, *, rotors: bool = True
+) -> dict[int, tuple[Floats, ...]]:
     """Position, quaternion, velocity and body rates at each horizon, flown by the simulator."""
     told = vehicle.coefficients
     body = any(x is not None for x in (told.drag.linear, told.drag.angular, told.drag.moment))
     rotor = any(x is not None for x in (told.rotors.drag, told.rotors.inflow))
-    effects = EffectOptions(body_drag=body, rotor_drag=rotor)
+    effects = EffectOptions(body_drag=body, rotor_drag=rotor and rotors)
     (coefficient,) = told.need("rotors.thrust_coefficient", "a flight from rotor speeds")
     parts: dict[int, list[tuple[Floats, ...]]] = {h: [] for h in HORIZONS}
     for first in range(0, len(windows.index), _WORLDS):
@@ -290,7 +315,12 @@ def _write(
                     writer.writerow([row["name"], flight.name, h, *(f"{x:.5f}" for x in errors)])
     # Chosen by kinds of flights that the fit had not seen, among the training flights.
     chosen = min(rows[1:], key=lambda row: row["unseen_score"])
-    (out / "vehicle.toml").write_text(chosen["file"], encoding="utf-8")
+    position, attitude, velocity, _ = chosen["errors"][HORIZONS[-1]]
+    told = {"position": position, "velocity": velocity, "attitude": attitude}
+    source = "benchmarks/real_flights.py: mean over the test flights of arXiv 2512.14450"
+    lines = [f'source = "{source}"', *(f"{name} = {value:.4g}" for name, value in told.items())]
+    text = "\n".join((chosen["file"].rstrip(), "", "[real_flights]", *lines, ""))
+    (out / "vehicle.toml").write_text(text, encoding="utf-8")
     summary = {
         "model": chosen["name"],
         "starts": starts,

@@ -76,7 +76,8 @@ def overview() -> str:
     rows = []
     for name, about in LIBRARY["vehicles"].items():
         vehicle = Vehicle.load(path_of(name))
-        numbers = read_vehicle_file(path_of(name)).numbers
+        file = read_vehicle_file(path_of(name))
+        numbers = file.numbers
         checks = examine(vehicle)
         rows.append(
             (
@@ -85,8 +86,9 @@ def overview() -> str:
                 f"{vehicle.mass:.4g}",
                 f"{vehicle.num_rotors}",
                 f"{thrust_to_weight(vehicle):.2f}",
-                _words(effects(vehicle)),
-                _words(sensors(vehicle)),
+                file.real_flights or "–",
+                ", ".join(effects(vehicle)).replace("_", " "),
+                ", ".join(sensors(vehicle)) or "–",
                 f"{len(numbers)}, {sum(bool(one.others) for one in numbers)}",
                 f"{sum(check.passed for check in checks)} of {len(checks)}",
             )
@@ -97,6 +99,7 @@ def overview() -> str:
         "kg",
         "rotors",
         "thrust / weight",
+        "error after 0.5 s of real flights",
         "effects with coefficients",
         "sensors with coefficients",
         "numbers, of which sources differ",
@@ -165,6 +168,7 @@ def shown(value: float | Sequence[float]) -> str:
 
 def _derived(vehicle: Vehicle) -> str:
     share = vehicle.hover_thrust / vehicle.thrust_high
+    flights = read_vehicle_file(vehicle.path).real_flights
     inertia, center = vehicle.inertia, vehicle.center_of_mass
     products = [f"{inertia[i, j] + 0.0:.4g}" for i, j in ((0, 1), (0, 2), (1, 2))]
     rows = [
@@ -179,6 +183,7 @@ def _derived(vehicle: Vehicle) -> str:
         ("physics step", f"{vehicle.timestep:g}", "s"),
         ("effects with coefficients", _words(effects(vehicle)), ""),
         ("sensors with coefficients", _words(sensors(vehicle)), ""),
+        ("error after 0.5 s of real flights", flights or "–", ""),
     ]
     return table(("quantity", "value", "unit"), rows)
 

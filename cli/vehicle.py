@@ -119,15 +119,19 @@ class Vehicle(Command):
         from ..models.vehicle_file import read_vehicle_file
 
         craft = Craft.load(self.file)
-        print(f"{craft.name} ({craft.path})\n")
+        toml = craft.path.suffix.lower() == ".toml"
+        file = read_vehicle_file(craft.path) if toml else None
+        print(f"{craft.name} ({craft.path})")
+        error = file.real_flights if file else ""
+        print(f"error after 0.5 s of real flights: {error or 'not measured'}\n")
         for name, value in _derived(craft):
             print(f"{name:17} {value}")
         print("\nrotors: position, direction, torque besides that of the position per thrust")
         for rotor in craft.rotors:
             print(f"{rotor.name:17} {_rotor_words(rotor)}")
-        if craft.path.suffix.lower() == ".toml":
+        if file:
             print(f"\nnumbers of {craft.path.name}")
-            for line in _provenance(read_vehicle_file(craft.path)):
+            for line in _provenance(file):
                 print(line)
             return
         print("\ncoefficients")

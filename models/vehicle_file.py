@@ -50,6 +50,9 @@ ENTRIES: Final[Mapping[str, Field[Any]]] = {
     "rotors.list.position": _entry("m", -100.0, 100.0, 3),
     "rotors.list.axis": _entry("1", -1e3, 1e3, 3),
     **dict(coefficient_fields()),
+    "real_flights.position": _entry("m", 0.0, 1e4),
+    "real_flights.velocity": _entry("m/s", 0.0, 1e4),
+    "real_flights.attitude": _entry("rad", 0.0, 3.15),
 }
 """Every number of a file by its dotted name; `metadata["limits"]` has its `Limits`."""
 
@@ -63,7 +66,7 @@ FRAMES: Final[Mapping[str, tuple[int, float]]] = {
 clockwise seen from above. The first turns clockwise, the next counterclockwise, and so on."""
 
 _WORDS: Final[Mapping[str, tuple[str, ...]]] = {
-    "vehicle": ("name", "model", "body", "rotors", "drag", "battery", "sensors"),
+    "vehicle": ("name", "model", "body", "rotors", "drag", "battery", "sensors", "real_flights"),
     "model": ("file",),
     "body": ("parts",),
     "body.parts": ("shape",),
@@ -141,6 +144,13 @@ class VehicleFile:
         return next((one.value for one in self.numbers if one.name == name), default)
 
     @property
+    def real_flights(self) -> str:
+        """Mean error of its simulation after half a second of recorded flights; empty: unknown."""
+        names = ("real_flights.position", "real_flights.velocity", "real_flights.attitude")
+        told = [one for one in self.numbers if one.name in names]
+        return ", ".join(f"{one.value:.3g} {one.unit}" for one in told)
+
+    @property
     def thrust(self) -> tuple[float, float]:
         """Least and largest thrust of a rotor, N."""
         low, high = self.value("rotors.thrust") or (
@@ -203,8 +213,9 @@ class _Reader:
         model = self._model(path, tree.get("model"))
         parts = self._body(tree.get("body"), model)
         rotors = self._rotors(tree.get("rotors"), model)
-        for group in ("drag", "battery", "sensors"):
+        for group in ("drag", "battery", "sensors", "real_flights"):
             self._read(tree.get(group, {}), group)
+        physical = {key: value for key, value in tree.items() if key != "real_flights"}
         self.result = VehicleFile(
             name=name,
             numbers=tuple(self.numbers),

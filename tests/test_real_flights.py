@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rotorgram.experiments.prediction import Flight, Windows
 from rotorgram.models.vehicle import Vehicle
+from rotorgram.models.vehicle_file import read_vehicle_file
 
 pytest.importorskip("scipy")
 pytest.importorskip("pandas")
@@ -96,3 +97,14 @@ def test_ours_is_ahead_of_the_published_rows_at_half_a_second() -> None:
     for name in ("physics", "hybrid"):
         assert all(a < b for a, b in zip(ours, published[name], strict=True))
     np.testing.assert_allclose(summary["ours"], summary["ours_in_numpy"], rtol=1e-3)
+
+
+def test_the_library_says_what_was_measured_of_its_file() -> None:
+    told = json.loads((RESULTS / "crazyflie_brushless.json").read_text(encoding="utf-8"))
+    vehicle = Vehicle.load("crazyflie_brushless")
+    assert told["vehicle_hash"] == vehicle.hash
+    position, attitude, velocity, _ = told["errors"]["50"]
+    file = read_vehicle_file(vehicle.path)
+    for name, value in (("position", position), ("velocity", velocity), ("attitude", attitude)):
+        assert file.value(f"real_flights.{name}") == pytest.approx(value, rel=5e-3)
+    assert file.real_flights == "0.596 m, 3.7 m/s, 1.84 rad"
