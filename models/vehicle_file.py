@@ -219,7 +219,7 @@ class _Reader:
         self.result = VehicleFile(
             name=name,
             numbers=tuple(self.numbers),
-            content=json.dumps(_plain(tree | {"name": name}), sort_keys=True),
+            content=json.dumps(_plain(physical | {"name": name}), sort_keys=True),
             model=model,
             rotors=rotors,
             parts=parts,
