@@ -28,6 +28,11 @@ FURTHEST: Final = 100.0
 """Largest coordinate of a start, m. float32 rounds 100 m to 8 µm; much further out a slow craft
 stands still, because what it flies in one physics step is rounded off."""
 
+_DERIVED: Final = (
+    "body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0", "actuator_acc0"
+)  # fmt: skip
+"""Fields that follow from `VARIED`: `set_const` computes them, of each world its own."""
+
 CONTACTS_PER_GEOM: Final = 4  # Most contacts of a geom with the ground: so many have memory
 
 
@@ -146,7 +151,8 @@ class WarpWorld:
             for name, new in self._randomize.draw(draw, self.xp).items():
                 old = self.parameters.get(name)
                 self.parameters[name] = new if old is None else torch.where(mask, new, old)
-            self._varied.apply(self.parameters)
+            with wp.ScopedDevice(self._name), wp.ScopedStream(self._stream()):
+                self._varied.apply(self.parameters)
         if self.effects is not None:
             thrust = self.effects.begin(mask, state, self.parameters)
             state.thrust.copy_(torch.where(rows, thrust, state.thrust))
@@ -309,10 +315,13 @@ class WarpWorld:
         return graph, *(wp.to_torch(array) for array in (*rays[:2], distance)), *rays, geom, body
 
     def _launch(self, graph: Any) -> None:
-        stream = None
-        if self.qpos.is_cuda:  # in turn with what torch does before and after
-            stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
-        wp.capture_launch(graph, stream=stream)
+        wp.capture_launch(graph, stream=self._stream())
+
+    def _stream(self) -> Any:
+        """That of torch, for what comes between its calls; None on the CPU."""
+        if not self.qpos.is_cuda:
+            return None
+        return wp.stream_from_torch(torch.cuda.current_stream(self.device))
 
 
 class _Varied:
@@ -329,13 +338,12 @@ class _Varied:
         self._axes = body_axes(plain)
         self._hung = payload_body(plain) if "payload" in self._names else None
         self._base, self._live = {}, {}
+        for name in (*VARIED, *_DERIVED):
+            shared = getattr(model, name)
+            value = np.repeat(shared.numpy(), data.nworld, axis=0)
+            setattr(model, name, wp.array(value, dtype=shared.dtype))
         for name in VARIED:
-            value = np.repeat(getattr(plain, name)[None], data.nworld, axis=0)
-            kind = {2: float, 3: wp.vec3}[value.ndim]
-            kind = wp.spatial_vector if name == "actuator_gear" else kind
-            array = wp.array(value, dtype=kind)
-            setattr(model, name, array)
-            self._live[name] = wp.to_torch(array)
+            self._live[name] = wp.to_torch(getattr(model, name))
             self._base[name] = self._live[name].clone()
 
     def apply(self, parameters: Mapping[str, Array]) -> None:
