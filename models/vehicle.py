@@ -142,10 +142,10 @@ class Vehicle:
 
         The cable is a tendon that is slack below its length, and as stiff as MuJoCo's limits. The
         ball has the density of water, and a free joint: `qpos` and `qvel` have it after the craft.
-        Raises `InputError` if it touches the craft when it hangs straight below.
+        Centers of mass may be moved. Raises `InputError` if the ball touches the craft when it
+        hangs straight below.
         """
-        spec = build_scene(self.path, visual=False)
-        craft = next(body for body in spec.bodies if any(_is_free(j) for j in body.joints))
+        spec, craft = self._spec()
         radius = payload_radius(mass)
         hook = craft.add_site(name="rotorgram/hook")
         ball = spec.worldbody.add_body(name="rotorgram/payload")
@@ -156,14 +156,31 @@ class Vehicle:
         tendon = spec.add_tendon(name="rotorgram/cable", limited=True, range=[0.0, cable])
         tendon.wrap_site(hook.name)
         tendon.wrap_site(end.name)
-        model = spec.compile()
-        model.dof_damping[0:3] = self.model.dof_damping[0:3]
+        model = self._compiled(spec)
         data = mujoco.MjData(model)
         data.qpos[2] = high = self.rest_height + 2 * (cable + radius)
         data.qpos[7:10] = (0.0, 0.0, high - cable)
         clear = not _touches(model, data, high)
         expected = f"a length at which a payload with a radius of {radius:.3g} m hangs clear"
         expect(clear, "effects: cable", expected, f"{cable:g} m")
+        return model
+
+    def with_movable_center(self) -> mujoco.MjModel:
+        """The model, compiled so that centers of mass may be moved: MuJoCo spares work where one
+        is the body's origin.
+        """
+        return self._compiled(self._spec()[0])
+
+    def _spec(self) -> tuple[mujoco.MjSpec, mujoco.MjsBody]:
+        """Vehicle and ground to be changed, and the free body in them."""
+        spec = build_scene(self.path, visual=False)
+        craft = next(body for body in spec.bodies if any(_is_free(j) for j in body.joints))
+        craft.simple = False  # its inertia is no diagonal matrix once its center has moved
+        return spec, craft
+
+    def _compiled(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
+        model = spec.compile()
+        model.dof_damping[0:3] = self.model.dof_damping[0:3]
         return model
 
     def __deepcopy__(self, memo: Any) -> Self:

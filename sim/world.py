@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, get_args
 from ..models.errors import InputError, expect, require
 from .effects import EffectOptions
 from .random import Draw, Noise
-from .randomize import Randomization
+from .randomize import CENTER, Randomization
 from .state import Array, Pose, WorldState
 
 if TYPE_CHECKING:
+    import mujoco
+
     from ..models.vehicle import Vehicle
 
 Backend = Literal["mujoco", "warp"]
@@ -94,6 +96,15 @@ class World(Protocol):
 def contact_check(timestep: float) -> int:
     """Physics steps between two checks for contact."""
     return max(1, round(CONTACT_CHECK / timestep))
+
+
+def flown_model(
+    vehicle: "Vehicle", effects: EffectOptions, drawn: Sequence[str]
+) -> "mujoco.MjModel":
+    """The vehicle's model, or one of its own with a payload or for a drawn center of mass."""
+    if effects.payload:
+        return vehicle.with_payload(effects.payload, effects.cable)
+    return vehicle.with_movable_center() if set(drawn) & set(CENTER) else vehicle.model
 
 
 def check_hung(height: float, least: float) -> None:

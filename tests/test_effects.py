@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from rotorgram.envs import Loop
 from rotorgram.models import InputError, Vehicle
+from rotorgram.models.library import vehicle_names
 from rotorgram.sim import (
     PARAMETERS,
     EffectOptions,
@@ -119,6 +120,12 @@ def fly(world: World, thrust: Any, steps: int, substeps: int = 1) -> World:
             command if world.xp is np else world.xp.asarray(command, dtype=world.xp.float32),
             substeps,
         )
+    return world
+
+
+def fly_hovering(world: World) -> World:
+    """A physics step of any vehicle with the thrusts of its hover."""
+    world.step(world.xp.asarray(world.vehicle.hover_thrust) + 0 * world.state.command, 1)
     return world
 
 
@@ -768,6 +775,28 @@ def test_drawn_mass_inertia_and_center_are_those_of_a_compiled_model(tmp_path: P
     np.testing.assert_allclose(state.velocity, data.qvel[:3], rtol=0, atol=1e-12)
     np.testing.assert_allclose(state.body_rates, data.qvel[3:6], rtol=0, atol=1e-12)
     assert abs(state.body_rates).max() > 1
+
+
+@pytest.mark.parametrize("name", [None, *vehicle_names()])
+def test_a_drawn_center_turns_every_vehicle(name: str | None) -> None:
+    vehicle = Vehicle.load(name)
+    weight = vehicle.mass * vehicle.gravity
+    x, y = 0.02 * vehicle.inertia[0, 0] / weight, -0.03 * vehicle.inertia[1, 1] / weight
+    world = begin(world_of(vehicle, randomize={"center_x": x, "center_y": y}))
+    rates = fly_hovering(world).state.body_rates / vehicle.timestep
+    # The thrust m g at (-x, -y) from the center: torque (-y m g, x m g, 0), and turn as I^-1 has it.
+    turn = np.linalg.solve(vehicle.inertia, (-y * weight, x * weight, 0.0))
+    np.testing.assert_allclose(rates, turn, rtol=1e-4, atol=1e-6)
+
+
+def test_a_drawn_center_leaves_what_touches_where_it_is(tmp_path: Path) -> None:
+    """A box that is all of the mass, off the origin: MuJoCo takes its frame for the center's."""
+    text = RACER.read_text().replace(' size="0.1', ' pos="0 0 0.01" mass="0.6" size="0.1')
+    text = re.sub("<inertial.*/>", "", text)
+    (tmp_path / "box.xml").write_text(text)
+    world = world_of(Vehicle.load(tmp_path / "box.xml"), randomize={"center_z": -0.05})
+    assert not begin(world, 0.021).state.touching  # The box reaches 0.02 m below the origin.
+    assert begin(world, 0.019).state.touching
 
 
 def test_a_center_that_moves_back_to_zero_is_zero() -> None:

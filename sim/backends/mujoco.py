@@ -20,7 +20,7 @@ from ..random import RANDOMIZATION, Draw, Noise, NumpyDraw, NumpyNoise, Streams
 from ..randomize import CENTER, MODEL, VARIED, Randomization
 from ..rotations import body_z
 from ..state import Array, Pose, WorldState, plain
-from ..world import PhysicsError, check_hung, contact_check
+from ..world import PhysicsError, check_hung, contact_check, flown_model
 
 _FEW: Final = 8
 _ONLY: Final = np.zeros(1, int)
@@ -57,15 +57,18 @@ class MujocoWorld:
         self._randomize, self.parameters = randomize, dict[str, Array]()
         self._draws = Streams(num_worlds, RANDOMIZATION)
         drawn = () if randomize is None else randomize.names
-        acting = Effects(vehicle, effects or EffectOptions(), self.noise, np, drawn)
+        options = effects or EffectOptions()
+        acting = Effects(vehicle, options, self.noise, np, drawn)
         self.effects = acting if acting.works else None
         self._check = contact_check(vehicle.timestep)
         threads = 1 if num_worlds == 1 else num_threads
-        self._batch = batch = Batch(self._model(effects), num_worlds, threads)
-        self._cable, self._least_height = None, 0.0
-        if effects is not None and effects.payload:
-            self._cable = effects.cable
-            self._least_height = effects.cable + payload_radius(effects.payload)
+        model = flown_model(vehicle, options, drawn)
+        if acting.on_rotors:  # commands are within their limits; thrusts need not be
+            model = copy.copy(model)
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+        self._batch = batch = Batch(model, num_worlds, threads)
+        self._cable = options.cable if options.payload else None
+        self._least_height = options.cable + payload_radius(options.payload)
         self._varied = None if randomize is None else _Varied(batch, randomize.names)
         self._owner = None if threads == 1 else os.getpid()
         self._initial = batch.state[0].copy()
@@ -81,8 +84,7 @@ class MujocoWorld:
         # Where controls are newtons, they are the thrusts, and without effects the commands too.
         alike = self._newtons is None and self.effects is None
         self._command = self._ctrl if alike else np.zeros_like(self._ctrl)
-        differ = self.effects is not None and self.effects.on_rotors
-        self._thrust = np.zeros_like(self._ctrl) if differ else self._command
+        self._thrust = np.zeros_like(self._ctrl) if acting.on_rotors else self._command
         self._applied: np.ndarray = batch.bind("qfrc_applied")
         self._touching = np.zeros(num_worlds, bool)
         self._qacc: np.ndarray | None = None  # bound by what first asks for it
@@ -231,16 +233,6 @@ class MujocoWorld:
     def _check_process(self) -> None:
         if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
             raise RuntimeError("the threads of an env do not follow into a fork: make another env")
-
-    def _model(self, effects: EffectOptions | None) -> mujoco.MjModel:
-        """The model that flies: the vehicle's, or a copy with what the effects change."""
-        model = self.vehicle.model
-        if effects is not None and effects.payload:
-            model = self.vehicle.with_payload(effects.payload, effects.cable)
-        if self.effects is not None and self.effects.on_rotors:
-            model = copy.copy(model)  # commands are within their limits; thrusts need not be
-            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
-        return model
 
     def _place_payload(self, ids: np.ndarray) -> None:
         """Hang the payload straight below the craft, moving along with it."""

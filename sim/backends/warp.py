@@ -19,7 +19,7 @@ from ..random import RANDOMIZATION, START, Draw, Noise
 from ..randomize import CENTER, MODEL, VARIED, Randomization
 from ..rotations import body_z
 from ..state import Array, Pose, WorldState, constant
-from ..world import PhysicsError, check_hung, contact_check
+from ..world import PhysicsError, check_hung, contact_check, flown_model
 
 wp: Any = warp  # its types have gaps
 mjw: Any = mujoco_warp
@@ -71,9 +71,7 @@ class WarpWorld:
         self.effects = acting if acting.works else None
         self._cable = options.cable if options.payload else None
         self._least_height = options.cable + payload_radius(options.payload)
-        model = copy.copy(vehicle.model)
-        if self._cable is not None:
-            model = vehicle.with_payload(options.payload, options.cable)
+        model = copy.copy(flown_model(vehicle, options, drawn))
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nothing reads them
         if acting.on_rotors:  # commands are within their limits; thrusts need not be
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
@@ -90,7 +88,7 @@ class WarpWorld:
             self.ctrl, self._rows = from_dlpack(data.ctrl), from_dlpack(data.nefc)
             self._warmstart = from_dlpack(data.qacc_warmstart)
             self._applied = from_dlpack(data.qfrc_applied)
-            self._varied = _Varied(vehicle, model, self._model, data, drawn)
+            self._varied = _Varied(model, self._model, data, drawn)
             self.qpos[:, 2] = vehicle.rest_height + 1.0
             if self._cable is not None:  # slack, and off the ground
                 self.qpos[:, 2] += 2 * self._least_height
@@ -107,14 +105,13 @@ class WarpWorld:
         self._hover = constant(vehicle.hover_thrust, self.ctrl)
         self._level = constant(np.array((1.0, 0.0, 0.0, 0.0)), self.ctrl)
         command = torch.zeros((num_worlds, 1, vehicle.num_rotors), device=self.device)
-        differ = acting.on_rotors
         self.state = WorldState(
             position=self.qpos[:, None, :3],
             quaternion=self.qpos[:, None, 3:7],
             velocity=self.qvel[:, None, :3],
             body_rates=self.qvel[:, None, 3:6],
             command=command,
-            thrust=torch.zeros_like(command) if differ else command,
+            thrust=torch.zeros_like(command) if acting.on_rotors else command,
             touching=torch.zeros(self.shape, dtype=torch.bool, device=self.device),
             payload=None if self._cable is None else self.qpos[:, None, 7:10],
         )
@@ -328,7 +325,7 @@ class _Varied:
     """Values of the model that differ between worlds: those of `MODEL`."""
 
     def __init__(
-        self, vehicle: Vehicle, plain: mujoco.MjModel, model: Any, data: Any, names: tuple[str, ...]
+        self, plain: mujoco.MjModel, model: Any, data: Any, names: tuple[str, ...]
     ) -> None:
         self._names = [name for name in MODEL if name in names]
         if not self._names:
