@@ -134,7 +134,7 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
     specs = [
         numbers("position", "XYZ", unit="m", frame="paper"),
         numbers("attitude", ("phi", "theta", "psi"), unit="deg", frame="paper"),
-        numbers(
+        numbers(  # bounds of the commands: rotors whose efficiency is drawn may leave them
             "thrust",
             [f"F{i + 1}" for i in range(vehicle.num_rotors)],
             unit="N",

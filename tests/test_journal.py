@@ -208,6 +208,37 @@ def test_both_sides_can_be_repeated_bit_for_bit(
     assert datagrams(both.agent, State)[1][40:] == datagrams(both.simulator, State)[1][40:]
 
 
+WORLD: dict[str, Any] = {
+    "effects": {
+        "motor_lag": True, "body_drag": True, "wind": (2.0, 1.0, 0.0), "gusts": 3.0,
+        "payload": 0.004, "cable": 0.3,
+    },
+    "randomize": {
+        "mass": "uniform(0.8, 1.2)", "center_x": "normal(0, 0.001)", "thrust": "normal(1, 0.1)",
+        "wind_x": "normal(0, 1)", "action_delay": "uniform(0, 3)",
+        "observation_delay": "uniform(0, 2)",
+    },
+    "sensors": {
+        "imu": True, "estimate": True,
+        "motion_capture": {
+            "noise": 0.001, "angle_noise": 0.01, "rate": 25, "delay": 0.1, "dropout": 0.2
+        },
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("drones", [1, 3])
+def test_what_acts_is_drawn_and_is_measured_is_repeated(drones: int, tmp_path: Path) -> None:
+    options = {**WORLD, "vehicle": "crazyflie2", "env": "rotorgram/Hover-v0", "episode_length": 40}
+    with pair(tmp_path, drones=drones, **options) as both:
+        assert fly(both.remote, 150, seed=None).episodes > 1
+        if drones > 1:
+            both.remote.reset(seed=5, options={"reset_mask": np.array([True, False, True])})
+            both.remote.step(both.remote.action_space.sample())
+    for side in ("agent", "simulator"):
+        assert Verification(getattr(both, side), vehicle="crazyflie2").identical
+
+
 def test_both_sides_write_the_same_datagrams(flight: SimpleNamespace) -> None:
     everything = State, Command, Hello, Welcome
     ours, theirs = datagrams(flight.agent, *everything), datagrams(flight.simulator, *everything)
