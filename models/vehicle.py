@@ -29,6 +29,9 @@ _MOST_HEIGHT: Final = 1e4  # m: above it no craft may touch anything
 _RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves
 _ROUNDED: Final = 1e-5  # of the weight, sideways: what a file's six digits leave
 
+SURROUNDINGS: Final = (True, False, False, False, False, False)
+"""Of a vehicle's model the groups of geoms that are not the craft's, for rays."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Rotor:
@@ -181,6 +184,7 @@ class Vehicle:
     def _compiled(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
         model = spec.compile()
         model.dof_damping[0:3] = self.model.dof_damping[0:3]
+        _group(model)
         return model
 
     def __deepcopy__(self, memo: Any) -> Self:
@@ -227,6 +231,11 @@ def payload_radius(mass: float) -> float:
 def craft_bodies(model: mujoco.MjModel) -> np.ndarray:
     """Ids of the free body, which has the first joint, and of what is welded to it."""
     return np.flatnonzero(model.body_rootid == model.jnt_bodyid[0])
+
+
+def _group(model: mujoco.MjModel) -> None:
+    """Put the craft's geoms into a group of their own: see `SURROUNDINGS`."""
+    model.geom_group[:] = np.isin(model.geom_bodyid, craft_bodies(model))
 
 
 def payload_body(model: mujoco.MjModel) -> int:
@@ -284,6 +293,7 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
     rotors = tuple(read_rotor(model, data, index) for index in range(model.nu))
     allocation = allocate(rotors, center)
     model.dof_damping[0:3] = drag * mass
+    _group(model)
     return Vehicle(
         path=path,
         name=str(spec.modelname),

@@ -80,7 +80,7 @@ class World(Protocol):
     def below(self) -> Array:
         """Distance from each body's origin along its -z axis to the first surface, m, (W, A).
 
-        Infinite where there is none. Geoms of the free body itself do not count.
+        Infinite where there is none. Geoms of the craft do not count; a payload is a surface.
         """
 
     def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:

@@ -225,6 +225,21 @@ def test_rangefinder_sees_what_stands_in_a_vehicles_file(tmp_path: Path) -> None
         assert reading == pytest.approx([expected], abs=1e-9)
 
 
+@pytest.mark.parametrize("backend", ["mujoco", "warp"])
+def test_rangefinder_looks_past_what_is_fixed_to_the_craft(backend: Any, tmp_path: Path) -> None:
+    if backend == "warp":
+        pytest.importorskip("mujoco_warp")
+    text = Vehicle.load().path.read_text()
+    leg = '<body pos="0 0 -0.3"><geom type="box" size="0.1 0.1 0.1" mass="0"/></body>'
+    file = tmp_path / "leg.xml"
+    file.write_text(text.replace("<freejoint", f"{leg}<freejoint", 1))
+    world = make_world(Vehicle.load(file), 2, backend)
+    position = world.xp.zeros((2, 1, 3), dtype=world.xp.float32)
+    position[..., 2] = 3.0
+    world.reset(world.xp.ones((2, 1), dtype=bool), Pose(position=position))
+    np.testing.assert_allclose(world.below(), 3.0, rtol=1e-6)
+
+
 def test_gps_and_motion_capture() -> None:
     pose = {"position": (1.0, -2.0, 3.0), "velocity": (4.0, 5.0, -6.0), "quaternion": LEFT}
     assert first("gps", GPS, **pose) == [1.0, -2.0, 3.0, 4.0, 5.0, -6.0]

@@ -14,7 +14,14 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from ...models.errors import InputError
-from ...models.vehicle import Vehicle, body_axes, craft_bodies, payload_body, payload_radius
+from ...models.vehicle import (
+    SURROUNDINGS,
+    Vehicle,
+    body_axes,
+    craft_bodies,
+    payload_body,
+    payload_radius,
+)  # fmt: skip
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, Draw, Noise, NumpyDraw, NumpyNoise, Streams
 from ..randomize import CENTER, MODEL, VARIED, Randomization
@@ -24,6 +31,7 @@ from ..world import PhysicsError, check_hung, contact_check, flown_model
 
 _FEW: Final = 8
 _ONLY: Final = np.zeros(1, int)
+_SEEN: Final = np.array(SURROUNDINGS, np.uint8)
 
 
 class MujocoWorld:
@@ -205,8 +213,7 @@ class MujocoWorld:
         origin, down = (
             array.reshape(-1, 1, 3) for array in (state.position, -body_z(state.quaternion))
         )
-        body = int(self.vehicle.model.jnt_bodyid[0])
-        distance = self._batch.ray(origin, down, bodyexclude=body)[0]
+        distance = self._batch.ray(origin, down, geomgroup=_SEEN)[0]
         return np.where(distance < 0, np.inf, distance).reshape(self.shape)[()]
 
     def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:

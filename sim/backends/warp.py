@@ -13,7 +13,14 @@ import warp
 from torch.utils.dlpack import from_dlpack
 
 from ...models.errors import InputError
-from ...models.vehicle import Vehicle, body_axes, craft_bodies, payload_body, payload_radius
+from ...models.vehicle import (
+    SURROUNDINGS,
+    Vehicle,
+    body_axes,
+    craft_bodies,
+    payload_body,
+    payload_radius,
+)  # fmt: skip
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, START, Draw, Noise
 from ..randomize import CENTER, MODEL, VARIED, Randomization
@@ -299,12 +306,12 @@ class WarpWorld:
         with wp.ScopedDevice(self._name):
             rays = [wp.zeros((worlds, 1), dtype=wp.vec3) for _ in range(3)]
             distance, geom = wp.zeros((worlds, 1), dtype=float), wp.zeros((worlds, 1), dtype=int)
-            body = wp.array([int(self.vehicle.model.jnt_bodyid[0])], dtype=int)
-            every = wp.types.vector(6, float)(-1.0)
+            body = wp.array([-1], dtype=int)
+            seen = wp.types.vector(6, float)(*map(float, SURROUNDINGS))
 
             def cast(model: Any, data: Any) -> None:
                 mjw.kinematics(model, data)
-                mjw.rays(model, data, *rays[:2], every, True, body, distance, geom, rays[2])
+                mjw.rays(model, data, *rays[:2], seen, True, body, distance, geom, rays[2])
 
             cast(model, self._data)
             wp.synchronize()
