@@ -91,6 +91,15 @@ class Randomization:
         """Names of what is drawn, in the order of `PARAMETERS`."""
         return tuple(name for name in PARAMETERS if name in self._kinds)
 
+    def to_options(self) -> dict[str, Any]:
+        """The distributions by name, each in one way of writing: a number, or a text."""
+        told: dict[str, Any] = {}
+        for name, (kind, numbers) in self._kinds.items():
+            inside = ", ".join(repr(number).removesuffix(".0") for number in numbers)
+            alone = kind == "choice" and len(numbers) == 1
+            told[name] = numbers[0] if alone else f"{kind}({inside})"
+        return told
+
     def most_steps(self, name: str) -> int:
         """No draw of a delay is longer, control steps."""
         kind, numbers = self._kinds[name]
@@ -133,7 +142,6 @@ def _distribution(name: str, text: Any) -> tuple[str, tuple[float, ...]]:
     most = max(1, len(numbers)) if match else 1
     right = kind in _KINDS and len(numbers) == (_KINDS.get(kind) or most)
     bounded = numbers[:1] if kind == "normal" else numbers
-    right = right and type(text) is not bool
     right = right and all(limits.low <= number <= limits.high for number in bounded)
     if right and kind in ("uniform", "loguniform"):
         right = numbers[0] <= numbers[1] and (kind == "uniform" or numbers[0] > 0)

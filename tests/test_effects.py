@@ -784,7 +784,7 @@ def test_a_drawn_center_turns_every_vehicle(name: str | None) -> None:
     x, y = 0.02 * vehicle.inertia[0, 0] / weight, -0.03 * vehicle.inertia[1, 1] / weight
     world = begin(world_of(vehicle, randomize={"center_x": x, "center_y": y}))
     rates = fly_hovering(world).state.body_rates / vehicle.timestep
-    # The thrust m g at (-x, -y) from the center: torque (-y m g, x m g, 0), and turn as I^-1 has it.
+    # The thrust m g acts at (-x, -y) from the center: the torque is (-y m g, x m g, 0).
     turn = np.linalg.solve(vehicle.inertia, (-y * weight, x * weight, 0.0))
     np.testing.assert_allclose(rates, turn, rtol=1e-4, atol=1e-6)
 
@@ -864,6 +864,19 @@ def test_a_drawn_strength_of_gusts() -> None:
 def test_a_rotor_that_the_vehicle_lacks_is_refused() -> None:
     with pytest.raises(InputError, match="randomize: expected one of the 4 rotors, got thrust_5"):
         world_of(randomize={"thrust_5": 0.5})
+
+
+def test_distributions_are_told_in_one_way_of_writing() -> None:
+    texts = {
+        "mass": " uniform(.8,1.20)", "inertia": np.float32(1.5), "center_x": np.int64(0),
+        "thrust": "normal(1,5e-2)", "center_z": "choice( 0,0.125 )", "reaction": "1.25",
+    }  # fmt: skip
+    told = Randomization(texts, None).to_options()
+    assert json.loads(json.dumps(told)) == {
+        "mass": "uniform(0.8, 1.2)", "inertia": 1.5, "center_x": 0.0,
+        "thrust": "normal(1, 0.05)", "center_z": "choice(0, 0.125)", "reaction": 1.25,
+    }  # fmt: skip
+    assert Randomization(told, None).to_options() == told
 
 
 def test_whole_numbers_have_equal_chances() -> None:

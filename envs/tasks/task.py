@@ -68,8 +68,8 @@ class TaskOptions:
         check_number(self, "linear_drag", 0.0, MOST_DRAG, "/s")
         effects = EffectOptions.from_options(self.effects)
         object.__setattr__(self, "effects", effects.to_options())
-        Randomization(self.randomize, effects)  # raises
-        object.__setattr__(self, "randomize", dict(self.randomize))
+        drawn = Randomization(self.randomize, effects)
+        object.__setattr__(self, "randomize", drawn.to_options())
         object.__setattr__(self, "sensors", checked_sensors(self.sensors))
         self.check()
 
