@@ -64,7 +64,7 @@ class Vehicle:
     model: mujoco.MjModel
     """Vehicle and ground, compiled without visual elements. Do not change it."""
     linear_drag: float
-    """Acceleration of -linear_drag · velocity, 1/s."""
+    """Acceleration of -linear_drag · velocity, 1/s, by a force at the body's origin."""
     mass: float
     """kg."""
     gravity: float

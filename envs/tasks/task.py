@@ -50,7 +50,8 @@ class TaskOptions:
     """Time between two actions, s: a multiple of the physics step, at most 1 s. The default is that
     of Unity's `FixedUpdate`."""
     linear_drag: float = 0.0
-    """Acceleration of -linear_drag · velocity, 1/s, as Unity's `Rigidbody.drag`; at most 100."""
+    """Acceleration of -linear_drag · velocity, 1/s, as Unity's `Rigidbody.drag`; at most 100. The
+    force acts at the body's origin."""
     effects: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Effects by name, as `sim.EffectOptions` has them; none are on by default."""
     randomize: Mapping[str, Any] = field(default_factory=dict, hash=False)
