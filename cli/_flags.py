@@ -132,7 +132,9 @@ def _world_options(command: Any, given: frozenset[str]) -> dict[str, Any]:
             name, equals, text = word.partition("=")
             several = re.fullmatch(r"[-+.\deE]+(,[-+.\deE]+)+", text)
             value = parse_value(f"[{text}]" if several else text)
-            values[name.replace("-", "_")] = value if equals else True
+            key = name.replace("-", "_")
+            expect(key not in values, flag, "each name once", f"{key!r} twice")
+            values[key] = value if equals else True
         options[flag] = values
     return options
 

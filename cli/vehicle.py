@@ -76,7 +76,7 @@ class Vehicle(Command):
     file: Annotated[Positional[str], arg(metavar="FILE")]
     """TOML or MJCF file, or the name of a vehicle of the library."""
     out: Annotated[Positional[Path | None], arg(metavar="OUT.xml")] = None
-    """MJCF file that `export` writes."""
+    """MJCF file that `export` writes, a new one."""
     frame: Literal["plus", "cross", "hexa", "octo", "list"] = "cross"
     """Arrangement of the rotors of `new`."""
 
@@ -133,10 +133,16 @@ class Vehicle(Command):
             print(f"\nnumbers of {craft.path.name}")
             for line in _provenance(file):
                 print(line)
-            return
-        print("\ncoefficients")
+            if file.model is None:
+                return
+            told = {one.name for one in file.numbers}
+            print(f"\ncoefficients of {file.model.name}")
+        else:
+            told = set()
+            print("\ncoefficients")
         for name, values in craft.coefficients.numbers().items():
-            print(f"{name} = {_listed(values)}")
+            if name not in told:
+                print(f"{name} = {_listed(values)}")
 
     def _export(self) -> None:
         from ..models.export import export_mjcf

@@ -178,7 +178,8 @@ def checked(name: str, one: Field[Any], values: Any) -> float | tuple[float, ...
     limits: Limits = one.metadata["limits"]
     many = limits.count or "one or more"
     numbers = "a number" if limits.count == 1 else f"{many} numbers"
-    expected = f"{numbers} from {limits.low:g} to {limits.high:g} {limits.unit}"
+    unit = "" if limits.unit == "1" else f" {limits.unit}"
+    expected = f"{numbers} from {limits.low:g} to {limits.high:g}{unit}"
     try:
         array = np.asarray(values)
         right = array.dtype.kind in "iuf" and array.ndim <= 1

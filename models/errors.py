@@ -27,8 +27,12 @@ class NotCopied:
 def expect(
     right: object, name: str, expected: str, got: str = "", kind: type[InputError] = InputError
 ) -> None:
-    """Raise an error with the sentence "name: expected this, got that", unless it is right."""
+    """Raise an error with the sentence "name: expected this, got that", unless it is right.
+
+    What was got is cut to 300 characters.
+    """
     if not right:
+        got = got if len(got) <= 300 else got[:299] + "…"
         raise kind(f"{name}: expected {expected}" + (f", got {got}" if got else ""))
 
 

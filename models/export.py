@@ -12,12 +12,13 @@ from .vehicle_file import read_vehicle_file
 
 
 def export_mjcf(vehicle: Path | str, out: Path) -> str:
-    """Write a vehicle's MJCF; returns how exact its numbers are, in words.
+    """Write a vehicle's MJCF to a new file; returns how exact its numbers are, in words.
 
     What a TOML file tells by itself is written with all its digits, and moves bit for bit as the
     vehicle. Other models are written by MuJoCo, with six digits. Raises `InputError`.
     """
     expect(out.suffix.lower() == ".xml", "out", "a name that ends in .xml", str(out))
+    expect(not out.exists(), "out", "the name of a new file", f"{out}, which is there")
     path = find_vehicle(vehicle)
     Vehicle.load(path)  # refuses what cannot fly
     if path.suffix.lower() == ".toml":

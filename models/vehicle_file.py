@@ -76,6 +76,8 @@ _WORDS: Final[Mapping[str, tuple[str, ...]]] = {
 """Keys of each table besides its numbers."""
 _SHAPES: Final[Mapping[str, tuple[str, ...]]] = {"box": ("size",), "cylinder": ("radius", "length")}
 _UP: Final = (0.0, 0.0, 1.0)
+_MOST_BYTES: Final = 1_000_000  # it is read within a few seconds
+_LEAST_MOMENT: Final = 1e-15  # kg m²: MuJoCo's mjMINVAL
 DEFAULT_TIMESTEP: Final = 0.01
 """Physics step of a file that tells none, s."""
 DEFAULT_GRAVITY: Final = 9.81
@@ -195,11 +197,15 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     """Read a TOML file. Raises `InputError` with the name and the range of the first wrong field,
     `OSError` if the file cannot be read.
     """
+    size = path.stat().st_size
+    expect(size <= _MOST_BYTES, "vehicle", f"a TOML file of at most {_MOST_BYTES} bytes", f"{size}")
     try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+        return _Reader(path, tomllib.loads(path.read_text(encoding="utf-8"))).result
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"vehicle: expected a TOML file, got {path.name}: {error}") from None
-    return _Reader(path, tree).result
+    except RecursionError:
+        wanted = "a TOML file with tables as in docs/vehicles.md"
+        raise InputError(f"vehicle: expected {wanted}, got too many in each other") from None
 
 
 class _Reader:
@@ -209,7 +215,7 @@ class _Reader:
         self.numbers: list[Number] = []
         self._read(tree, "vehicle")
         name = tree.get("name", path.parent.name if path.stem == "vehicle" else path.stem)
-        expect(isinstance(name, str) and name, "name", "a text", repr(name))
+        _check_name("name", name)
         model = self._model(path, tree.get("model"))
         parts = self._body(tree.get("body"), model)
         rotors = self._rotors(tree.get("rotors"), model)
@@ -300,7 +306,8 @@ class _Reader:
         expect(table is not None, "vehicle", "a table [rotors]", "none")
         given = self._read(table, "rotors")
         frame, listed = table.get("frame"), table.get("list")
-        if listed is None and frame is None and model is not None and model.suffix == ".xml":
+        mjcf = model is not None and model.suffix.lower() == ".xml"
+        if listed is None and frame is None and mjcf:
             self._only_coefficients(given)
             return ()
         both = "a frame or a list" if model is None else "a list"
@@ -349,7 +356,7 @@ class _Reader:
         _check_axis(f"{name}.axis", axis)
         expect(turn in ("cw", "ccw"), f"{name}.turn", "'cw' or 'ccw'", repr(turn))
         own = table.get("name", f"rotor{number}")
-        expect(isinstance(own, str) and own, f"{name}.name", "a text", repr(own))
+        _check_name(f"{name}.name", own)
         places = [key for key in ("link", "body", "site") if key in table]
         if model is None:
             expect(not places, name, "a position", "".join(places[:1]))
@@ -425,6 +432,11 @@ def _check_keys(name: str, table: Any, known: Sequence[str], *silent: str) -> No
         expect(right, name, f"some of {', '.join(known)}", repr(key))
 
 
+def _check_name(name: str, given: Any) -> None:
+    right = isinstance(given, str) and 0 < len(given) <= 100 and given.isprintable()
+    expect(right, name, "a text of 1 to 100 printable characters", repr(given))
+
+
 def _tables(name: str, given: Any, least: int = 1) -> list[Any]:
     right = isinstance(given, list) and len(given) >= least
     wanted = "a list of tables" + ", at least one" * least
@@ -446,7 +458,8 @@ def _check_inertia(values: tuple[float, ...]) -> None:
     expect(len(values) in (3, 6), "body.inertia", counts, got)
     xx, yy, zz, xy, xz, yz = (*values, 0.0, 0.0, 0.0)[:6]
     low, middle, high = np.linalg.eigvalsh(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))).tolist()
-    expect(low > 0, "body.inertia", "principal moments above 0 kg m²", got)
+    wanted = f"principal moments above {_LEAST_MOMENT:g} kg m²"
+    expect(low > _LEAST_MOMENT, "body.inertia", wanted, got)
     wanted = "principal moments of which none is larger than the sum of the others"
     right = high <= (low + middle) * (1 + 1e-9)
     expect(right, "body.inertia", wanted, f"{low:.4g}, {middle:.4g} and {high:.4g} kg m²")
@@ -691,7 +704,7 @@ def _find_meshes(spec: mujoco.MjSpec, folder: Path) -> None:
         if not mesh.file.startswith("package:"):
             continue
         inside = Path(mesh.file.removeprefix("package:").lstrip("/"))
-        ways = inside, inside.relative_to(inside.parts[0])  # with the package's name, or without
+        ways = inside, Path(*inside.parts[1:])  # with the package's name, or without
         places = (up / way for up in (folder, *folder.parents) for way in ways)
         found = next((place for place in places if place.is_file()), None)
         got = f"no file for {mesh.file}"

@@ -85,6 +85,22 @@ def test_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "\nmass " in out
 
 
+def test_show_has_what_a_models_file_tells(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = (DATA / "racer.xml").read_text(encoding="utf-8")
+    (tmp_path / "racer.xml").write_text(model, encoding="utf-8")
+    file = tmp_path / "mine.toml"
+    file.write_text('[model]\nfile = "racer.xml"\n[rotors]\nradius = 0.25\n')
+    assert 'name="rotorgram/rotors.time_constant" data="0.05"' in model
+    status, out, _ = run(capsys, "show", file)
+    assert status == 0
+    numbers, others = out.split("\nnumbers of mine.toml\n")[1].split("coefficients of racer.xml\n")
+    assert numbers == "rotors.radius = 0.25 m\n\n"
+    assert "rotors.time_constant = 0.05\n" in others
+    assert "radius" not in others
+
+
 def test_export(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, out = tmp_path / "mine.toml", tmp_path / "mine.xml"
     run(capsys, "new", file)
@@ -106,6 +122,10 @@ def test_export(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (["new", "there.toml"], "there.toml: File exists"),
         (["export", "there.toml"], "vehicle: expected two files, .*, got one"),
         (["export", "there.toml", "x.txt"], "out: expected a name that ends in .xml, got x.txt"),
+        (
+            ["export", "paper", "there.xml"],
+            "out: expected the name of a new file, got there.xml, wh",
+        ),
         (["show", "there.toml", "x.xml"], "vehicle: expected one file for show, got x.xml too"),
         (["show", "there.toml", "--frame", "cross"], "frame: expected no --frame but with new"),
         (["show", "nobodys"], "vehicle: expected a file, or one of .*paper.*, got 'nobodys'"),
@@ -122,6 +142,7 @@ def test_wrong_words_are_one_sentence(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("there.toml").touch()
+    Path("there.xml").touch()
     status, out, err = run(capsys, *words)
     assert (status, out) == (2 if words[0] == "check" else 1, "")
     assert re.match(rf"rotorgram: {sentence}.*\n$", err)
@@ -154,3 +175,6 @@ def test_every_command_takes_the_file(tmp_path: Path, capsys: pytest.CaptureFixt
     evaluate = ["evaluate", str(folder), "--episodes", "1", "--vehicle", str(file)]
     assert main([*evaluate, "--record", journal]) == 0
     assert main(["replay", journal, "--verify", "--vehicle", str(file)]) == 0
+    capsys.readouterr()
+    assert main(["replay", journal, "--verify"]) == 1  # the paper's has other rotors
+    assert re.search("the vehicle was .*: --vehicle names its file", capsys.readouterr().out)

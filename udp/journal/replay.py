@@ -11,6 +11,7 @@ from ...envs.loop import Loop
 from ...envs.registry import is_known
 from ...envs.spec import component_names
 from ...models.errors import InputError
+from ...models.vehicle import Vehicle
 from ..protocol.messages import Command, State
 from ..transport.stepped import reset_all
 from .reader import Item, Recording, Session, count_of, printable
@@ -115,16 +116,21 @@ class SessionVerdict:
                 f"expected a registered env id, got {spec.env_id!r}: "
                 "--env MODULE:NAME names the module that registers it"
             )
-        count = self.session.num_envs
-        loop = Loop(spec.env_id, count, vehicle=self.vehicle, options=spec.options)
+        count, drag = self.session.num_envs, spec.options.get("linear_drag", 0.0)
+        was, now = spec.vehicle_hash, Vehicle.load(self.vehicle, linear_drag=drag).hash
+        other = bool(was.strip("0")) and was != now
+        hint = f"; the vehicle was {was}, and is {now} here: --vehicle names its file" * other
+        try:
+            loop = Loop(spec.env_id, count, vehicle=self.vehicle, options=spec.options)
+        except InputError as error:
+            raise InputError(f"{error}{hint}") from None
         for name in ("observation", "action", "telemetry", "control_period"):
             was, now = getattr(spec, name), getattr(loop.spec, name)
             if was != now:
                 loop.close()
-                raise InputError(f"expected an env of the {name} {was}, got one of {now}")
-        was, now = spec.vehicle_hash, loop.spec.vehicle_hash
-        if was.strip("0") and was != now:
-            self.notes.append(f"the vehicle was {was}, and is {now} here")
+                raise InputError(f"expected an env of the {name} {was}, got one of {now}{hint}")
+        if other:
+            self.notes.append(hint.removeprefix("; "))
         return loop
 
     def _compare(self, recorded: State) -> None:
