@@ -157,6 +157,16 @@ def test_refusals_say_why(wanted: Any, env: str, given: Any, sentence: str) -> N
     assert sentence.replace("\\", "") in str(error)
 
 
+def test_spaces_in_a_distribution_do_not_differ() -> None:
+    wanted = {"randomize": {"mass": "uniform(0.9,1.1)"}}
+    with RemoteEnv(ANY, connect=False, env_id=ENV_ID, options=wanted) as remote:
+        given = {"randomize": {"mass": " uniform( 0.9, 1.1 )"}}
+        running = Running(Simulator(ENV_ID, server=remote.address, bind=ANY, config=QUICK, **given))
+        remote.connect()
+        assert remote.env_spec.options["randomize"] == {"mass": "uniform(0.9, 1.1)"}
+    running.join()
+
+
 def test_an_option_that_the_agent_does_not_know_is_refused() -> None:
     """A later version of the env may have more of them."""
     spec = env_spec(ENV_ID, {})
