@@ -10,7 +10,7 @@ from ..envs.registry import env_spec, is_known
 from ..envs.spec import EnvSpec
 from ..experiments.pairs import socket_pair
 from ..experiments.trajectories import Trajectory
-from ..models.errors import expect
+from ..models.errors import InputError, expect
 from ..udp import RemoteEnv, RemoteVectorEnv
 from ._flags import AgentFlags, EnvFlags, parse_address
 
@@ -71,7 +71,13 @@ def pilot_of(
         return None, None, chosen_env(command)
     checkpoint = load_checkpoint(what)
     env = chosen_env(command, checkpoint)
-    spec = env_spec(*env, vehicle=command.vehicle)
+    try:
+        spec = env_spec(*env, vehicle=command.vehicle)
+    except InputError as error:  # the paper's vehicle may lack what the policy's had
+        if checkpoint is None or "vehicle" in command.given:
+            raise
+        trained = f"the policy was trained on {checkpoint.spec.vehicle}: name it with --vehicle"
+        raise InputError(f"{error}; {trained}") from None
     return checkpoint, policy_for(command, checkpoint, spec), env
 
 

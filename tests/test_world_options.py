@@ -169,6 +169,19 @@ def test_flags(capsys: pytest.CaptureFixture[str]) -> None:
         assert sentence in capsys.readouterr().err
 
 
+def test_a_policy_needs_the_vehicle_that_has_its_effects(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = ["--vehicle", str(RACER), "--effects", "motor_lag", "--out", str(tmp_path / "run")]
+    assert main(["train", "a2c", "--env-steps", "256", *run]) == 0
+    assert main(["evaluate", str(tmp_path / "run"), "--episodes", "1"]) == 1
+    told = capsys.readouterr().err
+    assert "rotors.time_constant in the vehicle's file, which motor_lag needs, got none; " in told
+    assert "the policy was trained on racer: name it with --vehicle" in told
+    again = ["evaluate", str(tmp_path / "run"), "--episodes", "1", "--vehicle", str(RACER)]
+    assert main(again) == 0
+
+
 def test_files_of_a_comparison_tell_what_was_drawn(tmp_path: Path) -> None:
     words = ["--agents", "vpg", "--seeds", "1", "--env-steps", "1500", "--episodes", "2"]
     words += ["--jobs", "1", "--env.episode-length", "50", "--no-film"]
