@@ -10,7 +10,7 @@ from ..envs.registry import env_spec, is_known
 from ..envs.spec import EnvSpec
 from ..experiments.pairs import socket_pair
 from ..experiments.trajectories import Trajectory
-from ..models.errors import InputError, expect
+from ..models.errors import expect
 from ..udp import RemoteEnv, RemoteVectorEnv
 from ._flags import AgentFlags, EnvFlags, parse_address
 
@@ -44,7 +44,11 @@ def chosen_env(
     wanted = f"--env {checkpoint.env_id} with options of the task that the policy was trained on"
     right = not options or env_id == checkpoint.env_id
     expect(right, "env", wanted, f"options of {env_id}")
-    return checkpoint.env_id, {**checkpoint.options, **options}
+    env = checkpoint.env_id, {**checkpoint.options, **options}
+    own = getattr(command, "listen", None) is None  # a simulator of our own flies it
+    if own and is_known(env[0]):
+        _check_vehicle(command, checkpoint, env_spec(*env, vehicle=command.vehicle))
+    return env
 
 
 def policy_for(command: EnvFlags, checkpoint: Checkpoint | None, spec: EnvSpec) -> Policy:
@@ -53,6 +57,12 @@ def policy_for(command: EnvFlags, checkpoint: Checkpoint | None, spec: EnvSpec) 
     """
     if checkpoint is None:
         return PID(spec)
+    _check_vehicle(command, checkpoint, spec)
+    return checkpoint.policy(spec)
+
+
+def _check_vehicle(command: EnvFlags, checkpoint: Checkpoint, spec: EnvSpec) -> None:
+    """Raise `InputError` for another vehicle than the policy's that the user has not named."""
     trained = checkpoint.spec
     same_drag = trained.options.get("linear_drag") == spec.options.get("linear_drag")
     other = trained.vehicle_hash != spec.vehicle_hash and same_drag
@@ -60,7 +70,6 @@ def policy_for(command: EnvFlags, checkpoint: Checkpoint | None, spec: EnvSpec) 
     then, now = (f"{one.vehicle} (model {one.vehicle_hash[:8]})" for one in (trained, spec))
     wanted = f"{then}, on which the policy was trained"
     expect(right, "vehicle", wanted, f"{now}; name one with --vehicle")
-    return checkpoint.policy(spec)
 
 
 def pilot_of(
@@ -71,13 +80,7 @@ def pilot_of(
         return None, None, chosen_env(command)
     checkpoint = load_checkpoint(what)
     env = chosen_env(command, checkpoint)
-    try:
-        spec = env_spec(*env, vehicle=command.vehicle)
-    except InputError as error:  # the paper's vehicle may lack what the policy's had
-        if checkpoint is None or "vehicle" in command.given:
-            raise
-        trained = f"the policy was trained on {checkpoint.spec.vehicle}: name it with --vehicle"
-        raise InputError(f"{error}; {trained}") from None
+    spec = env_spec(*env, vehicle=command.vehicle)
     return checkpoint, policy_for(command, checkpoint, spec), env
 
 
