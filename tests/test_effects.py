@@ -1203,6 +1203,20 @@ def test_warp_draws_other_numbers_of_the_same_distributions(warp: Any) -> None:
         assert abs(gap[0] - gap[1]).max() < 1.95 * math.sqrt(2 / num)
 
 
+def test_warp_keeps_what_follows_from_a_drawn_mass_for_each_world(warp: Any) -> None:
+    turning, thrusts = {"body_rates": [1.0, 2.0, 3.0]}, [1.0, 1.2, 1.4, 1.6]
+    ours = begin(world_of(None, 3, "warp", {"mass": "uniform(0.5, 3)"}), **turning)
+    fly(ours, thrusts, 50, 4)
+    masses = ours.parameters["mass"][:, 0].tolist()
+    assert max(masses) > 1.05 * min(masses)
+    for index, mass in enumerate(masses):
+        alone = begin(world_of(randomize={"mass": mass}), **turning)
+        fly(alone, thrusts, 50, 4)
+        for name, tolerance in (("velocity", 5e-4), ("quaternion", 5e-5)):
+            mine = on_host(getattr(ours.state, name))[index, 0]
+            np.testing.assert_allclose(mine, getattr(alone.state, name), atol=tolerance)
+
+
 def test_warp_freezes_and_resets_some(warp: Any) -> None:
     world = world_of(None, 3, "warp", DRAWN, **{**GUSTY, "gusts": 0.0})
     fly(begin(world), 2.0, 5)
