@@ -382,7 +382,7 @@ def _untold(
         return {}
     sizes = {name: ratio for name, ratio in ratios.items() if ratio >= min(most, 4 * WIDEST)}
     return {
-        name: "not excited: 95 % interval " + ("any number" if np.isinf(r) else f"± {r:.0%}")
+        name: "not excited: 95 % interval " + ("any number" if r > 10 else f"± {r:.0%}")
         for name, r in sizes.items()
     }
 
