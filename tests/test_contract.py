@@ -159,7 +159,7 @@ def _connected(remote: Any) -> Any:
 
 
 @pytest.mark.parametrize("env_id", TASKS)
-@pytest.mark.parametrize("name", ["racer", "tiny"])
+@pytest.mark.parametrize("name", FILES)
 def test_on_warp(env_id: str, name: str) -> None:
     """The contract of a batch of tensors; that it flies as `mujoco` does, test_warp.py tests."""
     torch = pytest.importorskip("torch")
