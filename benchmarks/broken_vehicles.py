@@ -88,7 +88,7 @@ def free(words: str) -> Edit:
     return replace(('<freejoint name="free"/>', f'<joint name="free" type="free" {words}/>'))
 
 
-SITE1, SITE2 = '<site name="rotor1" pos=" 1  1 0"', '<site name="rotor2" pos=" 1 -1 0"'
+SITE1 = '<site name="rotor1" pos=" 1  1 0"'
 GEAR2 = 'site="rotor2" gear="0 0 1 0 0 -0.05"'
 SITE3 = '<site name="rotor3" pos="-1 -1 0"/>'
 MAST = '<body pos="3 0 0"><site name="rotor3"/></body></worldbody>'

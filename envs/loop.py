@@ -231,12 +231,11 @@ class Loop(NotCopied):
             array.name: slice(*ends[i : i + 2]) for i, array in enumerate(self.spec.telemetry)
         }
         self._has_goal = "goal" in self._columns
-        names = () if randomize is None else randomize.names
-        self._drawn = names
+        self._drawn = () if randomize is None else randomize.names
         self._late_actions = self._late_observations = None
-        if randomize is not None and "action_delay" in names:
+        if randomize is not None and "action_delay" in self._drawn:
             self._late_actions = Delay(randomize.most_steps("action_delay"), self._xp)
-        if randomize is not None and "observation_delay" in names:
+        if randomize is not None and "observation_delay" in self._drawn:
             most = randomize.most_steps("observation_delay")
             self._late_observations = {name: Delay(most, self._xp) for name, *_ in self._arrays}
 

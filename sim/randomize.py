@@ -56,10 +56,6 @@ PARAMETERS: Final = {
     "observation_delay": Parameter(0, 100, "steps", "age of an observation, control steps"),
 }
 CENTER: Final = ("center_x", "center_y", "center_z")
-MODEL: Final = ("mass", "inertia", *CENTER, "reaction", "payload")
-"""Parameters of the compiled model."""
-VARIED: Final = ("body_mass", "body_inertia", "body_ipos", "dof_damping", "actuator_gear")
-"""Fields of the compiled model that these change."""
 WHOLE: Final = ("action_delay", "observation_delay")
 """Parameters that are whole numbers: of a uniform draw each has the same chance."""
 _KINDS: Final = {"uniform": 2, "loguniform": 2, "normal": 2, "choice": 0}

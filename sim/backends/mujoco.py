@@ -14,20 +14,14 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from ...models.errors import InputError
-from ...models.vehicle import (
-    SURROUNDINGS,
-    Vehicle,
-    body_axes,
-    craft_bodies,
-    payload_body,
-    payload_radius,
-)  # fmt: skip
+from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, Draw, Noise, NumpyDraw, NumpyNoise, Streams
-from ..randomize import CENTER, MODEL, VARIED, Randomization
+from ..randomize import Randomization
 from ..rotations import body_z
 from ..state import Array, Pose, WorldState, plain
 from ..world import PhysicsError, check_hung, contact_check, flown_model
+from .varied import Varied
 
 _FEW: Final = 8
 _ONLY: Final = np.zeros(1, int)
@@ -77,7 +71,7 @@ class MujocoWorld:
         self._batch = batch = Batch(model, num_worlds, threads)
         self._cable = options.cable if options.payload else None
         self._least_height = options.cable + payload_radius(options.payload)
-        self._varied = None if randomize is None else _Varied(batch, randomize.names)
+        self._varied = Varied(batch.model, drawn, np)
         self._owner = None if threads == 1 else os.getpid()
         self._initial = batch.state[0].copy()
         # Live views of simulator memory, made once.
@@ -128,13 +122,17 @@ class MujocoWorld:
             given = getattr(pose, name)
             getattr(state, name)[here] = default if given is None else given[here]
         state.command[here] = state.thrust[here]
-        if self._randomize is not None and self._varied is not None:
+        if self._randomize is not None:
             draw = NumpyDraw(self._draws, ids.tolist(), self.shape)
             for name, values in self._randomize.draw(draw, np).items():
                 old = self.parameters.get(name)
                 kept = values if old is None else np.where(mask, values, old)
                 self.parameters[name] = plain(kept)
-            self._varied.apply(ids, self.parameters)
+            if self._varied.fields:
+                values = {name: np.reshape(x, -1)[ids] for name, x in self.parameters.items()}
+                for field, rows in self._varied.values(values).items():
+                    self._batch.expand(field)[ids] = rows
+                self._batch.set_const(ids)
         if self.effects is not None:
             state.thrust[here] = self.effects.begin(mask, state, self.parameters)[here]
         self._place_payload(ids)
@@ -264,40 +262,3 @@ class MujocoWorld:
         names = ", ".join(mujoco.mjtWarning(kind).name for kind in kinds)
         self._warnings.fill(0)  # so that a reset gives usable worlds again
         return f"MuJoCo warned of {names} in envs {ids[:5]}: reset the env"
-
-
-class _Varied:
-    """Values of the model that differ between worlds: those of `MODEL`."""
-
-    def __init__(self, batch: Batch, names: Sequence[str]) -> None:
-        self._batch, model = batch, batch.model
-        self._names = [name for name in MODEL if name in names]
-        self._bodies, self._axes = craft_bodies(model), body_axes(model)
-        self._base = {name: getattr(model, name).copy() for name in VARIED}
-
-    def apply(self, ids: np.ndarray, parameters: Mapping[str, Array]) -> None:
-        """Give the worlds `ids` the values that were drawn for them."""
-        if not self._names:
-            return
-        given = {name: np.reshape(parameters[name], -1)[ids] for name in self._names}
-        place, ones = np.ix_(ids, self._bodies), np.ones(len(ids))
-        mass, inertia = given.get("mass", ones), given.get("inertia", ones)
-        base, expand = self._base, self._batch.expand
-        expand("body_mass")[place] = mass[:, None] * base["body_mass"][self._bodies]
-        expand("body_inertia")[place] = (mass * inertia)[:, None, None] * (
-            base["body_inertia"][self._bodies]
-        )
-        if base["dof_damping"].any():  # the drag of Unity's bodies goes with their mass
-            expand("dof_damping")[ids, :3] = mass[:, None] * base["dof_damping"][:3]
-        if "payload" in given:
-            hung = payload_body(self._batch.model)
-            for name, axes in (("body_mass", ...), ("body_inertia", (..., None))):
-                expand(name)[ids, hung] = given["payload"][axes] * base[name][hung]
-        if "reaction" in given:
-            gear = given["reaction"][:, None, None] * base["actuator_gear"][:, 3:]
-            expand("actuator_gear")[ids, :, 3:] = gear
-        shift = np.stack([given.get(name, 0.0 * ones) for name in CENTER], axis=-1)
-        if given.keys() & set(CENTER):
-            turned = np.einsum("bji,wj->wbi", self._axes, shift)
-            expand("body_ipos")[place] = base["body_ipos"][self._bodies] + turned
-        self._batch.set_const(ids)

@@ -13,20 +13,14 @@ import warp
 from torch.utils.dlpack import from_dlpack
 
 from ...models.errors import InputError
-from ...models.vehicle import (
-    SURROUNDINGS,
-    Vehicle,
-    body_axes,
-    craft_bodies,
-    payload_body,
-    payload_radius,
-)  # fmt: skip
+from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, START, Draw, Noise
-from ..randomize import CENTER, MODEL, VARIED, Randomization
+from ..randomize import Randomization
 from ..rotations import body_z
 from ..state import Array, Pose, WorldState, constant
 from ..world import PhysicsError, check_hung, contact_check, flown_model
+from .varied import Varied
 
 wp: Any = warp  # its types have gaps
 mjw: Any = mujoco_warp
@@ -38,7 +32,7 @@ stands still, because what it flies in one physics step is rounded off."""
 _DERIVED: Final = (
     "body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0", "actuator_acc0"
 )  # fmt: skip
-"""Fields that follow from `VARIED`: `set_const` computes them, of each world its own."""
+"""Fields that follow from those of `Varied`: `set_const` computes them, of each world its own."""
 
 CONTACTS_PER_GEOM: Final = 4  # Most contacts of a geom with the ground: so many have memory
 
@@ -95,7 +89,12 @@ class WarpWorld:
             self.ctrl, self._rows = from_dlpack(data.ctrl), from_dlpack(data.nefc)
             self._warmstart = from_dlpack(data.qacc_warmstart)
             self._applied = from_dlpack(data.qfrc_applied)
-            self._varied = _Varied(model, self._model, data, drawn)
+            self._varied = Varied(model, drawn, torch_api)
+            if self._varied.fields:
+                for name in (*self._varied.fields, *_DERIVED):
+                    shared = getattr(self._model, name)
+                    own = np.repeat(shared.numpy(), num_worlds, axis=0)
+                    setattr(self._model, name, wp.array(own, dtype=shared.dtype))
             self.qpos[:, 2] = vehicle.rest_height + 1.0
             if self._cable is not None:  # slack, and off the ground
                 self.qpos[:, 2] += 2 * self._least_height
@@ -155,8 +154,12 @@ class WarpWorld:
             for name, new in self._randomize.draw(draw, self.xp).items():
                 old = self.parameters.get(name)
                 self.parameters[name] = new if old is None else torch.where(mask, new, old)
-            with wp.ScopedDevice(self._name), wp.ScopedStream(self._stream()):
-                self._varied.apply(self.parameters)
+            if self._varied.fields:
+                with wp.ScopedDevice(self._name), wp.ScopedStream(self._stream()):
+                    values = {name: x[:, 0] for name, x in self.parameters.items()}
+                    for name, changed in self._varied.values(values).items():
+                        wp.to_torch(getattr(self._model, name)).copy_(changed)
+                    mjw.set_const(self._model, self._data)
         if self.effects is not None:
             thrust = self.effects.begin(mask, state, self.parameters)
             state.thrust.copy_(torch.where(rows, thrust, state.thrust))
@@ -326,54 +329,6 @@ class WarpWorld:
         if not self.qpos.is_cuda:
             return None
         return wp.stream_from_torch(torch.cuda.current_stream(self.device))
-
-
-class _Varied:
-    """Values of the model that differ between worlds: those of `MODEL`."""
-
-    def __init__(
-        self, plain: mujoco.MjModel, model: Any, data: Any, names: tuple[str, ...]
-    ) -> None:
-        self._names = [name for name in MODEL if name in names]
-        if not self._names:
-            return
-        self._model, self._data = model, data
-        self._bodies = torch.from_numpy(craft_bodies(plain))
-        self._axes = body_axes(plain)
-        self._hung = payload_body(plain) if "payload" in self._names else None
-        self._base, self._live = {}, {}
-        for name in (*VARIED, *_DERIVED):
-            shared = getattr(model, name)
-            value = np.repeat(shared.numpy(), data.nworld, axis=0)
-            setattr(model, name, wp.array(value, dtype=shared.dtype))
-        for name in VARIED:
-            self._live[name] = wp.to_torch(getattr(model, name))
-            self._base[name] = self._live[name].clone()
-
-    def apply(self, parameters: Mapping[str, Array]) -> None:
-        """Give all worlds the values that were drawn for them."""
-        if not self._names:
-            return
-        ones = torch.ones_like(next(iter(parameters.values())))[:, 0]
-        given = {name: parameters[name][:, 0] for name in self._names}
-        mass, inertia = given.get("mass", ones), given.get("inertia", ones)
-        base, live, bodies = self._base, self._live, self._bodies
-        live["body_mass"][:, bodies] = mass[:, None] * base["body_mass"][:, bodies]
-        both = (mass * inertia)[:, None, None]
-        live["body_inertia"][:, bodies] = both * base["body_inertia"][:, bodies]
-        live["dof_damping"][:, :3] = mass[:, None] * base["dof_damping"][:, :3]
-        if self._hung is not None:
-            payload = given["payload"]
-            live["body_mass"][:, self._hung] = payload * base["body_mass"][:, self._hung]
-            both = payload[:, None] * base["body_inertia"][:, self._hung]
-            live["body_inertia"][:, self._hung] = both
-        reaction = given.get("reaction", ones)[:, None, None]
-        live["actuator_gear"][:, :, 3:] = reaction * base["actuator_gear"][:, :, 3:]
-        shift = torch.stack([given.get(name, 0.0 * ones) for name in CENTER], dim=-1)
-        axes = constant(self._axes, shift)
-        turned = torch.einsum("bji,wj->wbi", axes, shift)
-        live["body_ipos"][:, bodies] = base["body_ipos"][:, bodies] + turned
-        mjw.set_const(self._model, self._data)
 
 
 class TorchDraw(Draw):
