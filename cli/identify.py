@@ -48,6 +48,8 @@ class Identify(Command):
         expect(self.logs, "logs", "at least one file", "none")
         right = self.out.suffix.lower() == ".toml" and not self.out.exists()
         expect(right, "out", "a new file that ends in .toml", str(self.out))
+        there = self.out.absolute().parent.is_dir()
+        expect(there, "out", "a folder that is there for it", str(self.out))
         expect(1e-4 <= self.period <= 0.1, "period", "0.0001 to 0.1 s", f"{self.period:g}")
         columns = {}
         for text in self.columns:

@@ -330,3 +330,11 @@ def test_a_ulog_file_comes_in_our_frames(tmp_path: Path) -> None:
     # A quarter of the largest thrust, 3 N, at 3e-6 N s²/rad², is 500 rad/s.
     assert flight.speeds[7, 0] == pytest.approx(500.0)
     assert flight.speeds[7, 3] == pytest.approx(1000.0)
+
+
+def test_a_folder_that_is_not_there_is_told_before_anything_is_flown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "none" / "new.toml"
+    assert main(["identify", "log.csv", "--vehicle", "paper", "--out", str(out)]) == 1
+    assert "out: expected a folder that is there for it, got " in capsys.readouterr().err
