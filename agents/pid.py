@@ -36,8 +36,8 @@ class PID:
         expect("thrust" in telemetry, "pid", "the telemetry thrust", f"{sorted(telemetry)}")
         highest = telemetry["thrust"].bounds()[1]
         self._hover = float(highest[0]) / (1 + float(spec.observation[0].bounds()[1][2]))
-        self._increment = options["action_mode"] == "increment"
-        share = SHARES[options["action_mode"]]
+        self._increment = options["action"] == "increment"
+        share = SHARES[options["action"]]
         self._scale = options["thrust_scale"] or share * float(highest.max())
         self._period = spec.control_period
         self._integral = 0.0

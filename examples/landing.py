@@ -6,13 +6,14 @@ rotorgram train a2c --env landing:Landing-v0
 from dataclasses import dataclass
 
 from rotorgram.envs import ArraySpec, Metric, Outcome, Task, TaskOptions, check_number, register
-from rotorgram.sim import CollectiveThrust, Pose, clip, stack
+from rotorgram.sim import Pose, clip, stack
 
 
 @dataclass(frozen=True, kw_only=True)
 class LandingOptions(TaskOptions):
     """Options of `Landing-v0`."""
 
+    action: str = "offset"
     episode_length: int = 400
     start: float = 4.0
     """Mean height at which an episode begins, m above the ground; drawn from ± 1 m of it."""
@@ -28,7 +29,6 @@ class Landing(Task):
     metrics = (Metric(name="height", unit="m", settled=0.05, held=0.1, symbol="h"),)
 
     def setup(self):
-        self.controller = CollectiveThrust(self.vehicle, newtons=20.0, increment=False)
         self.highest = 2.0 * self.options.start + 1.0
         self.observation = (
             ArraySpec(

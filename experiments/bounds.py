@@ -34,9 +34,9 @@ def elevation_bounds(
     # Largest accelerations up and down, m/s², and the largest change of one in a control step.
     up = float(vehicle.thrust_high.sum()) / vehicle.mass - vehicle.gravity
     down = vehicle.gravity - float(vehicle.thrust_low.sum()) / vehicle.mass
-    newtons = options.thrust_scale or SHARES[options.action_mode] * float(vehicle.thrust_high.max())
+    newtons = options.thrust_scale or SHARES[options.action] * float(vehicle.thrust_high.max())
     change = vehicle.num_rotors * newtons / vehicle.mass
-    if options.action_mode == "offset":
+    if options.action == "offset":
         up, down, change = min(up, change), min(down, change), np.inf
     rising = starts > 0
     towards, against = np.where(rising, up, down), np.where(rising, down, up)

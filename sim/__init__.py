@@ -3,7 +3,7 @@
 Knows nothing of tasks, rewards or Gymnasium.
 """
 
-from .control import CollectiveThrust, Controller, RotorThrust
+from .control import LEVELS, CollectiveThrust, Controller, RotorThrust, make_controller
 from .effects import EffectOptions
 from .random import Draw
 from .randomize import PARAMETERS, Randomization
@@ -12,7 +12,8 @@ from .state import Array, Pose, WorldState, clip, component, constant, on_host, 
 from .world import BACKENDS, Backend, PhysicsError, World, make_world
 
 __all__ = [
-    "BACKENDS", "PARAMETERS", "Array", "Backend", "CollectiveThrust", "Controller", "Draw",
-    "EffectOptions", "PhysicsError", "Pose", "Randomization", "RotorThrust", "World", "WorldState",
-    "checked_sensors", "clip", "component", "constant", "make_world", "on_host", "plain", "stack",
+    "BACKENDS", "LEVELS", "PARAMETERS", "Array", "Backend", "CollectiveThrust", "Controller",
+    "Draw", "EffectOptions", "PhysicsError", "Pose", "Randomization", "RotorThrust", "World",
+    "WorldState", "checked_sensors", "clip", "component", "constant", "make_controller",
+    "make_world", "on_host", "plain", "stack",
 ]  # fmt: skip

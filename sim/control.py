@@ -6,10 +6,17 @@ within bounds, or is one of some choices.
 
 from typing import TYPE_CHECKING, Final, Protocol
 
+from ..models.errors import expect
 from .state import Array, WorldState, clip, component, constant, stack
 
 if TYPE_CHECKING:
     from ..models.vehicle import Vehicle
+
+
+LEVELS: Final = ("rotors", "increment", "offset")
+"""What an action may set: the thrust of each rotor, a change of all thrusts, all thrusts."""
+SHARES: Final = {"increment": 0.05, "offset": 0.2}
+"""Thrust of one unit of action over the rotors' largest thrust."""
 
 
 class Controller(Protocol):
@@ -50,6 +57,7 @@ class CollectiveThrust:
             ("decrease", "hold", "increase") if discrete else ("collective",)
         )
         self.choices = 3 if discrete else 0
+        self.newtons = newtons
         hover, low, high = vehicle.hover_thrust, vehicle.thrust_low, vehicle.thrust_high
         alike = all((values == values[0]).all() for values in (hover, low, high))
         # Rotors that are alike need one number for all of them.
@@ -90,3 +98,15 @@ class RotorThrust:
         """As `Controller.thrust`."""
         hover, up, down = (constant(x, state.thrust) for x in (self._hover, self._up, self._down))
         return hover + up * clip(action, 0.0, 1.0) + down * clip(action, -1.0, 0.0)
+
+
+def make_controller(level: str, vehicle: "Vehicle", period: float) -> Controller:
+    """The controller of one of `LEVELS`; `period` is the time between two actions, s.
+
+    Raises `InputError` if the level is none of them, or the vehicle cannot be flown at it.
+    """
+    expect(level in LEVELS, "action", f"one of {', '.join(LEVELS)}", repr(level))
+    if level == "rotors":
+        return RotorThrust(vehicle)
+    newtons = SHARES[level] * float(vehicle.thrust_high.max())
+    return CollectiveThrust(vehicle, newtons, increment=level == "increment")

@@ -52,7 +52,7 @@ def test_returns_of_the_papers_task() -> None:
 
 
 def test_offsets_limit_the_acceleration_and_not_its_change() -> None:
-    options = ElevationOptions(action_mode="offset", linear_drag=2.0)
+    options = ElevationOptions(action="offset", linear_drag=2.0)
     bounds = elevation_bounds(options, Vehicle.load(linear_drag=2.0), np.array([1.0]))
     left = flown(1.0, 4.0, 4.0, drag=2.0)  # four rotors, 20 N each, 20 kg
     assert bounds["time-optimal"] == pytest.approx(elevation_reward(left).sum())

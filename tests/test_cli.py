@@ -167,10 +167,10 @@ def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_flags_that_are_set_to_their_default_are_set() -> None:
-    words = ["--env.target", "5", "--num-envs=1", "--no-realtime", "--env.action_mode", "offset"]
+    words = ["--env.target", "5", "--num-envs=1", "--no-realtime", "--env.action", "offset"]
     command = parse(Sim, "rotorgram sim", words)
-    assert command.given == {"env.target", "num_envs", "realtime", "env.action_mode"}
-    assert command.options == {"target": 5.0, "action_mode": "offset"}
+    assert command.given == {"env.target", "num_envs", "realtime", "env.action"}
+    assert command.options == {"target": 5.0, "action": "offset"}
     assert parse(Sim, "rotorgram sim", []).options == {}
 
 

@@ -28,7 +28,7 @@ from rotorgram.sim import PhysicsError
 ID, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
 HEXA = str(Path(__file__).parent / "data" / "hexa.xml")
 COMBINATIONS: list[tuple[str, dict[str, Any]]] = [
-    (ID, {"action_mode": mode, "action_type": kind, "observation": seen, **rest})
+    (ID, {"action": mode, "action_type": kind, "observation": seen, **rest})
     for mode, kind, seen, rest in itertools.product(
         ("increment", "offset"),
         ("continuous", "discrete"),
@@ -182,7 +182,7 @@ def test_docstring_tables_agree_with_the_spaces() -> None:
         kind = _env(action_type=row[0].strip("`")).action_space
         assert repr(kind).replace(".0", "") == row[1].strip("`")
     for mode, formula in _table("Action")[4:6]:
-        flight = Flight(5.0, action_mode=mode.strip("`"))
+        flight = Flight(5.0, action=mode.strip("`"))
         flight.step(1.0)
         newtons = float(re.findall(r"(\d+) a", formula)[0])
         assert flight.loop.telemetry["thrust"].tolist() == [[49.0 + newtons] * 4]
@@ -194,7 +194,7 @@ def test_docstring_tables_agree_with_the_spaces() -> None:
 @pytest.mark.parametrize(("mode", "newtons"), [("increment", 5.0), ("offset", 20.0)])
 def test_discrete_actions_fly_as_the_continuous_ones(mode: str, newtons: float) -> None:
     for index, action in enumerate((-1.0, 0.0, 1.0)):
-        few, many = (_env(action_mode=mode, action_type=k) for k in ("discrete", "continuous"))
+        few, many = (_env(action=mode, action_type=k) for k in ("discrete", "continuous"))
         few.reset(seed=3)
         many.reset(seed=3)
         one, other = few.step(np.int64(index)), many.step(_a(action))
@@ -253,7 +253,7 @@ def test_number_types_of_an_action_do_not_matter() -> None:
 @pytest.mark.parametrize("period", [0.01, 0.02, 0.05])
 @pytest.mark.parametrize("mode", ["increment", "offset"])
 def test_flight_follows_the_formula_of_constant_acceleration(mode: str, period: float) -> None:
-    env = _env(action_mode=mode, control_period=period, flight_band=50.0, target=60.0)
+    env = _env(action=mode, control_period=period, flight_band=50.0, target=60.0)
     _, info = env.reset(seed=2)
     height, speed, thrust = info["Y"], 0.0, 49.0
     for n in range(60):
@@ -273,7 +273,7 @@ def test_flight_follows_the_formula_of_constant_acceleration(mode: str, period: 
 
 def test_flight_with_drag_follows_the_exponential() -> None:
     drag = 2.0
-    flight = Flight(5.0, action_mode="offset", linear_drag=drag, flight_band=20.0)
+    flight = Flight(5.0, action="offset", linear_drag=drag, flight_band=20.0)
     for n in range(1, 101):
         flight.step(1.0)  # hover + 20 N each: 4 m/s2
         fallen = (1 - math.exp(-drag * n * 0.02)) / drag
@@ -305,7 +305,7 @@ def test_telemetry_is_in_the_papers_frame() -> None:
 
 OPTIONS = st.fixed_dictionaries(
     {
-        "action_mode": st.sampled_from(["increment", "offset"]),
+        "action": st.sampled_from(["increment", "offset"]),
         "observation": st.sampled_from(["full", "error"]),
         "control_period": st.sampled_from([0.01, 0.02, 0.1, 1.0]),
         "linear_drag": st.sampled_from([0.0, 0.0, 2.0, 100.0]),
@@ -338,7 +338,7 @@ def test_bounds_are_never_left(
 def test_fastest_crossing_stays_within_the_bounds(side: float, period: float) -> None:
     """To one edge, back at full acceleration, and out at the other edge."""
     fastest = 0.0
-    env = _env(action_mode="offset", thrust_scale=51.0, target=10.0, episode_length=999,
+    env = _env(action="offset", thrust_scale=51.0, target=10.0, episode_length=999,
                start_band=0.0, control_period=period)  # fmt: skip
     space: Any = env.observation_space
     for turn in np.linspace(0.3, 2.99, 8).tolist():
@@ -372,7 +372,7 @@ def test_truncated_by_the_time_limit() -> None:
 def test_terminated_by_the_band_and_never_truncated_too(length: int) -> None:
     # From rest at the target in offset mode at full action: 4 m/s2, so 3 m after sqrt(1.5) s,
     # which lies in step 62 of 0.02 s: 2 * 1.22^2 = 2.9768 and 2 * 1.24^2 = 3.0752.
-    flight = Flight(5.0, action_mode="offset", episode_length=length)
+    flight = Flight(5.0, action="offset", episode_length=length)
     assert flight.fly_out(1.0) == 62
     assert flight.ends == (True, False)
     assert flight.height == pytest.approx(8.0752, abs=1e-9)
@@ -492,7 +492,7 @@ def _errors(gain: float, steps: int, **options: Any) -> np.ndarray:
 def test_increment_on_error_alone_diverges_even_with_drag(drag: float, gain: float) -> None:
     roots = np.roots([1.0, drag, 0.0, 50 * gain])
     assert roots.real.max() > 0.1
-    errors = _errors(gain, 5000, action_mode="increment", linear_drag=drag)
+    errors = _errors(gain, 5000, action="increment", linear_drag=drag)
     assert len(errors) < 5000
     assert abs(errors[-1]) > 3.0
 
@@ -500,7 +500,7 @@ def test_increment_on_error_alone_diverges_even_with_drag(drag: float, gain: flo
 def test_offset_on_error_alone_oscillates_without_drag() -> None:
     # w^2 = 4 k = 2; holding the thrust for a step feeds in energy: amplitude^2 grows by
     # 1 + w^2 h^2 / 2 = 1.0004 in each step.
-    errors = _errors(0.5, 1000, action_mode="offset")
+    errors = _errors(0.5, 1000, action="offset")
     assert len(errors) == 1000
     peaks = np.abs(errors[1:-1])[np.diff(np.sign(np.diff(errors))) != 0]
     periods = np.diff(np.flatnonzero(np.diff(np.sign(errors)) != 0)) * 2 * 0.02
@@ -514,12 +514,12 @@ def test_offset_on_error_alone_oscillates_without_drag() -> None:
 def test_offset_on_error_alone_converges_with_drag(gain: float, drag: float) -> None:
     slowest = -np.roots([1.0, drag, 4 * gain]).real.max()
     assert slowest > 0
-    errors = _errors(gain, round(10 / slowest / 0.02), action_mode="offset", linear_drag=drag)
+    errors = _errors(gain, round(10 / slowest / 0.02), action="offset", linear_drag=drag)
     assert np.abs(errors[-10:]).max() < 2e-4  # ten time constants: 0.2 m * e^-10 = 9e-6 m
 
 
 def test_offset_with_the_wrong_sign_diverges() -> None:
-    assert abs(_errors(-0.5, 1000, action_mode="offset", linear_drag=2.0)[-1]) > 3.0
+    assert abs(_errors(-0.5, 1000, action="offset", linear_drag=2.0)[-1]) > 3.0
 
 
 def test_increment_on_the_full_observation_can_converge() -> None:

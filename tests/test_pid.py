@@ -17,7 +17,7 @@ ENV = "rotorgram/Elevation-v0"
 @pytest.mark.parametrize("mode", ["increment", "offset"])
 @pytest.mark.parametrize("drag", [0.0, 0.5])
 def test_pid_holds_the_target(mode: str, drag: float) -> None:
-    env: Any = gym.make(ENV, action_mode=mode, linear_drag=drag)
+    env: Any = gym.make(ENV, action=mode, linear_drag=drag)
     policy = PID(env.get_wrapper_attr("env_spec"))
     for seed in range(3):
         policy.reset()
@@ -32,7 +32,7 @@ def test_pid_holds_the_target(mode: str, drag: float) -> None:
 
 def test_pid_takes_the_vehicle_from_the_spec() -> None:
     """Hover at 12 N of 30 N, scale 20 % of 30 N: 1 m too low wants 9 m/s² · 12 N / 9.8 m/s²."""
-    spec: Any = gym.make(ENV, action_mode="offset").get_wrapper_attr("env_spec")
+    spec: Any = gym.make(ENV, action="offset").get_wrapper_attr("env_spec")
     arrays = {array.name: array for array in spec.telemetry}
     thrust = replace(arrays["thrust"], low=0.0, high=30.0)
     telemetry = tuple(thrust if a.name == "thrust" else a for a in spec.telemetry)

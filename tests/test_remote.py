@@ -45,7 +45,7 @@ SIMULATE = """
     [
         {},
         {"action_type": "discrete", "observation": "error", "linear_drag": 0.5},
-        {"target": (4.0, 6.0), "episode_length": 20, "action_mode": "offset"},
+        {"target": (4.0, 6.0), "episode_length": 20, "action": "offset"},
     ],
 )
 def test_parity(codec: str, options: dict[str, Any]) -> None:

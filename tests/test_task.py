@@ -54,7 +54,7 @@ def test_defaults() -> None:
         "target": 5.0,
         "start_band": 1.0,
         "flight_band": 3.0,
-        "action_mode": "increment",
+        "action": "increment",
         "action_type": "continuous",
         "observation": "full",
         "thrust_scale": None,
@@ -90,7 +90,7 @@ def test_defaults() -> None:
         ({"control_period": 0.005}, "control_period: expected a positive multiple .* 0.01 s, got"),
         ({"control_period": 0.025}, "control_period: expected a positive multiple .*, got 0.025"),
         ({"control_period": 1.01}, "control_period: expected a number .* to 1 s, got 1.01"),
-        ({"action_mode": "delta"}, "action_mode: expected 'increment' or 'offset', got 'delta'"),
+        ({"action": "delta"}, "action: expected 'increment' or 'offset', got 'delta'"),
         ({"action_type": 3}, "action_type: expected 'continuous' or 'discrete', got 3"),
         ({"observation": ["full"]}, r"observation: expected 'full' or 'error', got \['full'\]"),
         ({"thrust_scale": 0}, "thrust_scale: expected a number .*, got 0"),
@@ -183,12 +183,12 @@ def test_float32_bounds_lie_outside_the_float64_ones() -> None:
             ],
         ),
         (
-            {"action_mode": "offset"},
+            {"action": "offset"},
             # the present thrust does not count
             [(90.0, 0.0, 49.0), (90.0, 1.0, 69.0), (0.0, -0.5, 39.0), (49.0, -9.0, 29.0)],
         ),
         (
-            {"action_mode": "offset", "thrust_scale": 100.0},
+            {"action": "offset", "thrust_scale": 100.0},
             [(49.0, 1.0, 100.0), (49.0, -0.5, 0.0), (49.0, 0.5, 99.0)],
         ),
         ({"action_type": "discrete"}, [(49.0, 0, 44.0), (49.0, 1, 49.0), (49.0, 2, 54.0)]),

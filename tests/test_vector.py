@@ -20,7 +20,7 @@ HEXA = Path(__file__).parent / "data" / "hexa.xml"
 N = 7
 FLOWN: list[tuple[str, dict[str, Any]]] = [
     (ID, {"flight_band": 1.5}),
-    (ID, {"action_mode": "offset", "flight_band": 1.5, "vehicle": HEXA}),
+    (ID, {"action": "offset", "flight_band": 1.5, "vehicle": HEXA}),
     (ID, {"action_type": "discrete", "observation": "error", "linear_drag": 0.5}),
     (ID, {"target": (4.0, 9.0), "control_period": 0.05}),
     (ID, {"control_period": 0.01, "target": 2.0, "flight_band": 10.0, "episode_length": 90}),

@@ -91,7 +91,7 @@ def test_action_zero_hovers_and_any_other_climbs(files: dict[str, Path], name: s
     vehicle = Vehicle.load(files[name])
     heights = {}
     for action in (0.0, 0.2):
-        env = gym.make(ELEVATION, vehicle=files[name], start_band=0.0, action_mode="offset")
+        env = gym.make(ELEVATION, vehicle=files[name], start_band=0.0, action="offset")
         _, info = env.reset(seed=0)
         for _ in range(100):
             *_, info = env.step(np.array([action], np.float32))
@@ -111,7 +111,7 @@ def test_action_zero_hovers_and_any_other_climbs(files: dict[str, Path], name: s
 def test_acceleration_is_that_of_newton(files: dict[str, Path], name: str) -> None:
     """Thrust in newtons reaches the body in newtons, whatever gear and gain."""
     vehicle = Vehicle.load(files[name])
-    loop = Loop(ELEVATION, vehicle=files[name], options={"action_mode": "offset"})
+    loop = Loop(ELEVATION, vehicle=files[name], options={"action": "offset"})
     still = np.zeros((1, 1), np.float32)
     loop.advance(still, np.ones(1, bool), [0])
     start = loop.telemetry["position"][0, 1]

@@ -147,7 +147,7 @@ def test_a_start_too_far_for_float32() -> None:
     "options",
     [
         {"episode_length": 60},
-        {"action_mode": "offset", "target": 90.0},
+        {"action": "offset", "target": 90.0},
         {"action_type": "discrete", "observation": "error", "linear_drag": 0.5},
         {"target": 2.0, "flight_band": 10.0, "control_period": 0.05},
     ],

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final, Literal, get_args
+from typing import Any, ClassVar, Final, Literal, get_args
 
 import numpy as np
 
@@ -30,7 +30,6 @@ AIR: Final = 0.6  # Least room under a craft that starts, m
 FURTHEST: Final = 1e6
 """Highest target and widest flight band, m: far inside what MuJoCo and float32 can hold."""
 
-ActionMode = Literal["increment", "offset"]
 ActionType = Literal["continuous", "discrete"]
 Observed = Literal["full", "error"]
 
@@ -45,7 +44,9 @@ class ElevationOptions(TaskOptions):
     """An episode starts at rest, hovering, up to this far above or below the target, m."""
     flight_band: float = 3.0
     """An episode terminates when the craft is further than this from the target, m."""
-    action_mode: ActionMode = "increment"
+    actions: ClassVar[tuple[str, ...]] = ("increment", "offset")
+
+    action: str = "increment"
     """`increment`: thrust += scale · action (paper, section 2.2).
     `offset`: thrust = hover + scale · action."""
     action_type: ActionType = "continuous"
@@ -63,7 +64,6 @@ class ElevationOptions(TaskOptions):
         wider = self.flight_band > self.start_band
         least = f"more than start_band = {self.start_band:g} m"
         expect(wider, "flight_band", least, f"{self.flight_band!r}")
-        check_choice(self, "action_mode", get_args(ActionMode))
         check_choice(self, "action_type", get_args(ActionType))
         check_choice(self, "observation", get_args(Observed))
         if self.thrust_scale is not None:
@@ -108,7 +108,7 @@ class Elevation(Task):
     | `continuous` | `Box(-1, 1, (1,), float32)` | a |
     | `discrete` | `Discrete(3)` | 0: a = -1, 1: a = 0, 2: a = +1 |
 
-    | `action_mode` | thrust F of every rotor, N, clipped to 0 ... 100 |
+    | `action` | thrust F of every rotor, N, clipped to 0 ... 100 |
     |---|---|
     | `increment` | F <- F + 5 a (`thrust_scale` changes the 5) |
     | `offset` | F <- 49 + 20 a (`thrust_scale` changes the 20) |
@@ -145,8 +145,9 @@ class Elevation(Task):
         reasons = f"(start_band = {options.start_band:g} m, and {room:g} m of room)"
         expected = f"{least:g} m {reasons} to {FURTHEST:g} m"
         expect(least <= low and high <= FURTHEST, "target", expected, f"{options.target!r}")
-        increment, most = options.action_mode == "increment", float(vehicle.thrust_high.max())
-        scale = options.thrust_scale or (0.05 if increment else 0.2) * most
+        increment, most = options.action == "increment", float(vehicle.thrust_high.max())
+        usual: Any = self.controller
+        scale = options.thrust_scale or usual.newtons
         expected = f"at most {most:g} N, the largest thrust of a rotor"
         expect(scale <= most, "thrust_scale", expected, f"{options.thrust_scale!r}")
         self.controller = CollectiveThrust(

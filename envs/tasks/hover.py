@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from ...models.errors import expect
-from ...sim import Array, Draw, Pose, RotorThrust, WorldState, clip, component, constant, stack
+from ...sim import Array, Draw, Pose, WorldState, clip, component, constant, stack
 from ..spec import ArraySpec, Metric
 from .task import Outcome, Task, TaskOptions, check_number, finite
 
@@ -103,7 +103,6 @@ class Hover(Task):
         least = vehicle.rest_height + AIR + options.start_band
         expected = f"a height of at least {least:g} m above the ground"
         expect(options.goal[2] >= least, "goal", expected, f"{options.goal[2]:g}")
-        self.controller = RotorThrust(vehicle)
         self._wanted = math.radians(options.heading)
         self._hover_thrust = vehicle.hover_thrust
         vectors = (

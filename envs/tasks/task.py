@@ -18,6 +18,7 @@ import numpy as np
 from ...models import MOST_DRAG
 from ...models.errors import expect
 from ...sim import (
+    LEVELS,
     Array,
     Controller,
     Draw,
@@ -26,6 +27,7 @@ from ...sim import (
     Randomization,
     WorldState,
     checked_sensors,
+    make_controller,
 )
 from ..spec import ArraySpec, Metric
 
@@ -46,6 +48,8 @@ class TaskOptions:
 
     episode_length: int = 250
     """Control steps after which an episode is truncated."""
+    action: str = "rotors"
+    """What an action sets: one of `sim.LEVELS`."""
     control_period: float = 0.02
     """Time between two actions, s: a multiple of the physics step, at most 1 s. The default is that
     of Unity's `FixedUpdate`."""
@@ -59,7 +63,11 @@ class TaskOptions:
     sensors: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """What the drone measures: by sensor its settings, or true. See `sim/sensors.py`."""
 
+    actions: ClassVar[tuple[str, ...]] = LEVELS
+    """Levels that the task can be flown at; one with a controller of its own may name fewer."""
+
     def __post_init__(self) -> None:
+        check_choice(self, "action", self.actions)
         length = finite(self.episode_length)
         right = length is not None and length == int(length) and 1 <= length <= LONGEST_EPISODE
         expected = "a whole number of control steps, 1 or more"
@@ -121,7 +129,8 @@ class Task:
         options, vehicle: As given.
         shape: (W, A), or () for a single drone.
         xp: Namespace of the array API standard.
-        controller: Turns actions into thrusts; set by `setup`.
+        controller: Turns actions into thrusts: that of the option `action`, unless `setup` sets
+            another.
         observation: Specs of one drone's observation; set by `setup`.
     """
 
@@ -136,10 +145,17 @@ class Task:
         self, options: Any, vehicle: "Vehicle", shape: tuple[int, ...] = (), xp: Any = np
     ) -> None:
         self.options, self.vehicle, self.shape, self.xp = options, vehicle, shape, xp
+        self.controller = of_level = make_controller(
+            options.action, vehicle, options.control_period
+        )
         self.setup()
+        ignored = self.controller is not of_level and options.actions is TaskOptions.actions
+        usual = type(options).action
+        right = not ignored or options.action == usual
+        expect(right, "action", f"{usual!r}, for the task has a controller", repr(options.action))
 
     def setup(self) -> None:
-        """Set `controller` and `observation`, from `options` and `vehicle`.
+        """Set `observation`, from `options` and `vehicle`.
 
         Also set initial values of an episode's memory, as numbers: `self.target = 0.0`. Raise
         `InputError` for an option that does not fit the vehicle.
