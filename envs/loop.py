@@ -28,11 +28,12 @@ from ..sim import (
     WorldState,
     clip,
     constant,
+    each,
     make_world,
     on_host,
+    plain,
 )  # fmt: skip
 from ..sim.sensors import Sensors, readings_of
-from ..sim.state import each, plain
 from . import registry
 from .autoreset import Seeds, checked_seeds
 from .delay import Delay

@@ -8,12 +8,24 @@ from .effects import EffectOptions
 from .random import Draw
 from .randomize import PARAMETERS, Randomization
 from .sensors import checked_sensors
-from .state import Array, Pose, WorldState, clip, component, constant, on_host, plain, stack
+from .state import (
+    Array,
+    Pose,
+    WorldState,
+    clip,
+    component,
+    constant,
+    each,
+    on_host,
+    plain,
+    square_root,
+    stack,
+)  # fmt: skip
 from .world import BACKENDS, Backend, PhysicsError, World, make_world
 
 __all__ = [
     "BACKENDS", "LEVELS", "PARAMETERS", "Array", "Backend", "CollectiveThrust", "Controller",
     "Draw", "EffectOptions", "PhysicsError", "Pose", "Randomization", "RotorThrust", "World",
-    "WorldState", "checked_sensors", "clip", "component", "constant", "make_controller",
-    "make_world", "on_host", "plain", "stack",
+    "WorldState", "checked_sensors", "clip", "component", "constant", "each",
+    "make_controller", "make_world", "on_host", "plain", "square_root", "stack",
 ]  # fmt: skip

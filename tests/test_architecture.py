@@ -82,6 +82,7 @@ def test_a_task_knows_the_world_and_the_spec() -> None:
     assert packages(names) == {"envs", "models", "sim"}
     assert {name for name in ours if ".envs." in name} == {
         "rotorgram.envs.spec",
+        "rotorgram.envs.tasks.flight",
         "rotorgram.envs.tasks.task",
     }
     assert {name for name in ours if ".sim" in name} == {"rotorgram.sim"}

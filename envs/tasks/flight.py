@@ -1,0 +1,135 @@
+"""What tasks of flight to a goal share: their observation, and the memory of an episode."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from ...models.errors import expect
+from ...sim import Array, WorldState, clip, component, constant, each, plain, stack
+from ..spec import ArraySpec
+from .task import Task, finite
+
+ERROR_SCALE: Final = 0.5  # Distance at which the reward for nearness crosses zero, m
+RATE_WEIGHT: Final = 0.02  # Cost of a body rate of 1 rad/s
+TERMINATION_REWARD: Final = -20.0  # Added to the reward of the step that terminates an episode
+LEAST_TILT_COSINE: Final = 0.0
+"""Cosine of the tilt (90°) past which the craft counts as flipped over."""
+AIR: Final = 0.6  # Least room under a craft that starts, m
+FURTHEST: Final = 1e4  # Furthest goal, m
+MOST_SPEED: Final = 100.0  # Speed past which an observation is clipped, m/s
+MOST_RATE: Final = 100.0  # Body rate past which an observation is clipped, rad/s
+
+Number = tuple[str, str, float]
+"""Name, unit and largest size of a number of an observation."""
+
+
+class Flight(Task):
+    """Base of tasks that are flown to a goal, with an observation of 15 + R numbers and more.
+
+    | index | quantity | unit | frame |
+    |---|---|---|---|
+    | 0-2 | goal minus position | m | world, turned by the wanted heading |
+    | 3-5 | velocity | m/s | the same |
+    | 6-8 | direction of body x, the nose | 1 | the same |
+    | 9-11 | direction of body z, the thrust | 1 | the same |
+    | 12-14 | body rates | rad/s | body |
+    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+
+    Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
+    A derived class calls `describe` in `setup`, `seen` in `observe`, and has `goal`.
+    """
+
+    wanted = 0.0
+    """Heading that the frame of the observation is turned by, rad, anticlockwise from x."""
+
+    def describe(self, band: float, more: Sequence[Number] = ()) -> None:
+        """Set `observation`: positions up to twice the band, m, and further numbers after them."""
+        vehicle = self.vehicle
+        vectors = (
+            ("goal - position", "m", 2 * band),
+            ("velocity", "m/s", MOST_SPEED),
+            ("nose", "1", 1.001),
+            ("thrust axis", "1", 1.001),
+            ("body rate", "rad/s", MOST_RATE),
+        )
+        first: list[Number] = [
+            (f"{v} {axis}", unit, most) for v, unit, most in vectors for axis in "xyz"
+        ]
+        rotors = range(1, vehicle.num_rotors + 1)
+        weakest, strongest = (
+            limit / vehicle.hover_thrust - 1 for limit in (vehicle.thrust_low, vehicle.thrust_high)
+        )
+        outer, inner = ([most for *_, most in numbers] for numbers in (first, more))
+        low = (*(-x for x in outer), *(weakest - 0.001).tolist(), *(-x for x in inner))
+        high = (*outer, *(strongest + 0.001).tolist(), *inner)
+        named = [*first, *((f"thrust {i} over hover", "1", 0.0) for i in rotors), *more]
+        self.observation = (
+            ArraySpec(
+                name="observation",
+                shape=(len(named),),
+                low=low,
+                high=high,
+                unit=tuple(unit for _, unit, _ in named),
+                frame="world turned by the wanted heading; body rates: body",
+                components=tuple(name for name, *_ in named),
+            ),
+        )
+        self._bounds = tuple(np.array(bound) for bound in (low, high))
+
+    def seen(self, state: WorldState, *more: Array, goal: Array = None) -> dict[str, Array]:
+        """The observation; `more` has vectors, shape (..., k), or numbers, in the order described.
+
+        The goal, world frame, m, shape (..., 3), is by default that of `goal`.
+        """
+        goal = self.goal(state) if goal is None else goal
+        nose, up = axes(state.quaternion)
+        world = (goal - state.position, state.velocity, nose, up)
+        thrust = state.thrust / constant(self.vehicle.hover_thrust, state.thrust) - 1.0
+        rest = [x if getattr(x, "ndim", 0) == state.position.ndim else stack((x,)) for x in more]
+        parts = (*map(self.turned, world), state.body_rates, thrust, *rest)
+        low, high = (constant(bound, state.thrust) for bound in self._bounds)
+        return {"observation": clip(self.xp.concat(parts, axis=-1), low, high)}
+
+    def turned(self, vectors: Array) -> Array:
+        """World vectors in the world frame turned by the wanted heading, shape (..., 3)."""
+        if self.wanted == 0.0:
+            return vectors
+        c, s = math.cos(self.wanted), math.sin(self.wanted)
+        x, y = vectors[..., 0], vectors[..., 1]
+        return stack((c * x + s * y, c * y - s * x, vectors[..., 2]))
+
+    def keep(self, mask: Array, **values: Array) -> None:
+        """Set attributes for the drones of a mask, shape (W, A), and leave those of the others."""
+        for name, new in values.items():
+            rows = each(mask) if getattr(new, "ndim", 0) > getattr(mask, "ndim", 0) else mask
+            setattr(self, name, plain(self.xp.where(rows, new, getattr(self, name))))
+
+
+def at(point: Sequence[float], state: WorldState) -> Array:
+    """A point for every drone, shape (W, A, 3)."""
+    zero = 0.0 * component(state.position, 0)
+    return stack([zero + value for value in point])
+
+
+def length(xp: Any, vectors: Array) -> Array:
+    """Sizes of vectors, shape (..., 3)."""
+    return xp.sqrt(xp.sum(vectors * vectors, axis=-1))
+
+
+def axes(quaternion: Array) -> tuple[Array, Array]:
+    """Directions of body x and body z in the world frame, shape (..., 3) each."""
+    w, x, y, z = (component(quaternion, i) for i in range(4))
+    nose = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+    up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    return stack(nose), stack(up)
+
+
+def check_point(options: Any, name: str) -> None:
+    """Keep an option as a point (x, y, z), m. Raises `InputError`."""
+    given = getattr(options, name)
+    values = [finite(x) for x in given] if isinstance(given, tuple | list) else []
+    right = len(values) == 3 and all(x is not None and abs(x) <= FURTHEST for x in values)
+    expect(right, name, "three numbers (x, y, z) in m", f"{given!r}")
+    object.__setattr__(options, name, tuple(values))
