@@ -1,7 +1,7 @@
 """Learning algorithms, their policies and files, and a PID controller.
 
-Policies, the PID and the reading of checkpoints need neither torch nor SB3: `make_agent` and
-`resume_agent` import them.
+Policies, the PID and the reading of checkpoints import no algorithm: `make_agent` and
+`resume_agent` do. Only SB3's needs torch.
 """
 
 from typing import TYPE_CHECKING
@@ -33,7 +33,7 @@ def make_agent(
 
     Raises:
         InputError: No such algorithm, or a config of another one.
-        MissingPackage: torch or SB3 is not installed.
+        MissingPackage: SB3 is not installed.
     """
     match algorithm, config:
         case "vpg", VPGConfig():
@@ -60,7 +60,7 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
     Raises:
         CheckpointError: The parts of the checkpoint do not fit together.
         ResumeError: The env is another one, or does not repeat the interrupted episodes.
-        MissingPackage: torch or SB3 is not installed.
+        MissingPackage: SB3 is not installed.
     """
     for name in ("env_id", "options", "vehicle_hash", "observation", "action"):
         expected, got = getattr(kept.spec, name), getattr(log.spec, name)
@@ -68,8 +68,9 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
             raise ResumeError(f"resume: expected an env with {name} {expected}, got {got}")
     try:
         config = preset(kept.algorithm, "paper", **kept.config)
-        if config.hidden != len(kept.actor["hidden.bias"]):
-            raise InputError(f"hidden: expected that of the policy, got {config.hidden}")
+        layers = kept.policy().layers
+        if config.hidden != tuple(len(bias) for _, bias in layers[:-1]):
+            raise InputError(f"hidden: expected those of the policy, got {config.hidden}")
         agent = make_agent(kept.algorithm, log, config, kept.seed)
         agent.set_state(kept.state)
     except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:

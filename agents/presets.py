@@ -18,9 +18,15 @@ def _is_number(value: Any, low: float, high: float = math.inf) -> bool:
     return type(value) in (int, float) and math.isfinite(value) and low <= value <= high
 
 
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value >= 1
+
+
 _RULES: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
-    ("hidden episodes_per_update steps_per_update", "a whole number, 1 or more",
-     lambda value: type(value) is int and value >= 1),
+    ("episodes_per_update steps_per_update", "a whole number, 1 or more", _is_count),
+    ("hidden", "whole numbers, 1 or more, one a layer",
+     lambda value: len(value) > 0 and all(map(_is_count, value))),
+    ("activation", "'relu' or 'tanh'", lambda value: value in ("relu", "tanh")),
     ("gamma gae_lambda", "a number from 0 to 1", lambda value: _is_number(value, 0, 1)),
     ("vf_coef ent_coef", "a number, 0 or more", lambda value: _is_number(value, 0)),
     ("anneal normalize", "true or false", lambda value: type(value) is bool),
@@ -35,8 +41,10 @@ _RULES: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
 class _Config:
     """What all algorithms have."""
 
-    hidden: int = 16
-    """Units of the hidden layer of each network (paper)."""
+    hidden: tuple[int, ...] = (16,)
+    """Units of each hidden layer of each network (paper: one of 16). A number is one layer."""
+    activation: Literal["relu", "tanh"] = "relu"
+    """Of the hidden units (paper: relu)."""
     learning_rate: float = 0.001
     """Of Adam (paper)."""
     anneal: bool = False
@@ -47,6 +55,9 @@ class _Config:
     """Initial logarithm of the policy's standard deviation, in units of the action."""
 
     def __post_init__(self) -> None:
+        hidden: Any = self.hidden
+        layers = tuple(hidden) if isinstance(hidden, list | tuple) else (hidden,)
+        object.__setattr__(self, "hidden", layers)
         for names, expected, is_right in _RULES:
             for name in (name for name in names.split() if name in vars(self)):
                 value = getattr(self, name)

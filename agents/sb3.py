@@ -10,15 +10,17 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from ..models.errors import expect, require
 from . import learner
 from .episodes import EpisodeLog
-from .networks import arrays_of, load_arrays, torch
+from .policies import NetworkPolicy
 from .presets import A2CConfig
 
 if TYPE_CHECKING:
     import stable_baselines3 as sb3
+    import torch
     from stable_baselines3.common import logger as sb3_logger
     from stable_baselines3.common import vec_env as sb3_vec
 else:
     sb3 = require("stable_baselines3", "train", "sb3-a2c")
+    torch = require("torch", "train", "sb3-a2c")
     sb3_logger, sb3_vec = sb3.common.logger, sb3.common.vec_env
 
 
@@ -93,8 +95,9 @@ class SB3A2C:
         torch_seed, _ = learner.seeds_of(seed)
         # SB3 draws from the global generators: torch for actions, NumPy for the order of samples.
         torch.manual_seed(torch_seed)
+        torch.set_num_threads(1)  # such small nets lose by a second thread
         np.random.seed(torch_seed % 2**32)  # noqa: NPY002
-        self._config, self._ahead = config, 0.0
+        self.spec, self._config, self._ahead = log.spec, config, 0.0
         self._rollout = config.rollout_size(log.num_envs)
         self._model = _A2C(
             "MlpPolicy",
@@ -109,8 +112,8 @@ class SB3A2C:
             use_rms_prop=False,
             normalize_advantage=config.normalize and self._rollout > 1,
             policy_kwargs={
-                "net_arch": {"pi": [config.hidden], "vf": [config.hidden]},
-                "activation_fn": torch.nn.ReLU,
+                "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
+                "activation_fn": torch.nn.ReLU if config.activation == "relu" else torch.nn.Tanh,
                 "log_std_init": config.log_std,
                 "optimizer_kwargs": {"eps": 1e-8, "foreach": True},
             },
@@ -144,13 +147,24 @@ class SB3A2C:
     def actor(self) -> dict[str, np.ndarray]:
         """Weights of the policy, under our names."""
         weights = arrays_of(self._model.policy)
-        return {ours: weights[theirs] for ours, theirs in _NAMES.items() if theirs in weights}
+        last = len(self._config.hidden)
+        layers = [*(f"mlp_extractor.policy_net.{2 * i}" for i in range(last)), "action_net"]
+        actor = {
+            f"layers.{i}.{kind}": weights[f"{name}.{kind}"]
+            for i, name in enumerate(layers)
+            for kind in ("weight", "bias")
+        }
+        return actor | ({"log_std": weights["log_std"]} if "log_std" in weights else {})
+
+    def policy(self) -> NetworkPolicy:
+        """The current policy: a copy."""
+        return NetworkPolicy(self.actor(), self.spec, self._config.activation)
 
     def state(self) -> dict[str, np.ndarray]:
         """Weights, optimizer and both generators."""
         model = self._model
         state = {f"policy.{name}": array for name, array in arrays_of(model.policy).items()}
-        state |= learner.optimizer_arrays(model.policy.optimizer)
+        state |= optimizer_arrays(model.policy.optimizer)
         state["rng.torch"] = torch.get_rng_state().numpy().copy()
         _, keys, place, *_ = np.random.get_state()  # noqa: NPY002
         return state | {"rng.numpy": np.append(keys, place).astype(np.uint32)}
@@ -159,8 +173,8 @@ class SB3A2C:
         """Take over a state."""
         model = self._model
         load_arrays(model.policy, state, "policy.")
-        learner.set_optimizer_arrays(model.policy.optimizer, state)
-        model._n_updates = learner.updates_of(model.policy.optimizer)
+        set_optimizer_arrays(model.policy.optimizer, state)
+        model._n_updates = updates_of(model.policy.optimizer)
         torch.set_rng_state(torch.from_numpy(state["rng.torch"].copy()))
         *keys, place = state["rng.numpy"]
         np.random.set_state(("MT19937", np.array(keys, np.uint32), int(place), 0, 0.0))  # noqa: NPY002
@@ -182,15 +196,67 @@ class _A2C(sb3.A2C):
 
     def train(self) -> None:
         super().train()
-        learner.check_finite(self.policy.optimizer)
+        check_finite(self.policy.optimizer)
         if not self.on_update():
             raise _Stopped
 
 
-_NAMES = {
-    "hidden.weight": "mlp_extractor.policy_net.0.weight",
-    "hidden.bias": "mlp_extractor.policy_net.0.bias",
-    "output.weight": "action_net.weight",
-    "output.bias": "action_net.bias",
-    "log_std": "log_std",
-}
+def arrays_of(module: torch.nn.Module) -> dict[str, np.ndarray]:
+    """Copies of a module's parameters."""
+    return {name: p.detach().numpy().copy() for name, p in module.state_dict().items()}
+
+
+def load_arrays(
+    module: torch.nn.Module, arrays: Mapping[str, np.ndarray], prefix: str = ""
+) -> None:
+    """Set a module's parameters from the arrays whose names begin with a prefix."""
+    given = {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
+    module.load_state_dict({name: torch.from_numpy(a.copy()) for name, a in given.items()})
+
+
+def check_finite(optimizer: torch.optim.Optimizer) -> None:
+    """Raise `Diverged` unless all weights that an optimizer moves are finite numbers."""
+    (group,) = optimizer.param_groups
+    weights = torch.cat([parameter.detach().flatten() for parameter in group["params"]])
+    if not torch.isfinite(weights).all():
+        raise learner.diverged(updates_of(optimizer))
+
+
+def optimizer_arrays(optimizer: torch.optim.Optimizer) -> dict[str, np.ndarray]:
+    """An optimizer's state as arrays named `optimizer.<parameter>.<quantity>`."""
+    return {
+        f"optimizer.{index}.{key}": value.numpy().copy()
+        for index, entries in optimizer.state_dict()["state"].items()
+        for key, value in entries.items()
+    }
+
+
+def set_optimizer_arrays(
+    optimizer: torch.optim.Optimizer, arrays: Mapping[str, np.ndarray]
+) -> None:
+    """Take over what `optimizer_arrays` gave. Raises `ValueError` unless it is whole."""
+    given = {k: v for k, v in arrays.items() if k.startswith("optimizer.")}
+    (group,) = optimizer.param_groups
+    expected = {
+        f"optimizer.{index}.{key}": () if key == "step" else tuple(parameter.shape)
+        for index, parameter in enumerate(group["params"])
+        for key in ("step", "exp_avg", "exp_avg_sq")
+    }
+    got = {name: array.shape for name, array in given.items()}
+    if got not in (expected, {}):
+        raise ValueError(f"optimizer: expected arrays of shapes {expected}, got {got}")
+    steps = {float(array) for name, array in given.items() if name.endswith(".step")}
+    if len(steps) > 1 or min(steps, default=1) < 1:
+        raise ValueError(f"optimizer: expected one step of 1 or more, got {sorted(steps)}")
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, value in given.items():
+        _, index, key = name.split(".")
+        state.setdefault(int(index), {})[key] = torch.from_numpy(value.copy())
+    groups = optimizer.state_dict()["param_groups"]
+    optimizer.load_state_dict({"state": state, "param_groups": groups})
+
+
+def updates_of(optimizer: torch.optim.Optimizer) -> int:
+    """Number of steps that an Adam optimizer has taken."""
+    states = list(optimizer.state.values())
+    return int(states[0]["step"]) if states else 0

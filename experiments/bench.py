@@ -346,8 +346,8 @@ def _echo(stack: ExitStack) -> Slice:
 def _policy(drones: int) -> Slice:
     dice = np.random.default_rng(0)
     shapes: dict[str, Any] = {
-        "hidden.weight": (16, 3), "hidden.bias": 16, "output.weight": (1, 16), "output.bias": 1,
-        "log_std": 1,
+        "layers.0.weight": (16, 3), "layers.0.bias": 16, "layers.1.weight": (1, 16),
+        "layers.1.bias": 1, "log_std": 1,
     }  # fmt: skip
     weights = {name: dice.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
     policy = NetworkPolicy(weights, env_spec(ENV_ID))

@@ -7,7 +7,6 @@ from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
-import torch
 
 from .. import agents
 from ..agents import A2CConfig, Checkpoint, CheckpointError
@@ -27,7 +26,7 @@ class Snapshot:
 
     env_steps: int
     seconds: float
-    actor: dict[str, np.ndarray]
+    policy: agents.NetworkPolicy
 
 
 def is_finished(kept: Checkpoint) -> bool:
@@ -56,8 +55,6 @@ class Training:
     taken: list[Snapshot] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        # Networks of 16 units: a second thread costs more than it brings.
-        torch.set_num_threads(1)
         drones, wanted = getattr(self.env, "num_envs", 1), self.run.num_envs
         expect(drones == wanted, "env", f"one of {wanted} drones", str(drones))
         self.log = agents.EpisodeLog(self.env, self.run.seed, keep_steps=self.keep_steps)
@@ -158,8 +155,8 @@ class Training:
     def _take(self) -> None:
         log = self.log
         if self.snapshots:
-            seconds, actor = log.seconds, self.agent.actor()
-            self.taken.append(Snapshot(env_steps=log.env_steps, seconds=seconds, actor=actor))
+            seconds, policy = log.seconds, self.agent.policy()
+            self.taken.append(Snapshot(env_steps=log.env_steps, seconds=seconds, policy=policy))
 
 
 def train_run(

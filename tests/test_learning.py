@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from rotorgram.agents import A2CConfig, EpisodeLog, NetworkPolicy, VPGConfig, make_agent, preset
+from rotorgram.agents import A2CConfig, EpisodeLog, VPGConfig, make_agent, preset
 from rotorgram.agents.a2c import A2C
 from rotorgram.agents.rollouts import Collector, Diverged, Rollout
 from rotorgram.agents.vpg import VPG
@@ -309,7 +309,7 @@ def test_time_baseline_leaves_nothing_of_a_reward_that_no_action_changes() -> No
     log = log_of("limit")
     agent = VPG(log, VPGConfig(baseline="time", episodes_per_update=4), seed=0)
     collector = Collector(log, np.random.default_rng(0))
-    data = collector.episodes(NetworkPolicy(agent.actor(), log.spec), 4, 10_000)
+    data = collector.episodes(agent.policy(), 4, 10_000)
     assert len(data) == 32
     np.testing.assert_allclose(agent.weights(data), 0, atol=1e-6)
 
@@ -330,7 +330,7 @@ def test_what_is_stored_is_not_clipped_and_what_is_flown_is_in_the_units_of_the_
     log = EpisodeLog(env, seed=0)
     agent = make_agent("a2c", log, A2CConfig(log_std=1.0), 0)
     collector = Collector(log, np.random.default_rng(0))
-    data = collector.steps(NetworkPolicy(agent.actor(), log.spec), 200)
+    data = collector.steps(agent.policy(), 200)
     assert np.abs(data.actions).max() > 2
     expected = 12 + 2 * np.clip(data.actions[:, 0, 0], -1, 1)
     np.testing.assert_allclose(env.flown, expected, rtol=1e-6)
@@ -405,7 +405,7 @@ def test_learns_to_hold_the_target(
         return LocalVectorEnv(ENV, count, autoreset_mode="Disabled")
 
     def late_error(agent: Any) -> float:
-        policy = NetworkPolicy(agent.actor(), log.spec)
+        policy = agent.policy()
         flown = fly_episodes(vector(5), policy, 5)
         return float(np.mean([np.abs(one.headline[-60:]).mean() for one in flown]))
 

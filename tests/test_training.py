@@ -10,7 +10,6 @@ import pytest
 import torch
 from rotorgram.agents import (
     CheckpointError,
-    NetworkPolicy,
     ResumeError,
     episode_seed,
     load,
@@ -79,7 +78,7 @@ def test_training_and_evaluation_share_no_seed() -> None:
 def test_evaluation_flies_without_noise() -> None:
     env = gym.make(ENV, disable_env_checker=True)
     log = EpisodeLog(env, 0)
-    policy = NetworkPolicy(make_agent("a2c", log, preset("a2c", "paper"), 0).actor(), log.spec)
+    policy = make_agent("a2c", log, preset("a2c", "paper"), 0).policy()
     first, second = (fly_episodes(env, policy, 2) for _ in range(2))
     for one, other in zip(first, second, strict=True):
         assert one.headline.tobytes() == other.headline.tobytes()

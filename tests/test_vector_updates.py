@@ -295,7 +295,7 @@ def collector_of(script: Script) -> tuple[Any, Collector, NetworkPolicy]:
     log = log_of(Scripted(script, reward=1.0))
     agent: Any = make_agent("a2c", log, A2CConfig(), 0)
     collector = Collector(log, np.random.default_rng(0))
-    return log, collector, NetworkPolicy(agent.actor(), log.spec)
+    return log, collector, agent.policy()
 
 
 LOST_THIRD: Script = [[(20, "limit")], [(20, "limit")], [(3, "lost"), (20, "limit")]]
