@@ -89,6 +89,9 @@ class SB3A2C:
 
     With Adam, without clipping of gradients, and with all settings from the same `A2CConfig`: given
     the same experience, it makes the same updates as ours.
+
+    Attributes:
+        model: SB3's own.
     """
 
     def __init__(self, log: EpisodeLog, config: A2CConfig, seed: int) -> None:
@@ -99,7 +102,7 @@ class SB3A2C:
         np.random.seed(torch_seed % 2**32)  # noqa: NPY002
         self.spec, self._config, self._ahead = log.spec, config, 0.0
         self._rollout = config.rollout_size(log.num_envs)
-        self._model = _A2C(
+        self.model = _A2C(
             "MlpPolicy",
             SB3VecEnv(log),
             learning_rate=self._learning_rate,
@@ -120,11 +123,11 @@ class SB3A2C:
             device="cpu",
         )
         # It keeps the numbers of the last update for us; SB3's own makes a folder in /tmp.
-        self._model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
+        self.model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: learner.OnUpdate) -> None:
         """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
-        model, done, whole = self._model, log.env_steps, self.last_step(env_steps)
+        model, done, whole = self.model, log.env_steps, self.last_step(env_steps)
         if done >= whole:
             return
         if done:  # the log is where the training stopped
@@ -146,7 +149,7 @@ class SB3A2C:
 
     def actor(self) -> dict[str, np.ndarray]:
         """Weights of the policy, under our names."""
-        weights = arrays_of(self._model.policy)
+        weights = arrays_of(self.model.policy)
         last = len(self._config.hidden)
         layers = [*(f"mlp_extractor.policy_net.{2 * i}" for i in range(last)), "action_net"]
         actor = {
@@ -162,7 +165,7 @@ class SB3A2C:
 
     def state(self) -> dict[str, np.ndarray]:
         """Weights, optimizer and both generators."""
-        model = self._model
+        model = self.model
         state = {f"policy.{name}": array for name, array in arrays_of(model.policy).items()}
         state |= optimizer_arrays(model.policy.optimizer)
         state["rng.torch"] = torch.get_rng_state().numpy().copy()
@@ -171,7 +174,7 @@ class SB3A2C:
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over a state."""
-        model = self._model
+        model = self.model
         load_arrays(model.policy, state, "policy.")
         set_optimizer_arrays(model.policy.optimizer, state)
         model._n_updates = updates_of(model.policy.optimizer)
@@ -181,7 +184,7 @@ class SB3A2C:
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as SB3 logs them; none before the first."""
-        kept = self._model.logger.name_to_value
+        kept = self.model.logger.name_to_value
         return {name: float(value) for name, value in kept.items() if name.startswith("train/")}
 
 

@@ -63,7 +63,6 @@ class Train(AgentFlags):
 
     def run(self) -> int:
         """Train by these settings, or by those of the folder to resume."""
-        require("torch", "train", "training")
         require("tensorboard", "train", "training")
         right = 0 < self.store_every < math.inf
         expect(right, "store-every", "seconds > 0", str(self.store_every))

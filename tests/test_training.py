@@ -89,7 +89,7 @@ def test_same_seed_same_numbers_and_other_seed_other_numbers() -> None:
         run = replace(run_of("a2c", 1), seed=seed, env_steps=300)
         training = Training(run, env_of(run))
         training.train()
-        return training.agent.actor()["output.weight"].tobytes()
+        return training.agent.actor()["layers.1.weight"].tobytes()
 
     assert weights(1) == weights(1)
     assert weights(1) != weights(2)
