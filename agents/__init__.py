@@ -11,25 +11,32 @@ from .checkpoints import Checkpoint, CheckpointError, load, store
 from .episodes import Episode, EpisodeLog, ResumeError, episode_seed
 from .pid import PID
 from .policies import NetworkPolicy, Policy
-from .presets import PRESETS, A2CConfig, AlgorithmName, VPGConfig, preset
+from .presets import (
+    PRESETS,
+    A2CConfig,
+    AlgorithmName,
+    Config,
+    PPOConfig,
+    VPGConfig,
+    config_type,
+    preset,
+)
 
 if TYPE_CHECKING:
     from .learner import Learner
-    from .sb3 import SB3A2C
+    from .sb3 import SB3Agent
 
-    Agent = Learner | SB3A2C
+    Agent = Learner | SB3Agent
 
 __all__ = [
     "PID", "PRESETS", "A2CConfig", "AlgorithmName", "Checkpoint", "CheckpointError", "Episode",
-    "EpisodeLog", "NetworkPolicy", "Policy", "ResumeError", "VPGConfig", "episode_seed", "load",
-    "make_agent", "preset", "resume_agent", "store",
+    "EpisodeLog", "NetworkPolicy", "PPOConfig", "Policy", "ResumeError", "VPGConfig",
+    "episode_seed", "load", "make_agent", "preset", "resume_agent", "store",
 ]  # fmt: skip
 
 
-def make_agent(
-    algorithm: str, log: EpisodeLog, config: VPGConfig | A2CConfig, seed: int
-) -> "Agent":
-    """A new agent, `vpg`, `a2c` or `sb3-a2c`, for the env of a log.
+def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> "Agent":
+    """A new agent of a name in `PRESETS`, for the env of a log.
 
     Raises:
         InputError: No such algorithm, or a config of another one.
@@ -40,14 +47,18 @@ def make_agent(
             from .vpg import VPG
 
             return VPG(log, config, seed)
-        case "a2c", A2CConfig():
+        case "ppo", PPOConfig():
+            from .ppo import PPO
+
+            return PPO(log, config, seed)
+        case "a2c", A2CConfig() if not isinstance(config, PPOConfig):
             from .a2c import A2C
 
             return A2C(log, config, seed)
-        case "sb3-a2c", A2CConfig():
-            from .sb3 import SB3A2C
+        case "sb3-a2c" | "sb3-ppo", A2CConfig() if type(config) is config_type(algorithm):
+            from .sb3 import SB3Agent
 
-            return SB3A2C(log, config, seed)
+            return SB3Agent(log, config, seed)
     raise InputError(
         f"algorithm: expected one of {sorted(PRESETS)} with its config, got {algorithm!r} "
         f"with {type(config).__name__}"
@@ -67,7 +78,7 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
         if expected != got and got != "0" * 32:  # the hash of a peer that tells none
             raise ResumeError(f"resume: expected an env with {name} {expected}, got {got}")
     try:
-        config = preset(kept.algorithm, "paper", **kept.config)
+        config = preset(kept.algorithm, "tuned", **kept.config)
         layers = kept.policy().layers
         if config.hidden != tuple(len(bias) for _, bias in layers[:-1]):
             raise InputError(f"hidden: expected those of the policy, got {config.hidden}")

@@ -24,8 +24,8 @@ class A2C(Learner):
 
     def gradient(self, rollout: Rollout) -> None:
         """Of minus the mean of A · log P, plus the weighted squared error of the value."""
-        config, observations = self.config, rollout.rows(rollout.observations)
-        advantage = rollout.rows(self.advantages(rollout)).astype(np.float32)
+        config, observations = self.config, self.inputs(rollout.rows(rollout.observations))
+        advantage = rollout.rows(self.advantages(rollout)[0]).astype(np.float32)
         values = self._critic.forward(observations)[:, 0]
         targets = values + advantage
         if config.normalize and len(advantage) > 1:
@@ -38,19 +38,26 @@ class A2C(Learner):
         self.terms = {"gain": gain, "entropy": entropy, "value_loss": value_loss}
         self.terms |= {"values": values, "targets": targets}
 
-    def advantages(self, rollout: Rollout) -> np.ndarray:
-        """A_t of every row, float64, shape (T, N)."""
-        return advantages(
+    def advantages(self, rollout: Rollout) -> tuple[np.ndarray, np.ndarray]:
+        """A_t and V(s_t) of every row, float64, shape (T, N)."""
+        values = self.values(rollout.observations)
+        following, new = np.empty_like(values), rollout.ends.copy()
+        following[:-1], new[-1] = values[1:], True
+        # The next row has the same observation, unless an episode ends between them.
+        following[new] = self.values(rollout.next_observations[new])
+        estimates = advantages(
             rollout.rewards,
-            self.values(rollout.observations),
-            self.values(rollout.next_observations),
+            values,
+            following,
             rollout.terminated,
             rollout.truncated,
             gamma=self.config.gamma,
             gae_lambda=self.config.gae_lambda,
         )
+        return estimates, values
 
     def values(self, observations: np.ndarray) -> np.ndarray:
-        """V(s), float64, shape (T, N), of observations, shape (T, N, n)."""
+        """V(s), float64, shape (...), of observations, shape (..., n)."""
         *lead, size = observations.shape
-        return self._critic.forward(observations.reshape(-1, size)).reshape(lead).astype(float)
+        values = self._critic.forward(self.inputs(observations.reshape(-1, size)))
+        return values.reshape(lead).astype(np.float64)

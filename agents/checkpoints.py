@@ -173,7 +173,7 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
         episodes=tuple(Episode(**dict(zip(_COLUMNS, row, strict=True))) for row in rows),
         **arrays["position"],
     )
-    config = vars(preset(meta["algorithm"], "paper", **meta["config"]))
+    config = vars(preset(meta["algorithm"], "tuned", **meta["config"]))
     config = json.loads(json.dumps(config))  # a tuple is a list there
     _expect(config == meta["config"], f"a config of all of {sorted(config)}", meta["config"])
     _check_position(position, spec, meta["env_steps"])

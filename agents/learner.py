@@ -8,6 +8,7 @@ import numpy as np
 
 from .episodes import EpisodeLog
 from .networks import MLP, Actor, Adam, Weights, mlp_shapes
+from .normalization import Moments
 from .policies import ActionMap, NetworkPolicy, flat_size
 from .rollouts import Collector, Diverged, Rollout
 
@@ -24,6 +25,8 @@ class Learner:
         weights: Of all networks: `actor.…`, and of a critic `critic.…`.
         optimizer: Adam of all weights.
         rate: Learning rate of the next update.
+        moments: Of the observations, where they are normalised; those of the next update have no
+            part in them yet.
         terms: Of the loss of the last update: `gain`, the mean of weight · log P, which the actor
             climbs; `entropy` of the policy, nats; and of a critic `value_loss`, the mean squared
             error of the values, with `values`, V(s_t) before the update, and their `targets`,
@@ -49,6 +52,7 @@ class Learner:
             self._critic = MLP(self.weights.part("critic."), config.activation)
             self._critic.initialise(dice, 1.0)
         self.optimizer, self.rate = Adam(self.weights), config.learning_rate
+        self.moments = Moments(inputs) if config.normalize_observations else None
         self.terms: dict[str, Any] = {}
 
     def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
@@ -75,6 +79,8 @@ class Learner:
             if len(rollout):
                 self.update(rollout)
                 self._actor.clamp()
+                if self.moments is not None:
+                    self.moments.add(rollout.rows(rollout.observations))
                 if not np.isfinite(self.weights.values).all():
                     raise diverged(self.optimizer.steps)
             if not on_update():
@@ -84,9 +90,19 @@ class Learner:
         """Env steps after which a training of so many ends: all are flown."""
         return env_steps
 
+    def inputs(self, observations: np.ndarray) -> np.ndarray:
+        """Observations as the networks take them: normalised, if the config says so."""
+        if self.moments is None:
+            return observations
+        return (observations - self.moments.mean) * self.moments.scale
+
     def actor(self) -> dict[str, np.ndarray]:
         """Weights for `NetworkPolicy`: copies."""
-        return {name: array.copy() for name, array in self._actor.weights.arrays.items()}
+        arrays = {name: array.copy() for name, array in self._actor.weights.arrays.items()}
+        if self.moments is not None:
+            moments = {"mean": self.moments.mean, "scale": self.moments.scale}
+            arrays |= named("observation.", moments)
+        return arrays
 
     def policy(self) -> NetworkPolicy:
         """The current policy: a copy."""
@@ -96,6 +112,8 @@ class Learner:
         """All that the next update depends on: weights, Adam's moments and the generator."""
         text = json.dumps(self._rng.bit_generator.state).encode()
         arrays = {"weights": self.weights.values.copy(), "rng": np.frombuffer(text, np.uint8)}
+        if self.moments is not None:
+            arrays |= named("observations.", self.moments.arrays())
         return arrays | named("optimizer.", self.optimizer.arrays())
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
@@ -105,6 +123,8 @@ class Learner:
             raise ValueError(f"weights: expected {values.shape}, got {weights.shape}")
         values[...] = weights
         self.optimizer.load(part_of(state, "optimizer."))
+        if self.moments is not None:
+            self.moments.load(part_of(state, "observations."))
         self._rng.bit_generator.state = json.loads(state["rng"].tobytes())
         self.terms = {}
 

@@ -1,4 +1,4 @@
-"""Stable-Baselines3: its A2C as the reference, and vector envs as it wants them."""
+"""Stable-Baselines3: its A2C and PPO as references, and vector envs as it wants them."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -11,7 +11,7 @@ from ..models.errors import expect, require
 from . import learner
 from .episodes import EpisodeLog
 from .policies import NetworkPolicy
-from .presets import A2CConfig
+from .presets import A2CConfig, PPOConfig
 
 if TYPE_CHECKING:
     import stable_baselines3 as sb3
@@ -84,11 +84,12 @@ class SB3VecEnv(sb3_vec.VecEnv):
         return [False] * len(list(self._get_indices(indices)))
 
 
-class SB3A2C:
-    """SB3's A2C behind the same interface as our own algorithms.
+class SB3Agent:
+    """SB3's A2C, or its PPO for a `PPOConfig`, behind the same interface as our own algorithms.
 
-    With Adam, without clipping of gradients, and with all settings from the same `A2CConfig`: given
-    the same experience, it makes the same updates as ours.
+    With all settings from the same config, Adam, and in A2C without clipping of gradients: given
+    the same experience, it makes the same updates as ours. Normalised observations raise
+    `InputError`.
 
     Attributes:
         model: SB3's own.
@@ -96,13 +97,16 @@ class SB3A2C:
 
     def __init__(self, log: EpisodeLog, config: A2CConfig, seed: int) -> None:
         torch_seed, _ = learner.seeds_of(seed)
+        right = not config.normalize_observations
+        expect(right, "normalize_observations", "false with SB3", "true")
         # SB3 draws from the global generators: torch for actions, NumPy for the order of samples.
         torch.manual_seed(torch_seed)
         torch.set_num_threads(1)  # such small nets lose by a second thread
         np.random.seed(torch_seed % 2**32)  # noqa: NPY002
         self.spec, self._config, self._ahead = log.spec, config, 0.0
         self._rollout = config.rollout_size(log.num_envs)
-        self.model = _A2C(
+        kind, settings = _kind_of(config, self._rollout)
+        self.model = kind(
             "MlpPolicy",
             SB3VecEnv(log),
             learning_rate=self._learning_rate,
@@ -111,8 +115,6 @@ class SB3A2C:
             gae_lambda=config.gae_lambda,
             ent_coef=config.ent_coef,
             vf_coef=config.vf_coef,
-            max_grad_norm=float("inf"),
-            use_rms_prop=False,
             normalize_advantage=config.normalize and self._rollout > 1,
             policy_kwargs={
                 "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
@@ -121,7 +123,10 @@ class SB3A2C:
                 "optimizer_kwargs": {"eps": 1e-8, "foreach": True},
             },
             device="cpu",
+            **settings,
         )
+        if isinstance(config, PPOConfig):
+            self.model.set_rates(config)
         # It keeps the numbers of the last update for us; SB3's own makes a folder in /tmp.
         self.model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
 
@@ -177,7 +182,7 @@ class SB3A2C:
         model = self.model
         load_arrays(model.policy, state, "policy.")
         set_optimizer_arrays(model.policy.optimizer, state)
-        model._n_updates = updates_of(model.policy.optimizer)
+        model._n_updates = updates_of(model.policy.optimizer) // model.steps_per_count
         torch.set_rng_state(torch.from_numpy(state["rng.torch"].copy()))
         *keys, place = state["rng.numpy"]
         np.random.set_state(("MT19937", np.array(keys, np.uint32), int(place), 0, 0.0))  # noqa: NPY002
@@ -192,16 +197,57 @@ class _Stopped(Exception):
     """Ends SB3's loop between an update and the next rollout."""
 
 
-class _A2C(sb3.A2C):
-    """SB3's A2C, which has no callback between an update and the next rollout."""
+class _Watched:
+    """SB3 has no callback between an update and the next rollout."""
 
     on_update: learner.OnUpdate
+    steps_per_count = 1
+    """Steps of Adam that SB3 counts as one update."""
 
     def train(self) -> None:
-        super().train()
-        check_finite(self.policy.optimizer)
+        super().train()  # type: ignore[misc]
+        check_finite(self.policy.optimizer)  # type: ignore[attr-defined]
         if not self.on_update():
             raise _Stopped
+
+
+class _A2C(_Watched, sb3.A2C):
+    pass
+
+
+class _PPO(_Watched, sb3.PPO):
+    """With a learning rate of its own for the critic; counts epochs."""
+
+    critic_share = 1.0
+    """Learning rate of the critic over that of the actor."""
+
+    def set_rates(self, config: PPOConfig) -> None:
+        rate, size = config.learning_rate, self.n_steps * self.n_envs
+        self.critic_share = (config.critic_learning_rate or rate) / rate
+        self.steps_per_count = -(-size // self.batch_size)
+        named = list(self.policy.named_parameters())
+        groups: Any = [
+            {"params": [parameter for name, parameter in named if ("value_net." in name) == critic]}
+            for critic in (False, True)
+        ]
+        self.policy.optimizer = torch.optim.Adam(groups, **self.policy.optimizer_kwargs)
+
+    def _update_learning_rate(self, optimizers: Any) -> None:
+        super()._update_learning_rate(optimizers)
+        actor, critic = self.policy.optimizer.param_groups
+        critic["lr"] = actor["lr"] * self.critic_share
+
+
+def _kind_of(config: A2CConfig, rollout: int) -> tuple[Any, dict[str, Any]]:
+    """Class of SB3 that serves a config, and the settings that it alone has."""
+    if not isinstance(config, PPOConfig):
+        return _A2C, {"max_grad_norm": float("inf"), "use_rms_prop": False}
+    return _PPO, {
+        "max_grad_norm": config.max_grad_norm,
+        "batch_size": -(-rollout // config.minibatches),
+        "n_epochs": config.epochs,
+        "clip_range": config.clip,
+    }
 
 
 def arrays_of(module: torch.nn.Module) -> dict[str, np.ndarray]:
@@ -219,8 +265,7 @@ def load_arrays(
 
 def check_finite(optimizer: torch.optim.Optimizer) -> None:
     """Raise `Diverged` unless all weights that an optimizer moves are finite numbers."""
-    (group,) = optimizer.param_groups
-    weights = torch.cat([parameter.detach().flatten() for parameter in group["params"]])
+    weights = torch.cat([parameter.detach().flatten() for parameter in parameters_of(optimizer)])
     if not torch.isfinite(weights).all():
         raise learner.diverged(updates_of(optimizer))
 
@@ -239,10 +284,9 @@ def set_optimizer_arrays(
 ) -> None:
     """Take over what `optimizer_arrays` gave. Raises `ValueError` unless it is whole."""
     given = {k: v for k, v in arrays.items() if k.startswith("optimizer.")}
-    (group,) = optimizer.param_groups
     expected = {
         f"optimizer.{index}.{key}": () if key == "step" else tuple(parameter.shape)
-        for index, parameter in enumerate(group["params"])
+        for index, parameter in enumerate(parameters_of(optimizer))
         for key in ("step", "exp_avg", "exp_avg_sq")
     }
     got = {name: array.shape for name, array in given.items()}
@@ -263,3 +307,8 @@ def updates_of(optimizer: torch.optim.Optimizer) -> int:
     """Number of steps that an Adam optimizer has taken."""
     states = list(optimizer.state.values())
     return int(states[0]["step"]) if states else 0
+
+
+def parameters_of(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:
+    """What an optimizer moves, in the order of its state."""
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]

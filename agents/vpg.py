@@ -25,7 +25,7 @@ class VPG(Learner):
         """Of minus the mean of R_t · log P(a_t | s_t)."""
         weights = self.returns(rollout)
         log_probability, entropy = self._actor.score(
-            rollout.rows(rollout.observations), rollout.rows(rollout.actions)
+            self.inputs(rollout.rows(rollout.observations)), rollout.rows(rollout.actions)
         )
         self._actor.backward(-weights / len(weights))
         self.terms = {"gain": (log_probability * weights).mean(), "entropy": entropy}

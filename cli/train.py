@@ -14,7 +14,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from ..agents import A2CConfig, AlgorithmName, Episode, load, preset, store
 from ..agents.checkpoints import software_versions, write_whole
-from ..agents.presets import PresetName
+from ..agents.presets import PPOConfig, PresetName, find_preset
 from ..experiments.folders import locked
 from ..experiments.settings import Run
 from ..models.errors import expect, require
@@ -41,17 +41,18 @@ class Train(AgentFlags):
     """
 
     algorithm: Positional[AlgorithmName]
-    """vpg, a2c or sb3-a2c."""
+    """vpg, a2c, ppo, sb3-a2c or sb3-ppo."""
     preset: PresetName = "tuned"
-    """Hyperparameters: the paper's, or ours."""
+    """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
     set: UseAppendAction[Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE …")]] = ()
     """Changes to the preset, such as gamma=0.99 steps_per_update=64."""
     seed: int = 0
     """Seed of weights, actions and episodes."""
-    env_steps: int = 200_000
-    """Env steps to train for."""
-    num_envs: int = 1
-    """Drones that fly at the same time, in lock-step. Env steps count all of them."""
+    env_steps: int | None = None
+    """Env steps to train for. Default: those of the preset."""
+    num_envs: int | None = None
+    """Drones that fly at the same time, in lock-step. Env steps count all of them. Default: those
+    of the preset."""
     num_simulators: int = 1
     """With --listen: simulators to wait for, each with its share of the drones."""
     out: Path | None = None
@@ -73,8 +74,11 @@ class Train(AgentFlags):
         from ._env import remote_env
 
         changes = dict(_change(word) for words in self.set for word in words)
-        config = preset(self.algorithm, self.preset, **changes)
-        run = Run(config=config, **self.settings(Run))
+        base = find_preset(self.algorithm, self.preset, self.env_id)
+        config = preset(self.algorithm, self.preset, self.env_id, **changes)
+        counts = {"num_envs": self.num_envs, "env_steps": self.env_steps}
+        chosen = {name: getattr(base, name) if n is None else n for name, n in counts.items()}
+        run = Run(config=config, **{**self.settings(Run), **chosen})
         if advice := _advice(run):
             print(f"note: {advice}", flush=True)
         required = bool(self.options) or "env" in self.given
@@ -159,6 +163,8 @@ def _advice(run: Run) -> str:
     """Advice if an update has too little data of so many drones; empty if not."""
     drones, config = run.num_envs, run.config
     if drones == 1 or "episode_length" not in run.options:
+        return ""
+    if isinstance(config, PPOConfig):  # many steps on each rollout
         return ""
     if isinstance(config, A2CConfig):
         steps = config.rollout_size(drones) // drones

@@ -32,8 +32,9 @@ class Snapshot:
 def is_finished(kept: Checkpoint) -> bool:
     """Whether a training has flown all its env steps. SB3 flies whole rollouts only."""
     least = 1
-    if kept.algorithm == "sb3-a2c":
-        least = A2CConfig(**kept.config).rollout_size(kept.num_envs)
+    if kept.algorithm.startswith("sb3-"):
+        config = agents.preset(kept.algorithm, "tuned", **kept.config)
+        least = config.rollout_size(kept.num_envs) if isinstance(config, A2CConfig) else 1
     return kept.env_steps - kept.position.env_steps < least
 
 
@@ -69,7 +70,7 @@ class Training:
         """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
         try:
             names = ("algorithm", "env_id", "options", "seed", "env_steps", "num_envs")
-            config = agents.preset(kept.algorithm, "paper", **kept.config)
+            config = agents.preset(kept.algorithm, "tuned", **kept.config)
             run = Run(config=config, **{name: getattr(kept, name) for name in names})
         except (InputError, TypeError, ValueError) as error:
             raise CheckpointError(f"checkpoint: its parts do not fit together: {error}") from None

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from rotorgram.agents import A2CConfig, EpisodeLog, VPGConfig, make_agent, preset
 from rotorgram.agents.a2c import A2C
 from rotorgram.agents.rollouts import Collector, Diverged, Rollout
-from rotorgram.agents.sb3 import SB3A2C
+from rotorgram.agents.sb3 import SB3Agent
 from rotorgram.agents.vpg import VPG
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.spec import ArraySpec, EnvSpec
@@ -298,7 +298,7 @@ def test_wrong_hyperparameters_are_one_sentence(
 
 def test_unknown_names_are_named() -> None:
     for arguments, changes, sentence in (
-        (("ppo", "paper"), {}, "algorithm: expected one of"),
+        (("dqn", "paper"), {}, "algorithm: expected one of"),
         (("vpg", "best"), {}, "preset: expected one of"),
         (("vpg", "paper"), {"rate": 1}, r"hyperparameters: expected some of .* got \['rate'\]"),
     ):
@@ -341,7 +341,7 @@ def test_what_is_stored_is_not_clipped_and_what_is_flown_is_in_the_units_of_the_
 
 def overwrite(agent: Any, fill: Callable[[np.ndarray], None]) -> None:
     """After each step of its optimizer, fill every array of weights."""
-    if isinstance(agent, SB3A2C):
+    if isinstance(agent, SB3Agent):
         optimizer: Any = agent.model.policy.optimizer
         arrays = [p.detach().numpy() for p in agent.model.policy.parameters()]
     else:

@@ -316,7 +316,7 @@ def test_a_lost_simulator_teaches_nothing(script: Script) -> None:
     agent.weights.arrays["critic.layers.1.weight"][:] = 0
     agent.weights.arrays["critic.layers.1.bias"][:] = 50
     rollout = collector.steps(policy, 10 * len(script))
-    left = rollout.rows(agent.advantages(rollout))
+    left = rollout.rows(agent.advantages(rollout)[0])
     np.testing.assert_allclose(left, 0, atol=1e-4)
     assert log.env_steps == 10 * len(script) - (len(script) > 1)  # of many, one begins instead
     assert len(rollout) == log.env_steps - 1
