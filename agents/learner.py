@@ -77,7 +77,8 @@ class Learner:
             if self.config.anneal:
                 self.rate = self.config.learning_rate * (1 - before / env_steps)
             if len(rollout):
-                self.update(rollout)
+                with np.errstate(over="ignore", invalid="ignore"):  # told below
+                    self.update(rollout)
                 self._actor.clamp()
                 if self.moments is not None:
                     self.moments.add(rollout.rows(rollout.observations))

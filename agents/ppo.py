@@ -1,11 +1,13 @@
 """Proximal Policy Optimisation: Schulman et al. 2017, arXiv 1707.06347, Equations 7 and 9."""
 
+import math
 from itertools import pairwise
 
 import numpy as np
 
 from .a2c import A2C
 from .episodes import EpisodeLog
+from .learner import diverged
 from .networks import clip_norm
 from .presets import PPOConfig
 from .rollouts import Rollout
@@ -45,7 +47,9 @@ class PPO(A2C):
             shuffled = [column[order] for column in columns]
             for first, last in pairwise(cuts):
                 terms.append(self.minibatch(*(column[first:last] for column in shuffled)))
-                clip_norm(self.weights.slopes, config.max_grad_norm)
+                norm = clip_norm(self.weights.slopes, config.max_grad_norm)
+                if not math.isfinite(norm):
+                    raise diverged(self.optimizer.steps)
                 self.optimizer.step(rates)
         self.terms |= dict(zip(_TERMS, np.mean(terms, axis=0).tolist(), strict=True))
         self.terms["approx_kl"] = np.mean([one[3] for one in terms[1 - len(cuts) :]])  # at the end

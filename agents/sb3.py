@@ -205,8 +205,13 @@ class _Watched:
     """Steps of Adam that SB3 counts as one update."""
 
     def train(self) -> None:
-        super().train()  # type: ignore[misc]
-        check_finite(self.policy.optimizer)  # type: ignore[attr-defined]
+        optimizer = self.policy.optimizer  # type: ignore[attr-defined]
+        try:
+            super().train()  # type: ignore[misc]
+        except ValueError:  # torch's, of a policy that gives NaN
+            check_finite(optimizer)
+            raise
+        check_finite(optimizer)
         if not self.on_update():
             raise _Stopped
 

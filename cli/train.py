@@ -1,5 +1,7 @@
 """`rotorgram train`: one run with a progress bar, checkpoints, and Ctrl-C that loses nothing."""
 
+import csv
+import io
 import json
 import math
 import signal
@@ -221,11 +223,12 @@ class _Keeper:
         self._scalars.close()
 
     def _write_episodes(self) -> None:
-        import pandas as pd
-
-        columns = [field.name for field in fields(Episode)]
-        table = pd.DataFrame(map(asdict, self._training.log.episodes), columns=columns)
-        write_whole(self._folder / EPISODES, table.to_csv(index=False).encode())
+        text = io.StringIO()  # pandas would take longer to import than a short training takes
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([field.name for field in fields(Episode)])
+        for episode in self._training.log.episodes:
+            writer.writerow("" if value != value else value for value in vars(episode).values())
+        write_whole(self._folder / EPISODES, text.getvalue().encode())
 
 
 @contextmanager

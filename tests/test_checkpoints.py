@@ -33,7 +33,9 @@ ENV = "rotorgram/Elevation-v0"
 SMALL: dict[str, dict[str, Any]] = {
     "vpg": {"episodes_per_update": 3},
     "a2c": {"steps_per_update": 64},
+    "ppo": {"steps_per_update": 64, "epochs": 2, "minibatches": 3, "normalize_observations": True},
     "sb3-a2c": {"steps_per_update": 64},
+    "sb3-ppo": {"steps_per_update": 64, "epochs": 2, "minibatches": 2},
 }
 OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
 TOTAL = 768
@@ -220,6 +222,11 @@ def test_parts_that_do_not_fit_are_refused(algorithm: str) -> None:
         {steps: np.array(-5, np.float32)},
         {second: np.zeros((7, 7), np.float32)},
         {"optimizer.9999.exp_avg": np.zeros(1, np.float32)},
+        *(
+            [{"observations.count": None}, {"observations.squares": -np.ones(3)}]
+            if algorithm == "ppo"
+            else []
+        ),
         {network: None},
         {network: np.zeros(9, np.float32)},
         {rng: None},

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from rotorgram.agents import A2CConfig, EpisodeLog, VPGConfig, make_agent, preset
+from rotorgram.agents import (
+    PRESETS,
+    A2CConfig,
+    EpisodeLog,
+    PPOConfig,
+    VPGConfig,
+    make_agent,
+    preset,
+)
 from rotorgram.agents.a2c import A2C
 from rotorgram.agents.rollouts import Collector, Diverged, Rollout
 from rotorgram.agents.sb3 import SB3Agent
@@ -185,11 +193,17 @@ def test_entropy_bonus_widens_the_policy() -> None:
     assert gradient(0.25) == pytest.approx(gradient(0.0) - 0.25, abs=1e-5)
 
 
-@pytest.mark.parametrize("algorithm", ["vpg", "a2c", "sb3-a2c"])
+_PPO = {"steps_per_update": 16, "epochs": 2, "minibatches": 2}
+_A2C = {"steps_per_update": 16}
+SMALL: dict[str, dict[str, int]] = {
+    "vpg": {"episodes_per_update": 2}, "a2c": _A2C, "ppo": _PPO, "sb3-a2c": _A2C, "sb3-ppo": _PPO,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("algorithm", SMALL)
 @pytest.mark.parametrize("anneal", [True, False])
 def test_learning_rate_falls_from_its_full_value_linearly(algorithm: str, anneal: bool) -> None:
-    size = {"episodes_per_update": 2} if algorithm == "vpg" else {"steps_per_update": 16}
-    config = preset(algorithm, "tuned", learning_rate=0.01, anneal=anneal, **size)
+    config = preset(algorithm, "tuned", learning_rate=0.01, anneal=anneal, **SMALL[algorithm])
     log = log_of("limit")
     agent: Any = make_agent(algorithm, log, config, 0)
     rates: list[float] = []
@@ -287,6 +301,9 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
             "episodes_per_update: expected 2 or more",
         ),
         ("vpg", {"learning_rate": 0}, "learning_rate: expected a number above 0"),
+        ("ppo", {"clip": 0}, "clip: expected a number above 0, got 0"),
+        ("ppo", {"epochs": 0}, "epochs: expected a whole number, 1 or more"),
+        ("ppo", {"critic_learning_rate": -1}, "critic_learning_rate: expected a number above 0"),
     ],
 )
 def test_wrong_hyperparameters_are_one_sentence(
@@ -306,6 +323,11 @@ def test_unknown_names_are_named() -> None:
             preset(*arguments, **changes)
     with pytest.raises(InputError, match=r"algorithm: expected one of .* with VPGConfig"):
         make_agent("a2c", log_of(), VPGConfig(), 0)
+    for algorithm, config in (("a2c", PPOConfig()), ("sb3-a2c", PPOConfig()), ("ppo", A2CConfig())):
+        with pytest.raises(InputError, match=r"algorithm: expected one of .* with its config"):
+            make_agent(algorithm, log_of(), config, 0)
+    with pytest.raises(InputError, match="normalize_observations: expected false with SB3"):
+        make_agent("sb3-ppo", log_of(), PPOConfig(normalize_observations=True), 0)
 
 
 def test_time_baseline_leaves_nothing_of_a_reward_that_no_action_changes() -> None:
@@ -356,11 +378,10 @@ def overwrite(agent: Any, fill: Callable[[np.ndarray], None]) -> None:
     optimizer.step = then_fill
 
 
-@pytest.mark.parametrize("algorithm", ["vpg", "a2c", "sb3-a2c"])
+@pytest.mark.parametrize("algorithm", SMALL)
 def test_a_training_that_diverges_says_so(algorithm: str) -> None:
-    size = {"episodes_per_update": 2} if algorithm == "vpg" else {"steps_per_update": 16}
     log = log_of("limit")
-    agent: Any = make_agent(algorithm, log, preset(algorithm, "paper", **size), 0)
+    agent: Any = make_agent(algorithm, log, preset(algorithm, "tuned", **SMALL[algorithm]), 0)
     overwrite(agent, lambda array: array.fill(np.inf))
     with pytest.raises(Diverged, match=r"training diverged: .* try a lower learning_rate"):
         agent.train(log, 2000, lambda: pytest.fail("an update that could have been stored"))
@@ -370,23 +391,25 @@ def test_a_training_that_diverges_says_so(algorithm: str) -> None:
 @pytest.mark.parametrize("algorithm", ["vpg", "a2c"])
 def test_huge_weights_of_a_training_that_diverges_are_no_error_of_the_env(algorithm: str) -> None:
     """Finite weights may still overflow in the policy's sums, long before the next update."""
-    size = {"episodes_per_update": 2} if algorithm == "vpg" else {"steps_per_update": 16}
     log = log_of("limit")
-    agent: Any = make_agent(algorithm, log, preset(algorithm, "paper", **size), 0)
+    agent: Any = make_agent(algorithm, log, preset(algorithm, "paper", **SMALL[algorithm]), 0)
     overwrite(agent, lambda array: array.fill(3e38 if array.ndim == 2 else 1.0))
     with pytest.raises(Diverged, match=r"training diverged: actions .* try a lower learning_rate"):
         agent.train(log, 2000, lambda: True)
 
 
-@pytest.mark.parametrize("algorithm", ["vpg", "a2c", "sb3-a2c"])
-@pytest.mark.parametrize("name", ["paper", "tuned"])
+@pytest.mark.parametrize(
+    ("algorithm", "name"),
+    [(algorithm, name) for algorithm in SMALL for name in PRESETS[algorithm]],
+)
 @pytest.mark.parametrize("action_type", ["continuous", "discrete"])
 def test_every_agent_trains_with_every_preset_and_kind_of_action(
     algorithm: str, name: str, action_type: str
 ) -> None:
     log = EpisodeLog(elevation(action_type=action_type, episode_length=60), seed=0)
     agent = make_agent(algorithm, log, preset(algorithm, name), 0)
-    before, steps = agent.actor(), 150 if name == "paper" else 512
+    rollouts = 1024 if "ppo" in algorithm else 512
+    before, steps = agent.actor(), 150 if name == "paper" else rollouts
     agent.train(log, steps, lambda: True)
     assert log.env_steps == steps
     assert any(not np.array_equal(before[k], array) for k, array in agent.actor().items())
@@ -397,6 +420,7 @@ def test_every_agent_trains_with_every_preset_and_kind_of_action(
     [
         ("a2c", 8, {"steps_per_update": 512}, 0.1),
         ("vpg", 4, {}, 0.2),
+        ("ppo", 32, {}, 0.05),
     ],
 )
 def test_learns_to_hold_the_target(
@@ -420,7 +444,7 @@ def test_learns_to_hold_the_target(
         log = EpisodeLog(vector(drones), seed)
         agent = make_agent(algorithm, log, preset(algorithm, "tuned", **changes), seed)
         before.append(late_error(agent))
-        agent.train(log, 60_000, lambda: True)
+        agent.train(log, 41_000 if algorithm == "ppo" else 60_000, lambda: True)
         after.append(late_error(agent))
     assert np.mean(before) > 0.3
     assert min(after) < bound

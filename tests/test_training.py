@@ -30,6 +30,7 @@ OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band
 SMALL: dict[str, dict[str, int]] = {
     "vpg": {"episodes_per_update": 4},
     "a2c": {"steps_per_update": 70},
+    "ppo": {"steps_per_update": 72, "epochs": 2, "minibatches": 2},
     "sb3-a2c": {"steps_per_update": 70},
 }
 
