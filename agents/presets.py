@@ -175,7 +175,15 @@ PRESETS: Final[dict[str, dict[str, Preset]]] = {
     "vpg": _VPG, "a2c": _A2C, "ppo": _PPOS, "sb3-a2c": _A2C, "sb3-ppo": _PPOS,
 }  # fmt: skip
 """By algorithm and name: of the paper's task, and of all others that `_OF_TASKS` does not have."""
-_OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {}
+_HOVER: Final = PPOConfig(
+    hidden=(64, 64), activation="tanh", learning_rate=0.003, anneal=True, gamma=0.98,
+    gae_lambda=0.95, log_std=-1.0, steps_per_update=4096, epochs=4, minibatches=16,
+)  # fmt: skip
+_OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {
+    ("ppo", "tuned", "rotorgram/Hover-v0"): Preset(
+        config=_HOVER, num_envs=128, env_steps=1_000_000
+    ),
+}
 """By algorithm without `sb3-`, name and id of the env."""
 
 

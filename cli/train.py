@@ -67,6 +67,8 @@ class Train(AgentFlags):
     def run(self) -> int:
         """Train by these settings, or by those of the folder to resume."""
         require("tensorboard", "train", "training")
+        if self.algorithm.startswith("sb3-"):
+            require("torch", "train", self.algorithm)
         right = 0 < self.store_every < math.inf
         expect(right, "store-every", "seconds > 0", str(self.store_every))
         return self._resume(self.resume) if self.resume else self._begin()
