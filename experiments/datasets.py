@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _ROW_GROUP: Final = 1 << 17  # rows of a Parquet file that are written together
 _BATCH: Final = 100  # episodes that Minari gets together
-_MINARI_ID: Final = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
+_MINARI_ID: Final = re.compile(r"([\w-]{2,}/)*[\w-]+-v\d+", re.ASCII)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -236,7 +236,7 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> tuple[int, int]:
     with _removed_on_error(out):
         for episode in episodes:
             batch = _table(episodes.spec, count, episode).replace_schema_metadata(metadata)
-            writer = writer or pq.ParquetWriter(out, batch.schema)
+            writer = writer or pq.ParquetWriter(out, batch.schema, compression="zstd")
             batches.append(batch)
             count, steps, waiting = count + 1, steps + len(episode), waiting + len(batch)
             if waiting > _ROW_GROUP:

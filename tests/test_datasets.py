@@ -268,8 +268,9 @@ def test_minari_needs_an_id_that_is_new(tmp_path: Path, monkeypatch: pytest.Monk
     path = tmp_path / "flight.mcap"
     with recording(path, episode_length=4) as remote:
         fly_one(remote, [1])
-    with pytest.raises(InputError, match="out: expected an id of Minari"):
-        write_minari(RecordedEpisodes([path]), "../flight")
+    for wrong in ("../flight-v0", "a/flight-v0", "flight", "rotorgram/flight-v"):
+        with pytest.raises(InputError, match="out: expected an id of Minari"):
+            write_minari(RecordedEpisodes([path]), wrong)
     write_minari(RecordedEpisodes([path]), "flight-v0")
     with pytest.raises(InputError, match="out: expected the id of a new data set"):
         write_minari(RecordedEpisodes([path]), "flight-v0")
