@@ -17,6 +17,7 @@ from .presets import (
     AlgorithmName,
     Config,
     PPOConfig,
+    SACConfig,
     VPGConfig,
     config_type,
     preset,
@@ -24,14 +25,15 @@ from .presets import (
 
 if TYPE_CHECKING:
     from .learner import Learner
+    from .sac import SAC
     from .sb3 import SB3Agent
 
-    Agent = Learner | SB3Agent
+    Agent = Learner | SAC | SB3Agent
 
 __all__ = [
     "PID", "PRESETS", "A2CConfig", "AlgorithmName", "Checkpoint", "CheckpointError", "Episode",
-    "EpisodeLog", "NetworkPolicy", "PPOConfig", "Policy", "ResumeError", "VPGConfig",
-    "episode_seed", "load", "make_agent", "preset", "resume_agent", "store",
+    "EpisodeLog", "NetworkPolicy", "PPOConfig", "Policy", "ResumeError", "SACConfig",
+    "VPGConfig", "episode_seed", "load", "make_agent", "preset", "resume_agent", "store",
 ]  # fmt: skip
 
 
@@ -55,6 +57,14 @@ def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> "A
             from .a2c import A2C
 
             return A2C(log, config, seed)
+        case "sac", SACConfig():
+            from .sac import SAC
+
+            return SAC(log, config, seed)
+        case "sb3-sac", SACConfig():
+            from .sb3_sac import SB3SAC
+
+            return SB3SAC(log, config, seed)
         case "sb3-a2c" | "sb3-ppo", A2CConfig() if type(config) is config_type(algorithm):
             from .sb3 import SB3Agent
 

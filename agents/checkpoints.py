@@ -23,7 +23,7 @@ from ..envs.spec import Discrete, EnvSpec
 from ..models.errors import InputError, require
 from .episodes import Episode, Position
 from .policies import NetworkPolicy, flat_size
-from .presets import PRESETS, preset
+from .presets import PRESETS, SQUASHED, preset
 
 FORMAT: Final = 3
 _GROUPS: Final = ("policy", "state", "position", "episodes")
@@ -78,7 +78,8 @@ class Checkpoint:
 
     def policy(self, spec: EnvSpec | None = None) -> NetworkPolicy:
         """The policy, ready to fly that env or its own. Raises `InputError` if it does not fit."""
-        return NetworkPolicy(self.actor, spec or self.spec, self.config["activation"])
+        spec, squash = spec or self.spec, self.algorithm in SQUASHED
+        return NetworkPolicy(self.actor, spec, self.config["activation"], squash=squash)
 
     def other_versions(self) -> dict[str, tuple[str, str]]:
         """Software whose version was another: its version then and now."""

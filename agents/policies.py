@@ -78,7 +78,7 @@ class ActionMap:
 
 
 def _expected_shapes(
-    got: Mapping[str, tuple[int, ...]], inputs: int, actions: ActionMap
+    got: Mapping[str, tuple[int, ...]], inputs: int, actions: ActionMap, squash: bool
 ) -> dict[str, tuple[int, ...]]:
     """Of the weights of a policy with as many units in its layers as those have."""
     expected: dict[str, tuple[int, ...]] = {}
@@ -88,7 +88,7 @@ def _expected_shapes(
         units = actions.outputs if i == last else (*got.get(f"layers.{i}.bias", ()), 0)[0]
         expected |= {f"layers.{i}.weight": (units, before), f"layers.{i}.bias": (units,)}
         before = units
-    if not actions.discrete:
+    if not (actions.discrete or squash):
         expected["log_std"] = (actions.outputs,)
     if any(name.startswith("observation.") for name in got):
         expected |= {"observation.mean": (inputs,), "observation.scale": (inputs,)}
@@ -102,8 +102,8 @@ class NetworkPolicy:
     gives the mean of the action or the logits of the choices, k numbers; for continuous actions
     `log_std` (k,); and where observations are normalised `observation.mean` (n,) and
     `observation.scale` (n,): the input is (observation - mean) · scale. With `squash` the output is
-    tanh of the last layer's. Raises `InputError` if an array is missing, or the shapes are not
-    those that the env needs.
+    tanh of the last layer's, there is no `log_std`, and the policy draws no actions. Raises
+    `InputError` if an array is missing, or the shapes are not those that the env needs.
 
     Attributes:
         layers: Weight (h, n) and bias (h,) of each layer.
@@ -127,7 +127,7 @@ class NetworkPolicy:
         self._relu = activation == "relu"
         expect(activation in ("relu", "tanh"), "activation", "relu or tanh", activation)
         got = {name: array.shape for name, array in weights.items()}
-        expected = _expected_shapes(got, flat_size(spec), self.actions)
+        expected = _expected_shapes(got, flat_size(spec), self.actions, squash)
         reason = (
             "it was trained for other observations or actions; give the --vehicle and the --env "
             "options of its training"
@@ -139,7 +139,7 @@ class NetworkPolicy:
                        for i in range(count)]  # fmt: skip
         self.mean, self.scale = weights.get("observation.mean"), weights.get("observation.scale")
         self._sums = [(weight.T, bias[np.newaxis]) for weight, bias in self.layers]
-        self._std = None if self.actions.discrete else np.exp(weights["log_std"])
+        self._std = np.exp(weights["log_std"]) if "log_std" in weights else None
 
     def reset(self) -> None:
         """Nothing to forget."""

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 from ..models.errors import expect
 
-AlgorithmName = Literal["vpg", "a2c", "ppo", "sb3-a2c", "sb3-ppo"]
+AlgorithmName = Literal["vpg", "a2c", "ppo", "sac", "sb3-a2c", "sb3-ppo", "sb3-sac"]
 PresetName = Literal["paper", "tuned"]
 
 
@@ -24,8 +24,8 @@ def _is_count(value: Any) -> bool:
 
 
 _RULES: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
-    ("episodes_per_update steps_per_update epochs minibatches", "a whole number, 1 or more",
-     _is_count),
+    ("episodes_per_update steps_per_update epochs minibatches gradient_steps batch_size buffer_size"
+     " learning_starts", "a whole number, 1 or more", _is_count),
     ("hidden", "whole numbers, 1 or more, one a layer",
      lambda value: len(value) > 0 and all(map(_is_count, value))),
     ("activation", "'relu' or 'tanh'", lambda value: value in ("relu", "tanh")),
@@ -33,7 +33,10 @@ _RULES: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
     ("clip max_grad_norm", "a number above 0", lambda value: _is_number(value, 5e-324)),
     ("vf_coef ent_coef", "a number, 0 or more", lambda value: _is_number(value, 0)),
     ("anneal normalize normalize_observations", "true or false", lambda value: type(value) is bool),
-    ("learning_rate", "a number above 0", lambda value: _is_number(value, 5e-324, 1e30)),
+    ("tau", "a number above 0, to 1", lambda value: _is_number(value, 5e-324, 1)),
+    ("target_entropy", "a number, or null",
+     lambda value: value is None or _is_number(value, -math.inf)),
+    ("learning_rate alpha", "a number above 0", lambda value: _is_number(value, 5e-324, 1e30)),
     ("critic_learning_rate", "a number above 0, or null",
      lambda value: value is None or _is_number(value, 5e-324, 1e30)),
     ("log_std", "a number from -4 to 1", lambda value: _is_number(value, -4, 1)),
@@ -140,7 +143,47 @@ class PPOConfig(A2CConfig):
     """The gradient, as one vector, is scaled down to this length."""
 
 
-Config = VPGConfig | A2CConfig | PPOConfig
+@dataclass(frozen=True, kw_only=True)
+class SACConfig(_Config):
+    """Soft Actor-Critic (Haarnoja et al. 2018, arXiv 1812.05905). Defaults: its Table 1.
+
+    Serves our SAC and Stable-Baselines3's.
+    """
+
+    hidden: tuple[int, ...] = (256, 256)
+    """Units of each hidden layer of each network."""
+    learning_rate: float = 0.0003
+    """Of Adam: actor, critics and temperature."""
+    steps_per_update: int = 1
+    """Env steps between updates, of all drones together."""
+    gradient_steps: int = 1
+    """Updates that follow them."""
+    batch_size: int = 256
+    """Transitions of an update, drawn from the buffer."""
+    buffer_size: int = 1_000_000
+    """Transitions that are kept; a checkpoint has them."""
+    learning_starts: int = 1_000
+    """Transitions of uniform actions before the first update. Table 1 has none."""
+    tau: float = 0.005
+    """Share of the critics that their targets take over in each update."""
+    alpha: float = 1.0
+    """Temperature at the beginning. Table 1 has none."""
+    target_entropy: float | None = None
+    """Entropy that the temperature aims at, nats; null: minus the number of actions."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        least, got = self.learning_starts, self.buffer_size
+        expect(got >= least, "buffer_size", f"learning_starts ({least}) or more", f"{got}")
+        right = not self.normalize_observations
+        expect(right, "normalize_observations", "false with SAC", "true")
+
+    def rollout_size(self, drones: int) -> int:
+        """Env steps between updates: `steps_per_update`, rounded up to whole steps of all."""
+        return -(-self.steps_per_update // drones) * drones
+
+
+Config = VPGConfig | A2CConfig | PPOConfig | SACConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,9 +213,20 @@ _A2C: Final = {
     "tuned": Preset(config=A2CConfig(**_TUNED, steps_per_update=256, gae_lambda=0.98)),
 }
 _PPOS: Final = {"tuned": Preset(config=_PPO, num_envs=32, env_steps=41_000)}
+_SACS: Final = {
+    "tuned": Preset(
+        config=SACConfig(
+            hidden=(32, 32), learning_rate=0.01, anneal=True, gamma=0.98, batch_size=128,
+            buffer_size=100_000, steps_per_update=8, tau=0.01, alpha=0.1,
+        ),
+        num_envs=8,
+        env_steps=40_000,
+    )
+}  # fmt: skip
 # The references get the very same settings: only the implementation differs.
 PRESETS: Final[dict[str, dict[str, Preset]]] = {
-    "vpg": _VPG, "a2c": _A2C, "ppo": _PPOS, "sb3-a2c": _A2C, "sb3-ppo": _PPOS,
+    "vpg": _VPG, "a2c": _A2C, "ppo": _PPOS, "sac": _SACS, "sb3-a2c": _A2C, "sb3-ppo": _PPOS,
+    "sb3-sac": _SACS,
 }  # fmt: skip
 """By algorithm and name: of the paper's task, and of all others that `_OF_TASKS` does not have."""
 _HOVER: Final = PPOConfig(
@@ -185,6 +239,10 @@ _OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {
     ),
 }
 """By algorithm without `sb3-`, name and id of the env."""
+
+
+SQUASHED: Final = ("sac", "sb3-sac")
+"""Algorithms whose policy bounds its output by tanh."""
 
 
 def find_preset(algorithm: str, name: str, env_id: str = "") -> Preset:

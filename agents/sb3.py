@@ -96,13 +96,9 @@ class SB3Agent:
     """
 
     def __init__(self, log: EpisodeLog, config: A2CConfig, seed: int) -> None:
-        torch_seed, _ = learner.seeds_of(seed)
         right = not config.normalize_observations
         expect(right, "normalize_observations", "false with SB3", "true")
-        # SB3 draws from the global generators: torch for actions, NumPy for the order of samples.
-        torch.manual_seed(torch_seed)
-        torch.set_num_threads(1)  # such small nets lose by a second thread
-        np.random.seed(torch_seed % 2**32)  # noqa: NPY002
+        seed_generators(seed)
         self.spec, self._config, self._ahead = log.spec, config, 0.0
         self._rollout = config.rollout_size(log.num_envs)
         kind, settings = _kind_of(config, self._rollout)
@@ -140,7 +136,7 @@ class SB3Agent:
             model._last_episode_starts = log.position().lengths == 0
         model.num_timesteps, model.on_update = done, on_update
         self._ahead = self._rollout / whole
-        with suppress(_Stopped):
+        with suppress(Stopped):
             model.learn(whole - done, reset_num_timesteps=done == 0)
 
     def last_step(self, env_steps: int) -> int:
@@ -172,10 +168,7 @@ class SB3Agent:
         """Weights, optimizer and both generators."""
         model = self.model
         state = {f"policy.{name}": array for name, array in arrays_of(model.policy).items()}
-        state |= optimizer_arrays(model.policy.optimizer)
-        state["rng.torch"] = torch.get_rng_state().numpy().copy()
-        _, keys, place, *_ = np.random.get_state()  # noqa: NPY002
-        return state | {"rng.numpy": np.append(keys, place).astype(np.uint32)}
+        return state | optimizer_arrays(model.policy.optimizer) | generator_arrays()
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over a state."""
@@ -183,9 +176,7 @@ class SB3Agent:
         load_arrays(model.policy, state, "policy.")
         set_optimizer_arrays(model.policy.optimizer, state)
         model._n_updates = updates_of(model.policy.optimizer) // model.steps_per_count
-        torch.set_rng_state(torch.from_numpy(state["rng.torch"].copy()))
-        *keys, place = state["rng.numpy"]
-        np.random.set_state(("MT19937", np.array(keys, np.uint32), int(place), 0, 0.0))  # noqa: NPY002
+        set_generators(state)
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as SB3 logs them; none before the first."""
@@ -193,7 +184,7 @@ class SB3Agent:
         return {name: float(value) for name, value in kept.items() if name.startswith("train/")}
 
 
-class _Stopped(Exception):
+class Stopped(Exception):
     """Ends SB3's loop between an update and the next rollout."""
 
 
@@ -213,7 +204,7 @@ class _Watched:
             raise
         check_finite(optimizer)
         if not self.on_update():
-            raise _Stopped
+            raise Stopped
 
 
 class _A2C(_Watched, sb3.A2C):
@@ -273,6 +264,29 @@ def check_finite(optimizer: torch.optim.Optimizer) -> None:
     weights = torch.cat([parameter.detach().flatten() for parameter in parameters_of(optimizer)])
     if not torch.isfinite(weights).all():
         raise learner.diverged(updates_of(optimizer))
+
+
+def seed_generators(seed: int) -> int:
+    """Seed what SB3 draws from: torch for actions, NumPy for samples. The seed that they get."""
+    torch_seed, _ = learner.seeds_of(seed)
+    torch.manual_seed(torch_seed)
+    torch.set_num_threads(1)  # such small nets lose by a second thread
+    np.random.seed(torch_seed % 2**32)  # noqa: NPY002
+    return torch_seed
+
+
+def generator_arrays() -> dict[str, np.ndarray]:
+    """States of the global generators."""
+    _, keys, place, *_ = np.random.get_state()  # noqa: NPY002
+    return {"rng.torch": torch.get_rng_state().numpy().copy(),
+            "rng.numpy": np.append(keys, place).astype(np.uint32)}  # fmt: skip
+
+
+def set_generators(arrays: Mapping[str, np.ndarray]) -> None:
+    """Take over what `generator_arrays` gave."""
+    torch.set_rng_state(torch.from_numpy(arrays["rng.torch"].copy()))
+    *keys, place = arrays["rng.numpy"]
+    np.random.set_state(("MT19937", np.array(keys, np.uint32), int(place), 0, 0.0))  # noqa: NPY002
 
 
 def optimizer_arrays(optimizer: torch.optim.Optimizer) -> dict[str, np.ndarray]:

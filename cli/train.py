@@ -16,7 +16,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from ..agents import A2CConfig, AlgorithmName, Episode, load, preset, store
 from ..agents.checkpoints import software_versions, write_whole
-from ..agents.presets import PPOConfig, PresetName, find_preset
+from ..agents.presets import PPOConfig, PresetName, SACConfig, find_preset
 from ..experiments.folders import locked
 from ..experiments.settings import Run
 from ..models.errors import expect, require
@@ -43,7 +43,7 @@ class Train(AgentFlags):
     """
 
     algorithm: Positional[AlgorithmName]
-    """vpg, a2c, ppo, sb3-a2c or sb3-ppo."""
+    """vpg, a2c, ppo, sac, sb3-a2c, sb3-ppo or sb3-sac."""
     preset: PresetName = "tuned"
     """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
     set: UseAppendAction[Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE …")]] = ()
@@ -168,7 +168,7 @@ def _advice(run: Run) -> str:
     drones, config = run.num_envs, run.config
     if drones == 1 or "episode_length" not in run.options:
         return ""
-    if isinstance(config, PPOConfig):  # many steps on each rollout
+    if isinstance(config, PPOConfig | SACConfig):  # many updates with each transition
         return ""
     if isinstance(config, A2CConfig):
         steps = config.rollout_size(drones) // drones

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import product
 from typing import Any, Literal
 
-from ..agents.presets import A2CConfig, Config, PresetName, preset
+from ..agents.presets import A2CConfig, Config, PresetName, SACConfig, preset
 from ..envs.registry import env_spec, is_known, options_type, task_type
 from ..models.errors import expect
 
@@ -60,7 +60,7 @@ class Run(EnvConfig):
         expect(self.seed >= 0, "seed", "0 or more", str(self.seed))
         expect(self.num_envs >= 1, "num_envs", "1 or more", str(self.num_envs))
         least = 1
-        if isinstance(self.config, A2CConfig):
+        if isinstance(self.config, A2CConfig | SACConfig):
             least = self.config.rollout_size(self.num_envs)
         elif self.num_envs > 1:  # a whole episode of each
             least = self.num_envs * int(self.options.get("episode_length", 1))

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from .. import agents
-from ..agents import A2CConfig, Checkpoint, CheckpointError
+from ..agents import Checkpoint, CheckpointError, VPGConfig
 from ..envs.autoreset import AdvancingVectorEnv
 from ..models.errors import InputError, expect
 from .settings import Run
@@ -34,7 +34,7 @@ def is_finished(kept: Checkpoint) -> bool:
     least = 1
     if kept.algorithm.startswith("sb3-"):
         config = agents.preset(kept.algorithm, "tuned", **kept.config)
-        least = config.rollout_size(kept.num_envs) if isinstance(config, A2CConfig) else 1
+        least = 1 if isinstance(config, VPGConfig) else config.rollout_size(kept.num_envs)
     return kept.env_steps - kept.position.env_steps < least
 
 
