@@ -88,7 +88,7 @@ def _expected_shapes(
         units = actions.outputs if i == last else (*got.get(f"layers.{i}.bias", ()), 0)[0]
         expected |= {f"layers.{i}.weight": (units, before), f"layers.{i}.bias": (units,)}
         before = units
-    if not (actions.discrete or squash):
+    if not actions.discrete and ("log_std" in got or not squash):
         expected["log_std"] = (actions.outputs,)
     if any(name.startswith("observation.") for name in got):
         expected |= {"observation.mean": (inputs,), "observation.scale": (inputs,)}
@@ -102,8 +102,8 @@ class NetworkPolicy:
     gives the mean of the action or the logits of the choices, k numbers; for continuous actions
     `log_std` (k,); and where observations are normalised `observation.mean` (n,) and
     `observation.scale` (n,): the input is (observation - mean) · scale. With `squash` the output is
-    tanh of the last layer's, there is no `log_std`, and the policy draws no actions. Raises
-    `InputError` if an array is missing, or the shapes are not those that the env needs.
+    tanh of the last layer's, and `log_std` may be left out: then the policy acts, but draws none.
+    Raises `InputError` if an array is missing, or the shapes are not those that the env needs.
 
     Attributes:
         layers: Weight (h, n) and bias (h,) of each layer.

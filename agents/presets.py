@@ -216,11 +216,11 @@ _PPOS: Final = {"tuned": Preset(config=_PPO, num_envs=32, env_steps=41_000)}
 _SACS: Final = {
     "tuned": Preset(
         config=SACConfig(
-            hidden=(32, 32), learning_rate=0.01, anneal=True, gamma=0.98, batch_size=128,
-            buffer_size=100_000, steps_per_update=8, tau=0.01, alpha=0.1,
+            hidden=(32, 32), learning_rate=0.01, anneal=True, gamma=0.98, batch_size=64,
+            buffer_size=100_000, steps_per_update=8, tau=0.02, alpha=0.1,
         ),
         num_envs=8,
-        env_steps=40_000,
+        env_steps=30_000,
     )
 }  # fmt: skip
 # The references get the very same settings: only the implementation differs.
