@@ -1,6 +1,7 @@
 """SAC: each gradient against torch, differences and numbers by hand; updates against SB3's."""
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -392,3 +393,16 @@ def test_learns_to_hold_the_target() -> None:
         flown = fly_episodes(evaluation, agent.policy(), 5)
         late.append(float(np.mean([np.abs(one.headline[-60:]).mean() for one in flown])))
     assert min(late) < 0.1
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "sb3-sac"])
+def test_what_is_logged_is_on_the_page(algorithm: str) -> None:
+    page = Path(__file__).parent.parent / "docs" / "algorithms" / f"{algorithm}.md"
+    told = set(re.findall(r"^\| `(train/\w+)`", page.read_text(encoding="utf-8"), re.MULTILINE))
+    log = elevation(2)
+    agent = make_agent(algorithm, log, preset(algorithm, "tuned", **SMALL), 0)
+    assert agent.scalars() == {}
+    agent.train(log, 48, lambda: True)
+    assert set(agent.scalars()) == told
+    assert agent.scalars()["train/n_updates"] >= 1
+    assert agent.scalars()["train/ent_coef"] == pytest.approx(0.1, rel=0.05)
