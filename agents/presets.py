@@ -237,6 +237,22 @@ _OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {
     ("ppo", "tuned", "rotorgram/Hover-v0"): Preset(
         config=_HOVER, num_envs=128, env_steps=1_000_000
     ),
+    ("sac", "tuned", "rotorgram/Hover-v0"): Preset(
+        config=SACConfig(
+            hidden=(64, 64),
+            learning_rate=0.003,
+            anneal=True,
+            gamma=0.98,
+            batch_size=128,
+            buffer_size=200_000,
+            steps_per_update=16,
+            gradient_steps=2,
+            tau=0.02,
+            alpha=0.1,
+        ),
+        num_envs=16,
+        env_steps=200_000,
+    ),
 }
 """By algorithm without `sb3-`, name and id of the env."""
 
