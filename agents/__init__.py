@@ -1,7 +1,7 @@
 """Learning algorithms, their policies and files, and a PID controller.
 
-Policies, the PID and the reading of checkpoints need neither torch nor SB3: `make_agent` and
-`resume_agent` import them.
+Policies, the PID and the reading of checkpoints import no algorithm: `make_agent` and
+`resume_agent` do. Only SB3's needs torch.
 """
 
 from typing import TYPE_CHECKING
@@ -11,43 +11,64 @@ from .checkpoints import Checkpoint, CheckpointError, load, store
 from .episodes import Episode, EpisodeLog, ResumeError, episode_seed
 from .pid import PID
 from .policies import NetworkPolicy, Policy
-from .presets import PRESETS, A2CConfig, AlgorithmName, VPGConfig, preset
+from .presets import (
+    PRESETS,
+    A2CConfig,
+    AlgorithmName,
+    Config,
+    PPOConfig,
+    SACConfig,
+    VPGConfig,
+    config_type,
+    preset,
+)
 
 if TYPE_CHECKING:
     from .learner import Learner
-    from .sb3 import SB3A2C
+    from .sac import SAC
+    from .sb3 import SB3Agent
 
-    Agent = Learner | SB3A2C
+    Agent = Learner | SAC | SB3Agent
 
 __all__ = [
     "PID", "PRESETS", "A2CConfig", "AlgorithmName", "Checkpoint", "CheckpointError", "Episode",
-    "EpisodeLog", "NetworkPolicy", "Policy", "ResumeError", "VPGConfig", "episode_seed", "load",
-    "make_agent", "preset", "resume_agent", "store",
+    "EpisodeLog", "NetworkPolicy", "PPOConfig", "Policy", "ResumeError", "SACConfig",
+    "VPGConfig", "episode_seed", "load", "make_agent", "preset", "resume_agent", "store",
 ]  # fmt: skip
 
 
-def make_agent(
-    algorithm: str, log: EpisodeLog, config: VPGConfig | A2CConfig, seed: int
-) -> "Agent":
-    """A new agent, `vpg`, `a2c` or `sb3-a2c`, for the env of a log.
+def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> "Agent":
+    """A new agent of a name in `PRESETS`, for the env of a log.
 
     Raises:
         InputError: No such algorithm, or a config of another one.
-        MissingPackage: torch or SB3 is not installed.
+        MissingPackage: SB3 is not installed.
     """
     match algorithm, config:
         case "vpg", VPGConfig():
             from .vpg import VPG
 
             return VPG(log, config, seed)
-        case "a2c", A2CConfig():
+        case "ppo", PPOConfig():
+            from .ppo import PPO
+
+            return PPO(log, config, seed)
+        case "a2c", A2CConfig() if not isinstance(config, PPOConfig):
             from .a2c import A2C
 
             return A2C(log, config, seed)
-        case "sb3-a2c", A2CConfig():
-            from .sb3 import SB3A2C
+        case "sac", SACConfig():
+            from .sac import SAC
 
-            return SB3A2C(log, config, seed)
+            return SAC(log, config, seed)
+        case "sb3-sac", SACConfig():
+            from .sb3_sac import SB3SAC
+
+            return SB3SAC(log, config, seed)
+        case "sb3-a2c" | "sb3-ppo", A2CConfig() if type(config) is config_type(algorithm):
+            from .sb3 import SB3Agent
+
+            return SB3Agent(log, config, seed)
     raise InputError(
         f"algorithm: expected one of {sorted(PRESETS)} with its config, got {algorithm!r} "
         f"with {type(config).__name__}"
@@ -60,16 +81,17 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
     Raises:
         CheckpointError: The parts of the checkpoint do not fit together.
         ResumeError: The env is another one, or does not repeat the interrupted episodes.
-        MissingPackage: torch or SB3 is not installed.
+        MissingPackage: SB3 is not installed.
     """
     for name in ("env_id", "options", "vehicle_hash", "observation", "action"):
         expected, got = getattr(kept.spec, name), getattr(log.spec, name)
         if expected != got and got != "0" * 32:  # the hash of a peer that tells none
             raise ResumeError(f"resume: expected an env with {name} {expected}, got {got}")
     try:
-        config = preset(kept.algorithm, "paper", **kept.config)
-        if config.hidden != len(kept.actor["hidden.bias"]):
-            raise InputError(f"hidden: expected that of the policy, got {config.hidden}")
+        config = preset(kept.algorithm, "tuned", **kept.config)
+        layers = kept.policy().layers
+        if config.hidden != tuple(len(bias) for _, bias in layers[:-1]):
+            raise InputError(f"hidden: expected those of the policy, got {config.hidden}")
         agent = make_agent(kept.algorithm, log, config, kept.seed)
         agent.set_state(kept.state)
     except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:

@@ -3,8 +3,7 @@
 import numpy as np
 
 from .learner import Learner
-from .networks import Critic, nn, torch
-from .policies import NetworkPolicy, flat_size
+from .policies import NetworkPolicy
 from .presets import A2CConfig
 from .rollouts import Collector, Rollout, advantages
 
@@ -17,53 +16,48 @@ class A2C(Learner):
     """
 
     config: A2CConfig
-
-    def others(self) -> dict[str, nn.Module]:
-        """The critic."""
-        self._critic = Critic(flat_size(self.spec), hidden=self.config.hidden)
-        return {"critic": self._critic}
+    has_critic = True
 
     def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
         """Fly a fixed number of steps, across episodes."""
         return collector.steps(policy, min(self.config.steps_per_update, most))
 
-    def loss(self, rollout: Rollout) -> torch.Tensor:
-        """Minus the mean of A · log P, plus the weighted squared error of the value."""
-        config = self.config
-        values = self._values(rollout.observations)
-        advantage = rollout.rows(self.advantages(rollout, values.detach().numpy()))
-        values = values[torch.from_numpy(rollout.kept)]
-        held = values.detach()
-        targets = torch.from_numpy(advantage.astype(np.float32)) + held
+    def gradient(self, rollout: Rollout) -> None:
+        """Of minus the mean of A · log P, plus the weighted squared error of the value."""
+        config, observations = self.config, self.inputs(rollout.rows(rollout.observations))
+        advantage = rollout.rows(self.advantages(rollout)[0]).astype(np.float32)
+        values = self._critic.forward(observations)[:, 0]
+        targets = values + advantage
         if config.normalize and len(advantage) > 1:
             advantage = (advantage - advantage.mean()) / (advantage.std(ddof=1) + 1e-8)
-        log_probability, entropy = self._actor.score(
-            torch.from_numpy(rollout.rows(rollout.observations)),
-            torch.from_numpy(rollout.rows(rollout.actions)),
-        )
-        gain = (log_probability * torch.from_numpy(advantage.astype(np.float32))).mean()
-        value_loss = (targets - values).square().mean()
-        loss: torch.Tensor = config.vf_coef * value_loss - gain - config.ent_coef * entropy.mean()
+        log_probability, entropy = self._actor.score(observations, rollout.rows(rollout.actions))
+        self._actor.backward(-advantage / len(advantage), -config.ent_coef)
+        errors = values - targets
+        self._critic.backward((2 * config.vf_coef / len(errors) * errors)[:, np.newaxis])
+        gain, value_loss = (log_probability * advantage).mean(), (errors * errors).mean()
         self.terms = {"gain": gain, "entropy": entropy, "value_loss": value_loss}
-        self.terms |= {"values": held, "targets": targets}
-        return loss
+        self.terms |= {"values": values, "targets": targets}
 
-    def advantages(self, rollout: Rollout, values: np.ndarray) -> np.ndarray:
-        """A_t of every row, float64, shape (T, N), from V(s_t), shape (T, N)."""
-        with torch.no_grad():
-            following = self._values(rollout.next_observations).numpy()
-        return advantages(
+    def advantages(self, rollout: Rollout) -> tuple[np.ndarray, np.ndarray]:
+        """A_t and V(s_t) of every row, float64, shape (T, N)."""
+        values = self.values(rollout.observations)
+        following, new = np.empty_like(values), rollout.ends.copy()
+        following[:-1], new[-1] = values[1:], True
+        # The next row has the same observation, unless an episode ends between them.
+        following[new] = self.values(rollout.next_observations[new])
+        estimates = advantages(
             rollout.rewards,
-            values.astype(np.float64),
-            following.astype(np.float64),
+            values,
+            following,
             rollout.terminated,
             rollout.truncated,
             gamma=self.config.gamma,
             gae_lambda=self.config.gae_lambda,
         )
+        return estimates, values
 
-    def _values(self, observations: np.ndarray) -> torch.Tensor:
-        """V(s), shape (T, N), of observations, shape (T, N, n)."""
-        shape = observations.shape
-        values: torch.Tensor = self._critic(torch.from_numpy(observations.reshape(-1, shape[-1])))
-        return values.reshape(shape[:-1])
+    def values(self, observations: np.ndarray) -> np.ndarray:
+        """V(s), float64, shape (...), of observations, shape (..., n)."""
+        *lead, size = observations.shape
+        values = self._critic.forward(self.inputs(observations.reshape(-1, size)))
+        return values.reshape(lead).astype(np.float64)

@@ -23,9 +23,9 @@ from ..envs.spec import Discrete, EnvSpec
 from ..models.errors import InputError, require
 from .episodes import Episode, Position
 from .policies import NetworkPolicy, flat_size
-from .presets import PRESETS, preset
+from .presets import PRESETS, SQUASHED, preset
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 _GROUPS: Final = ("policy", "state", "position", "episodes")
 _PLAIN: Final = ("algorithm", "config", "seed", "env_steps", "versions")
 _POSITION: Final = ("actions", "observations", "numbers", "lengths", "first_steps")
@@ -78,7 +78,8 @@ class Checkpoint:
 
     def policy(self, spec: EnvSpec | None = None) -> NetworkPolicy:
         """The policy, ready to fly that env or its own. Raises `InputError` if it does not fit."""
-        return NetworkPolicy(self.actor, spec or self.spec)
+        spec, squash = spec or self.spec, self.algorithm in SQUASHED
+        return NetworkPolicy(self.actor, spec, self.config["activation"], squash=squash)
 
     def other_versions(self) -> dict[str, tuple[str, str]]:
         """Software whose version was another: its version then and now."""
@@ -173,7 +174,8 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
         episodes=tuple(Episode(**dict(zip(_COLUMNS, row, strict=True))) for row in rows),
         **arrays["position"],
     )
-    config = vars(preset(meta["algorithm"], "paper", **meta["config"]))
+    config = vars(preset(meta["algorithm"], "tuned", **meta["config"]))
+    config = json.loads(json.dumps(config))  # a tuple is a list there
     _expect(config == meta["config"], f"a config of all of {sorted(config)}", meta["config"])
     _check_position(position, spec, meta["env_steps"])
     plain = {name: meta[name] for name in _PLAIN}

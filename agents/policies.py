@@ -1,12 +1,14 @@
-"""Policies for flying, in plain NumPy: 16 units need no tensor library."""
+"""Policies for flying, in plain NumPy: such small nets need no tensor library."""
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from ..envs.spec import ArraySpec, Discrete, EnvSpec
 from ..models.errors import expect
+
+_ZERO: Final = np.zeros((1, 1), np.float32)
 
 
 class Policy(Protocol):
@@ -75,46 +77,88 @@ class ActionMap:
         return clipped
 
 
-class NetworkPolicy:
-    """The actor of `networks.Actor`, from its weights.
+def _expected_shapes(
+    got: Mapping[str, tuple[int, ...]], inputs: int, actions: ActionMap, squash: bool
+) -> dict[str, tuple[int, ...]]:
+    """Of the weights of a policy with as many units in its layers as those have."""
+    expected: dict[str, tuple[int, ...]] = {}
+    last = max(sum(name.startswith("layers.") for name in got) // 2 - 1, 0)
+    before = inputs
+    for i in range(last + 1):
+        units = actions.outputs if i == last else (*got.get(f"layers.{i}.bias", ()), 0)[0]
+        expected |= {f"layers.{i}.weight": (units, before), f"layers.{i}.bias": (units,)}
+        before = units
+    if not actions.discrete and ("log_std" in got or not squash):
+        expected["log_std"] = (actions.outputs,)
+    if any(name.startswith("observation.") for name in got):
+        expected |= {"observation.mean": (inputs,), "observation.scale": (inputs,)}
+    return expected
 
-    These are `hidden.weight` (h, n), `hidden.bias` (h,), `output.weight` (k, h), `output.bias`
-    (k,), all float32, and for continuous actions `log_std` (k,). Raises `InputError` if one is
-    missing, or the shapes are not those that the env needs.
+
+class NetworkPolicy:
+    """The actor of `networks.Actor`, from its weights, all float32.
+
+    These are `layers.0.weight` (h, n), `layers.0.bias` (h,) and so on to the last layer, which
+    gives the mean of the action or the logits of the choices, k numbers; for continuous actions
+    `log_std` (k,); and where observations are normalised `observation.mean` (n,) and
+    `observation.scale` (n,): the input is (observation - mean) · scale. With `squash` the output is
+    tanh of the last layer's, and `log_std` may be left out: then the policy acts, but draws none.
+    Raises `InputError` if an array is missing, or the shapes are not those that the env needs.
+
+    Attributes:
+        layers: Weight (h, n) and bias (h,) of each layer.
+        activation: Of all layers but the last: `relu` or `tanh`.
+        squash: Whether the output is bounded by tanh.
+        mean: Of the observations: shape (n,), or None.
+        scale: Of the observations: shape (n,), or None.
+        actions: Map from outputs to actions of the env.
     """
 
-    def __init__(self, weights: Mapping[str, np.ndarray], spec: EnvSpec) -> None:
+    def __init__(
+        self,
+        weights: Mapping[str, np.ndarray],
+        spec: EnvSpec,
+        activation: str = "relu",
+        *,
+        squash: bool = False,
+    ) -> None:
         self.spec, self.actions = spec, ActionMap(spec.action)
+        self.activation, self.squash = activation, squash
+        self._relu = activation == "relu"
+        expect(activation in ("relu", "tanh"), "activation", "relu or tanh", activation)
         got = {name: array.shape for name, array in weights.items()}
-        units, outputs = (*got.get("hidden.bias", ()), 0)[0], self.actions.outputs
-        expected = {
-            "hidden.weight": (units, flat_size(spec)),
-            "hidden.bias": (units,),
-            "output.weight": (outputs, units),
-            "output.bias": (outputs,),
-        } | ({} if self.actions.discrete else {"log_std": (outputs,)})
+        expected = _expected_shapes(got, flat_size(spec), self.actions, squash)
         reason = (
             "it was trained for other observations or actions; give the --vehicle and the --env "
             "options of its training"
         )
-        right = got == expected and units
+        right = got == expected and 0 not in sum(got.values(), ())
         expect(right, "policy", f"weights of shapes {expected}", f"{got}: {reason}")
-        self._w1, self._b1 = weights["hidden.weight"].T, weights["hidden.bias"][np.newaxis]
-        self._w2, self._b2 = weights["output.weight"].T, weights["output.bias"][np.newaxis]
-        self._zero = np.zeros_like(self._b1)
-        self._std = None if self.actions.discrete else np.exp(weights["log_std"])
+        count = sum(name.startswith("layers.") for name in weights) // 2
+        self.layers = [(weights[f"layers.{i}.weight"], weights[f"layers.{i}.bias"])
+                       for i in range(count)]  # fmt: skip
+        self.mean, self.scale = weights.get("observation.mean"), weights.get("observation.scale")
+        self._sums = [(weight.T, bias[np.newaxis]) for weight, bias in self.layers]
+        self._std = np.exp(weights["log_std"]) if "log_std" in weights else None
 
     def reset(self) -> None:
         """Nothing to forget."""
 
     def output(self, observations: np.ndarray) -> np.ndarray:
         """Means, or logits, shape (N, k), of flat observations, shape (N, n)."""
-        hidden: np.ndarray = observations.dot(self._w1)
-        hidden += self._b1
-        np.maximum(hidden, self._zero, out=hidden)
-        output: np.ndarray = hidden.dot(self._w2)
-        output += self._b2
-        return output
+        values = observations
+        if self.mean is not None:
+            values = (values - self.mean) * self.scale
+        for i, (weight, bias) in enumerate(self._sums):
+            if i and self._relu:
+                np.maximum(values, _ZERO, out=values)
+            elif i:
+                np.tanh(values, out=values)
+            values = values.dot(weight)
+            values += bias
+        if self.squash:
+            np.tanh(values, out=values)
+        return values
 
     def act(self, observation: Any) -> Any:
         """The most likely action, inside the bounds of the env."""

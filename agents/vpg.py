@@ -3,7 +3,6 @@
 import numpy as np
 
 from .learner import Learner
-from .networks import torch
 from .policies import NetworkPolicy
 from .presets import VPGConfig
 from .rollouts import Collector, Rollout, rewards_to_go, step_of_episode
@@ -22,17 +21,16 @@ class VPG(Learner):
         """Fly whole episodes with one policy."""
         return collector.episodes(policy, self.config.episodes_per_update, most)
 
-    def loss(self, rollout: Rollout) -> torch.Tensor:
-        """Minus the mean of R_t · log P(a_t | s_t)."""
+    def gradient(self, rollout: Rollout) -> None:
+        """Of minus the mean of R_t · log P(a_t | s_t)."""
+        weights = self.returns(rollout)
         log_probability, entropy = self._actor.score(
-            torch.from_numpy(rollout.rows(rollout.observations)),
-            torch.from_numpy(rollout.rows(rollout.actions)),
+            self.inputs(rollout.rows(rollout.observations)), rollout.rows(rollout.actions)
         )
-        gain = (log_probability * torch.from_numpy(self.weights(rollout))).mean()
-        self.terms = {"gain": gain, "entropy": entropy}
-        return -gain
+        self._actor.backward(-weights / len(weights))
+        self.terms = {"gain": (log_probability * weights).mean(), "entropy": entropy}
 
-    def weights(self, rollout: Rollout) -> np.ndarray:
+    def returns(self, rollout: Rollout) -> np.ndarray:
         """R_t, less a baseline and scaled where the config says so: float32, shape (rows,)."""
         sums = rewards_to_go(rollout.rewards, rollout.ends, self.config.gamma)
         returns = rollout.rows(sums)

@@ -26,7 +26,6 @@ import json, sys
 import numpy as np
 import rotorgram.envs
 from rotorgram.agents import preset
-from rotorgram.agents.policies import NetworkPolicy
 from rotorgram.experiments.metrics import Headline
 from rotorgram.experiments.pairs import socket_pair
 from rotorgram.experiments.results import evaluation_row
@@ -41,7 +40,7 @@ with socket_pair(**run.env, num_envs=run.num_envs) as remote:
     training.train()
 spec = training.log.spec
 with socket_pair(**run.env, num_envs=20) as remote:
-    flown = fly_episodes(remote, NetworkPolicy(training.agent.actor(), spec), 20, "final")
+    flown = fly_episodes(remote, training.agent.policy(), 20, "final")
 rows = [evaluation_row(one, Headline.of(spec)) for one in flown]
 print(json.dumps({"training": training.log.seconds,
                   "error": float(np.mean([r["steady"] for r in rows]))}))

@@ -43,6 +43,7 @@ COMMANDS: Final = {
     "key": "Key",
     "relay": "Relay",
     "replay": "Replay",
+    "dataset": "Dataset",
 }
 """Class of each command, in the module of the command's name."""
 
@@ -53,6 +54,7 @@ EXTRAS: Final = {
     "render": ("PIL", "imageio_ffmpeg"),
     "report": ("matplotlib", "jinja2"),
     "ray": ("ray",),
+    "dataset": ("mcap", "pyarrow", "minari", "h5py", "PIL"),
     "identify": ("pyulog", "pandas", "pyarrow", "scipy"),
     "gpu": ("torch", "mujoco_warp", "warp"),
 }  # fmt: skip

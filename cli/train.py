@@ -1,5 +1,7 @@
 """`rotorgram train`: one run with a progress bar, checkpoints, and Ctrl-C that loses nothing."""
 
+import csv
+import io
 import json
 import math
 import signal
@@ -14,7 +16,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from ..agents import A2CConfig, AlgorithmName, Episode, load, preset, store
 from ..agents.checkpoints import software_versions, write_whole
-from ..agents.presets import PresetName
+from ..agents.presets import PPOConfig, PresetName, SACConfig, find_preset
 from ..experiments.folders import locked
 from ..experiments.settings import Run
 from ..models.errors import expect, require
@@ -41,17 +43,18 @@ class Train(AgentFlags):
     """
 
     algorithm: Positional[AlgorithmName]
-    """vpg, a2c or sb3-a2c."""
+    """vpg, a2c, ppo, sac, sb3-a2c, sb3-ppo or sb3-sac."""
     preset: PresetName = "tuned"
-    """Hyperparameters: the paper's, or ours."""
+    """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
     set: UseAppendAction[Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE …")]] = ()
     """Changes to the preset, such as gamma=0.99 steps_per_update=64."""
     seed: int = 0
     """Seed of weights, actions and episodes."""
-    env_steps: int = 200_000
-    """Env steps to train for."""
-    num_envs: int = 1
-    """Drones that fly at the same time, in lock-step. Env steps count all of them."""
+    env_steps: int | None = None
+    """Env steps to train for. Default: those of the preset."""
+    num_envs: int | None = None
+    """Drones that fly at the same time, in lock-step. Env steps count all of them. Default: those
+    of the preset."""
     num_simulators: int = 1
     """With --listen: simulators to wait for, each with its share of the drones."""
     out: Path | None = None
@@ -63,8 +66,9 @@ class Train(AgentFlags):
 
     def run(self) -> int:
         """Train by these settings, or by those of the folder to resume."""
-        require("torch", "train", "training")
         require("tensorboard", "train", "training")
+        if self.algorithm.startswith("sb3-"):
+            require("torch", "train", self.algorithm)
         right = 0 < self.store_every < math.inf
         expect(right, "store-every", "seconds > 0", str(self.store_every))
         return self._resume(self.resume) if self.resume else self._begin()
@@ -74,8 +78,11 @@ class Train(AgentFlags):
         from ._env import remote_env
 
         changes = dict(_change(word) for words in self.set for word in words)
-        config = preset(self.algorithm, self.preset, **changes)
-        run = Run(config=config, **self.settings(Run))
+        base = find_preset(self.algorithm, self.preset, self.env_id)
+        config = preset(self.algorithm, self.preset, self.env_id, **changes)
+        counts = {"num_envs": self.num_envs, "env_steps": self.env_steps}
+        chosen = {name: getattr(base, name) if n is None else n for name, n in counts.items()}
+        run = Run(config=config, **{**self.settings(Run), **chosen})
         if advice := _advice(run):
             print(f"note: {advice}", flush=True)
         required = bool(self.options) or "env" in self.given
@@ -161,6 +168,8 @@ def _advice(run: Run) -> str:
     drones, config = run.num_envs, run.config
     if drones == 1 or "episode_length" not in run.options:
         return ""
+    if isinstance(config, PPOConfig | SACConfig):  # many updates with each transition
+        return ""
     if isinstance(config, A2CConfig):
         steps = config.rollout_size(drones) // drones
         if steps >= _LEAST_STEPS:
@@ -216,11 +225,12 @@ class _Keeper:
         self._scalars.close()
 
     def _write_episodes(self) -> None:
-        import pandas as pd
-
-        columns = [field.name for field in fields(Episode)]
-        table = pd.DataFrame(map(asdict, self._training.log.episodes), columns=columns)
-        write_whole(self._folder / EPISODES, table.to_csv(index=False).encode())
+        text = io.StringIO()  # pandas would take longer to import than a short training takes
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([field.name for field in fields(Episode)])
+        for episode in self._training.log.episodes:
+            writer.writerow("" if value != value else value for value in vars(episode).values())
+        write_whole(self._folder / EPISODES, text.getvalue().encode())
 
 
 @contextmanager

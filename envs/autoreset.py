@@ -168,7 +168,10 @@ def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | 
     if isinstance(seed, int | np.integer):
         numbers = range(int(seed), int(seed) + num_envs)
     several = isinstance(numbers, Sequence | np.ndarray) and getattr(numbers, "ndim", 1) == 1
-    if not (several and len(numbers) == num_envs and all(map(is_seed, numbers))):
+    some = numbers
+    if isinstance(numbers, np.ndarray) and numbers.dtype.kind == "u" and numbers.size:
+        some = [int(numbers.max())]  # speaks for thousands, as a training has them
+    if not (several and len(numbers) == num_envs and all(map(is_seed, some))):
         up_to = "from 0 on" if most is None else f"from 0 to 2^{most.bit_length()} - 1"
         raise InputError(
             f"seed: expected a whole number {up_to}, or {num_envs} of them, got {seed!r}"

@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from rotorgram.agents import NetworkPolicy, preset, store
+from rotorgram.agents import preset, store
 from rotorgram.experiments.metrics import steady_state
 from rotorgram.experiments.pairs import socket_pair
 from rotorgram.experiments.settings import Run
@@ -41,7 +41,7 @@ store(training.checkpoint(), args.out)
 print(f"{training.log.env_steps:,} env steps in {training.log.seconds:.1f} s: {args.out}")
 
 with socket_pair(**run.env) as drone:
-    policy = NetworkPolicy(training.agent.actor(), drone.env_spec)
+    policy = training.agent.policy()
     trajectories = fly_episodes(drone, policy, episodes=5)
 errors = [abs(one.headline[1:]) for one in trajectories]
 print(f"steady-state |E|: {np.mean([steady_state(error) for error in errors]):.3f} m")

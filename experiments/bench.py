@@ -346,8 +346,8 @@ def _echo(stack: ExitStack) -> Slice:
 def _policy(drones: int) -> Slice:
     dice = np.random.default_rng(0)
     shapes: dict[str, Any] = {
-        "hidden.weight": (16, 3), "hidden.bias": 16, "output.weight": (1, 16), "output.bias": 1,
-        "log_std": 1,
+        "layers.0.weight": (16, 3), "layers.0.bias": 16, "layers.1.weight": (1, 16),
+        "layers.1.bias": 1, "log_std": 1,
     }  # fmt: skip
     weights = {name: dice.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
     policy = NetworkPolicy(weights, env_spec(ENV_ID))
@@ -359,7 +359,8 @@ def _policy(drones: int) -> Slice:
 def _training(stack: ExitStack, algorithm: str, drones: int) -> Slice:
     # With 64 drones: five steps of each for an update, as SB3's default has it; VPG an episode.
     batch = {"episodes_per_update": 64} if algorithm == "vpg" else {"steps_per_update": 64 * 5}
-    config = preset(algorithm, "tuned", **({} if drones == 1 else batch))
+    changes: dict[str, Any] = {} if drones == 1 else batch
+    config = preset(algorithm, "tuned", **changes)
     run = Run(algorithm=algorithm, config=config, seed=0, env_steps=10**9, num_envs=drones)
     env = stack.enter_context(socket_pair(**run.env, num_envs=drones))
     training = Training(run, env)

@@ -11,7 +11,6 @@ import numpy as np
 
 from ..agents.checkpoints import Checkpoint, store
 from ..agents.pid import PID
-from ..agents.policies import NetworkPolicy
 from ..envs.loop import Loop
 from ..envs.registry import env_spec, options_type
 from ..envs.spec import canonical_id
@@ -133,7 +132,7 @@ def _evaluate(
         headline = Headline.of(spec)
         snapshots: Sequence[Snapshot | None] = taken or [None]
         for snapshot in snapshots:
-            policy = NetworkPolicy(snapshot.actor, spec) if snapshot else PID(spec)
+            policy = snapshot.policy if snapshot else PID(spec)
             if snapshot is snapshots[-1]:
                 flown = fly_episodes(env, policy, config.episodes, "final")
             else:

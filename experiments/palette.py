@@ -3,7 +3,10 @@
 from collections.abc import Iterable
 from typing import Final
 
-_LABELS: Final = {"vpg": "VPG", "a2c": "A2C", "sb3-a2c": "SB3 A2C", "pid": "PID"}
+_LABELS: Final = {
+    "vpg": "VPG", "a2c": "A2C", "ppo": "PPO", "sac": "SAC", "sb3-a2c": "SB3 A2C",
+    "sb3-ppo": "SB3 PPO", "sb3-sac": "SB3 SAC", "pid": "PID",
+}  # fmt: skip
 # Okabe and Ito's palette: told apart by readers with colour-blindness. The second of a pair is the
 # same hue, lighter, for a dark ground.
 _COLORS: Final = {

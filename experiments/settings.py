@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import product
 from typing import Any, Literal
 
-from ..agents.presets import A2CConfig, PresetName, VPGConfig, preset
+from ..agents.presets import A2CConfig, Config, PresetName, SACConfig, preset
 from ..envs.registry import env_spec, is_known, options_type, task_type
 from ..models.errors import expect
 
@@ -48,7 +48,7 @@ class Run(EnvConfig):
     """Settings of one training: all that its numbers depend on but the software."""
 
     algorithm: str
-    config: VPGConfig | A2CConfig
+    config: Config
     seed: int
     env_steps: int
     """Of all drones together."""
@@ -60,7 +60,7 @@ class Run(EnvConfig):
         expect(self.seed >= 0, "seed", "0 or more", str(self.seed))
         expect(self.num_envs >= 1, "num_envs", "1 or more", str(self.num_envs))
         least = 1
-        if isinstance(self.config, A2CConfig):
+        if isinstance(self.config, A2CConfig | SACConfig):
             least = self.config.rollout_size(self.num_envs)
         elif self.num_envs > 1:  # a whole episode of each
             least = self.num_envs * int(self.options.get("episode_length", 1))
@@ -128,7 +128,7 @@ class _ManyRuns(RunsConfig, EnvConfig):
     def content(self, *algorithms: str) -> dict[str, Any]:
         """What `config.json` has of it, but for the env; `read_content` reads it."""
         content = {name: getattr(self, name) for name in ("preset", "env_steps", "num_envs")}
-        agents = {name: asdict(preset(name, self.preset)) for name in algorithms}
+        agents = {name: asdict(preset(name, self.preset, self.env_id)) for name in algorithms}
         return {**content, "seeds": list(self.all_seeds), "agents": agents}
 
     @staticmethod
@@ -141,7 +141,7 @@ class _ManyRuns(RunsConfig, EnvConfig):
 
     def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:
         shared = {"env_steps": self.env_steps, "num_envs": self.num_envs, **self.env}
-        config = preset(algorithm, self.preset, **changes)
+        config = preset(algorithm, self.preset, self.env_id, **changes)
         return Run(algorithm=algorithm, config=config, seed=seed, **shared)
 
 
@@ -168,7 +168,7 @@ class CompareConfig(_ManyRuns):
         """Every training, in the order in which they start: SB3's first, which take longest."""
         return [
             self._run(agent, seed)
-            for agent in sorted(self.agents, key=lambda agent: agent != "sb3-a2c")
+            for agent in sorted(self.agents, key=lambda agent: not agent.startswith("sb3-"))
             for seed in self.all_seeds
         ]
 
@@ -178,7 +178,7 @@ class SweepConfig(_ManyRuns):
     """Settings of a sweep and its workers. Its seeds are not those of a comparison."""
 
     algorithm: str
-    """`vpg`, `a2c` or `sb3-a2c`."""
+    """`vpg`, `a2c`, `ppo`, `sb3-a2c` or `sb3-ppo`."""
     grid: Mapping[str, tuple[Any, ...]]
     """Values of hyperparameters, by name: every combination is a point."""
     seeds: int = 3

@@ -17,7 +17,6 @@ from typing import Any, Final
 import pandas as pd
 
 from ..agents.checkpoints import write_whole
-from ..agents.policies import NetworkPolicy
 from ..envs.registry import env_spec
 from . import results
 from .compare import evaluation_pair
@@ -86,7 +85,7 @@ def _fly(config: SweepConfig, job: Job, tell: Tell) -> dict[str, Any]:
     point, run = job
     with shared_pair(**run.env, num_envs=run.num_envs) as env:
         training, times = train_run(run, env, tell)
-    policy = NetworkPolicy(training.agent.actor(), training.log.spec)
+    policy = training.agent.policy()
     with evaluation_pair(config, config.episodes) as env:
         trajectories = fly_episodes(env, policy, config.episodes, "tuning")
     headline = Headline.of(training.log.spec)

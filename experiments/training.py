@@ -7,10 +7,9 @@ from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
-import torch
 
 from .. import agents
-from ..agents import A2CConfig, Checkpoint, CheckpointError
+from ..agents import Checkpoint, CheckpointError, VPGConfig
 from ..envs.autoreset import AdvancingVectorEnv
 from ..models.errors import InputError, expect
 from .settings import Run
@@ -27,14 +26,15 @@ class Snapshot:
 
     env_steps: int
     seconds: float
-    actor: dict[str, np.ndarray]
+    policy: agents.NetworkPolicy
 
 
 def is_finished(kept: Checkpoint) -> bool:
     """Whether a training has flown all its env steps. SB3 flies whole rollouts only."""
     least = 1
-    if kept.algorithm == "sb3-a2c":
-        least = A2CConfig(**kept.config).rollout_size(kept.num_envs)
+    if kept.algorithm.startswith("sb3-"):
+        config = agents.preset(kept.algorithm, "tuned", **kept.config)
+        least = 1 if isinstance(config, VPGConfig) else config.rollout_size(kept.num_envs)
     return kept.env_steps - kept.position.env_steps < least
 
 
@@ -56,8 +56,6 @@ class Training:
     taken: list[Snapshot] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        # Networks of 16 units: a second thread costs more than it brings.
-        torch.set_num_threads(1)
         drones, wanted = getattr(self.env, "num_envs", 1), self.run.num_envs
         expect(drones == wanted, "env", f"one of {wanted} drones", str(drones))
         self.log = agents.EpisodeLog(self.env, self.run.seed, keep_steps=self.keep_steps)
@@ -72,7 +70,7 @@ class Training:
         """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
         try:
             names = ("algorithm", "env_id", "options", "seed", "env_steps", "num_envs")
-            config = agents.preset(kept.algorithm, "paper", **kept.config)
+            config = agents.preset(kept.algorithm, "tuned", **kept.config)
             run = Run(config=config, **{name: getattr(kept, name) for name in names})
         except (InputError, TypeError, ValueError) as error:
             raise CheckpointError(f"checkpoint: its parts do not fit together: {error}") from None
@@ -158,8 +156,8 @@ class Training:
     def _take(self) -> None:
         log = self.log
         if self.snapshots:
-            seconds, actor = log.seconds, self.agent.actor()
-            self.taken.append(Snapshot(env_steps=log.env_steps, seconds=seconds, actor=actor))
+            seconds, policy = log.seconds, self.agent.policy()
+            self.taken.append(Snapshot(env_steps=log.env_steps, seconds=seconds, policy=policy))
 
 
 def train_run(

@@ -33,7 +33,9 @@ ENV = "rotorgram/Elevation-v0"
 SMALL: dict[str, dict[str, Any]] = {
     "vpg": {"episodes_per_update": 3},
     "a2c": {"steps_per_update": 64},
+    "ppo": {"steps_per_update": 64, "epochs": 2, "minibatches": 3, "normalize_observations": True},
     "sb3-a2c": {"steps_per_update": 64},
+    "sb3-ppo": {"steps_per_update": 64, "epochs": 2, "minibatches": 2},
 }
 OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
 TOTAL = 768
@@ -209,17 +211,22 @@ def test_crafted_metadata_is_refused(
 def test_parts_that_do_not_fit_are_refused(algorithm: str) -> None:
     log = log_of(2)
     kept = checkpoint_of(algorithm, log, trained(algorithm, log, updates=3))
-    network = "policy.value_net.bias" if algorithm == "sb3-a2c" else "actor.output.bias"
-    rng = "rng.torch" if algorithm == "sb3-a2c" else "rng"
-    arrays = kept.state.items()
-    moments = next(name for name, v in arrays if v.ndim == 2 and name.endswith(".exp_avg_sq"))
+    network, rng = "weights", "rng"
+    first, second, steps = "optimizer.first", "optimizer.second", "optimizer.steps"
+    if algorithm.startswith("sb3"):
+        network, rng = "policy.value_net.bias", "rng.torch"
+        first, second, steps = (f"optimizer.0.{k}" for k in ("exp_avg", "exp_avg_sq", "step"))
     changes: list[dict[str, Any]] = [
-        {"optimizer.0.exp_avg": None},
-        {"optimizer.0.step": np.zeros(3, np.float32)},
-        {"optimizer.0.step": np.array(-5, np.float32)},
-        {moments: kept.state[moments].T},
-        {"optimizer.1.exp_avg_sq": np.zeros((7, 7), np.float32)},
+        {first: None},
+        {steps: np.zeros(3, np.float32)},
+        {steps: np.array(-5, np.float32)},
+        {second: np.zeros((7, 7), np.float32)},
         {"optimizer.9999.exp_avg": np.zeros(1, np.float32)},
+        *(
+            [{"observations.count": None}, {"observations.squares": -np.ones(3)}]
+            if algorithm == "ppo"
+            else []
+        ),
         {network: None},
         {network: np.zeros(9, np.float32)},
         {rng: None},
@@ -229,7 +236,7 @@ def test_parts_that_do_not_fit_are_refused(algorithm: str) -> None:
         state = {k: v for k, v in {**kept.state, **change}.items() if v is not None}
         with pytest.raises(CheckpointError, match="its parts do not fit together"):
             resume_agent(replace(kept, state=state), log_of(2))
-    for config in ({"hidden": 10**9}, {"gamma": 7}, {"other": 1}):
+    for config in ({"hidden": [10**9]}, {"gamma": 7}, {"other": 1}):
         wrong = replace(kept, config={**kept.config, **config})
         with pytest.raises(CheckpointError, match="its parts do not fit together"):
             resume_agent(wrong, log_of(2))

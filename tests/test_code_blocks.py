@@ -1,8 +1,9 @@
 """Every code block of README and docs: Python runs as pasted, commands are ones that there are.
 
 A block whose fence says `python continued` goes on from the block before it on that page. A block
-that names port 8001 gets simulators; the port is then one of the test's own. What else is not as
-on the page stands in `INSTEAD`, with the reason.
+that names port 8001 gets simulators; the port is then one of the test's own. A command of ours in a
+comment of its own is run first. What else is not as on the page stands in `INSTEAD`, with the
+reason.
 """
 
 import io
@@ -80,7 +81,7 @@ FLIGHT = """
 from threading import Thread
 from rotorgram.udp import RemoteEnv, Simulator
 env = RemoteEnv(("127.0.0.1", 0), connect=False, record="flight.mcap")
-simulator = Simulator(server=env.address, bind=("127.0.0.1", 0))
+simulator = Simulator(server=env.address, bind=("127.0.0.1", 0), episode_length=10)
 thread = Thread(target=simulator.run)
 thread.start()
 env.reset(seed=0)
@@ -123,12 +124,19 @@ def simulators_for(code: str, port: int, folder: Path) -> list[subprocess.Popen[
 @pytest.mark.parametrize(
     ("page", "code"), PROGRAMS, ids=[f"{page}-{i}" for i, (page, _) in enumerate(PROGRAMS)]
 )
-def test_python_runs_as_pasted(page: str, code: str, tmp_path: Path) -> None:
+def test_python_runs_as_pasted(
+    page: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "import minari" in code:
+        pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     for there, here, _ in INSTEAD.get(page, ()):
         code = code.replace(there, here)
     simulators = []
     if "flight.mcap" in code:
         run([sys.executable, "-c", FLIGHT], tmp_path)
+    for words in re.findall(r"^# rotorgram (.+)$", code, re.MULTILINE):
+        run(rotorgram(*words.split()), tmp_path)
     if "8001" in code:
         port = free_port()
         code = code.replace("8001", str(port))

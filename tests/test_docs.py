@@ -59,6 +59,23 @@ def test_the_seeds_of_vpg_that_do_not_hold_are_those_that_were_measured() -> Non
         assert f"| {row.seed} | {row[2]} | {slopes} |" in page
 
 
+def test_the_seeds_of_sac_are_those_that_were_measured() -> None:
+    measured = json.loads((RESULTS / "sac" / "elevation.json").read_text())
+    page = " ".join((ROOT / "docs" / "algorithms" / "sac.md").read_text().split())
+    seeds = measured["seeds"]
+    (steps,) = {row["env_steps"] for row in seeds}
+    errors, returns, loads = ([row[name] for row in seeds]
+                              for name in ("error", "return", "load_average"))  # fmt: skip
+    for told in (
+        f"After {steps:,} env steps {measured['hold']} of {measured['of']} seeds hold",
+        f"the worst seed's steady |E| is {max(errors):.3f} m",
+        f"returns are {min(returns):.0f} to {max(returns):.0f}",
+        f"the median was {measured['seconds']['median']:.0f} s",
+        f"the load average was {min(loads)} to {max(loads)}",
+    ):
+        assert told in page
+
+
 def test_the_speeds_are_those_of_the_benchmark() -> None:
     speed = json.loads((RESULTS / "training_speed.json").read_text())
     page = (ROOT / "docs" / "results.md").read_text()

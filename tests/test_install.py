@@ -74,6 +74,7 @@ def test_every_package_is_listed() -> None:
         ("record", ["sim", "--bind", "127.0.0.1:0", "--record", "a.mcap"],
          "pip install 'rotorgram[record]'"),
         ("record", ["replay", "FILE"], "pip install 'rotorgram[record]'"),
+        ("dataset", ["dataset", "FILE", "--to", "parquet", "--out", "a"], "'rotorgram[record]'"),
         ("render", ["render", "random", "--out", "a.mp4"], "pip install 'rotorgram[render]'"),
         ("report", ["compare", "--seeds", "1"], "pip install 'rotorgram[report]'"),
         ("ray", ["compare", "--backend", "ray"], "pip install 'rotorgram[ray]'"),

@@ -1,12 +1,13 @@
-"""The policy that flies (NumPy) is the policy that learns (torch), in the units of the space."""
+"""The policy that flies is the policy that learns, in the units of the space."""
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from rotorgram.agents.networks import Actor, Critic, arrays_of, load_arrays
+from rotorgram.agents.networks import Actor, Weights, mlp_shapes
 from rotorgram.agents.policies import ActionMap, NetworkPolicy, flat
+from rotorgram.agents.presets import preset
 from rotorgram.envs.spec import ArraySpec, Discrete
 from rotorgram.models.errors import InputError
 from scripted import spec_of
@@ -15,23 +16,23 @@ BOX = spec_of()
 CHOICE = spec_of(Discrete(n=3))
 
 
-def actor(spec: Any, seed: int = 0) -> Actor:
-    torch.manual_seed(seed)
+def actor(spec: Any, hidden: tuple[int, ...] = (16,), activation: str = "relu") -> Actor:
     actions = ActionMap(spec.action)
-    result = Actor(3, actions.outputs, discrete=actions.discrete)
-    with torch.no_grad():
-        for parameter in result.parameters():
-            parameter.add_(torch.randn_like(parameter))
-    return result
+    shapes = mlp_shapes((3, *hidden, actions.outputs))
+    if not actions.discrete:
+        shapes["log_std"] = (actions.outputs,)
+    weights = Weights.zeros(shapes)
+    weights.values[:] = np.random.default_rng(3).normal(size=weights.values.size)
+    return Actor(weights, activation)
 
 
 def constant(spec: Any, *outputs: float) -> NetworkPolicy:
     """A policy that gives the same for every observation of three numbers."""
     weights = {
-        "hidden.weight": np.zeros((16, 3), np.float32),
-        "hidden.bias": np.zeros(16, np.float32),
-        "output.weight": np.zeros((len(outputs), 16), np.float32),
-        "output.bias": np.array(outputs, np.float32),
+        "layers.0.weight": np.zeros((16, 3), np.float32),
+        "layers.0.bias": np.zeros(16, np.float32),
+        "layers.1.weight": np.zeros((len(outputs), 16), np.float32),
+        "layers.1.bias": np.array(outputs, np.float32),
     }
     if not isinstance(spec.action, Discrete):
         weights["log_std"] = np.zeros(len(outputs), np.float32)
@@ -39,40 +40,44 @@ def constant(spec: Any, *outputs: float) -> NetworkPolicy:
 
 
 @pytest.mark.parametrize("spec", [BOX, CHOICE], ids=["box", "discrete"])
-def test_numpy_and_torch_agree(spec: Any) -> None:
-    network = actor(spec)
-    policy = NetworkPolicy(arrays_of(network), spec)
+@pytest.mark.parametrize(("hidden", "activation"), [((16,), "relu"), ((8, 4), "tanh")])
+def test_the_policy_gives_what_the_actor_gives(
+    spec: Any, hidden: tuple[int, ...], activation: str
+) -> None:
+    network = actor(spec, hidden, activation)
+    policy = NetworkPolicy(network.weights.arrays, spec, activation)
     observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
-    expected = network(torch.from_numpy(observations)).detach().numpy()
+    expected = network.net.forward(observations)
     np.testing.assert_allclose(policy.output(observations), expected, rtol=1e-5, atol=1e-5)
     each = np.array([policy.output(row[np.newaxis])[0] for row in observations])
     np.testing.assert_allclose(each, expected, rtol=1e-5, atol=1e-5)
+    assert [weight.shape for weight, _ in policy.layers] == [
+        (after, before) for before, after in pairwise((3, *hidden, policy.actions.outputs))
+    ]
 
 
-def test_log_probability_and_entropy() -> None:
-    network = actor(BOX)
-    observations, actions = torch.randn(20, 3), 3 * torch.randn(20, 2)
-    assert network.log_std is not None
-    reference = torch.distributions.Normal(network(observations), network.log_std.exp())
-    log_probability, entropy = network.score(observations, actions)
-    torch.testing.assert_close(log_probability, reference.log_prob(actions).sum(1))
-    torch.testing.assert_close(entropy, reference.entropy().sum(1))
-    network = actor(CHOICE)
-    actions = torch.randint(3, (20, 1)).float()
-    choices = torch.distributions.Categorical(logits=network(observations))
-    log_probability, entropy = network.score(observations, actions)
-    torch.testing.assert_close(log_probability, choices.log_prob(actions.squeeze(1)))
-    torch.testing.assert_close(entropy, choices.entropy())
+def test_observations_are_normalised_and_outputs_squashed() -> None:
+    """Two layers of ones: 16 · sum of (o - mean) · scale, here 16 · (0.5 · 2 + 3 · 0.1)."""
+    weights = {name: np.ones(shape, np.float32) for name, shape in mlp_shapes((3, 16, 2)).items()}
+    weights |= {"layers.0.bias": np.zeros(16, "f"), "layers.1.bias": np.array([0, -20.3], "f")}
+    weights |= {"log_std": np.zeros(2, "f"), "observation.mean": np.array([1, 2, 3], "f"),
+                "observation.scale": np.array([2, 0.1, 1], "f")}  # fmt: skip
+    seen = np.array([[1.5, 5, 3]], np.float32)
+    policy = NetworkPolicy(weights, BOX)
+    np.testing.assert_allclose(policy.output(seen), [[20.8, 0.5]], rtol=1e-5)
+    assert seen.tolist() == [[1.5, 5, 3]]
+    squashed = NetworkPolicy(weights, BOX, squash=True)
+    np.testing.assert_allclose(squashed.output(seen), [[1, np.tanh(0.5)]], rtol=1e-5)
 
 
 def test_gaussian_sampling_has_the_mean_and_deviation_of_the_policy() -> None:
     network = actor(BOX)
-    policy = NetworkPolicy(arrays_of(network), BOX)
+    policy = NetworkPolicy(network.weights.arrays, BOX)
     observation = np.ones((1, 3), np.float32)
     noise = policy.draw_noise(np.random.default_rng(0), 40_000)
     drawn = policy.sample(np.repeat(observation, 40_000, axis=0), noise)
     assert network.log_std is not None
-    std = np.exp(network.log_std.detach().numpy())
+    std = np.exp(network.log_std)
     mean = policy.output(observation)[0]
     np.testing.assert_allclose(drawn.mean(0), mean, atol=5 * std.max() / 200)
     np.testing.assert_allclose(drawn.std(0), std, rtol=0.02)
@@ -80,12 +85,13 @@ def test_gaussian_sampling_has_the_mean_and_deviation_of_the_policy() -> None:
 
 
 def test_categorical_sampling_has_the_probabilities_of_the_policy() -> None:
-    network = actor(CHOICE, seed=3)
-    policy = NetworkPolicy(arrays_of(network), CHOICE)
+    network = actor(CHOICE)
+    policy = NetworkPolicy(network.weights.arrays, CHOICE)
     noise = policy.draw_noise(np.random.default_rng(0), 40_000)
     drawn = policy.sample(np.zeros((40_000, 3), np.float32), noise)
     counts = np.bincount(drawn[:, 0].astype(int), minlength=3)
-    expected = torch.softmax(network(torch.zeros(1, 3)), 1).detach().numpy()[0]
+    shares = np.exp(network.net.forward(np.zeros((1, 3), np.float32))[0])
+    expected = shares / shares.sum()
     np.testing.assert_allclose(counts / 40_000, expected, atol=0.012)
     envs = policy.actions.to_envs(drawn)
     assert (envs.dtype, envs.shape) == (np.int64, (40_000,))
@@ -123,12 +129,14 @@ def test_observations_of_many_arrays_are_joined_in_the_order_of_the_spec() -> No
 
 
 def test_weights_that_do_not_fit_are_refused() -> None:
-    weights = arrays_of(actor(BOX))
+    weights = actor(BOX).weights.arrays
     for wrong in (
         {k: v for k, v in weights.items() if k != "log_std"},
         {**weights, "log_std": np.zeros(3, np.float32)},
-        {**weights, "hidden.weight": np.zeros((16, 4), np.float32)},
-        {**weights, "output.bias": np.zeros((2, 1), np.float32)},
+        {**weights, "layers.0.weight": np.zeros((16, 4), np.float32)},
+        {**weights, "layers.1.bias": np.zeros((2, 1), np.float32)},
+        {**weights, "layers.2.bias": np.zeros(2, np.float32)},
+        {**weights, "observation.mean": np.zeros(3, np.float32)},
         {},
     ):
         with pytest.raises(InputError, match="policy: expected weights of shapes"):
@@ -136,34 +144,12 @@ def test_weights_that_do_not_fit_are_refused() -> None:
 
 
 def test_the_first_policy_holds_the_thrust() -> None:
-    torch.manual_seed(0)
-    policy = NetworkPolicy(arrays_of(Actor(3, 2)), BOX)
+    network = actor(BOX)
+    network.initialise(np.random.default_rng(0), -0.5)
+    policy = NetworkPolicy(network.weights.arrays, BOX)
     assert np.abs(policy.act(np.array([3, 5, 1], np.float32))).max() < 0.1
 
 
 def test_the_paper_s_networks_have_one_hidden_layer_of_16_relu_units() -> None:
-    arrays = arrays_of(Actor(1, 1))
-    assert {k: v.shape for k, v in arrays.items()} == {
-        "log_std": (1,),
-        "hidden.weight": (16, 1),
-        "hidden.bias": (16,),
-        "output.weight": (1, 16),
-        "output.bias": (1,),
-    }
-    critic = Critic(1)
-    load_arrays(critic, {
-        "hidden.weight": np.ones((16, 1), np.float32),
-        "hidden.bias": np.zeros(16, np.float32),
-        "output.weight": np.ones((1, 16), np.float32),
-        "output.bias": np.zeros(1, np.float32),
-    })  # fmt: skip
-    assert critic(torch.tensor([[2.0], [-2.0]])).tolist() == [32.0, 0.0]
-
-
-def test_standard_deviation_is_bounded() -> None:
-    network = actor(BOX)
-    assert network.log_std is not None
-    with torch.no_grad():
-        network.log_std.copy_(torch.tensor([9.0, -9.0]))
-    network.clamp_()
-    assert network.log_std.tolist() == [1.0, -4.0]
+    config = preset("a2c", "paper")
+    assert (config.hidden, config.activation) == ((16,), "relu")

@@ -16,7 +16,6 @@ import pandas as pd
 import pytest
 from comparisons import GATES, HEADLINE, spec_of
 from rotorgram.agents import preset
-from rotorgram.agents.policies import NetworkPolicy
 from rotorgram.cli import main
 from rotorgram.cli.sweep import parse_grid
 from rotorgram.experiments.compare import compare, read_compare_config
@@ -83,7 +82,7 @@ def test_a_row_is_what_the_run_gives_in_process(folder: Path) -> None:
     )  # fmt: skip
     training = Training(run, env)
     training.train()
-    policy = NetworkPolicy(training.agent.actor(), training.log.spec)
+    policy = training.agent.policy()
     errors, returns, crashed = [], [], 0
     for episode in range(3):
         observation, _ = env.reset(seed=evaluation_seed(episode, "tuning"))

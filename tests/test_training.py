@@ -10,7 +10,6 @@ import pytest
 import torch
 from rotorgram.agents import (
     CheckpointError,
-    NetworkPolicy,
     ResumeError,
     episode_seed,
     load,
@@ -31,6 +30,7 @@ OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band
 SMALL: dict[str, dict[str, int]] = {
     "vpg": {"episodes_per_update": 4},
     "a2c": {"steps_per_update": 70},
+    "ppo": {"steps_per_update": 72, "epochs": 2, "minibatches": 2},
     "sb3-a2c": {"steps_per_update": 70},
 }
 
@@ -79,7 +79,7 @@ def test_training_and_evaluation_share_no_seed() -> None:
 def test_evaluation_flies_without_noise() -> None:
     env = gym.make(ENV, disable_env_checker=True)
     log = EpisodeLog(env, 0)
-    policy = NetworkPolicy(make_agent("a2c", log, preset("a2c", "paper"), 0).actor(), log.spec)
+    policy = make_agent("a2c", log, preset("a2c", "paper"), 0).policy()
     first, second = (fly_episodes(env, policy, 2) for _ in range(2))
     for one, other in zip(first, second, strict=True):
         assert one.headline.tobytes() == other.headline.tobytes()
@@ -90,7 +90,7 @@ def test_same_seed_same_numbers_and_other_seed_other_numbers() -> None:
         run = replace(run_of("a2c", 1), seed=seed, env_steps=300)
         training = Training(run, env_of(run))
         training.train()
-        return training.agent.actor()["output.weight"].tobytes()
+        return training.agent.actor()["layers.1.weight"].tobytes()
 
     assert weights(1) == weights(1)
     assert weights(1) != weights(2)

@@ -119,7 +119,7 @@ def test_a_missing_layer(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
-    check(["train", "a2c"], ["pip install 'rotorgram[train]'"], capsys)
+    check(["train", "sb3-a2c"], ["pip install 'rotorgram[train]'"], capsys)
 
 
 def test_a_task_that_is_not_known(capsys: pytest.CaptureFixture[str]) -> None:

@@ -42,11 +42,11 @@ def single(**options: Any) -> Any:
 def policy(log: EpisodeLog) -> NetworkPolicy:
     dice = np.random.default_rng(0)
     size = log.single_observation_space.shape[0]  # type: ignore[index]
-    shapes = {"hidden.weight": (16, size), "hidden.bias": (16,),
-              "output.weight": (log.actions.outputs, 16)}  # fmt: skip
+    shapes = {"layers.0.weight": (16, size), "layers.0.bias": (16,),
+              "layers.1.weight": (log.actions.outputs, 16)}  # fmt: skip
     weights = {k: 0.3 * dice.normal(size=s).astype(np.float32) for k, s in shapes.items()}
     zeros = np.zeros(log.actions.outputs, np.float32)
-    return NetworkPolicy({**weights, "output.bias": zeros, "log_std": zeros}, log.spec)
+    return NetworkPolicy({**weights, "layers.1.bias": zeros, "log_std": zeros}, log.spec)
 
 
 def collector_of(drones: int, **options: Any) -> tuple[EpisodeLog, Collector, NetworkPolicy]:

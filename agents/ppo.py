@@ -1,0 +1,98 @@
+"""Proximal Policy Optimisation: Schulman et al. 2017, arXiv 1707.06347, Equations 7 and 9."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+
+from .a2c import A2C
+from .episodes import EpisodeLog
+from .learner import diverged
+from .networks import clip_norm
+from .presets import PPOConfig
+from .rollouts import Rollout
+
+_TERMS = ("gain", "entropy", "value_loss", "approx_kl", "clip_fraction")
+
+
+class PPO(A2C):
+    """Many small steps on the same rollout, while the policy stays near the one that flew it.
+
+    Each epoch draws the transitions in another order and cuts them into minibatches. Each of these
+    is one step of Adam on the loss of Equation 9, with the clipped objective of Equation 7.
+    """
+
+    config: PPOConfig
+
+    def __init__(self, log: EpisodeLog, config: PPOConfig, seed: int) -> None:
+        super().__init__(log, config, seed)
+        critic = self.weights.part("critic.").values.size
+        self._shares = np.ones_like(self.weights.values)
+        if config.critic_learning_rate is not None:
+            self._shares[-critic:] = config.critic_learning_rate / config.learning_rate
+
+    @property
+    def rates(self) -> np.ndarray:
+        """Learning rate of every weight in the next update, float32."""
+        return np.float32(self.rate) * self._shares
+
+    def update(self, rollout: Rollout) -> None:
+        """Learn from a rollout: by `epochs` times `minibatches` steps of Adam."""
+        config, columns = self.config, self._columns(rollout)
+        rates, count = self.rates, len(rollout)
+        cuts = np.linspace(0, count, min(config.minibatches, count) + 1).astype(int).tolist()
+        terms: list[tuple[float, ...]] = []
+        for _ in range(config.epochs):
+            order = self._rng.permutation(count)
+            shuffled = [column[order] for column in columns]
+            for first, last in pairwise(cuts):
+                terms.append(self.minibatch(*(column[first:last] for column in shuffled)))
+                norm = clip_norm(self.weights.slopes, config.max_grad_norm)
+                if not math.isfinite(norm):
+                    raise diverged(self.optimizer.steps)
+                self.optimizer.step(rates)
+        self.terms |= dict(zip(_TERMS, np.mean(terms, axis=0).tolist(), strict=True))
+        self.terms["approx_kl"] = np.mean([one[3] for one in terms[1 - len(cuts) :]])  # at the end
+
+    def minibatch(
+        self,
+        observations: np.ndarray,
+        actions: np.ndarray,
+        before: np.ndarray,
+        advantage: np.ndarray,
+        targets: np.ndarray,
+    ) -> tuple[float, ...]:
+        """Set the gradients of the loss of B transitions; its terms, by the names of `terms`.
+
+        Log-probabilities `before`, shape (B,), are those of the policy that flew, as `advantage`,
+        and `targets` of V(s). The objective is the mean of min(r A, clip(r, 1 - c, 1 + c) A) for
+        the ratio r of the probabilities. Its derivative by log P is r A, or 0 where it is clipped.
+        """
+        config, count = self.config, len(before)
+        if config.normalize and count > 1:
+            advantage = advantage - advantage.mean()
+            advantage /= np.sqrt(advantage.dot(advantage) / (count - 1)) + 1e-8
+        log_probability, entropy = self._actor.score(observations, actions)
+        change = log_probability - before
+        ratio = np.exp(change)
+        gains = ratio * advantage
+        bounded = np.minimum(np.maximum(ratio, 1 - config.clip), 1 + config.clip) * advantage
+        self._actor.backward(gains * (gains <= bounded) / -count, -config.ent_coef)
+        errors = self._critic.forward(observations)[:, 0] - targets
+        self._critic.backward((2 * config.vf_coef / count * errors)[:, np.newaxis])
+        clipped = np.count_nonzero(np.abs(ratio - 1) > config.clip) / count
+        distance = float((ratio - 1 - change).mean())  # of KL, as SB3 estimates it
+        gain = float(np.minimum(gains, bounded).mean())
+        return gain, entropy, float(errors.dot(errors)) / count, distance, clipped
+
+    def _columns(self, rollout: Rollout) -> tuple[np.ndarray, ...]:
+        """Arguments of `minibatch` for all transitions of a rollout."""
+        observations = self.inputs(rollout.rows(rollout.observations))
+        actions = rollout.rows(rollout.actions)
+        advantage, values = (
+            rollout.rows(array).astype(np.float32) for array in self.advantages(rollout)
+        )
+        targets = values + advantage
+        before, _ = self._actor.score(observations, actions)
+        self.terms = {"values": values, "targets": targets}
+        return observations, actions, before, advantage, targets

@@ -1,0 +1,191 @@
+"""Networks and gradients by hand: against torch, finite differences and written-out numbers."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from rotorgram.agents.networks import MLP, Actor, Adam, Weights, clip_norm, mlp_shapes, orthogonal
+
+DICE = np.random.default_rng(0)
+INPUTS, BATCH = 5, 17
+
+
+def normal(*shape: int) -> np.ndarray:
+    return DICE.normal(size=shape).astype(np.float32)
+
+
+def mlp(hidden: tuple[int, ...], outputs: int, activation: str) -> MLP:
+    weights = Weights.zeros(mlp_shapes((INPUTS, *hidden, outputs)))
+    weights.values[:] = 0.5 * normal(weights.values.size)
+    return MLP(weights, activation)
+
+
+def actor(hidden: tuple[int, ...], activation: str, *, discrete: bool) -> Actor:
+    shapes = mlp_shapes((INPUTS, *hidden, 3)) | ({} if discrete else {"log_std": (3,)})
+    weights = Weights.zeros(shapes)
+    weights.values[:] = 0.5 * normal(weights.values.size)
+    return Actor(weights, activation)
+
+
+def tensors(weights: Weights) -> dict[str, torch.Tensor]:
+    return {k: torch.tensor(a, requires_grad=True) for k, a in weights.arrays.items()}
+
+
+def torch_mlp(arrays: dict[str, torch.Tensor], inputs: torch.Tensor, activation: str) -> Any:
+    count = sum(name.startswith("layers.") for name in arrays) // 2
+    for i in range(count):
+        inputs = inputs @ arrays[f"layers.{i}.weight"].T + arrays[f"layers.{i}.bias"]
+        if i < count - 1:
+            inputs = torch.relu(inputs) if activation == "relu" else torch.tanh(inputs)
+    return inputs
+
+
+def agree(weights: Weights, expected: dict[str, torch.Tensor]) -> None:
+    for name, gradient in weights.gradients.items():
+        theirs = expected[name].grad
+        assert theirs is not None
+        np.testing.assert_allclose(gradient, theirs, rtol=2e-5, atol=2e-6, err_msg=name)
+
+
+def test_arrays_are_views_of_one() -> None:
+    weights = Weights.zeros({"a.x": (2, 3), "b.x": (2,), "b.y": (1, 2)})
+    weights.part("b.").arrays["y"][:] = 7
+    weights.gradients["a.x"][1] = 3
+    assert weights.values.tolist() == [0, 0, 0, 0, 0, 0, 0, 0, 7, 7]
+    assert weights.slopes.tolist() == [0, 0, 0, 3, 3, 3, 0, 0, 0, 0]
+    with pytest.raises(ValueError, match="expected arrays of shapes"):
+        weights.part("a.").load({"x": np.zeros((3, 2))})
+    weights.part("a.").load({"x": np.ones((2, 3))})
+    assert weights.values.sum() == 6 + 14
+
+
+def test_forward_by_hand() -> None:
+    """Two inputs, layers of two and one units, one output."""
+    weights = Weights.zeros(mlp_shapes((2, 2, 1, 1)))
+    weights.values[:] = [1, 2, -1, 1, 0.5, -0.5, 2, 1, 1, 3, 10]
+    inputs = np.array([[1, 1], [-1, 2]], np.float32)
+    # hidden: (3.5, -0.5) -> (3.5, 0) -> 8; (3.5, 2.5) -> 10.5
+    assert MLP(weights).forward(inputs).tolist() == [[34.0], [41.5]]
+    first = np.tanh([3.5, -0.5])
+    second = np.tanh(2 * first[0] + first[1] + 1)
+    got = MLP(weights, "tanh").forward(inputs)[0, 0]
+    assert got == pytest.approx(3 * second + 10, rel=1e-6)
+
+
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+@pytest.mark.parametrize("hidden", [(16,), (8, 9), (7, 6, 5)])
+def test_gradients_are_those_of_torch(hidden: tuple[int, ...], activation: str) -> None:
+    net, seen, slope = mlp(hidden, 2, activation), normal(BATCH, INPUTS), normal(BATCH, 2)
+    theirs, inputs = tensors(net.weights), torch.tensor(seen, requires_grad=True)
+    output = torch_mlp(theirs, inputs, activation)
+    (output * torch.from_numpy(slope)).sum().backward()
+    np.testing.assert_allclose(net.forward(seen), output.detach(), rtol=1e-5, atol=1e-5)
+    by_inputs = net.backward(slope, by_inputs=True)
+    assert inputs.grad is not None
+    np.testing.assert_allclose(by_inputs, inputs.grad, rtol=2e-5, atol=2e-6)
+    agree(net.weights, theirs)
+
+
+def test_gradients_are_finite_differences() -> None:
+    net, seen = mlp((8, 9), 1, "tanh"), normal(BATCH, INPUTS)
+    net.forward(seen)
+    net.backward(np.full((BATCH, 1), 1 / BATCH, np.float32))
+    for i in range(0, net.weights.values.size, 7):
+        found, before = [], net.weights.values[i]
+        for step in (0.02, -0.02):
+            net.weights.values[i] = before + step
+            found.append(net.forward(seen).astype(float).mean())
+        net.weights.values[i] = before
+        slope = (found[0] - found[1]) / 0.04
+        assert net.weights.slopes[i] == pytest.approx(slope, rel=5e-3, abs=2e-4)
+
+
+@pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
+def test_log_probability_entropy_and_their_gradients_are_those_of_torch(discrete: bool) -> None:
+    ours, seen = actor((16,), "relu", discrete=discrete), normal(BATCH, INPUTS)
+    actions = DICE.integers(3, size=(BATCH, 1)).astype("f") if discrete else 2 * normal(BATCH, 3)
+    theirs = tensors(ours.weights)
+    output = torch_mlp(theirs, torch.from_numpy(seen), "relu")
+    given = torch.from_numpy(actions)
+    if discrete:
+        choices: Any = torch.distributions.Categorical(logits=output)
+        expected, entropy = choices.log_prob(given[:, 0]), choices.entropy().mean()
+    else:
+        choices = torch.distributions.Normal(output, theirs["log_std"].exp())
+        expected, entropy = choices.log_prob(given).sum(1), choices.entropy().sum(1).mean()
+    got, mean = ours.score(seen, actions)
+    np.testing.assert_allclose(got, expected.detach(), rtol=1e-5, atol=1e-5)
+    assert mean == pytest.approx(entropy.item(), rel=1e-5)
+    slope = normal(BATCH)
+    ((expected * torch.from_numpy(slope)).sum() - 0.7 * entropy).backward()
+    ours.backward(slope, -0.7)
+    agree(ours.weights, theirs)
+
+
+def test_log_probability_of_a_gaussian_by_hand() -> None:
+    """Mean 0; deviations 1, 1, e: log P = -(1 + 4 + 1) / 2 - 1 - 1.5 log 2 pi."""
+    ours = Actor(Weights.zeros(mlp_shapes((INPUTS, 2, 3)) | {"log_std": (3,)}))
+    assert ours.log_std is not None
+    ours.log_std[:] = 0, 0, 1
+    got, entropy = ours.score(np.zeros((1, INPUTS), np.float32), np.array([[1, 2, np.e]], "f"))
+    assert got[0] == pytest.approx(-3 - 1 - 1.5 * 1.8378771, rel=1e-6)
+    assert entropy == pytest.approx(1.5 * (1 + 1.8378771) + 1, rel=1e-6)
+    ours.log_std[:] = 9, 0, -9
+    ours.clamp()
+    assert ours.log_std.tolist() == [1, 0, -4]
+
+
+def test_adam_is_torch_s() -> None:
+    weights = Weights.zeros({"w": (40,)})
+    weights.values[:] = normal(40)
+    theirs = torch.tensor(weights.values.copy(), requires_grad=True)
+    reference, ours = torch.optim.Adam([theirs], lr=0.01), Adam(weights)
+    for step in range(50):
+        weights.slopes[:] = normal(40) * 10.0 ** (step % 5 - 3)
+        theirs.grad = torch.from_numpy(weights.slopes.copy())
+        reference.step()
+        ours.step(0.01)
+        np.testing.assert_allclose(weights.values, theirs.detach(), rtol=1e-6, atol=2e-7)
+
+
+def test_adam_by_hand() -> None:
+    """First step: moments 0.1 g and 0.001 g^2, unbiased g and g^2: a step of the rate against g."""
+    weights = Weights.zeros({"w": (3,)})
+    adam = Adam(weights)
+    weights.slopes[:] = 4, -0.5, 0
+    adam.step(np.array([0.1, 0.2, 0.3], np.float32))
+    np.testing.assert_allclose(weights.values, [-0.1, 0.2, 0], rtol=1e-6)
+    kept = adam.arrays()
+    np.testing.assert_allclose(kept["second"], [0.016, 0.00025, 0], rtol=1e-6)
+    assert kept["steps"] == 1
+    for wrong in ({**kept, "first": np.zeros(2)}, {**kept, "steps": np.array(-1)}, {}):
+        with pytest.raises(ValueError, match="optimizer: expected"):
+            adam.load(wrong)
+
+
+def test_a_norm_is_clipped_as_in_torch() -> None:
+    slopes = np.array([3, 4], np.float32)
+    assert clip_norm(slopes, 6.0) == 5.0
+    assert slopes.tolist() == [3, 4]
+    assert clip_norm(slopes, 0.5) == 5.0
+    np.testing.assert_allclose(slopes, [0.3, 0.4], rtol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(16, 3), (3, 16), (4, 4)])
+def test_the_first_weights_are_orthogonal(shape: tuple[int, int]) -> None:
+    q = orthogonal(np.random.default_rng(1), shape, 2.0)
+    product = q @ q.T if shape[0] < shape[1] else q.T @ q
+    np.testing.assert_allclose(product, 4 * np.eye(min(shape)), atol=1e-12)
+    other = orthogonal(np.random.default_rng(2), shape, 2.0)
+    assert not np.allclose(q, other)
+
+
+def test_an_actor_begins_near_zero_and_a_net_with_gains() -> None:
+    ours = actor((16,), "relu", discrete=False)
+    ours.initialise(np.random.default_rng(0), -0.5)
+    arrays = ours.weights.arrays
+    np.testing.assert_allclose(np.linalg.norm(arrays["layers.0.weight"], axis=0), 2**0.5, rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(arrays["layers.1.weight"], axis=1), 0.01, rtol=1e-5)
+    assert arrays["log_std"].tolist() == [-0.5] * 3
+    assert not arrays["layers.0.bias"].any()

@@ -1,0 +1,49 @@
+"""Running moments of observations, and where the policy and its checkpoint have them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from rotorgram.agents import A2CConfig, EpisodeLog, make_agent
+from rotorgram.agents.normalization import Moments
+from rotorgram.envs import LocalVectorEnv
+
+
+def test_moments_of_parts_are_those_of_the_whole() -> None:
+    rows = np.random.default_rng(0).normal([1e6, -2, 0], [3, 0.5, 1e-4], (1000, 3))
+    moments = Moments(3)
+    assert (moments.mean.tolist(), moments.scale.tolist()) == ([0, 0, 0], [1, 1, 1])
+    for part in np.split(rows, [1, 7, 500]):
+        moments.add(part)
+    np.testing.assert_allclose(moments.mean, rows.mean(0), rtol=1e-6)
+    np.testing.assert_allclose(moments.scale[:2], 1 / rows[:, :2].std(0), rtol=1e-6)
+    assert moments.scale[2] == 100, "no deviation counts as less than 0.01"
+    other = Moments(3)
+    other.load(moments.arrays())
+    other.add(rows[:10])
+    moments.add(rows[:10])
+    assert other.mean.tobytes() == moments.mean.tobytes()
+    with pytest.raises(ValueError, match="observations: expected moments of shapes"):
+        Moments(2).load(moments.arrays())
+
+
+def test_the_policy_has_the_moments_of_all_rollouts_before_it() -> None:
+    """Reward and weights apart, what is seen decides: mean and deviation of the rollouts."""
+    env: Any = LocalVectorEnv("rotorgram/Elevation-v0", 4, autoreset_mode="Disabled")
+    log = EpisodeLog(env, 0)
+    agent: Any = make_agent("a2c", log, A2CConfig(normalize_observations=True,
+                                                  steps_per_update=40), 0)  # fmt: skip
+    update, seen = agent.update, []
+    agent.update = lambda rollout: (seen.append(rollout.rows(rollout.observations)),
+                                    update(rollout))[1]  # fmt: skip
+
+    def check() -> bool:
+        rows = np.concatenate(seen).astype(float)
+        policy = agent.policy()
+        np.testing.assert_allclose(policy.mean, rows.mean(0), atol=1e-5)
+        expected = 1 / np.maximum(rows.std(0), 0.01)
+        np.testing.assert_allclose(policy.scale, expected, rtol=1e-4)
+        return True
+
+    agent.train(log, 200, check)
+    assert len(seen) == 5

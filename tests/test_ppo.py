@@ -1,0 +1,212 @@
+"""PPO: its loss by hand and against torch, and the updates of SB3's on the same experience."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from rotorgram.agents import EpisodeLog, PPOConfig, make_agent
+from rotorgram.agents.networks import clip_norm
+from rotorgram.agents.ppo import PPO
+from rotorgram.envs import LocalVectorEnv
+from test_learning import Recorder, copy_weights, elevation, log_of, rollout, torch_net
+
+SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minibatches=1)
+
+
+def filled(config: PPOConfig, actor: float = 0.0, critic: float = 0.0, seed: int = 0) -> PPO:
+    """A linear critic V(s) = critic · s of one unit; an actor of constant weights."""
+    agent = PPO(log_of(), config, seed)
+    for part, value in (("actor.", actor), ("critic.", critic)):
+        for name, array in agent.weights.part(part).arrays.items():
+            array[...] = value if name.endswith("weight") else 0.0
+    return agent
+
+
+def test_the_clipped_objective_by_hand() -> None:
+    """Mean 0, deviation 1, of which log P(a) = -a²/2 - 0.9189; r is the exponential of the change.
+
+    | r | A | min(r A, clip(r) A) | dL / dlog P |
+    |---|---|---|---|
+    | 1.1 | 2 | 2.2 | 2.2 |
+    | 1.5 | 2 | 1.2 · 2 | 0 |
+    | 0.5 | 2 | 1 | 1 |
+    | 1.5 | -1 | -1.5 | -1.5 |
+    | 0.5 | -1 | -0.8 | 0 |
+    """
+    config = PPOConfig(hidden=1, log_std=0.0, normalize=False, clip=0.2)
+    agent = filled(config)
+    actions = np.array([0.5, 1.0, -2.0, 1.5, 0.3], np.float32)
+    ratio, advantage = np.array([1.1, 1.5, 0.5, 1.5, 0.5]), np.array([2, 2, 2, -1, -1], "f")
+    before = (-(actions**2) / 2 - 0.9189385 - np.log(ratio)).astype(np.float32)
+    seen, targets = np.ones((5, 1), np.float32), np.array([1, 2, 3, 4, 5], np.float32)
+    gain, entropy, value_loss, distance, clipped = agent.minibatch(
+        seen, actions[:, np.newaxis], before, advantage, targets
+    )
+    assert gain == pytest.approx((2.2 + 2.4 + 1.0 - 1.5 - 0.8) / 5, rel=1e-5)
+    assert entropy == pytest.approx(0.5 + 0.9189385, rel=1e-6)
+    assert value_loss == pytest.approx((1 + 4 + 9 + 16 + 25) / 5)
+    assert distance == pytest.approx(np.mean(ratio - 1 - np.log(ratio)), rel=1e-5)
+    assert clipped == 4 / 5
+    slope = np.array([2.2, 0, 1, -1.5, 0]) / -5
+    gradients = agent.weights.gradients
+    # d log P / d mean = a and d log P / d log_std = a² - 1
+    assert gradients["actor.layers.1.bias"] == pytest.approx(slope @ actions, rel=1e-5)
+    assert gradients["actor.log_std"] == pytest.approx(slope @ (actions**2 - 1), rel=1e-5)
+    # 0.5 · mean of (0 - target)²
+    assert gradients["critic.layers.1.bias"] == pytest.approx(-3.0)
+
+
+def columns(count: int) -> tuple[np.ndarray, ...]:
+    dice = np.random.default_rng(1)
+    shapes = [(count, 1), (count, 1), (count,), (count,), (count,)]
+    return tuple(dice.normal(size=shape).astype(np.float32) for shape in shapes)
+
+
+def test_gradients_are_those_of_torch() -> None:
+    agent = PPO(log_of(), PPOConfig(ent_coef=0.03, vf_coef=0.7, clip=0.3), 0)
+    agent.weights.values[:] += np.random.default_rng(0).normal(size=agent.weights.values.size) / 3
+    seen, actions, before, advantage, targets = columns(40)
+    before = before / 3 - 1.2  # near the log-probabilities
+    agent.minibatch(seen, actions, before, advantage, targets)
+    arrays = {k: torch.tensor(a, requires_grad=True) for k, a in agent.weights.arrays.items()}
+    actor, critic = ({k.removeprefix(p): a for k, a in arrays.items() if k.startswith(p)}
+                     for p in ("actor.", "critic."))  # fmt: skip
+    inputs, old, gains, goals = map(torch.from_numpy, (seen, before, advantage, targets))
+    normal: Any = torch.distributions.Normal(torch_net(actor, inputs), actor["log_std"].exp())
+    ratio = (normal.log_prob(torch.from_numpy(actions)).sum(1) - old).exp()
+    gains = (gains - gains.mean()) / (gains.std() + 1e-8)
+    objective = torch.min(ratio * gains, ratio.clamp(0.7, 1.3) * gains).mean()
+    value_loss = (torch_net(critic, inputs)[:, 0] - goals).square().mean()
+    (0.7 * value_loss - objective - 0.03 * normal.entropy().sum(1).mean()).backward()
+    share = ((ratio - 1).abs() > 0.3).float().mean()
+    assert 0.1 < share < 0.9, "some are clipped, some are not"
+    for name, gradient in agent.weights.gradients.items():
+        theirs = arrays[name].grad
+        assert theirs is not None
+        np.testing.assert_allclose(gradient, theirs, rtol=1e-4, atol=1e-6, err_msg=name)
+
+
+def test_rates_of_actor_and_critic() -> None:
+    """Adam's first step is the rate, whatever the gradient."""
+    agent = PPO(log_of(), replace(SMALL, learning_rate=0.01, critic_learning_rate=0.03), 0)
+    before = {name: array.copy() for name, array in agent.weights.arrays.items()}
+    agent.update(rollout())
+    for name, array in agent.weights.arrays.items():
+        moved = np.abs(array - before[name])[np.abs(agent.weights.gradients[name]) > 1e-3]
+        rate = 0.03 if name.startswith("critic.") else 0.01
+        np.testing.assert_allclose(moved, rate, rtol=1e-3, err_msg=name)
+
+
+def test_every_epoch_takes_every_transition_once() -> None:
+    agent = PPO(log_of(), replace(SMALL, epochs=4, minibatches=3, normalize=False), 0)
+    taken: list[tuple[np.ndarray, ...]] = []
+    minibatch = agent.minibatch
+
+    def keep(*arguments: np.ndarray) -> tuple[float, ...]:
+        taken.append(tuple(a.copy() for a in arguments))
+        return minibatch(*arguments)
+
+    agent.minibatch = keep  # type: ignore[method-assign]
+    dice = np.random.default_rng(0)
+    names = "observations", "actions", "next_observations"
+    many = {name: dice.normal(size=(20, 1)).astype(np.float32) for name in names}
+    many["rewards"] = dice.normal(size=20)
+    flags = dict.fromkeys(("terminated", "truncated"), np.zeros(20, bool))
+    kept = np.arange(20) != 7
+    data = rollout(**many, **flags, kept=kept)
+    agent.update(data)
+    assert [len(part[0]) for part in taken] == [6, 6, 7] * 4
+    assert agent.optimizer.steps == 12
+    orders = [[tuple(column[i].item() for column in part) for part in taken[first : first + 3]
+               for i in range(len(part[0]))] for first in range(0, 12, 3)]  # fmt: skip
+    for order in orders:
+        assert sorted(row[0] for row in order) == sorted(data.observations[kept, 0, 0].tolist())
+        assert sorted(order) == sorted(orders[0]), "the columns of a transition stay together"
+    assert len(set(map(tuple, orders))) == 4
+
+
+def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
+    """SB3 flies; ours, from the same weights, is given what it flew, as one minibatch."""
+    config = PPOConfig(
+        steps_per_update=64, gamma=0.98, gae_lambda=0.95, learning_rate=0.003, ent_coef=0.01,
+        critic_learning_rate=0.01, epochs=5, minibatches=1, clip=0.1, max_grad_norm=0.5,
+    )  # fmt: skip
+    recorder = Recorder(elevation(episode_length=40, flight_band=1.1))
+    log = EpisodeLog(recorder, seed=0)
+    theirs: Any = make_agent("sb3-ppo", log, config, 0)
+    ours = PPO(log, config, seed=1)
+    copy_weights(theirs, ours)
+    buffer, seen = theirs.model.rollout_buffer, []
+    prepare = buffer.compute_returns_and_advantage
+
+    def keep_buffer(*args: Any, **kwargs: Any) -> None:
+        seen[:] = buffer.observations[:, 0].copy(), buffer.actions[:, 0].copy()
+        prepare(*args, **kwargs)
+
+    buffer.compute_returns_and_advantage = keep_buffer
+
+    def follow() -> bool:
+        after, rewards, terminated, truncated, _ = zip(*recorder.results, strict=True)
+        recorder.results.clear()
+        data = rollout(
+            observations=seen[0], actions=seen[1], rewards=np.array(rewards),
+            next_observations=np.array(after), terminated=np.array(terminated),
+            truncated=np.array(truncated), kept=np.ones(len(rewards), bool),
+        )  # fmt: skip
+        ours.update(data)
+        here, there = ours.scalars(), theirs.scalars()
+        assert here["train/clip_fraction"] == pytest.approx(there["train/clip_fraction"], abs=0.02)
+        assert here["train/value_loss"] == pytest.approx(there["train/value_loss"], rel=2e-3)
+        assert here["train/approx_kl"] == pytest.approx(
+            there["train/approx_kl"], rel=0.02, abs=1e-5
+        )
+        return True
+
+    theirs.train(log, 512, follow)
+    assert any(e.truncated for e in log.episodes)
+    assert any(e.terminated for e in log.episodes)
+    assert ours.optimizer.steps == 40
+    for name, expected in theirs.actor().items():
+        np.testing.assert_allclose(ours.actor()[name], expected, atol=2e-4, err_msg=name)
+
+
+def test_sb3_and_ours_make_the_same_steps_of_the_same_minibatches() -> None:
+    """Four drones; SB3 draws the minibatches."""
+    config = PPOConfig(
+        steps_per_update=128, gamma=0.98, learning_rate=0.003, critic_learning_rate=0.01, epochs=3,
+        minibatches=4, ent_coef=0.01,
+    )  # fmt: skip
+    env: Any = LocalVectorEnv("rotorgram/Hover-v0", 4, autoreset_mode="Disabled")
+    log = EpisodeLog(env, seed=0)
+    theirs: Any = make_agent("sb3-ppo", log, config, 0)
+    ours = PPO(log, config, seed=1)
+    copy_weights(theirs, ours)
+    get, parts = theirs.model.rollout_buffer.get, []
+
+    def keep(size: int) -> Any:
+        for part in get(size):
+            parts.append(part)
+            yield part
+
+    theirs.model.rollout_buffer.get = keep
+    clipped: list[float] = []
+
+    def follow() -> bool:
+        for part in parts:
+            terms = ours.minibatch(
+                *(tensor.numpy() for tensor in (part.observations, part.actions, part.old_log_prob,
+                                                part.advantages, part.returns))
+            )  # fmt: skip
+            clip_norm(ours.weights.slopes, config.max_grad_norm)
+            ours.optimizer.step(ours.rates)
+            clipped.append(terms[4])
+        parts.clear()
+        return True
+
+    theirs.train(log, 4 * 128, follow)
+    assert len(clipped) == 4 * 3 * 4
+    assert max(clipped) > 0
+    for name, expected in theirs.actor().items():
+        np.testing.assert_allclose(ours.actor()[name], expected, atol=5e-5, err_msg=name)
