@@ -48,6 +48,10 @@ class ActionMap:
         outputs: Numbers that the network gives.
         size: Numbers of a drawn action, k: 1 if discrete.
         discrete: Whether an action is a choice.
+        middle: Action of an output 0, shape (1, k); the others likewise. None of them if discrete.
+        half: What an output 1 adds to it.
+        low: Lower bound of the action, float32; -inf where there is none.
+        high: Upper bound.
     """
 
     def __init__(self, action: ArraySpec | Discrete) -> None:
@@ -62,18 +66,18 @@ class ActionMap:
         low, high = (bound.reshape(1, -1) for bound in action.bounds())
         bounded = np.isfinite(low) & np.isfinite(high)
         with np.errstate(invalid="ignore"):
-            self._middle = np.where(bounded, (low + high) / 2, 0.0).astype(np.float32)
-            self._half = np.where(bounded, (high - low) / 2, 1.0).astype(np.float32)
-        self._low, self._high = low.astype(np.float32), high.astype(np.float32)
-        self._plain = bool((self._middle == 0).all() and (self._half == 1).all())
+            self.middle = np.where(bounded, (low + high) / 2, 0.0).astype(np.float32)
+            self.half = np.where(bounded, (high - low) / 2, 1.0).astype(np.float32)
+        self.low, self.high = low.astype(np.float32), high.astype(np.float32)
+        self._plain = bool((self.middle == 0).all() and (self.half == 1).all())
 
     def to_envs(self, actions: np.ndarray) -> np.ndarray:
         """Drawn actions (N, k) as the env's: float32, (N, k), inside the bounds; or int64, (N,)."""
         if self.discrete:
             return actions[:, 0].astype(np.int64)
         if not self._plain:
-            actions = self._middle + self._half * actions
-        clipped: np.ndarray = np.minimum(np.maximum(actions, self._low), self._high)
+            actions = self.middle + self.half * actions
+        clipped: np.ndarray = np.minimum(np.maximum(actions, self.low), self.high)
         return clipped
 
 

@@ -31,6 +31,7 @@ COMMANDS: Final = {
     "train": "Train",
     "serve": "Serve",
     "evaluate": "Evaluate",
+    "export": "Export",
     "view": "View",
     "compare": "Compare",
     "sweep": "Sweep",
@@ -57,6 +58,7 @@ EXTRAS: Final = {
     "dataset": ("mcap", "pyarrow", "minari", "h5py", "PIL"),
     "identify": ("pyulog", "pandas", "pyarrow", "scipy"),
     "gpu": ("torch", "mujoco_warp", "warp"),
+    "export": ("onnx", "onnxruntime"),
 }  # fmt: skip
 """Import names of the packages of each extra, as pyproject.toml lists them."""
 

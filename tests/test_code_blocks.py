@@ -6,12 +6,15 @@ comment of its own is run first. What else is not as on the page stands in `INST
 reason.
 """
 
+import atexit
 import io
 import re
 import shlex
+import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import tomllib
 from contextlib import redirect_stdout
 from functools import cache
@@ -32,6 +35,7 @@ PAGES = [
 ]
 FENCE = re.compile(r"^```(.*?)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LANGUAGES = {"python", "python continued", "sh", "text", "toml", "mermaid"}
+COMPILED = {"c", "csharp"}  # tests/test_export.py compiles and runs them
 
 
 class Block(NamedTuple):
@@ -109,6 +113,15 @@ def free_port() -> int:
         return int(sock.getsockname()[1])
 
 
+@cache
+def short_training() -> str:
+    """The folder of one, for pages that fly a policy."""
+    folder = tempfile.mkdtemp()
+    atexit.register(shutil.rmtree, folder)
+    run(rotorgram("train", "a2c", "--env-steps", "256", "--out", f"{folder}/run"), Path(folder))
+    return f"{folder}/run"
+
+
 def simulators_for(code: str, port: int, folder: Path) -> list[subprocess.Popen[bytes]]:
     """What the page's text says runs in other terminals."""
     count, drones = (2, 4) if "RemoteVectorEnv" in code else (1, 1)
@@ -137,6 +150,9 @@ def test_python_runs_as_pasted(
         run([sys.executable, "-c", FLIGHT], tmp_path)
     for words in re.findall(r"^# rotorgram (.+)$", code, re.MULTILINE):
         run(rotorgram(*words.split()), tmp_path)
+    for file, target in {"policy.onnx": "onnx", "policy.pt": "torchscript"}.items():
+        if file in code:
+            run(rotorgram("export", short_training(), "--to", target), tmp_path)
     if "8001" in code:
         port = free_port()
         code = code.replace("8001", str(port))
@@ -157,7 +173,8 @@ def test_every_fence_says_what_it_is() -> None:
     """So that no block escapes the tests; text is what is shown, mermaid is drawn."""
     for block in ALL:
         drawing = block.page == "models/README.md" and not block.language
-        assert block.language in LANGUAGES or drawing, f"{block.page}: {block.language}"
+        compiled = block.language in COMPILED and block.page == "docs/export.md"
+        assert block.language in LANGUAGES or drawing or compiled, f"{block.page}: {block.language}"
     assert len(PROGRAMS) >= 16
 
 
@@ -204,7 +221,7 @@ OTHERS = {
     "source": "the shell's; `make install` makes the file",
     "export": "the shell's",
     "tensorboard": "a dependency's; tests/test_logs.py reads what it reads",
-    "gcc": "tests/test_peers.py",
+    "gcc": "tests/test_peers.py, tests/test_export.py",
     "./agent": "tests/test_peers.py",
     "mcs": "tests/test_peers.py",
     "mono": "tests/test_peers.py",

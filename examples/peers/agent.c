@@ -5,6 +5,9 @@
  *     ./agent [PORT [EPISODES [SEED [SECONDS]]]]       in one terminal
  *     rotorgram sim --codec text                       in another
  *
+ * With -DPOLICY='"rotorgram_policy.h"' it flies the policy that `rotorgram export --to c` wrote to that
+ * file (docs/export.md) in place of the PD law.
+ *
  * Episode i, counted from 1, is reset with SEED + i - 1. It waits SECONDS for a legal datagram.
  * Exit status: 0 all episodes flown, 1 the simulator went away or none came, 2 wrong arguments. */
 
@@ -24,9 +27,39 @@
 #include <time.h>
 #include <unistd.h>
 
+enum { MOST_BYTES = 1024 };
+
+#ifdef POLICY
+#include POLICY
+#define LAST "last |observation[0]| %.6f"
+enum {
+    OBSERVATIONS = ROTORGRAM_OBSERVATIONS,
+    ACTIONS = ROTORGRAM_ACTIONS,
+    TELEMETRY = ROTORGRAM_TELEMETRY
+};
+
+/* Text has the digits of a double; observations and actions are floats on both sides. */
+static void act(const double *values, double *action)
+{
+    float observation[OBSERVATIONS], chosen[ACTIONS];
+    for (int i = 0; i < OBSERVATIONS; i++)
+        observation[i] = (float)values[i];
+    rotorgram_policy(observation, chosen);
+    for (int i = 0; i < ACTIONS; i++)
+        action[i] = chosen[i];
+}
+#else
 /* Of rotorgram/Elevation-v0: E, its rate, thrust / hover - 1; X, Y, Z, three angles, F1 to F4,
  * the goal X, Y, Z, and E again as the metric. */
-enum { OBSERVATIONS = 3, TELEMETRY = 14, MOST_BYTES = 1024 };
+#define LAST "last |E| %.6f m"
+enum { OBSERVATIONS = 3, ACTIONS = 1, TELEMETRY = 14 };
+
+static void act(const double *values, double *action)
+{
+    double error = values[0], rate = values[1], thrust = values[2];
+    action[0] = fmax(-1, fmin(1, 9 * error + 6 * rate - 9.8 * thrust));
+}
+#endif
 
 typedef struct {
     uint64_t sequence;
@@ -36,7 +69,7 @@ typedef struct {
 
 static int udp;
 static struct sockaddr_in simulator; /* the one that this agent is pinned to, once `begun` */
-static char answer[64];              /* the last one, which every repeat gets again */
+static char answer[MOST_BYTES];      /* the last one, which every repeat gets again */
 
 /* Parsing. Each function reads one piece of the grammar at *at and goes behind it, if it is there. */
 
@@ -191,15 +224,14 @@ static int fly(uint64_t episodes, uint64_t seed, double patience)
             continue;
         }
 
-        double error = m.values[0], rate = m.values[1], thrust = m.values[2];
         bool done = !begun; /* the simulator's own start has a seed of its own: reset it with ours */
         if (begun && !fresh) {
             steps++;
             total += m.reward;
             done = m.terminated || m.truncated;
             if (done) {
-                printf("episode %" PRIu64 ": %" PRIu64 " steps, return %.12g, last |E| %.6f m, %s\n",
-                       ++episode, steps, total, fabs(error),
+                printf("episode %" PRIu64 ": %" PRIu64 " steps, return %.12g, " LAST ", %s\n",
+                       ++episode, steps, total, fabs(m.values[0]),
                        m.terminated ? "terminated" : "truncated");
                 fflush(stdout);
             }
@@ -211,8 +243,11 @@ static int fly(uint64_t episodes, uint64_t seed, double patience)
             steps = 0;
             total = 0;
         } else {
-            double action = fmax(-1, fmin(1, 9 * error + 6 * rate - 9.8 * thrust));
-            snprintf(answer, sizeof answer, "%" PRIu64 ",%.17g", m.sequence, action);
+            double action[ACTIONS];
+            int end = snprintf(answer, sizeof answer, "%" PRIu64, m.sequence);
+            act(m.values, action);
+            for (int i = 0; i < ACTIONS && end < MOST_BYTES; i++)
+                end += snprintf(answer + end, sizeof answer - (size_t)end, ",%.17g", action[i]);
         }
         simulator = from;
         begun = true;

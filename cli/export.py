@@ -1,0 +1,39 @@
+"""`rotorgram export`: a trained policy as a file that flies without rotorgram."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from ..models.errors import expect
+from ._flags import Command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Command):
+    """Write a trained policy as one file that flies without rotorgram."""
+
+    policy: Positional[Annotated[str, arg(metavar="CHECKPOINT")]]
+    """Checkpoint, or folder of a training."""
+    to: Literal["onnx", "c", "csharp", "torchscript"]
+    """Kind of file."""
+    out: Path | None = None
+    """File to write, a new one. Default: policy.onnx, rotorgram_policy.h, RotorgramPolicy.cs or
+    policy.pt in the working directory."""
+
+    def run(self) -> int:
+        """Write it."""
+        from ..agents.checkpoints import write_whole
+        from ..agents.export import TARGETS, export
+        from ._env import load_checkpoint
+
+        out = self.out or Path(TARGETS[self.to])
+        expect(not out.exists(), "out", "the name of a new file", f"{out}, which is there")
+        checkpoint = load_checkpoint(self.policy)
+        expect(checkpoint, "policy", "a checkpoint or the folder of a training", self.policy)
+        assert checkpoint is not None
+        content = export(checkpoint, self.to)
+        write_whole(out, content)
+        print(f"policy: {out} ({len(content):,} bytes)")
+        return 0
