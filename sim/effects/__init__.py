@@ -103,3 +103,12 @@ class Effects:
             gust = self._gusts.step(mask, self._noise.normal(mask))
             wind = [a + b for a, b in zip(wind, gust, strict=True)]
         return mean, end, self._air.step(state, mean, root, wind, mask)
+
+    def detach(self) -> None:
+        """End the graph of gradients of torch tensors."""
+        for part in (self._rotors, self._air, self._gusts):
+            for name, memory in vars(part).items() if part is not None else ():
+                if hasattr(memory, "detach"):
+                    setattr(part, name, memory.detach())
+                elif isinstance(memory, list):
+                    setattr(part, name, [getattr(x, "detach", lambda x=x: x)() for x in memory])
