@@ -26,7 +26,11 @@ _PACKAGES: Final = {  # and the extra that has them
     "rigid": ("train", ("torch",)),
     "warp": ("gpu", ("torch", "warp", "mujoco_warp")),
 }
-_SETTINGS: Final = {"mujoco": ("num_threads",), "rigid": ("device", "dtype"), "warp": ("device",)}
+_SETTINGS: Final = {
+    "mujoco": ("num_threads",),
+    "rigid": ("device", "dtype", "compiled"),
+    "warp": ("device",),
+}
 
 MAX_WORLDS: Final = 1 << 16  # Most worlds of a batch
 CONTACT_CHECK: Final = 0.02
@@ -127,7 +131,7 @@ def make_world(
     **settings: Any,
 ) -> World:
     """W worlds of one drone each; settings are `num_threads` of `mujoco`, `device` of the others,
-    and `dtype` of `rigid`.
+    `dtype` and `compiled` of `rigid`.
 
     Raises:
         InputError: The backend, the number or a setting is not what it should be.

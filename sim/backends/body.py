@@ -97,16 +97,17 @@ class RigidBody:
     def vary(self, parameters: Mapping[str, Array]) -> None:
         """Take drawn parameters by their names, each of shape (W,)."""
         (mass, center), (own, far) = self._least, self._inertias
+        inertia: Any
         factor, more = parameters.get("mass", 1.0), parameters.get("inertia", 1.0)
         self._mass = mass * factor
         self._easier = 1.0 / factor
         if isinstance(more, float) or not far.any():
             self._easier, inertia = self._easier / more, own + far
         else:
-            own, far = (
-                torch.as_tensor(x, dtype=more.dtype, device=more.device) for x in (own, far)
+            inertia = sum(
+                torch.as_tensor(x, dtype=more.dtype, device=more.device) * share
+                for x, share in ((own, more[:, None, None]), (far, 1.0))
             )
-            inertia = more[:, None, None] * own + far
         self._turn, self._gyroscopic = _euler(inertia)
         self._reaction = parameters.get("reaction")
         self._shift: Vector = tuple(parameters.get(name, 0.0) for name in CENTER)
@@ -268,19 +269,16 @@ def _euler(inertia: Any) -> tuple[Any, Any]:
 
     Each axis has its list of terms: k times component i times component j of the rates.
     """
-    if isinstance(inertia, np.ndarray):
-        inverse, cross = np.linalg.inv(inertia), _CROSS
-        terms = -np.einsum("il,ljm,mk->ijk", inverse, cross, inertia)
-    else:
-        inverse = torch.linalg.inv(inertia)
+    if not isinstance(inertia, np.ndarray):
         cross = torch.as_tensor(_CROSS, dtype=inertia.dtype, device=inertia.device)
-        terms = torch.einsum("wil,ljm,wmk->ijkw", -inverse, cross, inertia)
-        inverse = inverse.permute(1, 2, 0)
-        return list(inverse), [
-            [(j, k, terms[i, j, k]) for j in range(3) for k in range(3)] for i in range(3)
-        ]
-    least = _NOTHING * abs(terms).max()
-    found = []
+        turn = torch.linalg.inv(inertia)
+        products = -torch.einsum("wil,ljm,wmk->ijkw", turn, cross, inertia)
+        pairs = [(j, k) for j in range(3) for k in range(3)]
+        found = [[(j, k, axis[j, k]) for j, k in pairs] for axis in products]
+        return list(turn.permute(1, 2, 0)), found
+    inverse = np.linalg.inv(inertia)
+    terms = -np.einsum("il,ljm,mk->ijk", inverse, _CROSS, inertia)
+    least, found = _NOTHING * abs(terms).max(), []
     for axis in terms:
         folded = np.triu(axis + axis.T) - np.diag(np.diag(axis))
         places = np.argwhere(abs(folded) > least).tolist()
@@ -328,7 +326,7 @@ def _sum(total: Any, *products: tuple[Any, ...]) -> Any:
 def _times(matrix: list[list[float]], thrust: torch.Tensor) -> Vector:
     """A matrix (3, R) and thrusts (R, W): three vectors."""
     rotors = thrust.unbind(0)
-    return tuple(_sum(0.0, *zip(row, rotors, strict=True)) for row in matrix)  # type: ignore[return-value]
+    return tuple(_sum(0.0, *zip(row, rotors, strict=True)) for row in matrix)
 
 
 def _is_there(vector: Any) -> bool:
@@ -336,11 +334,11 @@ def _is_there(vector: Any) -> bool:
 
 
 def _plus(a: Any, b: Any, share: float = 1.0) -> Vector:
-    return tuple(_sum(x, (share, y)) for x, y in zip(a, b, strict=True))  # type: ignore[return-value]
+    return tuple(_sum(x, (share, y)) for x, y in zip(a, b, strict=True))
 
 
 def _scaled(vector: Any, share: Any) -> Vector:
-    return tuple(_sum(0.0, (share, x)) for x in vector)  # type: ignore[return-value]
+    return tuple(_sum(0.0, (share, x)) for x in vector)
 
 
 def _cross(a: Any, b: Any) -> Vector:
@@ -354,7 +352,7 @@ def _cross(a: Any, b: Any) -> Vector:
 
 def _forth(matrix: Any, vector: Any) -> Vector:
     """A matrix, three rows, and a vector."""
-    return tuple(_sum(0.0, *zip(row, vector, strict=True)) for row in matrix)  # type: ignore[return-value]
+    return tuple(_sum(0.0, *zip(row, vector, strict=True)) for row in matrix)
 
 
 def _back(matrix: Any, vector: Any) -> Vector:
@@ -419,7 +417,7 @@ def _of_rotation_vector(spin: Vector, time: float, square: Any, rates: Vector) -
     series = (series + _BORTZ[0] + 2.0 / (4 * math.pi**2 - square)) * (time * time)
     once = _cross(spin, rates)
     twice = _cross(spin, once)
-    return tuple(  # type: ignore[return-value]
+    return tuple(
         _sum(w, (0.5 * time, a), (series, b)) for w, a, b in zip(rates, once, twice, strict=True)
     )
 

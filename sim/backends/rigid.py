@@ -31,6 +31,9 @@ class RigidWorld(TensorWorld):
 
     A step makes new tensors for the state. Where thrusts require a gradient, the state has it;
     `detach` ends it.
+
+    `compiled` has torch compile a physics step at the first one: it needs a C++ compiler, and takes
+    half a minute, or some seconds where torch's cache has it. Small batches gain most.
     """
 
     def __init__(
@@ -42,7 +45,9 @@ class RigidWorld(TensorWorld):
         randomize: Randomization | None = None,
         device: str | None = None,
         dtype: str = "float32",
+        compiled: bool = False,
     ) -> None:
+        expect(type(compiled) is bool, "compiled", "true or false", repr(compiled))
         expect(dtype in DTYPES, "dtype", " or ".join(DTYPES), repr(dtype))
         super().__init__(num_worlds, randomize, torch_device(device), DTYPES[dtype])
         self.vehicle = vehicle
@@ -55,13 +60,16 @@ class RigidWorld(TensorWorld):
         self._check = contact_check(vehicle.timestep)
         self._body, self._hull = RigidBody(vehicle), Hull(vehicle, self.dtype, self.device)
         _check_forces(vehicle, self._body)
+        self._advance: Any = torch.compile(self._body.fly) if compiled else self._body.fly
+        self._at_once = 1 if compiled else None  # physics steps of a call
         put: Any = {"dtype": self.dtype, "device": self.device}
         self._hover, self._low, self._high = (
             torch.tensor(x, **put)
             for x in (vehicle.hover_thrust, vehicle.thrust_low, vehicle.thrust_high)
         )
         thrust = torch.zeros((num_worlds, 1, vehicle.num_rotors), **put)
-        self._acting, self._wrench = thrust, None  # mean over the last physics step
+        self._acting = thrust  # mean over the last physics step
+        self._wrench: torch.Tensor | None = None
         level = torch.tensor((0.0, 0.0, 0.0, 1.0, *[0.0] * 9), **put)
         self._rows = level[:, None].expand(13, num_worlds)
         self.state = WorldState(
@@ -111,23 +119,23 @@ class RigidWorld(TensorWorld):
 
     def _fly(self, steps: int, mask: torch.Tensor | None) -> None:
         """Fly some physics steps, between which nobody looks for contact."""
-        state, effects = self.state, self.effects
-        acting, at_once = state.command, steps if effects is None else 1
-        wrench: torch.Tensor | None = None
+        state, effects, wrench = self.state, self.effects, self._wrench
+        acting, parts = state.command, None
+        at_once = self._at_once or (steps if effects is None else 1)
         for _ in range(steps // at_once):
             if effects is not None:
                 acting, end, push = effects.step(state, mask)
                 if effects.on_rotors:
                     state.thrust = _kept(mask, end, state.thrust)
-                wrench = None if push is None else push[:, 0].T
+                if push is not None:
+                    wrench = push[:, 0].T
+                    parts = wrench.unbind(0)
             if effects is None or not effects.on_rotors:  # as MuJoCo clamps controls
                 acting = clip(acting, self._low, self._high)
-            parts = None if wrench is None else wrench.unbind(0)
-            new = self._body.fly(self._rows, acting[:, 0].T.contiguous(), parts, at_once)
+            new = self._advance(self._rows, acting[:, 0].T.contiguous(), parts, at_once)
             self._rows = new if mask is None else torch.where(mask[:, 0], new, self._rows)
             self._show()
-        self._acting = _kept(mask, acting, self._acting)
-        self._wrench = wrench
+        self._acting, self._wrench = _kept(mask, acting, self._acting), wrench
 
     def detach(self) -> None:
         """End the graph of gradients: what comes next does not depend on what was before."""
