@@ -32,7 +32,7 @@ BACKENDS = ("warp", "mujoco")
 
 
 def on_device(worlds: int, device: str) -> Callable[[], None]:
-    env = LocalVectorEnv(TASK, worlds, backend="warp", device=device)
+    env = LocalVectorEnv(TASK, worlds, backend="warp", device=device, tensors=True)
     env.reset(seed=0)
     actions = torch.empty(env.action_space.shape, device=device)
 

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
+from ..models import BACKENDS, Backend
 from ..models.errors import InputError, expect, require
 from .effects import EffectOptions
 from .random import Draw, Noise
@@ -14,11 +15,6 @@ if TYPE_CHECKING:
     import mujoco
 
     from ..models.vehicle import Vehicle
-
-Backend = Literal["mujoco", "rigid", "warp"]
-"""`mujoco`: threads of this machine, float64. `rigid`: the rigid body in torch, no contact. `warp`:
-MuJoCo Warp, float32. The last two take a GPU if there is one."""
-BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
 
 _WORLDS: Final = {"mujoco": "MujocoWorld", "rigid": "RigidWorld", "warp": "WarpWorld"}
 _PACKAGES: Final = {  # and the extra that has them
