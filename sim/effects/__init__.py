@@ -107,8 +107,12 @@ class Effects:
     def detach(self) -> None:
         """End the graph of gradients of torch tensors."""
         for part in (self._rotors, self._air, self._gusts):
-            for name, memory in vars(part).items() if part is not None else ():
-                if hasattr(memory, "detach"):
-                    setattr(part, name, memory.detach())
-                elif isinstance(memory, list):
-                    setattr(part, name, [getattr(x, "detach", lambda x=x: x)() for x in memory])
+            if part is not None:
+                vars(part).update({name: _detached(value) for name, value in vars(part).items()})
+
+
+def _detached(value: Any) -> Any:
+    """A tensor, or those of a list, without their graph; anything else as it is."""
+    if isinstance(value, list):
+        return [_detached(one) for one in value]
+    return value.detach() if hasattr(value, "requires_grad") else value
