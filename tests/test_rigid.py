@@ -41,11 +41,12 @@ def angle(ours: Any, theirs: np.ndarray) -> float:
 # --- the motion -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("drag", [0.0, 0.3])
-@pytest.mark.parametrize("file", FILES.values(), ids=FILES)
-def test_flies_as_mujoco_for_five_seconds(file: Path, drag: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "drag"), [*((name, 0.0) for name in FILES), ("paper", 0.3), ("hexa", 0.3)]
+)
+def test_flies_as_mujoco_for_five_seconds(name: str, drag: float) -> None:
     """1e-6 m and 1e-6 rad, from any attitude, tumbling, at random thrusts; measured: 1e-9."""
-    vehicle, dice = Vehicle.load(file, linear_drag=drag), np.random.default_rng(0)
+    vehicle, dice = Vehicle.load(FILES[name], linear_drag=drag), np.random.default_rng(0)
     turned = dice.normal(size=(N, 1, 4))
     pose = {
         "position": dice.uniform(1000.0, 1001.0, (N, 1, 3)),
