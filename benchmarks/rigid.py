@@ -147,7 +147,8 @@ def speed(args: argparse.Namespace) -> None:
             if python:
                 script = str(HERE / f"rigid_{name}.py")
                 command = [python, script, str(args.drones), str(args.seconds)]
-                told = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+                said = subprocess.run(command, capture_output=True, check=True).stdout
+                told = json.loads(said.splitlines()[-1])  # warnings come before
                 for kind in ("rate", "own_rate"):
                     if kind in told:
                         label = name if kind == "rate" else f"{name}, one physics step"

@@ -1,5 +1,6 @@
 """The backend rigid: MuJoCo's flights without contact, the tasks on it, gradients through it."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,23 @@ def test_a_spin_about_a_principal_axis_keeps_its_rate() -> None:
     turned = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
     torch.testing.assert_close(world.state.quaternion[0, 0], turned, atol=1e-12, rtol=0)
     assert float(world.state.position[0, 0, 2]) == pytest.approx(50.0, abs=1e-12)
+
+
+@pytest.mark.quiet
+@pytest.mark.timeout(300)
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch needs a compiler")
+def test_compiled_it_flies_the_same() -> None:
+    vehicle, dice = Vehicle.load(), np.random.default_rng(0)
+    worlds = [rigid(vehicle, N, "float32", compiled=choice) for choice in (False, True)]
+    pose = {"position": np.full((N, 1, 3), 5.0), "body_rates": dice.normal(size=(N, 1, 3))}
+    thrust = torch.tensor(dice.uniform(40.0, 60.0, (N, 1, 4)), dtype=torch.float32)
+    for world in worlds:
+        begin(world, **pose)
+        for _ in range(10):
+            world.step(thrust, 2)
+    for name in ("position", "quaternion", "velocity", "body_rates"):
+        one, other = (getattr(world.state, name) for world in worlds)
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
 
 
 EFFECTS = {
