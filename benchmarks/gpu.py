@@ -1,4 +1,4 @@
-"""Env steps per second on a GPU (rigid, MuJoCo Warp), beside mujoco.batch on the same machine's CPU.
+"""Env steps per second on a GPU (rigid, MuJoCo Warp), beside mujoco.batch on the CPU beside it.
 
     python benchmarks/gpu.py [--worlds 1024 4096 16384 65536] [--repeats 5] [--out FILE.json]
 
