@@ -93,6 +93,7 @@ def test_a_spin_about_a_principal_axis_keeps_its_rate() -> None:
 
 @pytest.mark.quiet
 @pytest.mark.timeout(300)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of torch's own modules
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch needs a compiler")
 def test_compiled_it_flies_the_same() -> None:
     vehicle, dice = Vehicle.load(), np.random.default_rng(0)

@@ -119,8 +119,8 @@ class RigidWorld(TensorWorld):
 
     def _fly(self, steps: int, mask: torch.Tensor | None) -> None:
         """Fly some physics steps, between which nobody looks for contact."""
-        state, effects, wrench = self.state, self.effects, self._wrench
-        acting, parts = state.command, None
+        state, effects = self.state, self.effects
+        acting, wrench, parts = state.command, None, None
         at_once = self._at_once or (steps if effects is None else 1)
         for _ in range(steps // at_once):
             if effects is not None:
@@ -135,7 +135,10 @@ class RigidWorld(TensorWorld):
             new = self._advance(self._rows, acting[:, 0].T.contiguous(), parts, at_once)
             self._rows = new if mask is None else torch.where(mask[:, 0], new, self._rows)
             self._show()
-        self._acting, self._wrench = _kept(mask, acting, self._acting), wrench
+        self._acting = _kept(mask, acting, self._acting)
+        if wrench is not None:
+            old = torch.zeros_like(wrench) if self._wrench is None else self._wrench
+            self._wrench = wrench if mask is None else torch.where(mask[:, 0], wrench, old)
 
     def detach(self) -> None:
         """End the graph of gradients: what comes next does not depend on what was before."""
