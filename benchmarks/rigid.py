@@ -8,7 +8,8 @@ vehicle of the library and of the tests. float64 and float32 begin 1000 m up for
 nothing is touched, and at the origin for `rigid`, which has no contact: so the figure of float32 is
 of a flight near the origin.
 
-Speed: control steps per second of 4,096 drones, in turn, medians: of the world alone for `mujoco`
+Speed: control steps of 4,096 drones, per second and per second of a processor (which a busy machine
+disturbs less), in turn, medians: of the world alone for `mujoco`
 and `rigid`, eager and compiled; the same for one env, `Loop.advance` of Hover. With PYTHON of an
 environment that has them (pip install numba; pip install crazyflow): the same physics step by
 Numba, and Crazyflow's own step benchmark at the same rates, each in a process of its own.
@@ -82,13 +83,14 @@ def distances(file: Path, dtype: str, drones: int = 32) -> dict[str, float]:
     }
 
 
-def rate(fly: Callable[[], None], drones: int, seconds: float) -> float:
-    """Control steps per second of all drones."""
-    times, start = 0, time.perf_counter()
+def rate(fly: Callable[[], None], drones: int, seconds: float) -> tuple[float, float]:
+    """Control steps of all drones per second, and per second of a processor."""
+    times, start, used = 0, time.perf_counter(), time.process_time()
     while times < 3 or time.perf_counter() - start < seconds:
         fly()
         times += 1
-    return times * drones / (time.perf_counter() - start)
+    flown = times * drones
+    return flown / (time.perf_counter() - start), flown / (time.process_time() - used)
 
 
 def world(backend: Any, drones: int, steps: int = 2, **settings: Any) -> Callable[[], None]:
@@ -136,7 +138,7 @@ def speed(args: argparse.Namespace) -> None:
             ways[name] = make(backend, args.drones, **settings)
             ways[name]()
         firsts[name] = round(time.perf_counter() - start, 2)
-    rates: dict[str, list[float]] = {name: [] for name in ways}
+    rates: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
     others = {"numba": args.numba, "crazyflow": args.crazyflow}
     reports: dict[str, Any] = {}
     for _ in range(args.repeats):
@@ -152,15 +154,18 @@ def speed(args: argparse.Namespace) -> None:
                 for kind in ("rate", "own_rate"):
                     if kind in told:
                         label = name if kind == "rate" else f"{name}, one physics step"
-                        rates.setdefault(label, []).append(told.pop(kind))
+                        rates.setdefault(label, []).append(tuple(told.pop(kind)))
                 reports[name] = told
-    medians = {name: round(statistics.median(values)) for name, values in rates.items()}
+    medians, processor = (
+        {name: round(statistics.median(x[i] for x in values)) for name, values in rates.items()}
+        for i in (0, 1)
+    )
     for name, median in medians.items():
-        print(f"{name:32} {median:14,.0f} control steps/s")
+        print(f"{name:32} {median:14,} control steps/s, {processor[name]:14,} of a processor's")
     write("speed", {
-        "drones": args.drones, "medians": medians, "first_step_s": firsts, "others": reports,
-        "rates": {name: [round(x) for x in values] for name, values in rates.items()},
-        "threads": torch.get_num_threads(),
+        "drones": args.drones, "repeats": args.repeats, "threads": torch.get_num_threads(),
+        "medians": medians, "medians_per_processor_second": processor,
+        "first_step_s": firsts, "others": reports,
     })  # fmt: skip
 
 

@@ -7,7 +7,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from remotes import flying
 from rotorgram.envs import LocalVectorEnv, Loop
+from rotorgram.experiments.settings import CompareConfig
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError, Pose, World, make_world
@@ -241,6 +243,29 @@ def test_seeds_repeat_starts_in_float32() -> None:
     assert first.tobytes() == again.tobytes()
     assert first.tobytes() != other.tobytes()
     assert len({row.tobytes() for row in first}) == 50
+
+
+def test_over_udp_it_flies_as_in_process() -> None:
+    with flying(HOVER, backend="rigid") as pair:
+        pair.remote.connect()
+        local = LocalVectorEnv(HOVER, 1, backend="rigid", autoreset_mode="Disabled")
+        seen = pair.remote.reset(seed=4)[0], local.reset(seed=[4])[0]
+        assert seen[0].tobytes() == seen[1].tobytes()
+        for _ in range(5):
+            actions = np.full((1, 4), 0.1, np.float32)
+            here, there = pair.remote.step(actions[0]), local.step(actions)
+            assert here[0].tobytes() == there[0].tobytes()
+            assert here[1] == there[1][0]
+
+
+def test_runs_train_on_it_and_are_evaluated_on_mujoco() -> None:
+    config = CompareConfig(backend="rigid", seeds=1, agents=("a2c",))
+    (run,) = config.runs()
+    assert run.training_env["backend"] == "rigid"
+    assert "backend" not in config.env
+    assert config.content("a2c")["backend"] == "rigid"
+    with pytest.raises(InputError, match="backend: expected mujoco or rigid or warp, got 'unity'"):
+        CompareConfig(backend="unity")  # type: ignore[arg-type]
 
 
 # --- gradients ------------------------------------------------------------------------------------
