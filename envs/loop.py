@@ -521,6 +521,8 @@ class Loop(NotCopied):
             raise InputError(f"resets, frozen: expected {expected}, got {mask!r:.80}")
         if self._xp is np:
             return mask
+        if isinstance(mask, np.ndarray):
+            mask = np.require(mask, requirements="W")  # that of a datagram is read-only
         return self._xp.asarray(mask, device=self._nobody.device)
 
     def _per_drone(self, values: Array) -> Array:

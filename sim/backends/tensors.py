@@ -80,6 +80,8 @@ class TensorWorld:
         """
         if isinstance(actions, torch.Tensor) and actions.device != self.device:
             raise InputError(f"actions: expected a tensor on {self.device}, got {actions.device}")
+        if isinstance(actions, np.ndarray):
+            actions = np.require(actions, requirements="W")  # those of a datagram are read-only
         try:
             values = torch.as_tensor(actions, device=self.device)
         except (TypeError, ValueError, RuntimeError):
