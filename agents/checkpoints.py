@@ -20,6 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from ..envs.spec import Discrete, EnvSpec
+from ..models import BACKENDS, Backend
 from ..models.errors import InputError, require
 from .episodes import Episode, Position
 from .policies import NetworkPolicy, flat_size
@@ -27,7 +28,7 @@ from .presets import PRESETS, SQUASHED, preset
 
 FORMAT: Final = 3
 _GROUPS: Final = ("policy", "state", "position", "episodes")
-_PLAIN: Final = ("algorithm", "config", "seed", "env_steps", "versions")
+_PLAIN: Final = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
 _POSITION: Final = ("actions", "observations", "numbers", "lengths", "first_steps")
 _COLUMNS: Final[dict[str, type[np.generic]]] = {
     f.name: {int: np.int64, float: np.float64, bool: np.bool_}[f.type]  # type: ignore[index]
@@ -51,6 +52,8 @@ class Checkpoint:
     """Hyperparameters."""
     spec: EnvSpec
     """Of the env: id, options, vehicle and shapes."""
+    backend: Backend = "mujoco"
+    """What stepped the env in training."""
     seed: int
     env_steps: int
     """Env steps that the whole training is to have."""
@@ -157,6 +160,8 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
         _expect(_is_finite(name, array), f"finite numbers in {name}", "NaN or infinity")
         group, _, rest = name.partition("/")
         arrays[group][rest] = array
+    meta.setdefault("backend", BACKENDS[0])
+    _expect(meta["backend"] in BACKENDS, f"one of {BACKENDS}", meta["backend"])
     _expect(meta["algorithm"] in PRESETS, f"one of {sorted(PRESETS)}", meta["algorithm"])
     for name in ("config", "versions", "position"):
         _expect(isinstance(meta[name], dict), f"an object for {name}", meta[name])

@@ -1,10 +1,11 @@
-"""Env steps per second on a GPU (MuJoCo Warp), beside mujoco.batch on the CPU of the same machine.
+"""Env steps per second on a GPU (rigid, MuJoCo Warp), beside mujoco.batch on the CPU beside it.
 
     python benchmarks/gpu.py [--worlds 1024 4096 16384 65536] [--repeats 5] [--out FILE.json]
 
-Both fly the default task with random actions, each made where it is used: on the GPU, or by NumPy.
-They take turns, and medians are compared. Making an env, Warp's compilation among it, is not
-counted; nor is a first, short flight. Without a CUDA device it says so and
+All fly Hover with random actions, each made where it is used: on the GPU, or by NumPy. `rigid` is
+compiled; `rigid world` is its world alone: no controller, observation, reward or reset. They take
+turns, and medians are compared. Making an env and compilation are not counted; nor is a first,
+short flight. Without a CUDA device it says so and
 exits with status 2. `--device cpu` tries the script on Warp's CPU device, and writes nothing
 unless told where.
 """
@@ -25,14 +26,33 @@ import numpy as np
 import torch
 from rotorgram.agents.checkpoints import software_versions
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.models import Vehicle
+from rotorgram.sim import Pose, make_world
 
 OUT = Path("docs/results/performance/gpu.json")
-TASK = "rotorgram/Elevation-v0"
-BACKENDS = ("warp", "mujoco")
+TASK = "rotorgram/Hover-v0"
+BACKENDS = ("rigid world", "rigid", "warp", "mujoco")
 
 
-def on_device(worlds: int, device: str) -> Callable[[], None]:
-    env = LocalVectorEnv(TASK, worlds, backend="warp", device=device)
+def of_rigid_world(worlds: int, device: str) -> Callable[[], None]:
+    vehicle = Vehicle.load()
+    world = make_world(vehicle, worlds, "rigid", device=device, compiled=True)
+    place = torch.zeros((worlds, 1, 3), device=device) + 5.0
+    world.reset(torch.ones((worlds, 1), dtype=torch.bool, device=device), Pose(position=place))
+    thrust = torch.full((worlds, 1, vehicle.num_rotors), 49.0, device=device)
+
+    def fly() -> None:
+        for _ in range(10):
+            world.step(thrust, vehicle.substeps(0.02))
+        if thrust.is_cuda:
+            torch.cuda.synchronize(thrust.device)
+
+    return fly
+
+
+def on_device(backend: Any, worlds: int, device: str) -> Callable[[], None]:
+    given = {"compiled": True} if backend == "rigid" else {}
+    env = LocalVectorEnv(TASK, worlds, backend=backend, device=device, tensors=True, **given)
     env.reset(seed=0)
     actions = torch.empty(env.action_space.shape, device=device)
 
@@ -52,7 +72,7 @@ def on_cpu(worlds: int) -> Callable[[], None]:
 
     def fly() -> None:
         for _ in range(10):
-            env.step(2.0 * dice.random((worlds, 1), np.float32) - 1.0)
+            env.step(2.0 * dice.random((worlds, 4), np.float32) - 1.0)
 
     return fly
 
@@ -67,7 +87,12 @@ def rate(fly: Callable[[], None], worlds: int, seconds: float) -> float:
 
 
 def measure(worlds: int, args: argparse.Namespace) -> dict[str, Any]:
-    flown = {"warp": on_device(worlds, args.device), "mujoco": on_cpu(worlds)}
+    flown = {
+        "rigid world": of_rigid_world(worlds, args.device),
+        "rigid": on_device("rigid", worlds, args.device),
+        "warp": on_device("warp", worlds, args.device),
+        "mujoco": on_cpu(worlds),
+    }
     for fly in flown.values():
         rate(fly, worlds, args.seconds / 10)
     rates: dict[str, list[float]] = {backend: [] for backend in BACKENDS}
@@ -76,7 +101,7 @@ def measure(worlds: int, args: argparse.Namespace) -> dict[str, Any]:
             rates[backend].append(round(rate(flown[backend], worlds, args.seconds)))
     medians = {backend: statistics.median(values) for backend, values in rates.items()}
     for backend, median in medians.items():
-        print(f"{worlds:7,} worlds  {backend:8} {median:14,.0f} env steps/s", flush=True)
+        print(f"{worlds:7,} worlds  {backend:12} {median:14,.0f} env steps/s", flush=True)
     return {"worlds": worlds, "rates": rates, "medians": medians}
 
 

@@ -146,7 +146,7 @@ def measure_runs(env_steps, rounds):
             stack.callback(cluster.wait)
             stack.callback(cluster.stdin.close)
             address = next(x for x in cluster.stdout if x.startswith("at ")).split()[1]
-            ways["two, Ray"] = replace(config, jobs=2, backend="ray", address=address)
+            ways["two, Ray"] = replace(config, jobs=2, runner="ray", address=address)
         seconds = {name: [] for name in ways}
         for number in range(rounds):
             for name, way in ways.items():

@@ -10,6 +10,7 @@ from ..envs.registry import env_spec, is_known
 from ..envs.spec import EnvSpec
 from ..experiments.pairs import socket_pair
 from ..experiments.trajectories import Trajectory
+from ..models import Backend
 from ..models.errors import expect
 from ..udp import RemoteEnv, RemoteVectorEnv
 from ._flags import AgentFlags, EnvFlags, parse_address
@@ -102,9 +103,10 @@ def remote_env(
     required: bool = True,
     num_envs: int | None = 1,
     num_simulators: int = 1,
+    backend: Backend = "mujoco",
 ) -> Iterator[Any]:
-    """A remote env with a simulator of its own, or those that come to `command.listen`; at the end
-    the counters of the wire are printed.
+    """A remote env with a simulator of its own, on a backend, or those that come to
+    `command.listen`; at the end the counters of the wire are printed.
 
     One drone is a `RemoteEnv`, more are a `RemoteVectorEnv` without autoreset; None are as many as
     the first simulator has, in a `RemoteVectorEnv`. Where it is `required`, simulators that come
@@ -112,6 +114,8 @@ def remote_env(
     first that comes decides. Raises `InputError` for flags that contradict each other.
     """
     if command.listen is not None:
+        theirs = "it of the simulator that comes: rotorgram sim --backend"
+        expect("backend" not in command.given, "backend", theirs)
         settings = {"env_id": env_id, "options": options or None} if required else {}
         opened = _waiting(command, command.listen, num_envs, num_simulators, **settings)
     else:
@@ -122,8 +126,9 @@ def remote_env(
         reason = "the task is not known here without the module that registers it"
         expect(is_known(env_id), "env", f"--env MODULE:{env_id}, for {reason}")
         opened = socket_pair(
-            env_id, options, num_envs=num_envs or 1, vehicle=command.vehicle, record=command.record
-        )
+            env_id, options, num_envs=num_envs or 1, vehicle=command.vehicle, backend=backend,
+            record=command.record,
+        )  # fmt: skip
     with opened as env:
         try:
             yield env

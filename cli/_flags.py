@@ -15,6 +15,7 @@ import tyro
 from tyro.conf import Fixed, Suppress, arg
 
 from ..experiments.folders import new_folder
+from ..models import Backend
 from ..models.errors import InputError, expect
 
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
@@ -64,6 +65,14 @@ class EnvFlags(Command):
     def env_id(self) -> str:
         """The task without its module."""
         return self.env.rpartition(":")[2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackendFlags(EnvFlags):
+    """A command that chooses what steps the drones."""
+
+    backend: Backend = "mujoco"
+    """What steps the drones: mujoco, rigid (without contact, fast) or warp (for a GPU)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Final
 from tyro.conf import arg
 
 from ..experiments.settings import RunsConfig
-from ._flags import EnvFlags, folder_to_write, go_on_with
+from ._flags import BackendFlags, folder_to_write, go_on_with
 
 if TYPE_CHECKING:
     from ..experiments.workers import OnProgress
 
-RESUMED: Final = ("jobs", "backend", "address", "resume", "env")
+RESUMED: Final = ("jobs", "runner", "address", "resume", "env")
 """Flags that a resumed command may be given: they change no number. `--env` imports the module of a
 task."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunsFlags(RunsConfig, EnvFlags):
+class RunsFlags(RunsConfig, BackendFlags):
     """A command of many runs, on the cores of this machine or on many machines."""
 
     out: Path | None = None
@@ -51,7 +51,7 @@ def runs_folder(name: str, command: RunsFlags) -> "Iterator[tuple[Path, OnProgre
                 yield folder, progress
         except BaseException:
             if any(folder.iterdir()):
-                print(go_on_with(command, name, folder, "env", "backend", "address"))
+                print(go_on_with(command, name, folder, "env", "runner", "address"))
             raise
 
 

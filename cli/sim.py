@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ._flags import EnvFlags, parse_address
+from ._flags import BackendFlags, parse_address
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sim(EnvFlags):
+class Sim(BackendFlags):
     """Simulate drones for an agent: the UDP client.
 
     Waits for the agent, flies by its commands and ends when it closes. An agent that is killed and
@@ -53,6 +53,7 @@ class Sim(EnvFlags):
             bind=parse_address(self.bind),
             codec=self.codec,
             vehicle=self.vehicle,
+            backend=self.backend,
             config=LinkConfig(timeout=self.timeout),
             key_file=self.key_file,
             insecure=self.insecure,

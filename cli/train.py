@@ -20,7 +20,14 @@ from ..agents.presets import PPOConfig, PresetName, SACConfig, find_preset
 from ..experiments.folders import locked
 from ..experiments.settings import Run
 from ..models.errors import expect, require
-from ._flags import AgentFlags, folder_to_write, go_on_with, parse_value, refuse_settings
+from ._flags import (
+    AgentFlags,
+    BackendFlags,
+    folder_to_write,
+    go_on_with,
+    parse_value,
+    refuse_settings,
+)
 
 if TYPE_CHECKING:
     from ..experiments.training import Training
@@ -35,7 +42,7 @@ _LEAST_UPDATES: Final = 30  # of VPG
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(AgentFlags):
+class Train(AgentFlags, BackendFlags):
     """Train an agent: the UDP server.
 
     Starts a simulator process of its own, or waits for one with --listen. Ctrl-C stops at the next
@@ -89,7 +96,7 @@ class Train(AgentFlags):
         with (
             folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
             remote_env(self, self.env_id, self.options, required=required, num_envs=run.num_envs,
-                       num_simulators=self.num_simulators) as env,
+                       num_simulators=self.num_simulators, backend=run.backend) as env,
             locked(folder),
         ):  # fmt: skip
             spec = env.env_spec  # of the simulator that came
@@ -119,7 +126,8 @@ class Train(AgentFlags):
             for name, (then, now) in kept.other_versions().items():
                 print(f"note: {name} was {then} and is {now}: the numbers may differ", flush=True)
             with remote_env(self, kept.env_id, kept.options, required=True, num_envs=kept.num_envs,
-                            num_simulators=self.num_simulators) as env:  # fmt: skip
+                            num_simulators=self.num_simulators,
+                            backend=kept.backend) as env:  # fmt: skip
                 return self._train(Training.resume(kept, env), folder)
 
     def _train(self, training: "Training", folder: Path) -> int:

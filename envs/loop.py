@@ -162,7 +162,7 @@ class Loop(NotCopied):
     """N drones of one env, each in a world of its own.
 
     The vehicle is a file, None the paper's; options are the task's, by name; settings the
-    backend's: `num_threads`, or `device`.
+    backend's: see `sim.make_world`.
 
     Attributes:
         task, world: Their arrays have the leading axes of the world; all others here have one axis
@@ -521,6 +521,8 @@ class Loop(NotCopied):
             raise InputError(f"resets, frozen: expected {expected}, got {mask!r:.80}")
         if self._xp is np:
             return mask
+        if isinstance(mask, np.ndarray):
+            mask = np.require(mask, requirements="W")  # that of a datagram is read-only
         return self._xp.asarray(mask, device=self._nobody.device)
 
     def _per_drone(self, values: Array) -> Array:
@@ -546,11 +548,11 @@ class OnHost:
 
     def _take(self) -> None:
         loop = self.loop
-        dtypes = {array.name: array.dtype for array in self.spec.observation}
-        self.observations = {
-            name: on_host(values).astype(dtypes[name]) for name, values in loop.observations.items()
+        self.observations = {  # copies already, of the declared types
+            name: np.ascontiguousarray(values.detach().cpu().numpy())
+            for name, values in loop.observations.items()
         }
-        self.rewards = on_host(loop.rewards).astype(np.float64)
+        self.rewards = on_host(loop.rewards)
         self.terminated, self.truncated = on_host(loop.terminated), on_host(loop.truncated)
         self.done = on_host(loop.done)
 

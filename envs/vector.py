@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from ..models.errors import InputError, NotCopied
+from ..models.errors import InputError, NotCopied, expect
 from ..sim import Backend, on_host
 from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
-from .loop import Loop
+from .loop import Loop, OnHost
 from .rendering import RENDER_MODES, Renderer
 from .spaces import joined
 
@@ -26,9 +26,10 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
     gives reward 0. With SAME_STEP the observation is that of the next episode, and `info` has
     `final_obs` and `final_info` where one ended. With DISABLED a reset with a mask begins the next.
 
-    With the backend `warp` a step gives torch tensors on the world's device; it accepts tensors
-    or NumPy arrays. `info` then holds the metrics and the terms of the reward alone:
-    `telemetry` copies the rest to the host on access.
+    A step gives NumPy arrays, whatever the backend. With `tensors`, those of `rigid` and `warp` are
+    torch tensors on the world's device, and nothing is copied: `info` then holds the metrics and
+    the terms of the reward alone, and `telemetry` copies the rest to the host on access. Actions
+    may be of either kind.
 
     Args:
         env_id: Of a registered task.
@@ -36,9 +37,12 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         render_mode: None, `rgb_array` (N pictures) or `human` (a window shows sixteen of them).
         autoreset_mode: `AutoresetMode`, or its value.
         vehicle: As of `Vehicle.load`: a file or a name; None is the paper's.
-        backend: `mujoco`, or `warp`.
+        backend: `mujoco`, `rigid` or `warp`.
         num_threads: Threads that step `mujoco`; 0 takes one for each processor.
-        device: Of `warp`; None takes a GPU if there is one.
+        device: Of `rigid` and `warp`; None takes a GPU if there is one.
+        dtype: Of `rigid`: `float32`, or `float64`.
+        compiled: Of `rigid`: whether torch compiles it.
+        tensors: Give torch tensors, with `rigid` and `warp`.
         options: Of the task, by name.
 
     Raises:
@@ -60,10 +64,17 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         backend: Backend = "mujoco",
         num_threads: int | None = None,
         device: str | None = None,
+        dtype: str | None = None,
+        compiled: bool | None = None,
+        tensors: bool = False,
         **options: Any,
     ) -> None:
         self.closed = True  # nothing is open yet
-        settings: dict[str, Any] = {"num_threads": num_threads, "device": device}
+        settings: dict[str, Any] = {
+            "num_threads": num_threads, "device": device, "dtype": dtype, "compiled": compiled
+        }  # fmt: skip
+        right = not tensors or backend != "mujoco"
+        expect(right, "tensors", "False with the backend mujoco", repr(tensors))
         given = {name: value for name, value in settings.items() if value is not None}
         self._loop = loop = Loop(
             env_id, num_envs, vehicle=vehicle, backend=backend, options=options, **given
@@ -71,8 +82,9 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
-        self._on_device = not isinstance(loop.done, np.ndarray)
-        self._nobody = self.lost = self.done = loop.done
+        self._on_device = tensors
+        self._flown = OnHost(loop) if backend != "mujoco" and not tensors else loop
+        self._nobody = self.lost = self.done = self._flown.done
         self._episodes = np.zeros(num_envs, int)
         self.closed = False
 
@@ -115,7 +127,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         chosen: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """As `AdvancingVectorEnv.advance`; `chosen` as of `Loop.advance`."""
-        loop = self._loop
+        loop = self._flown
         loop.advance(actions, resets, seeds, frozen, chosen)
         self.observations = joined(loop.spec, loop.observations)
         self.rewards, self.terminated = loop.rewards, loop.terminated
@@ -144,6 +156,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         loop = self._loop
         told = {f"reward_{name}": term for name, term in loop.reward_terms.items()}
         if not self._on_device:
+            told = {name: on_host(term) for name, term in told.items()}
             return super()._info(mask) | told | {f"_{name}": mask for name in told}
         told, which = loop.metrics | told, loop.ours(mask)
         return told | {f"_{name}": which for name in told}

@@ -96,7 +96,7 @@ def _fly(config: CompareConfig, run: Run | None, tell: Tell) -> _Done:
     """Train and evaluate (in a worker process)."""
     if run is None:
         return _evaluate("pid", 0, config)
-    with shared_pair(**run.env, num_envs=run.num_envs) as env:
+    with shared_pair(**run.training_env, num_envs=run.num_envs) as env:
         training, times = train_run(run, env, tell, config.snapshots, keep_steps=True)
         checkpoint, log = training.checkpoint(), training.log
     evaluated = _evaluate(run.algorithm, run.seed, config, training.taken)

@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, Final
 
+from ..models import Backend
 from ..udp import PeerClosed, PeerSilent, RemoteEnv, RemoteVectorEnv
 from .settings import EnvConfig
 
@@ -27,11 +28,13 @@ def socket_pair(
     *,
     num_envs: int = 1,
     vehicle: str | Path | None = None,
+    backend: Backend = "mujoco",
     record: Path | None = None,
 ) -> Iterator[Any]:
     """A connected remote env, on free ports of the loopback interface: of a task that is registered
-    here, with a vehicle by file or name, or the paper's. One drone makes a `RemoteEnv`, more make
-    a `RemoteVectorEnv` without autoreset. `record` is the MCAP file of the agent's journal.
+    here, with a vehicle by file or name, or the paper's, on a backend. One drone makes a
+    `RemoteEnv`, more make a `RemoteVectorEnv` without autoreset. `record` is the MCAP file of the
+    agent's journal.
 
     The simulator ends with this process, however this one ends.
 
@@ -40,7 +43,7 @@ def socket_pair(
         PeerSilent: The simulator runs and does not answer.
     """
     file = None if vehicle is None else str(vehicle)
-    config = EnvConfig(env_id=env_id, options=options or {}, vehicle=file)
+    config = EnvConfig(env_id=env_id, options=options or {}, vehicle=file, backend=backend)
     settings: dict[str, Any] = {
         "env_id": env_id, "options": config.options, "connect": False, "connect_timeout": _POLL,
         "timeout": _ANSWER_TIMEOUT, "record": record,
@@ -52,7 +55,7 @@ def socket_pair(
     else:
         env = RemoteVectorEnv(here, num_envs=num_envs, autoreset_mode="Disabled", **settings)
     arguments = {"server": env.address, "bind": here, "num_envs": num_envs, "env": env_id}
-    arguments |= {"vehicle": file, "options": config.options}
+    arguments |= {"vehicle": file, "backend": backend, "options": config.options}
     arguments |= {"module": config.module} if config.module else {}
     # -P: no folder of the working directory stands for the package.
     command = [sys.executable, "-P", "-m", "rotorgram.udp", json.dumps(arguments)]

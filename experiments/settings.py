@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from ..agents.presets import A2CConfig, Config, PresetName, SACConfig, preset
 from ..envs.registry import env_spec, is_known, options_type, task_type
+from ..models import BACKENDS, Backend
 from ..models.errors import expect
 
 
@@ -24,8 +25,11 @@ class EnvConfig:
     """Options of the env by name. Those that are not given have their defaults."""
     vehicle: str | None = None
     """File or name of the vehicle; None: the paper's."""
+    backend: Backend = "mujoco"
+    """What steps it in training. A trained policy is always evaluated on `mujoco`."""
 
     def __post_init__(self) -> None:
+        expect(self.backend in BACKENDS, "backend", " or ".join(BACKENDS), repr(self.backend))
         options: dict[str, Any] = dict(self.options)
         if is_known(self.env_id):
             options = options_type(self.env_id).from_options(options).to_options()
@@ -33,8 +37,13 @@ class EnvConfig:
 
     @property
     def env(self) -> dict[str, Any]:
-        """Keyword arguments of `EnvConfig` and `pairs.socket_pair`."""
+        """Keyword arguments of `EnvConfig` and `pairs.socket_pair`, on `mujoco`."""
         return {"env_id": self.env_id, "options": self.options, "vehicle": self.vehicle}
+
+    @property
+    def training_env(self) -> dict[str, Any]:
+        """The same on the backend of the training."""
+        return self.env | {"backend": self.backend}
 
     @property
     def module(self) -> str | None:
@@ -73,7 +82,7 @@ class WorkersConfig:
 
     jobs: int | None = None
     """Runs at a time. Default: one for each core of this machine, or of the cluster."""
-    backend: Literal["loky", "ray"] = "loky"
+    runner: Literal["loky", "ray"] = "loky"
     """loky: processes of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
     address: str | None = None
     """The cluster's: `ray://HOST:PORT` of its client server from anywhere, `HOST:PORT` or None on
@@ -81,8 +90,8 @@ class WorkersConfig:
 
     def __post_init__(self) -> None:
         expect(self.jobs is None or self.jobs >= 1, "jobs", "at least 1", str(self.jobs))
-        right = self.address is None or self.backend == "ray"
-        expect(right, "address", "it with backend ray", f"it with {self.backend}")
+        right = self.address is None or self.runner == "ray"
+        expect(right, "address", "it with runner ray", f"it with {self.runner}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +136,8 @@ class _ManyRuns(RunsConfig, EnvConfig):
 
     def content(self, *algorithms: str) -> dict[str, Any]:
         """What `config.json` has of it, but for the env; `read_content` reads it."""
-        content = {name: getattr(self, name) for name in ("preset", "env_steps", "num_envs")}
+        names = ("preset", "env_steps", "num_envs", "backend")
+        content = {name: getattr(self, name) for name in names}
         agents = {name: asdict(preset(name, self.preset, self.env_id)) for name in algorithms}
         return {**content, "seeds": list(self.all_seeds), "agents": agents}
 
@@ -137,10 +147,11 @@ class _ManyRuns(RunsConfig, EnvConfig):
         seeds, spec = content["seeds"], content["spec"]
         kept = {name: content[name] for name in ("preset", "env_steps", "num_envs", "vehicle")}
         kept |= {name: spec[name] for name in ("env_id", "options")}
+        kept["backend"] = content.get("backend", "mujoco")
         return kept | {"seeds": len(seeds), "first_seed": seeds[0]}
 
     def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:
-        shared = {"env_steps": self.env_steps, "num_envs": self.num_envs, **self.env}
+        shared = {"env_steps": self.env_steps, "num_envs": self.num_envs, **self.training_env}
         config = preset(algorithm, self.preset, self.env_id, **changes)
         return Run(algorithm=algorithm, config=config, seed=seed, **shared)
 

@@ -83,7 +83,7 @@ def missing_runs(config: SweepConfig, rows: pd.DataFrame) -> dict[str, Job]:
 def _fly(config: SweepConfig, job: Job, tell: Tell) -> dict[str, Any]:
     """Train and evaluate (in a worker process); the row of the run."""
     point, run = job
-    with shared_pair(**run.env, num_envs=run.num_envs) as env:
+    with shared_pair(**run.training_env, num_envs=run.num_envs) as env:
         training, times = train_run(run, env, tell)
     policy = training.agent.policy()
     with evaluation_pair(config, config.episodes) as env:

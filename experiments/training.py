@@ -69,7 +69,7 @@ class Training:
     def resume(cls, kept: Checkpoint, env: AnyEnv) -> "Training":
         """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
         try:
-            names = ("algorithm", "env_id", "options", "seed", "env_steps", "num_envs")
+            names = ("algorithm", "env_id", "options", "backend", "seed", "env_steps", "num_envs")
             config = agents.preset(kept.algorithm, "tuned", **kept.config)
             run = Run(config=config, **{name: getattr(kept, name) for name in names})
         except (InputError, TypeError, ValueError) as error:
@@ -136,6 +136,7 @@ class Training:
             algorithm=self.run.algorithm,
             config=asdict(self.run.config),
             spec=self.log.spec,
+            backend=self.run.backend,
             seed=self.run.seed,
             env_steps=self.run.env_steps,
             actor=self.agent.actor(),

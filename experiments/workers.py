@@ -113,7 +113,7 @@ def open_workers(config: WorkersConfig, on_progress: OnProgress) -> Iterator[Wor
     """Workers, to the end of the block; told is how far the jobs of this machine are, and which are
     done. Raises `InputError` if there is no such Ray cluster.
     """
-    here = config.backend == "loky"
+    here = config.runner == "loky"
     with (_loky if here else _ray)(config) as do, _listening(on_progress) as (home, tell):
         yield Workers(do, home, tell, os.getpid() if here else None)
 
@@ -195,7 +195,7 @@ def _loky(config: WorkersConfig) -> Iterator[_Do]:
 @contextmanager
 def _ray(config: WorkersConfig) -> Iterator[_Do]:
     """Connect to the cluster. Raises `InputError`."""
-    ray: Any = require("ray", "ray", "the backend ray")
+    ray: Any = require("ray", "ray", "the runner ray")
     address = config.address or "auto"
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:

@@ -6,7 +6,7 @@ on first use.
 
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from .errors import InputError, MissingPackage
 
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from .vehicle import Rotor, Vehicle
 
 __all__ = [
-    "AIRPORT_XML", "MOST_DRAG", "QUAD_XML", "SCENE_XML", "InputError", "MissingPackage",
-    "Rotor", "Vehicle", "attach_airport", "build_scene",
+    "AIRPORT_XML", "BACKENDS", "MOST_DRAG", "QUAD_XML", "SCENE_XML", "Backend", "InputError",
+    "MissingPackage", "Rotor", "Vehicle", "attach_airport", "build_scene",
 ]  # fmt: skip
 
 QUAD_XML: Final = Path(__file__).parent / "quad.xml"
@@ -25,6 +25,10 @@ SCENE_XML: Final = Path(__file__).parent / "scene.xml"
 """Ground, sky and light, which `build_scene` puts around a vehicle."""
 AIRPORT_XML: Final = Path(__file__).parent / "airport.xml"
 """The airport that `attach_airport` adds around a scene. It is visual only."""
+Backend = Literal["mujoco", "rigid", "warp"]
+"""What steps vehicles. `mujoco`: threads of this machine, float64. `rigid`: the rigid body in
+torch, no contact. `warp`: MuJoCo Warp, float32. The last two take a GPU if there is one."""
+BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
 MOST_DRAG: Final = 100.0
 """Largest linear drag, 1/s. RK4 at 10 ms is within 0.1 % there, and unstable above 278 /s."""
 

@@ -3,6 +3,7 @@
 Knows nothing of tasks, rewards or Gymnasium.
 """
 
+from ..models import BACKENDS, Backend
 from .control import LEVELS, CollectiveThrust, Controller, RotorThrust, make_controller
 from .effects import EffectOptions
 from .random import Draw
@@ -21,7 +22,7 @@ from .state import (
     square_root,
     stack,
 )  # fmt: skip
-from .world import BACKENDS, Backend, PhysicsError, World, make_world
+from .world import PhysicsError, World, make_world
 
 __all__ = [
     "BACKENDS", "LEVELS", "PARAMETERS", "Array", "Backend", "CollectiveThrust", "Controller",

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
+from ..models import BACKENDS, Backend
 from ..models.errors import InputError, expect, require
 from .effects import EffectOptions
 from .random import Draw, Noise
@@ -15,14 +16,17 @@ if TYPE_CHECKING:
 
     from ..models.vehicle import Vehicle
 
-Backend = Literal["mujoco", "warp"]
-"""`mujoco`: threads of this machine, float64. `warp`: MuJoCo Warp, float32, a GPU if there is
-one."""
-BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
-
-_WORLDS: Final = {"mujoco": "MujocoWorld", "warp": "WarpWorld"}
-_PACKAGES: Final = {"mujoco": (), "warp": ("torch", "warp", "mujoco_warp")}
-_SETTINGS: Final = {"mujoco": "num_threads", "warp": "device"}
+_WORLDS: Final = {"mujoco": "MujocoWorld", "rigid": "RigidWorld", "warp": "WarpWorld"}
+_PACKAGES: Final = {  # and the extra that has them
+    "mujoco": ("", ()),
+    "rigid": ("train", ("torch",)),
+    "warp": ("gpu", ("torch", "warp", "mujoco_warp")),
+}
+_SETTINGS: Final = {
+    "mujoco": ("num_threads",),
+    "rigid": ("device", "dtype", "compiled"),
+    "warp": ("device",),
+}
 
 MAX_WORLDS: Final = 1 << 16  # Most worlds of a batch
 CONTACT_CHECK: Final = 0.02
@@ -122,7 +126,8 @@ def make_world(
     randomize: Randomization | None = None,
     **settings: Any,
 ) -> World:
-    """W worlds of one drone each; the backend's setting is `num_threads`, or `device`.
+    """W worlds of one drone each; settings are `num_threads` of `mujoco`, `device` of the others,
+    `dtype` and `compiled` of `rigid`.
 
     Raises:
         InputError: The backend, the number or a setting is not what it should be.
@@ -133,13 +138,16 @@ def make_world(
     if type(num_worlds) is not int or not 1 <= num_worlds <= MAX_WORLDS:
         raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
     for name, value in settings.items():
-        if name != _SETTINGS[backend]:
+        known = _SETTINGS[backend]
+        if name not in known:
+            plural = "s" if len(known) > 1 else ""
             raise InputError(
-                f"{name}: expected {_SETTINGS[backend]}, the setting of the backend {backend}, "
-                f"got {name}={value!r}"
+                f"{name}: expected {' or '.join(known)}, the setting{plural} of the backend "
+                f"{backend}, got {name}={value!r}"
             )
-    for package in _PACKAGES[backend]:
-        require(package, "gpu", f"the backend {backend}")
+    extra, packages = _PACKAGES[backend]
+    for package in packages:
+        require(package, extra, f"the backend {backend}")
     module = import_module(f".backends.{backend}", __package__)
     world: World = getattr(module, _WORLDS[backend])(
         vehicle, num_worlds, effects=effects, randomize=randomize, **settings

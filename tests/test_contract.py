@@ -1,7 +1,8 @@
-"""The contract of every vehicle in every task: alone, in a batch, over UDP, on either backend.
+"""The contract of every vehicle in every task: alone, in a batch, over UDP, on every backend.
 
 What a task or a backend promises beyond this has tests of its own: test_env.py, test_vector.py,
-test_remote.py, test_warp.py. Here the vehicles vary: those of the tests, and those of the library.
+test_remote.py, test_rigid.py, test_warp.py. Here the vehicles vary: those of the tests, and those
+of the library.
 """
 
 from collections.abc import Iterator
@@ -158,14 +159,20 @@ def _connected(remote: Any) -> Any:
     return remote
 
 
+@pytest.mark.parametrize("backend", ["rigid", "warp"])
 @pytest.mark.parametrize("env_id", TASKS)
 @pytest.mark.parametrize("name", FILES)
-def test_on_warp(env_id: str, name: str) -> None:
-    """The contract of a batch of tensors; that it flies as `mujoco` does, test_warp.py tests."""
+def test_on_tensors(env_id: str, name: str, backend: str) -> None:
+    """The contract of a batch of tensors; that it flies as `mujoco` does, others test."""
     torch = pytest.importorskip("torch")
-    pytest.importorskip("warp").config.log_level = 30
-    pytest.importorskip("mujoco_warp")
-    options = options_of(FILES[name]) | {"backend": "warp", "device": "cpu"}
+    options = options_of(FILES[name]) | {"backend": backend, "device": "cpu", "tensors": True}
+    if backend == "warp":
+        pytest.importorskip("warp").config.log_level = 30
+        pytest.importorskip("mujoco_warp")
+    else:  # it has no cable
+        effects = options["effects"].items()
+        kept = {one: value for one, value in effects if one not in ("payload", "cable")}
+        options["effects"] = kept
     env = gym.make_vec(env_id, num_envs=N, autoreset_mode="Disabled", **options)
     flights = []
     for _ in range(2):

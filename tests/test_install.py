@@ -77,7 +77,7 @@ def test_every_package_is_listed() -> None:
         ("dataset", ["dataset", "FILE", "--to", "parquet", "--out", "a"], "'rotorgram[record]'"),
         ("render", ["render", "random", "--out", "a.mp4"], "pip install 'rotorgram[render]'"),
         ("report", ["compare", "--seeds", "1"], "pip install 'rotorgram[report]'"),
-        ("ray", ["compare", "--backend", "ray"], "pip install 'rotorgram[ray]'"),
+        ("ray", ["compare", "--runner", "ray"], "pip install 'rotorgram[ray]'"),
     ],
 )  # fmt: skip
 def test_a_missing_package_is_one_sentence(

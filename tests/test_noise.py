@@ -105,7 +105,7 @@ def test_a_world_seeds_its_noises_and_its_starts_stay(worlds: int) -> None:
 def test_on_a_device_of_torch() -> None:
     torch = pytest.importorskip("torch")
     pytest.importorskip("mujoco_warp")
-    from rotorgram.sim.backends.warp import TorchNoise
+    from rotorgram.sim.backends.tensors import TorchNoise
 
     noise, other = (TorchNoise((4, 1, 3), use, torch.device("cpu")) for use in (USE, 1))
     drawn = []

@@ -133,7 +133,7 @@ def test_it_flies_on_tensors(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mujoco_warp")
     monkeypatch.syspath_prepend(LANDING.parent)
     options: dict[str, Any] = {"num_envs": 3, "autoreset_mode": "Disabled", "start": 2.0}
-    env = gym.make_vec(registry.load(ID), backend="warp", device="cpu", **options)
+    env = gym.make_vec(registry.load(ID), backend="warp", device="cpu", tensors=True, **options)
     env.reset(seed=0)
     for _ in range(25):
         observations, _, terminated, _, info = env.step(np.full((3, 1), -0.5, np.float32))

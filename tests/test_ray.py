@@ -67,7 +67,7 @@ def address() -> Iterator[str]:
 def test_the_numbers_are_those_of_this_machine(tmp_path: Path, address: str) -> None:
     shown = []
     on_ray, here = (new_folder(tmp_path / name, "compare") for name in ("ray", "here"))
-    config = replace(CONFIG, backend="ray", address=address)
+    config = replace(CONFIG, runner="ray", address=address)
     compare(config, on_ray, "", lambda name, done, total, words: shown.append((name, words)))
     compare(CONFIG, here, "", nothing)
     assert {("a2c seed 0", "done"), ("pid", "done")} <= {*shown}
@@ -95,8 +95,8 @@ def test_a_sweep_gives_the_rows_of_this_machine(tmp_path: Path, address: str) ->
         options={"episode_length": 50},
     )  # fmt: skip
     tables = []
-    for where in (config, replace(config, backend="ray", address=address)):
-        folder = new_folder(tmp_path / where.backend, "sweep")
+    for where in (config, replace(config, runner="ray", address=address)):
+        folder = new_folder(tmp_path / where.runner, "sweep")
         sweep(where, folder, "", nothing)
         rows = read_sweep_runs(folder, config).sort_values("point").reset_index(drop=True)
         tables.append(rows.drop(columns=TIMES))
@@ -109,7 +109,7 @@ def test_every_node_flies(address: str) -> None:
         time.sleep(0.5)
         return job, ray.get_runtime_context().get_node_id()
 
-    config = WorkersConfig(backend="ray", address=address)
+    config = WorkersConfig(runner="ray", address=address)
     with open_workers(config, nothing) as workers:
         results = list(workers.fly(node, {f"job {n}": n for n in range(4)}))
     assert sorted((result.name, result.value[0]) for result in results) == [
@@ -123,7 +123,7 @@ def test_a_worker_with_other_software_is_refused(
 ) -> None:
     here = software_versions()
     monkeypatch.setattr(module, "software_versions", lambda: {**here, "numpy": "0.1"})
-    config = replace(CONFIG, backend="ray", address=address)
+    config = replace(CONFIG, runner="ray", address=address)
     sentence = f"numpy: expected version 0.1 .*, got {here['numpy']} on {socket.gethostname()}"
     with pytest.raises(RunsFailed, match=f"2 of 2 runs failed: .*{sentence}"):
         compare(config, tmp_path, "", nothing)
@@ -131,7 +131,7 @@ def test_a_worker_with_other_software_is_refused(
 
 def test_ctrl_c_ends_workers_and_simulators(tmp_path: Path, address: str) -> None:
     folder = tmp_path / "out"
-    where = ["--backend", "ray", "--address", address]
+    where = ["--runner", "ray", "--address", address]
     settings = ["--agents", "a2c", "--seeds", "2", "--env-steps", "1000000", "--out", str(folder)]
     before = set(_simulators())  # of workers that other tests have used
     process = subprocess.Popen(
@@ -177,16 +177,16 @@ def test_no_such_cluster(tmp_path: Path) -> None:
         address = f"127.0.0.1:{sock.getsockname()[1]}"
         sentence = f"address: expected a Ray cluster at {address}, got: Connection refused"
         with pytest.raises(ValueError, match=sentence):
-            compare(replace(CONFIG, backend="ray", address=address), tmp_path, "", nothing)
+            compare(replace(CONFIG, runner="ray", address=address), tmp_path, "", nothing)
     assert not list(tmp_path.iterdir())
 
 
 def test_no_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ImportError, match=r"pip install 'rotorgram\[ray\]'"):
-        compare(replace(CONFIG, backend="ray"), tmp_path, "", nothing)
+        compare(replace(CONFIG, runner="ray"), tmp_path, "", nothing)
 
 
 def test_an_address_is_of_a_cluster() -> None:
-    with pytest.raises(ValueError, match="address: expected it with backend ray"):
+    with pytest.raises(ValueError, match="address: expected it with runner ray"):
         replace(CONFIG, address="auto")

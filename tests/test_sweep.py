@@ -323,7 +323,7 @@ def test_the_grid_is_read_by_name() -> None:
         (["--grid", "gamma=0.9", "--env-steps", "9"], "env_steps: expected at least 256, got 9"),
         (["--grid", "gamma=0.9", "--num-envs", "0"], "num_envs: expected 1 or more, got 0"),
         (["--grid", "gamma=0.9", "--jobs", "0"], "jobs: expected at least 1, got 0"),
-        (["--grid", "gamma=0.9", "--address", "a:1"], "address: expected it with backend ray"),
+        (["--grid", "gamma=0.9", "--address", "a:1"], "address: expected it with runner ray"),
         (["--grid", "gamma=0.9", "--env.target", "1"], "target: expected"),
         (["--grid", "gamma=0.9", "--out", "."], "exists already"),
         (["--resume", "nowhere"], "config.json is missing"),

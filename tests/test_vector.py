@@ -180,7 +180,7 @@ def test_wrong_seeds(seed: Any) -> None:
         ({"num_envs": 10**9}, "num_envs: expected 1 to 65536, got 1000000000"),
         ({"num_threads": -1}, "num_threads: expected 0 or more, got -1"),
         ({"device": "cuda"}, "device: expected num_threads, the setting of the backend mujoco"),
-        ({"backend": "bullet"}, "backend: expected mujoco or warp, got 'bullet'"),
+        ({"backend": "bullet"}, "backend: expected mujoco or rigid or warp, got 'bullet'"),
         ({"autoreset_mode": "never"}, "autoreset_mode: expected 'NextStep' or 'SameStep'"),
         ({"render_mode": "ansi"}, "render_mode: expected None, 'human' or 'rgb_array', got 'ansi'"),
         ({"speed": 1}, "options: expected some of episode_length"),

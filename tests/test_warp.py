@@ -36,7 +36,8 @@ def quiet() -> None:
 
 
 def env_of(env_id: str = ELEVATION, num_envs: int = N, **options: Any) -> LocalVectorEnv:
-    env = gym.make_vec(env_id, num_envs=num_envs, backend="warp", device="cpu", **options)
+    options |= {"backend": "warp", "device": "cpu", "tensors": True}
+    env = gym.make_vec(env_id, num_envs=num_envs, **options)
     assert isinstance(env, LocalVectorEnv)
     return env
 
@@ -382,7 +383,7 @@ def test_without_the_package_one_sentence_tells_what_to_install(
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 def test_a_gpu_flies_as_the_cpu_does() -> None:
-    ours = gym.make_vec(ELEVATION, num_envs=N, backend="warp", device="cuda")
+    ours = gym.make_vec(ELEVATION, num_envs=N, backend="warp", device="cuda", tensors=True)
     theirs = env_of()
     for env in (ours, theirs):
         env.reset(seed=0, options={"start": np.linspace(4.0, 6.0, N)})

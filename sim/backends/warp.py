@@ -1,10 +1,8 @@
 """MuJoCo Warp, float32, on a GPU or on the CPU; torch tensors share the simulator's memory."""
 
 import copy
-from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-import array_api_compat.torch as torch_api
 import mujoco
 import mujoco_warp
 import numpy as np
@@ -15,11 +13,11 @@ from torch.utils.dlpack import from_dlpack
 from ...models.errors import InputError
 from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
 from ..effects import EffectOptions, Effects
-from ..random import RANDOMIZATION, START, Draw, Noise
 from ..randomize import Randomization
 from ..rotations import body_z
 from ..state import Array, Pose, WorldState, constant
 from ..world import PhysicsError, check_hung, contact_check, flown_model
+from .tensors import TensorWorld
 from .varied import Varied
 
 wp: Any = warp  # its types have gaps
@@ -37,7 +35,7 @@ _DERIVED: Final = (
 CONTACTS_PER_GEOM: Final = 4  # Most contacts of a geom with the ground: so many have memory
 
 
-class WarpWorld:
+class WarpWorld(TensorWorld):
     """W worlds of one drone over ground of its own: `World`, in float32 on one device.
 
     `device` is `cpu`, `cuda`, `cuda:1`...; None takes a CUDA device if there is one. Physics steps
@@ -45,8 +43,6 @@ class WarpWorld:
     backend `mujoco`; a craft touches where there are constraints for a contact. `qpos`, `qvel` and
     `ctrl` are live views of simulator memory, float32, shapes (W, 7), (W, 6), (W, R).
     """
-
-    xp: Any = torch_api
 
     def __init__(
         self,
@@ -57,18 +53,13 @@ class WarpWorld:
         randomize: Randomization | None = None,
         device: str | None = None,
     ) -> None:
-        self.vehicle, self.shape = vehicle, (num_worlds, 1)
-        self.device, self._name = _device(device)
+        theirs, self._name = _device(device)
+        super().__init__(num_worlds, randomize, theirs)
+        self.vehicle = vehicle
         self._check = contact_check(vehicle.timestep)
-        self._generator = torch.Generator(self.device)
-        self._generator.seed()
-        self._noises: list[TorchNoise] = []
         options = effects or EffectOptions()
-        self._randomize, self.parameters = randomize, dict[str, Array]()
-        self._draws = torch.Generator(self.device)
-        self._draws.seed()
         drawn = () if randomize is None else randomize.names
-        acting = Effects(vehicle, options, self.noise, torch_api, drawn)
+        acting = Effects(vehicle, options, self.noise, self.xp, drawn)
         self.effects = acting if acting.works else None
         self._cable = options.cable if options.payload else None
         self._least_height = options.cable + payload_radius(options.payload)
@@ -89,7 +80,7 @@ class WarpWorld:
             self.ctrl, self._rows = from_dlpack(data.ctrl), from_dlpack(data.nefc)
             self._warmstart = from_dlpack(data.qacc_warmstart)
             self._applied = from_dlpack(data.qfrc_applied)
-            self._varied = Varied(model, drawn, torch_api)
+            self._varied = Varied(model, drawn, self.xp)
             if self._varied.fields:
                 for name in (*self._varied.fields, *_DERIVED):
                     shared = getattr(self._model, name)
@@ -109,7 +100,6 @@ class WarpWorld:
         newtons = np.array([rotor.newtons for rotor in vehicle.rotors])
         self._newtons = constant(newtons, self.ctrl)
         self._hover = constant(vehicle.hover_thrust, self.ctrl)
-        self._level = constant(np.array((1.0, 0.0, 0.0, 0.0)), self.ctrl)
         command = torch.zeros((num_worlds, 1, vehicle.num_rotors), device=self.device)
         self.state = WorldState(
             position=self.qpos[:, None, :3],
@@ -138,28 +128,18 @@ class WarpWorld:
             )
         if self._cable is not None and mask.any():
             check_hung(float(pose.position[mask][:, 2].min()), self._least_height)
-        for array, values, default in (
-            (state.position, pose.position, 0.0),
-            (state.quaternion, pose.quaternion, self._level),
-            (state.velocity, pose.velocity, 0.0),
-            (state.body_rates, pose.body_rates, 0.0),
-            (state.thrust, pose.thrust, self._hover),
-        ):
-            array.copy_(torch.where(rows, default if values is None else values, array))
+        for name, values in self._begun(mask, pose, self._hover).items():
+            getattr(state, name).copy_(values)
         state.command.copy_(torch.where(rows, state.thrust, state.command))
         self._warmstart.masked_fill_(mask, 0.0)
         self._applied.masked_fill_(mask, 0.0)
-        if self._randomize is not None:
-            draw = TorchDraw(self._draws, mask, {})
-            for name, new in self._randomize.draw(draw, self.xp).items():
-                old = self.parameters.get(name)
-                self.parameters[name] = new if old is None else torch.where(mask, new, old)
-            if self._varied.fields:
-                with wp.ScopedDevice(self._name), wp.ScopedStream(self._stream()):
-                    values = {name: x[:, 0] for name, x in self.parameters.items()}
-                    for name, changed in self._varied.values(values).items():
-                        wp.to_torch(getattr(self._model, name)).copy_(changed)
-                    mjw.set_const(self._model, self._data)
+        self._draw_parameters(mask)
+        if self._varied.fields:
+            with wp.ScopedDevice(self._name), wp.ScopedStream(self._stream()):
+                values = {name: x[:, 0] for name, x in self.parameters.items()}
+                for name, changed in self._varied.values(values).items():
+                    wp.to_torch(getattr(self._model, name)).copy_(changed)
+                mjw.set_const(self._model, self._data)
         if self.effects is not None:
             thrust = self.effects.begin(mask, state, self.parameters)
             state.thrust.copy_(torch.where(rows, thrust, state.thrust))
@@ -171,7 +151,7 @@ class WarpWorld:
 
     def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
         """As `World.step`."""
-        state, before = self.state, []
+        state, thrust, before = self.state, thrust.detach(), []
         if mask is not None:
             thrust = torch.where(mask[..., None], thrust, state.command)
             before = [(array, array.clone()) for array in (self.qpos, self.qvel, self._warmstart)]
@@ -200,50 +180,6 @@ class WarpWorld:
             ids = bad.nonzero().flatten().tolist()
             raise PhysicsError(f"MuJoCo Warp gave bad states in envs {ids[:5]}: reset the env")
 
-    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
-        """Seed the one generator of all worlds with the seeds of the mask together."""
-        ids = mask.flatten().nonzero().flatten().tolist()
-        _seed(self._generator, START, [seeds[i] for i in ids])
-        _seed(self._draws, RANDOMIZATION, [seeds[i] for i in ids])
-        for noise in self._noises:
-            noise.seed(ids, [seeds[i] for i in ids])
-
-    def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
-        """As `World.draw`; a seed does not give the numbers that it gives the other backends."""
-        put = {
-            name: torch.as_tensor(values, dtype=torch.float32, device=self.device)
-            for name, values in (chosen or {}).items()
-        }
-        return TorchDraw(self._generator, mask, put)
-
-    def checked(self, actions: Array, width: int, choices: int, flown: Array | None) -> Array:
-        """As `World.checked`: a tensor on `device` or a NumPy array, as float32, shape (W, k)."""
-        if isinstance(actions, torch.Tensor) and actions.device != self.device:
-            raise InputError(f"actions: expected a tensor on {self.device}, got {actions.device}")
-        try:
-            values = torch.as_tensor(actions, device=self.device).detach()
-        except (TypeError, ValueError, RuntimeError):
-            raise InputError(f"actions: expected real numbers, got {actions!r:.80}") from None
-        shape = (self.shape[0], width)
-        if values.is_complex() or values.numel() != shape[0] * width:
-            raise InputError(
-                f"actions: expected real numbers of shape {shape}, "
-                f"got {values.dtype} of shape {tuple(values.shape)}"
-            )
-        values = values.reshape(shape).to(torch.float32)
-        right = values.isfinite()
-        if choices:
-            right = (values >= 0) & (values < choices) & (values % 1 == 0)
-        wrong = ~right.all(dim=1)
-        if flown is not None:
-            wrong = wrong & flown
-        if wrong.any():
-            first = int(wrong.nonzero()[0])
-            expected = f"a whole number 0 to {choices - 1}" if choices else "finite numbers"
-            got = values[first].tolist()
-            raise InputError(f"actions: expected {expected}, got {got} for env {first}")
-        return torch.where(right, values, 0.0)
-
     def acceleration(self) -> Array:
         """As `World.acceleration`."""
         before = self._warmstart.clone()
@@ -260,11 +196,6 @@ class WarpWorld:
         down.copy_(-body_z(self.state.quaternion))
         self._launch(graph)
         return torch.where(distance < 0, torch.inf, distance)
-
-    def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
-        """As `World.noise`; one generator of the use gives the numbers of all worlds."""
-        self._noises.append(TorchNoise((*self.shape, size), use, self.device))
-        return self._noises[-1]
 
     def close(self) -> None:
         """Release the graphs."""
@@ -286,7 +217,7 @@ class WarpWorld:
     def _place_payload(self, mask: torch.Tensor, cable: float) -> None:
         """Hang the payload straight below the craft, moving along with it."""
         below = self.qpos[:, :3] - torch.tensor((0.0, 0.0, cable), device=self.device)
-        turn = self._level.expand(len(below), 4)
+        turn = torch.tensor((1.0, 0.0, 0.0, 0.0), device=self.device).expand(len(below), 4)
         hung = torch.cat((self.qpos[:, :7], below, turn), dim=1)
         still = torch.zeros_like(below)
         moved = torch.cat((self.qvel[:, :6], self.qvel[:, :3], still), dim=1)
@@ -329,57 +260,6 @@ class WarpWorld:
         if not self.qpos.is_cuda:
             return None
         return wp.stream_from_torch(torch.cuda.current_stream(self.device))
-
-
-class TorchDraw(Draw):
-    """Float32, from one generator for all worlds, so that the host need not know which draw."""
-
-    def __init__(
-        self, generator: torch.Generator, mask: torch.Tensor, chosen: Mapping[str, Array]
-    ) -> None:
-        super().__init__(chosen)
-        self._generator, self._mask = generator, mask
-
-    def _draw(self, kind: str, parameters: tuple[float, float], size: tuple[int, ...]) -> Array:
-        first, second = parameters
-        shape, device = (*self._mask.shape, *size), self._mask.device
-        if kind == "uniform":
-            numbers = torch.rand(shape, generator=self._generator, device=device)
-            numbers = first + (second - first) * numbers
-        else:
-            numbers = second * torch.randn(shape, generator=self._generator, device=device)
-        mask = self._mask.reshape(*self._mask.shape, *[1] * len(size))
-        return torch.where(mask, numbers, 0.0)
-
-
-class TorchNoise:
-    """A `Noise` in float32 from one generator for all worlds, which every call moves on."""
-
-    def __init__(
-        self, shape: tuple[int, ...], use: int | tuple[int, ...], device: torch.device
-    ) -> None:
-        self._shape, self._use, self._generator = shape, use, torch.Generator(device)
-        self._generator.seed()
-
-    def seed(self, ids: Sequence[int], seeds: Sequence[int | None]) -> None:
-        """As `WarpWorld.seed`."""
-        _seed(self._generator, self._use, seeds)
-
-    def normal(self, mask: Array | None = None) -> Array:
-        """As `Noise.normal`."""
-        device = self._generator.device
-        numbers = torch.randn(self._shape, generator=self._generator, device=device)
-        return numbers if mask is None else torch.where(mask[..., None], numbers, 0.0)
-
-
-def _seed(
-    generator: torch.Generator, use: int | tuple[int, ...], seeds: Sequence[int | None]
-) -> None:
-    """Seed a use's generator with all the seeds together; with none it goes on."""
-    if given := [int(seed) for seed in seeds if seed is not None]:
-        key = use if isinstance(use, tuple) else (use,)
-        state = np.random.SeedSequence(given, spawn_key=key).generate_state(1, np.uint64)
-        generator.manual_seed(int(state[0]))
 
 
 def _device(name: str | None) -> tuple[torch.device, str]:

@@ -103,3 +103,16 @@ class Effects:
             gust = self._gusts.step(mask, self._noise.normal(mask))
             wind = [a + b for a, b in zip(wind, gust, strict=True)]
         return mean, end, self._air.step(state, mean, root, wind, mask)
+
+    def detach(self) -> None:
+        """End the graph of gradients of torch tensors."""
+        for part in (self._rotors, self._air, self._gusts):
+            if part is not None:
+                vars(part).update({name: _detached(value) for name, value in vars(part).items()})
+
+
+def _detached(value: Any) -> Any:
+    """A tensor, or those of a list, without their graph; anything else as it is."""
+    if isinstance(value, list):
+        return [_detached(one) for one in value]
+    return value.detach() if hasattr(value, "requires_grad") else value

@@ -164,7 +164,8 @@ class RotorEffects:
                 answer = self._answers[not rises]
             else:
                 pairs = zip(*self._answers, strict=True)
-                answer = tuple(self._xp.where(rises, up, down) for up, down in pairs)
+                # Of two numbers torch would make float32.
+                answer = tuple(self._xp.where(rises, up, down + 0.0 * off) for up, down in pairs)
         gone, first, second = answer
         # The square of: wanted + off · exp(-t / time).
         mean = wanted * wanted + off * (2 * wanted * first + off * second)

@@ -37,7 +37,7 @@ def make_stepped(
         env: Id of a registered task, of an env of Gymnasium, or one env itself.
         num_envs: N.
         vehicle: File or name, for a registered task; None is the paper's.
-        backend: `mujoco` or `warp`, for a registered task.
+        backend: One of `sim.BACKENDS`, for a registered task.
         options: Of the env, by name.
     """
     right = type(num_envs) is int and 1 <= num_envs <= MAX_DRONES

@@ -1,0 +1,430 @@
+"""Motion of one rigid body in free flight, as arithmetic on vectors of W worlds.
+
+Every component is a vector of its own, shape (W,), or a number that counts for all worlds, and a
+number 0.0 costs nothing: a craft whose rotors are parallel and whose center of mass is its origin
+needs a third of the operations of any craft. Nothing is changed in place, so that torch can
+differentiate a flight.
+
+Frames: world, z up, and the body's. Position and velocity are those of the body's origin.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+
+from ...models.vehicle import Vehicle, craft_bodies
+from ..randomize import CENTER
+from ..state import Array
+
+Vector = tuple[Any, Any, Any]
+
+_NOTHING: Final = 1e-12  # of the largest number of its kind: what rounding leaves
+_TINY: Final = 1e-30  # keeps the slope of a square root finite where nothing turns
+_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
+_BORTZ: Final = tuple(
+    2 * (zeta - 1) / (2 * math.pi) ** (2 * n)
+    for n, zeta in enumerate(
+        (math.pi**2 / 6, math.pi**4 / 90, math.pi**6 / 945, math.pi**8 / 9450, math.pi**10 / 93555),
+        start=1,
+    )
+)
+"""Of Bortz's coefficient without its pole at a turn: powers 0, 2... of the angle."""
+_CROSS: Final = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
+"""Of a cross product: (a × b)ᵢ = Σ _CROSS[i, j, k] aⱼ bₖ."""
+
+
+class Motion(NamedTuple):
+    """State of W bodies, each component a vector, SI units."""
+
+    position: Any
+    """World frame, three."""
+    quaternion: Any
+    """From body to world, four."""
+    velocity: Any
+    """World frame, three."""
+    rates: Any
+    """Angular velocity, body frame, three."""
+
+
+class Push(NamedTuple):
+    """What acts on a body, constant over a physics step, besides gravity and the air."""
+
+    inner: Vector
+    """Force of the rotors over the mass, body frame, m/s²."""
+    turning: Vector
+    """Angular acceleration by the torque about the center of mass, body frame, rad/s²."""
+    outer: Vector
+    """Force at the body's origin over the mass, world frame, m/s²."""
+
+
+class RigidBody:
+    """A vehicle's equations of motion, and MuJoCo's RK4 over its physics step.
+
+    With the center of mass c, body frame; s the force on the body over its mass but gravity, body
+    frame; R the attitude; τ the torque about c:
+
+        origin'' = R (s - ω' × c - ω × (ω × c)) - g z,    I ω' = τ - ω × I ω.
+
+    `linear_drag` acts at the origin; a fluid acts on the inertia boxes of MuJoCo's bodies. The
+    stages of the classical Runge-Kutta method add up for rotation vectors, not for quaternions, so
+    it integrates the former (Munthe-Kaas, BIT 38, 1998).
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        model, rotors = vehicle.model, vehicle.rotors
+        self._step, self._gravity, self._drag = (
+            vehicle.timestep, vehicle.gravity, vehicle.linear_drag
+        )  # fmt: skip
+        self._least = (vehicle.mass, vehicle.center_of_mass.tolist())
+        axes, reactions, places = (
+            np.array([getattr(rotor, name) for rotor in rotors]).T
+            for name in ("axis", "reaction", "position")
+        )
+        levers = np.cross(places - vehicle.center_of_mass[:, None], axes, axis=0)
+        size = abs(levers + reactions).max()
+        self._axes, self._levers = _sparse(axes), _sparse(levers, size)
+        self._reactions, self._torques = _sparse(reactions, size), _sparse(levers + reactions)
+        boxes = _boxes(model)
+        self._inertias = _own_and_far(vehicle, boxes)
+        fluid = model.opt.density or model.opt.viscosity
+        self._fluid = _Fluid(model, boxes) if fluid else None
+        self.vary({})
+
+    def vary(self, parameters: Mapping[str, Array]) -> None:
+        """Take drawn parameters by their names, each of shape (W,)."""
+        (mass, center), (own, far) = self._least, self._inertias
+        inertia: Any
+        factor, more = parameters.get("mass", 1.0), parameters.get("inertia", 1.0)
+        self._mass = mass * factor
+        self._easier = 1.0 / factor
+        if isinstance(more, float) or not far.any():
+            self._easier, inertia = self._easier / more, own + far
+        else:
+            inertia = sum(
+                torch.as_tensor(x, dtype=more.dtype, device=more.device) * share
+                for x, share in ((own, more[:, None, None]), (far, 1.0))
+            )
+        self._turn, self._gyroscopic = _euler(inertia)
+        self._reaction = parameters.get("reaction")
+        self._shift: Vector = tuple(parameters.get(name, 0.0) for name in CENTER)
+        self._center: Vector = _plus(self._shift, center)
+        if self._fluid is not None:
+            self._fluid.vary(more, self._shift)
+
+    def fly(
+        self, rows: torch.Tensor, thrust: torch.Tensor, wrench: Sequence[Any] | None, steps: int
+    ) -> torch.Tensor:
+        """States (13, W) after physics steps; the rows of a state are those of `Motion`."""
+        push, now = self.push(thrust, wrench), motion(rows)
+        for _ in range(steps):
+            now = self.advance(now, push)
+        return torch.stack((*now.position, *now.quaternion, *now.velocity, *now.rates))
+
+    def push(self, thrust: torch.Tensor, wrench: Sequence[Any] | None = None) -> Push:
+        """Of thrusts (R, W), N, and a force and torque, six as `Effects.step` gives them."""
+        force = _times(self._axes, thrust)
+        if self._reaction is None:
+            torque = _times(self._torques, thrust)
+        else:
+            both = zip(_times(self._levers, thrust), _times(self._reactions, thrust), strict=True)
+            torque = tuple(_sum(a, (b, self._reaction)) for a, b in both)
+        torque = _plus(torque, _cross(force, self._shift))
+        outer = _ZERO
+        if wrench is not None:
+            outer = _scaled(wrench[:3], 1.0 / self._mass)
+            torque = _plus(torque, wrench[3:])
+        return Push(_scaled(force, 1.0 / self._mass), self._turned(torque), outer)
+
+    def acceleration(self, now: Motion, push: Push) -> tuple[Vector, Vector]:
+        """Of the body's origin, world frame, m/s², and angular, body frame, rad/s²."""
+        _, quaternion, velocity, rates = now
+        inner, turning, outer = push
+        center, off = self._center, _is_there(self._center)
+        matrix: Any = None
+        if self._drag:
+            outer = _plus(outer, velocity, -self._drag)
+        if self._fluid is not None:
+            matrix = _matrix(quaternion)
+            force, torque = self._fluid.push(matrix, velocity, rates)
+            inner = _plus(inner, _scaled(force, 1.0 / self._mass))
+            turning = _plus(turning, self._turned(_plus(torque, _cross(force, center))))
+        if off and _is_there(outer):
+            matrix = matrix or _matrix(quaternion)
+            # The force at the origin has the torque -c × F about the center of mass.
+            lever = _cross(_scaled(_back(matrix, outer), self._mass), center)
+            turning = _plus(turning, self._turned(lever))
+        turning = tuple(
+            _sum(start, *((k, rates[i], rates[j]) for i, j, k in terms))
+            for start, terms in zip(turning, self._gyroscopic, strict=True)
+        )
+        if off:
+            inner = _plus(inner, _cross(center, turning))
+            inner = _plus(inner, _cross(_cross(rates, center), rates))
+        x, y, z = _plus(_to_world(quaternion, matrix, inner), outer)
+        return (x, y, _sum(z, (-self._gravity,))), turning
+
+    def advance(self, now: Motion, push: Push) -> Motion:
+        """The motion after a physics step."""
+        h, (position, quaternion, velocity, rates) = self._step, now
+        moves = self._drag or self._fluid is not None  # the acceleration depends on the velocity
+        stages = [(*self.acceleration(now, push), rates)]
+        for part in (0.5 * h, 0.5 * h, h):
+            linear, angular, spin = stages[-1]
+            turned, square = _rotated(quaternion, spin, part)
+            turning = _plus(rates, angular, part)
+            moved = _plus(velocity, linear, part) if moves else velocity
+            now = Motion(None, turned, moved, turning)
+            follows = _of_rotation_vector(spin, part, square, turning)
+            stages.append((*self.acceleration(now, push), follows))
+        (a, u, p), (b, v, q), (c, w, r), (d, x, s) = stages
+        # The stages' velocities are V, V + h/2 a, V + h/2 b and V + h c.
+        early, late = _plus(_plus(a, b), c), _plus(_plus(b, c), d)
+        turns, middle = _plus(_plus(u, x), _plus(v, w), 2.0), _plus(q, r)
+        spin = _plus(_plus(p, s), middle, 2.0)
+        return Motion(
+            _plus(_plus(position, velocity, h), early, h * h / 6),
+            _normalized(_rotated(quaternion, spin, h / 6)[0]),
+            _plus(velocity, _plus(early, late), h / 6),
+            _plus(rates, turns, h / 6),
+        )
+
+    def _turned(self, torque: Vector) -> Vector:
+        """Angular acceleration by a torque about the center of mass, N·m."""
+        return _scaled(_forth(self._turn, torque), self._easier)
+
+
+class _Fluid:
+    """Forces on the inertia boxes of MuJoCo's bodies in a fluid: its "inertia box model"."""
+
+    def __init__(self, model: mujoco.MjModel, boxes: list[Any]) -> None:
+        self._density, self._viscosity = float(model.opt.density), float(model.opt.viscosity)
+        self._wind, self._boxes = (-model.opt.wind).tolist(), []
+        for mass, (x, y, z), axes, place in boxes:
+            sides = np.sqrt(6 / mass * np.maximum((y + z - x, x + z - y, x + y - z), 1e-15))
+            self._boxes.append((sides.tolist(), axes.tolist(), place.tolist()))
+        self.vary(1.0, _ZERO)
+
+    def vary(self, inertia: Any, shift: Vector) -> None:
+        """A box's sides grow with the square root of its inertia over its mass."""
+        self._scale, self._shift = inertia**0.5, shift
+
+    def push(self, matrix: Any, velocity: Vector, rates: Vector) -> tuple[Vector, Vector]:
+        """Force, N, and torque about the body's origin, N·m; both in the body frame."""
+        air = _back(matrix, _plus(velocity, self._wind))
+        scale, force, torque = self._scale, _ZERO, _ZERO
+        area, volume = scale * scale, scale * scale * scale
+        for sides, axes, place in self._boxes:
+            center = _plus(self._shift, place)
+            through = _back(axes, _plus(air, _cross(rates, center)))
+            spin, mean = _back(axes, rates), sum(sides) / 3
+            pushes, twists = [], []
+            for i, (v, w) in enumerate(zip(through, spin, strict=True)):
+                a, b = sides[i - 2], sides[i - 1]
+                slow = -3 * math.pi * mean * self._viscosity
+                fast = -0.5 * self._density * a * b
+                pushes.append(_sum(0.0, (slow, v, scale), (fast, v, abs(v), area)))
+                slow = -math.pi * mean**3 * self._viscosity
+                fast = -self._density * sides[i] * (a**4 + b**4) / 64
+                twists.append(_sum(0.0, (slow, w, volume), (fast, w, abs(w), area, volume)))
+            pushed = _forth(axes, pushes)
+            force = _plus(force, pushed)
+            torque = _plus(torque, _plus(_forth(axes, twists), _cross(center, pushed)))
+        return force, torque
+
+
+def motion(rows: torch.Tensor) -> Motion:
+    """The motion of states (13, W)."""
+    x = rows.unbind(0)
+    return Motion(x[:3], x[3:7], x[7:10], x[10:])
+
+
+def _boxes(model: mujoco.MjModel) -> list[Any]:
+    """Mass, principal inertia, their axes and center of each body with a mass, body frame."""
+    data = mujoco.MjData(model)
+    data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
+    mujoco.mj_kinematics(model, data)
+    return [
+        (model.body_mass[i], model.body_inertia[i], data.ximat[i].reshape(3, 3), data.xipos[i])
+        for i in craft_bodies(model).tolist()
+        if model.body_mass[i] > 0
+    ]
+
+
+def _own_and_far(vehicle: Vehicle, boxes: list[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """The inertia as the sum of that of the bodies, and of their masses about the center."""
+    own = np.zeros((3, 3))
+    for _, inertia, axes, _ in boxes:
+        own += axes @ np.diag(inertia) @ axes.T
+    far = vehicle.inertia - own
+    far[abs(far) < _NOTHING * abs(vehicle.inertia).max()] = 0.0
+    return vehicle.inertia - far, far
+
+
+def _euler(inertia: Any) -> tuple[Any, Any]:
+    """Of an inertia, (3, 3) or (W, 3, 3): its inverse, and -I⁻¹ (ω × I ω) as terms (i, j, k).
+
+    Each axis has its list of terms: k times component i times component j of the rates.
+    """
+    if not isinstance(inertia, np.ndarray):
+        cross = torch.as_tensor(_CROSS, dtype=inertia.dtype, device=inertia.device)
+        turn = torch.linalg.inv(inertia)
+        products = -torch.einsum("wil,ljm,wmk->ijkw", turn, cross, inertia)
+        pairs = [(j, k) for j in range(3) for k in range(3)]
+        found = [[(j, k, axis[j, k]) for j, k in pairs] for axis in products]
+        return list(turn.permute(1, 2, 0)), found
+    inverse = np.linalg.inv(inertia)
+    terms = -np.einsum("il,ljm,mk->ijk", inverse, _CROSS, inertia)
+    least, found = _NOTHING * abs(terms).max(), []
+    for axis in terms:
+        folded = np.triu(axis + axis.T) - np.diag(np.diag(axis))
+        places = np.argwhere(abs(folded) > least).tolist()
+        found.append([(j, k, float(folded[j, k])) for j, k in places])
+    return _sparse(inverse), found
+
+
+def _sparse(matrix: np.ndarray, size: float | None = None) -> list[list[float]]:
+    """A matrix as lists, without what is nothing beside its largest number, or `size`."""
+    largest = abs(matrix).max() if size is None else size
+    rows: list[list[float]] = np.where(abs(matrix) > _NOTHING * largest, matrix, 0.0).tolist()
+    return rows
+
+
+def _sum(total: Any, *products: tuple[Any, ...]) -> Any:
+    """The total and the products of some vectors and numbers, in the fewest operations."""
+    for product in products:
+        share, vectors = 1.0, []
+        for one in product:
+            if isinstance(one, float):
+                share *= one
+            else:
+                vectors.append(one)
+        if share == 0.0:
+            continue
+        if not vectors:
+            total = total + share
+            continue
+        *rest, last = vectors
+        if isinstance(total, float):
+            for one in rest:
+                last = last * one
+            last = last if share == 1.0 else last * share
+            total = last if total == 0.0 else last + total
+        elif not rest:
+            total = torch.add(total, last, alpha=share)
+        else:
+            first = rest[0]
+            for one in rest[1:]:
+                first = first * one
+            total = torch.addcmul(total, first, last, value=share)
+    return total
+
+
+def _times(matrix: list[list[float]], thrust: torch.Tensor) -> Vector:
+    """A matrix (3, R) and thrusts (R, W): three vectors."""
+    rotors = thrust.unbind(0)
+    return tuple(_sum(0.0, *zip(row, rotors, strict=True)) for row in matrix)
+
+
+def _is_there(vector: Any) -> bool:
+    return any(not isinstance(x, float) or x != 0.0 for x in vector)
+
+
+def _plus(a: Any, b: Any, share: float = 1.0) -> Vector:
+    return tuple(_sum(x, (share, y)) for x, y in zip(a, b, strict=True))
+
+
+def _scaled(vector: Any, share: Any) -> Vector:
+    return tuple(_sum(0.0, (share, x)) for x in vector)
+
+
+def _cross(a: Any, b: Any) -> Vector:
+    (p, q, r), (x, y, z) = a, b
+    return (
+        _sum(0.0, (q, z), (-1.0, r, y)),
+        _sum(0.0, (r, x), (-1.0, p, z)),
+        _sum(0.0, (p, y), (-1.0, q, x)),
+    )
+
+
+def _forth(matrix: Any, vector: Any) -> Vector:
+    """A matrix, three rows, and a vector."""
+    return tuple(_sum(0.0, *zip(row, vector, strict=True)) for row in matrix)
+
+
+def _back(matrix: Any, vector: Any) -> Vector:
+    """The transposed matrix and a vector."""
+    return _forth(tuple(zip(*matrix, strict=True)), vector)
+
+
+def _matrix(quaternion: Any) -> Any:
+    """Rotation matrix, three rows."""
+    w, x, y, z = quaternion
+    a, b, c = x + x, y + y, z + z
+    wx, wy, wz, xx, xy, xz = w * a, w * b, w * c, x * a, x * b, x * c
+    yy, yz, zz = y * b, y * c, z * c
+    return (
+        (1.0 - (yy + zz), xy - wz, xz + wy),
+        (xy + wz, 1.0 - (xx + zz), yz - wx),
+        (xz - wy, yz + wx, 1.0 - (xx + yy)),
+    )
+
+
+def _to_world(quaternion: Any, matrix: Any, vector: Vector) -> Vector:
+    """A body vector in the world frame; the matrix of the quaternion is None if nobody made it."""
+    if matrix is not None or _is_there(vector[:2]):
+        return _forth(matrix or _matrix(quaternion), vector)
+    w, x, y, z = quaternion
+    up = vector[2]
+    twice = up + up
+    return (
+        torch.addcmul(x * z, w, y) * twice,
+        torch.addcmul(y * z, w, x, value=-1) * twice,
+        _sum(up, (-1.0, torch.addcmul(x * x, y, y), twice)),
+    )
+
+
+def _rotated(quaternion: Any, rates: Vector, time: float) -> tuple[Any, Any]:
+    """A quaternion turned for a time at body rates, and the square of the angle."""
+    w, x, y, z = quaternion
+    a, b, c = rates
+    square = torch.addcmul(torch.addcmul(a * a, b, b), c, c) * (time * time)
+    half = _sum(_TINY, (0.25, square)).sqrt()
+    share = half.sin() / half * (0.5 * time)
+    a, b, c, d = half.cos(), a * share, b * share, c * share
+    turned = (
+        _sum(w * a, (-1.0, x, b), (-1.0, y, c), (-1.0, z, d)),
+        _sum(x * a, (w, b), (y, d), (-1.0, z, c)),
+        _sum(y * a, (w, c), (z, b), (-1.0, x, d)),
+        _sum(z * a, (w, d), (x, c), (-1.0, y, b)),
+    )
+    return turned, square
+
+
+def _of_rotation_vector(spin: Vector, time: float, square: Any, rates: Vector) -> Vector:
+    """How fast the rotation vector r = spin · time changes at body rates in the turned frame.
+
+    rates + r × rates / 2 + k r × (r × rates), k = (1 - |r| / 2 · cot(|r| / 2)) / |r|² (Bortz,
+    IEEE Trans. AES-7, 1971): the sum of 2 / ((2 π n)² - |r|²) over n > 0. Here up to |r| = π.
+    """
+    square = square.clip(max=math.pi**2)
+    series = square * _BORTZ[-1]
+    for one in _BORTZ[-2:0:-1]:
+        series = (series + one) * square
+    series = (series + _BORTZ[0] + 2.0 / (4 * math.pi**2 - square)) * (time * time)
+    once = _cross(spin, rates)
+    twice = _cross(spin, once)
+    return tuple(
+        _sum(w, (0.5 * time, a), (series, b)) for w, a, b in zip(rates, once, twice, strict=True)
+    )
+
+
+def _normalized(quaternion: Any) -> Any:
+    """A quaternion whose size is nearly 1: Newton's step towards 1."""
+    w, x, y, z = quaternion
+    square = torch.addcmul(torch.addcmul(torch.addcmul(w * w, x, x), y, y), z, z)
+    share = _sum(1.5, (-0.5, square))
+    return w * share, x * share, y * share, z * share
