@@ -3,7 +3,7 @@
 Knows nothing of tasks, rewards or Gymnasium.
 """
 
-from .control import LEVELS, CollectiveThrust, Controller, RotorThrust, make_controller
+from .control import LEVELS, CollectiveThrust, Controller, Gains, RotorThrust, make_controller
 from .effects import EffectOptions
 from .random import Draw
 from .randomize import PARAMETERS, Randomization
@@ -25,7 +25,7 @@ from .world import BACKENDS, Backend, PhysicsError, World, make_world
 
 __all__ = [
     "BACKENDS", "LEVELS", "PARAMETERS", "Array", "Backend", "CollectiveThrust", "Controller",
-    "Draw", "EffectOptions", "PhysicsError", "Pose", "Randomization", "RotorThrust", "World",
-    "WorldState", "checked_sensors", "clip", "component", "constant", "each",
+    "Draw", "EffectOptions", "Gains", "PhysicsError", "Pose", "Randomization", "RotorThrust",
+    "World", "WorldState", "checked_sensors", "clip", "component", "constant", "each",
     "make_controller", "make_world", "on_host", "plain", "square_root", "stack",
 ]  # fmt: skip

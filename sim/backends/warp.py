@@ -169,7 +169,9 @@ class WarpWorld:
         self._launch(self._forward)
         state.touching.copy_(torch.where(mask, self._contact(), state.touching))
 
-    def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
+    def step(
+        self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
+    ) -> None:
         """As `World.step`."""
         state, before = self.state, []
         if mask is not None:
@@ -178,7 +180,7 @@ class WarpWorld:
         state.command.copy_(thrust)
         if self.effects is None:
             self._apply_thrust(state.command)
-        touching = torch.zeros_like(state.touching)
+        touching = state.touching.clone() if again else torch.zeros_like(state.touching)
         while substeps > 0:
             steps = min(substeps, self._check)
             at_once = steps if self.effects is None else 1
