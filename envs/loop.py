@@ -223,7 +223,7 @@ class Loop(NotCopied):
         self._sensors = Sensors(sensors, self.world, period) if sensors else None
         estimated = draft.options.estimated  # it may leave the task's bounds
         self._limits = {a.name: a.bounds() for a in self.spec.observation if estimated}
-        # An estimate is one for a control step, and so are the thrusts of a controller that sees it.
+        # An estimate is one for a control step, and so are the thrusts of what sees it.
         often = getattr(self.task.controller, "every_step", False) and not estimated
         self._held = 1 if often else self._substeps
         none = self.world.state.touching != self.world.state.touching  # all False, on its device

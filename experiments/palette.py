@@ -3,7 +3,13 @@
 from collections.abc import Iterable
 from typing import Final
 
-_LABELS: Final = {"vpg": "VPG", "a2c": "A2C", "sb3-a2c": "SB3 A2C", "pid": "PID"}
+_LABELS: Final = {
+    "vpg": "VPG",
+    "a2c": "A2C",
+    "sb3-a2c": "SB3 A2C",
+    "pid": "PID",
+    "geometric": "Geometric",
+}
 # Okabe and Ito's palette: told apart by readers with colour-blindness. The second of a pair is the
 # same hue, lighter, for a dark ground.
 _COLORS: Final = {
@@ -11,6 +17,7 @@ _COLORS: Final = {
     "a2c": ("#0072B2", "#55B0F0"),
     "sb3-a2c": ("#009E73", "#2CC998"),
     "pid": ("#555555", "#B4BCC4"),
+    "geometric": ("#555555", "#B4BCC4"),
 }
 _SPARE: Final = (
     ("#CC79A7", "#E29AC3"),

@@ -10,8 +10,8 @@ body rates Ω, what is wanted of them, R_d and Ω_d, and the inertia J,
 with k_R = kᵣ kₐ J and k_Ω = kᵣ J: a rate loop follows Rᵀ R_d Ω_d - kₐ e_R. R_d comes from R by the
 shortest turn of the thrust axis to the wanted one. Of that turn, by an angle θ, e_R has the size
 2 sin(θ / 2), after T. Lee, "Exponential stability of an attitude tracking control system on SO(3)
-for large-angle rotational maneuvers", Systems & Control Letters 61, 2012; the sin θ of 2010 vanishes
-upside down. Wanted angular accelerations are left out.
+for large-angle rotational maneuvers", Systems & Control Letters 61, 2012; the sin θ of 2010
+vanishes upside down. Wanted angular accelerations are left out.
 
 Array code for NumPy and torch with any leading axes; of a single drone the numbers are Python's.
 """

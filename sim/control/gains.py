@@ -21,7 +21,7 @@ Yaw has a p of its own, by the same rule from its own α.
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
@@ -125,6 +125,6 @@ class Gains:
         )
 
 
-def _rows(allocation: np.ndarray) -> np.ndarray:
+def _rows(allocation: np.ndarray) -> Any:
     """Largest number of each row, so that the rank does not depend on the craft's size."""
     return np.maximum(np.abs(allocation).max(axis=1, keepdims=True), 1e-12)
