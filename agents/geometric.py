@@ -11,7 +11,7 @@ from ..models.errors import expect
 from .policies import flat
 
 GRAVITY: Final = 9.81  # m/s²
-FILTER: Final = 5.0  # Filters forget so many times faster than the position loop answers
+FILTER: Final = 20.0  # Filters forget so many times faster than the position loop answers
 OVER: Final = (
     2.5  # Gain of the velocity loop over that of the position loop: `sim/control/gains.py`
 )
