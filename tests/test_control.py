@@ -100,60 +100,66 @@ def test_five_equal_poles() -> None:
 
 
 def test_rates_by_hand() -> None:
-    assert [49.0, 49.0, 49.0, 49.0] == thrusts("rates", (0, 0, 0, 0))
-    assert [100.0] * 4 == thrusts("rates", (1, 0, 0, 0))
-    assert [74.5] * 4 == thrusts("rates", (0.5, 0, 0, 0))  # 49 + 0.5 · 51
-    assert [0.0] * 4 == thrusts("rates", (-7, 0, 0, 0))  # beyond the bound is the bound
+    assert thrusts("rates", (0, 0, 0, 0)) == [49.0, 49.0, 49.0, 49.0]
+    assert thrusts("rates", (1, 0, 0, 0)) == [100.0] * 4
+    assert thrusts("rates", (0.5, 0, 0, 0)) == [74.5] * 4  # 49 + 0.5 · 51
+    assert thrusts("rates", (-7, 0, 0, 0)) == [0.0] * 4  # beyond the bound is the bound
     # 1.10689 rad/s · 8.83168 /s · 5.025725 kg m² = 49.1298 N m: 12.2825 N of each rotor.
-    assert [61.2825, 36.7175, 36.7175, 61.2825] == thrusts("rates", (0, 0.1, 0, 0))
-    assert [36.7175, 36.7175, 61.2825, 61.2825] == thrusts("rates", (0, 0, 0.1, 0))
+    assert thrusts("rates", (0, 0.1, 0, 0)) == [61.2825, 36.7175, 36.7175, 61.2825]
+    assert thrusts("rates", (0, 0, 0.1, 0)) == [36.7175, 36.7175, 61.2825, 61.2825]
     # 0.175449 · 1.39987 · 10.00163 = 2.45646 N m; a rotor gives 0.05 N m/N, four share it.
-    assert [61.2823, 36.7177, 61.2823, 36.7177] == thrusts("rates", (0, 0, 0, 0.1))
+    assert thrusts("rates", (0, 0, 0, 0.1)) == [61.2823, 36.7177, 61.2823, 36.7177]
 
 
 def test_the_gyroscopic_torque_by_hand() -> None:
     """At the rates that are wanted, (0, 2, 1) rad/s: 2 · 1 · (10.00163 - 5.025725) N m of roll."""
     wanted = (0, 0, 2 / 11.06889, 1 / 1.754486)
     spinning = thrusts("rates", wanted, body_rates=np.array((0.0, 2.0, 1.0)))
-    assert [51.48795, 46.51205, 46.51205, 51.48795] == spinning
+    assert spinning == [51.48795, 46.51205, 46.51205, 51.48795]
 
 
 def test_attitude_by_hand() -> None:
     # A roll of 0.0974452 rad: 2 sin of its half is 0.0974067; times 4.41584 /s, 8.83168 /s and
     # 5.025725 kg m² it is 19.0918 N m.
-    assert [53.77295, 44.22705, 44.22705, 53.77295] == thrusts("attitude", (0, 0.1, 0, 0))
-    assert [44.22705, 44.22705, 53.77295, 53.77295] == thrusts("attitude", (0, 0, 0.1, 0))
+    assert thrusts("attitude", (0, 0.1, 0, 0)) == [53.77295, 44.22705, 44.22705, 53.77295]
+    assert thrusts("attitude", (0, 0, 0.1, 0)) == [44.22705, 44.22705, 53.77295, 53.77295]
     # Rolled by 90°, to level: 2 sin 45° · 4.41584 · 8.83168 · 5.025725 = 277.185 N m to the right,
     # more than 200: with the collective thrust in the middle, two rotors at full thrust.
     half = math.sqrt(0.5)
-    assert [0.0, 100.0, 100.0, 0.0] == thrusts(
-        "attitude", (0, 0, 0, 0), quaternion=np.array((half, half, 0.0, 0.0))
-    )
+    assert thrusts("attitude", (0, 0, 0, 0), quaternion=np.array((half, half, 0.0, 0.0))) == [
+        0.0,
+        100.0,
+        100.0,
+        0.0,
+    ]
     # Upside down the error is 2 rad, about x.
     over = np.array((0.0, 1.0, 0.0, 0.0))
-    assert [100.0, 0.0, 0.0, 100.0] == thrusts("attitude", (0, 0, 0, 0), quaternion=over)
+    assert thrusts("attitude", (0, 0, 0, 0), quaternion=over) == [100.0, 0.0, 0.0, 100.0]
 
 
 def test_velocity_by_hand() -> None:
     # 0.313050 m/s · 2.20792 /s = 0.691189 m/s²: 20 kg · 10.491189 m/s² over four.
-    assert [52.45595] * 4 == thrusts("velocity", (0, 0, 0.1, 0))
+    assert thrusts("velocity", (0, 0, 0.1, 0)) == [52.45595] * 4
     # 0.537368 m/s · 2.20792 /s = 1.186466 m/s² forward: a tilt of atan(1.186466 / 9.8) =
     # 0.1204821 rad; 2 sin of its half is 0.1204092; · 4.41584 · 8.83168 · 5.025725 = 23.60013 N m.
-    assert [43.09997, 43.09997, 54.90003, 54.90003] == thrusts("velocity", (0.1, 0, 0, 0))
+    assert thrusts("velocity", (0.1, 0, 0, 0)) == [43.09997, 43.09997, 54.90003, 54.90003]
     # With the nose to the left, forward is left: the same torque about the same body axis.
     left = np.array((math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
-    assert [43.09997, 43.09997, 54.90003, 54.90003] == thrusts(
-        "velocity", (0.1, 0, 0, 0), quaternion=left
-    )
+    assert thrusts("velocity", (0.1, 0, 0, 0), quaternion=left) == [
+        43.09997,
+        43.09997,
+        54.90003,
+        54.90003,
+    ]
 
 
 def test_position_by_hand() -> None:
     # 0.4 m · 0.883168 /s · 2.20792 /s = 0.779998 m/s².
-    assert [52.89999] * 4 == thrusts("position", (0, 0, 0.1, 0))
+    assert thrusts("position", (0, 0, 0.1, 0)) == [52.89999] * 4
     # 4 m: half of 4.9 m/s² stops from 3.1305 m/s, within 2 m; 3.1305 · 2.20792 is more than 4.9.
-    assert [73.5] * 4 == thrusts("position", (0, 0, 1, 0))
+    assert thrusts("position", (0, 0, 1, 0)) == [73.5] * 4
     # 0.0314159 rad · 0.69994 /s · 1.39987 /s · 10.00163 kg m² = 0.307878 N m.
-    assert [50.53939, 47.46061, 50.53939, 47.46061] == thrusts("position", (0, 0, 0, 0.01))
+    assert thrusts("position", (0, 0, 0, 0.01)) == [50.53939, 47.46061, 50.53939, 47.46061]
 
 
 def test_mixing_keeps_roll_and_pitch_before_collective_and_that_before_yaw() -> None:
@@ -163,14 +169,14 @@ def test_mixing_keeps_roll_and_pitch_before_collective_and_that_before_yaw() -> 
     def mixed(collective: float, *torque: float) -> Any:
         return pytest.approx(controller.mixed(collective, torque), abs=1e-6)
 
-    assert [74.0, 24.0, 24.0, 74.0] == mixed(196.0, 100.0, 0.0, 0.0)  # all fits
-    assert [100.0, 50.0, 50.0, 100.0] == mixed(400.0, 100.0, 0.0, 0.0)  # less collective thrust
-    assert [50.0, 0.0, 0.0, 50.0] == mixed(0.0, 100.0, 0.0, 0.0)  # more of it
-    assert [100.0, 0.0, 0.0, 100.0] == mixed(196.0, 900.0, 0.0, 5.0)  # no room: no yaw
-    assert [50.0, 0.0, 50.0, 100.0] == mixed(196.0, 300.0, 300.0, 0.0)  # both scaled alike
-    assert [54.0, 44.0, 54.0, 44.0] == mixed(196.0, 0.0, 0.0, 1.0)
-    assert [98.0, 0.0, 98.0, 0.0] == mixed(196.0, 0.0, 0.0, 30.0)  # yaw takes what is left
-    assert [99.0, 0.0, 49.0, 50.0] == mixed(198.0, 100.0, 0.0, 30.0)  # which is 98 / 20 N m
+    assert mixed(196.0, 100.0, 0.0, 0.0) == [74.0, 24.0, 24.0, 74.0]  # all fits
+    assert mixed(400.0, 100.0, 0.0, 0.0) == [100.0, 50.0, 50.0, 100.0]  # less collective thrust
+    assert mixed(0.0, 100.0, 0.0, 0.0) == [50.0, 0.0, 0.0, 50.0]  # more of it
+    assert mixed(196.0, 900.0, 0.0, 5.0) == [100.0, 0.0, 0.0, 100.0]  # no room: no yaw
+    assert mixed(196.0, 300.0, 300.0, 0.0) == [50.0, 0.0, 50.0, 100.0]  # both scaled alike
+    assert mixed(196.0, 0.0, 0.0, 1.0) == [54.0, 44.0, 54.0, 44.0]
+    assert mixed(196.0, 0.0, 0.0, 30.0) == [98.0, 0.0, 98.0, 0.0]  # yaw takes what is left
+    assert mixed(198.0, 100.0, 0.0, 30.0) == [99.0, 0.0, 49.0, 50.0]  # which is 98 / 20 N m
 
 
 # --- array code -----------------------------------------------------------------------------------
@@ -331,9 +337,7 @@ def test_a_batch_of_every_level_flies_as_single_envs(level: str) -> None:
             assert env.step(actions[i])[0].tobytes() == seen[i].tobytes()
 
 
-@pytest.mark.parametrize(
-    ("estimate", "calls"), [(False, 4), (True, 1)], ids=["exact", "estimate"]
-)
+@pytest.mark.parametrize(("estimate", "calls"), [(False, 4), (True, 1)], ids=["exact", "estimate"])
 def test_loops_run_in_every_physics_step_unless_they_see_an_estimate(
     estimate: bool, calls: int
 ) -> None:

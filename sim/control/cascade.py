@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ..state import Array, WorldState, clip, component, stack
+from ..state import Array, WorldState, clip, stack
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
@@ -73,12 +73,12 @@ class Rates:
 
     def turn(self, collective: Any, rates: Parts, state: WorldState) -> Array:
         """Thrusts for a collective thrust, N, and body rates, rad/s."""
-        p, q, r = (component(state.body_rates, i) for i in range(3))
-        errors = rates[0] - p, rates[1] - q, rates[2] - r
-        wanted = [gain * error for gain, error in zip(self.gains.rate, errors, strict=True)]
-        u, v, w = self._with_inertia((p, q, r))
-        spin = q * w - r * v, r * u - p * w, p * v - q * u
-        torque = [a + b for a, b in zip(self._with_inertia(wanted), spin, strict=True)]
+        p, q, r = _parts(state.body_rates)
+        about_x, about_y, about_z = self.gains.rate
+        wanted = about_x * (rates[0] - p), about_y * (rates[1] - q), about_z * (rates[2] - r)
+        roll, pitch, yaw = self._with_inertia(*wanted)
+        u, v, w = self._with_inertia(p, q, r)
+        torque = roll + (q * w - r * v), pitch + (r * u - p * w), yaw + (p * v - q * u)
         return self._driven(self.mixed(collective, torque), state)
 
     def mixed(self, collective: Any, torque: Parts) -> list[Any]:
@@ -86,16 +86,15 @@ class Rates:
         gains, (roll, pitch, yaw) = self.gains, torque
         low, high = gains.lowest, gains.highest
         added = [a * roll + b * pitch for a, b, _ in gains.mix]
-        span = reduce(_larger, added) - reduce(_smaller, added)
-        scale = clip((high - low) / clip(span, 1e-9 * high, math.inf), 0.0, 1.0)
-        added = [scale * part for part in added]
-        least, most = low - reduce(_smaller, added), high - reduce(_larger, added)
+        lower, upper = _least(added), _most(added)
+        scale = clip((high - low) / clip(upper - lower, 1e-9 * high, math.inf), 0.0, 1.0)
+        least, most = low - scale * lower, high - scale * upper
         middle = _smaller(_larger(collective + 0.0 * least, least), most)
-        parts = [middle + part for part in added]
+        parts = [middle + scale * part for part in added]
         yaws = [(part, c) for part, (*_, c) in zip(parts, gains.mix, strict=True) if c]
         ends = [((low - part) / c, (high - part) / c)[:: 1 if c > 0 else -1] for part, c in yaws]
-        yaw = _larger(yaw, reduce(_larger, [end for end, _ in ends]))
-        yaw = _smaller(yaw, reduce(_smaller, [end for _, end in ends]))
+        yaw = _larger(yaw, _most([end for end, _ in ends]))
+        yaw = _smaller(yaw, _least([end for _, end in ends]))
         rotors = zip(gains.share, parts, gains.mix, strict=True)
         return [share * (part + c * yaw) for share, part, (*_, c) in rotors]
 
@@ -103,21 +102,20 @@ class Rates:
         """Commands that make rotors with a lag give these thrusts."""
         lead = self.gains.lead
         if lead != 1.0:
-            now = [component(state.thrust, i) for i in range(len(wanted))]
+            now = _parts(state.thrust)
             wanted = [old + lead * (new - old) for old, new in zip(now, wanted, strict=True)]
         limited = zip(wanted, self._limits, strict=True)
         return stack([clip(part, low, high) for part, (low, high) in limited])
 
     def _scaled(self, action: Array) -> list[Any]:
-        sizes = enumerate(self._sizes)
-        return [size * clip(component(action, i), -1.0, 1.0) for i, size in sizes]
+        pairs = zip(_parts(action), self._sizes, strict=True)
+        return [size * clip(part, -1.0, 1.0) for part, size in pairs]
 
     def _collective(self, share: Any) -> Any:
         """N, of a number in [-1, 1]."""
         return self._hover + self._up * clip(share, 0.0, 1.0) + self._down * clip(share, -1.0, 0.0)
 
-    def _with_inertia(self, vector: Parts) -> list[Any]:
-        x, y, z = vector
+    def _with_inertia(self, x: Any, y: Any, z: Any) -> list[Any]:
         return [a * x + b * y + c * z for a, b, c in self._inertia]
 
 
@@ -189,11 +187,12 @@ class Velocity(Attitude):
         """Thrusts for a velocity in the world frame, m/s; the others as of `point`."""
         gains, gravity = self.gains, self._gravity
         level, up = gains.most_acceleration
-        now = (component(state.velocity, i) for i in range(3))
-        x, y, z = (gains.velocity * (new - old) for new, old in zip(velocity, now, strict=True))
-        z = gravity + clip(z, -up, up)
+        u, v, w = _parts(state.velocity)
+        k = gains.velocity
+        x, y = k * (velocity[0] - u), k * (velocity[1] - v)
+        z = gravity + clip(k * (velocity[2] - w), -up, up)
         # Sideways no more than what the largest tilt gives at this lift.
-        share = clip(level / gravity * z / _length((x, y)), 0.0, 1.0)
+        share = clip(level / gravity * z / _length(x, y), 0.0, 1.0)
         x, y = share * x, share * y
         size = _root(x * x + y * y + z * z)
         collective = self._mass * _dot((x, y, z), axes[2])
@@ -223,9 +222,9 @@ class Position(Velocity):
         x, y, z, heading = self._scaled(action)
         axes, gains = _axes(state.quaternion), self.gains
         (level, up), (fast, climb) = gains.most_acceleration, gains.most_velocity
-        along = self._gain(_length((x, y)), level, fast)
+        along = self._gain(_length(x, y), level, fast)
         x, y = _turned(axes[0], along * x, along * y)
-        z = self._gain(_length((z,)), up, climb) * z
+        z = self._gain(_length(z), up, climb) * z
         most = gains.most_rate[2]
         return self.fly((x, y, z), clip(gains.heading * heading, -most, most), axes, state)
 
@@ -237,7 +236,7 @@ class Position(Velocity):
 
 def _axes(quaternion: Array) -> tuple[Parts, Parts, Parts]:
     """Body x, y and z in the world frame."""
-    w, x, y, z = (component(quaternion, i) for i in range(4))
+    w, x, y, z = _parts(quaternion)
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
         (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
@@ -250,7 +249,7 @@ def _turned(nose: Parts, x: Any, y: Any) -> tuple[Any, Any]:
 
     The heading is the direction of the nose on the ground; 0 where the nose is vertical.
     """
-    length = _length(nose[:2])
+    length = _length(nose[0], nose[1])
     c, s = nose[0] / length, nose[1] / length
     return c * x - s * y, s * x + c * y
 
@@ -259,8 +258,24 @@ def _dot(a: Parts, b: Parts) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _length(vector: Parts) -> Any:
-    return _root(sum(part * part for part in vector) + _TINY)
+def _length(x: Any, y: Any = 0.0) -> Any:
+    return _root(x * x + y * y + _TINY)
+
+
+def _parts(array: Array) -> list[Any]:
+    """Components of the last axis; of a single drone Python's numbers."""
+    if array.ndim == 1:
+        numbers: list[Any] = array.tolist()
+        return numbers
+    return [array[..., i] for i in range(array.shape[-1])]
+
+
+def _most(parts: list[Any]) -> Any:
+    return max(parts) if isinstance(parts[0], float) else reduce(_larger, parts)
+
+
+def _least(parts: list[Any]) -> Any:
+    return min(parts) if isinstance(parts[0], float) else reduce(_smaller, parts)
 
 
 def _root(square: Any) -> Any:
