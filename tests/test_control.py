@@ -1,5 +1,6 @@
 """Action levels: hand-computed thrusts, NumPy as torch, batch as single, and all vehicles fly."""
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from rotorgram.sim import (
 )
 
 DATA = Path(__file__).parent / "data"
+DOCS = Path(__file__).parent.parent / "docs"
 HOVER = "rotorgram/Hover-v0"
 MOCAP = {"noise": 0.001, "angle_noise": 0.002}
 ESTIMATE = {"imu": True, "motion_capture": MOCAP, "estimate": True, "observe": "estimate"}
@@ -384,3 +386,32 @@ def test_a_craft_that_cannot_yaw_is_refused(tmp_path: Path) -> None:
     vehicle = Vehicle.load(file)
     with pytest.raises(InputError, match=r"vehicle: expected .* yaw it.* got .* of rank 3"):
         make_controller("rates", vehicle, 0.01)
+
+
+# --- the page -------------------------------------------------------------------------------------
+
+
+def test_the_page_tells_what_the_benchmark_wrote_and_the_code_gives() -> None:
+    page = (DOCS / "control.md").read_text(encoding="utf-8")
+    told = json.loads((DOCS / "results/control/control.json").read_text(encoding="utf-8"))
+    assert sorted(told["gains"]) == sorted(
+        name for name, file in FILES.items() if "vehicles" in str(file)
+    )
+    for name, given in told["gains"].items():
+        gains = Gains.of(Vehicle.load(name), given["timestep"], given["lag"])
+        for field in given.keys() - {"timestep", "lag"}:
+            assert getattr(gains, field) == pytest.approx(given[field], abs=1e-4)
+        tilt, (level, up) = math.degrees(gains.most_tilt), gains.most_offset
+        assert f"| {tilt:.0f} | {given['most_velocity'][0]:.2f}, " in page
+        assert f"{given['most_velocity'][1]:.2f} | {level:.2f}, {up:.2f} |" in page
+        assert f"| {gains.velocity:.2f} | {given['position']:.3f} | {given['lead']:.2f} |" in page
+    for name, steps in told["responses"].items():
+        cells = [
+            f"{one['rise_s']:.2f} s, {100 * one['overshoot']:.0f} %, {one['settled_s']:.2f} s"
+            for one in steps.values()
+        ]
+        row = f"| `{name}` | {' | '.join(cells)} | {100 * told['circle_m'][name]:.0f} cm |"
+        assert row in page
+    for level in LEVELS:
+        costs = [f"{told['cost'][n]['ratio_to_rotors'][level]:.2f}" for n in ("1", "1024")]
+        assert f"| `{level}` | {' | '.join(costs)} |" in page
