@@ -1,6 +1,6 @@
-"""Learning algorithms, their policies and files, and a PID controller.
+"""Learning algorithms, their policies and files, and controllers: PID and geometric.
 
-Policies, the PID and the reading of checkpoints import no algorithm: `make_agent` and
+Policies, controllers and the reading of checkpoints import no algorithm: `make_agent` and
 `resume_agent` do. Only SB3's needs torch.
 """
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from ..models.errors import InputError
 from .checkpoints import Checkpoint, CheckpointError, load, store
 from .episodes import Episode, EpisodeLog, ResumeError, episode_seed
+from .geometric import Geometric
 from .pid import PID
 from .policies import NetworkPolicy, Policy
 from .presets import (
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "PID", "PRESETS", "A2CConfig", "AlgorithmName", "Checkpoint", "CheckpointError", "Episode",
-    "EpisodeLog", "NetworkPolicy", "PPOConfig", "Policy", "ResumeError", "SACConfig",
+    "EpisodeLog", "Geometric", "NetworkPolicy", "PPOConfig", "Policy", "ResumeError", "SACConfig",
     "VPGConfig", "episode_seed", "load", "make_agent", "preset", "resume_agent", "store",
 ]  # fmt: skip
 

@@ -1,6 +1,6 @@
 """A hand-tuned PID controller: the classical baseline of `Elevation-v0`."""
 
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -25,6 +25,9 @@ class PID:
     relative to hover, give the thrust at hover, and that over g the mass that a rotor carries.
     Raises `InputError` for another env, or where options or telemetry lack what it needs.
     """
+
+    options: ClassVar[dict[str, Any]] = {}
+    """Options of the env that it needs."""
 
     def __init__(self, spec: EnvSpec) -> None:
         options = spec.options

@@ -5,7 +5,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from ..agents import PID, Checkpoint, Policy, load
+from ..agents import PID, Checkpoint, Geometric, Policy, load
 from ..envs.registry import env_spec, is_known
 from ..envs.spec import EnvSpec
 from ..experiments.pairs import socket_pair
@@ -16,30 +16,39 @@ from ..udp import RemoteEnv, RemoteVectorEnv
 from ._flags import AgentFlags, EnvFlags, parse_address
 
 CHECKPOINT: Final = "checkpoint.safetensors"
+Controller = type[PID] | type[Geometric]
+CONTROLLERS: Final[dict[str, Controller]] = {"pid": PID, "geometric": Geometric}
 _CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
 
 
-def load_checkpoint(name: str) -> Checkpoint | None:
-    """The checkpoint of a file or a training's folder; None for `pid`. Raises `InputError`."""
-    if name == "pid":
-        return None
+def load_checkpoint(name: str) -> Checkpoint | Controller:
+    """The checkpoint of a file or a training's folder, or one of `CONTROLLERS`. Raises
+    `InputError`.
+    """
+    if name in CONTROLLERS:
+        return CONTROLLERS[name]
     path = Path(name)
     file, others = path / CHECKPOINT if path.is_dir() else path, path / "checkpoints"
     got = f"{name}, where there is no file {file}"
     got += f": look into {others}" if others.is_dir() else ""
-    expect(file.is_file(), "policy", "pid, a checkpoint or the folder of a training", got)
+    expect(
+        file.is_file(), "policy", "pid, geometric, a checkpoint or the folder of a training", got
+    )
     return load(file)
 
 
 def chosen_env(
-    command: EnvFlags, checkpoint: Checkpoint | None = None
+    command: EnvFlags, checkpoint: Checkpoint | Controller | None = None
 ) -> tuple[str, dict[str, Any]]:
     """Id of the task, and its options that are not the default.
 
-    A checkpoint brings those that it was trained with; options that the user set win. Raises
-    `InputError` if they are of another task than the checkpoint's.
+    A checkpoint brings those that it was trained with, a controller those it needs;
+    options that the user set win. Raises `InputError` if they are of another task than the
+    checkpoint's.
     """
     env_id, options = command.env_id, command.options
+    if isinstance(checkpoint, type):
+        return env_id, {**checkpoint.options, **options}
     if checkpoint is None or ("env" in command.given and env_id != checkpoint.env_id):
         return env_id, options
     wanted = f"--env {checkpoint.env_id} with options of the task that the policy was trained on"
@@ -52,12 +61,12 @@ def chosen_env(
     return env
 
 
-def policy_for(command: EnvFlags, checkpoint: Checkpoint | None, spec: EnvSpec) -> Policy:
-    """The policy of a checkpoint, or the PID. Raises `InputError` if it does not fit the env, or
-    was trained on another vehicle and the user has not named one.
+def policy_for(command: EnvFlags, checkpoint: Checkpoint | Controller, spec: EnvSpec) -> Policy:
+    """The policy of a checkpoint, or a controller. Raises `InputError` if it does not fit the env,
+    or was trained on another vehicle and the user has not named one.
     """
-    if checkpoint is None:
-        return PID(spec)
+    if isinstance(checkpoint, type):
+        return checkpoint(spec)
     _check_vehicle(command, checkpoint, spec)
     return checkpoint.policy(spec)
 
@@ -76,13 +85,14 @@ def _check_vehicle(command: EnvFlags, checkpoint: Checkpoint, spec: EnvSpec) -> 
 def pilot_of(
     command: EnvFlags, what: str
 ) -> tuple[Checkpoint | None, Policy | None, tuple[str, dict[str, Any]]]:
-    """Checkpoint (None for `pid`), policy (None for `random`) and env of what flies here."""
+    """Checkpoint (None without one), policy (None for `random`) and env of what flies here."""
     if what == "random":
         return None, None, chosen_env(command)
     checkpoint = load_checkpoint(what)
     env = chosen_env(command, checkpoint)
     spec = env_spec(*env, vehicle=command.vehicle)
-    return checkpoint, policy_for(command, checkpoint, spec), env
+    policy = policy_for(command, checkpoint, spec)
+    return None if isinstance(checkpoint, type) else checkpoint, policy, env
 
 
 def words_of(trajectory: Trajectory) -> str:

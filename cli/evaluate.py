@@ -10,10 +10,10 @@ from ._flags import AgentFlags, check_count
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(AgentFlags):
-    """Measure a trained policy or the PID over episodes without exploration."""
+    """Measure a trained policy or a controller over episodes without exploration."""
 
     policy: Positional[Annotated[str, arg(metavar="POLICY")]]
-    """Checkpoint, folder of a training, or pid."""
+    """Checkpoint, folder of a training, pid or geometric."""
     episodes: int = 20
     """Episodes to fly, from seeds that no training uses."""
 

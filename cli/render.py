@@ -13,7 +13,7 @@ from ..experiments.trajectories import Trajectory, flown_trajectories, recorded_
 from ..models.errors import expect
 from ._flags import EnvFlags, check_count
 
-_ALIKE: Final = ("pid", "random")  # their words tell no two of them apart
+_ALIKE: Final = ("pid", "geometric", "random")  # their words tell no two of them apart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,8 +24,8 @@ class Render(EnvFlags):
     """
 
     what: Positional[tuple[str, ...]]
-    """Checkpoint, folder of a training, pid, random, or a journal (.mcap). Policies fly evaluation
-    episodes without exploration."""
+    """Checkpoint, folder of a training, pid, geometric, random, or a journal (.mcap). Policies fly
+    evaluation episodes without exploration."""
     out: Path
     """film.mp4, film.gif, picture.png, or a folder for pictures 0001.png and so on. It must not
     exist."""
@@ -88,7 +88,7 @@ class Render(EnvFlags):
     def _check(self) -> None:
         right, flights = self.at is None or self.out.suffix.lower() == ".png", len(self.what)
         expect(right, "at", "it with a picture, --out NAME.png", str(self.out))
-        expect(self.what, "what", "a checkpoint, pid, random or a journal", "nothing")
+        expect(self.what, "what", "a checkpoint, pid, geometric, random or a journal", "nothing")
         right = len(self.names) in (0, flights)
         expect(right, "names", f"one for each of {flights} flights", str(len(self.names)))
         expect(self.episode >= 0, "episode", "0 or more", str(self.episode))

@@ -17,7 +17,7 @@ class Serve(AgentFlags):
     """
 
     policy: Positional[str]
-    """Checkpoint, folder of a training, or pid."""
+    """Checkpoint, folder of a training, pid or geometric."""
     listen: Annotated[str | None, arg(metavar="HOST:PORT")] = "127.0.0.1:8001"
     """Address to wait at."""
     episodes: int | None = None

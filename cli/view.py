@@ -22,7 +22,7 @@ class View(EnvFlags):
     """
 
     what: Positional[str]
-    """Checkpoint, folder of a training, pid, random, or a journal (.mcap)."""
+    """Checkpoint, folder of a training, pid, geometric, random, or a journal (.mcap)."""
     web: bool = False
     """Serve a page for browsers, for a machine without a display."""
     port: int = 8080

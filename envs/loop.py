@@ -105,7 +105,15 @@ def spec_of(env_id: str, task: Task) -> EnvSpec:
     action: ArraySpec | Discrete = (
         Discrete(n=controller.choices, components=names)
         if controller.choices
-        else ArraySpec(name="action", shape=(len(low),), low=low, high=high, components=names)
+        else ArraySpec(
+            name="action",
+            shape=(len(low),),
+            low=low,
+            high=high,
+            unit=getattr(controller, "units", ""),
+            frame=getattr(controller, "frame", ""),
+            components=names,
+        )
     )
     return EnvSpec(
         env_id=env_id,
@@ -213,8 +221,11 @@ class Loop(NotCopied):
         ]
         period, sensors = self.spec.control_period, draft.options.sensors
         self._sensors = Sensors(sensors, self.world, period) if sensors else None
-        estimated = sensors.get("observe") == "estimate"  # it may leave the task's bounds
+        estimated = draft.options.estimated  # it may leave the task's bounds
         self._limits = {a.name: a.bounds() for a in self.spec.observation if estimated}
+        # An estimate is one for a control step, and so are the thrusts of what sees it.
+        often = getattr(self.task.controller, "every_step", False) and not estimated
+        self._held = 1 if often else self._substeps
         none = self.world.state.touching != self.world.state.touching  # all False, on its device
         self._none, self._nobody = none, none.reshape(num_envs)
         self._everybody: Array = ~none
@@ -285,9 +296,11 @@ class Loop(NotCopied):
         if self._late_actions is not None:
             self._late_actions.push(None if some is None else some[..., None], values)
             values = self._late_actions.get(each(world.parameters["action_delay"]))
-        thrust = self.task.controller.thrust(values, self._seen())
+        controller = self.task.controller
         try:
-            world.step(thrust, self._substeps, some)
+            for step in range(0, self._substeps, self._held):
+                thrust = controller.thrust(values, self._seen())
+                world.step(thrust, self._held, some, again=step > 0)
         except PhysicsError:
             self._waiting = self._waiting | (~self._nobody if flown is None else flown)
             self._anyone_waits = True

@@ -4,7 +4,7 @@ Knows nothing of tasks, rewards or Gymnasium.
 """
 
 from ..models import BACKENDS, Backend
-from .control import LEVELS, CollectiveThrust, Controller, RotorThrust, make_controller
+from .control import LEVELS, CollectiveThrust, Controller, Gains, RotorThrust, make_controller
 from .effects import EffectOptions
 from .random import Draw
 from .randomize import PARAMETERS, Randomization
@@ -26,7 +26,7 @@ from .world import PhysicsError, World, make_world
 
 __all__ = [
     "BACKENDS", "LEVELS", "PARAMETERS", "Array", "Backend", "CollectiveThrust", "Controller",
-    "Draw", "EffectOptions", "PhysicsError", "Pose", "Randomization", "RotorThrust", "World",
-    "WorldState", "checked_sensors", "clip", "component", "constant", "each",
+    "Draw", "EffectOptions", "Gains", "PhysicsError", "Pose", "Randomization", "RotorThrust",
+    "World", "WorldState", "checked_sensors", "clip", "component", "constant", "each",
     "make_controller", "make_world", "on_host", "plain", "square_root", "stack",
 ]  # fmt: skip

@@ -58,11 +58,14 @@ class World(Protocol):
     def reset(self, mask: Array, pose: Pose) -> None:
         """Reset the worlds of the mask, bool, shape (W, A), to their rows of `pose`."""
 
-    def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
+    def step(
+        self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
+    ) -> None:
         """Fly the worlds of the mask, None for all, for so many physics steps with these thrusts.
 
-        Thrusts in N, shape (W, A, R). A bad state raises `PhysicsError`, which names the worlds to
-        be reset.
+        Thrusts in N, shape (W, A, R). Where it goes on `again` after a step with the same mask, the
+        state's `touching` counts from that step on. A bad state raises `PhysicsError`, which names
+        the worlds to be reset.
         """
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:

@@ -90,6 +90,11 @@ class TaskOptions:
         """Whether the vehicle flies as its model alone: no effects, nothing drawn."""
         return not (self.effects or self.randomize)
 
+    @property
+    def estimated(self) -> bool:
+        """Whether controller and observation see the onboard estimate, once a control step."""
+        return bool(self.sensors.get("observe") == "estimate")
+
     def to_options(self) -> dict[str, Any]:
         """Every option by its name, as a spec has them; of mappings those that are not empty."""
         told = {one.name: getattr(self, one.name) for one in fields(self)}
@@ -145,14 +150,21 @@ class Task:
         self, options: Any, vehicle: "Vehicle", shape: tuple[int, ...] = (), xp: Any = np
     ) -> None:
         self.options, self.vehicle, self.shape, self.xp = options, vehicle, shape, xp
-        self.controller = of_level = make_controller(
-            options.action, vehicle, options.control_period
-        )
+        self.controller = of_level = self._of_level()
         self.setup()
         ignored = self.controller is not of_level and options.actions is TaskOptions.actions
         usual = type(options).action
         right = not ignored or options.action == usual
         expect(right, "action", f"{usual!r}, for the task has a controller", repr(options.action))
+
+    def _of_level(self) -> Controller:
+        """The controller of the option `action`."""
+        options, told = self.options, self.vehicle.coefficients.rotors
+        lags = options.effects.get("motor_lag", False)
+        times = (told.time_constant, told.time_constant_down) if lags else ()
+        lag = max((time for time in times if time), default=0.0)
+        period = options.control_period if options.estimated else self.vehicle.timestep
+        return make_controller(options.action, self.vehicle, period, lag=lag)
 
     def setup(self) -> None:
         """Set `observation`, from `options` and `vehicle`.

@@ -142,7 +142,9 @@ class MujocoWorld:
             self._batch.forward(some if self.shape else None)
         self._touching[ids] = self._contacts[ids] > 0
 
-    def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
+    def step(
+        self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
+    ) -> None:
         """As `World.step`."""
         self._check_process()
         ids = None if mask is None else self._ids(mask)
@@ -152,7 +154,8 @@ class MujocoWorld:
         if self.effects is None:
             self._apply_thrust(self._command)
         touching = self._touching
-        touching[some] = False
+        if not again:
+            touching[some] = False
         while substeps > 0:
             steps = min(substeps, self._check)
             try:

@@ -149,7 +149,9 @@ class WarpWorld(TensorWorld):
         self._launch(self._forward)
         state.touching.copy_(torch.where(mask, self._contact(), state.touching))
 
-    def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
+    def step(
+        self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
+    ) -> None:
         """As `World.step`."""
         state, thrust, before = self.state, thrust.detach(), []
         if mask is not None:
@@ -158,7 +160,7 @@ class WarpWorld(TensorWorld):
         state.command.copy_(thrust)
         if self.effects is None:
             self._apply_thrust(state.command)
-        touching = torch.zeros_like(state.touching)
+        touching = state.touching.clone() if again else torch.zeros_like(state.touching)
         while substeps > 0:
             steps = min(substeps, self._check)
             at_once = steps if self.effects is None else 1

@@ -1,41 +1,11 @@
-"""Controllers: they turn actions into rotor thrusts.
+"""Controllers whose actions are thrusts: of all rotors alike, or of each."""
 
-A controller has no memory: what it needs of the past is in the state. An action has k numbers
-within bounds, or is one of some choices.
-"""
+from typing import TYPE_CHECKING, Final
 
-from typing import TYPE_CHECKING, Final, Protocol
-
-from ..models.errors import expect
-from .state import Array, WorldState, clip, component, constant, stack
+from ..state import Array, WorldState, clip, component, constant, stack
 
 if TYPE_CHECKING:
-    from ..models.vehicle import Vehicle
-
-
-LEVELS: Final = ("rotors", "increment", "offset")
-"""What an action may set: the thrust of each rotor, a change of all thrusts, all thrusts."""
-SHARES: Final = {"increment": 0.05, "offset": 0.2}
-"""Thrust of one unit of action over the rotors' largest thrust."""
-
-
-class Controller(Protocol):
-    """Turns actions into thrusts."""
-
-    low: tuple[float, ...]
-    """Lower bound of each number of an action, shape (k,)."""
-    high: tuple[float, ...]
-    """Upper bounds, shape (k,)."""
-    components: tuple[str, ...]
-    """Name of each number, or of each choice."""
-    choices: int
-    """0: an action is k numbers. Otherwise it is one number, 0 to choices - 1."""
-
-    def thrust(self, action: Array, state: WorldState) -> Array:
-        """Thrust of each rotor until the next action, N, shape (W, A, R), or what broadcasts to it.
-
-        Actions are float64, shape (W, A, k), finite; one beyond a bound counts as the bound.
-        """
+    from ...models.vehicle import Vehicle
 
 
 class CollectiveThrust:
@@ -98,15 +68,3 @@ class RotorThrust:
         """As `Controller.thrust`."""
         hover, up, down = (constant(x, state.thrust) for x in (self._hover, self._up, self._down))
         return hover + up * clip(action, 0.0, 1.0) + down * clip(action, -1.0, 0.0)
-
-
-def make_controller(level: str, vehicle: "Vehicle", period: float) -> Controller:
-    """The controller of one of `LEVELS`; `period` is the time between two actions, s.
-
-    Raises `InputError` if the level is none of them, or the vehicle cannot be flown at it.
-    """
-    expect(level in LEVELS, "action", f"one of {', '.join(LEVELS)}", repr(level))
-    if level == "rotors":
-        return RotorThrust(vehicle)
-    newtons = SHARES[level] * float(vehicle.thrust_high.max())
-    return CollectiveThrust(vehicle, newtons, increment=level == "increment")

@@ -1,0 +1,75 @@
+"""Controllers: they turn actions into rotor thrusts. `docs/control.md` is their page.
+
+A controller has no memory: what it needs of the past is in the state. An action has k numbers
+within bounds, or is one of some choices.
+"""
+
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from ...models.errors import expect
+from ..state import Array, WorldState
+from .cascade import Attitude, Position, Rates, Velocity
+from .gains import Gains
+from .thrusts import CollectiveThrust, RotorThrust
+
+if TYPE_CHECKING:
+    from ...models.vehicle import Vehicle
+
+__all__ = [
+    "LEVELS", "SHARES", "CollectiveThrust", "Controller", "Gains", "RotorThrust", "make_controller",
+]  # fmt: skip
+
+_CASCADE: Final[dict[str, Any]] = {
+    "rates": Rates,
+    "attitude": Attitude,
+    "velocity": Velocity,
+    "position": Position,
+}
+LEVELS: Final = ("rotors", *_CASCADE, "increment", "offset")
+"""What an action may set: the thrust of each rotor; collective thrust and body rates; collective
+thrust, roll, pitch and yaw rate; velocity and yaw rate; position and heading; a change of all
+thrusts; all thrusts."""
+SHARES: Final = {"increment": 0.05, "offset": 0.2}
+"""Thrust of one unit of action over the rotors' largest thrust."""
+
+
+class Controller(Protocol):
+    """Turns actions into thrusts.
+
+    It may also have `every_step`, true where it is asked before each physics step and not once for
+    an action, and `units` and `frame` of its numbers, as of an `ArraySpec`.
+    """
+
+    low: tuple[float, ...]
+    """Lower bound of each number of an action, shape (k,)."""
+    high: tuple[float, ...]
+    """Upper bounds, shape (k,)."""
+    components: tuple[str, ...]
+    """Name of each number, or of each choice."""
+    choices: int
+    """0: an action is k numbers. Otherwise it is one number, 0 to choices - 1."""
+
+    def thrust(self, action: Array, state: WorldState) -> Array:
+        """Thrust of each rotor until the next call, N, shape (W, A, R), or what broadcasts to it.
+
+        Actions are float64, shape (W, A, k), finite; one beyond a bound counts as the bound.
+        """
+
+
+def make_controller(
+    level: str, vehicle: "Vehicle", period: float, *, lag: float = 0.0
+) -> Controller:
+    """The controller of one of `LEVELS`.
+
+    `period` is the time between two looks at the state, s: the physics step, or the control period
+    where the state is an estimate. `lag` is the rotors' time constant, s; 0 where they follow at
+    once. Raises `InputError` if the level is none of them, or the vehicle cannot be flown at it.
+    """
+    expect(level in LEVELS, "action", f"one of {', '.join(LEVELS)}", repr(level))
+    if level == "rotors":
+        return RotorThrust(vehicle)
+    if level in _CASCADE:
+        controller: Controller = _CASCADE[level](vehicle, Gains.of(vehicle, period, lag))
+        return controller
+    newtons = SHARES[level] * float(vehicle.thrust_high.max())
+    return CollectiveThrust(vehicle, newtons, increment=level == "increment")

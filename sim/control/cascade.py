@@ -1,0 +1,312 @@
+"""The levels rates, attitude, velocity and position: each loop built on the one below.
+
+Attitude control after T. Lee, M. Leok, N. H. McClamroch, "Control of Complex Maneuvers for a
+Quadrotor UAV using Geometric Methods on SE(3)", arXiv 1003.2005, 2010: with the attitude R, the
+body rates Ω, what is wanted of them, R_d and Ω_d, and the inertia J,
+
+    f = (m a_d + m g e₃) · R e₃
+    M = -k_R e_R - k_Ω e_Ω + Ω × J Ω,   e_Ω = Ω - Rᵀ R_d Ω_d,
+
+with k_R = kᵣ kₐ J and k_Ω = kᵣ J: a rate loop follows Rᵀ R_d Ω_d - kₐ e_R. R_d comes from R by the
+shortest turn of the thrust axis to the wanted one. Of that turn, by an angle θ, e_R has the size
+2 sin(θ / 2), after T. Lee, "Exponential stability of an attitude tracking control system on SO(3)
+for large-angle rotational maneuvers", Systems & Control Letters 61, 2012; the sin θ of 2010
+vanishes upside down. Wanted angular accelerations are left out.
+
+Array code for NumPy and torch with any leading axes; of a single drone the numbers are Python's.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import reduce
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from ..state import Array, WorldState, clip, stack
+
+if TYPE_CHECKING:
+    from ...models.vehicle import Vehicle
+    from .gains import Gains
+
+Parts = Sequence[Any]
+"""Numbers of a vector, or of the rotors: each a number, or an array of shape (W, A)."""
+
+_ASIDE: Final = 1e-3  # Upside down every way to turn is as short: it is about x
+_TINY: Final = 1e-12  # Added to squares under a root, whose slope at 0 is infinite
+_HEADING: Final = "world turned by the heading"
+
+
+class Rates:
+    """Collective thrust and body rates.
+
+    The rate loop: torque = J kᵣ (wanted rates - rates) + rates × J rates. The mixing: torques of
+    roll and pitch come first, scaled down alike where they span more than the rotors' range; then
+    the collective thrust moves as little as makes room for them; yaw gets the room that is left.
+    """
+
+    every_step: Final = True
+    choices: Final = 0
+    components: tuple[str, ...] = ("collective thrust", "roll rate", "pitch rate", "yaw rate")
+    frame = "body"
+
+    def __init__(self, vehicle: "Vehicle", gains: "Gains") -> None:
+        self.gains = gains
+        self.low, self.high = (-1.0,) * len(self.components), (1.0,) * len(self.components)
+        self.units = tuple(f"{size:.7g} {unit}" if unit else "1" for size, unit in self.ranges())
+        self._sizes = [size for size, _ in self.ranges()]
+        self._mass, self._gravity = vehicle.mass, vehicle.gravity
+        self._hover = vehicle.mass * vehicle.gravity
+        self._up, self._down = gains.highest - self._hover, self._hover - gains.lowest
+        self._inertia = vehicle.inertia.tolist()
+        limits = vehicle.thrust_low.tolist(), vehicle.thrust_high.tolist()
+        self._limits = list(zip(*limits, strict=True))
+
+    def ranges(self) -> list[tuple[float, str]]:
+        """What an action of 1 stands for, and the unit; of a collective thrust it is its limit."""
+        return [(1.0, ""), *((rate, "rad/s") for rate in self.gains.most_rate)]
+
+    def thrust(self, action: Array, state: WorldState) -> Array:
+        """As `Controller.thrust`."""
+        share, *rates = self._scaled(action)
+        return self.turn(self._collective(share), rates, state)
+
+    def turn(self, collective: Any, rates: Parts, state: WorldState) -> Array:
+        """Thrusts for a collective thrust, N, and body rates, rad/s."""
+        p, q, r = _parts(state.body_rates)
+        about_x, about_y, about_z = self.gains.rate
+        wanted = about_x * (rates[0] - p), about_y * (rates[1] - q), about_z * (rates[2] - r)
+        roll, pitch, yaw = self._with_inertia(*wanted)
+        u, v, w = self._with_inertia(p, q, r)
+        torque = roll + (q * w - r * v), pitch + (r * u - p * w), yaw + (p * v - q * u)
+        return self._driven(self.mixed(collective, torque), state)
+
+    def mixed(self, collective: Any, torque: Parts) -> list[Any]:
+        """Thrust of each rotor, N, for a collective thrust, N, and a torque, N·m."""
+        gains, (roll, pitch, yaw) = self.gains, torque
+        low, high = gains.lowest, gains.highest
+        added = [a * roll + b * pitch for a, b, _ in gains.mix]
+        lower, upper = _least(added), _most(added)
+        scale = clip((high - low) / clip(upper - lower, 1e-9 * high, math.inf), 0.0, 1.0)
+        least, most = low - scale * lower, high - scale * upper
+        middle = _smaller(_larger(collective + 0.0 * least, least), most)
+        parts = [middle + scale * part for part in added]
+        yaws = [(part, c) for part, (*_, c) in zip(parts, gains.mix, strict=True) if c]
+        ends = [((low - part) / c, (high - part) / c)[:: 1 if c > 0 else -1] for part, c in yaws]
+        yaw = _larger(yaw, _most([end for end, _ in ends]))
+        yaw = _smaller(yaw, _least([end for _, end in ends]))
+        rotors = zip(gains.share, parts, gains.mix, strict=True)
+        return [share * (part + c * yaw) for share, part, (*_, c) in rotors]
+
+    def _driven(self, wanted: list[Any], state: WorldState) -> Array:
+        """Commands that make rotors with a lag give these thrusts."""
+        lead = self.gains.lead
+        if lead != 1.0:
+            now = _parts(state.thrust)
+            wanted = [old + lead * (new - old) for old, new in zip(now, wanted, strict=True)]
+        limited = zip(wanted, self._limits, strict=True)
+        return stack([clip(part, low, high) for part, (low, high) in limited])
+
+    def _scaled(self, action: Array) -> list[Any]:
+        pairs = zip(_parts(action), self._sizes, strict=True)
+        return [size * clip(part, -1.0, 1.0) for part, size in pairs]
+
+    def _collective(self, share: Any) -> Any:
+        """N, of a number in [-1, 1]."""
+        return self._hover + self._up * clip(share, 0.0, 1.0) + self._down * clip(share, -1.0, 0.0)
+
+    def _with_inertia(self, x: Any, y: Any, z: Any) -> list[Any]:
+        return [a * x + b * y + c * z for a, b, c in self._inertia]
+
+
+class Attitude(Rates):
+    """Collective thrust, roll, pitch and yaw rate.
+
+    Roll and pitch are those of the order yaw, pitch, roll (z, y, x), from the present heading: the
+    wanted thrust axis is (cos roll sin pitch, -sin roll, cos roll cos pitch) in the world frame
+    turned by the heading. The yaw rate is that about the vertical.
+    """
+
+    components = ("collective thrust", "roll", "pitch", "yaw rate")
+    frame = _HEADING
+
+    def ranges(self) -> list[tuple[float, str]]:
+        """As of `Rates`."""
+        gains = self.gains
+        tilt = (gains.most_tilt, "rad")
+        return [(1.0, ""), tilt, tilt, (gains.most_rate[2], "rad/s")]
+
+    def thrust(self, action: Array, state: WorldState) -> Array:
+        """As `Controller.thrust`."""
+        share, roll, pitch, yaw_rate = self._scaled(action)
+        axes = _axes(state.quaternion)
+        cosine = _cos(roll)
+        x, y = _turned(axes[0], cosine * _sin(pitch), -_sin(roll))
+        axis = x, y, cosine * _cos(pitch)
+        return self.point(self._collective(share), axis, yaw_rate, axes, state)
+
+    def point(
+        self, collective: Any, axis: Parts, yaw_rate: Any, axes: Sequence[Parts], state: WorldState
+    ) -> Array:
+        """Thrusts for a collective thrust, N, and a thrust axis, a unit vector of the world.
+
+        `axes` are the body's axes in the world frame; the yaw rate is about the vertical, rad/s.
+        """
+        x, y, z = (_dot(own, axis) for own in axes)
+        aside = _ASIDE * (z < 0.0)
+        # Of the turn by θ about (-y, x, 0) / sin θ: over cos(θ / 2), which is sqrt((1 + z) / 2).
+        size = self.gains.attitude / _root(0.5 * (1.0 + z) + 0.25 * (aside * aside))
+        rates = size * (aside - y), size * x, yaw_rate * axes[2][2]
+        return self.turn(collective, rates, state)
+
+
+class Velocity(Attitude):
+    """Velocity in the world frame turned by the heading, and yaw rate.
+
+    Wanted acceleration = kᵥ (wanted velocity - velocity), within `Gains.most_acceleration`. With
+    gravity it gives the thrust axis, and along the present one the collective thrust.
+    """
+
+    components = ("velocity x", "velocity y", "velocity z", "yaw rate")
+
+    def ranges(self) -> list[tuple[float, str]]:
+        """As of `Rates`."""
+        gains = self.gains
+        level, up = gains.most_velocity
+        return [(level, "m/s"), (level, "m/s"), (up, "m/s"), (gains.most_rate[2], "rad/s")]
+
+    def thrust(self, action: Array, state: WorldState) -> Array:
+        """As `Controller.thrust`."""
+        x, y, z, yaw_rate = self._scaled(action)
+        axes = _axes(state.quaternion)
+        return self.fly((*_turned(axes[0], x, y), z), yaw_rate, axes, state)
+
+    def fly(
+        self, velocity: Parts, yaw_rate: Any, axes: Sequence[Parts], state: WorldState
+    ) -> Array:
+        """Thrusts for a velocity in the world frame, m/s; the others as of `point`."""
+        gains, gravity = self.gains, self._gravity
+        level, up = gains.most_acceleration
+        u, v, w = _parts(state.velocity)
+        k = gains.velocity
+        x, y = k * (velocity[0] - u), k * (velocity[1] - v)
+        z = gravity + clip(k * (velocity[2] - w), -up, up)
+        # Sideways no more than what the largest tilt gives at this lift.
+        share = clip(level / gravity * z / _length(x, y), 0.0, 1.0)
+        x, y = share * x, share * y
+        size = _root(x * x + y * y + z * z)
+        collective = self._mass * _dot((x, y, z), axes[2])
+        return self.point(collective, (x / size, y / size, z / size), yaw_rate, axes, state)
+
+
+class Position(Velocity):
+    """A point at an offset from the craft, in the world frame turned by the heading; a heading.
+
+    Wanted velocity = kₚ offset, no faster than what half the largest acceleration stops within the
+    offset, and within `Gains.most_velocity`; wanted yaw rate = gain · offset of the heading.
+    """
+
+    components = ("offset x", "offset y", "offset z", "offset of the heading")
+
+    def __init__(self, vehicle: "Vehicle", gains: "Gains") -> None:
+        super().__init__(vehicle, gains)
+        self.frame = f"{_HEADING}, approached at {gains.position:.7g} /s"
+
+    def ranges(self) -> list[tuple[float, str]]:
+        """As of `Rates`."""
+        level, up = self.gains.most_offset
+        return [(level, "m"), (level, "m"), (up, "m"), (math.pi, "rad")]
+
+    def thrust(self, action: Array, state: WorldState) -> Array:
+        """As `Controller.thrust`."""
+        x, y, z, heading = self._scaled(action)
+        axes, gains = _axes(state.quaternion), self.gains
+        (level, up), (fast, climb) = gains.most_acceleration, gains.most_velocity
+        along = self._gain(_length(x, y), level, fast)
+        x, y = _turned(axes[0], along * x, along * y)
+        z = self._gain(_length(z), up, climb) * z
+        most = gains.most_rate[2]
+        return self.fly((x, y, z), clip(gains.heading * heading, -most, most), axes, state)
+
+    def _gain(self, distance: Any, acceleration: float, speed: float) -> Any:
+        """Velocity over offset, 1/s."""
+        braked = _root(0.5 * acceleration / distance)
+        return clip(_smaller(braked, speed / distance), 0.0, self.gains.position)
+
+
+def _axes(quaternion: Array) -> tuple[Parts, Parts, Parts]:
+    """Body x, y and z in the world frame."""
+    w, x, y, z = _parts(quaternion)
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def _turned(nose: Parts, x: Any, y: Any) -> tuple[Any, Any]:
+    """A horizontal vector of the frame turned by the heading, in the world frame.
+
+    The heading is the direction of the nose on the ground; 0 where the nose is vertical.
+    """
+    length = _length(nose[0], nose[1])
+    c, s = nose[0] / length, nose[1] / length
+    return c * x - s * y, s * x + c * y
+
+
+def _dot(a: Parts, b: Parts) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _length(x: Any, y: Any = 0.0) -> Any:
+    return _root(x * x + y * y + _TINY)
+
+
+def _parts(array: Array) -> list[Any]:
+    """Components of the last axis; of a single drone Python's numbers."""
+    if array.ndim == 1:
+        numbers: list[Any] = array.tolist()
+        return numbers
+    return [array[..., i] for i in range(array.shape[-1])]
+
+
+def _most(parts: list[Any]) -> Any:
+    return max(parts) if isinstance(parts[0], float) else reduce(_larger, parts)
+
+
+def _least(parts: list[Any]) -> Any:
+    return min(parts) if isinstance(parts[0], float) else reduce(_smaller, parts)
+
+
+def _root(square: Any) -> Any:
+    if isinstance(square, float):
+        return math.sqrt(square)
+    return np.sqrt(square) if isinstance(square, np.ndarray) else square.sqrt()
+
+
+def _larger(a: Any, b: Any) -> Any:
+    if isinstance(a, float):
+        return max(a, b)
+    return np.maximum(a, b) if isinstance(a, np.ndarray) else a.maximum(b)
+
+
+def _smaller(a: Any, b: Any) -> Any:
+    if isinstance(a, float):
+        return min(a, b)
+    return np.minimum(a, b) if isinstance(a, np.ndarray) else a.minimum(b)
+
+
+def _sin(angle: Any) -> Any:
+    return _by_name("sin", angle)
+
+
+def _cos(angle: Any) -> Any:
+    return _by_name("cos", angle)
+
+
+def _by_name(name: str, angle: Any) -> Any:
+    """Of numbers too by NumPy: a batch gets the bits of a single drone."""
+    if isinstance(angle, float | np.ndarray):
+        found = getattr(np, name)(angle)
+        return float(found) if isinstance(angle, float) else found
+    return getattr(angle, name)()
