@@ -196,3 +196,14 @@ def recovery_bounds(
         "turn_upright": float(np.mean(2 * np.sqrt(tilt / turn))),
         "height_lost": float(lost.mean()),
     }
+
+
+def payload_time(distance: float, share: float, vehicle: Vehicle) -> float:
+    """Least time in which craft and payload get from rest to rest so far aside, at one height, s.
+
+    Their common center of mass, of (1 + share) times the vehicle's mass, has the acceleration a of
+    all thrust less what carries the weight: a² = lift² - g². Bang-bang: 2 sqrt(distance / a).
+    """
+    mass = (1 + share) * vehicle.mass
+    lift = float(vehicle.thrust_high @ vehicle.allocation[0]) / mass
+    return float(2 * np.sqrt(distance / np.sqrt(lift * lift - vehicle.gravity**2)))
