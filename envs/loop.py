@@ -166,7 +166,7 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
     if drawn := Randomization(task.options.randomize, None).names:
         units = tuple(PARAMETERS[name].unit for name in drawn)
         specs.append(numbers("drawn", [f"drawn_{name}" for name in drawn], unit=units))
-    if task.options.effects.get("payload"):
+    if task.options.effects_on(vehicle.mass).get("payload"):
         names = ("X_payload", "Y_payload", "Z_payload")
         specs.append(numbers("payload", names, unit="m", frame="paper"))
     if type(task).goal is not Task.goal:
@@ -212,7 +212,7 @@ class Loop(NotCopied):
         **settings: Any,
     ) -> None:
         draft = make_task(env_id, options or {}, vehicle)
-        effects = EffectOptions.from_options(draft.options.effects)
+        effects = EffectOptions.from_options(draft.options.effects_on(draft.vehicle.mass))
         drawn = draft.options.randomize
         randomize = Randomization(drawn, effects) if drawn else None
         self.world: World = make_world(

@@ -58,9 +58,12 @@ def effects_of(file: Path) -> dict[str, Any]:
     return {**effects, "efficiency": share, "payload": 0.1 * vehicle.mass, "cable": 0.5}
 
 
-def options_of(file: Path, windy: bool = True) -> dict[str, Any]:
+def options_of(env_id: str, file: Path, windy: bool = True) -> dict[str, Any]:
+    effects = effects_of(file)
+    if "Payload" in env_id:  # it hangs one itself
+        effects = {name: x for name, x in effects.items() if name not in ("payload", "cable")}
     return {"vehicle": file, "episode_length": STEPS} | (
-        {"effects": effects_of(file), "randomize": {"mass": "uniform(0.9, 1.1)"}} if windy else {}
+        {"effects": effects, "randomize": {"mass": "uniform(0.9, 1.1)"}} if windy else {}
     )
 
 
@@ -90,7 +93,7 @@ def flown(env: gym.Env, seed: int, steps: int = STEPS) -> Iterator[tuple[Any, ..
 @pytest.mark.parametrize("windy", [False, True], ids=["calm", "windy"])
 @everything
 def test_alone(env_id: str, file: Path, windy: bool) -> None:
-    env = gym.make(env_id, disable_env_checker=True, **options_of(file, windy)).unwrapped
+    env = gym.make(env_id, disable_env_checker=True, **options_of(env_id, file, windy)).unwrapped
     assert isinstance(env, SingleEnv)
     check_env(env, skip_render_check=True)
     first, again = list(flown(env, 3)), list(flown(env, 3))
@@ -118,7 +121,7 @@ def test_alone(env_id: str, file: Path, windy: bool) -> None:
 @everything
 def test_in_a_batch(env_id: str, file: Path) -> None:
     """Each drone of a batch gets the bits of a single env with its seed."""
-    options = options_of(file)
+    options = options_of(env_id, file)
     batch = gym.make_vec(env_id, num_envs=N, autoreset_mode="Disabled", **options)
     assert isinstance(batch, LocalVectorEnv)
     singles = [list(flown(gym.make(env_id, **options), 5 + i)) for i in range(N)]
@@ -140,7 +143,7 @@ def test_in_a_batch(env_id: str, file: Path) -> None:
 
 @everything
 def test_over_udp(env_id: str, file: Path) -> None:
-    options = options_of(file)
+    options = options_of(env_id, file)
     local = gym.make(env_id, **options)
     with flying(env_id, **options) as pair:
         remote = list(flown(_connected(pair.remote), 11))
@@ -165,7 +168,7 @@ def test_on_warp(env_id: str, name: str) -> None:
     torch = pytest.importorskip("torch")
     pytest.importorskip("warp").config.log_level = 30
     pytest.importorskip("mujoco_warp")
-    options = options_of(FILES[name]) | {"backend": "warp", "device": "cpu"}
+    options = options_of(env_id, FILES[name]) | {"backend": "warp", "device": "cpu"}
     env = gym.make_vec(env_id, num_envs=N, autoreset_mode="Disabled", **options)
     flights = []
     for _ in range(2):

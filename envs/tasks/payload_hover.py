@@ -1,8 +1,9 @@
 """`rotorgram/PayloadHover-v0`: hold a payload on a cable at a point, and damp its swing."""
 
 import math
-from dataclasses import dataclass, replace
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
 
 from ...models.errors import expect
 from ...sim import (
@@ -43,9 +44,9 @@ class PayloadHoverOptions(TaskOptions):
     goal: tuple[float, float, float] = (0.0, 0.0, 4.0)
     """Point at which to hold the payload: x, y, z in MuJoCo's world frame (z up), m."""
     payload_share: float = 0.1
-    """Mass of the payload over that of the vehicle. It sets `payload` of the effects."""
+    """Mass of the payload over that of the vehicle."""
     cable: float = 1.0
-    """Length of the cable, m. It sets `cable` of the effects."""
+    """Length of the cable, m."""
     start_band: float = 1.0
     """Largest distance of the payload from the goal along each axis at the start, m."""
     start_speed: float = 1.0
@@ -57,6 +58,9 @@ class PayloadHoverOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
+        hung = sorted({"payload", "cable"} & set(self.effects))
+        expected = "payload_share and cable as options of the task"
+        expect(not hung, "effects", expected, " and ".join(hung))
         check_point(self, "goal")
         check_number(self, "payload_share", 0.001, 10.0)
         check_number(self, "cable", 0.05, 100.0, "m")
@@ -68,12 +72,16 @@ class PayloadHoverOptions(TaskOptions):
         expected = f"more than sqrt(3) · start_band = {least:.4g} m"
         expect(self.flight_band > least, "flight_band", expected, f"{self.flight_band!r}")
 
+    def effects_on(self, mass: float) -> Mapping[str, Any]:
+        """Those of `effects`, and the payload."""
+        return {**self.effects, "payload": self.payload_share * mass, "cable": self.cable}
+
 
 class PayloadHover(Flight):
     """Hold a payload on a cable at a point, and damp its swing.
 
     The payload is the effect of that name, a ball on a tendon that is slack below its length. The
-    task switches it on: `payload_share` and `cable` set what the effects have of it.
+    task switches it on; its options `payload_share` and `cable` take the place of the effect's.
 
     ## Observation, `float32`, shape (21 + R,)
 
@@ -125,8 +133,6 @@ class PayloadHover(Flight):
 
         options, vehicle = self.options, self.vehicle
         mass = options.payload_share * vehicle.mass
-        hung = {"payload": mass, "cable": options.cable}
-        self.options = options = replace(options, effects={**options.effects, **hung})
         least = payload_radius(mass) + AIR + options.start_band
         expected = f"a height of at least {least:.4g} m above the ground"
         expect(options.goal[2] >= least, "goal", expected, f"{options.goal[2]:g}")

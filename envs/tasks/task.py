@@ -85,13 +85,18 @@ class TaskOptions:
         check_number(self, "linear_drag", 0.0, MOST_DRAG, "/s")
         effects = EffectOptions.from_options(self.effects)
         object.__setattr__(self, "effects", effects.to_options())
-        drawn = Randomization(self.randomize, effects)
-        object.__setattr__(self, "randomize", drawn.to_options())
         object.__setattr__(self, "sensors", checked_sensors(self.sensors))
         self.check()
+        acting = EffectOptions.from_options(self.effects_on(1.0))
+        drawn = Randomization(self.randomize, acting)
+        object.__setattr__(self, "randomize", drawn.to_options())
 
     def check(self) -> None:
         """Check the options of a derived class; raise `InputError`."""
+
+    def effects_on(self, mass: float) -> Mapping[str, Any]:
+        """Effects on a vehicle of a mass, kg: those of `effects`, and what the task adds."""
+        return self.effects
 
     @property
     def ideal(self) -> bool:
