@@ -384,7 +384,7 @@ class Loop(NotCopied):
         if self._late_observations is not None:
             age = self._per_drone(self.world.parameters["observation_delay"])
             for name, past in self._keep(self._late_observations, flown, begun):
-                ones = self._ones(self.observations[name])
+                ones = (n,) + (1,) * (self.observations[name].ndim - 1)
                 self.observations[name] = past.get(age.reshape(ones))
         if self._history is not None:
             for name, past in self._keep(self._history, flown, begun):
@@ -429,15 +429,11 @@ class Loop(NotCopied):
         """Add the observations of now to those of the last steps; a reset's are all of now."""
         for name, kept in past.items():
             values = self.observations[name]
-            ones = self._ones(values)
+            ones = (self.num_envs,) + (1,) * (values.ndim - 1)
             if begun is not None:
                 kept.begin(begun.reshape(ones), values)
             kept.push(None if flown is None else flown.reshape(ones), values)
             yield name, kept
-
-    def _ones(self, values: Array) -> tuple[int, ...]:
-        """Shape of one number for each drone that broadcasts to these values."""
-        return (self.num_envs,) + (1,) * (values.ndim - 1)
 
     def _refuse_not_finite(self) -> None:
         """Raise `InputError` for the NaN or infinity that a task gave."""

@@ -126,7 +126,7 @@ def test_drift_is_relative_to_the_pad() -> None:
         outcome = task.outcome(state)
         assert outcome.metrics["landed"] == landed
         relative = math.hypot(1.0 - speed, 0.2)
-        assert outcome.metrics["pad_speed"] == pytest.approx(relative, abs=0.03)
+        assert outcome.metrics["relative_speed"] == pytest.approx(relative, abs=0.03)
         assert outcome.metrics["pad_distance"] == pytest.approx(0.04, abs=1e-3)  # in two steps
 
 

@@ -137,7 +137,7 @@ class Landing(Flight):
     metrics = (
         Metric(name="landed", unit="", goal="high", held=0.9, final=True),
         Metric(name="pad_distance", unit="m"),
-        Metric(name="pad_speed", unit="m/s"),
+        Metric(name="relative_speed", unit="m/s"),
     )
 
     def setup(self) -> None:
@@ -222,7 +222,7 @@ class Landing(Flight):
             metrics={
                 "landed": landed * 1.0,
                 "pad_distance": distance,
-                "pad_speed": length(self.xp, stack(speed)),
+                "relative_speed": length(self.xp, stack(speed)),
             },
         )
 
