@@ -51,7 +51,7 @@ class PID:
 
     def act(self, observation: np.ndarray) -> Any:
         """Change of thrust, or thrust over hover, as the env's action, float32, shape (1,)."""
-        error, rate, thrust = observation.tolist()
+        error, rate, thrust = observation.tolist()[-3:]  # the newest of a history
         if abs(error) < INTEGRAL_BAND:
             self._integral += error * self._period
         acceleration = PROPORTIONAL * error + DERIVATIVE * rate + INTEGRAL * self._integral

@@ -36,5 +36,11 @@ def __getattr__(name: str) -> Any:
     return getattr(import_module(f".{_HOMES.get(name, 'tasks.task')}", __name__), name)
 
 
-for _name in ("Elevation", "Hover"):
-    register(f"rotorgram/{_name}-v0", f"rotorgram.envs.tasks.{_name.lower()}:{_name}")
+for _module, _name in (
+    ("elevation", "Elevation"),
+    ("hover", "Hover"),
+    ("landing", "Landing"),
+    ("recovery", "Recovery"),
+    ("payload_hover", "PayloadHover"),
+):
+    register(f"rotorgram/{_name}-v0", f"rotorgram.envs.tasks.{_module}:{_name}")

@@ -1,4 +1,4 @@
-"""Arrays that arrive some control steps late: actions on their way, and observations."""
+"""Arrays of the last control steps: actions on their way, observations that are late or kept."""
 
 from typing import Any
 
@@ -28,6 +28,10 @@ class Delay:
             pairs = zip(new, self._past, strict=True)
             new = [self._xp.where(mask, value, old) for value, old in pairs]
         self._past = new
+
+    def row(self) -> Array:
+        """All of them side by side along the second axis, the oldest first."""
+        return self._xp.concat(self._past[::-1], axis=1)
 
     def get(self, age: Array) -> Array:
         """Values of so many steps ago; the age, whole numbers, broadcasts to them."""

@@ -4,7 +4,8 @@ A single env is the loop with one world. An agent's command resets some drones, 
 flies the others for one control period: `advance` is that step, the step of the wire.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from math import isfinite, prod
 from pathlib import Path
 from typing import Any, Final
@@ -121,17 +122,36 @@ def spec_of(env_id: str, task: Task) -> EnvSpec:
         control_period=task.options.control_period,
         vehicle=vehicle.name,
         vehicle_hash=vehicle.hash,
-        observation=task.observation + _reading_specs(task),
+        observation=tuple(_repeated(a, task.options.history) for a in _observed(task)),
         action=action,
         telemetry=_telemetry_specs(task),
         metrics=task.metrics,
     )
 
 
-def _reading_specs(task: Task) -> tuple[ArraySpec, ...]:
+def _observed(task: Task) -> tuple[ArraySpec, ...]:
+    """What is observed of one moment: by the task, and by sensors."""
     options = task.options
     readings = readings_of(options.sensors, task.vehicle, options.control_period)
-    return tuple(ArraySpec(**reading._asdict()) for reading in readings)
+    return task.observation + tuple(ArraySpec(**reading._asdict()) for reading in readings)
+
+
+def _repeated(array: ArraySpec, count: int) -> ArraySpec:
+    """So many values of an array side by side along its first axis, the oldest first."""
+    if count == 1:
+        return array
+    length, *rest = array.shape or (1,)
+    low, high = (np.tile(end.ravel(), count) for end in array.bounds())
+    units = array.unit if isinstance(array.unit, str) else array.unit * count
+    names = tuple(
+        name if age == 0 else f"{name}, {age} step{'s' * (age > 1)} ago"
+        for age in reversed(range(count))
+        for name in array.components
+    )
+    return replace(
+        array, shape=(count * length, *rest), low=tuple(low.tolist()), high=tuple(high.tolist()),
+        unit=units, components=names,
+    )  # fmt: skip
 
 
 def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
@@ -154,7 +174,7 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
     if drawn := Randomization(task.options.randomize, None).names:
         units = tuple(PARAMETERS[name].unit for name in drawn)
         specs.append(numbers("drawn", [f"drawn_{name}" for name in drawn], unit=units))
-    if task.options.effects.get("payload"):
+    if task.options.effects_on(vehicle.mass).get("payload"):
         names = ("X_payload", "Y_payload", "Z_payload")
         specs.append(numbers("payload", names, unit="m", frame="paper"))
     if type(task).goal is not Task.goal:
@@ -200,7 +220,7 @@ class Loop(NotCopied):
         **settings: Any,
     ) -> None:
         draft = make_task(env_id, options or {}, vehicle)
-        effects = EffectOptions.from_options(draft.options.effects)
+        effects = EffectOptions.from_options(draft.options.effects_on(draft.vehicle.mass))
         drawn = draft.options.randomize
         randomize = Randomization(drawn, effects) if drawn else None
         self.world: World = make_world(
@@ -215,14 +235,15 @@ class Loop(NotCopied):
         self._choices = self.task.controller.choices
         self._width = len(self.task.controller.low)
         self._action_shape = (*lead, self._width)
+        flat = (1,) if draft.options.history > 1 else ()
         self._arrays = [
-            (a.name, (num_envs, *a.shape), getattr(self._xp, a.dtype))
-            for a in self.spec.observation
+            (a.name, (num_envs, *(a.shape or flat)), getattr(self._xp, a.dtype))
+            for a in _observed(self.task)
         ]
         period, sensors = self.spec.control_period, draft.options.sensors
         self._sensors = Sensors(sensors, self.world, period) if sensors else None
         estimated = draft.options.estimated  # it may leave the task's bounds
-        self._limits = {a.name: a.bounds() for a in self.spec.observation if estimated}
+        self._limits = {a.name: a.bounds() for a in _observed(self.task) if estimated}
         # An estimate is one for a control step, and so are the thrusts of what sees it.
         often = getattr(self.task.controller, "every_step", False) and not estimated
         self._held = 1 if often else self._substeps
@@ -250,6 +271,9 @@ class Loop(NotCopied):
         if randomize is not None and "observation_delay" in self._drawn:
             most = randomize.most_steps("observation_delay")
             self._late_observations = {name: Delay(most, self._xp) for name, *_ in self._arrays}
+        self._history: dict[str, Delay] | None = None
+        if (count := draft.options.history) > 1:
+            self._history = {name: Delay(count - 1, self._xp) for name, *_ in self._arrays}
 
     def advance(
         self,
@@ -365,12 +389,19 @@ class Loop(NotCopied):
                 low, high = (constant(end, observed[name]) for end in limits)
                 observed[name] = clip(observed[name], low, high)
         if self._outcome is None:
-            _check_returned(self.spec, observed, outcome, n, alone=not self.world.shape)
+            one = replace(self.spec, observation=_observed(task))
+            _check_returned(one, observed, outcome, n, alone=not self.world.shape)
         self.observations = {}
         for name, shape, dtype in self._arrays:
             self.observations[name] = _as_type(observed[name].reshape(shape), dtype)
         if self._late_observations is not None:
-            self._delay(self._late_observations, flown, begun)
+            age = self._per_drone(self.world.parameters["observation_delay"])
+            for name, past in self._keep(self._late_observations, flown, begun):
+                ones = (n,) + (1,) * (self.observations[name].ndim - 1)
+                self.observations[name] = past.get(age.reshape(ones))
+        if self._history is not None:
+            for name, past in self._keep(self._history, flown, begun):
+                self.observations[name] = past.row()
         self._outcome, self.terms = outcome, outcome.reward
         ended: Array = outcome.terminated
         late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b
@@ -405,16 +436,17 @@ class Loop(NotCopied):
                 self._waiting, self._anyone_waits = self._waiting | ends, True
                 self.done = self.done | ends
 
-    def _delay(self, late: dict[str, Delay], flown: Array | None, begun: Array | None) -> None:
-        """Put observations of earlier steps in place of those of now; a reset's are of now."""
-        age = self._per_drone(self.world.parameters["observation_delay"])
-        for name, shape, _ in self._arrays:
-            ones = (self.num_envs,) + (1,) * (len(shape) - 1)
+    def _keep(
+        self, past: dict[str, Delay], flown: Array | None, begun: Array | None
+    ) -> Iterator[tuple[str, Delay]]:
+        """Add the observations of now to those of the last steps; a reset's are all of now."""
+        for name, kept in past.items():
+            values = self.observations[name]
+            ones = (self.num_envs,) + (1,) * (values.ndim - 1)
             if begun is not None:
-                late[name].begin(begun.reshape(ones), self.observations[name])
-            moved = None if flown is None else flown.reshape(ones)
-            late[name].push(moved, self.observations[name])
-            self.observations[name] = late[name].get(age.reshape(ones))
+                kept.begin(begun.reshape(ones), values)
+            kept.push(None if flown is None else flown.reshape(ones), values)
+            yield name, kept
 
     def _refuse_not_finite(self) -> None:
         """Raise `InputError` for the NaN or infinity that a task gave."""

@@ -169,7 +169,7 @@ class Discrete(_Part):
 class Metric(_Part):
     """A measure of how well a task is done. The first metric of a task is its headline."""
 
-    _optional = ("settled", "held", "symbol", "signed")
+    _optional = ("settled", "held", "symbol", "signed", "final")
 
     name: str
     unit: str
@@ -183,6 +183,9 @@ class Metric(_Part):
     """Short symbol for figures and overlays, as E; empty: the name."""
     signed: bool = False
     """Whether it changes sign where it passes its best: then there is an overshoot."""
+    final: bool = False
+    """Whether its value at the end of an episode counts, as of a landing, in place of the mean of
+    the last quarter. An episode that terminates with its goal held is then no crash."""
 
     def __post_init__(self) -> None:
         for name in ("name", "unit", "symbol"):
@@ -190,8 +193,9 @@ class Metric(_Part):
         name = self.name
         _expect(name, "metric", "a name", name)
         _expect(self.goal in ("zero", "high"), name, "the goal 'zero' or 'high'", self.goal)
-        right = type(self.signed) is bool
-        _expect(right, name, "signed to be true or false", self.signed)
+        for field_name in ("signed", "final"):
+            value = getattr(self, field_name)
+            _expect(type(value) is bool, name, f"{field_name} to be true or false", value)
         for field_name in ("settled", "held"):
             value = getattr(self, field_name)
             right = value is None or (_is_number(value) and 0 < value <= _LARGEST)

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from ..agents.pid import SHARES
 from ..envs.tasks.elevation import ERROR_SCALE, ElevationOptions
+from ..envs.tasks.recovery import Recovery, RecoveryOptions
 from ..models.vehicle import Vehicle
 
 _HALVINGS: Final = 24
@@ -121,3 +122,88 @@ def _flown(
         speed = speed * decay + acceleration * gain
         ways[:, step] = way
     return ways, speed
+
+
+def landing_time(height: float, sink: float, vehicle: Vehicle) -> float:
+    """Least time to come down from rest and to arrive with a climb rate of no less than -sink, s.
+
+    Bang-bang control of the height alone (m, m/s): no craft that keeps its thrust from pointing
+    downwards falls faster than gravity, or brakes with more than all of its thrust upright. From
+    the two conditions at the end, way and speed, follows the speed v at which braking begins:
+    v² / 2a + (v² - sink²) / 2b = height. Where v is not above `sink`, the fall takes all the time.
+    """
+    lift = float(vehicle.thrust_high @ vehicle.allocation[0]) / vehicle.mass
+    fall = vehicle.gravity - min(0.0, float(vehicle.thrust_low.sum()) / vehicle.mass)
+    brake = lift - vehicle.gravity
+    if sink * sink >= 2 * fall * height:
+        return float(np.sqrt(2 * height / fall))
+    speed = np.sqrt((2 * height * brake + sink * sink) * fall / (fall + brake))
+    return float(speed / fall + (speed - sink) / brake)
+
+
+def least_height_lost(
+    tilt: Floats, climb: Floats, rate: Floats, turn: float, lift: tuple[float, float],
+    gravity: float, step: float = 1e-3,
+) -> Floats:  # fmt: skip
+    """Height that a thrown craft loses at least before it rises again, m, shape (n,).
+
+    It begins with a tilt (rad), a climb rate (m/s) and a rate of its tilt (rad/s), shape (n,) each.
+    Its tilt cannot become smaller than under its largest angular acceleration `turn` (rad/s²)
+    from the start on, tilt - |rate| t - turn t² / 2, which does not even stop at upright; and at
+    each moment the vertical thrust is at most that of the tilt, of accelerations between the two
+    of `lift` (m/s²). Both are bounds for themselves; together no flight reaches them. Gyroscopic
+    torques are left out. Integrated in steps of so many seconds.
+    """
+    low, high = lift
+    speed, height = np.array(climb, float), np.zeros(len(tilt))
+    lowest = height
+    for count in range(round(60.0 / step)):
+        # The vertical thrust of the best tilt within the step: that of its end.
+        time = (count + 1) * step
+        upright = np.cos(np.clip(tilt - np.abs(rate) * time - turn * time * time / 2, 0.0, np.pi))
+        acceleration = np.maximum(low * upright, high * upright) - gravity
+        height = height + speed * step + acceleration * step * step / 2
+        speed = speed + acceleration * step
+        lowest = np.minimum(lowest, height)
+        if (speed >= 0).all() and (acceleration >= 0).all():
+            break
+    return -lowest
+
+
+def recovery_bounds(
+    options: RecoveryOptions, vehicle: Vehicle, count: int = 4096
+) -> dict[str, float]:
+    """Means over the starts of `Recovery-v0`, of so many that are drawn, always the same.
+
+    `turn_upright`: least time from the tilt to upright, both at rest, by bang-bang control about
+    one axis with the largest angular acceleration a, 2 sqrt(tilt / a), s. `height_lost`: see
+    `least_height_lost`, m.
+    """
+    dice, angles = np.random.default_rng(0), np.radians(np.arange(360.0))
+    axes = np.stack((np.cos(angles), np.sin(angles), 0.0 * angles), axis=1)
+    turn = max(map(vehicle.turning, axes)) / float(np.cos(np.radians(0.5)))  # between the axes
+    most = Recovery(options, vehicle).spin
+    rates = dice.uniform(-most, most, (count, 3))
+    tilt = np.arccos(dice.uniform(-1.0, 1.0, count))
+    climb = dice.uniform(0.0, options.start_speed, count) * dice.uniform(-1.0, 1.0, count)
+    low, high = (
+        float(ends @ vehicle.allocation[0]) / vehicle.mass
+        for ends in (vehicle.thrust_low, vehicle.thrust_high)
+    )
+    spin = np.hypot(*rates.T[:2])
+    lost = least_height_lost(tilt, climb, spin, turn, (low, high), vehicle.gravity)
+    return {
+        "turn_upright": float(np.mean(2 * np.sqrt(tilt / turn))),
+        "height_lost": float(lost.mean()),
+    }
+
+
+def payload_time(distance: float, share: float, vehicle: Vehicle) -> float:
+    """Least time in which craft and payload get from rest to rest so far aside, at one height, s.
+
+    Their common center of mass, of (1 + share) times the vehicle's mass, has the acceleration a of
+    all thrust less what carries the weight: a² = lift² - g². Bang-bang: 2 sqrt(distance / a).
+    """
+    mass = (1 + share) * vehicle.mass
+    lift = float(vehicle.thrust_high @ vehicle.allocation[0]) / mass
+    return float(2 * np.sqrt(distance / np.sqrt(lift * lift - vehicle.gravity**2)))

@@ -101,10 +101,18 @@ class Headline(Metric):
         bound = np.nan if self.held is None else self.held  # no number is above or below nan
         return np.asarray(array >= bound if self.high else array < bound)
 
+    def crashed(self, evaluations: pd.DataFrame) -> "pd.Series[bool]":
+        """Which episodes terminated; of a `final` metric those that did not hold its goal."""
+        ended = evaluations["terminated"].astype(bool)
+        return ended & ~self.holds(evaluations["steady"]) if self.final else ended
 
-def steady_state(sizes: Values) -> float:
-    """Mean of the last quarter of an episode's sizes, (T,), at least of the last; nan if T = 0."""
-    last = np.asarray(sizes, float)[-max(1, len(sizes) // 4) :]
+
+def steady_state(sizes: Values, *, final: bool = False) -> float:
+    """Mean of the last quarter of an episode's sizes, (T,), at least of the last; nan if T = 0.
+
+    Of a `final` metric only the last counts.
+    """
+    last = np.asarray(sizes, float)[-1 if final else -max(1, len(sizes) // 4) :]
     return float(last.mean()) if last.size else math.nan
 
 
@@ -226,7 +234,7 @@ def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tup
     """
     # A crash, or a value that is missing, must not vanish in a mean that skips it.
     never = -np.inf if headline.high else np.inf
-    steady = evaluations["steady"].fillna(never).mask(evaluations["terminated"], never)
+    steady = evaluations["steady"].fillna(never).mask(headline.crashed(evaluations), never)
     snapshots = evaluations.assign(steady=steady).groupby("env_steps")
     misses = ~headline.holds(snapshots["steady"].mean().to_numpy())
     lasting = snapshots["seconds"].max()[~np.logical_or.accumulate(misses[::-1])[::-1]]
@@ -248,13 +256,15 @@ def final_per_run(evaluations: pd.DataFrame, headline: Headline) -> pd.DataFrame
     """
     final = final_evaluations(evaluations)
     # Files leave a crash's settling time empty; a value there would be a mistake.
-    settling_time = final["settling_time"].mask(final["terminated"])
-    final = final.assign(settling_time=settling_time, missing=final["steady"].isna())
+    crashed = headline.crashed(final)
+    settling_time = final["settling_time"].mask(crashed)
+    missing = final["steady"].isna()
+    final = final.assign(settling_time=settling_time, missing=missing, crashed=crashed)
     rows = final.groupby(["agent", "seed"], sort=True).agg(
         **{name: (name, "mean") for name in _MEASURES},
         episodes=("episode", "size"),
         settled=("settling_time", "count"),
-        crashed=("terminated", "sum"),
+        crashed=("crashed", "sum"),
         missing=("missing", "sum"),
     ).reset_index()  # fmt: skip
     whole = (rows["crashed"] == 0) & (rows.pop("missing") == 0)

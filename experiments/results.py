@@ -223,7 +223,7 @@ def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]
         "length": len(trajectory),
         "return": float(trajectory.rewards.sum()),
         "start": float(values[0]),
-        "steady": steady_state(headline.size(values[1:])),
+        "steady": steady_state(headline.size(values[1:]), final=headline.final),
         "settling_time": settled,
         "overshoot": overshoot(values) if headline.signed else np.nan,
         "terminated": trajectory.terminated,

@@ -132,6 +132,15 @@ class Vehicle:
         most, least = ends.max(axis=0).sum(), ends.min(axis=0).sum()
         return float(max(most / self.mass - self.gravity, self.gravity - least / self.mass))
 
+    def turning(self, axis: Sequence[float] | np.ndarray) -> float:
+        """Largest angular acceleration about an axis through the center of mass, rad/s².
+
+        The axis is a unit vector in the body frame, and its sign matters. The craft is at rest, and
+        what its rotors do to the other axes and to its height does not count.
+        """
+        per_newton = np.asarray(axis) @ np.linalg.solve(self.inertia, self.allocation[1:])
+        return float((per_newton * (self.thrust_low, self.thrust_high)).max(axis=0).sum())
+
     def substeps(self, period: float) -> int:
         """Physics steps in a control period of so many seconds. Raises `InputError`."""
         ratio = period / self.timestep

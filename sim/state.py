@@ -44,6 +44,8 @@ class WorldState:
     """Whether any part was in contact since the last step or reset, bool, shape (W, A)."""
     payload: Array = None
     """Position of each payload, world frame, m, shape (W, A, 3); None without payloads."""
+    payload_velocity: Array = None
+    """Velocity of each payload, world frame, m/s, shape (W, A, 3); None without payloads."""
 
     @property
     def tilt_cosine(self) -> Array:

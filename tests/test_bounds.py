@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 from rotorgram.envs.tasks.elevation import ElevationOptions
-from rotorgram.experiments.bounds import bang_bang, elevation_bounds, elevation_reward
+from rotorgram.experiments.bounds import (
+    bang_bang,
+    elevation_bounds,
+    elevation_reward,
+    landing_time,
+    payload_time,
+)
 from rotorgram.models.vehicle import Vehicle
 
 
@@ -56,3 +62,17 @@ def test_offsets_limit_the_acceleration_and_not_its_change() -> None:
     bounds = elevation_bounds(options, Vehicle.load(linear_drag=2.0), np.array([1.0]))
     left = flown(1.0, 4.0, 4.0, drag=2.0)  # four rotors, 20 N each, 20 kg
     assert bounds["time-optimal"] == pytest.approx(elevation_reward(left).sum())
+
+
+def test_least_time_to_land_by_hand() -> None:
+    # 400 N on 20 kg at 9.8 m/s²: it falls at 9.8 and brakes at 10.2 m/s². From v² / 19.6 +
+    # (v² - 1) / 20.4 = 4 m follow v = 6.365 m/s, v / 9.8 = 0.6495 s and (v - 1) / 10.2 = 0.526 s.
+    paper = Vehicle.load()
+    assert landing_time(4.0, 1.0, paper) == pytest.approx(1.1755, abs=1e-3)
+    assert landing_time(0.05, 1.0, paper) == pytest.approx(np.sqrt(0.1 / 9.8))  # a mere fall
+    assert landing_time(4.0, 1e-9, paper) > landing_time(4.0, 1.0, paper)
+
+
+def test_least_time_to_carry_a_payload_by_hand() -> None:
+    # 400 N on 22 kg: 18.18 m/s², of which sqrt(18.18² - 9.8²) = 15.31 m/s² are left for the side.
+    assert payload_time(1.0, 0.1, Vehicle.load()) == pytest.approx(2 / np.sqrt(15.315), abs=1e-3)

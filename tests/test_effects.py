@@ -565,6 +565,9 @@ def test_the_tension_of_a_cable_is_the_weight_of_its_payload() -> None:
 def test_a_cable_is_slack_in_free_fall() -> None:
     world = fly(begin(world_of(payload=0.15, cable=0.5)), 0.0, 200)
     assert world.state.velocity[2] == pytest.approx(-G * 1.0, rel=1e-12)
+    assert world.state.payload_velocity[2] == pytest.approx(-G * 1.0, rel=1e-12)
+    assert world.state.payload_velocity[:2].tolist() == [0.0, 0.0]
+    assert world_of().state.payload_velocity is None
 
 
 def pendulum(vehicle: Vehicle, mass: float, cable: float, angle: float) -> tuple[Any, Any]:

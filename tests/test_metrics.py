@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from comparisons import ERROR, GATES, HEADLINE, spec_of
+from rotorgram.envs import Metric
 from rotorgram.experiments.metrics import (
     Curve,
     Headline,
@@ -45,6 +46,21 @@ def test_the_steady_state_is_the_mean_size_of_the_last_quarter():
     assert steady_state(sizes) == pytest.approx(0.2)
     assert steady_state(np.array([3.0, 2.0])) == 2.0  # at least the last step
     assert math.isnan(steady_state(np.array([])))
+    assert steady_state(np.array([0.0, 0.0, 0.0, 1.0]), final=True) == 1.0  # as of a landing
+    assert math.isnan(steady_state(np.array([]), final=True))
+
+
+def test_of_a_final_metric_an_end_that_holds_the_goal_is_no_crash():
+    landed = Metric(name="landed", unit="", goal="high", held=0.75, final=True)
+    rows = [("a", 0, 100, value, math.nan, True) for value in (1.0, 1.0, 1.0, 0.0)]
+    frame = evaluations(*rows, *(("a", 1, 100, 1.0, math.nan, True) for _ in range(4)))
+    final = final_per_run(frame, Headline.of(spec_of(landed)))
+    assert final["crashed"].tolist() == [1, 0]
+    assert final["held"].tolist() == [False, True]
+    once = Headline.of(spec_of(replace(landed, final=False)))
+    assert final_per_run(frame, once)["crashed"].tolist() == [4, 4]
+    steps, _ = first_lasting_snapshot(frame[frame["seed"] == 1], Headline.of(spec_of(landed)))
+    assert steps == 100.0
 
 
 def test_a_headline_says_how_its_numbers_are_read():

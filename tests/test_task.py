@@ -47,6 +47,7 @@ def test_defaults() -> None:
     assert asdict(ElevationOptions()) == {
         "episode_length": 250,
         "control_period": 0.02,
+        "history": 1,
         "linear_drag": 0.0,
         "effects": {},
         "randomize": {},

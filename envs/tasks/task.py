@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 LONGEST_CONTROL_PERIOD: Final = 1.0  # Longest time between two actions, s
 LONGEST_EPISODE: Final = 1 << 31  # Most control steps of an episode
+LONGEST_HISTORY: Final = 1000  # Most observations side by side
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +54,9 @@ class TaskOptions:
     control_period: float = 0.02
     """Time between two actions, s: a multiple of the physics step, at most 1 s. The default is that
     of Unity's `FixedUpdate`."""
+    history: int = 1
+    """The agent observes the last so many observations side by side, the oldest first; at the start
+    of an episode all are the first one."""
     linear_drag: float = 0.0
     """Acceleration of -linear_drag · velocity, 1/s, as Unity's `Rigidbody.drag`; at most 100. The
     force acts at the body's origin."""
@@ -68,22 +72,31 @@ class TaskOptions:
 
     def __post_init__(self) -> None:
         check_choice(self, "action", self.actions)
-        length = finite(self.episode_length)
-        right = length is not None and length == int(length) and 1 <= length <= LONGEST_EPISODE
-        expected = "a whole number of control steps, 1 or more"
-        expect(right, "episode_length", expected, f"{self.episode_length!r}")
-        object.__setattr__(self, "episode_length", int(self.episode_length))
+        for name, most, what in (
+            ("episode_length", LONGEST_EPISODE, "control steps, 1 or more"),
+            ("history", LONGEST_HISTORY, f"observations from 1 to {LONGEST_HISTORY}"),
+        ):
+            given = getattr(self, name)
+            number = finite(given)
+            right = number is not None and number == int(number) and 1 <= number <= most
+            expect(right, name, f"a whole number of {what}", f"{given!r}")
+            object.__setattr__(self, name, int(given))
         check_number(self, "control_period", 1e-6, LONGEST_CONTROL_PERIOD, "s")
         check_number(self, "linear_drag", 0.0, MOST_DRAG, "/s")
         effects = EffectOptions.from_options(self.effects)
         object.__setattr__(self, "effects", effects.to_options())
-        drawn = Randomization(self.randomize, effects)
-        object.__setattr__(self, "randomize", drawn.to_options())
         object.__setattr__(self, "sensors", checked_sensors(self.sensors))
         self.check()
+        acting = EffectOptions.from_options(self.effects_on(1.0))
+        drawn = Randomization(self.randomize, acting)
+        object.__setattr__(self, "randomize", drawn.to_options())
 
     def check(self) -> None:
         """Check the options of a derived class; raise `InputError`."""
+
+    def effects_on(self, mass: float) -> Mapping[str, Any]:
+        """Effects on a vehicle of a mass, kg: those of `effects`, and what the task adds."""
+        return self.effects
 
     @property
     def ideal(self) -> bool:

@@ -100,6 +100,7 @@ class MujocoWorld:
             thrust=self._thrust.reshape((*lead, -1)),
             touching=self._touching.reshape(lead),
             payload=None if self._cable is None else qpos[:, 7:10].reshape((*lead, 3)),
+            payload_velocity=None if self._cable is None else qvel[:, 6:9].reshape((*lead, 3)),
         )
         assert np.shares_memory(self.state.position, qpos)
 

@@ -110,6 +110,7 @@ class WarpWorld(TensorWorld):
             thrust=torch.zeros_like(command) if acting.on_rotors else command,
             touching=torch.zeros(self.shape, dtype=torch.bool, device=self.device),
             payload=None if self._cable is None else self.qpos[:, None, 7:10],
+            payload_velocity=None if self._cable is None else self.qvel[:, None, 6:9],
         )
 
     def reset(self, mask: Array, pose: Pose) -> None:

@@ -1,0 +1,261 @@
+"""`rotorgram/Landing-v0`: touch down softly on a pad that moves over the ground."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final, Literal, get_args
+
+from ...models.errors import expect
+from ...sim import Array, Draw, Pose, WorldState, component, each, plain, square_root, stack
+from ..spec import Metric
+from .flight import LEAST_TILT_COSINE, RATE_WEIGHT, TERMINATION_REWARD, Flight, length
+from .task import Outcome, TaskOptions, check_choice, check_number, finite
+
+MATCHING_TIME: Final = 0.5  # Progress that 1 m/s less relative speed is worth, over 1 m less way, s
+LANDING_REWARD: Final = 20.0  # Added to the reward of a step that ends with a landing
+FASTEST_PAD: Final = 20.0  # m/s
+FURTHEST: Final = 1e3  # m
+
+Motion = Literal["circle", "line"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LandingOptions(TaskOptions):
+    """Options of `rotorgram/Landing-v0`."""
+
+    episode_length: int = 400
+    """Control steps after which an episode is truncated."""
+    motion: Motion = "circle"
+    """Path of the pad about (0, 0): a `circle`, or a `line` on which it swings to and fro."""
+    pad_path: float = 2.0
+    """Radius of the circle, or half the length of the line, m."""
+    pad_speed: float | tuple[float, float] = (0.0, 1.0)
+    """Speed of the pad, m/s, on a line the largest: a number, or (low, high) to draw one uniformly
+    for each episode."""
+    pad_radius: float = 0.5
+    """A landing's largest horizontal distance of the body's origin from the pad's centre, m."""
+    sink: float = 1.0
+    """A landing's largest vertical speed, m/s."""
+    drift: float = 0.5
+    """A landing's largest horizontal speed relative to the pad, m/s."""
+    tilt: float = 15.0
+    """A landing's largest tilt, degrees."""
+    start_height: float = 4.0
+    """Mean height at the start above that of a craft on the ground, m."""
+    start_band: float = 1.0
+    """Largest distance of the start from (0, 0, mean height) along each axis, m."""
+    flight_band: float = 10.0
+    """An episode terminates when the craft is further than this from the pad, m."""
+
+    def check(self) -> None:
+        """Check the options of this task. Raises `InputError`."""
+        check_choice(self, "motion", get_args(Motion))
+        check_number(self, "pad_path", 0.01, FURTHEST, "m")
+        speed: Any = self.pad_speed
+        pair = speed if isinstance(speed, tuple | list) else (speed, speed)
+        values = [value for value in map(finite, pair) if value is not None]
+        right = len(values) == len(pair) == 2 and 0 <= values[0] <= values[1] <= FASTEST_PAD
+        expected = f"a speed of 0 to {FASTEST_PAD:g} m/s, or a pair (low, high) with low <= high"
+        expect(right, "pad_speed", expected, f"{speed!r}")
+        object.__setattr__(self, "pad_speed", tuple(values) if pair is speed else values[0])
+        check_number(self, "pad_radius", 0.01, FURTHEST, "m")
+        check_number(self, "sink", 0.01, 100.0, "m/s")
+        check_number(self, "drift", 0.01, 100.0, "m/s")
+        check_number(self, "tilt", 0.1, 90.0, "degrees")
+        check_number(self, "start_height", 0.1, FURTHEST, "m")
+        check_number(self, "start_band", 0.0, FURTHEST, "m")
+        check_number(self, "flight_band", 0.1, 10 * FURTHEST, "m")
+        lowest = self.start_height - self.start_band
+        expect(lowest >= 0.5, "start_band", "at most start_height - 0.5 m", f"{self.start_band!r}")
+        reach = self.pad_path + math.sqrt(2) * self.start_band
+        furthest = math.hypot(reach, self.start_height + self.start_band)
+        expected = f"more than the {furthest:.4g} m of the furthest start"
+        expect(self.flight_band > furthest, "flight_band", expected, f"{self.flight_band!r}")
+
+    @property
+    def pad_speeds(self) -> tuple[float, float]:
+        """Least and largest speed of the pad, m/s."""
+        speed = self.pad_speed
+        return speed if isinstance(speed, tuple) else (speed, speed)
+
+
+class Landing(Flight):
+    """Touch down on a moving pad: inside it, slowly, and upright.
+
+    The pad is a mark at height 0, no body of its own: what touches it touches the ground, and does
+    not move along with it.
+
+    ## Observation, `float32`, shape (17 + R,)
+
+    | index | quantity | unit | frame |
+    |---|---|---|---|
+    | 0-2 | goal minus position: the pad, at the height of a craft that stands | m | world |
+    | 3-5 | velocity | m/s | world |
+    | 6-8 | direction of body x, the nose | 1 | world |
+    | 9-11 | direction of body z, the thrust | 1 | world |
+    | 12-14 | body rates | rad/s | body |
+    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+    | 15 + R... | velocity of the pad, x and y | m/s | world |
+
+    Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
+
+    ## Action
+
+    By the option `action`; with `rotors` the thrust of each rotor: 0 is hover, -1 its least, 1 its
+    largest.
+
+    ## The pad
+
+    It moves about (0, 0) by φ(t) = φ0 + speed / path · t: on a circle of radius 2 m (`pad_path`) to
+    the left or to the right, or as path · cos φ along a line in a direction that is drawn
+    (`motion`). Its speed (`pad_speed`, on a line the largest) is drawn from 0 to 1 m/s, φ0 and the
+    rest uniformly.
+
+    ## Success
+
+    Contact ends the episode. It is a landing if the body's origin is within 0.5 m of the pad's
+    centre (`pad_radius`), and the craft sank with at most 1 m/s (`sink`), drifted with at most
+    0.5 m/s relative to the pad (`drift`) and was tilted by at most 15° (`tilt`). Speed and tilt are
+    those at the end of the control step before contact: contact itself changes them.
+
+    ## Reward
+
+    Progress P' - P of the potential P = -(d + 0.5 s · w) / 1 m, for the distance d to the goal and
+    the speed w relative to the pad (potential-based shaping: Ng, Harada and Russell 1999);
+    -0.02 s/rad times the size of the body rates; 20 for a landing, and -20 on a step that
+    terminates otherwise.
+
+    ## Start, termination, truncation
+
+    Level and at rest, at hover thrust, within 1 m (`start_band`) of the point 4 m (`start_height`)
+    above the middle of the pad's path along each axis.
+
+    *Terminated*: contact, further than 10 m from the pad (`flight_band`), or a tilt above 90°.
+    *Truncated*: after 400 steps of 0.02 s.
+    """
+
+    Options = LandingOptions
+    metrics = (
+        Metric(name="landed", unit="", goal="high", held=0.9, final=True),
+        Metric(name="pad_distance", unit="m"),
+        Metric(name="relative_speed", unit="m/s"),
+    )
+
+    def setup(self) -> None:
+        """See the class."""
+        options = self.options
+        fastest = options.pad_speeds[1] + 0.001
+        self.describe(
+            options.flight_band, [(f"velocity of the pad {axis}", "m/s", fastest) for axis in "xy"]
+        )
+        self._least_upright = math.cos(math.radians(options.tilt))
+        self._height = self.vehicle.rest_height
+        # The pad: phase (rad), its rate (rad/s), direction of the line, and the side of a circle.
+        self._phase = self._rate = self._cosine = self._sine = self._side = 0.0
+        # Of the last step: velocity, cosine of the tilt, potential; the first two before contact.
+        self._velocity = self._upright = self._potential = 0.0
+        self._arrival = self._arrival_upright = self._progress = 0.0
+
+    def begin(self, mask: Array, draw: Draw) -> Pose:
+        """Level and at rest above the pad's path."""
+        xp, options = self.xp, self.options
+        offset = draw.uniform(-options.start_band, options.start_band, (3,))
+        speed = draw.uniform(*options.pad_speeds)
+        direction, phase = draw.uniform(-math.pi, math.pi), draw.uniform(-math.pi, math.pi)
+        side = draw.uniform(-1.0, 1.0)
+        zero = 0.0 * phase
+        circle = options.motion == "circle"
+        self.keep(
+            mask,
+            _phase=phase,
+            _rate=speed / options.pad_path,
+            _cosine=xp.cos(direction),
+            _sine=xp.sin(direction),
+            _side=xp.where(side < 0, zero - 1.0, zero + 1.0) if circle else zero,
+        )
+        position = stack((zero, zero, zero + self._height + options.start_height)) + offset
+        rest, level = 0.0 * position, zero + 1.0
+        potential = self._potential_of(position, rest)
+        self.keep(mask, _velocity=rest, _upright=level, _potential=potential)
+        self.keep(mask, _arrival=rest, _arrival_upright=level, _progress=zero)
+        return Pose(position=position)
+
+    def remember(self, state: WorldState, mask: Array) -> None:
+        """Move the pad; keep speed and tilt from before contact, and what was won on the way."""
+        xp, touching = self.xp, state.touching
+        self.keep(mask, _phase=self._phase + self._rate * self.options.control_period)
+        velocity = xp.where(each(touching), self._velocity, state.velocity)
+        upright = xp.where(touching, self._upright, state.tilt_cosine)
+        potential = self._potential_of(state.position, velocity)
+        self.keep(mask, _arrival=velocity, _arrival_upright=upright)
+        self.keep(mask, _progress=potential - self._potential, _potential=potential)
+        self.keep(mask, _velocity=state.velocity, _upright=state.tilt_cosine)
+
+    def observe(self, state: WorldState) -> dict[str, Array]:
+        """See the table of the class."""
+        return self.seen(state, *self._pad()[1])
+
+    def outcome(self, state: WorldState) -> Outcome:
+        """Progress and the end: a landing, a crash, a flip-over, or outside the band."""
+        options, touching = self.options, plain(state.touching)
+        speed = self._relative(self._arrival)
+        away = self.goal(state) - state.position
+        x, y = component(away, 0), component(away, 1)
+        distance = square_root(x * x + y * y, self.xp)
+        drift = square_root(speed[0] * speed[0] + speed[1] * speed[1], self.xp)
+        landed = (
+            touching
+            & (distance <= options.pad_radius)
+            & (-speed[2] <= options.sink)
+            & (drift <= options.drift)
+            & (self._arrival_upright >= self._least_upright)
+        )
+        outside = length(self.xp, away) > options.flight_band
+        terminated = touching | outside | (state.tilt_cosine < LEAST_TILT_COSINE)
+        return Outcome(
+            reward={
+                "progress": self._progress,
+                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
+                "landing": landed * LANDING_REWARD,
+                "termination": (terminated > landed) * TERMINATION_REWARD + 0.0,
+            },
+            terminated=terminated,
+            metrics={
+                "landed": landed * 1.0,
+                "pad_distance": distance,
+                "relative_speed": length(self.xp, stack(speed)),
+            },
+        )
+
+    def goal(self, state: WorldState) -> Array:
+        """The pad's centre, at the height of a craft that stands on it."""
+        return self._goal()
+
+    def _goal(self) -> Array:
+        x, y = self._pad()[0]
+        return stack((x, y, 0.0 * x + self._height))
+
+    def _pad(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Position, m, and velocity, m/s, of the pad's centre, x and y, world frame."""
+        path = self.options.pad_path
+        c, s = path * self.xp.cos(self._phase), path * self.xp.sin(self._phase)
+
+        def turned(along: Array, across: Array) -> tuple[Array, Array]:
+            across = self._side * across
+            return (
+                self._cosine * along - self._sine * across,
+                self._sine * along + self._cosine * across,
+            )
+
+        return turned(c, s), turned(-self._rate * s, self._rate * c)
+
+    def _relative(self, velocity: Array) -> tuple[Array, Array, Array]:
+        """A velocity, (..., 3), as the pad sees it, m/s."""
+        x, y, z = (component(velocity, i) for i in range(3))
+        _, (across, along) = self._pad()
+        return x - across, y - along, z
+
+    def _potential_of(self, position: Array, velocity: Array) -> Array:
+        """Minus the distance to the goal, m, and what the relative speed counts."""
+        away = self._goal() - position
+        speed = length(self.xp, stack(self._relative(velocity)))
+        return -(length(self.xp, away) + MATCHING_TIME * speed)

@@ -1,0 +1,197 @@
+"""`rotorgram/PayloadHover-v0`: hold a payload on a cable at a point, and damp its swing."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from ...models.errors import expect
+from ...sim import (
+    Array,
+    Draw,
+    Pose,
+    WorldState,
+    component,
+    constant,
+    each,
+    plain,
+    square_root,
+    stack,
+)
+from ..spec import Metric
+from .flight import (
+    AIR,
+    ERROR_SCALE,
+    FURTHEST,
+    LEAST_TILT_COSINE,
+    MOST_SPEED,
+    RATE_WEIGHT,
+    TERMINATION_REWARD,
+    Flight,
+    at,
+    check_point,
+    length,
+)
+from .task import Outcome, TaskOptions, check_number
+
+SWING_WEIGHT: Final = 0.1  # Cost of a payload that moves at 1 m/s relative to the craft
+
+
+@dataclass(frozen=True, kw_only=True)
+class PayloadHoverOptions(TaskOptions):
+    """Options of `rotorgram/PayloadHover-v0`."""
+
+    goal: tuple[float, float, float] = (0.0, 0.0, 4.0)
+    """Point at which to hold the payload: x, y, z in MuJoCo's world frame (z up), m."""
+    payload_share: float = 0.1
+    """Mass of the payload over that of the vehicle."""
+    cable: float = 1.0
+    """Length of the cable, m."""
+    start_band: float = 1.0
+    """Largest distance of the payload from the goal along each axis at the start, m."""
+    start_speed: float = 1.0
+    """Largest horizontal speed at the start along each axis, m/s, of craft and payload alike."""
+    start_tilt: float = 15.0
+    """Largest tilt at the start, degrees, about a horizontal axis drawn uniformly."""
+    flight_band: float = 3.0
+    """An episode terminates when the payload is further than this from its goal, m."""
+
+    def check(self) -> None:
+        """Check the options of this task. Raises `InputError`."""
+        hung = sorted({"payload", "cable"} & set(self.effects))
+        expected = "payload_share and cable as options of the task"
+        expect(not hung, "effects", expected, " and ".join(hung))
+        check_point(self, "goal")
+        check_number(self, "payload_share", 0.001, 10.0)
+        check_number(self, "cable", 0.05, 100.0, "m")
+        check_number(self, "start_band", 0.0, FURTHEST, "m")
+        check_number(self, "start_speed", 0.0, 100.0, "m/s")
+        check_number(self, "start_tilt", 0.0, 80.0, "degrees")
+        check_number(self, "flight_band", 0.0, FURTHEST, "m")
+        least = self.start_band * math.sqrt(3)
+        expected = f"more than sqrt(3) · start_band = {least:.4g} m"
+        expect(self.flight_band > least, "flight_band", expected, f"{self.flight_band!r}")
+
+    def effects_on(self, mass: float) -> Mapping[str, Any]:
+        """Those of `effects`, and the payload."""
+        return {**self.effects, "payload": self.payload_share * mass, "cable": self.cable}
+
+
+class PayloadHover(Flight):
+    """Hold a payload on a cable at a point, and damp its swing.
+
+    The payload is the effect of that name, a ball on a tendon that is slack below its length. The
+    task switches it on; its options `payload_share` and `cable` take the place of the effect's.
+
+    ## Observation, `float32`, shape (21 + R,)
+
+    | index | quantity | unit | frame |
+    |---|---|---|---|
+    | 0-2 | goal minus position of the craft: above the payload's by the cable | m | world |
+    | 3-5 | velocity | m/s | world |
+    | 6-8 | direction of body x, the nose | 1 | world |
+    | 9-11 | direction of body z, the thrust | 1 | world |
+    | 12-14 | body rates | rad/s | body |
+    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+    | 15 + R... | position of the payload minus that of the craft | m | world |
+    | 18 + R... | velocity of the payload minus that of the craft | m/s | world |
+
+    Numbers are clipped: positions at twice the flight band or the cable, speeds at 100 m/s, rates
+    at 100 rad/s. The payload's are exact, with sensors too: nothing measures them.
+
+    ## Action
+
+    By the option `action`; with `rotors` the thrust of each rotor: 0 is hover without the payload,
+    -1 its least, 1 its largest.
+
+    ## Reward
+
+    (s - d) / (s + d) for the distance d of the payload to its goal with s = 0.5 m; -0.1 s/m times
+    the speed of the payload relative to the craft; -0.02 s/rad times the size of the body rates;
+    and -20 on the step that terminates.
+
+    ## Start, termination, truncation
+
+    The payload hangs straight down, within 1 m of the goal along each axis (`start_band`). Both
+    move alike, by up to 1 m/s along x and y (`start_speed`): as soon as the craft brakes, the
+    payload swings. The craft is tilted by up to 15° (`start_tilt`), at the thrust that carries
+    both.
+
+    *Terminated*: the payload further than 3 m from its goal (`flight_band`), a tilt above 90°, or
+    contact of either. *Truncated*: after 250 steps of 0.02 s.
+    """
+
+    Options = PayloadHoverOptions
+    metrics = (
+        Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e"),
+        Metric(name="swing", unit="deg", settled=5.0),
+    )
+
+    def setup(self) -> None:
+        """See the class."""
+        from ...models.vehicle import payload_radius
+
+        options, vehicle = self.options, self.vehicle
+        mass = options.payload_share * vehicle.mass
+        least = payload_radius(mass) + AIR + options.start_band
+        expected = f"a height of at least {least:.4g} m above the ground"
+        expect(options.goal[2] >= least, "goal", expected, f"{options.goal[2]:g}")
+        self.describe(
+            options.flight_band,
+            [
+                *((f"payload - position {axis}", "m", 2 * options.cable) for axis in "xyz"),
+                *((f"payload velocity - velocity {axis}", "m/s", MOST_SPEED) for axis in "xyz"),
+            ],
+        )
+
+    def begin(self, mask: Array, draw: Draw) -> Pose:
+        """The payload near its goal, hanging still below a craft that moves and tilts."""
+        xp, options = self.xp, self.options
+        band, fastest = options.start_band, options.start_speed
+        offset = draw.uniform(-band, band, (3,))
+        tilt = draw.uniform(0.0, math.radians(options.start_tilt)) / 2
+        azimuth = draw.uniform(-math.pi, math.pi)
+        along, across = draw.uniform(-fastest, fastest), draw.uniform(-fastest, fastest)
+        sine, zero = xp.sin(tilt), 0.0 * tilt
+        x, y, z = options.goal
+        above = stack((zero + x, zero + y, zero + z + options.cable))
+        carrying = (1.0 + options.payload_share) * constant(self.vehicle.hover_thrust, offset)
+        return Pose(
+            position=above + offset,
+            quaternion=stack((xp.cos(tilt), sine * xp.cos(azimuth), sine * xp.sin(azimuth), zero)),
+            velocity=stack((along, across, zero)),
+            thrust=carrying + each(zero),
+        )
+
+    def observe(self, state: WorldState) -> dict[str, Array]:
+        """See the table of the class."""
+        x, y, z = self.options.goal
+        goal = at((x, y, z + self.options.cable), state)
+        hung, moving = state.payload - state.position, state.payload_velocity - state.velocity
+        return self.seen(state, hung, moving, goal=goal)
+
+    def outcome(self, state: WorldState) -> Outcome:
+        """Nearness of the payload, its swing; the end at contact, a flip-over, or too far away."""
+        xp = self.xp
+        distance = length(self.xp, self.goal(state) - state.payload)
+        hung = state.position - state.payload
+        x, y, z = (component(hung, i) for i in range(3))
+        swing = xp.atan2(square_root(x * x + y * y, xp), z) * (180 / math.pi)
+        outside = distance > self.options.flight_band
+        flipped = state.tilt_cosine < LEAST_TILT_COSINE
+        terminated = outside | plain(state.touching) | flipped
+        moving = length(self.xp, state.payload_velocity - state.velocity)
+        return Outcome(
+            reward={
+                "payload": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
+                "swing": -SWING_WEIGHT * moving,
+                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
+                "termination": terminated * TERMINATION_REWARD + 0.0,
+            },
+            terminated=terminated,
+            metrics={"payload_error": distance, "swing": swing},
+        )
+
+    def goal(self, state: WorldState) -> Array:
+        """Of the payload, the same for every drone."""
+        return at(self.options.goal, state)

@@ -1,0 +1,199 @@
+"""`rotorgram/Recovery-v0`: thrown at any attitude and spinning, come to rest where it began."""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ...models.errors import expect
+from ...sim import (
+    Array,
+    Draw,
+    Pose,
+    WorldState,
+    component,
+    constant,
+    plain,
+    square_root,
+    stack,
+)
+from ..spec import Metric
+from .flight import AIR, RATE_WEIGHT, Flight, at, check_point, length
+from .task import Outcome, TaskOptions, check_number
+
+ERROR_SCALE: Final = 1.0  # Distance at which the reward for nearness crosses zero, m
+TILT_WEIGHT: Final = 0.25  # Cost of a tilt of 90°; upside down it is twice as much
+TERMINATION_REWARD: Final = -100.0  # Added to the reward of the step that terminates an episode
+STOP_TIME: Final = 0.5  # Longest time to stop the spin about an axis by all torque about it, s
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecoveryOptions(TaskOptions):
+    """Options of `rotorgram/Recovery-v0`."""
+
+    episode_length: int = 400
+    """Control steps after which an episode is truncated."""
+    goal: tuple[float, float, float] = (0.0, 0.0, 20.0)
+    """Where it is thrown, and has to come back to: x, y, z in MuJoCo's world frame (z up), m."""
+    start_speed: float = 3.0
+    """Largest speed at the start, m/s, in a direction drawn uniformly."""
+    spin: float = 10.0
+    """Largest rate about each body axis at the start, rad/s; no faster than the vehicle's largest
+    torque about that axis stops in 0.5 s."""
+    near: float = 0.5
+    """A craft has recovered while it is nearer to the goal than this, m, ..."""
+    slow: float = 0.5
+    """... slower than this, m/s, ..."""
+    upright: float = 15.0
+    """... and tilted by less than this, degrees."""
+    flight_band: float = 15.0
+    """An episode terminates when the craft is further than this from its goal, m."""
+
+    def check(self) -> None:
+        """Check the options of this task. Raises `InputError`."""
+        check_point(self, "goal")
+        check_number(self, "start_speed", 0.0, 100.0, "m/s")
+        check_number(self, "spin", 0.0, 100.0, "rad/s")
+        check_number(self, "near", 0.01, 1e3, "m")
+        check_number(self, "slow", 0.01, 100.0, "m/s")
+        check_number(self, "upright", 0.1, 90.0, "degrees")
+        check_number(self, "flight_band", 0.1, 1e4, "m")
+        expected = f"more than near = {self.near:g} m"
+        expect(self.flight_band > self.near, "flight_band", expected, f"{self.flight_band!r}")
+
+
+class Recovery(Flight):
+    """Thrown at any attitude, moving and spinning: turn upright and come back to rest.
+
+    ## Observation, `float32`, shape (15 + R,)
+
+    | index | quantity | unit | frame |
+    |---|---|---|---|
+    | 0-2 | goal minus position | m | world |
+    | 3-5 | velocity | m/s | world |
+    | 6-8 | direction of body x, the nose | 1 | world |
+    | 9-11 | direction of body z, the thrust | 1 | world |
+    | 12-14 | body rates | rad/s | body |
+    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+
+    Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
+
+    ## Action
+
+    By the option `action`; with `rotors` the thrust of each rotor: 0 is hover, -1 its least, 1 its
+    largest.
+
+    ## Reward
+
+    (s - d) / (s + d) for the distance d to the goal with s = 1 m; -0.25 (1 - cosine of the tilt);
+    -0.02 s/rad times the size of the body rates; and -100 on the step that terminates: a fall costs
+    more than a slow recovery.
+
+    ## Metrics
+
+    It has `recovered` (1 or 0) while it is nearer than 0.5 m to the goal (`near`), slower than
+    0.5 m/s (`slow`) and tilted by less than 15° (`upright`). `recovery_time` is the time at the
+    last step until now at which it had not, and `height_lost` that between the start and the lowest
+    point until now.
+
+    ## Start, termination, truncation
+
+    At the goal, at hover thrust; the attitude uniform over all rotations (Shoemake, "Uniform random
+    rotations", Graphics Gems III, 1992); the speed uniform up to 3 m/s (`start_speed`), its
+    direction uniform on the sphere; the rate about each body axis uniform up to 10 rad/s (`spin`)
+    or what the largest torque about that axis stops in 0.5 s: 0.5 rad/s about z for the paper's
+    vehicle.
+
+    *Terminated*: further than 15 m from the goal (`flight_band`), or contact. *Truncated*: after
+    400 steps of 0.02 s.
+
+    Attributes:
+        spin: Largest rate about each body axis at the start, rad/s, shape (3,).
+    """
+
+    Options = RecoveryOptions
+    metrics = (
+        Metric(name="recovered", unit="", goal="high", held=0.9),
+        Metric(name="recovery_time", unit="s"),
+        Metric(name="height_lost", unit="m"),
+        Metric(name="position_error", unit="m", settled=0.5, held=0.5),
+    )
+
+    def setup(self) -> None:
+        """See the class."""
+        options, vehicle = self.options, self.vehicle
+        least = vehicle.rest_height + AIR
+        expected = f"a height of at least {least:g} m above the ground"
+        expect(options.goal[2] >= least, "goal", expected, f"{options.goal[2]:g}")
+        turning = [min(vehicle.turning(axis), vehicle.turning(-axis)) for axis in np.eye(3)]
+        self.spin = np.minimum(options.spin, STOP_TIME * np.array(turning))
+        self.describe(options.flight_band)
+        self._least_upright = math.cos(math.radians(options.upright))
+        self._time = self._missed = self._lowest = 0.0  # s, s, m
+
+    def begin(self, mask: Array, draw: Draw) -> Pose:
+        """At the goal, thrown."""
+        xp, options, turn = self.xp, self.options, math.pi
+        share, a, b = (
+            draw.uniform(low, high) for low, high in ((0, 1), (-turn, turn), (-turn, turn))
+        )
+        long, short = xp.sqrt(share), xp.sqrt(1.0 - share)
+        quaternion = stack((
+            long * xp.cos(b), short * xp.sin(a), short * xp.cos(a), long * xp.sin(b)
+        ))  # fmt: skip
+        speed = draw.uniform(0.0, options.start_speed)
+        climb, azimuth = draw.uniform(-1.0, 1.0), draw.uniform(-turn, turn)
+        level = square_root(1.0 - climb * climb, xp) * speed
+        velocity = stack((level * xp.cos(azimuth), level * xp.sin(azimuth), climb * speed))
+        rates = draw.uniform(-1.0, 1.0, (3,))
+        zero = 0.0 * share
+        self.keep(mask, _time=zero, _missed=zero, _lowest=zero + options.goal[2])
+        return Pose(
+            position=stack([zero + value for value in options.goal]),
+            quaternion=quaternion,
+            velocity=velocity,
+            body_rates=rates * constant(self.spin, rates),
+        )
+
+    def remember(self, state: WorldState, mask: Array) -> None:
+        """Time, the last step that was not recovered, and the lowest point."""
+        xp, height = self.xp, component(state.position, 2)
+        self.keep(mask, _time=self._time + self.options.control_period)
+        self.keep(mask, _missed=xp.where(self._recovered(state), self._missed, self._time))
+        self.keep(mask, _lowest=xp.where(height < self._lowest, height, self._lowest))
+
+    def observe(self, state: WorldState) -> dict[str, Array]:
+        """See the table of the class."""
+        return self.seen(state)
+
+    def outcome(self, state: WorldState) -> Outcome:
+        """Nearness to the goal, tilt and spin; the end at a crash or outside the band."""
+        distance = length(self.xp, self.goal(state) - state.position)
+        terminated = (distance > self.options.flight_band) | plain(state.touching)
+        return Outcome(
+            reward={
+                "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
+                "tilt": TILT_WEIGHT * (state.tilt_cosine - 1.0),
+                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
+                "termination": terminated * TERMINATION_REWARD + 0.0,
+            },
+            terminated=terminated,
+            metrics={
+                "recovered": self._recovered(state) * 1.0,
+                "recovery_time": self._missed,
+                "height_lost": self.options.goal[2] - self._lowest,
+                "position_error": distance,
+            },
+        )
+
+    def goal(self, state: WorldState) -> Array:
+        """The same for every drone."""
+        return at(self.options.goal, state)
+
+    def _recovered(self, state: WorldState) -> Array:
+        """Whether it is near, slow and upright, bool, shape (W, A)."""
+        options = self.options
+        near = length(self.xp, self.goal(state) - state.position) < options.near
+        slow = length(self.xp, state.velocity) < options.slow
+        return near & slow & (state.tilt_cosine > self._least_upright)

@@ -1,0 +1,44 @@
+"""What tests of tasks share: states and draws that are written out."""
+
+import math
+from typing import Any
+
+import numpy as np
+from rotorgram.sim import Draw, WorldState
+
+
+def state_of(rotors: int = 4, **arrays: Any) -> WorldState:
+    """A single level craft at rest at (0, 0, 5), but for the arrays that are given."""
+    fields: dict[str, Any] = {
+        "position": (0.0, 0.0, 5.0),
+        "quaternion": (1.0, 0.0, 0.0, 0.0),
+        "velocity": (0.0,) * 3,
+        "body_rates": (0.0,) * 3,
+        "thrust": (49.0,) * rotors,
+        "touching": False,
+    }
+    given = {name: np.array(value) for name, value in {**fields, **arrays}.items()}
+    return WorldState(**given, command=given["thrust"])
+
+
+def about(axis: tuple[float, float, float], degrees: float) -> tuple[float, ...]:
+    """Quaternion of a turn about a unit vector."""
+    half = math.radians(degrees) / 2
+    return (math.cos(half), *(math.sin(half) * part for part in axis))
+
+
+class Shares(Draw):
+    """Gives, one after another, these shares of the way from the low end of a draw to the high."""
+
+    def __init__(self, *shares: Any) -> None:
+        super().__init__(None)
+        self._shares = iter(shares)
+
+    def uniform(
+        self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
+    ) -> Any:
+        share = next(self._shares)
+        if hasattr(share, "shape"):
+            return low + (high - low) * share
+        values = low + (high - low) * np.asarray(share, np.float64)
+        return np.broadcast_to(values, size).copy()[()]
