@@ -39,6 +39,7 @@ def __getattr__(name: str) -> Any:
 for _module, _name in (
     ("elevation", "Elevation"),
     ("hover", "Hover"),
+    ("waypoints", "Waypoints"),
     ("landing", "Landing"),
     ("recovery", "Recovery"),
     ("payload_hover", "PayloadHover"),

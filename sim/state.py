@@ -86,7 +86,7 @@ def component(array: Array, index: int) -> Array:
 
 def each(values: Array) -> Array:
     """A drone's number for each of several: with a last axis of one; of a single drone as it is."""
-    return values if isinstance(values, float) else values[..., None]
+    return values if isinstance(values, _NUMBERS) else values[..., None]
 
 
 def kept(mask: Array, new: Any, old: Any, xp: Any) -> Any:

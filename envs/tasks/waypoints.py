@@ -1,0 +1,182 @@
+"""`rotorgram/Waypoints-v0`: fly to some points, one after the other."""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from ...models.errors import expect
+from ...sim import Array, Draw, Pose, WorldState, component, each, plain, stack
+from ..spec import Metric
+from .flight import (
+    AIR,
+    FURTHEST,
+    LEAST_TILT_COSINE,
+    RATE_WEIGHT,
+    TERMINATION_REWARD,
+    Flight,
+    at,
+    check_point,
+    length,
+)
+from .task import Outcome, TaskOptions, check_number, finite
+
+PASSING_REWARD: Final = 1.0  # Added to the reward of a step in which a point is reached
+MOST_POINTS: Final = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaypointsOptions(TaskOptions):
+    """Options of `rotorgram/Waypoints-v0`."""
+
+    episode_length: int = 750
+    """Control steps after which an episode is truncated."""
+    points: int = 4
+    """Points of an episode, 1 to 64."""
+    center: tuple[float, float, float] = (0.0, 0.0, 5.0)
+    """Middle of the box in which points and start are drawn: x, y, z in MuJoCo's world frame, m."""
+    box: tuple[float, float, float] = (3.0, 3.0, 1.5)
+    """From that middle to the sides of the box, along x, y and z, m."""
+    radius: float = 0.3
+    """A point is reached by a craft that is nearer to it than this at a control step, m."""
+    margin: float = 3.0
+    """An episode terminates when the craft is further outside the box than this, m."""
+
+    def check(self) -> None:
+        """Check the options of this task. Raises `InputError`."""
+        count = finite(self.points)
+        right = count is not None and count == int(count) and 1 <= count <= MOST_POINTS
+        expect(right, "points", f"a whole number from 1 to {MOST_POINTS}", f"{self.points!r}")
+        object.__setattr__(self, "points", int(self.points))
+        check_point(self, "center")
+        check_point(self, "box")
+        expect(min(self.box) >= 0, "box", "three numbers of 0 m or more", f"{self.box!r}")
+        check_number(self, "radius", 1e-3, FURTHEST, "m")
+        check_number(self, "margin", 0.1, FURTHEST, "m")
+
+
+class Waypoints(Flight):
+    """Reach points one after the other, as soon as possible; with the last the episode ends.
+
+    ## Observation, `float32`, shape (18 + R,)
+
+    | index | quantity | unit | frame |
+    |---|---|---|---|
+    | 0-2 | next point minus position | m | world |
+    | 3-5 | velocity | m/s | world |
+    | 6-8 | direction of body x, the nose | 1 | world |
+    | 9-11 | direction of body z, the thrust | 1 | world |
+    | 12-14 | body rates | rad/s | body |
+    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+    | 15 + R... | the point after the next minus position; of the last point the same | m | world |
+
+    Numbers are clipped: positions at the diagonal of the box and its margin, speeds at 100 m/s,
+    rates at 100 rad/s.
+
+    ## Action
+
+    By the option `action`; with `rotors` the thrust of each rotor: 0 is hover, -1 its least, 1 its
+    largest.
+
+    ## Reward
+
+    By how much the craft came nearer to the point in this step, 1/m; 1 on the step that reaches
+    it; -0.02 s/rad times the size of the body rates; and -20 on a step that terminates with points
+    left.
+
+    ## Metrics
+
+    `points_left`, those that were not reached, and `flight_time`, s, until now.
+
+    ## Start, termination, truncation
+
+    At rest and level, at hover thrust, at a point of the box.
+
+    *Terminated*: the last point is reached; further than 3 m outside the box (`margin`), a tilt
+    above 90°, or contact. *Truncated*: after 750 steps of 0.02 s.
+    """
+
+    Options = WaypointsOptions
+    metrics = (
+        Metric(name="points_left", unit="1", settled=0.5, held=0.5, final=True),
+        Metric(name="flight_time", unit="s", final=True),
+    )
+
+    def setup(self) -> None:
+        """See the class."""
+        options = self.options
+        least = self.vehicle.rest_height + AIR + options.box[2]
+        expected = f"a height of at least {least:g} m above the ground"
+        expect(options.center[2] >= least, "center", expected, f"{options.center[2]:g}")
+        self._sides = tuple(side + options.margin for side in options.box)
+        furthest = 2 * math.hypot(*self._sides)
+        after = [(f"point after - position {axis}", "m", furthest) for axis in "xyz"]
+        self.describe(furthest / 2, after)
+        self._points: list[Array] = [0.0] * options.points
+        self._reached: Array = 0.0  # points that were
+        self._time: Array = 0.0
+        self._progress = self._passed = self._distance = 0.0
+
+    def begin(self, mask: Array, draw: Draw) -> Pose:
+        """At rest, level, somewhere in the box; the points are drawn alike."""
+        options, count = self.options, self.options.points
+        sides = list(zip(options.center, options.box, strict=True))
+        start, *points = (
+            stack([middle + side * share[..., axis] for axis, (middle, side) in enumerate(sides)])
+            for share in [draw.uniform(-1.0, 1.0, (3,)) for _ in range(count + 1)]
+        )
+        rows = each(mask) if start.ndim > 1 else mask
+        both = zip(points, self._points, strict=True)
+        self._points = [self.xp.where(rows, new, old) for new, old in both]
+        distance = plain(length(self.xp, points[0] - start))
+        zero = 0.0 * distance
+        self.keep(mask, _reached=zero, _time=zero, _progress=zero, _passed=zero, _distance=distance)
+        return Pose(position=start)
+
+    def remember(self, state: WorldState, mask: Array) -> None:
+        """Count the point that was reached, and how much nearer the craft came."""
+        distance = plain(length(self.xp, self.goal(state) - state.position))
+        left = self._reached < self.options.points
+        passed = (distance < self.options.radius) & left
+        self.keep(
+            mask,
+            _progress=self._distance - distance,
+            _passed=passed * 1.0,
+            _reached=self._reached + passed,
+            _time=self._time + self.options.control_period,
+        )
+        self.keep(mask, _distance=plain(length(self.xp, self.goal(state) - state.position)))
+
+    def observe(self, state: WorldState) -> dict[str, Array]:
+        """See the table of the class."""
+        return self.seen(state, self._point(self._reached + 1.0) - state.position)
+
+    def outcome(self, state: WorldState) -> Outcome:
+        """Progress to the next point; the end at the last one, or far away."""
+        options = self.options
+        left = options.points - self._reached
+        off = abs(state.position - at(options.center, state))
+        crashed = plain(state.touching) | (state.tilt_cosine < LEAST_TILT_COSINE)
+        for axis, side in enumerate(self._sides):
+            crashed = crashed | (component(off, axis) > side)
+        finished = left < 0.5
+        return Outcome(
+            reward={
+                "progress": self._progress,
+                "passing": PASSING_REWARD * self._passed,
+                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
+                "termination": (crashed & (left > 0.5)) * TERMINATION_REWARD + 0.0,
+            },
+            terminated=crashed | finished,
+            metrics={"points_left": left, "flight_time": self._time},
+        )
+
+    def goal(self, state: WorldState) -> Array:
+        """The next point."""
+        return self._point(self._reached)
+
+    def _point(self, index: Array) -> Array:
+        """A point by its number from 0, the last for any larger one, shape (..., 3)."""
+        chosen = self._points[0]
+        for number, point in enumerate(self._points[1:], start=1):
+            chosen = self.xp.where(each(index >= number), point, chosen)
+        return chosen
