@@ -1,0 +1,293 @@
+"""`rotorgram/Racing-v0`: fly through the gates of a track, in their order and direction."""
+
+import json
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from ...models.errors import InputError, expect
+from ...sim import Array, Draw, Pose, WorldState, clip, component, constant, each, plain, stack
+from ..spec import Metric
+from .flight import (
+    AIR,
+    FURTHEST,
+    LEAST_TILT_COSINE,
+    RATE_WEIGHT,
+    TERMINATION_REWARD,
+    Flight,
+    length,
+)
+from .task import Outcome, TaskOptions, check_number, finite
+
+TRACKS: Final = Path(__file__).parent.parent / "tracks"
+MOST_GATES: Final = 64
+MOST_LAPS: Final = 1000
+PASSING_REWARD: Final = 1.0  # Added to the reward of a step in which a gate is passed
+_WAY: Final = "a track of ours, a TOML file of gates, or its content as JSON"
+
+
+class Gate(NamedTuple):
+    """A square opening that stands upright."""
+
+    position: tuple[float, float, float]
+    """Of its centre, world frame, m."""
+    heading: float
+    """Direction in which it is passed, degrees about z, anticlockwise from x."""
+    size: float
+    """Width and height, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RacingOptions(TaskOptions):
+    """Options of `rotorgram/Racing-v0`."""
+
+    episode_length: int = 1500
+    """Control steps after which an episode is truncated."""
+    track: str = "oval"
+    """A track of ours (`oval`, `dive`), or a TOML file with its gates and its start. It is kept as
+    JSON, so that it crosses the wire."""
+    laps: int = 1
+    """Rounds of all gates."""
+    start_band: float = 0.5
+    """Largest distance of the start from that of the track along each axis, m."""
+    margin: float = 5.0
+    """An episode terminates when the craft is further than this from the line between the gate that
+    it has passed, or the start, and the next one, m."""
+
+    def check(self) -> None:
+        """Check the options of this task. Raises `InputError`."""
+        gates, start = read_track(self.track)
+        rows = [gate._asdict() for gate in gates]
+        content = {"gates": rows, "start": {"position": start.position, "heading": start.heading}}
+        object.__setattr__(self, "track", json.dumps(content, separators=(",", ":")))
+        laps = finite(self.laps)
+        right = laps is not None and laps == int(laps) and 1 <= laps <= MOST_LAPS
+        expect(right, "laps", f"a whole number from 1 to {MOST_LAPS}", f"{self.laps!r}")
+        object.__setattr__(self, "laps", int(self.laps))
+        check_number(self, "start_band", 0.0, FURTHEST, "m")
+        check_number(self, "margin", 0.1, FURTHEST, "m")
+
+
+class Racing(Flight):
+    """Pass the gates of a track in their order and direction, as fast as possible.
+
+    Gates are not solid: they are lines in the air, and a craft that misses one has to come back.
+
+    ## Observation, `float32`, shape (23 + R,)
+
+    | index | quantity | unit | frame |
+    |---|---|---|---|
+    | 0-2 | centre of the next gate minus position | m | world |
+    | 3-5 | velocity | m/s | world |
+    | 6-8 | direction of body x, the nose | 1 | world |
+    | 9-11 | direction of body z, the thrust | 1 | world |
+    | 12-14 | body rates | rad/s | body |
+    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+    | 15 + R... | x and y of the direction in which the next gate is passed | 1 | world |
+    | 17 + R... | centre of the gate after it minus position | m | world |
+    | 20 + R... | x and y of the direction of that gate | 1 | world |
+    | 22 + R | half the size of the next gate | m | |
+
+    Numbers are clipped: positions at the size of the track, speeds at 100 m/s, rates at 100 rad/s.
+
+    ## Action
+
+    By the option `action`; with `rotors` the thrust of each rotor: 0 is hover, -1 its least, 1 its
+    largest.
+
+    ## Reward
+
+    By how much the craft came nearer to the centre of the gate in this step, 1/m, the progress of
+    Song et al. 2021 (arXiv 2103.08624, equation 2); 1 on the step that passes it; -0.02 s/rad times
+    the size of the body rates; and -20 on a step that terminates with gates left.
+
+    A gate is passed in a step whose straight way goes through its opening in its direction; one
+    gate in a step at most.
+
+    ## Metrics
+
+    `gates_left`, those that were not passed; `flight_time`, s, until now; and `lap_time`, s, of the
+    last whole round, 0 before it.
+
+    ## Start, termination, truncation
+
+    At rest, the nose along the track, within 0.5 m of its start along each axis (`start_band`), at
+    hover thrust.
+
+    *Terminated*: the last gate is passed; further than 5 m from the line between the last gate and
+    the next (`margin`), a tilt above 90°, or contact. *Truncated*: after 1500 steps of 0.02 s.
+    """
+
+    Options = RacingOptions
+    metrics = (
+        Metric(name="gates_left", unit="1", settled=0.5, held=0.5, final=True),
+        Metric(name="flight_time", unit="s", final=True),
+        Metric(name="lap_time", unit="s", final=True),
+    )
+
+    def setup(self) -> None:
+        """See the class."""
+        gates, self._start = read_track(self.options.track)
+        least = self.vehicle.rest_height + AIR + self.options.start_band
+        got = self._start.position[2]
+        expect(
+            got >= least, "track", f"a start at least {least:.4g} m above the ground", f"{got:g}"
+        )
+        self._total = len(gates) * self.options.laps
+        self._count = len(gates)
+        turns = np.radians([gate.heading for gate in gates])
+        # Of each gate its centre, the x and y of its direction, and half its size.
+        centers = np.array([gate.position for gate in gates])
+        halves = np.array([gate.size / 2 for gate in gates])
+        self._gates = np.column_stack((centers, np.cos(turns), np.sin(turns), halves))
+        corners = np.vstack((centers, self._start.position))
+        reach = float(np.linalg.norm(np.ptp(corners, axis=0))) + 2 * self.options.margin
+        after = [(f"gate after - position {axis}", "m", reach) for axis in "xyz"]
+        self.describe(
+            reach / 2,
+            [
+                *((f"direction of the gate {axis}", "1", 1.001) for axis in "xy"),
+                *after,
+                *((f"direction of the gate after {axis}", "1", 1.001) for axis in "xy"),
+                ("half size of the gate", "m", float(halves.max()) + 0.001),
+            ],
+        )
+        self._passed = self._time = self._lap = self._lap_began = 0.0
+        self._progress = self._passing = self._off = 0.0
+        self._position: Array = 0.0  # before the last step
+        self._behind: Array = 0.0  # where the way to the next gate began
+
+    def begin(self, mask: Array, draw: Draw) -> Pose:
+        """At rest near the start, the nose along the track."""
+        band = self.options.start_band
+        offset = draw.uniform(-band, band, (3,))
+        zero = 0.0 * plain(offset[..., 0])
+        position = stack([zero + x for x in self._start.position]) + offset
+        half = math.radians(self._start.heading) / 2
+        self.keep(mask, _position=position, _behind=position)
+        names = ("_passed", "_time", "_lap", "_lap_began", "_progress", "_passing", "_off")
+        self.keep(mask, **dict.fromkeys(names, zero))
+        turn = stack((zero + math.cos(half), zero, zero, zero + math.sin(half)))
+        return Pose(position=position, quaternion=turn)
+
+    def remember(self, state: WorldState, mask: Array) -> None:
+        """Whether the gate was passed, how much nearer it came, and the times of rounds."""
+        xp, now, before = self.xp, state.position + 0.0, self._position
+        gate = self._gate(self._passed)
+        center = gate[..., :3]
+        x, y, half = (component(gate, i) for i in (3, 4, 5))
+        a, b = before - center, now - center
+        ahead, behind = (component(p, 0) * x + component(p, 1) * y for p in (b, a))
+        through = (behind < 0.0) & (ahead >= 0.0)
+        share = each(plain(behind / xp.where(through, behind - ahead, -1.0)))
+        at = a + share * (b - a)
+        aside = component(at, 1) * x - component(at, 0) * y
+        inside = (abs(aside) <= half) & (abs(component(at, 2)) <= half)
+        left = self._passed < self._total
+        passing = plain(through & inside & left) * 1.0
+        progress = plain(length(xp, a) - length(xp, b))
+        passed, time = self._passed + passing, self._time + self.options.control_period
+        whole = (passing > 0.5) & (passed % self._count == 0.0)
+        way, come = center - self._behind, now - self._behind
+        along = plain(xp.sum(come * way, axis=-1)) / (plain(xp.sum(way * way, axis=-1)) + 1e-12)
+        off = plain(length(xp, come - each(clip(along, 0.0, 1.0)) * way))
+        behind_now = xp.where(each(passing > 0.5), center, self._behind)
+        self.keep(
+            mask, _passed=passed, _time=time, _passing=passing, _progress=progress, _off=off,
+            _lap=plain(xp.where(whole, time - self._lap_began, self._lap)),
+            _lap_began=plain(xp.where(whole, time, self._lap_began)),
+            _position=now, _behind=behind_now,
+        )  # fmt: skip
+
+    def observe(self, state: WorldState) -> dict[str, Array]:
+        """See the table of the class."""
+        gate, after = self._gate(self._passed), self._gate(self._passed + 1.0)
+        return self.seen(
+            state,
+            gate[..., 3:5],
+            after[..., :3] - state.position,
+            after[..., 3:5],
+            plain(gate[..., 5]),
+        )
+
+    def outcome(self, state: WorldState) -> Outcome:
+        """Progress to the next gate; the end at the last one, or off the track."""
+        left = self._total - self._passed
+        flipped = state.tilt_cosine < LEAST_TILT_COSINE
+        crashed = (self._off > self.options.margin) | plain(state.touching) | flipped
+        return Outcome(
+            reward={
+                "progress": self._progress,
+                "passing": PASSING_REWARD * self._passing,
+                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
+                "termination": (crashed & (left > 0.5)) * TERMINATION_REWARD + 0.0,
+            },
+            terminated=crashed | (left < 0.5),
+            metrics={"gates_left": left, "flight_time": self._time, "lap_time": self._lap},
+        )
+
+    def goal(self, state: WorldState) -> Array:
+        """The centre of the next gate."""
+        return self._gate(self._passed)[..., :3] + 0.0 * state.position
+
+    def _gate(self, passed: Array) -> Array:
+        """The gate that is due after so many, shape (..., 6); after the last that one."""
+        number = self.xp.where(passed < self._total, passed, 1.0 * self._total - 1.0)
+        number = plain(number) % self._count
+        rows = constant(self._gates, number)
+        chosen = rows[0]
+        for index in range(1, self._count):
+            chosen = self.xp.where(each(number >= index), rows[index], chosen)
+        return chosen
+
+
+def read_track(given: Any) -> tuple[list[Gate], Gate]:
+    """Gates of a track, and its start, a gate of size 0. Raises `InputError`."""
+    expect(isinstance(given, str), "track", _WAY, f"{given!r:.80}")
+    try:
+        if given.lstrip().startswith("{"):
+            content = json.loads(given)
+        else:
+            ours = TRACKS / f"{given}.toml"
+            path = ours if ours.is_file() and ours.parent == TRACKS else Path(given)
+            content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        names = ", ".join(sorted(path.stem for path in TRACKS.glob("*.toml")))
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"track: expected {_WAY} ({names}), got {given!r:.80}: {reason:.120}"
+        ) from None
+    right = isinstance(content, Mapping) and isinstance(content.get("gates"), list)
+    expect(right, "track", "a list of gates", f"{content!r:.80}")
+    unknown = sorted({*content} - {"gates", "start"})
+    expect(not unknown, "track", "gates and start", f"{unknown}")
+    rows = content["gates"]
+    expect(1 <= len(rows) <= MOST_GATES, "track", f"1 to {MOST_GATES} gates", f"{len(rows)}")
+    gates = [_gate(row, f"gate {i}") for i, row in enumerate(rows, start=1)]
+    return gates, _gate(content.get("start"), "start", sized=False)
+
+
+def _gate(row: Any, what: str, *, sized: bool = True) -> Gate:
+    names = ["position", "heading", *(["size"] if sized else [])]
+    right = isinstance(row, Mapping) and sorted(row) == sorted(names)
+    expect(right, f"track: {what}", " and ".join(names), f"{row!r:.80}")
+    place = row["position"]
+    numbers = [finite(x) for x in place] if isinstance(place, list | tuple) else []
+    right = len(numbers) == 3 and all(x is not None and abs(x) <= FURTHEST for x in numbers)
+    expect(right, f"track: {what}", "a position (x, y, z) in m", f"{place!r:.80}")
+    heading, size = finite(row["heading"]), finite(row.get("size", 0.0))
+    right = heading is not None and abs(heading) <= 360.0
+    expect(right, f"track: {what}", "a heading from -360 to 360 degrees", f"{row['heading']!r:.80}")
+    right = size is not None and (not sized or 0.01 <= size <= FURTHEST)
+    expect(
+        right, f"track: {what}", f"a size from 0.01 to {FURTHEST:g} m", f"{row.get('size')!r:.80}"
+    )
+    assert heading is not None
+    assert size is not None
+    x, y, z = (float(value) for value in place)
+    return Gate((x, y, z), heading, size)
