@@ -40,6 +40,7 @@ for _module, _name in (
     ("elevation", "Elevation"),
     ("hover", "Hover"),
     ("waypoints", "Waypoints"),
+    ("tracking", "Tracking"),
     ("racing", "Racing"),
     ("landing", "Landing"),
     ("recovery", "Recovery"),

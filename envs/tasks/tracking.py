@@ -1,0 +1,349 @@
+"""`rotorgram/Tracking-v0`: follow a trajectory in time."""
+
+import csv
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from ...models.errors import InputError, expect
+from ...sim import Array, Draw, Pose, WorldState, clip, component, constant, each, plain, stack
+from ..spec import Metric
+from .flight import (
+    AIR,
+    ERROR_SCALE,
+    FURTHEST,
+    LEAST_TILT_COSINE,
+    RATE_WEIGHT,
+    TERMINATION_REWARD,
+    Flight,
+    check_point,
+    length,
+)
+from .task import Outcome, TaskOptions, check_number, finite
+
+MOST_SAMPLES: Final = 20_000  # Rows of a file
+MOST_POINTS: Final = 16  # That a minimum-snap trajectory goes through
+_KINDS: Final = ("circle", "lemniscate", "snap")
+_EXPECTED: Final = "circle, lemniscate, snap, or a CSV file with columns t, x, y, z"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackingOptions(TaskOptions):
+    """Options of `rotorgram/Tracking-v0`."""
+
+    episode_length: int = 600
+    """Control steps after which an episode is truncated."""
+    trajectory: str = "circle"
+    """`circle` or `lemniscate`, level and without end; `snap`, a minimum-snap trajectory from rest
+    to rest through points; or a CSV file with columns t (s), x, y, z (m, world frame), straight
+    between its rows. The rows of a file are kept as JSON, so that they cross the wire."""
+    center: tuple[float, float, float] = (0.0, 0.0, 5.0)
+    """Middle of a circle, a lemniscate, or the box of points: world frame, m."""
+    radius: float = 2.0
+    """Of the circle, half the length of the lemniscate, or half the width of the box, which is half
+    as high, m."""
+    period: float = 10.0
+    """Time of a round, or of all of a `snap`, s."""
+    points: int = 5
+    """Points of a `snap`, 2 to 16, which are drawn in the box for each episode."""
+    preview: int = 3
+    """Later points of the trajectory in the observation, 0 to 20."""
+    preview_time: float = 0.2
+    """Time between these, s."""
+    start_band: float = 0.3
+    """Largest distance of the start from the trajectory along each axis, m."""
+    flight_band: float = 3.0
+    """An episode terminates when the craft is further than this from where it should be, m."""
+
+    def check(self) -> None:
+        """Check the options of this task. Raises `InputError`."""
+        if self.trajectory not in _KINDS:
+            rows = json.dumps(read_samples(self.trajectory).tolist(), separators=(",", ":"))
+            object.__setattr__(self, "trajectory", rows)
+        check_point(self, "center")
+        check_number(self, "radius", 0.0, FURTHEST, "m")
+        check_number(self, "period", 0.1, 1e4, "s")
+        check_number(self, "preview_time", 0.0, 100.0, "s")
+        check_number(self, "start_band", 0.0, FURTHEST, "m")
+        check_number(self, "flight_band", 0.01, FURTHEST, "m")
+        for name, low, high in (("points", 2, MOST_POINTS), ("preview", 0, 20)):
+            value = finite(given := getattr(self, name))
+            right = value is not None and value == int(value) and low <= value <= high
+            expect(right, name, f"a whole number from {low} to {high}", f"{given!r}")
+            object.__setattr__(self, name, int(given))
+
+
+class Tracking(Flight):
+    """Be at the right place at the right time, along a trajectory that can be seen ahead.
+
+    ## Observation, `float32`, shape (18 + R + 3 P,) with P = 3 later points (`preview`)
+
+    | index | quantity | unit | frame |
+    |---|---|---|---|
+    | 0-2 | where it should be minus position | m | world |
+    | 3-5 | velocity | m/s | world |
+    | 6-8 | direction of body x, the nose | 1 | world |
+    | 9-11 | direction of body z, the thrust | 1 | world |
+    | 12-14 | body rates | rad/s | body |
+    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+    | 15 + R... | velocity of the trajectory | m/s | world |
+    | 18 + R... | where it should be, every 0.2 s (`preview_time`), minus position | m | world |
+
+    Numbers are clipped: positions at the size of the trajectory, speeds at 100 m/s, rates at
+    100 rad/s.
+
+    ## Action
+
+    By the option `action`; with `rotors` the thrust of each rotor: 0 is hover, -1 its least, 1 its
+    largest.
+
+    ## Reward
+
+    (s - d) / (s + d) for the distance d from where it should be with s = 0.5 m; -0.02 s/rad times
+    the size of the body rates; and -20 on the step that terminates.
+
+    ## Trajectories
+
+    A circle and a lemniscate of Bernoulli begin at a phase drawn uniformly. A `snap` has pieces of
+    seventh order of equal times with six continuous derivatives and no speed, acceleration or jerk
+    at its ends: of all curves through these points at these times it has the least integral of the
+    squared snap (Mellinger and Kumar, ICRA 2011). At its end it stays, and so does that of a file.
+
+    ## Start, termination, truncation
+
+    Level, within 0.3 m of the trajectory along each axis (`start_band`), at its velocity, at hover
+    thrust.
+
+    *Terminated*: further than 3 m from where it should be (`flight_band`), a tilt above 90°, or
+    contact. *Truncated*: after 600 steps of 0.02 s.
+    """
+
+    Options = TrackingOptions
+    metrics = (
+        Metric(name="tracking_error", unit="m", settled=0.2, held=0.2, symbol="e"),
+        Metric(name="reference_speed", unit="m/s"),
+    )
+
+    def setup(self) -> None:
+        """See the class."""
+        options, step = self.options, self.options.control_period
+        middle = np.array(options.center)
+        self._closed = options.trajectory in ("circle", "lemniscate")
+        self._drawn = options.trajectory == "snap"
+        if self._closed:
+            count = max(2, round(options.period / step))
+            phases = 2 * np.pi * np.arange(count) / count
+            curve = _circle if options.trajectory == "circle" else _lemniscate
+            self._table, self._rates = curve(phases, options.radius, 2 * np.pi / (count * step))
+            self._table = self._table + middle
+        elif self._drawn:
+            times = np.arange(math.ceil(options.period / step) + 1) * step / options.period
+            self._table, rates = (
+                snap_basis(options.points, np.minimum(times, 1.0), derivative)
+                for derivative in (0, 1)
+            )
+            self._rates = rates / options.period
+        else:
+            rows = read_samples(options.trajectory)
+            times = rows[0, 0] + np.arange(math.ceil(np.ptp(rows[:, 0]) / step) + 1) * step
+            table = [np.interp(times, rows[:, 0], rows[:, axis]) for axis in (1, 2, 3)]
+            self._table = np.column_stack(table)
+            self._rates = np.gradient(self._table, step, axis=0)
+            self._rates[-1] = 0.0  # it stays
+        box = options.radius * np.array((1.0, 1.0, 0.5))
+        low, high = (
+            (middle - box, middle + box)
+            if self._drawn
+            else (self._table.min(axis=0), self._table.max(axis=0))
+        )
+        least = self.vehicle.rest_height + AIR + options.start_band
+        expected = f"a height of at least {least:.4g} m above the ground"
+        expect(low[2] >= least, "trajectory", expected, f"{low[2]:.4g}")
+        self._box = list(zip(middle.tolist(), box.tolist(), strict=True))
+        self._check_speed()
+        reach = float(np.linalg.norm(high - low)) + 2 * options.flight_band
+        later = [
+            (f"reference {number * options.preview_time:g} s later - position {axis}", "m", reach)
+            for number in range(1, options.preview + 1)
+            for axis in "xyz"
+        ]
+        speed = [(f"reference velocity {axis}", "m/s", 100.0) for axis in "xyz"]
+        self.describe(reach / 2, [*speed, *later])
+        self._ahead = [
+            float(round(number * options.preview_time / step))
+            for number in range(1, options.preview + 1)
+        ]
+        self._points: list[Array] = [0.0] * (options.points if self._drawn else 0)
+        self._index: Array = 0.0  # row of the table
+
+    def _check_speed(self) -> None:
+        """Raise `InputError` for a trajectory that asks for more thrust than the rotors have."""
+        ratio = self.quickest / self.options.period
+        if self._closed:
+            expected = f"at least {self.quickest:.4g} s, which the rotors' thrust needs"
+            expect(ratio <= 1.0, "period", expected, f"{self.options.period:g}")
+
+    @property
+    def quickest(self) -> float:
+        """Least time of a round that the rotors' thrust allows, s; 0 of a `snap` or a file.
+
+        The largest acceleration a, level, and gravity need a thrust of hypot(a, g) times the mass;
+        a falls with the square of the time. Of a circle a = r (2 π / T)².
+        """
+        if not self._closed:
+            return 0.0
+        step = self.options.control_period
+        after, before = np.roll(self._table, -1, axis=0), np.roll(self._table, 1, axis=0)
+        largest = float(np.linalg.norm(after - 2 * self._table + before, axis=1).max() / step**2)
+        vehicle = self.vehicle
+        lift = float(vehicle.allocation[0] @ vehicle.thrust_high) / vehicle.mass
+        free = math.sqrt(max(lift**2 - vehicle.gravity**2, 1e-12))
+        return float(len(self._table) * step * math.sqrt(largest / free))
+
+    def begin(self, mask: Array, draw: Draw) -> Pose:
+        """Near the beginning of the trajectory, or anywhere on a closed one, at its velocity."""
+        xp, band = self.xp, self.options.start_band
+        share = draw.uniform(0.0, 1.0)
+        index = xp.floor(share * len(self._table)) if self._closed else 0.0 * share
+        index = plain(index)
+        for number in range(len(self._points)):
+            place = draw.uniform(-1.0, 1.0, (3,))
+            new = stack([m + half * place[..., i] for i, (m, half) in enumerate(self._box)])
+            rows = each(mask) if new.ndim > 1 else mask
+            self._points[number] = xp.where(rows, new, self._points[number])
+        self.keep(mask, _index=index)
+        offset = draw.uniform(-band, band, (3,))
+        position, velocity = (self._at(table, 0.0) for table in (self._table, self._rates))
+        return Pose(position=position + offset, velocity=velocity + 0.0 * offset)
+
+    def remember(self, state: WorldState, mask: Array) -> None:
+        """Go on along the trajectory."""
+        self.keep(mask, _index=self._index + 1.0)
+
+    def observe(self, state: WorldState) -> dict[str, Array]:
+        """See the table of the class."""
+        velocity = self._at(self._rates, 0.0) + 0.0 * state.position
+        later = [self._at(self._table, ahead) - state.position for ahead in self._ahead]
+        return self.seen(state, velocity, *later)
+
+    def outcome(self, state: WorldState) -> Outcome:
+        """Nearness to where it should be; the end at contact, a flip-over, or too far away."""
+        distance = length(self.xp, self.goal(state) - state.position)
+        outside = distance > self.options.flight_band
+        flipped = state.tilt_cosine < LEAST_TILT_COSINE
+        terminated = outside | plain(state.touching) | flipped
+        speed = length(self.xp, self._at(self._rates, 0.0))
+        return Outcome(
+            reward={
+                "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
+                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
+                "termination": terminated * TERMINATION_REWARD + 0.0,
+            },
+            terminated=terminated,
+            metrics={"tracking_error": distance, "reference_speed": speed},
+        )
+
+    def goal(self, state: WorldState) -> Array:
+        """Where it should be."""
+        return self._at(self._table, 0.0) + 0.0 * state.position
+
+    def _at(self, table: np.ndarray, ahead: float) -> Array:
+        """Row of a table so many steps ahead, of a `snap` times its points: shape (..., 3)."""
+        index = self._index + ahead
+        last = float(len(table))
+        index = index % last if self._closed else clip(index, 0.0, last - 1.0)
+        rows = constant(table, index)
+        row = rows[int(index) if isinstance(index, float) else self.xp.astype(index, self.xp.int64)]
+        if not self._points:
+            return row
+        parts = [each(component(row, k)) * point for k, point in enumerate(self._points)]
+        total = parts[0]
+        for part in parts[1:]:
+            total = total + part
+        return total
+
+
+def _circle(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positions from the middle, m, and velocities, m/s, shape (L, 3)."""
+    c, s, zero = np.cos(phase), np.sin(phase), 0.0 * phase
+    place = np.column_stack((c, s, zero))
+    return radius * place, radius * rate * np.column_stack((-s, c, zero))
+
+
+def _lemniscate(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Bernoulli's: (cos φ, sin φ cos φ) / (1 + sin² φ)."""
+    c, s, zero = np.cos(phase), np.sin(phase), 0.0 * phase
+    below = 1 + s * s
+    place = np.column_stack((c / below, s * c / below, zero))
+    x = -s * (below + 2 * c * c) / below**2
+    y = ((c * c - s * s) * below - 2 * s * s * c * c) / below**2
+    return radius * place, radius * rate * np.column_stack((x, y, zero))
+
+
+def snap_basis(points: int, times: np.ndarray, derivative: int = 0) -> np.ndarray:
+    """Share of each point in a minimum-snap trajectory, or in its derivative: shape (L, K).
+
+    It is at the K points at equal times from 0 to 1. Its K - 1 pieces have 8 coefficients each: 2
+    ends, 6 continuous derivatives inside, and 3 that are 0 at each end of all.
+    """
+    pieces = points - 1
+
+    def row(piece: int, at: float, order: int) -> np.ndarray:
+        """Of the coefficients, for a derivative by the piece's own time from 0 to 1."""
+        values = np.zeros(8 * pieces)
+        for n in range(order, 8):
+            power = 1.0 if n == order else at ** (n - order)
+            values[8 * piece + n] = math.factorial(n) / math.factorial(n - order) * power
+        return values
+
+    rows, given = [], []
+    for piece in range(pieces):
+        for end in (0, 1):
+            rows.append(row(piece, float(end), 0))
+            given.append(np.eye(points)[piece + end])
+    nothing = np.zeros(points)
+    for order in range(1, 7):
+        for piece in range(pieces - 1):
+            rows.append(row(piece, 1.0, order) - row(piece + 1, 0.0, order))
+            given.append(nothing)
+        if order <= 3:
+            rows += [row(0, 0.0, order), row(pieces - 1, 1.0, order)]
+            given += [nothing, nothing]
+    coefficients = np.linalg.solve(np.array(rows), np.array(given))
+    found = []
+    for time in times.tolist():
+        piece = min(int(time * pieces), pieces - 1)
+        found.append(row(piece, time * pieces - piece, derivative) @ coefficients)
+    return np.array(found) * pieces**derivative
+
+
+def read_samples(given: str) -> np.ndarray:
+    """Times and places of a CSV file, or of its content as JSON: shape (rows, 4).
+
+    Raises `InputError`.
+    """
+    expect(isinstance(given, str), "trajectory", _EXPECTED, f"{given!r:.80}")
+    try:
+        if given.lstrip().startswith("["):
+            rows = json.loads(given)
+        else:
+            with open(given, encoding="utf-8", newline="") as file:
+                reader = csv.DictReader(file)
+                rows = [[float(row[name]) for name in ("t", "x", "y", "z")] for row in reader]
+        samples: np.ndarray = np.array(rows, np.float64)
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        got = f"{str(Path(given[:80]))!r}: {reason:.120}"
+        raise InputError(f"trajectory: expected {_EXPECTED}, got {got}") from None
+    shape = samples.shape
+    right = samples.ndim == 2 and shape[1:] == (4,) and 2 <= len(samples) <= MOST_SAMPLES
+    expect(right, "trajectory", f"2 to {MOST_SAMPLES} rows of t, x, y, z", f"shape {shape}")
+    expect(bool(np.isfinite(samples).all()), "trajectory", "finite numbers", "others")
+    far = float(np.abs(samples[:, 1:]).max())
+    expect(far <= FURTHEST, "trajectory", f"coordinates up to {FURTHEST:g} m", f"{far:g}")
+    expect(bool((np.diff(samples[:, 0]) > 0).all()), "trajectory", "times that rise", "others")
+    return np.asarray(samples)
