@@ -30,6 +30,7 @@ FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/ve
 N, STEPS = 3, 40
 STORM = {"wind": (4.0, -3.0, 6.0), "gusts": 8.0}
 
+
 def pairs(every: int) -> Any:
     """Tasks and vehicles: each task with one vehicle in so many, each vehicle with some tasks."""
     chosen = [
@@ -104,11 +105,15 @@ def flown(env: gym.Env, seed: int, steps: int = STEPS) -> Iterator[tuple[Any, ..
 
 @some
 def test_alone_without_effects(env_id: str, file: Path) -> None:
-    test_alone(env_id, file, windy=False)
+    check_alone(env_id, file, windy=False)
 
 
 @everything
-def test_alone(env_id: str, file: Path, windy: bool = True) -> None:
+def test_alone(env_id: str, file: Path) -> None:
+    check_alone(env_id, file, windy=True)
+
+
+def check_alone(env_id: str, file: Path, windy: bool) -> None:
     env = gym.make(env_id, disable_env_checker=True, **options_of(env_id, file, windy)).unwrapped
     assert isinstance(env, SingleEnv)
     check_env(env, skip_render_check=True)

@@ -153,7 +153,7 @@ def test_the_quickest_circle() -> None:
     quickest = 2 * math.pi * math.sqrt(2.0 / math.sqrt(20.0**2 - 9.8**2))
     assert make_task(ID, {}).quickest == pytest.approx(quickest, rel=1e-3)
     make_task(ID, {"period": 1.01 * quickest})
-    with pytest.raises(InputError, match="period: expected at least 2.12"):
+    with pytest.raises(InputError, match=r"period: expected at least 2\.12"):
         make_task(ID, {"period": 0.96 * quickest})
 
 

@@ -318,7 +318,8 @@ def snap_basis(points: int, times: np.ndarray, derivative: int = 0) -> np.ndarra
     for time in times.tolist():
         piece = min(int(time * pieces), pieces - 1)
         found.append(row(piece, time * pieces - piece, derivative) @ coefficients)
-    return np.array(found) * pieces**derivative
+    basis: np.ndarray = np.array(found) * float(pieces**derivative)
+    return basis
 
 
 def read_samples(given: str) -> np.ndarray:
@@ -346,4 +347,4 @@ def read_samples(given: str) -> np.ndarray:
     far = float(np.abs(samples[:, 1:]).max())
     expect(far <= FURTHEST, "trajectory", f"coordinates up to {FURTHEST:g} m", f"{far:g}")
     expect(bool((np.diff(samples[:, 0]) > 0).all()), "trajectory", "times that rise", "others")
-    return np.asarray(samples)
+    return samples

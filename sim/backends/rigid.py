@@ -102,12 +102,14 @@ class RigidWorld(TensorWorld):
             self._wrench = torch.where(mask[:, 0], 0.0, self._wrench)
         state.touching = torch.where(mask, self._touches(), state.touching)
 
-    def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
+    def step(
+        self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
+    ) -> None:
         """As `World.step`."""
         state = self.state
         command = thrust.expand(state.command.shape)  # one number for all rotors counts for each
         state.command = _kept(mask, command, state.command)
-        touching = torch.zeros_like(state.touching)
+        touching = state.touching if again else torch.zeros_like(state.touching)
         while substeps > 0:
             self._fly(min(substeps, self._check), mask)
             touching = touching | self._touches()
