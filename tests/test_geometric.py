@@ -10,6 +10,7 @@ import pytest
 import rotorgram.envs  # noqa: F401
 from remotes import flying
 from rotorgram.agents import Geometric
+from rotorgram.cli import main
 from rotorgram.envs import register
 from rotorgram.envs.tasks.hover import Hover
 from rotorgram.models import QUAD_XML
@@ -101,3 +102,11 @@ def test_it_says_what_it_needs() -> None:
     nameless = replace(spec, observation=(replace(spec.observation[0], components=()),))
     with pytest.raises(InputError, match=r"geometric: expected .*'goal - position x', got"):
         Geometric(nameless)
+
+
+def test_evaluate_flies_it_at_its_level(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "geometric", "--env", HOVER, "--episodes", "1"]) == 0
+    assert "geometric on rotorgram/Hover-v0\nepisodes   1, 0 terminated" in capsys.readouterr().out
+    assert main(["evaluate", "geometric", "--episodes", "1"]) != 0
+    expected = "action: expected 'increment' or 'offset', got 'position'"
+    assert expected in capsys.readouterr().err
