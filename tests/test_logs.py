@@ -74,7 +74,7 @@ def sized(algorithm: str, steps: int = 100) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize("drones", [1, 2])
-@pytest.mark.parametrize("algorithm", AGENTS)
+@pytest.mark.parametrize("algorithm", [*AGENTS, "ppo"])
 def test_the_names_are_those_of_the_pages(algorithm: str, drones: int, tmp_path: Path) -> None:
     logged = train(
         algorithm, tmp_path / "run", "--env-steps", 600, "--num-envs", drones, *sized(algorithm)

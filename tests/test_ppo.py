@@ -1,15 +1,20 @@
 """PPO: its loss by hand and against torch, and the updates of SB3's on the same experience."""
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from rotorgram.agents import EpisodeLog, PPOConfig, make_agent
+from rotorgram.agents import EpisodeLog, PPOConfig, load, make_agent
 from rotorgram.agents.networks import clip_norm
 from rotorgram.agents.ppo import PPO
+from rotorgram.agents.presets import find_preset
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.models.errors import InputError
 from test_learning import Recorder, copy_weights, elevation, log_of, rollout, torch_net
 
 SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minibatches=1)
@@ -210,3 +215,29 @@ def test_sb3_and_ours_make_the_same_steps_of_the_same_minibatches() -> None:
     assert max(clipped) > 0
     for name, expected in theirs.actor().items():
         np.testing.assert_allclose(ours.actor()[name], expected, atol=5e-5, err_msg=name)
+
+
+def test_the_tuned_preset_depends_on_the_task() -> None:
+    ours = find_preset("ppo", "tuned", "rotorgram/Elevation-v0")
+    assert (ours.num_envs, ours.env_steps, ours.config.hidden) == (32, 41_000, (16,))
+    hover = find_preset("ppo", "tuned", "rotorgram/Hover-v0")
+    assert (hover.num_envs, hover.config.hidden) == (128, (64, 64))
+    assert find_preset("sb3-ppo", "tuned", "rotorgram/Hover-v0") == hover
+    assert find_preset("ppo", "tuned", "other/Task-v0") == ours
+    with pytest.raises(InputError, match=r"preset: expected one of \['tuned'\], got 'paper'"):
+        find_preset("ppo", "paper")
+
+
+def test_training_by_the_command_takes_the_preset_s_drones_and_loads_no_torch(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "run"
+    words = ["train", "ppo", "--env-steps", "2100", "--out", str(folder)]
+    code = f"import sys; from rotorgram.cli import main; assert main({words}) == 0; " + (
+        "print(sorted({'torch', 'pandas', 'stable_baselines3'} & set(sys.modules)))"
+    )
+    told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert told.stdout.splitlines()[-1] == "[]"
+    kept = load(folder / "checkpoint.safetensors")
+    assert (kept.num_envs, kept.algorithm) == (32, "ppo")
+    assert 2100 <= kept.position.env_steps < 2132
