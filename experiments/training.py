@@ -31,7 +31,11 @@ class Snapshot:
 
 
 def is_finished(kept: Checkpoint) -> bool:
-    """Whether a training has flown all its env steps. SB3 flies whole rollouts only."""
+    """Whether a training has flown all its env steps. SB3 flies whole rollouts only.
+
+    Raises `ResumeError` for a policy alone.
+    """
+    kept.check_resumable()
     least = 1
     if kept.algorithm == "sb3-a2c":
         least = A2CConfig(**kept.config).rollout_size(kept.num_envs)
@@ -70,6 +74,7 @@ class Training:
     @classmethod
     def resume(cls, kept: Checkpoint, env: AnyEnv) -> "Training":
         """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
+        kept.check_resumable()
         try:
             names = ("algorithm", "env_id", "options", "seed", "env_steps", "num_envs")
             config = agents.preset(kept.algorithm, "paper", **kept.config)
