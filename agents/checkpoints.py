@@ -186,7 +186,8 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
         _expect(kinds == _COLUMNS, f"columns {sorted(_COLUMNS)} of episodes", sorted(kinds))
         rows = zip(*(columns[name].tolist() for name in _COLUMNS), strict=True)
         episodes = tuple(Episode(**dict(zip(_COLUMNS, row, strict=True))) for row in rows)
-        position = replace(position, episodes=episodes, **arrays["position"])
+        given: dict[str, Any] = {**arrays["position"]}
+        position = replace(position, episodes=episodes, **given)
         _check_position(position, spec, meta["env_steps"])
     config = vars(preset(meta["algorithm"], "paper", **meta["config"]))
     _expect(config == meta["config"], f"a config of all of {sorted(config)}", meta["config"])
