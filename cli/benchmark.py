@@ -26,6 +26,8 @@ class Benchmark(FolderFlags, WorkersConfig):
     """Number of seeds, the same for every row. Default: the file's, or 10."""
     first_seed: int | None = None
     """The first of them. Default: the file's, or 5000, which no other command uses."""
+    env_steps: int | None = None
+    """Env steps of every training, for a short look. Default: each row's own."""
     page: Path | None = None
     """Markdown page to write. Default: baselines.md in the folder."""
 
@@ -51,6 +53,9 @@ class Benchmark(FolderFlags, WorkersConfig):
             changes = {name: getattr(self, name) for name in ("seeds", "first_seed")}
             given = {name: value for name, value in changes.items() if value is not None}
             config = read_rows_file(self.rows or BOARD, **given, **self.settings(WorkersConfig))
+            if self.env_steps is not None:
+                rows = (replace(row, env_steps=self.env_steps) for row in config.rows)
+                config = replace(config, rows=tuple(rows))
         with runs_folder("benchmark", self) as (folder, progress):
             try:
                 benchmark(config, folder, command_line(), progress)

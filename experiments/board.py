@@ -75,6 +75,7 @@ def _introduction(board: Board, where: Path) -> str:
         f"[`{SEEDS_FILE}`]({where / SEEDS_FILE}) a line for each seed.",
         f"Seeds {seeds}; {config.episodes} evaluation episodes each; {content['created'][:10]}, "
         f"{machine['cores']} cores ({machine['processor']}), MuJoCo {versions['mujoco']}.",
+        *(["Fewer than five seeds: a short look, which decides nothing."] * (config.seeds < 5)),
         *([f"{missing} of {len(config.runs())} runs are missing."] if missing else []),
         "",
         "* **Steady**: mean size of the task's deciding metric in the last quarter of an episode. "
