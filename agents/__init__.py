@@ -81,9 +81,11 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
 
     Raises:
         CheckpointError: The parts of the checkpoint do not fit together.
-        ResumeError: The env is another one, or does not repeat the interrupted episodes.
+        ResumeError: It has a policy alone, or the env is another one, or does not repeat the
+            interrupted episodes.
         MissingPackage: SB3 is not installed.
     """
+    kept.check_resumable()
     for name in ("env_id", "options", "vehicle_hash", "observation", "action"):
         expected, got = getattr(kept.spec, name), getattr(log.spec, name)
         if expected != got and got != "0" * 32:  # the hash of a peer that tells none

@@ -1,5 +1,8 @@
 """Checkpoints: one safetensors file with weights, state, config, spec, seed and versions.
 
+A *policy alone*, without the state and the position of the training, is a small one: it flies, and
+no training goes on from it.
+
 Loading one runs no code from it. Writing one replaces the old file whole or not at all. A checksum
 over all bytes of the file detects any damage.
 """
@@ -12,7 +15,7 @@ import re
 import secrets
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +25,7 @@ import numpy as np
 from ..envs.spec import Discrete, EnvSpec
 from ..models import BACKENDS, Backend
 from ..models.errors import InputError, require
-from .episodes import Episode, Position
+from .episodes import Episode, Position, ResumeError
 from .policies import NetworkPolicy, flat_size
 from .presets import PRESETS, SQUASHED, preset
 
@@ -76,8 +79,19 @@ class Checkpoint:
 
     @property
     def num_envs(self) -> int:
-        """Drones that it trains with."""
+        """Drones that it trains with; 0 of a policy alone."""
         return len(self.position.numbers)
+
+    def policy_alone(self) -> "Checkpoint":
+        """Without the state and the position, which only a training needs."""
+        where = self.position
+        position = _no_position(where.env_steps, where.seconds)
+        return replace(self, state={}, position=position)
+
+    def check_resumable(self) -> None:
+        """Raises `ResumeError` for a policy alone."""
+        if not self.num_envs:
+            raise ResumeError("resume: expected the checkpoint of a training, got a policy alone")
 
     def policy(self, spec: EnvSpec | None = None) -> NetworkPolicy:
         """The policy, ready to fly that env or its own. Raises `InputError` if it does not fit."""
@@ -113,10 +127,11 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
         "position": {name: getattr(where, name) for name in _POSITION},
         "episodes": {n: np.array([vars(row)[n] for row in rows], k) for n, k in _COLUMNS.items()},
     }
+    groups = _GROUPS if checkpoint.num_envs else ("policy",)
     arrays = {
         f"{group}/{name}": np.array(value, order="C")
-        for group, part in parts.items()
-        for name, value in part.items()
+        for group in groups
+        for name, value in parts[group].items()
     }
     for name, array in arrays.items():
         if not _is_finite(name, array):
@@ -169,25 +184,31 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
     for count in (meta["seed"], meta["env_steps"], where["env_steps"]):
         _expect(type(count) is int and 0 <= count < 2**62, "a whole number, 0 or more", count)
     _expect(type(seconds) is float and 0 <= seconds < float("inf"), "seconds", seconds)
-    spec, columns = EnvSpec.from_json(meta["spec"]), arrays["episodes"]
-    kinds = {name: column.dtype.type for name, column in columns.items()}
-    _expect(kinds == _COLUMNS, f"columns {sorted(_COLUMNS)} of episodes", sorted(kinds))
-    rows = zip(*(columns[name].tolist() for name in _COLUMNS), strict=True)
-    position = Position(
-        env_steps=where["env_steps"],
-        seconds=seconds,
-        episodes=tuple(Episode(**dict(zip(_COLUMNS, row, strict=True))) for row in rows),
-        **arrays["position"],
-    )
+    spec = EnvSpec.from_json(meta["spec"])
+    position = _no_position(where["env_steps"], seconds)
+    if arrays["position"] or arrays["state"] or arrays["episodes"]:
+        columns = arrays["episodes"]
+        kinds = {name: column.dtype.type for name, column in columns.items()}
+        _expect(kinds == _COLUMNS, f"columns {sorted(_COLUMNS)} of episodes", sorted(kinds))
+        rows = zip(*(columns[name].tolist() for name in _COLUMNS), strict=True)
+        episodes = tuple(Episode(**dict(zip(_COLUMNS, row, strict=True))) for row in rows)
+        given: dict[str, Any] = {**arrays["position"]}
+        position = replace(position, episodes=episodes, **given)
+        _check_position(position, spec, meta["env_steps"])
     config = vars(preset(meta["algorithm"], "tuned", **meta["config"]))
     config = json.loads(json.dumps(config))  # a tuple is a list there
     _expect(config == meta["config"], f"a config of all of {sorted(config)}", meta["config"])
-    _check_position(position, spec, meta["env_steps"])
     plain = {name: meta[name] for name in _PLAIN}
     actor, state = arrays["policy"], arrays["state"]
     checkpoint = Checkpoint(**plain, spec=spec, actor=actor, state=state, position=position)
     checkpoint.policy()  # raises if it does not fit
     return checkpoint
+
+
+def _no_position(env_steps: int, seconds: float) -> Position:
+    """Of a policy alone: what the training had flown, and no drones."""
+    none: dict[str, Any] = {name: np.zeros(0, np.int64) for name in _POSITION}
+    return Position(env_steps=env_steps, seconds=seconds, **none)
 
 
 def _with_checksum(data: bytes, checksum: bytes) -> bytes:

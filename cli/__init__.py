@@ -35,6 +35,7 @@ COMMANDS: Final = {
     "view": "View",
     "compare": "Compare",
     "sweep": "Sweep",
+    "benchmark": "Benchmark",
     "report": "Report",
     "render": "Render",
     "bench": "Bench",

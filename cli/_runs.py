@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 from tyro.conf import arg
 
 from ..experiments.settings import RunsConfig
-from ._flags import BackendFlags, folder_to_write, go_on_with
+from ._flags import BackendFlags, Command, folder_to_write, go_on_with
 
 if TYPE_CHECKING:
     from ..experiments.workers import OnProgress
@@ -23,8 +23,8 @@ task."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunsFlags(RunsConfig, BackendFlags):
-    """A command of many runs, on the cores of this machine or on many machines."""
+class FolderFlags(Command):
+    """A command of many runs, on the cores of this machine or on many machines: where to write."""
 
     out: Path | None = None
     """Folder to write; it must not exist. Default: runs/COMMAND-TIME."""
@@ -34,13 +34,18 @@ class RunsFlags(RunsConfig, BackendFlags):
     """The Ray cluster. Default: the one that this machine is part of."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class RunsFlags(FolderFlags, RunsConfig, BackendFlags):
+    """Such a command that flies one task."""
+
+
 def command_line() -> str:
     """The command as the user typed it."""
     return shlex.join(["rotorgram", *sys.argv[1:]])
 
 
 @contextmanager
-def runs_folder(name: str, command: RunsFlags) -> "Iterator[tuple[Path, OnProgress]]":
+def runs_folder(name: str, command: FolderFlags) -> "Iterator[tuple[Path, OnProgress]]":
     """The folder to write to, and what shows progress; says how to resume if the runs fail."""
     from ._progress import bars
 
@@ -110,3 +115,12 @@ def report_sweep(folder: Path) -> None:
     Console(width=100).print(table)
     print(f"{results['seeds'].sum()} of {len(config.runs())} runs done")
     print(f"table: {folder / SWEEP_FILE}")
+
+
+def report_board(folder: Path, page: Path | None = None) -> None:
+    """Write the page of a board from the folder's files."""
+    from ..experiments.board import write_page
+
+    page = page or folder / "baselines.md"
+    write_page(folder, page)
+    print(f"page: {page}")

@@ -10,19 +10,23 @@ from ._flags import Command
 
 @dataclass(frozen=True, kw_only=True)
 class Report(Command):
-    """Draw a comparison's figures, table and report again from its files, or a sweep's table."""
+    """Draw a comparison's figures, table and report again, a sweep's table, or a board's page."""
 
     folder: Positional[Path]
-    """Folder that `rotorgram compare` or `rotorgram sweep` wrote."""
+    """Folder that `rotorgram compare`, `rotorgram sweep` or `rotorgram benchmark` wrote."""
+    page: Path | None = None
+    """Page of a board to write. Default: baselines.md in the folder."""
     film: bool = True
     """Whether a comparison's agents are filmed, if there is no film yet, where there is OpenGL."""
 
     def run(self) -> int:
         """Write figures and report from the files, and print the table."""
-        from ..experiments.results import read_config
-        from ._runs import report_comparison, report_sweep
+        from ..experiments.results import content_of, read_config
+        from ._runs import report_board, report_comparison, report_sweep
 
-        if "sweep" in read_config(self.folder):
+        if "board" in content_of(self.folder):
+            report_board(self.folder, self.page)
+        elif "sweep" in read_config(self.folder):
             report_sweep(self.folder)
         else:
             report_comparison(self.folder, film=self.film)

@@ -22,9 +22,10 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter
 
 from . import metrics
-from .metrics import Curve, Floats, Headline, Spread
+from .metrics import Curve, Headline, Spread
 from .palette import agent_color, agent_label, sort_agents
 from .results import Results, read_steps
+from .statistics import Floats, iqm
 
 AVERAGING_SHARE: Final = 0.05
 """Share of training over which the average reward is a running mean."""
@@ -144,7 +145,7 @@ def flown_sizes(steps: pd.DataFrame, control_period: float, headline: Headline) 
     groups = [headline.size(rows.to_numpy()) for _, rows in shown.groupby("step")["value"]]
     ends = np.array([np.quantile(values, metrics.extent(len(values))) for values in groups])
     x = np.unique(shown["step"]) * control_period
-    return Spread(x, np.array([metrics.iqm(values) for values in groups]), *ends.T)
+    return Spread(x, np.array([iqm(values) for values in groups]), *ends.T)
 
 
 def learning_curves(evaluations: pd.DataFrame) -> tuple[dict[str, Spread], dict[str, float]]:
@@ -156,7 +157,7 @@ def learning_curves(evaluations: pd.DataFrame) -> tuple[dict[str, Spread], dict[
     for agent, own in _by_agent(evaluations.dropna(subset="steady")):
         means = own.groupby(["seed", "env_steps"])["steady"].mean().reset_index()
         if means["env_steps"].max() == 0:
-            levels[agent] = metrics.iqm(means["steady"].to_numpy())
+            levels[agent] = iqm(means["steady"].to_numpy())
             continue
         columns = ["env_steps", "steady"]
         runs = [Curve(*run[columns].to_numpy(float).T) for _, run in means.groupby("seed")]

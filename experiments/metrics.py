@@ -1,9 +1,8 @@
 """Measures of a trajectory and of a set of runs: pure functions of arrays and frames.
 
 Over an episode: `steady_state`, `settling_time`, `overshoot` of the headline metric. Over seeds:
-the interquartile mean (`iqm`) with a percentile-bootstrap interval, as Agarwal et al. ("Deep
-Reinforcement Learning at the Edge of the Statistical Precipice", 2021) recommend for few runs,
-the share of seeds that hold their goal, and the worst seed. `results_table` puts them together.
+the interquartile mean with its interval (`statistics`), the share of seeds that hold their goal,
+and the worst seed. `results_table` puts them together.
 
 How episodes that end early (a crash) enter: the steady state, the overshoot and the return are
 those of the flown part; the settling time is missing, and the table says how many episodes
@@ -13,7 +12,7 @@ settled and how many crashed; a run with a crash in its evaluation does not hold
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,13 +21,10 @@ import pandas as pd
 from ..envs.spec import EnvSpec, Metric
 from ..models.errors import InputError
 from .palette import sort_agents
+from .statistics import Floats, Values, bootstrap_interval, iqm, trimmed_mean
 
-_RESAMPLES: Final = 2000
 _MEASURES: Final = ("steady", "settling_time", "overshoot", "return")
 _COUNTS: Final = ("seeds", "episodes", "settled", "crashed")
-
-Floats = npt.NDArray[np.float64]
-Values = Sequence[float] | npt.NDArray[np.floating[Any]]
 
 
 class Curve(NamedTuple):
@@ -138,49 +134,6 @@ def overshoot(errors: Values) -> float:
         return math.nan
     passed = -np.sign(values[0]) * values if values[0] else np.abs(values)
     return max(0.0, float(passed.max()))
-
-
-def _finite(values: Values) -> Floats:
-    array = np.asarray(values, float)
-    return np.asarray(array[np.isfinite(array)])
-
-
-def trimmed_mean(values: Values, axis: int = -1) -> Floats:
-    """Mean along an axis without the lowest and the highest quarter; below four nothing is cut."""
-    ordered = np.moveaxis(np.sort(values, axis=axis), axis, 0)
-    cut = len(ordered) // 4
-    return np.asarray(ordered[cut : len(ordered) - cut].mean(axis=0))
-
-
-def iqm(values: Values) -> float:
-    """Interquartile mean: `trimmed_mean` of the values that are not missing; nan if all are."""
-    finite = _finite(values)
-    return float(trimmed_mean(finite)) if finite.size else math.nan
-
-
-def bootstrap_interval(*samples: Values) -> tuple[float, float]:
-    """95 % percentile-bootstrap interval of the interquartile mean over seeds, always the same; of
-    two samples, of the difference between theirs.
-
-    Missing values are left out. Fewer than two give (nan, nan): one seed shows no spread, which is
-    not the same as a spread of zero. With few seeds the interval is narrower than it should be.
-    """
-    rng, finite = np.random.default_rng(0), [_finite(values) for values in samples]
-    if min(one.size for one in finite) < 2:
-        return math.nan, math.nan
-    means = [trimmed_mean(rng.choice(one, size=(_RESAMPLES, one.size))) for one in finite]
-    low, high = np.quantile(np.subtract(*means) if len(means) > 1 else means[0], [0.025, 0.975])
-    return float(low), float(high)
-
-
-def bootstrap_difference(first: Values, second: Values) -> tuple[float, float, float]:
-    """iqm(first) - iqm(second) over seeds, and the ends of its `bootstrap_interval`.
-
-    The runs of the two agents are resampled independently, although runs of one seed share their
-    starting states, and VPG's and A2C's also the actor's first weights and the stream of noise. As
-    far as this makes the runs of a seed alike, the interval is wider than it need be.
-    """
-    return iqm(first) - iqm(second), *bootstrap_interval(first, second)
 
 
 def training_runs(episodes: pd.DataFrame, agent: str) -> list[pd.DataFrame]:

@@ -125,12 +125,16 @@ def write_config(
     """Write `config.json`: the user's command, the env's spec, the path of its vehicle, and
     the settings of the comparison or the sweep, with which all of `CONFIG_KEYS` are there.
     """
+    about = {"spec": json.loads(spec.to_json()), "vehicle": vehicle}
+    write_settings(folder, command, {**content, **about})
+
+
+def write_settings(folder: Path, command: str, content: Mapping[str, Any]) -> None:
+    """Write `config.json`: the user's command, settings, versions and machine."""
     whole = {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": command,
         **content,
-        "spec": json.loads(spec.to_json()),
-        "vehicle": vehicle,
         "versions": software_versions(),
         "machine": machine(),
     }
@@ -145,13 +149,18 @@ def machine() -> dict[str, Any]:
 
 def read_config(folder: Path | str) -> dict[str, Any]:
     """Read `config.json` and check that the keys of `CONFIG_KEYS` are there."""
+    config = content_of(folder)
+    _check_names(Path(folder) / CONFIG_FILE, "key", CONFIG_KEYS, config)
+    return config
+
+
+def content_of(folder: Path | str) -> dict[str, Any]:
+    """Content of any `config.json`. Raises `ResultsError` if there is none."""
     path = _existing(folder, CONFIG_FILE)
     try:
-        config = dict(json.loads(path.read_text(encoding="utf-8")))
+        return dict(json.loads(path.read_text(encoding="utf-8")))
     except (TypeError, ValueError) as error:
         raise ResultsError(f"{path} is not JSON, or no object: {error}") from error
-    _check_names(path, "key", CONFIG_KEYS, config)
-    return config
 
 
 def read_spec(folder: Path | str) -> EnvSpec:

@@ -7,12 +7,25 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from itertools import product
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
-from ..agents.presets import A2CConfig, Config, PresetName, SACConfig, preset
+from ..agents.geometric import Geometric
+from ..agents.pid import PID
+from ..agents.presets import (
+    PRESETS,
+    A2CConfig,
+    Config,
+    PresetName,
+    SACConfig,
+    find_preset,
+    preset,
+)  # fmt: skip
 from ..envs.registry import env_spec, is_known, options_type, task_type
 from ..models import BACKENDS, Backend
 from ..models.errors import expect
+
+CONTROLLERS: Final[dict[str, type[PID] | type[Geometric]]] = {"pid": PID, "geometric": Geometric}
+"""Agents that need no training, made of an env's spec."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,6 +195,100 @@ class CompareConfig(_ManyRuns):
             for agent in sorted(self.agents, key=lambda agent: not agent.startswith("sb3-"))
             for seed in self.all_seeds
         ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardRow(EnvConfig):
+    """A row of the baselines board: an agent on a task with a vehicle."""
+
+    agent: str
+    """An algorithm, or a controller, which needs no training and has no seeds."""
+    preset: PresetName = "tuned"
+    """Hyperparameters of an algorithm."""
+    env_steps: int = 0
+    """Env steps of each training, of all its drones together; 0: those of the preset."""
+    num_envs: int = 0
+    """Drones that fly at the same time in each training; 0: those of the preset."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        known = (*CONTROLLERS, *PRESETS)
+        expect(self.agent in known, "agent", f"one of {', '.join(known)}", self.agent)
+        if not self.controller:
+            usual = find_preset(self.agent, self.preset, self.env_id)
+            for name in ("env_steps", "num_envs"):
+                object.__setattr__(self, name, getattr(self, name) or getattr(usual, name))
+        expect(is_known(self.env_id), "env_id", "a registered id", self.env_id)
+        expect(env_spec(**self.env).headline, "env_id", "one that names a metric", self.env_id)
+        if not self.controller:
+            self.run(0)  # wrong names and numbers are told before anything is trained
+
+    @property
+    def controller(self) -> bool:
+        """Whether there is nothing to train."""
+        return self.agent in CONTROLLERS
+
+    @property
+    def task(self) -> str:
+        """The env in words: its name, the options that are not the default, the vehicle."""
+        usual = options_type(self.env_id)().to_options()
+        other = {name: value for name, value in self.options.items() if value != usual[name]}
+        words = [self.env_id.rpartition("/")[2]]
+        words += [f"{name}={json.dumps(value)}" for name, value in other.items()]
+        words += [f"with {self.vehicle}"] if self.vehicle else []
+        return " ".join(words).replace('"', "")
+
+    @property
+    def name(self) -> str:
+        """Of the row: agent, preset where there is one, and task."""
+        return " ".join([self.agent, *([] if self.controller else [self.preset]), self.task])
+
+    def run(self, seed: int) -> Run:
+        """The training of a seed."""
+        names = ("env_steps", "num_envs", "backend")
+        shared = {**{name: getattr(self, name) for name in names}, **self.env}
+        config = preset(self.agent, self.preset, self.env_id)
+        return Run(algorithm=self.agent, config=config, seed=seed, **shared)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkConfig(WorkersConfig):
+    """Settings of the baselines board and its workers."""
+
+    rows: tuple[BoardRow, ...]
+    """What is trained and flown."""
+    seeds: int = 10
+    """Trainings of each row of an algorithm."""
+    first_seed: int = 5000
+    """The first of the seeds: by default none that a comparison or a sweep uses."""
+    snapshots: int = 20
+    """Policies kept during each training, for the steps and the time to the threshold."""
+    curve_episodes: int = 10
+    """Evaluation episodes of each of them."""
+    episodes: int = 20
+    """Evaluation episodes of each final policy."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("seeds", "snapshots", "curve_episodes", "episodes"):
+            expect(getattr(self, name) >= 1, name, "at least 1", str(getattr(self, name)))
+        expect(self.first_seed >= 0, "first_seed", "0 or more", str(self.first_seed))
+        expect(self.rows, "row", "at least one", "none")
+        names = [row.name for row in self.rows]
+        twice = [name for name in names if names.count(name) > 1]
+        expect(not twice, "row", "each row once", f"{(twice or [''])[0]} twice")
+
+    def runs(self) -> dict[str, tuple[BoardRow, int]]:
+        """Every run by name, a row and a seed: all rows with one seed, then with the next. A
+        controller flies once.
+        """
+        seeds = range(self.first_seed, self.first_seed + self.seeds)
+        return {
+            f"{row.name} seed {seed}": (row, seed)
+            for seed in seeds
+            for row in self.rows
+            if seed == self.first_seed or not row.controller
+        }
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,14 +19,14 @@ import pandas as pd
 from ..agents.checkpoints import write_whole
 from ..envs.registry import env_spec
 from . import results
-from .compare import evaluation_pair
+from .evaluations import evaluate_stages, stages_of
 from .folders import locked
 from .metrics import Headline, final_per_run
 from .pairs import shared_pair
 from .results import CONFIG_FILE, ResultsError
+from .rows import adding_rows, read_rows
 from .settings import Run, SweepConfig
 from .training import train_run
-from .trajectories import fly_episodes
 from .workers import OnProgress, Tell, open_workers
 
 SWEEP_FILE: Final = "sweep.csv"
@@ -64,13 +64,8 @@ def sweep(config: SweepConfig, folder: Path, command: str, on_progress: OnProgre
             content["sweep"] = {"grid": dict(config.grid), "episodes": config.episodes}
             results.write_config(folder, command, spec, config.vehicle, content)
         done = read_sweep_runs(folder, config)
-        rows = done.to_dict("records")
-
-        def keep(_: Job, row: dict[str, Any]) -> None:
-            rows.append(row)
-            table = _with_settings(pd.DataFrame(rows, columns=list(RUN_COLUMNS)), config)
-            write_whole(folder / results.RUNS_FILE, table.to_csv(index=False).encode())
-
+        add = adding_rows(folder / results.RUNS_FILE, done, partial(_with_settings, config))
+        keep = lambda _, row: add(row)  # noqa: E731
         workers.fly_all(partial(_fly, config), missing_runs(config, done), keep, config)
 
 
@@ -84,14 +79,12 @@ def _fly(config: SweepConfig, job: Job, tell: Tell) -> dict[str, Any]:
     """Train and evaluate (in a worker process); the row of the run."""
     point, run = job
     with shared_pair(**run.training_env, num_envs=run.num_envs) as env:
-        training, times = train_run(run, env, tell)
-    policy = training.agent.policy()
-    with evaluation_pair(config, config.episodes) as env:
-        trajectories = fly_episodes(env, policy, config.episodes, "tuning")
-    headline = Headline.of(training.log.spec)
-    frame = pd.DataFrame([results.evaluation_row(one, headline) for one in trajectories])
-    frame = frame.assign(agent=run.algorithm, seed=run.seed, env_steps=times["env_steps"])
-    (row,) = final_per_run(frame, headline).to_dict("records")
+        training, times = train_run(run, env, tell, snapshots=1)
+    evaluated, _ = evaluate_stages(
+        config, stages_of(training.taken)[-1:], config.episodes, of="tuning"
+    )
+    frame = pd.DataFrame(evaluated).assign(agent=run.algorithm, seed=run.seed)
+    (row,) = final_per_run(frame, Headline.of(training.log.spec)).to_dict("records")
     whole = {"point": point, **row, **times}
     return {column: whole[column] for column in RUN_COLUMNS}
 
@@ -113,7 +106,7 @@ def sweep_table(config: SweepConfig, rows: pd.DataFrame, headline: Headline) -> 
     ).reset_index()  # fmt: skip
     order = {"seeds": False, "most_crashed": True, "worst": not headline.high}
     table = table.sort_values(list(order), ascending=list(order.values()), kind="stable")
-    return _with_settings(table, config).reset_index(drop=True)
+    return _with_settings(config, table).reset_index(drop=True)
 
 
 def write_sweep_table(config: SweepConfig, folder: Path) -> pd.DataFrame:
@@ -126,20 +119,8 @@ def write_sweep_table(config: SweepConfig, folder: Path) -> pd.DataFrame:
 
 def read_sweep_runs(folder: Path, config: SweepConfig) -> pd.DataFrame:
     """The runs that are done, columns `RUN_COLUMNS`. Raises `ResultsError` if others are there."""
-    path = folder / results.RUNS_FILE
-    if not path.exists():
-        return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in RUN_COLUMNS.items()})
-    try:
-        # By way of strings: they are written again with every run, and have to keep their bits.
-        text = pd.read_csv(path, usecols=list(RUN_COLUMNS), dtype=str)
-        rows = text[list(RUN_COLUMNS)].astype(dict(RUN_COLUMNS))
-    except ValueError as error:  # an empty file, a missing column, or a value of another type
-        raise ResultsError(f"{path}: expected the runs of a sweep: {error}") from None
     wanted = {(point, run.seed) for point, run in config.runs().values()}
-    got = list(zip(rows["point"], rows["seed"], strict=True))
-    if len(set(got)) < len(got) or not wanted.issuperset(got):
-        raise ResultsError(f"{path}: expected each run of the sweep once, got others")
-    return rows
+    return read_rows(folder / results.RUNS_FILE, RUN_COLUMNS, ("point", "seed"), wanted, "sweep")
 
 
 def read_sweep_config(folder: Path) -> SweepConfig:
@@ -157,7 +138,7 @@ def read_sweep_config(folder: Path) -> SweepConfig:
         raise ResultsError(f"{folder / CONFIG_FILE}: expected a sweep's: {error!r}") from None
 
 
-def _with_settings(table: pd.DataFrame, config: SweepConfig) -> pd.DataFrame:
+def _with_settings(config: SweepConfig, table: pd.DataFrame) -> pd.DataFrame:
     """A table by points, with the settings of each after its number."""
     settings = pd.DataFrame(config.points(), dtype=object).iloc[table["point"]]
     settings.index = table.index

@@ -30,7 +30,11 @@ class Snapshot:
 
 
 def is_finished(kept: Checkpoint) -> bool:
-    """Whether a training has flown all its env steps. SB3 flies whole rollouts only."""
+    """Whether a training has flown all its env steps. SB3 flies whole rollouts only.
+
+    Raises `ResumeError` for a policy alone.
+    """
+    kept.check_resumable()
     least = 1
     if kept.algorithm.startswith("sb3-"):
         config = agents.preset(kept.algorithm, "tuned", **kept.config)
@@ -68,6 +72,7 @@ class Training:
     @classmethod
     def resume(cls, kept: Checkpoint, env: AnyEnv) -> "Training":
         """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
+        kept.check_resumable()
         try:
             names = ("algorithm", "env_id", "options", "backend", "seed", "env_steps", "num_envs")
             config = agents.preset(kept.algorithm, "tuned", **kept.config)

@@ -288,3 +288,23 @@ def test_a_file_is_written_whole_or_not_at_all(
     assert error.value.filename == str(path), "a sentence about a full disk names the file"
     assert path.read_bytes() == b"one"
     assert os.listdir(path.parent) == ["file"]
+
+
+@pytest.mark.parametrize("kind", ["continuous", "discrete"])
+def test_a_policy_alone_is_small_flies_the_same_and_resumes_nothing(
+    kind: str, tmp_path: Path
+) -> None:
+    log = log_of(1, action_type=kind)
+    whole = checkpoint_of("a2c", log, trained("a2c", log, updates=2))
+    store(whole, tmp_path / "whole")
+    store(whole.policy_alone(), tmp_path / "alone")
+    # The actor's weights (82 numbers if continuous) and the spec are all that it needs.
+    alone, size = ((tmp_path / name).stat().st_size for name in ("alone", "whole"))
+    assert alone < min(6000, size / 2)
+    kept = load(tmp_path / "alone")
+    assert (kept.num_envs, kept.position.env_steps) == (0, whole.position.env_steps)
+    observation = np.array([0.5, -0.2, 0.1], np.float32)
+    assert kept.policy().act(observation) == whole.policy().act(observation)
+    words = "resume: expected the checkpoint of a training, got a policy alone"
+    with pytest.raises(ResumeError, match=words):
+        resume_agent(kept, log_of(1, action_type=kind))

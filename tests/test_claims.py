@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -36,7 +37,7 @@ def step_at(episode: int, top: float = 1.0) -> np.ndarray:
     return np.where(np.arange(COUNT) < episode, 0.0, top)
 
 
-def training(make: Callable[[str, int], np.ndarray], seeds: int = 30) -> pd.DataFrame:
+def training(make: Callable[[str, int], np.ndarray], seeds: int = 50) -> pd.DataFrame:
     return pd.concat(
         run(make(agent, seed), agent, seed) for agent in ("a2c", "vpg") for seed in range(seeds)
     )
@@ -53,7 +54,7 @@ def evaluated(**errors: list[float]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(EVALUATION_COLUMNS))
 
 
-HELD = evaluated(a2c=[0.01] * 30, vpg=[0.02] * 30)
+HELD = evaluated(a2c=[0.01] * 50, vpg=[0.02] * 50)
 
 
 def outcomes(episodes: pd.DataFrame, evaluations: pd.DataFrame = HELD) -> list[str]:
@@ -170,7 +171,7 @@ def test_runs_that_did_not_converge_are_counted_and_left_out():
     assert verdict.verdict == "undecided"
     flat = training(lambda agent, seed: np.zeros(COUNT))
     verdict = judge_claims(flat, HELD, "paper", HEADLINE)[0]
-    assert "A2C no value (0 of 30 seeds, 30 did not converge), VPG no value" in verdict.evidence
+    assert "A2C no value (0 of 50 seeds, 50 did not converge), VPG no value" in verdict.evidence
 
 
 def test_an_agent_that_was_not_trained_is_not_tested():
@@ -195,25 +196,64 @@ def test_one_agent_that_fails_refutes_both_even_if_the_other_was_not_trained():
 @pytest.mark.parametrize(
     ("vpg", "expected"),
     [
-        ([0.02, 0.03, 0.04, 0.05, 0.06] * 6, "borne out"),
-        ([0.2, 0.3, 0.4, 0.5, 0.6] * 6, "not borne out"),
-        ([0.02] * 20 + [0.4] * 10, "undecided"),  # the interval reaches beyond 0.1
-        ([0.02] * 30 + [math.nan], "undecided"),  # a seed without a value proves nothing
-        ([0.02] * 28 + [0.9] * 2, "undecided"),  # two seeds do not hold, and the mean hides them
+        ([0.02, 0.03, 0.04, 0.05, 0.06] * 10, "borne out"),
+        # 48 of 48 show a share of 0.00625^(1/48) = 89.97 %, 49 of 49 one of 90.2 %.
+        ([0.02] * 48, "undecided"),
+        ([0.02] * 49, "borne out"),
+        ([0.2, 0.3, 0.4, 0.5, 0.6] * 10, "not borne out"),
+        ([0.02] * 25 + [0.4] * 25, "not borne out"),  # the interval ends at 68 %
+        ([0.02] * 50 + [math.nan], "undecided"),  # a seed without a value does not hold
+        ([0.02] * 48 + [0.9] * 2, "undecided"),  # and the mean hides them
     ],
 )
 def test_holding_the_target(vpg, expected):
-    errors = evaluated(a2c=[0.01] * 30, vpg=vpg)
+    errors = evaluated(a2c=[0.01] * 50, vpg=vpg)
     verdict = judge_claims(training(paper_like), errors, "paper", HEADLINE)[3]
     assert verdict.verdict == expected
-    assert "A2C 0.01 m" in verdict.evidence
+    assert "A2C 0.01 m, holds in 50 of 50 seeds, 98.75 % interval of the share 90." in (
+        verdict.evidence
+    )
+
+
+def test_an_undecided_share_tells_how_many_seeds_decide_it():
+    errors = evaluated(a2c=[0.01] * 30, vpg=[0.02] * 28 + [0.9] * 2)
+    verdict = judge_claims(training(paper_like, 30), errors, "paper", HEADLINE)[3]
+    assert verdict.verdict == "undecided"
+    assert "49 seeds would decide it if the share is 100.0%" in verdict.evidence
+    number = re.search(r"holds in 28 of 30 seeds.* (\S+) seeds would decide", verdict.evidence)
+    # By the normal approximation, with shares p = 28 / 30 and q = 0.9:
+    # ((2.498 sqrt(q (1 - q)) + 0.842 sqrt(p (1 - p))) / (p - q))² = 827.
+    assert number
+    assert float(number[1].replace(",", "")) == pytest.approx(827, rel=0.2)
+
+
+def test_an_undecided_difference_tells_how_many_seeds_decide_it():
+    def noisy(agent: str, seed: int) -> np.ndarray:
+        # Long-run returns of a standard deviation of 1, A2C's higher by 0.25 on average.
+        level = np.random.default_rng([seed, agent == "vpg"]).normal()
+        return step_at(10, top=10 + level + 0.25 * (agent == "a2c"))
+
+    verdict = judge_claims(training(noisy), HELD, "paper", HEADLINE)[1]
+    assert verdict.verdict == "undecided"
+    numbers = re.search(
+        r"difference (\S+), 98.75 % interval (\S+) to (\S+); to decide it with a probability of "
+        r"80% takes (\S+) seeds of each if this is the difference, and at least (\S+) if",
+        verdict.evidence,
+    )
+    assert numbers
+    found, low, high, wanted, fewest = (float(text.replace(",", "")) for text in numbers.groups())
+    # (2.498 + 0.842)² · 2 · v / d², where the interval tells v: 2 · 2.498 sqrt(2 v / 50) wide.
+    variance = ((high - low) / (2 * 2.498)) ** 2 * 50 / 2
+    for number, difference in ((wanted, found), (fewest, max(-low, high))):
+        assert number == pytest.approx(3.34**2 * 2 * variance / difference**2, rel=0.15)
 
 
 def test_a_crash_in_the_evaluation_is_not_holding():
-    errors = HELD.assign(terminated=[True, *[False] * 59])
+    errors = HELD.assign(terminated=[True, *[False] * 99])
     verdict = judge_claims(training(paper_like), errors, "paper", HEADLINE)[3]
     assert verdict.verdict == "undecided"
-    assert "1 of 30 episodes crashed" in verdict.evidence
+    assert "holds in 49 of 50 seeds" in verdict.evidence
+    assert "1 of 50 episodes crashed" in verdict.evidence
 
 
 def test_runs_that_are_too_short_are_named():

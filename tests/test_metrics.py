@@ -12,18 +12,14 @@ from rotorgram.experiments.metrics import (
     Curve,
     Headline,
     average_return,
-    bootstrap_difference,
-    bootstrap_interval,
     final_evaluations,
     final_per_run,
     first_lasting_snapshot,
-    iqm,
     overshoot,
     results_table,
     settling_time,
     spread_over_seeds,
     steady_state,
-    trimmed_mean,
 )
 from rotorgram.experiments.results import EVALUATION_COLUMNS, RUN_COLUMNS
 
@@ -104,38 +100,6 @@ def test_settling_time(errors, expected):
 )
 def test_overshoot(errors, expected):
     assert overshoot(np.array(errors)) == pytest.approx(expected, nan_ok=True)
-
-
-def test_iqm_cuts_a_quarter_from_each_end():
-    assert iqm([1.0, 2.0, 3.0, 100.0]) == 2.5
-    assert iqm([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 700.0]) == 3.5
-    assert iqm([1.0, 2.0, 6.0]) == 3.0  # nothing to cut below four
-    assert iqm([math.nan, 4.0]) == 4.0
-    assert math.isnan(iqm([]))
-
-
-def test_bootstrap_interval():
-    assert bootstrap_interval([3.0] * 5) == (3.0, 3.0)
-    assert all(math.isnan(end) for end in bootstrap_interval([3.0]))
-    assert all(math.isnan(end) for end in bootstrap_interval([3.0, math.nan]))
-    # Of two values, a quarter of the resamples holds one alone: the 95 % interval spans both.
-    assert bootstrap_interval([1.0, 2.0]) == (1.0, 2.0)
-    values = np.random.default_rng(3).normal(10.0, 1.0, size=40)
-    low, high = bootstrap_interval(values)
-    assert low < iqm(values) < high
-    # The standard error of the mean of 40 would be 0.16, and the interval 0.62 wide.
-    assert 0.4 < high - low < 1.2
-    assert bootstrap_interval(values) == (low, high)
-
-
-def test_bootstrap_difference():
-    assert bootstrap_difference([5.0] * 3, [2.0] * 4) == (3.0, 3.0, 3.0)
-    difference, low, high = bootstrap_difference([1.0, 2.0], [0.0, 4.0])
-    assert (difference, low, high) == (-0.5, -3.0, 2.0)
-    difference, low, high = bootstrap_difference([1.0], [0.0, 4.0])
-    assert difference == -1.0
-    assert math.isnan(low)
-    assert math.isnan(high)
 
 
 def test_reaching_the_target_counts_from_the_first_snapshot_that_lasts():
@@ -232,9 +196,3 @@ def test_spread_over_seeds_keeps_to_what_all_seeds_reach():
     assert (three.low.tolist(), three.high.tolist()) == ([1.0, 1.0], [6.0, 6.0])
     five = spread_over_seeds([line(10, height) for height in (0.0, 1.0, 2.0, 3.0, 40.0)], grid)
     assert (five.low[0], five.middle[0], five.high[0]) == (1.0, 2.0, 3.0)
-
-
-def test_the_trimmed_mean_leaves_a_quarter_out_at_each_end():
-    assert trimmed_mean(np.array([1.0, 2.0, 6.0])) == 3.0
-    assert trimmed_mean(np.array([100.0, 2.0, 4.0, -100.0])) == 3.0
-    assert trimmed_mean(np.array([[0.0, 8.0], [2.0, 4.0]]), axis=0).tolist() == [1.0, 6.0]

@@ -1,0 +1,278 @@
+"""The baselines board: its runs, its page, and the policies that are committed with it."""
+
+import json
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from comparisons import GATES, spec_of
+from rotorgram.agents import load
+from rotorgram.cli import main
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.registry import env_spec
+from rotorgram.experiments.benchmark import (
+    BOARD,
+    Board,
+    benchmark,
+    checkpoint_file,
+    missing_seeds,
+    read_board,
+    read_rows_file,
+    read_seeds,
+)
+from rotorgram.experiments.board import page_of, scores
+from rotorgram.experiments.metrics import Headline, steady_state
+from rotorgram.experiments.results import ResultsError
+from rotorgram.experiments.settings import BenchmarkConfig, BoardRow
+from rotorgram.experiments.trajectories import fly_episodes
+from rotorgram.models.errors import InputError
+
+DOCS = Path(__file__).parent.parent / "docs"
+COMMITTED = DOCS / "results" / "baselines"
+OPTIONS: dict[str, Any] = {"episode_length": 40, "flight_band": 1.2}
+CONFIG = BenchmarkConfig(
+    rows=(
+        BoardRow(agent="a2c", env_steps=600, options=OPTIONS),
+        BoardRow(agent="pid", options=OPTIONS),
+    ),
+    seeds=2, snapshots=2, curve_episodes=2, episodes=3, jobs=1,
+)  # fmt: skip
+A2C, PID = (row.name for row in CONFIG.rows)
+
+
+def nothing(*_: object) -> None:
+    """No progress is shown."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("board")
+    benchmark(CONFIG, path, "rotorgram benchmark", nothing)
+    return path
+
+
+def measured(board: Board, folder: Path, row: BoardRow) -> tuple[float, float]:
+    """Steady size and return of a row's checkpoint, flown in process, over the board's episodes."""
+    policy = load(checkpoint_file(folder, row)).policy()
+    count = board.config.episodes
+    env = LocalVectorEnv(
+        row.env_id, count, vehicle=row.vehicle, autoreset_mode="Disabled", **row.options
+    )
+    with closing(env):
+        flown = fly_episodes(env, policy, count, "final")
+    headline = Headline.of(board.specs[row.name])
+    steady = [steady_state(headline.size(one.headline[1:])) for one in flown]
+    return float(np.mean(steady)), float(np.mean([one.rewards.sum() for one in flown]))
+
+
+def test_a_row_is_what_its_checkpoint_flies(folder: Path) -> None:
+    board = read_board(folder)
+    assert replace(board.config, jobs=1) == CONFIG
+    runs = list(zip(board.seeds["row"], board.seeds["seed"], strict=True))
+    assert sorted(runs) == sorted([(A2C, 5000), (A2C, 5001), (PID, 5000)])
+    (row, controller), seeds = CONFIG.rows, board.seeds.set_index(["row", "seed"])
+    first = seeds.loc[A2C, 5000]
+    assert measured(board, folder, row) == pytest.approx((first["steady"], first["return"]))
+    assert (first["env_steps"], first["episodes"]) == (600, 3)
+    assert first["steps_per_second"] == pytest.approx(600 / first["seconds"])
+    assert seeds.loc[PID, 5000]["env_steps"] == 0
+    assert not checkpoint_file(folder, controller).exists()
+    assert checkpoint_file(folder, row).stat().st_size < 6000
+    assert load(checkpoint_file(folder, row)).seed == 5000
+
+
+def test_what_is_missing_is_flown_to_the_same_numbers(folder: Path, tmp_path: Path) -> None:
+    lines = (folder / "seeds.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "config.json").write_bytes((folder / "config.json").read_bytes())
+    kept = [line for line in lines if ",5001," not in line]
+    (tmp_path / "seeds.csv").write_text("".join(kept))
+    assert list(missing_seeds(CONFIG, read_seeds(tmp_path, CONFIG))) == [f"{A2C} seed 5001"]
+    assert main(["benchmark", "--resume", str(tmp_path), "--jobs", "1"]) == 0
+    assert (tmp_path / "baselines.md").read_text() == page_of(tmp_path, tmp_path)
+    assert (tmp_path / "seeds.csv").read_text().startswith("".join(kept))
+    one, other = (
+        read_seeds(path, CONFIG).sort_values(["row", "seed"], ignore_index=True)
+        for path in (folder, tmp_path)
+    )
+    clocks = [name for name in one if "second" in name]
+    pd.testing.assert_frame_equal(
+        one.drop(columns=clocks), other.drop(columns=clocks), check_exact=True
+    )
+
+
+def test_the_command_writes_the_page_and_resumes_nothing_that_is_finished(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "page.md"
+    assert main(["report", str(folder), "--page", str(page)]) == 0
+    assert page.read_text() == page_of(folder, tmp_path)
+    capsys.readouterr()
+    assert main(["benchmark", "--resume", str(folder)]) == 1
+    assert "expected an interrupted board" in capsys.readouterr().err
+    assert main(["benchmark", "--resume", str(folder), "--seeds", "3"]) == 1
+    assert "others by --seeds" in capsys.readouterr().err
+
+
+def test_the_command_flies_the_rows_of_a_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows, out = tmp_path / "rows.toml", tmp_path / "out"
+    few = "seeds = 1\nsnapshots = 1\ncurve_episodes = 1\nepisodes = 1\n"
+    rows.write_text(few + '[[row]]\nagent = "pid"\n[row.options]\nepisode_length = 30\n')
+    assert main(["benchmark", str(rows), "--out", str(out), "--jobs", "1"]) == 0
+    assert f"page: {out / 'baselines.md'}" in capsys.readouterr().out
+    assert "| PID | " in (out / "baselines.md").read_text()
+    assert "## Elevation-v0 episode_length=30\n" in (out / "baselines.md").read_text()
+
+
+# ---- the page
+
+
+def made_up(folder: Path, seeds: pd.DataFrame) -> None:
+    """A board of two agents on two tasks, with these rows."""
+    other = {"observation": "error", "action": "offset"}
+    rows = [BoardRow(agent=agent, options=options)
+            for options in ({}, other) for agent in ("vpg", "a2c")]  # fmt: skip
+    config = BenchmarkConfig(rows=tuple(rows), seeds=4)
+    content = {
+        "created": "2026-11-22T00:00:00+00:00",
+        "command": "rotorgram benchmark",
+        "versions": {"mujoco": "4.0.0"},
+        "machine": {"cores": 2, "processor": "x86_64"},
+        "board": {"seeds": 4, "first_seed": 5000, "snapshots": 20, "curve_episodes": 10,
+                  "episodes": 20},
+        "rows": [
+            {name: getattr(row, name) for name in vars(row)}
+            | {"spec": json.loads(env_spec(**row.env).to_json()), "bounds": {"hover": 17.25}}
+            for row in config.rows
+        ],
+    }  # fmt: skip
+    (folder / "config.json").write_text(json.dumps(content))
+    seeds.to_csv(folder / "seeds.csv", index=False)
+
+
+def rows_of(name: str, *steady: float, crashed: int = 0) -> pd.DataFrame:
+    count = len(steady)
+    return pd.DataFrame({
+        "row": name, "seed": range(5000, 5000 + count), "env_steps": 200_000, "steady": steady,
+        "return": [200.0] * count, "episodes": 20, "settled": 20,
+        "crashed": [crashed] * count, "held": [int(one < 0.1) for one in steady],
+        "env_steps_to_hold": [1000.0 if one < 0.1 else np.nan for one in steady],
+        "seconds_to_hold": [2.5 if one < 0.1 else np.nan for one in steady],
+        "seconds": 60.0, "steps_per_second": 3000.0,
+    })  # fmt: skip
+
+
+OTHER = "Elevation-v0 action=offset observation=error"
+
+
+def test_the_page_has_the_numbers_of_the_files(tmp_path: Path) -> None:
+    made_up(tmp_path, pd.concat([
+        rows_of("vpg tuned Elevation-v0", 0.025, 0.025, 0.025, 0.9),
+        rows_of("a2c tuned Elevation-v0", 0.025, 0.025, 0.025, 0.025),
+        rows_of(f"vpg tuned {OTHER}", 0.1, 0.1, 0.1, 0.1, crashed=1),
+        rows_of(f"a2c tuned {OTHER}", 0.1, 0.1, 0.1, 0.1),
+    ]))  # fmt: skip
+    page = page_of(tmp_path, tmp_path)
+    # Without the lowest and the highest of four; in 5 % of the resamples three are 0.9, or four.
+    assert (
+        "| VPG, `tuned` | 0.025 [0.025, 0.9] | 3 of 4 | 0 of 80 | 1,000 (3 of 4) | 2.5 "
+        "| 200 [200, 200] | 200,000 | – |" in page
+    )
+    assert (
+        "| A2C, `tuned` | 0.025 [0.025, 0.025] | 4 of 4 | 0 of 80 | 1,000 | 2.5 "
+        "| 200 [200, 200] | 200,000 | – |" in page
+    )
+    assert "| hover (bound) | – | – | – | – | – | 17.2 | – | – |" in page
+    assert f"## {OTHER}\n" in page
+    # Scores: 0.1 / (0.1 + 0.025) = 0.8, 0.1 for the fourth, 0 with a crash, 0.5 at the bound.
+    # A2C: the middle half of 0.8 four times and 0.5 four times. Above 1/2 are four of eight.
+    assert "| A2C, `tuned` | 0.650 [0.650, 0.650] | 50% | 0% | 0% |" in page
+    # VPG: the middle half of 0.8 three times, 0.1 and four zeros is 0, 0, 0.1, 0.8.
+    assert "| VPG, `tuned` | 0.225 [" in page
+    # VPG against A2C: 12 ties of 16 pairs and 4 losses give 0.375; all lost on the other task.
+    assert "| VPG, `tuned` | – | 19% [" in page
+    assert "| A2C, `tuned` | 81% [" in page
+    assert "missing" not in page
+
+
+def test_what_is_missing_is_said(tmp_path: Path) -> None:
+    made_up(tmp_path, rows_of("vpg tuned Elevation-v0", 0.025, 0.025))
+    page = page_of(tmp_path, tmp_path)
+    assert "14 of 16 runs are missing." in page
+    assert "A2C" not in page
+    assert "## Which is better" not in page
+
+
+def test_scores_of_what_is_to_be_high() -> None:
+    own = rows_of("x", 3.0, 9.0, 0.0, np.nan)
+    # Held from 3 gates on: 3 / 6, 9 / 12, 0 / 3, and nothing without a value.
+    assert scores(own, Headline.of(spec_of(GATES))).tolist() == [0.5, 0.75, 0.0, 0.0]
+
+
+# ---- wrong input
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "row: expected at least one, got none"),
+        ('[[row]]\nagent = "lqg"', "agent: expected one of pid, "),
+        ('[[row]]\nagent = "a2c"\n[[row]]\nagent = "a2c"', "row: expected each row once, got a2c"),
+        ('[[row]]\nagent = "a2c"\nenv_id = "x/Y-v0"', "env_id: expected a registered id"),
+        ('[[row]]\nagent = "a2c"\ncolour = 1', "expected the settings of a board"),
+        ('[[row]]\nagent = "a2c"\nenv_steps = 0', "env_steps: expected at least 256, got 0"),
+        ('seeds = 0\n[[row]]\nagent = "pid"', "seeds: expected at least 1, got 0"),
+        ("[[row", "expected a TOML file of rows"),
+    ],
+)
+def test_wrong_rows_are_one_sentence(text: str, sentence: str, tmp_path: Path) -> None:
+    path = tmp_path / "rows.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as error:
+        read_rows_file(path)
+    assert sentence in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_files_that_are_no_board_are_refused(tmp_path: Path, folder: Path) -> None:
+    with pytest.raises(ResultsError, match=r"config\.json is missing"):
+        read_board(tmp_path)
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(ResultsError, match="expected a board's settings"):
+        read_board(tmp_path)
+    (tmp_path / "config.json").write_bytes((folder / "config.json").read_bytes())
+    text = (folder / "seeds.csv").read_text()
+    (tmp_path / "seeds.csv").write_text(text + text.splitlines()[-1] + "\n")
+    with pytest.raises(ResultsError, match="expected each run of the board once"):
+        read_board(tmp_path)
+
+
+# ---- what is committed
+
+
+def test_our_own_rows_are_right() -> None:
+    config = read_rows_file(BOARD)
+    assert config.seeds == 10
+    assert {"vpg", "a2c", "sb3-a2c", "pid"} <= {row.agent for row in config.rows}
+
+
+def test_the_committed_page_is_made_of_the_committed_files() -> None:
+    assert (DOCS / "baselines.md").read_text() == page_of(COMMITTED, DOCS)
+
+
+def test_the_committed_policies_fly_the_committed_numbers() -> None:
+    board = read_board(COMMITTED)
+    trained = [row for row in board.config.rows if not row.controller]
+    files = {checkpoint_file(COMMITTED, row) for row in trained}
+    assert files == set((COMMITTED / "checkpoints").iterdir())
+    seeds = board.seeds.set_index(["row", "seed"])
+    for row in trained:
+        first = seeds.loc[row.name, board.config.first_seed]
+        found = measured(board, COMMITTED, row)
+        # Another processor may round otherwise.
+        assert found == pytest.approx((first["steady"], first["return"]), rel=1e-3), row.name
