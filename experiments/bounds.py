@@ -22,7 +22,9 @@ from ..envs.loop import Loop
 from ..envs.registry import options_type
 from ..envs.spec import canonical_id
 from ..envs.tasks.elevation import ERROR_SCALE, ElevationOptions
+from ..envs.tasks.racing import RacingOptions, read_track
 from ..envs.tasks.recovery import Recovery, RecoveryOptions
+from ..envs.tasks.waypoints import WaypointsOptions
 from ..models.vehicle import Vehicle
 from .settings import EnvConfig
 from .trajectories import evaluation_seed
@@ -228,3 +230,59 @@ def payload_time(distance: float, share: float, vehicle: Vehicle) -> float:
     mass = (1 + share) * vehicle.mass
     lift = float(vehicle.thrust_high @ vehicle.allocation[0]) / mass
     return float(2 * np.sqrt(distance / np.sqrt(lift * lift - vehicle.gravity**2)))
+
+
+def course_time(points: Floats, radii: Floats, lift: float, gravity: float) -> float:
+    """No flight is shorter from rest to within each point's radius, one after the other, s.
+
+    The first of the points, shape (n + 1, 3), m, is the start; radii have shape (n,), m. Thrust
+    over mass is at most `lift`, m/s², in any direction: along a unit vector u a craft accelerates
+    by at most a = lift - gravity u_z, and against it by b = lift + gravity u_z. Seen along u it has
+    to go at least from turn to turn, and its speed along u is 0 at each: that takes
+    sqrt(2 d (1 / a + 1 / b)) for a way d, and the last way sqrt(2 d / a), as nothing stops it
+    there. The bound is the largest of 288 directions u; a flight has to satisfy all of them at
+    once, and to turn its thrust, so it takes longer. There is no wind.
+    """
+    around, up = np.meshgrid(np.radians(np.arange(0, 360, 10)), np.radians(np.arange(0, 80, 10)))
+    units = np.stack((np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)), -1)
+    return max(
+        _time_along(points @ u, radii, lift - gravity * u[2], lift + gravity * u[2])
+        for u in units.reshape(-1, 3)
+    )
+
+
+def _time_along(places: Floats, radii: Floats, up: float, down: float) -> float:
+    """Least time along a line through intervals about places, by accelerations both ways."""
+    turns = [float(places[0])]
+    for place, radius in zip(places[1:].tolist(), radii.tolist(), strict=True):
+        now = min(max(turns[-1], place - radius), place + radius)  # it goes no further than it must
+        if len(turns) > 1 and (now - turns[-1]) * (turns[-1] - turns[-2]) >= 0:
+            turns[-1] = now
+        elif now != turns[-1]:
+            turns.append(now)
+    ways = np.diff(turns)
+    forth = np.where(ways > 0, up, down)
+    stop = np.where(np.arange(len(ways)) < len(ways) - 1, 1 / (up + down - forth), 0.0)
+    return float(np.sqrt(2 * np.abs(ways) * (1 / forth + stop)).sum())
+
+
+def waypoints_time(options: WaypointsOptions, vehicle: Vehicle, count: int = 64) -> float:
+    """Mean `course_time` of the courses of `Waypoints-v0`, of so many that are drawn, s."""
+    shares = np.random.default_rng(0).uniform(-1.0, 1.0, (count, options.points + 1, 3))
+    courses = np.array(options.center) + shares * np.array(options.box)
+    radii = np.full(options.points, options.radius)
+    return float(np.mean([course_time(one, radii, *_limits(vehicle)) for one in courses]))
+
+
+def racing_time(options: RacingOptions, vehicle: Vehicle) -> float:
+    """`course_time` of a track of `Racing-v0` from its start, s, by the ball about each opening."""
+    gates, start = read_track(options.track)
+    gates = gates * options.laps
+    points = np.array([start.position, *(gate.position for gate in gates)])
+    radii = np.array([gate.size for gate in gates]) / np.sqrt(2)
+    return course_time(points, radii, *_limits(vehicle))
+
+
+def _limits(vehicle: Vehicle) -> tuple[float, float]:
+    """Largest thrust over mass, and gravity, m/s²."""
+    return float(vehicle.thrust_high @ vehicle.allocation[0]) / vehicle.mass, vehicle.gravity

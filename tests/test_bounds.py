@@ -3,12 +3,17 @@
 import numpy as np
 import pytest
 from rotorgram.envs.tasks.elevation import ElevationOptions
+from rotorgram.envs.tasks.racing import RacingOptions
+from rotorgram.envs.tasks.waypoints import WaypointsOptions
 from rotorgram.experiments.bounds import (
     bang_bang,
+    course_time,
     elevation_bounds,
     elevation_reward,
     landing_time,
     payload_time,
+    racing_time,
+    waypoints_time,
 )
 from rotorgram.models.vehicle import Vehicle
 from scipy import sparse
@@ -103,3 +108,32 @@ def test_the_largest_return_is_nearly_that_of_the_time_optimal_flight(start: flo
     best = max(returns)
     optimal = elevation_bounds(ElevationOptions(), Vehicle.load(), np.array([start]))
     assert best - 0.3 < optimal["time-optimal"] < best + 0.05
+
+
+def test_least_time_of_a_course_by_hand() -> None:
+    start, east, none = (0.0, 0.0, 0.0), (2.0, 0.0, 0.0), np.zeros(2)
+    # 1 m/s² without gravity: 2 m take sqrt(2 · 2) s, and there and back 2 sqrt(2) + sqrt(2 · 2) s.
+    assert course_time(np.array((start, east)), none[:1], 1.0, 0.0) == pytest.approx(2.0)
+    back = np.array((start, east, start))
+    assert course_time(back, none, 1.0, 0.0) == pytest.approx(2 * np.sqrt(2) + 2)
+    # A radius of 0.5 m: 1.5 m there, 1 m back.
+    near = course_time(back, none + 0.5, 1.0, 0.0)
+    assert near == pytest.approx(2 * np.sqrt(1.5) + np.sqrt(2))
+    # A point on the way does not stop it, and one within reach of the start takes no time.
+    on = np.array((start, (1.0, 0.0, 0.0), east))
+    assert course_time(on, none, 1.0, 0.0) == pytest.approx(2.0)
+    assert course_time(np.array((start, east)), np.array((2.0,)), 1.0, 0.0) == 0.0
+    # Along u of 30° above the way, 2 m away: cos 30° · 2 m by 5 - 3 sin 30° m/s².
+    level = course_time(np.array((start, east)), none[:1], 5.0, 3.0)
+    largest = max(np.cos(e) / (5 - 3 * np.sin(e)) for e in np.radians(np.arange(0, 80, 10)))
+    assert level == pytest.approx(np.sqrt(2 * 2 * largest))
+    # Level flight has 4 of the 5 m/s², and nothing is faster: sqrt(2 · 2 / 4) s, within 1 %.
+    assert 0.99 < level <= 1.0
+
+
+def test_courses_of_a_vehicle_with_more_points_or_rounds_take_longer() -> None:
+    paper = Vehicle.load()
+    few, many = (waypoints_time(WaypointsOptions(points=n), paper, 8) for n in (2, 4))
+    once, twice = (racing_time(RacingOptions(laps=n), paper) for n in (1, 2))
+    assert 0.0 < few < many
+    assert 0.0 < once < twice

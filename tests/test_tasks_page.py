@@ -7,8 +7,17 @@ import gymnasium as gym
 import pytest
 import rotorgram.envs  # noqa: F401
 from rotorgram.envs.registry import env_spec, task_type
+from rotorgram.envs.tasks.racing import RacingOptions
 from rotorgram.envs.tasks.recovery import RecoveryOptions
-from rotorgram.experiments.bounds import landing_time, payload_time, recovery_bounds
+from rotorgram.envs.tasks.tracking import Tracking, TrackingOptions
+from rotorgram.envs.tasks.waypoints import WaypointsOptions
+from rotorgram.experiments.bounds import (
+    landing_time,
+    payload_time,
+    racing_time,
+    recovery_bounds,
+    waypoints_time,
+)
 from rotorgram.models import Vehicle
 
 PAGE = (Path(__file__).parent.parent / "docs" / "tasks.md").read_text(encoding="utf-8")
@@ -44,6 +53,11 @@ def test_the_bounds_are_those_that_are_computed() -> None:
     paper = Vehicle.load()
     recovery = recovery_bounds(RecoveryOptions(), paper)
     for number, unit in (
+        (waypoints_time(WaypointsOptions(), paper), "s"),
+        (Tracking(TrackingOptions(), paper).quickest, "s"),
+        (Tracking(TrackingOptions(trajectory="lemniscate"), paper).quickest, "s"),
+        (racing_time(RacingOptions(), paper), "s"),
+        (racing_time(RacingOptions(track="dive"), paper), "s"),
         (landing_time(4.0, 1.0, paper), "s"),
         (recovery["turn_upright"], "s"),
         (recovery["height_lost"], "m"),
