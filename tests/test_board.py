@@ -225,7 +225,7 @@ def test_scores_of_what_is_to_be_high() -> None:
         ('[[row]]\nagent = "a2c"\n[[row]]\nagent = "a2c"', "row: expected each row once, got a2c"),
         ('[[row]]\nagent = "a2c"\nenv_id = "x/Y-v0"', "env_id: expected a registered id"),
         ('[[row]]\nagent = "a2c"\ncolour = 1', "expected the settings of a board"),
-        ('[[row]]\nagent = "a2c"\nenv_steps = 0', "env_steps: expected at least 256, got 0"),
+        ('[[row]]\nagent = "a2c"\nenv_steps = 100', "env_steps: expected at least 256, got 100"),
         ('seeds = 0\n[[row]]\nagent = "pid"', "seeds: expected at least 1, got 0"),
         ("[[row", "expected a TOML file of rows"),
     ],

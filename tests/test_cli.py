@@ -134,7 +134,7 @@ def test_wrong_input_is_one_sentence(
 
 
 @pytest.mark.parametrize(
-    "arguments", [["train", "ppo"], ["sim", "--speed", "2"], ["fly"], ["compare", "--seeds", "x"]]
+    "arguments", [["train", "dqn"], ["sim", "--speed", "2"], ["fly"], ["compare", "--seeds", "x"]]
 )
 def test_wrong_flags_name_what_was_expected(
     arguments: list[str], capsys: pytest.CaptureFixture[str]

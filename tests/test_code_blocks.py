@@ -287,6 +287,7 @@ def test_commands_and_flags_in_the_text_are_ones_that_there_are(
             used = {word for word in words if re.match(r"--[a-z]", word) and "…" not in word}
             if words[0] == "rotorgram" and words[1:] and words[1] != "COMMAND":
                 assert words[1] in COMMANDS, f"{name}: {mention}"
-                assert used <= flags_of(words[1]) | {"--help"}, f"{name}: {mention}"
+                task = words[(at := words.index("--env")) : at + 2] if "--env" in words else []
+                assert used <= flags_of(words[1], *task) | {"--help"}, f"{name}: {mention}"
             elif words[0] in used:
                 assert used <= flags, f"{name}: {mention}"

@@ -91,7 +91,9 @@ def test_over_udp() -> None:
 def test_torch() -> None:
     torch = pytest.importorskip("torch")
     pytest.importorskip("mujoco_warp")
-    env: Any = gym.make_vec(HOVER, num_envs=2, backend="warp", device="cpu", history=3)
+    env: Any = gym.make_vec(
+        HOVER, num_envs=2, backend="warp", device="cpu", tensors=True, history=3
+    )
     seen = [env.reset(seed=0)[0].numpy().copy()]
     seen += [env.step(torch.zeros(2, 4))[0].numpy().copy() for _ in range(5)]
     usual = [row[:, -19:] for row in seen]  # 15 numbers and 4 rotors
