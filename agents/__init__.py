@@ -16,6 +16,7 @@ from .presets import (
     PRESETS,
     A2CConfig,
     AlgorithmName,
+    APGConfig,
     Config,
     PPOConfig,
     SACConfig,
@@ -32,9 +33,10 @@ if TYPE_CHECKING:
     Agent = Learner | SAC | SB3Agent
 
 __all__ = [
-    "PID", "PRESETS", "A2CConfig", "AlgorithmName", "Checkpoint", "CheckpointError", "Episode",
-    "EpisodeLog", "Geometric", "NetworkPolicy", "PPOConfig", "Policy", "ResumeError", "SACConfig",
-    "VPGConfig", "episode_seed", "load", "make_agent", "preset", "resume_agent", "store",
+    "PID", "PRESETS", "A2CConfig", "APGConfig", "AlgorithmName", "Checkpoint", "CheckpointError",
+    "Episode", "EpisodeLog", "Geometric", "NetworkPolicy", "PPOConfig", "Policy", "ResumeError",
+    "SACConfig", "VPGConfig", "episode_seed", "load", "make_agent", "preset", "resume_agent",
+    "store",
 ]  # fmt: skip
 
 
@@ -50,6 +52,10 @@ def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> "A
             from .vpg import VPG
 
             return VPG(log, config, seed)
+        case "apg", APGConfig():
+            from .apg import APG
+
+            return APG(log, config, seed)
         case "ppo", PPOConfig():
             from .ppo import PPO
 

@@ -151,12 +151,20 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Drones may begin their next episode instead, or stay as they are: bool, shape (N,). One
         whose episode has ended has to do either.
         """
-        env, sent, seeds, idle = self.env, self.actions.to_envs(actions), None, frozen
+        self.advance(self.actions.to_envs(actions), begins, frozen)
+
+    def advance(
+        self, sent: Any, begins: np.ndarray | None = None, frozen: np.ndarray | None = None
+    ) -> None:
+        """The same with actions of the env, shape (N, k), or (N,) if discrete; or with a tensor, to
+        an env that takes those.
+        """
+        env, seeds, idle = self.env, None, frozen
         if begins is not None:
             self._number(begins)
             seeds, idle = self._seeds, begins if frozen is None else begins | frozen
         env.advance(sent, begins, seeds, frozen)
-        self._flown.append(sent)
+        self._flown.append(sent.detach().numpy() if hasattr(sent, "detach") else sent)
         self._keep_step(idle)
         self.env_steps += self.num_envs - (0 if idle is None else int(np.count_nonzero(idle)))
         ended = env.terminated | env.truncated

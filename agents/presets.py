@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 from ..models.errors import expect
 
-AlgorithmName = Literal["vpg", "a2c", "ppo", "sac", "sb3-a2c", "sb3-ppo", "sb3-sac"]
+AlgorithmName = Literal["vpg", "a2c", "ppo", "sac", "apg", "sb3-a2c", "sb3-ppo", "sb3-sac"]
 PresetName = Literal["paper", "tuned"]
 
 
@@ -24,8 +24,8 @@ def _is_count(value: Any) -> bool:
 
 
 _RULES: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
-    ("episodes_per_update steps_per_update epochs minibatches gradient_steps batch_size buffer_size"
-     " learning_starts", "a whole number, 1 or more", _is_count),
+    ("episodes_per_update steps_per_update epochs minibatches horizon gradient_steps batch_size"
+     " buffer_size learning_starts", "a whole number, 1 or more", _is_count),
     ("hidden", "whole numbers, 1 or more, one a layer",
      lambda value: len(value) > 0 and all(map(_is_count, value))),
     ("activation", "'relu' or 'tanh'", lambda value: value in ("relu", "tanh")),
@@ -183,7 +183,31 @@ class SACConfig(_Config):
         return -(-self.steps_per_update // drones) * drones
 
 
-Config = VPGConfig | A2CConfig | PPOConfig | SACConfig
+@dataclass(frozen=True, kw_only=True)
+class APGConfig(_Config):
+    """Analytic policy gradient, on the backend `rigid`. Defaults are ours."""
+
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of each hidden layer."""
+    activation: Literal["relu", "tanh"] = "tanh"
+    """Of the hidden units."""
+    learning_rate: float = 0.005
+    """Of Adam."""
+    anneal: bool = True
+    """Lower the learning rate linearly to zero over the run."""
+    normalize_observations: bool = True
+    """Shift and scale each observation by its mean and deviation until now."""
+    horizon: int = 100
+    """Steps of each drone that an update looks through."""
+    max_grad_norm: float = 1.0
+    """The gradient, as one vector, is scaled down to this length."""
+
+    def rollout_size(self, drones: int) -> int:
+        """Env steps between updates: `horizon` of each drone."""
+        return self.horizon * drones
+
+
+Config = VPGConfig | A2CConfig | PPOConfig | SACConfig | APGConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,10 +247,13 @@ _SACS: Final = {
         env_steps=30_000,
     )
 }  # fmt: skip
+_APGS: Final = {
+    "tuned": Preset(config=APGConfig(), num_envs=64, env_steps=1_000_000, backend="rigid")
+}
 # The references get the very same settings: only the implementation differs.
 PRESETS: Final[dict[str, dict[str, Preset]]] = {
-    "vpg": _VPG, "a2c": _A2C, "ppo": _PPOS, "sac": _SACS, "sb3-a2c": _A2C, "sb3-ppo": _PPOS,
-    "sb3-sac": _SACS,
+    "vpg": _VPG, "a2c": _A2C, "ppo": _PPOS, "sac": _SACS, "apg": _APGS, "sb3-a2c": _A2C,
+    "sb3-ppo": _PPOS, "sb3-sac": _SACS,
 }  # fmt: skip
 """By algorithm and name: of the paper's task, and of all others that `_OF_TASKS` does not have."""
 _HOVER: Final = PPOConfig(

@@ -16,7 +16,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from ..agents import A2CConfig, AlgorithmName, Episode, load, preset, store
 from ..agents.checkpoints import software_versions, write_whole
-from ..agents.presets import PPOConfig, PresetName, SACConfig, find_preset
+from ..agents.presets import PPOConfig, PresetName, VPGConfig, find_preset
 from ..experiments.folders import locked
 from ..experiments.settings import Run
 from ..models.errors import expect, require
@@ -50,7 +50,7 @@ class Train(AgentFlags, BackendFlags):
     """
 
     algorithm: Positional[AlgorithmName]
-    """vpg, a2c, ppo, sac, sb3-a2c, sb3-ppo or sb3-sac."""
+    """vpg, a2c, ppo, sac, apg, sb3-a2c, sb3-ppo or sb3-sac."""
     preset: PresetName = "tuned"
     """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
     set: UseAppendAction[Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE …")]] = ()
@@ -74,7 +74,7 @@ class Train(AgentFlags, BackendFlags):
     def run(self) -> int:
         """Train by these settings, or by those of the folder to resume."""
         require("tensorboard", "train", "training")
-        if self.algorithm.startswith("sb3-"):
+        if self.algorithm.startswith("sb3-") or self.algorithm == "apg":
             require("torch", "train", self.algorithm)
         right = 0 < self.store_every < math.inf
         expect(right, "store-every", "seconds > 0", str(self.store_every))
@@ -82,21 +82,22 @@ class Train(AgentFlags, BackendFlags):
 
     def _begin(self) -> int:
         from ..experiments.training import Training
-        from ._env import remote_env
 
         changes = dict(_change(word) for words in self.set for word in words)
         base = find_preset(self.algorithm, self.preset, self.env_id)
         config = preset(self.algorithm, self.preset, self.env_id, **changes)
         counts = {"num_envs": self.num_envs, "env_steps": self.env_steps}
         chosen = {name: getattr(base, name) if n is None else n for name, n in counts.items()}
+        if self.algorithm == "apg":
+            chosen["backend"] = "rigid"
         run = Run(config=config, **{**self.settings(Run), **chosen})
         if advice := _advice(run):
             print(f"note: {advice}", flush=True)
         required = bool(self.options) or "env" in self.given
         with (
             folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
-            remote_env(self, self.env_id, self.options, required=required, num_envs=run.num_envs,
-                       num_simulators=self.num_simulators, backend=run.backend) as env,
+            self._env(self.env_id, self.options, required=required, num_envs=run.num_envs,
+                      backend=run.backend) as env,
             locked(folder),
         ):  # fmt: skip
             spec = env.env_spec  # of the simulator that came
@@ -109,7 +110,7 @@ class Train(AgentFlags, BackendFlags):
 
     def _resume(self, folder: Path) -> int:
         from ..experiments.training import Training, is_finished
-        from ._env import CHECKPOINT, remote_env
+        from ._env import CHECKPOINT
 
         with locked(folder):
             kept = load(folder / CHECKPOINT)
@@ -125,10 +126,17 @@ class Train(AgentFlags, BackendFlags):
                 return 0
             for name, (then, now) in kept.other_versions().items():
                 print(f"note: {name} was {then} and is {now}: the numbers may differ", flush=True)
-            with remote_env(self, kept.env_id, kept.options, required=True, num_envs=kept.num_envs,
-                            num_simulators=self.num_simulators,
-                            backend=kept.backend) as env:  # fmt: skip
+            with self._env(kept.env_id, kept.options, required=True, num_envs=kept.num_envs,
+                           backend=kept.backend) as env:  # fmt: skip
                 return self._train(Training.resume(kept, env), folder)
+
+    def _env(self, env_id: str, options: dict[str, Any], **settings: Any) -> Any:
+        """The env of the training, over the wire; of apg in this process."""
+        from ._env import local_env, remote_env
+
+        if self.algorithm == "apg":
+            return local_env(self, env_id, options, settings["num_envs"], settings["backend"])
+        return remote_env(self, env_id, options, num_simulators=self.num_simulators, **settings)
 
     def _train(self, training: "Training", folder: Path) -> int:
         from ._env import CHECKPOINT
@@ -176,7 +184,7 @@ def _advice(run: Run) -> str:
     drones, config = run.num_envs, run.config
     if drones == 1 or "episode_length" not in run.options:
         return ""
-    if isinstance(config, PPOConfig | SACConfig):  # many updates with each transition
+    if isinstance(config, PPOConfig):  # many updates with each transition
         return ""
     if isinstance(config, A2CConfig):
         steps = config.rollout_size(drones) // drones
@@ -188,6 +196,8 @@ def _advice(run: Run) -> str:
             f"little from fewer than {_LEAST_STEPS}: try --set steps_per_update={better}, a higher "
             f"learning_rate, and --env-steps {100 * better} or more"
         )
+    if not isinstance(config, VPGConfig):
+        return ""
     whole = -(-config.episodes_per_update // drones) * drones * run.options["episode_length"]
     updates = run.env_steps // whole
     if updates >= _LEAST_UPDATES:

@@ -33,6 +33,10 @@ class Delay:
         """All of them side by side along the second axis, the oldest first."""
         return self._xp.concat(self._past[::-1], axis=1)
 
+    def detach(self) -> None:
+        """End the graph of gradients of tensors."""
+        self._past = [values.detach() for values in self._past]
+
     def get(self, age: Array) -> Array:
         """Values of so many steps ago; the age, whole numbers, broadcasts to them."""
         values = self._past[0]

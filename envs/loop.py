@@ -552,6 +552,20 @@ class Loop(NotCopied):
                 row.append(float(self._outcome.metrics[metric.name]))
         return row
 
+    def detach(self) -> None:
+        """End the graph of gradients, on the backend `rigid`, at the present state."""
+        world: Any = self.world
+        world.detach()
+        for name, value in vars(self.task).items():
+            if getattr(value, "requires_grad", False):
+                setattr(self.task, name, value.detach())
+        kept = (self._late_actions, *(self._late_observations or {}).values())
+        for past in (*kept, *(self._history or {}).values()):
+            if past is not None:
+                past.detach()
+        self.observations = {name: x.detach() for name, x in self.observations.items()}
+        self.rewards = self.rewards.detach()
+
     def close(self) -> None:
         """Release threads and memory; what the last step gave can be read on."""
         self.world.close()

@@ -88,6 +88,11 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         self._episodes = np.zeros(num_envs, int)
         self.closed = False
 
+    @property
+    def loop(self) -> Loop:
+        """The loop that it steps: its world, its task and, on `rigid`, what has derivatives."""
+        return self._loop
+
     def reset(
         self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:

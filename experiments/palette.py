@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Final
 
 _LABELS: Final = {
-    "vpg": "VPG", "a2c": "A2C", "ppo": "PPO", "sac": "SAC", "sb3-a2c": "SB3 A2C",
+    "vpg": "VPG", "a2c": "A2C", "ppo": "PPO", "sac": "SAC", "apg": "APG", "sb3-a2c": "SB3 A2C",
     "sb3-ppo": "SB3 PPO", "sb3-sac": "SB3 SAC", "pid": "PID",
     "geometric": "Geometric",
 }  # fmt: skip

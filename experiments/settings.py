@@ -14,6 +14,7 @@ from ..agents.pid import PID
 from ..agents.presets import (
     PRESETS,
     A2CConfig,
+    APGConfig,
     Config,
     PresetName,
     SACConfig,
@@ -82,7 +83,7 @@ class Run(EnvConfig):
         expect(self.seed >= 0, "seed", "0 or more", str(self.seed))
         expect(self.num_envs >= 1, "num_envs", "1 or more", str(self.num_envs))
         least = 1
-        if isinstance(self.config, A2CConfig | SACConfig):
+        if isinstance(self.config, A2CConfig | SACConfig | APGConfig):
             least = self.config.rollout_size(self.num_envs)
         elif self.num_envs > 1:  # a whole episode of each
             least = self.num_envs * int(self.options.get("episode_length", 1))
