@@ -4,7 +4,7 @@ Policies, controllers and the reading of checkpoints import no algorithm: `make_
 `resume_agent` do. Only SB3's needs torch.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ..models.errors import InputError
 from .checkpoints import Checkpoint, CheckpointError, load, store
@@ -32,11 +32,14 @@ if TYPE_CHECKING:
 
     Agent = Learner | SAC | SB3Agent
 
+CONTROLLERS: Final[dict[str, type[PID] | type[Geometric]]] = {"pid": PID, "geometric": Geometric}
+"""Agents that need no training, made of an env's spec."""
+
 __all__ = [
-    "PID", "PRESETS", "A2CConfig", "APGConfig", "AlgorithmName", "Checkpoint", "CheckpointError",
-    "Episode", "EpisodeLog", "Geometric", "NetworkPolicy", "PPOConfig", "Policy", "ResumeError",
-    "SACConfig", "VPGConfig", "episode_seed", "load", "make_agent", "preset", "resume_agent",
-    "store",
+    "CONTROLLERS", "PID", "PRESETS", "A2CConfig", "APGConfig", "AlgorithmName", "Checkpoint",
+    "CheckpointError", "Episode", "EpisodeLog", "Geometric", "NetworkPolicy", "PPOConfig",
+    "Policy", "ResumeError", "SACConfig", "VPGConfig", "episode_seed", "load", "make_agent",
+    "preset", "resume_agent", "store",
 ]  # fmt: skip
 
 

@@ -37,6 +37,7 @@ class APG(Learner):
         expect(backend == "rigid", "apg", "an env in this process, on the backend rigid", backend)
         sensed = "sensors" in log.spec.options
         expect(not sensed, "apg", "an env without sensors, which have no derivative", "some")
+        torch.set_num_threads(1)  # such small tensors lose by a second thread
         actions = log.actions
         expect(not actions.discrete, "apg", "continuous actions", "choices")
         self._map = [

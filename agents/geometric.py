@@ -12,9 +12,7 @@ from .policies import flat
 
 GRAVITY: Final = 9.81  # m/s²
 FILTER: Final = 20.0  # Filters forget so many times faster than the position loop answers
-OVER: Final = (
-    2.5  # Gain of the velocity loop over that of the position loop: `sim/control/gains.py`
-)
+OVER: Final = 2.5  # Gain of the velocity loop over the position loop's: `sim/control/gains.py`
 JUMP: Final = 4.0  # A goal that moves so many times as fast as the craft may was put elsewhere
 _ACTION: Final = ("offset x", "offset y", "offset z", "offset of the heading")
 _VECTORS: Final = ("goal - position", "velocity", "thrust axis")

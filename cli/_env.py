@@ -5,7 +5,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from ..agents import PID, Checkpoint, Geometric, Policy, load
+from ..agents import CONTROLLERS, PID, Checkpoint, Geometric, Policy, load
 from ..envs.registry import env_spec, is_known
 from ..envs.spec import EnvSpec
 from ..experiments.pairs import socket_pair
@@ -17,7 +17,6 @@ from ._flags import AgentFlags, EnvFlags, parse_address
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 Controller = type[PID] | type[Geometric]
-CONTROLLERS: Final[dict[str, Controller]] = {"pid": PID, "geometric": Geometric}
 _CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
 
 

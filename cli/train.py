@@ -86,10 +86,9 @@ class Train(AgentFlags, BackendFlags):
         changes = dict(_change(word) for words in self.set for word in words)
         base = find_preset(self.algorithm, self.preset, self.env_id)
         config = preset(self.algorithm, self.preset, self.env_id, **changes)
-        counts = {"num_envs": self.num_envs, "env_steps": self.env_steps}
-        chosen = {name: getattr(base, name) if n is None else n for name, n in counts.items()}
-        if self.algorithm == "apg":
-            chosen["backend"] = "rigid"
+        named: dict[str, Any] = {"num_envs": self.num_envs, "env_steps": self.env_steps}
+        named["backend"] = self.backend if "backend" in self.given else None
+        chosen = {name: getattr(base, name) if n is None else n for name, n in named.items()}
         run = Run(config=config, **{**self.settings(Run), **chosen})
         if advice := _advice(run):
             print(f"note: {advice}", flush=True)

@@ -23,6 +23,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import pandas as pd
 
+from ..agents import CONTROLLERS
 from ..agents.checkpoints import Checkpoint, store
 from ..envs.registry import env_spec
 from ..envs.spec import EnvSpec
@@ -35,7 +36,7 @@ from .metrics import Headline, final_per_run, first_lasting_snapshot
 from .pairs import shared_pair
 from .results import CONFIG_FILE, ResultsError
 from .rows import adding_rows, read_rows
-from .settings import CONTROLLERS, BenchmarkConfig, BoardRow
+from .settings import BenchmarkConfig, BoardRow
 from .training import train_run
 from .workers import OnProgress, Tell, open_workers
 

@@ -2,6 +2,7 @@
 
 import atexit
 import json
+import os
 import subprocess
 import sys
 import time
@@ -60,8 +61,10 @@ def socket_pair(
     # -P: no folder of the working directory stands for the package.
     command = [sys.executable, "-P", "-m", "rotorgram.udp", json.dumps(arguments)]
     with TemporaryFile("w+") as said:
+        # A second thread of torch makes small tensors slower, and takes the agent's core.
+        around = {"OMP_NUM_THREADS": "1", **os.environ}
         process = subprocess.Popen(
-            [*command, "--until-stdin-closes"], stdin=subprocess.PIPE, stderr=said
+            [*command, "--until-stdin-closes"], stdin=subprocess.PIPE, stderr=said, env=around
         )
         try:
             _connect(env, process)

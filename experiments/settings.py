@@ -7,10 +7,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from itertools import product
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
-from ..agents.geometric import Geometric
-from ..agents.pid import PID
+from ..agents import CONTROLLERS
 from ..agents.presets import (
     PRESETS,
     A2CConfig,
@@ -24,9 +23,6 @@ from ..agents.presets import (
 from ..envs.registry import env_spec, is_known, options_type, task_type
 from ..models import BACKENDS, Backend
 from ..models.errors import expect
-
-CONTROLLERS: Final[dict[str, type[PID] | type[Geometric]]] = {"pid": PID, "geometric": Geometric}
-"""Agents that need no training, made of an env's spec."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +123,11 @@ class RunsConfig(WorkersConfig):
     """The first of them."""
 
 
+def _check_wired(algorithm: str) -> None:
+    """Raise `InputError` for an algorithm that does not learn over the wire, as many runs do."""
+    expect(algorithm != "apg", "agent", "one that learns over the wire", algorithm)
+
+
 @dataclass(frozen=True, kw_only=True)
 class _ManyRuns(RunsConfig, EnvConfig):
     """Base of comparisons and sweeps."""
@@ -165,6 +166,7 @@ class _ManyRuns(RunsConfig, EnvConfig):
         return kept | {"seeds": len(seeds), "first_seed": seeds[0]}
 
     def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:
+        _check_wired(algorithm)
         shared = {"env_steps": self.env_steps, "num_envs": self.num_envs, **self.training_env}
         config = preset(algorithm, self.preset, self.env_id, **changes)
         return Run(algorithm=algorithm, config=config, seed=seed, **shared)
@@ -212,9 +214,12 @@ class BoardRow(EnvConfig):
     """Drones that fly at the same time in each training; 0: those of the preset."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         known = (*CONTROLLERS, *PRESETS)
         expect(self.agent in known, "agent", f"one of {', '.join(known)}", self.agent)
+        if self.controller:
+            options = {**CONTROLLERS[self.agent].options, **self.options}
+            object.__setattr__(self, "options", options)
+        super().__post_init__()
         if not self.controller:
             usual = find_preset(self.agent, self.preset, self.env_id)
             for name in ("env_steps", "num_envs"):
@@ -232,7 +237,7 @@ class BoardRow(EnvConfig):
     @property
     def task(self) -> str:
         """The env in words: its name, the options that are not the default, the vehicle."""
-        usual = options_type(self.env_id)().to_options()
+        usual = json.loads(json.dumps(options_type(self.env_id)().to_options()))
         other = {name: value for name, value in self.options.items() if value != usual[name]}
         words = [self.env_id.rpartition("/")[2]]
         words += [f"{name}={json.dumps(value)}" for name, value in other.items()]
@@ -246,6 +251,7 @@ class BoardRow(EnvConfig):
 
     def run(self, seed: int) -> Run:
         """The training of a seed."""
+        _check_wired(self.agent)
         names = ("env_steps", "num_envs", "backend")
         shared = {**{name: getattr(self, name) for name in names}, **self.env}
         config = preset(self.agent, self.preset, self.env_id)
@@ -297,7 +303,7 @@ class SweepConfig(_ManyRuns):
     """Settings of a sweep and its workers. Its seeds are not those of a comparison."""
 
     algorithm: str
-    """`vpg`, `a2c`, `ppo`, `sb3-a2c` or `sb3-ppo`."""
+    """Any but `apg`, which does not learn over the wire."""
     grid: Mapping[str, tuple[Any, ...]]
     """Values of hyperparameters, by name: every combination is a point."""
     seeds: int = 3

@@ -224,6 +224,7 @@ def test_scores_of_what_is_to_be_high() -> None:
         ('[[row]]\nagent = "lqg"', "agent: expected one of pid, "),
         ('[[row]]\nagent = "a2c"\n[[row]]\nagent = "a2c"', "row: expected each row once, got a2c"),
         ('[[row]]\nagent = "a2c"\nenv_id = "x/Y-v0"', "env_id: expected a registered id"),
+        ('[[row]]\nagent = "apg"', "agent: expected one that learns over the wire, got apg"),
         ('[[row]]\nagent = "a2c"\ncolour = 1', "expected the settings of a board"),
         ('[[row]]\nagent = "a2c"\nenv_steps = 100', "env_steps: expected at least 256, got 100"),
         ('seeds = 0\n[[row]]\nagent = "pid"', "seeds: expected at least 1, got 0"),
@@ -276,3 +277,9 @@ def test_the_committed_policies_fly_the_committed_numbers() -> None:
         found = measured(board, COMMITTED, row)
         # Another processor may round otherwise.
         assert found == pytest.approx((first["steady"], first["return"]), rel=1e-3), row.name
+
+
+def test_a_controller_brings_its_options() -> None:
+    row = BoardRow(agent="geometric", env_id="rotorgram/Hover-v0", options={"episode_length": 9})
+    assert (row.options["action"], row.options["episode_length"]) == ("position", 9)
+    assert row.name == "geometric Hover-v0 episode_length=9 action=position"

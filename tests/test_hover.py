@@ -7,34 +7,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from flights import about, state_of
 from rotorgram.envs import Loop
 from rotorgram.envs.loop import make_task
 from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.sim import WorldState
 
 ID = "rotorgram/Hover-v0"
 HEXA = Path(__file__).parent / "data" / "hexa.xml"
-
-
-def state_of(rotors: int = 4, **arrays: Any) -> WorldState:
-    """A single level craft at rest at (0, 0, 5), but for the arrays that are given."""
-    fields: dict[str, Any] = {
-        "position": (0.0, 0.0, 5.0),
-        "quaternion": (1.0, 0.0, 0.0, 0.0),
-        "velocity": (0.0,) * 3,
-        "body_rates": (0.0,) * 3,
-        "thrust": (49.0,) * rotors,
-        "touching": False,
-    }
-    given = {name: np.array(value) for name, value in {**fields, **arrays}.items()}
-    return WorldState(**given, command=given["thrust"])
-
-
-def about(axis: tuple[float, float, float], degrees: float) -> tuple[float, ...]:
-    half = math.radians(degrees) / 2
-    return (math.cos(half), *(math.sin(half) * part for part in axis))
 
 
 def test_observation_by_hand() -> None:

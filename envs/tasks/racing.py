@@ -103,7 +103,7 @@ class Racing(Flight):
     ## Reward
 
     By how much the craft came nearer to the centre of the gate in this step, 1/m, the progress of
-    Song et al. 2021 (arXiv 2103.08624, equation 2); 1 on the step that passes it; -0.02 s/rad times
+    Song et al. 2021 (arXiv 2103.08624); 1 on the step that passes it; -0.02 s/rad times
     the size of the body rates; and -20 on a step that terminates with gates left.
 
     A gate is passed in a step whose straight way goes through its opening in its direction; one
