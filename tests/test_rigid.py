@@ -322,7 +322,7 @@ def test_gradients_are_numbers_where_nothing_turns_and_no_rotor_pushes(
         reward = reward + loop.rewards.sum()
     (slope,) = torch.autograd.grad(reward, actions)
     assert bool(torch.isfinite(slope).all())
-    # Thrust is then in proportion to the action; with a lag it begins like a root, infinitely steep.
+    # Without effects thrust is in proportion to the action; with a lag it begins as a root.
     assert bool((slope != 0).all()) == (not effects)
 
 

@@ -84,6 +84,12 @@ def test_seeds_that_decide_a_difference():
         found.append(number)
     assert np.median(found) == pytest.approx(74.7, rel=0.1)
     assert seeds_to_decide([1.0, 2.0] * 5, [1.0, 2.0] * 5)[0] == math.inf
+    # Four times the seeds of one agent tell the same variance of its seeds, and the same number.
+    first, second = dice.normal(0.0, 1.0, 40), dice.normal(0.5, 1.0, 40)
+    many = np.tile(second, 4)
+    assert seeds_to_decide(first, many)[0] == pytest.approx(
+        seeds_to_decide(first, second)[0], rel=0.1
+    )
     assert all(math.isnan(number) for number in seeds_to_decide([1.0], [2.0, 3.0]))
 
 
