@@ -82,18 +82,6 @@ def performance_profile(strata: Strata, thresholds: Values) -> Floats:
     return np.asarray(np.mean(shares, axis=0))
 
 
-def profile_interval(
-    strata: Strata, thresholds: Values, level: float = 0.95
-) -> tuple[Floats, Floats]:
-    """Ends of the bootstrap interval of `performance_profile` at each threshold, shape (m,)."""
-    marks = np.asarray(thresholds, float)
-    if (resampled := _resampled(strata)) is None:
-        return np.full(marks.shape, np.nan), np.full(marks.shape, np.nan)
-    shares = np.array([[(one > mark).mean(axis=1) for mark in marks] for one in resampled])
-    low, high = np.quantile(shares.mean(axis=0), _quantiles(level), axis=1)
-    return low, high
-
-
 def probability_of_improvement(first: Strata, second: Strata) -> float:
     """Probability that a run of the first agent has the higher score, on a task drawn at random:
     the mean over the tasks of P(X > Y) + P(X = Y) / 2, the Mann-Whitney U statistic over the number
@@ -177,12 +165,8 @@ def _resampled(strata: Strata) -> list[Floats] | None:
     return [rng.choice(one, size=(_RESAMPLES, one.size)) for one in scores]
 
 
-def _quantiles(level: float) -> list[float]:
-    return [(1 - level) / 2, (1 + level) / 2]
-
-
 def _ends(values: Floats, level: float) -> tuple[float, float]:
-    low, high = np.quantile(values, _quantiles(level))
+    low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
 
 
