@@ -54,7 +54,7 @@ SEED_COLUMNS: Final[Mapping[str, str]] = {
     "episodes": "int64",  # of the evaluation
     "settled": "int64",  # episodes
     "crashed": "int64",  # episodes
-    "held": "int64",  # 1 if the goal is held, without a crash
+    "held": "int64",  # 1 if the goal is held: see `final_per_run`
     "env_steps_to_hold": "float64",  # of the first snapshot from which on all hold; empty: never
     "seconds_to_hold": "float64",  # of training, wall time, to that snapshot
     "seconds": "float64",  # of training, wall time

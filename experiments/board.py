@@ -4,8 +4,8 @@ Tables by task; then, where agents share tasks, measures over all of them by the
 `statistics`, of a *score*: with the mean size of the headline metric in the last quarter, and the
 bound below (above) which a goal counts as held, bound / (bound + size), or for a metric that is to
 be high size / (bound + size). A share that is to be high, without a unit and with a bound below 1,
-counts by what it lacks to 1. So 1/2 is the bound itself, and 1 the best. A run with a crash, or
-without a value, scores 0.
+counts by what it lacks to 1. So 1/2 is the bound itself, and 1 the best. A run with a crash that
+the size does not count, or without a value, scores 0.
 """
 
 import os
@@ -84,7 +84,8 @@ def _introduction(board: Board, where: Path) -> str:
         "  the interquartile mean over seeds, with its 95 % bootstrap interval, by the definitions "
         "of",
         "  [rliable](https://arxiv.org/abs/2108.13264).",
-        "* **Hold**: seeds whose steady size is on the good side of the bound, without a crash.",
+        "* **Hold**: seeds whose steady size is on the good side of the bound, without a crash "
+        "(`landed` counts crashes itself).",
         "* **Env steps and training time to hold**: to the first of "
         f"{config.snapshots} snapshots from which on all hold;",
         "  the interquartile mean over the seeds that get there. The time has simulator and wire "
@@ -159,7 +160,8 @@ def scores(own: pd.DataFrame, headline: Headline) -> np.ndarray:
         size, bound, high = 1 - size, 1 - bound, False
     size = np.maximum(size, 0.0)
     score = (size if high else bound) / (bound + size)
-    return np.where((own["crashed"] > 0) | np.isnan(size), 0.0, score)
+    crashed = (own["crashed"] > 0) & (not headline.counts_crashes)
+    return np.where(crashed | np.isnan(size), 0.0, score)
 
 
 def _overall(board: Board, tasks: Sequence[tuple[str, list[BoardRow]]]) -> list[str]:

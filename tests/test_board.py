@@ -217,11 +217,16 @@ def test_scores_of_what_is_to_be_high() -> None:
 
 
 def test_a_share_of_one_scores_one() -> None:
-    landed = Headline.of(spec_of(replace(GATES, name="landed", held=0.75)))
+    recovered = replace(GATES, name="recovered", held=0.75)
     # It lacks 0, 1/4 (the bound), 1/2 and 1: 1 / 1, 1/4 / 1/2, 1/4 / 3/4, 1/4 / 5/4.
     own = rows_of("x", 1.0, 0.75, 0.5, 0.0)
-    assert scores(own, landed).tolist() == [1.0, 0.5, pytest.approx(1 / 3), 0.2]
-    assert scores(rows_of("x", 1.0, crashed=1), landed).tolist() == [0.0]
+    expected = [1.0, 0.5, pytest.approx(1 / 3), 0.2]
+    assert scores(own, Headline.of(spec_of(recovered))).tolist() == expected
+    # The share of landings counts the crashes; that of the time after a recovery does not.
+    own = rows_of("x", 1.0, 0.75, 0.5, 0.0, crashed=1)
+    assert scores(own, Headline.of(spec_of(recovered))).tolist() == [0.0] * 4
+    landed = Headline.of(spec_of(replace(recovered, name="landed", final=True)))
+    assert scores(own, landed).tolist() == expected
 
 
 # ---- wrong input
