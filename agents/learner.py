@@ -87,10 +87,6 @@ class Learner:
             if not on_update():
                 return
 
-    def last_step(self, env_steps: int) -> int:
-        """Env steps after which a training of so many ends: all are flown."""
-        return env_steps
-
     def inputs(self, observations: np.ndarray) -> np.ndarray:
         """Observations as the networks take them: normalised, if the config says so."""
         if self.moments is None:
@@ -111,8 +107,7 @@ class Learner:
 
     def state(self) -> dict[str, np.ndarray]:
         """All that the next update depends on: weights, Adam's moments and the generator."""
-        text = json.dumps(self._rng.bit_generator.state).encode()
-        arrays = {"weights": self.weights.values.copy(), "rng": np.frombuffer(text, np.uint8)}
+        arrays = {"weights": self.weights.values.copy(), "rng": generator_array(self._rng)}
         if self.moments is not None:
             arrays |= named("observations.", self.moments.arrays())
         return arrays | named("optimizer.", self.optimizer.arrays())
@@ -126,7 +121,7 @@ class Learner:
         self.optimizer.load(part_of(state, "optimizer."))
         if self.moments is not None:
             self.moments.load(part_of(state, "observations."))
-        self._rng.bit_generator.state = json.loads(state["rng"].tobytes())
+        set_generator(self._rng, state["rng"])
         self.terms = {}
 
     def scalars(self) -> dict[str, float]:
@@ -171,3 +166,13 @@ def seeds_of(seed: int) -> tuple[int, np.random.Generator]:
     """Seed of the weights and generator of the actions, independent of each other."""
     weights = np.random.SeedSequence(seed, spawn_key=(0,)).generate_state(1, np.uint64)[0]
     return int(weights), np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
+
+
+def generator_array(rng: np.random.Generator) -> np.ndarray:
+    """State of a generator: JSON, as bytes."""
+    return np.frombuffer(json.dumps(rng.bit_generator.state).encode(), np.uint8)
+
+
+def set_generator(rng: np.random.Generator, array: np.ndarray) -> None:
+    """Take over what `generator_array` gave. Raises `ValueError` or `TypeError` for another."""
+    rng.bit_generator.state = json.loads(array.tobytes())

@@ -1,6 +1,5 @@
 """Soft Actor-Critic: Haarnoja et al. 2018, arXiv 1812.05905, with an automatic temperature."""
 
-import json
 import math
 from collections.abc import Mapping
 from typing import Any, Final
@@ -9,7 +8,15 @@ import numpy as np
 
 from ..models.errors import expect
 from .episodes import EpisodeLog
-from .learner import OnUpdate, diverged, named, part_of, seeds_of
+from .learner import (
+    OnUpdate,
+    diverged,
+    generator_array,
+    named,
+    part_of,
+    seeds_of,
+    set_generator,
+)
 from .networks import MLP, Adam, Weights, mlp_shapes
 from .policies import ActionMap, NetworkPolicy, flat_size
 from .presets import SACConfig
@@ -216,10 +223,6 @@ class SAC:
         inputs = np.concatenate([states, actions], axis=1)
         return [net.forward(inputs)[:, 0] for net in nets]
 
-    def last_step(self, env_steps: int) -> int:
-        """Env steps after which a training of so many ends: all are flown."""
-        return env_steps
-
     def actor(self) -> dict[str, np.ndarray]:
         """Weights for `NetworkPolicy`, which squashes: the last layer gives the mean of u."""
         arrays = {name: array.copy() for name, array in self._of_actor.arrays.items()}
@@ -233,9 +236,8 @@ class SAC:
 
     def state(self) -> dict[str, np.ndarray]:
         """All that the next update depends on, with the transitions that are kept."""
-        text = json.dumps(self._rng.bit_generator.state).encode()
         arrays = {"weights": self.weights.values.copy(), "targets": self.targets.values.copy(),
-                  "rng": np.frombuffer(text, np.uint8), "updates": np.array(self.updates),
+                  "rng": generator_array(self._rng), "updates": np.array(self.updates),
                   "buffer": self.buffer.rows[: len(self.buffer)].copy(),
                   "added": np.array(self.buffer.added)}  # fmt: skip
         for name, adam in self._adams.items():
@@ -255,7 +257,7 @@ class SAC:
         self.buffer.added, self.updates = added, int(state["updates"])
         for name, adam in self._adams.items():
             adam.load(part_of(state, f"optimizer.{name}."))
-        self._rng.bit_generator.state = json.loads(state["rng"].tobytes())
+        set_generator(self._rng, state["rng"])
         self._numbers = {}
 
     def scalars(self) -> dict[str, float]:

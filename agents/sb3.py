@@ -128,7 +128,8 @@ class SB3Agent:
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: learner.OnUpdate) -> None:
         """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
-        model, done, whole = self.model, log.env_steps, self.last_step(env_steps)
+        model, done = self.model, log.env_steps
+        whole = env_steps // self._rollout * self._rollout
         if done >= whole:
             return
         if done:  # the log is where the training stopped
@@ -138,10 +139,6 @@ class SB3Agent:
         self._ahead = self._rollout / whole
         with suppress(Stopped):
             model.learn(whole - done, reset_num_timesteps=done == 0)
-
-    def last_step(self, env_steps: int) -> int:
-        """Env steps after which a training of so many ends."""
-        return env_steps // self._rollout * self._rollout
 
     def _learning_rate(self, left: float) -> float:
         # SB3 counts what is left after the rollout; ours, and so here, before it.

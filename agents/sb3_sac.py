@@ -1,6 +1,5 @@
 """Stable-Baselines3's SAC as the reference for ours."""
 
-import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
@@ -96,8 +95,8 @@ class SB3SAC(SB3Agent):
         state |= {f"buffer.{name}": getattr(buffer, name)[:filled].copy() for name in _COLUMNS}
         state["counts"] = np.array([buffer.pos, buffer.full, model._n_updates])
         state["log_alpha"] = model.log_ent_coef.detach().numpy().copy()
-        text = json.dumps(model.action_space.np_random.bit_generator.state)
-        return state | generator_arrays() | {"rng.space": np.frombuffer(text.encode(), np.uint8)}
+        state["rng.space"] = learner.generator_array(model.action_space.np_random)
+        return state | generator_arrays()
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over a state. Raises `ValueError` or `KeyError` unless it is whole."""
@@ -115,8 +114,7 @@ class SB3SAC(SB3Agent):
         buffer.pos, buffer.full = place, bool(full)
         model.log_ent_coef.data = torch.from_numpy(state["log_alpha"].copy())
         set_generators(state)
-        text = json.loads(state["rng.space"].tobytes())
-        model.action_space.np_random.bit_generator.state = text
+        learner.set_generator(model.action_space.np_random, state["rng.space"])
 
     def _optimizers(self) -> dict[str, Any]:
         model = self.model

@@ -54,7 +54,7 @@ SEED_COLUMNS: Final[Mapping[str, str]] = {
     "episodes": "int64",  # of the evaluation
     "settled": "int64",  # episodes
     "crashed": "int64",  # episodes
-    "held": "int64",  # 1 if the goal is held, without a crash
+    "held": "int64",  # 1 if the goal is held: see `final_per_run`
     "env_steps_to_hold": "float64",  # of the first snapshot from which on all hold; empty: never
     "seconds_to_hold": "float64",  # of training, wall time, to that snapshot
     "seconds": "float64",  # of training, wall time
@@ -166,6 +166,8 @@ class Board(NamedTuple):
     config: BenchmarkConfig
     specs: dict[str, EnvSpec]
     """Of the env of each row, by the row's name."""
+    bounds: dict[str, dict[str, float]]
+    """Of its returns, by the row's name: `known_bounds`."""
     seeds: pd.DataFrame
     """`seeds.csv`, `SEED_COLUMNS`."""
 
@@ -178,10 +180,12 @@ def read_board(folder: Path) -> Board:
         rows = [BoardRow(**{name: row[name] for name in _ROW}) for row in content["rows"]]
         config = BenchmarkConfig(rows=tuple(rows), **content["board"])
         specs = [EnvSpec.from_json(json.dumps(row["spec"])) for row in content["rows"]]
+        bounds = [row["bounds"] for row in content["rows"]]
     except (KeyError, TypeError, InputError) as error:
         raise ResultsError(f"{path}: expected a board's settings, got: {error!r}") from None
-    named = {row.name: spec for row, spec in zip(rows, specs, strict=True)}
-    return Board(content, config, named, read_seeds(folder, config))
+    names = [row.name for row in rows]
+    named, of_returns = (dict(zip(names, values, strict=True)) for values in (specs, bounds))
+    return Board(content, config, named, of_returns, read_seeds(folder, config))
 
 
 def read_seeds(folder: Path, config: BenchmarkConfig) -> pd.DataFrame:

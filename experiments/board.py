@@ -3,15 +3,16 @@
 Tables by task; then, where agents share tasks, measures over all of them by the definitions of
 `statistics`, of a *score*: with the mean size of the headline metric in the last quarter, and the
 bound below (above) which a goal counts as held, bound / (bound + size), or for a metric that is to
-be high size / (bound + size). So 1/2 is the bound itself, and 1 the best. A run with a crash, or
-without a value, scores 0.
+be high size / (bound + size). A share that is to be high, without a unit and with a bound below 1,
+counts by what it lacks to 1. So 1/2 is the bound itself, and 1 the best. A run with a crash that
+the size does not count, or without a value, scores 0.
 """
 
 import os
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -83,7 +84,8 @@ def _introduction(board: Board, where: Path) -> str:
         "  the interquartile mean over seeds, with its 95 % bootstrap interval, by the definitions "
         "of",
         "  [rliable](https://arxiv.org/abs/2108.13264).",
-        "* **Hold**: seeds whose steady size is on the good side of the bound, without a crash.",
+        "* **Hold**: seeds whose steady size is on the good side of the bound, without a crash "
+        "(`landed` counts crashes itself).",
         "* **Env steps and training time to hold**: to the first of "
         f"{config.snapshots} snapshots from which on all hold;",
         "  the interquartile mean over the seeds that get there. The time has simulator and wire "
@@ -111,7 +113,7 @@ def _task(board: Board, folder: Path, where: Path, task: str, rows: Sequence[Boa
         own = board.seeds[board.seeds["row"] == row.name]
         if len(own):
             lines.append(_line(_cells(row, own, headline, _link(folder, where, row))))
-    bounds = next(one["bounds"] for one in board.content["rows"] if _is(one, rows[0]))
+    bounds = board.bounds[rows[0].name]
     for name, value in bounds.items():
         empty = [_NOTHING] * (len(headings) - 4)
         lines.append(_line([f"{name} (bound)", *empty, _figure(value), _NOTHING, _NOTHING]))
@@ -119,12 +121,6 @@ def _task(board: Board, folder: Path, where: Path, task: str, rows: Sequence[Boa
         lines += ["", "Bounds: mean returns over the same episodes; "
                   "[their derivation](results.md#the-returns-bound)."]  # fmt: skip
     return "\n".join(lines)
-
-
-def _is(content: dict[str, Any], row: BoardRow) -> bool:
-    return all(content[name] == getattr(row, name) for name in ("agent", "env_id", "vehicle")) and (
-        content["options"] == row.options and content["preset"] == row.preset
-    )
 
 
 def _cells(row: BoardRow, own: pd.DataFrame, headline: Headline, link: str) -> list[str]:
@@ -157,11 +153,15 @@ def _link(folder: Path, where: Path, row: BoardRow) -> str:
 
 def scores(own: pd.DataFrame, headline: Headline) -> np.ndarray:
     """Scores from 0 to 1 of the seeds of a row, (n,): see the module. NaN without a bound."""
-    size, bound = own["steady"].to_numpy(), headline.held
+    size, bound, high = own["steady"].to_numpy(), headline.held, headline.high
     if bound is None:
         return np.full(len(own), np.nan)
-    score = (size if headline.high else bound) / (bound + size)
-    return np.where((own["crashed"] > 0) | np.isnan(size), 0.0, np.clip(score, 0.0, 1.0))
+    if high and not headline.unit and bound < 1:
+        size, bound, high = 1 - size, 1 - bound, False
+    size = np.maximum(size, 0.0)
+    score = (size if high else bound) / (bound + size)
+    crashed = (own["crashed"] > 0) & (not headline.counts_crashes)
+    return np.where(crashed | np.isnan(size), 0.0, score)
 
 
 def _overall(board: Board, tasks: Sequence[tuple[str, list[BoardRow]]]) -> list[str]:
@@ -191,9 +191,9 @@ def _totals(found: dict[str, dict[str, np.ndarray]]) -> list[str]:
         "",
         f"Of the {len(shared)} tasks that all agents fly. Score: b / (b + e) for a steady size e "
         "and the bound b of holding (e / (b + e) of",
-        "a metric that is to be high), 0 with a crash. Interquartile mean over all runs, resampled "
-        "task by task; then the performance",
-        "profile.",
+        "a metric that is to be high; of a share that is, e and b are what it lacks to 1), 0 with "
+        "a crash. Interquartile mean over all runs,",
+        "resampled task by task; then the performance profile.",
         "",
         _line(headings),
         _line(["---", *["---:"] * (len(headings) - 1)]),

@@ -6,7 +6,8 @@ and the worst seed. `results_table` puts them together.
 
 How episodes that end early (a crash) enter: the steady state, the overshoot and the return are
 those of the flown part; the settling time is missing, and the table says how many episodes
-settled and how many crashed; a run with a crash in its evaluation does not hold its goal.
+settled and how many crashed; a run with a crash in its evaluation does not hold its goal, unless
+the mean of its metric counts crashes already, as the share of landings does.
 """
 
 import math
@@ -97,6 +98,11 @@ class Headline(Metric):
         bound = np.nan if self.held is None else self.held  # no number is above or below nan
         return np.asarray(array >= bound if self.high else array < bound)
 
+    @property
+    def counts_crashes(self) -> bool:
+        """Whether the mean over the episodes says how many crashed, as the share of landings."""
+        return self.final and self.high
+
     def crashed(self, evaluations: pd.DataFrame) -> "pd.Series[bool]":
         """Which episodes terminated; of a `final` metric those that did not hold its goal."""
         ended = evaluations["terminated"].astype(bool)
@@ -182,12 +188,13 @@ def extent(count: int) -> tuple[float, float]:
 def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tuple[float, float]:
     """Env steps and seconds of training after which one run holds its goal for good; nan if never.
 
-    They are those of the first snapshot from which on every snapshot holds without a crash. Few
+    They are those of the first snapshot from which on every snapshot holds its goal. Few
     episodes judge a snapshot, and even an untrained network can pass them by luck.
     """
     # A crash, or a value that is missing, must not vanish in a mean that skips it.
     never = -np.inf if headline.high else np.inf
-    steady = evaluations["steady"].fillna(never).mask(headline.crashed(evaluations), never)
+    crashed = headline.crashed(evaluations) & (not headline.counts_crashes)
+    steady = evaluations["steady"].fillna(never).mask(crashed, never)
     snapshots = evaluations.assign(steady=steady).groupby("env_steps")
     misses = ~headline.holds(snapshots["steady"].mean().to_numpy())
     lasting = snapshots["seconds"].max()[~np.logical_or.accumulate(misses[::-1])[::-1]]
@@ -205,7 +212,7 @@ def final_per_run(evaluations: pd.DataFrame, headline: Headline) -> pd.DataFrame
 
     `settling_time` is the mean over the episodes that settled (nan if none did); `episodes`,
     `settled` and `crashed` count them. `held`: whether its mean steady state holds the goal, with
-    a value in every episode and without a crash.
+    a value in every episode and without a crash that this does not count.
     """
     final = final_evaluations(evaluations)
     # Files leave a crash's settling time empty; a value there would be a mistake.
@@ -220,7 +227,7 @@ def final_per_run(evaluations: pd.DataFrame, headline: Headline) -> pd.DataFrame
         crashed=("crashed", "sum"),
         missing=("missing", "sum"),
     ).reset_index()  # fmt: skip
-    whole = (rows["crashed"] == 0) & (rows.pop("missing") == 0)
+    whole = ((rows["crashed"] == 0) | headline.counts_crashes) & (rows.pop("missing") == 0)
     return rows.assign(held=headline.holds(rows["steady"].to_numpy()) & whole)
 
 

@@ -120,14 +120,16 @@ def headings(headline: Headline) -> tuple[str, ...]:
 def table_note(headline: Headline) -> str:
     """Explanation of the columns."""
     size, goal, settled = headline.size_symbol, headline.held_text, headline.settled
+    which = f"{size} at the end" if headline.final else f"mean {size} in the last quarter"
+    crash = "" if headline.counts_crashes else " and without a crash"
     parts = [
         "Interquartile means over seeds with 95 % bootstrap intervals, from the deterministic "
         "evaluation after training, on episodes of its own. "
-        f"Steady {size}: mean {size} in the last quarter of an episode."
+        f"Steady {size}: {which} of an episode."
     ]
     if goal:
         parts.append(
-            f"Seeds that hold: those with a mean steady state of {goal} and without a crash in "
+            f"Seeds that hold: those with a mean steady state of {goal}{crash} in "
             "that evaluation; below it the worst seed's steady state. Env steps and training "
             f"time: up to the first snapshot from which on all hold {goal}, over the seeds that "
             "get there."

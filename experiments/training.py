@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from .. import agents
-from ..agents import Checkpoint, CheckpointError, VPGConfig
+from ..agents import Checkpoint, CheckpointError
 from ..envs.autoreset import AdvancingVectorEnv
 from ..models.errors import InputError, expect
 from .settings import Run
@@ -30,16 +30,16 @@ class Snapshot:
 
 
 def is_finished(kept: Checkpoint) -> bool:
-    """Whether a training has flown all its env steps. SB3 flies whole rollouts only.
-
-    Raises `ResumeError` for a policy alone.
-    """
+    """Whether a training has flown all its env steps. Raises `ResumeError` for a policy alone."""
     kept.check_resumable()
-    least = 1
-    if kept.algorithm.startswith("sb3-"):
-        config = agents.preset(kept.algorithm, "tuned", **kept.config)
-        least = 1 if isinstance(config, VPGConfig) else config.rollout_size(kept.num_envs)
-    return kept.env_steps - kept.position.env_steps < least
+    config = agents.preset(kept.algorithm, "tuned", **kept.config)
+    left = kept.env_steps - kept.position.env_steps
+    return left < _least_flown(kept.algorithm, config, kept.num_envs)
+
+
+def _least_flown(algorithm: str, config: Any, num_envs: int) -> int:
+    """Env steps that a training flies at least: SB3 flies whole rollouts only."""
+    return int(config.rollout_size(num_envs)) if algorithm.startswith("sb3-") else 1
 
 
 @dataclass
@@ -105,7 +105,8 @@ class Training:
         if self.taken and self.taken[-1].env_steps < log.env_steps:
             self._take()
         tell(log.env_steps, total, self.words())
-        return log.env_steps >= self.agent.last_step(total)
+        run = self.run
+        return total - log.env_steps < _least_flown(run.algorithm, run.config, run.num_envs)
 
     def words(self) -> str:
         """Recent return and size of the headline metric, for a progress bar."""

@@ -212,6 +212,21 @@ def test_scores_of_what_is_to_be_high() -> None:
     own = rows_of("x", 3.0, 9.0, 0.0, np.nan)
     # Held from 3 gates on: 3 / 6, 9 / 12, 0 / 3, and nothing without a value.
     assert scores(own, Headline.of(spec_of(GATES))).tolist() == [0.5, 0.75, 0.0, 0.0]
+    climb = replace(GATES, name="climb", unit="m/s")
+    assert scores(rows_of("x", -9.0, 3.0), Headline.of(spec_of(climb))).tolist() == [0.0, 0.5]
+
+
+def test_a_share_of_one_scores_one() -> None:
+    recovered = replace(GATES, name="recovered", held=0.75)
+    # It lacks 0, 1/4 (the bound), 1/2 and 1: 1 / 1, 1/4 / 1/2, 1/4 / 3/4, 1/4 / 5/4.
+    own = rows_of("x", 1.0, 0.75, 0.5, 0.0)
+    expected = [1.0, 0.5, pytest.approx(1 / 3), 0.2]
+    assert scores(own, Headline.of(spec_of(recovered))).tolist() == expected
+    # The share of landings counts the crashes; that of the time after a recovery does not.
+    own = rows_of("x", 1.0, 0.75, 0.5, 0.0, crashed=1)
+    assert scores(own, Headline.of(spec_of(recovered))).tolist() == [0.0] * 4
+    landed = Headline.of(spec_of(replace(recovered, name="landed", final=True)))
+    assert scores(own, landed).tolist() == expected
 
 
 # ---- wrong input

@@ -37,6 +37,8 @@ from test_peers import PEERS, ROOT, compiled, ended, running, tool, waiting
 ROWS = 10_000
 C_FLAGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-pedantic", "-Werror"]
 CPP_FLAGS = ["-x", "c++", "-std=c++11", *C_FLAGS[1:]]
+# An access out of bounds, or what C leaves undefined, ends the program with a text on stderr.
+CHECKED = ["-Wconversion", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 
 
 def policy_of(
@@ -163,7 +165,7 @@ def by_gcc(
 ) -> np.ndarray:
     (folder / "rotorgram_policy.h").write_bytes(c_target.write(policy, told_of(policy.spec)))
     (folder / "main.c").write_text(C_MAIN)
-    flags = C_FLAGS if compiler == "gcc" else CPP_FLAGS
+    flags = [*C_FLAGS, *CHECKED] if compiler == "gcc" else CPP_FLAGS
     compiled(tool(compiler), *flags, "-o", folder / "main", folder / "main.c")
     return fed(observations, folder / "main")
 

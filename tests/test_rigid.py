@@ -306,6 +306,26 @@ def test_gradients_through_a_rollout_are_those_of_differences(effects: dict[str,
     assert not world.state.position.requires_grad  # the last flight had none
 
 
+@pytest.mark.parametrize("env_id", ["rotorgram/Landing-v0", "rotorgram/Waypoints-v0"])
+@pytest.mark.parametrize("effects", [{}, {"motor_lag": True, "battery": True, "rotor_drag": True}])
+def test_gradients_are_numbers_where_nothing_turns_and_no_rotor_pushes(
+    env_id: str, effects: dict[str, Any]
+) -> None:
+    """A root has no slope at 0. Level, all rotors at their least: rates and thrusts are 0."""
+    loop = Loop(env_id, 2, vehicle=RACER, backend="rigid", device="cpu",
+                options={"effects": effects})  # fmt: skip
+    loop.advance(np.zeros((2, 4)), np.ones(2, bool), [0, 1])
+    actions = torch.full((2, 4), -1.0, requires_grad=True)
+    reward = 0.0
+    for _ in range(2):
+        loop.advance(actions)
+        reward = reward + loop.rewards.sum()
+    (slope,) = torch.autograd.grad(reward, actions)
+    assert bool(torch.isfinite(slope).all())
+    # Without effects thrust is in proportion to the action; with a lag it begins as a root.
+    assert bool((slope != 0).all()) == (not effects)
+
+
 def test_actions_keep_their_graph_through_the_loop_until_it_is_detached() -> None:
     loop = Loop(HOVER, 2, backend="rigid", device="cpu")
     loop.advance(np.zeros((2, 4)), np.ones(2, bool), [0, 1])

@@ -189,7 +189,9 @@ class Followed:
         flown = [rows[known:] for rows, known in zip(self.env.flown, self._known, strict=True)]
         self._known = [len(rows) for rows in self.env.flown]
         assert self.log.env_steps == sum(self._known)
-        whole = self.agent.last_step(self.total)
+        whole = self.total
+        if not isinstance(self.agent, VPG | A2C):  # SB3 flies whole rollouts only
+            whole -= whole % (self.agent.model.n_steps * self.agent.model.n_envs)
         update = self._vpg if isinstance(self.agent, VPG) else self._a2c
         update(flown, RATE * (1 - before / whole))
         pairs = [(self.actor, self.agent.actor()), (self.critic, self._critic())]

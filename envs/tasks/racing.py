@@ -22,7 +22,7 @@ from .flight import (
     Flight,
     length,
 )
-from .task import Outcome, TaskOptions, check_number, finite
+from .task import Outcome, TaskOptions, check_number, check_whole, finite
 
 TRACKS: Final = Path(__file__).parent.parent / "tracks"
 MOST_GATES: Final = 64
@@ -65,10 +65,7 @@ class RacingOptions(TaskOptions):
         rows = [gate._asdict() for gate in gates]
         content = {"gates": rows, "start": {"position": start.position, "heading": start.heading}}
         object.__setattr__(self, "track", json.dumps(content, separators=(",", ":")))
-        laps = finite(self.laps)
-        right = laps is not None and laps == int(laps) and 1 <= laps <= MOST_LAPS
-        expect(right, "laps", f"a whole number from 1 to {MOST_LAPS}", f"{self.laps!r}")
-        object.__setattr__(self, "laps", int(self.laps))
+        check_whole(self, "laps", 1, MOST_LAPS)
         check_number(self, "start_band", 0.0, FURTHEST, "m")
         check_number(self, "margin", 0.1, FURTHEST, "m")
 

@@ -72,15 +72,8 @@ class TaskOptions:
 
     def __post_init__(self) -> None:
         check_choice(self, "action", self.actions)
-        for name, most, what in (
-            ("episode_length", LONGEST_EPISODE, "control steps, 1 or more"),
-            ("history", LONGEST_HISTORY, f"observations from 1 to {LONGEST_HISTORY}"),
-        ):
-            given = getattr(self, name)
-            number = finite(given)
-            right = number is not None and number == int(number) and 1 <= number <= most
-            expect(right, name, f"a whole number of {what}", f"{given!r}")
-            object.__setattr__(self, name, int(given))
+        check_whole(self, "episode_length", 1, LONGEST_EPISODE, " of control steps")
+        check_whole(self, "history", 1, LONGEST_HISTORY, " of observations")
         check_number(self, "control_period", 1e-6, LONGEST_CONTROL_PERIOD, "s")
         check_number(self, "linear_drag", 0.0, MOST_DRAG, "/s")
         effects = EffectOptions.from_options(self.effects)
@@ -238,6 +231,14 @@ def check_number(options: Any, name: str, low: float, high: float, unit: str = "
     expected = f"a number from {low:g} to {high:g} {unit}".rstrip()
     expect(value is not None and low <= value <= high, name, expected, f"{given!r}")
     object.__setattr__(options, name, value)
+
+
+def check_whole(options: Any, name: str, low: int, high: int, of: str = "") -> None:
+    """Keep an option as an int within bounds. Raises `InputError`."""
+    value, given = finite(getattr(options, name)), getattr(options, name)
+    right = value is not None and value == int(value) and low <= value <= high
+    expect(right, name, f"a whole number{of} from {low} to {high}", f"{given!r}")
+    object.__setattr__(options, name, int(given))
 
 
 def check_choice(options: Any, name: str, allowed: tuple[str, ...]) -> None:

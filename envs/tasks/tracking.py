@@ -23,7 +23,7 @@ from .flight import (
     check_point,
     length,
 )
-from .task import Outcome, TaskOptions, check_number, finite
+from .task import Outcome, TaskOptions, check_number, check_whole
 
 MOST_SAMPLES: Final = 20_000  # Rows of a file
 MOST_POINTS: Final = 16  # That a minimum-snap trajectory goes through
@@ -70,11 +70,8 @@ class TrackingOptions(TaskOptions):
         check_number(self, "preview_time", 0.0, 100.0, "s")
         check_number(self, "start_band", 0.0, FURTHEST, "m")
         check_number(self, "flight_band", 0.01, FURTHEST, "m")
-        for name, low, high in (("points", 2, MOST_POINTS), ("preview", 0, 20)):
-            value = finite(given := getattr(self, name))
-            right = value is not None and value == int(value) and low <= value <= high
-            expect(right, name, f"a whole number from {low} to {high}", f"{given!r}")
-            object.__setattr__(self, name, int(given))
+        check_whole(self, "points", 2, MOST_POINTS)
+        check_whole(self, "preview", 0, 20)
 
 
 class Tracking(Flight):

@@ -18,7 +18,7 @@ from .flight import (
     check_point,
     length,
 )
-from .task import Outcome, TaskOptions, check_number, finite
+from .task import Outcome, TaskOptions, check_number, check_whole
 
 PASSING_REWARD: Final = 1.0  # Added to the reward of a step in which a point is reached
 MOST_POINTS: Final = 64
@@ -43,10 +43,7 @@ class WaypointsOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        count = finite(self.points)
-        right = count is not None and count == int(count) and 1 <= count <= MOST_POINTS
-        expect(right, "points", f"a whole number from 1 to {MOST_POINTS}", f"{self.points!r}")
-        object.__setattr__(self, "points", int(self.points))
+        check_whole(self, "points", 1, MOST_POINTS)
         check_point(self, "center")
         check_point(self, "box")
         expect(min(self.box) >= 0, "box", "three numbers of 0 m or more", f"{self.box!r}")
