@@ -129,14 +129,15 @@ class MLP:
     def backward(self, slope: np.ndarray, *, by_inputs: bool = False) -> np.ndarray:
         """Set the gradients of a loss, from its derivatives by the last outputs, shape (B, k).
 
-        Returns the derivatives by the inputs, shape (B, n), where they are asked for.
+        With `by_inputs` it leaves them, and returns the derivatives by the inputs, shape (B, n).
         """
         if len(self._ones) != len(slope):
             self._ones = np.ones(len(slope), np.float32)
         for i in range(len(self._layers) - 1, -1, -1):
             (weight, _, by_weight, by_bias), seen = self._layers[i], self._seen[i]
-            np.dot(slope.T, seen, out=by_weight)
-            np.dot(self._ones, slope, out=by_bias)
+            if not by_inputs:
+                np.dot(slope.T, seen, out=by_weight)
+                np.dot(self._ones, slope, out=by_bias)
             if i or by_inputs:
                 slope = slope.dot(weight)
             if i:

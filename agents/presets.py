@@ -260,27 +260,27 @@ _HOVER: Final = PPOConfig(
     hidden=(64, 64), activation="tanh", learning_rate=0.003, anneal=True, gamma=0.98,
     gae_lambda=0.95, log_std=-1.0, steps_per_update=4096, epochs=4, minibatches=16,
 )  # fmt: skip
+_HOLD: Final = Preset(config=_HOVER, num_envs=128, env_steps=1_000_000)
+_WIDE: Final = replace(_HOVER, steps_per_update=16_384, minibatches=32)  # of 512 drones
 _OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {
-    ("ppo", "tuned", "rotorgram/Hover-v0"): Preset(
-        config=_HOVER, num_envs=128, env_steps=1_000_000
+    ("ppo", "tuned", "rotorgram/Hover-v0"): _HOLD,
+    ("ppo", "tuned", "rotorgram/PayloadHover-v0"): _HOLD,
+    ("ppo", "tuned", "rotorgram/Landing-v0"): Preset(
+        config=replace(_WIDE, gamma=0.99), num_envs=512, env_steps=4_000_000, backend="rigid"
+    ),
+    ("ppo", "tuned", "rotorgram/Recovery-v0"): Preset(
+        config=replace(_WIDE, log_std=0.0, normalize_observations=True),
+        num_envs=512, env_steps=3_000_000, backend="rigid",
     ),
     ("sac", "tuned", "rotorgram/Hover-v0"): Preset(
         config=SACConfig(
-            hidden=(64, 64),
-            learning_rate=0.003,
-            anneal=True,
-            gamma=0.98,
-            batch_size=128,
-            buffer_size=200_000,
-            steps_per_update=16,
-            gradient_steps=2,
-            tau=0.02,
-            alpha=0.1,
+            hidden=(64, 64), learning_rate=0.003, anneal=True, gamma=0.98, batch_size=128,
+            buffer_size=25_000, steps_per_update=64, gradient_steps=8, tau=0.02, alpha=0.1,
         ),
-        num_envs=16,
+        num_envs=64,
         env_steps=200_000,
     ),
-}
+}  # fmt: skip
 """By algorithm without `sb3-`, name and id of the env."""
 
 

@@ -157,15 +157,19 @@ class SAC:
             if config.anneal:
                 self.rate = config.learning_rate * (1 - before / env_steps)
             if not self.warming_up:
-                shape = config.gradient_steps, config.batch_size
-                places = self._rng.integers(len(self.buffer), size=shape)
-                noise = self._rng.standard_normal((2, *shape, self._k), dtype=np.float32)
-                for i, some in enumerate(places):
-                    self.update(self.buffer.take(some), noise[0, i], noise[1, i])
-                if not np.isfinite(self.weights.values).all():
-                    raise diverged(self.updates)
+                self.learn()
             if not on_update():
                 return
+
+    def learn(self) -> None:
+        """Make `gradient_steps` updates, each from other transitions. Raises `Diverged`."""
+        shape = self.config.gradient_steps, self.config.batch_size
+        places = self._rng.integers(len(self.buffer), size=shape)
+        noise = self._rng.standard_normal((2, *shape, self._k), dtype=np.float32)
+        for i, some in enumerate(places):
+            self.update(self.buffer.take(some), noise[0, i], noise[1, i])
+        if not np.isfinite(self.weights.values).all():
+            raise diverged(self.updates)
 
     @property
     def warming_up(self) -> bool:

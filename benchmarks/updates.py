@@ -1,17 +1,19 @@
-"""Samples per second of updates: our PPO and A2C beside SB3's, on rollouts of the same env.
+"""Samples per second of updates: our PPO, A2C and SAC beside SB3's, on data of the same env.
 
-    OMP_NUM_THREADS=1 python benchmarks/updates.py [--seconds 3] [--out FILE.json]
+    OMP_NUM_THREADS=1 python benchmarks/updates.py [--seconds 3] [--cases ppo] [--out FILE.json]
 
 Networks, batch, epochs and minibatches are the same. A sample is a transition in one step of Adam,
 so an epoch counts each of a rollout once. Ours and SB3's take turns, update by update, in one
 process: set OMP_NUM_THREADS=1; medians are compared. Computing the advantages is part of an update
-of ours, and of SB3's `train` it is not: SB3 does it while it flies.
+of ours, and of SB3's `train` it is not: SB3 does it while it flies. Both SACs draw their batches
+from the buffer within the update.
 """
 
 import argparse
 import json
 import os
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,8 @@ CASES: dict[str, tuple[str, str, int, dict[str, Any]]] = {
     "a2c, 256 steps of 1 drone": ("a2c", "rotorgram/Elevation-v0", 1, {}),
     "a2c, 1,024 steps of 64 drones": ("a2c", "rotorgram/Elevation-v0", 64,
                                       {"steps_per_update": 1024}),
+    "sac, Elevation-v0": ("sac", "rotorgram/Elevation-v0", 8, {"gradient_steps": 8}),
+    "sac, Hover-v0": ("sac", "rotorgram/Hover-v0", 64, {}),
 }  # fmt: skip
 """Algorithm, env, drones and changes to the preset `tuned`."""
 
@@ -39,11 +43,15 @@ class Updates:
         log = EpisodeLog(env, 0)
         self.agent: Any = make_agent(algorithm, log, config, 0)
         self.rollouts: list[Rollout] = []
-        total = 2 * config.rollout_size(drones)
+        total = 2 * config.rollout_size(drones) + getattr(config, "learning_starts", 0)
         if algorithm.startswith("sb3-"):
             self.agent.train(log, total, lambda: True)
             self.agent.model.on_update = lambda: True
-            self.update = self.agent.model.train
+            batch = [config.gradient_steps, config.batch_size] if algorithm == "sb3-sac" else []
+            self.update = partial(self.agent.model.train, *batch)
+        elif algorithm == "sac":
+            self.agent.train(log, total, lambda: True)
+            self.update = self.agent.learn
         else:
             update = self.agent.update
             self.agent.update = lambda rollout: (self.rollouts.append(rollout), update(rollout))
@@ -69,11 +77,15 @@ def measure(case: tuple[str, str, int, dict[str, Any]], seconds: float) -> dict[
     while time.perf_counter() < until or len(times[algorithm]) < 5:
         for name, update in updates.items():
             times[name].append(update.seconds())
-    samples = config.rollout_size(drones) * getattr(config, "epochs", 1)
+    if algorithm == "sac":
+        batch, samples = config.batch_size, config.batch_size * config.gradient_steps
+    else:
+        batch = config.rollout_size(drones)
+        samples = batch * getattr(config, "epochs", 1)
     medians = {name: np.median(one, axis=0) for name, one in times.items()}
     wall, processor = medians[f"sb3-{algorithm}"] / medians[algorithm]
     return {
-        "hidden": config.hidden, "batch": config.rollout_size(drones),
+        "hidden": config.hidden, "batch": batch,
         "minibatches": getattr(config, "minibatches", 1), "epochs": getattr(config, "epochs", 1),
         "samples_per_second": {name: round(samples / t[0]) for name, t in medians.items()},
         "ratio": round(wall, 2), "ratio_of_processor_time": round(processor, 2),
@@ -83,10 +95,13 @@ def measure(case: tuple[str, str, int, dict[str, Any]], seconds: float) -> dict[
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=3.0)
+    parser.add_argument("--cases", default="", help="only those whose names begin so")
     parser.add_argument("--out", type=Path, default=Path("docs/results/updates.json"))
     args = parser.parse_args()
     cases = {}
     for name, case in CASES.items():
+        if not name.startswith(args.cases):
+            continue
         cases[name] = result = measure(case, args.seconds)
         print(
             f"{name:30} {result['samples_per_second']}, ratio {result['ratio']} "

@@ -194,3 +194,18 @@ def test_the_limits_are_those_that_were_measured() -> None:
     factor = rates["Crazyflow DroneReachPos-v0, 4096"] / rates["rotorgram, 4096"]
     assert round(factor) == 5
     assert "Crazyflow is five times as fast" in page
+
+
+@pytest.mark.parametrize("task", ["PayloadHover", "Landing", "Recovery"])
+def test_the_seeds_of_ppo_are_those_that_were_flown(task: str) -> None:
+    name = {"PayloadHover": "payload"}.get(task, task.lower())
+    found = json.loads((RESULTS / f"seconds_{name}.json").read_text())
+    sizes, count = [row["steady"] for row in found["seeds"]], len(found["seeds"])
+    crashes, beside = sum(row["crashes"] for row in found["seeds"]), found["beside"]["geometric"]
+    row = (
+        f"| {found['hold']} of {count} | {min(sizes):.3g} to {max(sizes):.3g} "
+        f"| {crashes} of {20 * count} | {beside['steady']:.3g}, {beside['crashes']} of 20 "
+        f"| {found['processor_seconds']['median']:.0f} |"
+    )
+    rows = (ROOT / "docs" / "algorithms" / "ppo.md").read_text().splitlines()
+    assert any(line.startswith(f"| `{task}-v0` |") and row in line for line in rows)

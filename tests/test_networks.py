@@ -81,7 +81,10 @@ def test_gradients_are_those_of_torch(hidden: tuple[int, ...], activation: str) 
     output = torch_mlp(theirs, inputs, activation)
     (output * torch.from_numpy(slope)).sum().backward()
     np.testing.assert_allclose(net.forward(seen), output.detach(), rtol=1e-5, atol=1e-5)
-    by_inputs = net.backward(slope, by_inputs=True)
+    net.backward(slope)
+    before = net.weights.slopes.copy()
+    by_inputs = net.backward(2 * slope, by_inputs=True) / 2
+    np.testing.assert_array_equal(net.weights.slopes, before)
     assert inputs.grad is not None
     np.testing.assert_allclose(by_inputs, inputs.grad, rtol=2e-5, atol=2e-6)
     agree(net.weights, theirs)

@@ -228,6 +228,26 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
         find_preset("ppo", "paper")
 
 
+@pytest.mark.parametrize(
+    ("task", "backend", "drones", "gamma", "log_std", "normalized"),
+    [
+        ("PayloadHover", "mujoco", 128, 0.98, -1.0, False),  # `rigid` has no payload
+        ("Landing", "rigid", 512, 0.99, -1.0, False),
+        ("Recovery", "rigid", 512, 0.98, 0.0, True),
+    ],
+)
+def test_presets_of_flights_are_variations_of_hover_s(
+    task: str, backend: str, drones: int, gamma: float, log_std: float, normalized: bool
+) -> None:
+    found = find_preset("ppo", "tuned", f"rotorgram/{task}-v0")
+    config = found.config
+    assert isinstance(config, PPOConfig)
+    assert (found.backend, found.num_envs) == (backend, drones)
+    assert (config.gamma, config.log_std) == (gamma, log_std)
+    assert config.normalize_observations == normalized
+    assert config.rollout_size(drones) == 32 * drones
+
+
 def test_training_by_the_command_takes_the_preset_s_drones_and_loads_no_torch(
     tmp_path: Path,
 ) -> None:

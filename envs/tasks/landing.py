@@ -7,11 +7,13 @@ from typing import Any, Final, Literal, get_args
 from ...models.errors import expect
 from ...sim import Array, Draw, Pose, WorldState, component, each, plain, square_root, stack
 from ..spec import Metric
-from .flight import LEAST_TILT_COSINE, RATE_WEIGHT, TERMINATION_REWARD, Flight, length
+from .flight import LEAST_TILT_COSINE, RATE_WEIGHT, Flight, length
 from .task import Outcome, TaskOptions, check_choice, check_number, finite
 
 MATCHING_TIME: Final = 0.5  # Progress that 1 m/s less relative speed is worth, over 1 m less way, s
 LANDING_REWARD: Final = 20.0  # Added to the reward of a step that ends with a landing
+TIME_COST: Final = 0.1  # Of each step
+CRASH_REWARD: Final = -10.0  # Added to the reward of a step that terminates in another way
 FASTEST_PAD: Final = 20.0  # m/s
 FURTHEST: Final = 1e3  # m
 
@@ -121,8 +123,9 @@ class Landing(Flight):
 
     Progress P' - P of the potential P = -(d + 0.5 s · w) / 1 m, for the distance d to the goal and
     the speed w relative to the pad (potential-based shaping: Ng, Harada and Russell 1999);
-    -0.02 s/rad times the size of the body rates; 20 for a landing, and -20 on a step that
-    terminates otherwise.
+    -0.02 s/rad times the size of the body rates; -0.1 for each step; 20 for a landing, and -10 on
+    a step that terminates otherwise. With γ = 0.99 to stay in the air for ever costs 10 too: a
+    touch-down that may fail is no worse. If time costs nothing a policy hovers above the pad.
 
     ## Start, termination, truncation
 
@@ -214,9 +217,10 @@ class Landing(Flight):
         return Outcome(
             reward={
                 "progress": self._progress,
+                "time": -TIME_COST,
                 "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
                 "landing": landed * LANDING_REWARD,
-                "termination": (terminated > landed) * TERMINATION_REWARD + 0.0,
+                "termination": (terminated > landed) * CRASH_REWARD + 0.0,
             },
             terminated=terminated,
             metrics={
