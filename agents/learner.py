@@ -6,6 +6,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
+from .checkpoints import Checkpoint
 from .episodes import EpisodeLog
 from .networks import MLP, Actor, Adam, Weights, mlp_shapes
 from .normalization import Moments
@@ -128,6 +129,20 @@ class Learner:
             self.moments.load(part_of(state, "observations."))
         self._rng.bit_generator.state = json.loads(state["rng"].tobytes())
         self.terms = {}
+
+    def start_from(self, kept: Checkpoint) -> None:
+        """Take over the policy of another training with its normalisation, and a critic's weights.
+
+        Raises `ValueError` or `KeyError` unless they fit.
+        """
+        arrays = kept.actor.items()
+        own = {name: array for name, array in arrays if not name.startswith("observation.")}
+        self._actor.weights.load(own)
+        weights = kept.state["weights"]
+        if self.has_critic and weights.shape == self.weights.values.shape:
+            self.weights.values[...] = weights
+        if self.moments is not None:
+            self.moments.load(part_of(kept.state, "observations."))
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as in `docs/algorithms/README.md`; none before the first."""

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from ..models.errors import expect
+from .checkpoints import Checkpoint
 from .episodes import EpisodeLog
 from .learner import OnUpdate, diverged, named, part_of, seeds_of
 from .networks import MLP, Adam, Weights, mlp_shapes
@@ -257,6 +258,14 @@ class SAC:
             adam.load(part_of(state, f"optimizer.{name}."))
         self._rng.bit_generator.state = json.loads(state["rng"].tobytes())
         self._numbers = {}
+
+    def start_from(self, kept: Checkpoint) -> None:
+        """Take over the weights of another training; the buffer begins empty.
+
+        Raises `ValueError` or `KeyError` unless they fit.
+        """
+        self.weights.values[...] = kept.state["weights"]
+        self.targets.values[...] = self._of_critics.values
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, under SB3's names; none before the first."""

@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ..models.errors import expect, require
 from . import learner
+from .checkpoints import Checkpoint
 from .episodes import EpisodeLog
 from .policies import NetworkPolicy
 from .presets import A2CConfig, PPOConfig
@@ -177,6 +178,10 @@ class SB3Agent:
         set_optimizer_arrays(model.policy.optimizer, state)
         model._n_updates = updates_of(model.policy.optimizer) // model.steps_per_count
         set_generators(state)
+
+    def start_from(self, kept: Checkpoint) -> None:
+        """Take over the networks of another training."""
+        load_arrays(self.model.policy, kept.state, "policy.")
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as SB3 logs them; none before the first."""
