@@ -133,14 +133,13 @@ class Learner:
     def start_from(self, kept: Checkpoint) -> None:
         """Take over the policy of another training with its normalisation, and a critic's weights.
 
-        Raises `ValueError` or `KeyError` unless they fit.
+        The noise begins anew, at `log_std`. Raises `ValueError` or `KeyError` unless they fit.
         """
-        arrays = kept.actor.items()
-        own = {name: array for name, array in arrays if not name.startswith("observation.")}
-        self._actor.weights.load(own)
+        self._actor.net.weights.load(part_of(kept.actor, "layers."))
         weights = kept.state["weights"]
         if self.has_critic and weights.shape == self.weights.values.shape:
-            self.weights.values[...] = weights
+            critic = self._critic.weights.values
+            critic[...] = weights[-critic.size :]
         if self.moments is not None:
             self.moments.load(part_of(kept.state, "observations."))
 

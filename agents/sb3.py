@@ -180,8 +180,11 @@ class SB3Agent:
         set_generators(state)
 
     def start_from(self, kept: Checkpoint) -> None:
-        """Take over the networks of another training."""
-        load_arrays(self.model.policy, kept.state, "policy.")
+        """As `Learner.start_from`."""
+        policy = self.model.policy
+        load_arrays(policy, kept.state, "policy.")
+        if hasattr(policy, "log_std"):
+            policy.log_std.data.fill_(self._config.log_std)
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as SB3 logs them; none before the first."""
