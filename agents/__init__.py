@@ -6,13 +6,15 @@ Policies, controllers and the reading of checkpoints import no algorithm: `make_
 
 from typing import TYPE_CHECKING, Final
 
-from ..models.errors import InputError
+from ..envs.spec import Discrete, EnvSpec, component_names
+from ..models.errors import InputError, expect
 from .checkpoints import Checkpoint, CheckpointError, load, store
 from .episodes import Episode, EpisodeLog, ResumeError, episode_seed
 from .geometric import Geometric
 from .pid import PID
 from .policies import NetworkPolicy, Policy
 from .presets import (
+    NETWORKS,
     PRESETS,
     A2CConfig,
     AlgorithmName,
@@ -39,7 +41,7 @@ __all__ = [
     "CONTROLLERS", "PID", "PRESETS", "A2CConfig", "APGConfig", "AlgorithmName", "Checkpoint",
     "CheckpointError", "Episode", "EpisodeLog", "Geometric", "NetworkPolicy", "PPOConfig",
     "Policy", "ResumeError", "SACConfig", "VPGConfig", "episode_seed", "load", "make_agent",
-    "preset", "resume_agent", "store",
+    "preset", "resume_agent", "start_agent", "store",
 ]  # fmt: skip
 
 
@@ -85,6 +87,57 @@ def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> "A
     )
 
 
+_ALIKE: Final = {"vpg", "a2c", "ppo", "apg"}
+"""Algorithms whose policies are the same network."""
+
+
+def start_agent(
+    kept: Checkpoint, algorithm: str, log: EpisodeLog, config: Config, seed: int
+) -> "Agent":
+    """A new agent that begins with the networks of a checkpoint; all else of it is fresh.
+
+    The checkpoint is of the same algorithm; `vpg`, `a2c`, `ppo` and `apg` take each other's policy
+    too, and `a2c` and `ppo` each other's critic. Its task, vehicle and effects may be others, its
+    observation and action may not.
+
+    Raises:
+        InputError: The checkpoint has other networks, or is a policy alone.
+        CheckpointError: The parts of the checkpoint do not fit together.
+    """
+    names = ", ".join(sorted(_ALIKE)) if algorithm in _ALIKE else algorithm
+    right = kept.algorithm in (_ALIKE if algorithm in _ALIKE else {algorithm})
+    expect(right, "start-from", f"a training of {names}", kept.algorithm)
+    expect(kept.num_envs, "start-from", "the checkpoint of a training", "a policy alone")
+    for (what, wanted), (_, got) in zip(_parts(kept.spec), _parts(log.spec), strict=True):
+        fit = f"the {what} of {kept.env_id}"
+        expect(len(got) == len(wanted), "start-from", f"{fit}, {len(wanted)}", f"{len(got)}")
+        for one, other in zip(wanted, got, strict=True):
+            expect(one == other, "start-from", f"{fit} with {one!r}", repr(other))
+    begun_with = preset(kept.algorithm, "tuned", **kept.config)
+    for name in NETWORKS:
+        value, own = getattr(config, name), getattr(begun_with, name)
+        expect(value == own, name, f"{own} of the training to start from", f"{value}")
+    agent = make_agent(algorithm, log, config, seed)
+    try:
+        agent.start_from(kept)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise _unfit(error) from None
+    return agent
+
+
+def _parts(spec: EnvSpec) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """Names of what an env's policy sees, and of what it sets."""
+    seen = tuple(name for array in spec.observation for name in component_names(array))
+    if isinstance(spec.action, Discrete):
+        return ("observed numbers", seen), ("choices", tuple(map(str, range(spec.action.n))))
+    return ("observed numbers", seen), ("actions", component_names(spec.action))
+
+
+def _unfit(error: Exception) -> CheckpointError:
+    reason = " ".join(str(error).split())
+    return CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}")
+
+
 def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
     """The agent of a checkpoint; the log, a new one of as many drones, resumes where it was.
 
@@ -107,7 +160,6 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
         agent = make_agent(kept.algorithm, log, config, kept.seed)
         agent.set_state(kept.state)
     except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
-        reason = " ".join(str(error).split())
-        raise CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}") from None
+        raise _unfit(error) from None
     log.resume(kept.position)
     return agent

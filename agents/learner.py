@@ -6,6 +6,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
+from .checkpoints import Checkpoint
 from .episodes import EpisodeLog
 from .networks import MLP, Actor, Adam, Weights, mlp_shapes
 from .normalization import Moments
@@ -123,6 +124,19 @@ class Learner:
             self.moments.load(part_of(state, "observations."))
         set_generator(self._rng, state["rng"])
         self.terms = {}
+
+    def start_from(self, kept: Checkpoint) -> None:
+        """Take over the policy of another training with its normalisation, and a critic's weights.
+
+        The noise begins anew, at `log_std`. Raises `ValueError` or `KeyError` unless they fit.
+        """
+        self._actor.net.weights.load(part_of(kept.actor, "layers."))
+        weights = kept.state["weights"]
+        if self.has_critic and weights.shape == self.weights.values.shape:
+            critic = self._critic.weights.values
+            critic[...] = weights[-critic.size :]
+        if self.moments is not None:
+            self.moments.load(part_of(kept.state, "observations."))
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as in `docs/algorithms/README.md`; none before the first."""

@@ -207,6 +207,8 @@ class APGConfig(_Config):
         return self.horizon * drones
 
 
+NETWORKS: Final = ("hidden", "activation", "normalize_observations")
+"""Hyperparameters that all have, which say what networks there are."""
 Config = VPGConfig | A2CConfig | PPOConfig | SACConfig | APGConfig
 
 

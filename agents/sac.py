@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from ..models.errors import expect
+from .checkpoints import Checkpoint
 from .episodes import EpisodeLog
 from .learner import (
     OnUpdate,
@@ -263,6 +264,14 @@ class SAC:
             adam.load(part_of(state, f"optimizer.{name}."))
         set_generator(self._rng, state["rng"])
         self._numbers = {}
+
+    def start_from(self, kept: Checkpoint) -> None:
+        """Take over the weights of another training; the buffer begins empty.
+
+        Raises `ValueError` or `KeyError` unless they fit.
+        """
+        self.weights.values[...] = kept.state["weights"]
+        self.targets.values[...] = self._of_critics.values
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, under SB3's names; none before the first."""

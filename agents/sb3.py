@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ..models.errors import expect, require
 from . import learner
+from .checkpoints import Checkpoint
 from .episodes import EpisodeLog
 from .policies import NetworkPolicy
 from .presets import A2CConfig, PPOConfig
@@ -174,6 +175,13 @@ class SB3Agent:
         set_optimizer_arrays(model.policy.optimizer, state)
         model._n_updates = updates_of(model.policy.optimizer) // model.steps_per_count
         set_generators(state)
+
+    def start_from(self, kept: Checkpoint) -> None:
+        """As `Learner.start_from`."""
+        policy = self.model.policy
+        load_arrays(policy, kept.state, "policy.")
+        if hasattr(policy, "log_std"):
+            policy.log_std.data.fill_(self._config.log_std)
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as SB3 logs them; none before the first."""

@@ -9,14 +9,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ..agents import A2CConfig, AlgorithmName, Episode, load, preset, store
-from ..agents.checkpoints import software_versions, write_whole
-from ..agents.presets import PPOConfig, PresetName, VPGConfig, find_preset
+from ..agents.checkpoints import Checkpoint, software_versions, write_whole
+from ..agents.presets import NETWORKS, PPOConfig, PresetName, VPGConfig, find_preset
 from ..experiments.folders import locked
 from ..experiments.settings import Run
 from ..models.errors import expect, require
@@ -66,6 +67,9 @@ class Train(AgentFlags, BackendFlags):
     """With --listen: simulators to wait for, each with its share of the drones."""
     out: Path | None = None
     """Folder to write to. Default: runs/ALGORITHM-seedSEED-TIME."""
+    start_from: Path | None = None
+    """Checkpoint, or folder of a training, with whose networks to begin: the next stage of a
+    curriculum. Their sizes and the normalisation are the checkpoint's."""
     resume: Path | None = None
     """Folder of a training to go on with; it keeps its settings."""
     store_every: float = 10.0
@@ -83,7 +87,9 @@ class Train(AgentFlags, BackendFlags):
     def _begin(self) -> int:
         from ..experiments.training import Training
 
-        changes = dict(_change(word) for words in self.set for word in words)
+        start, told = self._start()
+        changes = {name: start.config[name] for name in NETWORKS} if start else {}
+        changes |= dict(_change(word) for words in self.set for word in words)
         base = find_preset(self.algorithm, self.preset, self.env_id)
         config = preset(self.algorithm, self.preset, self.env_id, **changes)
         named: dict[str, Any] = {"num_envs": self.num_envs, "env_steps": self.env_steps}
@@ -101,11 +107,22 @@ class Train(AgentFlags, BackendFlags):
         ):  # fmt: skip
             spec = env.env_spec  # of the simulator that came
             run = replace(run, env_id=spec.env_id, options=spec.options)
-            training = Training(run, env)
+            training = Training(run, env, start=start)
             about = {"vehicle_hash": spec.vehicle_hash, "versions": software_versions()}
-            content = json.dumps({**asdict(run), **about}, indent=2) + "\n"
+            content = json.dumps({**asdict(run), **told, **about}, indent=2) + "\n"
             write_whole(folder / "config.json", content.encode())
             return self._train(training, folder)
+
+    def _start(self) -> tuple[Checkpoint | None, dict[str, Any]]:
+        """The checkpoint to start from, and what `config.json` has of it."""
+        from ._env import CHECKPOINT
+
+        if not (path := self.start_from):
+            return None, {}
+        file = path / CHECKPOINT if path.is_dir() else path
+        kept = load(file)
+        checksum = sha256(file.read_bytes()).hexdigest()
+        return kept, {"start_from": {"file": str(file), "sha256": checksum}}
 
     def _resume(self, folder: Path) -> int:
         from ..experiments.training import Training, is_finished

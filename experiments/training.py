@@ -49,7 +49,8 @@ class Training:
     The env is local or remote, a vector env where the run has many drones, and not closed here.
     Besides the untrained policy, so many `snapshots` are kept in `taken` for later evaluation,
     evenly spread. With `keep_steps` every step is kept, for `log.steps()`. A run that goes on does
-    so from the checkpoint `kept`.
+    so from the checkpoint `kept`; a new one may begin with the networks of another training, those
+    of the checkpoint `start`.
     """
 
     run: Run
@@ -57,17 +58,22 @@ class Training:
     snapshots: int = 0
     keep_steps: bool = False
     kept: Checkpoint | None = None
+    start: Checkpoint | None = None
     taken: list[Snapshot] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
         drones, wanted = getattr(self.env, "num_envs", 1), self.run.num_envs
         expect(drones == wanted, "env", f"one of {wanted} drones", str(drones))
         self.log = agents.EpisodeLog(self.env, self.run.seed, keep_steps=self.keep_steps)
-        self.agent: agents.Agent = (
-            agents.resume_agent(self.kept, self.log)
-            if self.kept
-            else agents.make_agent(self.run.algorithm, self.log, self.run.config, self.run.seed)
-        )
+        run = self.run
+        new = run.algorithm, self.log, run.config, run.seed
+        self.agent: agents.Agent
+        if self.kept:
+            self.agent = agents.resume_agent(self.kept, self.log)
+        elif self.start:
+            self.agent = agents.start_agent(self.start, *new)
+        else:
+            self.agent = agents.make_agent(*new)
 
     @classmethod
     def resume(cls, kept: Checkpoint, env: AnyEnv) -> "Training":

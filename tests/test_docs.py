@@ -209,3 +209,27 @@ def test_the_seeds_of_ppo_are_those_that_were_flown(task: str) -> None:
     )
     rows = (ROOT / "docs" / "algorithms" / "ppo.md").read_text().splitlines()
     assert any(line.startswith(f"| `{task}-v0` |") and row in line for line in rows)
+
+
+def test_the_shifts_are_those_that_were_measured() -> None:
+    """Position error in cm and crashes in per cent, of each row of the page's table."""
+    page = (ROOT / "docs" / "transfer.md").read_text()
+    summary = pd.read_csv(RESULTS / "transfer" / "summary.csv", dtype={"at": str})
+    found = re.findall(r"^\| (\w+) \| (\S+) \| (.* %) \|$", page, re.MULTILINE)
+    assert len(found) >= 10
+    for by, at, cells in found:
+        some = summary[(summary["by"] == by) & (summary["at"] == at)].set_index("row")
+        rows = some.loc[["plain", "randomised", "randomised, history", "geometric"]]
+        expected = [
+            f"{100 * row.error_m:.1f}, {100 * row.crashes:.0f} %"
+            for row in rows.itertuples(index=False)
+        ]
+        assert cells.replace("–", "nan") == " | ".join(expected)
+
+
+def test_the_curriculum_is_the_one_that_was_measured() -> None:
+    page = (ROOT / "docs" / "transfer.md").read_text().replace("−", "-")
+    lines = pd.read_csv(RESULTS / "transfer" / "curriculum.csv")
+    assert len(lines) >= 10
+    for row in lines.itertuples(index=False):
+        assert f"| {row.row} | {row.seed} | {100 * row.crashes:.0f} % | {row[3]} |" in page
