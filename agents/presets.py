@@ -260,9 +260,19 @@ _HOVER: Final = PPOConfig(
     hidden=(64, 64), activation="tanh", learning_rate=0.003, anneal=True, gamma=0.98,
     gae_lambda=0.95, log_std=-1.0, steps_per_update=4096, epochs=4, minibatches=16,
 )  # fmt: skip
+_LARGE: Final = replace(_HOVER, steps_per_update=16_384, minibatches=32)  # of 512 drones
 _OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {
     ("ppo", "tuned", "rotorgram/Hover-v0"): Preset(
         config=_HOVER, num_envs=128, env_steps=1_000_000
+    ),
+    ("ppo", "tuned", "rotorgram/Waypoints-v0"): Preset(
+        config=_LARGE, num_envs=512, env_steps=3_000_000, backend="rigid"
+    ),
+    ("ppo", "tuned", "rotorgram/Tracking-v0"): Preset(
+        config=_LARGE, num_envs=512, env_steps=1_000_000, backend="rigid"
+    ),
+    ("ppo", "tuned", "rotorgram/Racing-v0"): Preset(
+        config=_LARGE, num_envs=512, env_steps=1_500_000, backend="rigid"
     ),
     ("sac", "tuned", "rotorgram/Hover-v0"): Preset(
         config=SACConfig(

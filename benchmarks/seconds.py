@@ -1,7 +1,7 @@
 """Wall time from process start to a policy that holds, by `rotorgram train`, over many seeds.
 
     python benchmarks/seconds.py [--seeds 20] [--first-seed 100] [--out FILE.json]
-        [-- ppo --env rotorgram/Hover-v0 …]
+        [--beside geometric] [-- ppo --env rotorgram/Hover-v0 …]
 
 After `--` are the words of `rotorgram train`; without any, PPO on the paper's task, with its tuned
 preset. The clock runs from before the process starts to after it has ended, with its checkpoint
@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rotorgram.agents import load
+from rotorgram.agents import CONTROLLERS, load
 from rotorgram.agents.checkpoints import software_versions
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.experiments.metrics import Headline, steady_state
@@ -50,21 +50,25 @@ def processor_seconds() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def evaluate(folder: Path, vehicle: str | None, within: float) -> dict[str, Any]:
-    """Steady size of the headline metric and return, means over episodes; crashes; the verdict."""
-    kept = load(folder / "checkpoint.safetensors")
-    env: Any = LocalVectorEnv(kept.env_id, EPISODES, autoreset_mode="Disabled", vehicle=vehicle,
-                              **kept.options)  # fmt: skip
-    flown = fly_episodes(env, kept.policy(env.env_spec), EPISODES, "final")
+def evaluate(agent: Any, env_id: str, within: float, vehicle: str | None) -> dict[str, Any]:
+    """Of a `Checkpoint`, or of a controller by its name: steady size of the headline metric and
+    return, means over episodes; crashes; the verdict.
+    """
+    options = CONTROLLERS[agent].options if isinstance(agent, str) else agent.options
+    env: Any = LocalVectorEnv(env_id, EPISODES, autoreset_mode="Disabled", vehicle=vehicle,
+                              **options)  # fmt: skip
+    spec = env.env_spec
+    policy = CONTROLLERS[agent](spec) if isinstance(agent, str) else agent.policy(spec)
+    flown = fly_episodes(env, policy, EPISODES, "final")
     env.close()
-    headline = replace(Headline.of(kept.spec), held=within)
+    headline = replace(Headline.of(spec), held=within)
     sizes = [steady_state(headline.size(one.headline[1:]), final=headline.final) for one in flown]
     crashes = 0 if headline.final else sum(bool(one.terminated) for one in flown)
     return {
-        "env_steps": kept.position.env_steps,
         "steady": round(float(np.mean(sizes)), 5),
         "worst": round(float(min(sizes) if headline.high else max(sizes)), 5),
         "return": round(float(np.mean([one.rewards.sum() for one in flown])), 2),
+        "flight_seconds": round(float(np.mean([one.seconds for one in flown])), 2),
         "crashes": crashes,
         "holds": bool(headline.holds(np.mean(sizes))) and not crashes,
     }
@@ -76,32 +80,49 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=100)
     parser.add_argument("--within", type=float, default=0.05)
     parser.add_argument("--vehicle")
+    parser.add_argument("--beside", choices=sorted(CONTROLLERS), nargs="+", default=[],
+                        help="controllers that fly the same starts")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("docs/results/seconds.json"))
     parser.add_argument("words", nargs="*", default=["ppo"])
     args = parser.parse_args()
     words = args.words + (["--vehicle", args.vehicle] if args.vehicle else [])
-    rows = []
+    rows: list[dict[str, Any]] = []
+    beside: dict[str, Any] = {}
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         with tempfile.TemporaryDirectory() as folder:
             row = {"seed": seed, **train(words, seed, Path(folder) / "run")}
-            row |= evaluate(Path(folder) / "run", args.vehicle, args.within)
+            kept = load(Path(folder) / "run" / "checkpoint.safetensors")
+        row["env_steps"] = kept.position.env_steps
+        row |= evaluate(kept, kept.env_id, args.within, args.vehicle)
         row["load_average"] = round(os.getloadavg()[0], 1)
         rows.append(row)
         print(row, flush=True)
+        beside = beside or {
+            name: evaluate(name, kept.env_id, args.within, args.vehicle) for name in args.beside
+        }
+        write(args.out, words, args.within, rows, beside)
+    print(f"{sum(row['holds'] for row in rows)} of {len(rows)} hold {args.within}")
+
+
+def write(
+    path: Path, words: list[str], within: float, rows: list[Any], beside: dict[str, Any]
+) -> None:
+    """After every seed, so that an interrupted measurement has those that were flown."""
     result = {
         "command": f"rotorgram train {' '.join(words)}",
-        "within": args.within,
+        "within": within,
         "hold": sum(row["holds"] for row in rows),
         "of": len(rows),
-        "seconds": {"median": statistics.median(row["seconds"] for row in rows),
-                    "most": max(row["seconds"] for row in rows)},
+        **{name: {"median": round(statistics.median(row[name] for row in rows), 2),
+                  "most": max(row[name] for row in rows)}
+           for name in ("seconds", "processor_seconds")},
         "seeds": rows,
+        **({"beside": beside} if beside else {}),
         "versions": software_versions(),
         "machine": {"cores": os.cpu_count()},
     }  # fmt: skip
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
-    print(f"{result['hold']} of {result['of']} hold {args.within}; seconds {result['seconds']}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(result, indent=2) + "\n")
 
 
 if __name__ == "__main__":
