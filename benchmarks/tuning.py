@@ -34,13 +34,12 @@ PPO: Final[dict[str, Any]] = {
 _MORE: Final = {"env_steps": 300_000, "steps_per_update": 1024}
 _FAST: Final = {**_MORE, "learning_rate": 0.005}
 _WIDE: Final = {"drones": 128, "steps_per_update": 4096, "minibatches": 16}
-_SHORT: Final = {"env_steps": 300_000}
 _LARGE: Final = {**_WIDE, "backend": "rigid", "drones": 512, "steps_per_update": 16_384,
                  "minibatches": 32, "env_steps": 1_000_000}  # fmt: skip
+_HALF: Final = {**_LARGE, "drones": 256, "steps_per_update": 8192, "env_steps": 600_000}
 _FAR: Final = {**_LARGE, "gamma": 0.99}
 _THROWN: Final = {**_LARGE, "log_std": 0.0, "normalize_observations": True}
-_SMALL: Final = {"options": "", "backend": "mujoco", **_SHORT}
-_BATCH: Final = {"options": "", **_LARGE}
+_COURSE: Final = {"options": "", **_LARGE}
 POINTS: Final[dict[tuple[str, str], list[dict[str, Any]]]] = {
     ("ppo", "Hover-v0"): [
         {},
@@ -60,34 +59,15 @@ POINTS: Final[dict[tuple[str, str], list[dict[str, Any]]]] = {
         {**_WIDE, "env_steps": 600_000},
         {**_WIDE, "env_steps": 1_000_000},
     ],
-    ("ppo", "Waypoints-v0"): [
-        _SMALL,
-        {**_SMALL, "action": "rates", "log_std": -2.0},
-        {**_SMALL, "action": "attitude"},
-        {**_SMALL, "action": "velocity"},
-        {**_SMALL, "env_steps": 700_000},
-        {**_SMALL, "env_steps": 700_000, "gamma": 0.99, "normalize_observations": True},
-        {**_BATCH, "env_steps": 2_000_000},
-        {**_BATCH, "env_steps": 3_000_000},
-    ],
-    ("ppo", "Tracking-v0"): [
-        _SMALL,
-        {**_BATCH, "env_steps": 1_000_000},
-        {**_BATCH, "env_steps": 1_000_000, "options": "trajectory=lemniscate"},
-        {**_BATCH, "env_steps": 1_000_000, "options": "trajectory=snap"},
-        {**_SMALL, "action": "attitude"},
-    ],
+    ("ppo", "Waypoints-v0"): [{**_LARGE, "env_steps": 2_000_000}],
+    ("ppo", "Tracking-v0"): [_COURSE, {**_COURSE, "options": "trajectory=lemniscate"}],
     ("ppo", "Racing-v0"): [
-        _SMALL,
-        {**_SMALL, "env_steps": 700_000},
-        {**_BATCH, "env_steps": 1_500_000},
-        {**_BATCH, "env_steps": 1_500_000, "options": "track=dive"},
-        {**_SMALL, "action": "attitude"},
-        {**_SMALL, "action": "velocity"},
+        {**_COURSE, "env_steps": 1_500_000},
+        {**_COURSE, "env_steps": 1_500_000, "options": "track=dive"},
     ],
     ("ppo", "Landing-v0"): [
         _FAR,
-        {**_LARGE},
+        _LARGE,
         {**_FAR, "env_steps": 2_500_000},
         {**_FAR, "env_steps": 3_000_000},
         {**_FAR, "env_steps": 1_500_000, "vf_coef": 0.02},
@@ -95,7 +75,12 @@ POINTS: Final[dict[tuple[str, str], list[dict[str, Any]]]] = {
     ],
     ("ppo", "Recovery-v0"): [
         {**_WIDE, "env_steps": 300_000},
-        {**_THROWN},
+        {**_HALF, "env_steps": 300_000, "minibatches": 16},
+        {**_HALF, "normalize_observations": True},
+        {**_HALF, "normalize_observations": True, "gamma": 0.99},
+        {**_HALF, "log_std": 0.0},
+        {**_HALF, "log_std": 0.0, "normalize_observations": True},
+        _THROWN,
         {**_THROWN, "learning_rate": 0.005},
         {**_THROWN, "gamma": 0.97},
         {**_THROWN, "gamma": 0.99},
@@ -168,6 +153,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     points = POINTS[args.algorithm, args.task]
+    names = dict.fromkeys(name for point in points for name in (*PPO, *point))
     name = f"{args.algorithm}_{args.task.split('-')[0].lower()}.csv"
     out = args.out or Path("docs/results/tuning") / name
     for point in range(len(points)) if args.points is None else args.points:
@@ -175,7 +161,7 @@ def main() -> None:
             settings = {**PPO, **points[point]}
             layers = " ".join(map(str, settings["hidden"]))
             result = measure(args.algorithm, args.task, settings, seed)
-            row = {"point": point, **settings, "hidden": layers, **result}
+            row = {"point": point, **names, **settings, "hidden": layers, **result}
             print(row, flush=True)
             fresh = not out.exists()
             with out.open("a", newline="") as file:
