@@ -87,6 +87,7 @@ POINTS: Final[dict[tuple[str, str], list[dict[str, Any]]]] = {
         {**_THROWN, "env_steps": 1_500_000},
         {**_THROWN, "env_steps": 1_500_000, "vf_coef": 0.005},
         {**_THROWN, "env_steps": 2_500_000},
+        {**_THROWN, "env_steps": 2_500_000, "activation": "relu"},
         {**_THROWN, "env_steps": 3_000_000},
         {**_THROWN, "env_steps": 3_000_000, "gamma": 0.99},
         {**_THROWN, "env_steps": 5_000_000},
