@@ -263,16 +263,22 @@ _HOVER: Final = PPOConfig(
     gae_lambda=0.95, log_std=-1.0, steps_per_update=4096, epochs=4, minibatches=16,
 )  # fmt: skip
 _HOLD: Final = Preset(config=_HOVER, num_envs=128, env_steps=1_000_000)
-_WIDE: Final = replace(_HOVER, steps_per_update=16_384, minibatches=32)  # of 512 drones
+
+
+def _large(env_steps: int, **changes: Any) -> Preset:
+    config = replace(_HOVER, steps_per_update=16_384, minibatches=32, **changes)
+    return Preset(config=config, num_envs=512, env_steps=env_steps, backend="rigid")
+
+
 _OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {
     ("ppo", "tuned", "rotorgram/Hover-v0"): _HOLD,
     ("ppo", "tuned", "rotorgram/PayloadHover-v0"): _HOLD,
-    ("ppo", "tuned", "rotorgram/Landing-v0"): Preset(
-        config=replace(_WIDE, gamma=0.99), num_envs=512, env_steps=4_000_000, backend="rigid"
-    ),
-    ("ppo", "tuned", "rotorgram/Recovery-v0"): Preset(
-        config=replace(_WIDE, log_std=0.0, normalize_observations=True),
-        num_envs=512, env_steps=3_000_000, backend="rigid",
+    ("ppo", "tuned", "rotorgram/Tracking-v0"): _large(1_000_000),
+    ("ppo", "tuned", "rotorgram/Racing-v0"): _large(1_500_000),
+    ("ppo", "tuned", "rotorgram/Waypoints-v0"): _large(3_000_000),
+    ("ppo", "tuned", "rotorgram/Landing-v0"): _large(4_000_000, gamma=0.99),
+    ("ppo", "tuned", "rotorgram/Recovery-v0"): _large(
+        3_000_000, log_std=0.0, normalize_observations=True
     ),
     ("sac", "tuned", "rotorgram/Hover-v0"): Preset(
         config=SACConfig(

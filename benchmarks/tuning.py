@@ -34,18 +34,12 @@ PPO: Final[dict[str, Any]] = {
 _MORE: Final = {"env_steps": 300_000, "steps_per_update": 1024}
 _FAST: Final = {**_MORE, "learning_rate": 0.005}
 _WIDE: Final = {"drones": 128, "steps_per_update": 4096, "minibatches": 16}
-_SHORT: Final = {"env_steps": 300_000}
 _LARGE: Final = {**_WIDE, "backend": "rigid", "drones": 512, "steps_per_update": 16_384,
                  "minibatches": 32, "env_steps": 1_000_000}  # fmt: skip
 _HALF: Final = {**_LARGE, "drones": 256, "steps_per_update": 8192, "env_steps": 600_000}
 _FAR: Final = {**_LARGE, "gamma": 0.99}
 _THROWN: Final = {**_LARGE, "log_std": 0.0, "normalize_observations": True}
-_LEVELS: Final = [
-    {**_SHORT, "action": "rates", "log_std": -2.0},
-    {**_SHORT, "action": "attitude"},
-    {**_SHORT, "action": "velocity"},
-    {**_SHORT, "action": "position"},
-]
+_COURSE: Final = {"options": "", **_LARGE}
 POINTS: Final[dict[tuple[str, str], list[dict[str, Any]]]] = {
     ("ppo", "Hover-v0"): [
         {},
@@ -65,23 +59,11 @@ POINTS: Final[dict[tuple[str, str], list[dict[str, Any]]]] = {
         {**_WIDE, "env_steps": 600_000},
         {**_WIDE, "env_steps": 1_000_000},
     ],
-    ("ppo", "Waypoints-v0"): [
-        _SHORT,
-        *_LEVELS,
-        {**_SHORT, "gamma": 0.99},
-        {**_SHORT, "normalize_observations": True},
-    ],
-    ("ppo", "Tracking-v0"): [
-        _SHORT,
-        *_LEVELS,
-        {**_SHORT, "gamma": 0.96},
-        {**_SHORT, "normalize_observations": True},
-    ],
+    ("ppo", "Waypoints-v0"): [{**_LARGE, "env_steps": 2_000_000}],
+    ("ppo", "Tracking-v0"): [_COURSE, {**_COURSE, "options": "trajectory=lemniscate"}],
     ("ppo", "Racing-v0"): [
-        _SHORT,
-        *_LEVELS,
-        {**_SHORT, "gamma": 0.99},
-        {**_SHORT, "normalize_observations": True},
+        {**_COURSE, "env_steps": 1_500_000},
+        {**_COURSE, "env_steps": 1_500_000, "options": "track=dive"},
     ],
     ("ppo", "Landing-v0"): [
         _FAR,
@@ -134,6 +116,7 @@ def measure(algorithm: str, task: str, settings: dict[str, Any], seed: int) -> d
     config = dict(settings)
     drones, env_steps = config.pop("drones"), config.pop("env_steps")
     options, backend = {"action": config.pop("action")}, config.pop("backend", "mujoco")
+    options |= dict(word.split("=") for word in config.pop("options", "").split())
 
     def make(count: int, backend: str = "mujoco") -> Any:
         settings = {"num_threads": 1} if backend == "mujoco" else {"backend": backend}

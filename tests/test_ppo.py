@@ -223,6 +223,8 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     hover = find_preset("ppo", "tuned", "rotorgram/Hover-v0")
     assert (hover.num_envs, hover.config.hidden) == (128, (64, 64))
     assert find_preset("sb3-ppo", "tuned", "rotorgram/Hover-v0") == hover
+    racing = find_preset("ppo", "tuned", "rotorgram/Racing-v0")
+    assert (racing.num_envs, racing.backend, racing.config.hidden) == (512, "rigid", (64, 64))
     assert find_preset("ppo", "tuned", "other/Task-v0") == ours
     with pytest.raises(InputError, match=r"preset: expected one of \['tuned'\], got 'paper'"):
         find_preset("ppo", "paper")

@@ -84,7 +84,7 @@ def test_a_lap_by_hand() -> None:
     task = begun(laps=2)
     outcome = moved(task, 1.5, 0.0, 5.0, body_rates=(3.0, 0.0, 4.0))
     assert {name: float(value) for name, value in outcome.reward.items()} == pytest.approx(
-        {"progress": 1.5, "passing": 0.0, "rates": -0.1, "termination": 0.0}
+        {"progress": 1.5, "passing": 0.0, "rates": -0.01, "termination": 0.0}
     )
     outcome = moved(task, 2.5, 0.0, 5.0)  # 0.5 m before the gate, 0.5 m behind it
     assert outcome.reward["progress"] == pytest.approx(0.0, abs=1e-12)
@@ -117,7 +117,7 @@ def test_a_lap_by_hand() -> None:
 def test_ends(place: Any, rest: dict[str, Any], ends: bool) -> None:
     outcome = moved(begun(), *place, **rest)
     assert bool(outcome.terminated) == ends
-    assert outcome.reward["termination"] == (-20.0 if ends else 0.0)
+    assert outcome.reward["termination"] == (-5.0 if ends else 0.0)
 
 
 def test_a_track_of_a_file_crosses_the_wire(tmp_path: Path) -> None:

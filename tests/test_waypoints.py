@@ -59,7 +59,7 @@ def test_progress_and_passing_by_hand() -> None:
     task = begun(MIDDLE, EAST, ABOVE, radius=0.5)
     outcome = moved(task, 1.0, 0.0, 5.0, body_rates=(3.0, 0.0, 4.0))
     assert {name: float(value) for name, value in outcome.reward.items()} == pytest.approx(
-        {"progress": 1.0, "passing": 0.0, "rates": -0.1, "termination": 0.0}
+        {"progress": 1.0, "passing": 0.0, "rates": -0.01, "termination": 0.0}
     )
     assert moved(task, 0.5, 0.0, 5.0).reward["progress"] == pytest.approx(-0.5)
     assert moved(task, 2.5, 0.0, 5.0).metrics["points_left"] == 2  # 0.5 m away is not nearer
@@ -94,7 +94,7 @@ def test_ends(place: tuple[float, float, float], rest: dict[str, Any], ends: boo
     task = begun(MIDDLE, (0.0, 0.0, 0.0), ABOVE)
     outcome = moved(task, *place, **rest)
     assert bool(outcome.terminated) == ends
-    assert outcome.reward["termination"] == (-20.0 if ends else 0.0)
+    assert outcome.reward["termination"] == (-5.0 if ends else 0.0)
 
 
 def test_points_of_others_stay() -> None:

@@ -14,6 +14,9 @@ from .task import Task, finite
 ERROR_SCALE: Final = 0.5  # Distance at which the reward for nearness crosses zero, m
 RATE_WEIGHT: Final = 0.02  # Cost of a body rate of 1 rad/s
 TERMINATION_REWARD: Final = -20.0  # Added to the reward of the step that terminates an episode
+PASSING_REWARD: Final = 1.0  # Of a course: added in a step in which a point or gate is passed
+COURSE_RATE_WEIGHT: Final = 0.002  # Of a course: cost of a body rate of 1 rad/s in a step
+COURSE_TERMINATION_REWARD: Final = -5.0  # Of a course: for an end before its own
 LEAST_TILT_COSINE: Final = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
 AIR: Final = 0.6  # Least room under a craft that starts, m

@@ -15,10 +15,11 @@ from ...sim import Array, Draw, Pose, WorldState, clip, component, constant, eac
 from ..spec import Metric
 from .flight import (
     AIR,
+    COURSE_RATE_WEIGHT,
+    COURSE_TERMINATION_REWARD,
     FURTHEST,
     LEAST_TILT_COSINE,
-    RATE_WEIGHT,
-    TERMINATION_REWARD,
+    PASSING_REWARD,
     Flight,
     length,
 )
@@ -27,7 +28,6 @@ from .task import Outcome, TaskOptions, check_number, check_whole, finite
 TRACKS: Final = Path(__file__).parent.parent / "tracks"
 MOST_GATES: Final = 64
 MOST_LAPS: Final = 1000
-PASSING_REWARD: Final = 1.0  # Added to the reward of a step in which a gate is passed
 _WAY: Final = "a track of ours, a TOML file of gates, or its content as JSON"
 
 
@@ -100,8 +100,9 @@ class Racing(Flight):
     ## Reward
 
     By how much the craft came nearer to the centre of the gate in this step, 1/m, the progress of
-    Song et al. 2021 (arXiv 2103.08624); 1 on the step that passes it; -0.02 s/rad times
-    the size of the body rates; and -20 on a step that terminates with gates left.
+    Song et al. 2021 (arXiv 2103.08624); 1 on the step that passes it; -0.002 s/rad times
+    the size of the body rates; and -5 on a step that terminates with gates left. The last two
+    weights are those of `Waypoints`.
 
     A gate is passed in a step whose straight way goes through its opening in its direction; one
     gate in a step at most.
@@ -221,8 +222,8 @@ class Racing(Flight):
             reward={
                 "progress": self._progress,
                 "passing": PASSING_REWARD * self._passing,
-                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
-                "termination": (crashed & (left > 0.5)) * TERMINATION_REWARD + 0.0,
+                "rates": -COURSE_RATE_WEIGHT * length(self.xp, state.body_rates),
+                "termination": (crashed & (left > 0.5)) * COURSE_TERMINATION_REWARD + 0.0,
             },
             terminated=crashed | (left < 0.5),
             metrics={"gates_left": left, "flight_time": self._time, "lap_time": self._lap},

@@ -9,10 +9,11 @@ from ...sim import Array, Draw, Pose, WorldState, component, each, plain, stack
 from ..spec import Metric
 from .flight import (
     AIR,
+    COURSE_RATE_WEIGHT,
+    COURSE_TERMINATION_REWARD,
     FURTHEST,
     LEAST_TILT_COSINE,
-    RATE_WEIGHT,
-    TERMINATION_REWARD,
+    PASSING_REWARD,
     Flight,
     at,
     check_point,
@@ -20,7 +21,6 @@ from .flight import (
 )
 from .task import Outcome, TaskOptions, check_number, check_whole
 
-PASSING_REWARD: Final = 1.0  # Added to the reward of a step in which a point is reached
 MOST_POINTS: Final = 64
 
 
@@ -77,8 +77,9 @@ class Waypoints(Flight):
     ## Reward
 
     By how much the craft came nearer to the point in this step, 1/m; 1 on the step that reaches
-    it; -0.02 s/rad times the size of the body rates; and -20 on a step that terminates with points
-    left.
+    it; -0.002 s/rad times the size of the body rates; and -5 on a step that terminates with points
+    left. Progress pays 1 for a metre, not for a step: with the weights of Hover, 0.02 s/rad and
+    -20, a turn costs more than it brings, and a craft that hovers loses nothing.
 
     ## Metrics
 
@@ -160,8 +161,8 @@ class Waypoints(Flight):
             reward={
                 "progress": self._progress,
                 "passing": PASSING_REWARD * self._passed,
-                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
-                "termination": (crashed & (left > 0.5)) * TERMINATION_REWARD + 0.0,
+                "rates": -COURSE_RATE_WEIGHT * length(self.xp, state.body_rates),
+                "termination": (crashed & (left > 0.5)) * COURSE_TERMINATION_REWARD + 0.0,
             },
             terminated=crashed | finished,
             metrics={"points_left": left, "flight_time": self._time},
