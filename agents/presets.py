@@ -202,9 +202,9 @@ class APGConfig(_Config):
     tail: int = 20
     """Last steps of these, and before a truncation, whose actions move no weight: their
     consequences are not seen."""
-    minibatches: int = 4
+    minibatches: int = 6
     """Parts of the other steps, each for one step of Adam."""
-    crash_cost: float = 5.0
+    crash_cost: float = 20.0
     """Reward that an episode's termination counts as less, smoothed over states that are near."""
     max_grad_norm: float = 1.0
     """The gradient, as one vector, is scaled down to this length."""
@@ -261,7 +261,7 @@ _SACS: Final = {
     )
 }  # fmt: skip
 _APGS: Final = {
-    "tuned": Preset(config=APGConfig(), num_envs=256, env_steps=600_000, backend="rigid")
+    "tuned": Preset(config=APGConfig(), num_envs=512, env_steps=1_200_000, backend="rigid")
 }
 # The references get the very same settings: only the implementation differs.
 PRESETS: Final[dict[str, dict[str, Preset]]] = {

@@ -1,11 +1,11 @@
-"""What was tried for PPO on Hover-v0: each point, changes to one base, on a few seeds.
+"""What was tried for PPO and APG on Hover-v0: each point, changes to one base, on a few seeds.
 
-    OMP_NUM_THREADS=1 python benchmarks/hover_tuning.py [--points 0 3] [--seeds 0 1]
+    OMP_NUM_THREADS=1 python benchmarks/hover_tuning.py [ppo|apg] [--points 0 3] [--seeds 0 1]
 
-Training flies in this process on `mujoco`. Each policy then flies 50 episodes: an error is the mean
-distance over the last 50 of 250 steps, and infinite if the episode crashes. A row a seed is
-added to docs/results/tuning/ppo_hover.csv, or to `--out`. Seconds are of processor time, for the
-machine was busy; early rows have none.
+Training flies in this process on `mujoco`, that of APG on `rigid`. Each policy then flies 50
+episodes: an error is the mean distance over the last 50 of 250 steps, and infinite if the episode
+crashes. A row a seed is added to docs/results/tuning/ALGORITHM_hover.csv, or to `--out`. Seconds
+are of processor time, for the machine was busy; early rows have none.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from rotorgram.agents import EpisodeLog, PPOConfig, make_agent
+from rotorgram.agents import EpisodeLog, make_agent, preset
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.experiments.trajectories import fly_episodes
 
@@ -45,14 +45,24 @@ POINTS: Final[list[dict[str, Any]]] = [
     {"drones": 128, "env_steps": 600_000, "steps_per_update": 4096, "minibatches": 16},
     {"drones": 128, "env_steps": 1_000_000, "steps_per_update": 4096, "minibatches": 16},
 ]
+APG_BASE: Final[dict[str, Any]] = {
+    "drones": 256, "env_steps": 400_000, "hidden": (64, 64), "horizon": 64, "tail": 20,
+    "minibatches": 4, "crash_cost": 5.0, "learning_rate": 0.005, "gamma": 0.99,
+}  # fmt: skip
+APG_POINTS: Final[list[dict[str, Any]]] = [
+    {"tail": 0, "crash_cost": 0.0},
+    {"crash_cost": 0.0},
+    {},
+]
 
 
-def measure(settings: dict[str, Any], seed: int) -> dict[str, Any]:
+def measure(algorithm: str, settings: dict[str, Any], seed: int) -> dict[str, Any]:
     config = dict(settings)
     drones, env_steps = config.pop("drones"), config.pop("env_steps")
-    env: Any = LocalVectorEnv(ENV, drones, autoreset_mode="Disabled", num_threads=1)
+    flown_on: Any = {"backend": "rigid"} if algorithm == "apg" else {"num_threads": 1}
+    env: Any = LocalVectorEnv(ENV, drones, autoreset_mode="Disabled", **flown_on)
     log = EpisodeLog(env, seed)
-    agent = make_agent("ppo", log, PPOConfig(**config, anneal=True), seed)
+    agent = make_agent(algorithm, log, preset(algorithm, "tuned", ENV, **config), seed)
     began = time.process_time()
     agent.train(log, env_steps, lambda: True)
     seconds = time.process_time() - began
@@ -69,18 +79,22 @@ def measure(settings: dict[str, Any], seed: int) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--points", type=int, nargs="+", default=range(len(POINTS)))
+    parser.add_argument("algorithm", nargs="?", choices=("ppo", "apg"), default="ppo")
+    parser.add_argument("--points", type=int, nargs="+")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
-    parser.add_argument("--out", type=Path, default=Path("docs/results/tuning/ppo_hover.csv"))
+    parser.add_argument("--out", type=Path)
     args = parser.parse_args()
+    base, points = (BASE, POINTS) if args.algorithm == "ppo" else (APG_BASE, APG_POINTS)
+    out = args.out or Path(f"docs/results/tuning/{args.algorithm}_hover.csv")
     for seed in args.seeds:
-        for point in args.points:
-            settings = {**BASE, **POINTS[point]}
+        for point in args.points or range(len(points)):
+            settings = {**base, **points[point]}
             layers = " ".join(map(str, settings["hidden"]))
-            row = {"point": point, **settings, "hidden": layers, **measure(settings, seed)}
+            found = measure(args.algorithm, settings, seed)
+            row = {"point": point, **settings, "hidden": layers, **found}
             print(row, flush=True)
-            fresh = not args.out.exists()
-            with args.out.open("a", newline="") as file:
+            fresh = not out.exists()
+            with out.open("a", newline="") as file:
                 writer = csv.DictWriter(file, row.keys(), lineterminator="\n")
                 if fresh:
                     writer.writeheader()
