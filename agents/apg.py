@@ -104,6 +104,8 @@ class APG(Learner):
             weight = torch.where(torch.from_numpy(ended | done), 1.0, weight * gamma)
         (cost * danger - total).backward()  # type: ignore[no-untyped-call]
         self._loop.detach()
+        if env.done.any():  # a checkpoint has running episodes only
+            log.begin(env.done)
         observations, weights, terminated, ended, flew = map(np.array, zip(*rows, strict=True))
         by_outputs: Any = nudges.grad
         slopes = by_outputs.numpy() / weights[..., np.newaxis]

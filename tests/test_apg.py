@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rotorgram.agents import EpisodeLog, make_agent
+from rotorgram.agents import EpisodeLog, load, make_agent, store
 from rotorgram.agents.apg import near_end, steps_left
 from rotorgram.agents.presets import APGConfig
 from rotorgram.cli import main
@@ -147,15 +147,18 @@ def test_it_climbs() -> None:
     assert np.mean(gains[-3:]) < np.mean(gains[:3]) - 0.02  # minus the gain
 
 
-def test_it_resumes_to_the_bit() -> None:
+@pytest.mark.parametrize("length", [25, 20])
+def test_it_resumes_to_the_bit(length: int, tmp_path: Path) -> None:
+    """After two updates of 10 steps, in the middle of an episode and just after its end."""
     config = APGConfig(horizon=10, tail=4, hidden=(8,))
     run = Run(env_id=HOVER, backend="rigid", algorithm="apg", config=config, seed=1,
-              env_steps=320, num_envs=8, options={"episode_length": 25})  # fmt: skip
-    whole, part = (Training(run, env_of(8, episode_length=25)) for _ in range(2))
+              env_steps=320, num_envs=8, options={"episode_length": length})  # fmt: skip
+    whole, part = (Training(run, env_of(8, episode_length=length)) for _ in range(2))
     whole.train()
     updates = []
     assert not part.train(lambda: updates.append(0) or len(updates) < 2)
-    rest = Training.resume(part.checkpoint(), env_of(8, episode_length=25))
+    store(part.checkpoint(), tmp_path / "kept")
+    rest = Training.resume(load(tmp_path / "kept"), env_of(8, episode_length=length))
     rest.train()
     for name, array in whole.agent.state().items():
         assert rest.agent.state()[name].tobytes() == array.tobytes(), name
