@@ -68,6 +68,28 @@ def evaluate(folder: Path, vehicle: str | None, episodes: int) -> dict[str, Any]
     }
 
 
+def write(
+    path: Path, words: list[str], within: float, episodes: int, rows: list[dict[str, Any]]
+) -> None:
+    """The file of the seeds until now: a run that is stopped keeps them."""
+    result = {
+        "command": f"rotorgram train {' '.join(words)}",
+        "within": within,
+        "hold": sum(row["holds"] for row in rows),
+        "of": len(rows),
+        "episodes": episodes,
+        "seconds": {"median": statistics.median(row["seconds"] for row in rows),
+                    "most": max(row["seconds"] for row in rows),
+                    "processor": statistics.median(row["processor"] for row in rows)},
+        "seeds": rows,
+        "versions": software_versions(),
+        "machine": {"cores": os.cpu_count()},
+    }  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(result, indent=2) + "\n")
+    print(f"{result['hold']} of {result['of']} hold {within}; seconds {result['seconds']}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20)
@@ -89,22 +111,7 @@ def main() -> None:
         row["load_average"] = round(os.getloadavg()[0], 1)
         rows.append(row)
         print(row, flush=True)
-    result = {
-        "command": f"rotorgram train {' '.join(words)}",
-        "within": args.within,
-        "hold": sum(row["holds"] for row in rows),
-        "of": len(rows),
-        "episodes": args.episodes,
-        "seconds": {"median": statistics.median(row["seconds"] for row in rows),
-                    "most": max(row["seconds"] for row in rows),
-                    "processor": statistics.median(row["processor"] for row in rows)},
-        "seeds": rows,
-        "versions": software_versions(),
-        "machine": {"cores": os.cpu_count()},
-    }  # fmt: skip
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
-    print(f"{result['hold']} of {result['of']} hold {args.within}; seconds {result['seconds']}")
+        write(args.out, words, args.within, args.episodes, rows)
 
 
 if __name__ == "__main__":
