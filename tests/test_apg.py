@@ -191,9 +191,9 @@ def test_what_it_cannot_fly(env_id: str, settings: Any, sentence: str) -> None:
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["train", "apg", "--env", HOVER, "--num-envs", "4", "--out", str(tmp_path / "run")]
-    short = ["--env-steps", "800", "--set", "horizon=50"]
+    short = ["--env-steps", "160", "--set", "horizon=20", "tail=5"]
     assert main([*words, *short]) == 0
-    assert "trained 800 of 800 env steps" in capsys.readouterr().out
+    assert "trained 160 of 160 env steps" in capsys.readouterr().out
     assert main(["evaluate", str(tmp_path / "run"), "--episodes", "1"]) == 0
     assert main([*words[:-1], str(tmp_path / "no"), "--listen", "127.0.0.1:0"]) == 1
     assert "listen: expected no flags of the wire" in capsys.readouterr().err
