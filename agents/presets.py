@@ -31,7 +31,7 @@ _RULES: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
     ("activation", "'relu' or 'tanh'", lambda value: value in ("relu", "tanh")),
     ("gamma gae_lambda", "a number from 0 to 1", lambda value: _is_number(value, 0, 1)),
     ("clip max_grad_norm", "a number above 0", lambda value: _is_number(value, 5e-324)),
-    ("vf_coef ent_coef", "a number, 0 or more", lambda value: _is_number(value, 0)),
+    ("vf_coef ent_coef crash_cost", "a number, 0 or more", lambda value: _is_number(value, 0)),
     ("anneal normalize normalize_observations", "true or false", lambda value: type(value) is bool),
     ("tau", "a number above 0, to 1", lambda value: _is_number(value, 5e-324, 1)),
     ("target_entropy", "a number, or null",
@@ -197,10 +197,23 @@ class APGConfig(_Config):
     """Lower the learning rate linearly to zero over the run."""
     normalize_observations: bool = True
     """Shift and scale each observation by its mean and deviation until now."""
-    horizon: int = 100
+    horizon: int = 64
     """Steps of each drone that an update looks through."""
+    tail: int = 20
+    """Last steps of these, and before a truncation, whose actions move no weight: their
+    consequences are not seen."""
+    minibatches: int = 6
+    """Parts of the other steps, each for one step of Adam."""
+    crash_cost: float = 20.0
+    """Reward that an episode's termination counts as less, smoothed over states that are near."""
     max_grad_norm: float = 1.0
     """The gradient, as one vector, is scaled down to this length."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        right = type(self.tail) is int and 0 <= self.tail < self.horizon
+        expected = f"a whole number from 0, below horizon ({self.horizon})"
+        expect(right, "tail", expected, f"{self.tail!r}")
 
     def rollout_size(self, drones: int) -> int:
         """Env steps between updates: `horizon` of each drone."""
@@ -250,7 +263,7 @@ _SACS: Final = {
     )
 }  # fmt: skip
 _APGS: Final = {
-    "tuned": Preset(config=APGConfig(), num_envs=64, env_steps=1_000_000, backend="rigid")
+    "tuned": Preset(config=APGConfig(), num_envs=512, env_steps=1_200_000, backend="rigid")
 }
 # The references get the very same settings: only the implementation differs.
 PRESETS: Final[dict[str, dict[str, Preset]]] = {

@@ -1,14 +1,14 @@
 """Wall time from process start to a policy that holds, by `rotorgram train`, over many seeds.
 
-    python benchmarks/seconds.py [--seeds 20] [--first-seed 100] [--out FILE.json]
-        [--beside geometric] [-- ppo --env rotorgram/Hover-v0 …]
+    python benchmarks/seconds.py [--seeds 20] [--first-seed 100] [--episodes 20]
+        [--out FILE.json] [--beside geometric] [-- ppo --env rotorgram/Hover-v0 …]
 
 After `--` are the words of `rotorgram train`; without any, PPO on the paper's task, with its tuned
 preset. The clock runs from before the process starts to after it has ended, with its checkpoint
 written. Processor seconds are of all its processes: on a busy machine compare these. Each policy
-then flies 20 episodes on `mujoco`, of starts that no training has seen. A seed holds if the mean of
-the steady headline metric over the episodes is on the good side of `--within`, and none of them
-crashes; for a metric whose last value counts, as `landed`, the mean alone decides.
+then flies 20 `--episodes` on `mujoco`, of starts that no training has seen. A seed holds if the
+mean of the steady headline metric over the episodes is on the good side of `--within`, and none of
+them crashes; for a metric whose last value counts, as `landed`, the mean alone decides.
 """
 
 import argparse
@@ -31,8 +31,6 @@ from rotorgram.envs import LocalVectorEnv
 from rotorgram.experiments.metrics import Headline, steady_state
 from rotorgram.experiments.trajectories import fly_episodes
 
-EPISODES = 20
-
 
 def train(words: list[str], seed: int, folder: Path) -> dict[str, float]:
     """Wall time and processor time of a training, s."""
@@ -50,16 +48,18 @@ def processor_seconds() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def evaluate(agent: Any, env_id: str, within: float, vehicle: str | None) -> dict[str, Any]:
+def evaluate(
+    agent: Any, env_id: str, within: float, vehicle: str | None, episodes: int
+) -> dict[str, Any]:
     """Of a `Checkpoint`, or of a controller by its name: steady size of the headline metric and
     return, means over episodes; crashes; the verdict.
     """
     options = CONTROLLERS[agent].options if isinstance(agent, str) else agent.options
-    env: Any = LocalVectorEnv(env_id, EPISODES, autoreset_mode="Disabled", vehicle=vehicle,
+    env: Any = LocalVectorEnv(env_id, episodes, autoreset_mode="Disabled", vehicle=vehicle,
                               **options)  # fmt: skip
     spec = env.env_spec
     policy = CONTROLLERS[agent](spec) if isinstance(agent, str) else agent.policy(spec)
-    flown = fly_episodes(env, policy, EPISODES, "final")
+    flown = fly_episodes(env, policy, episodes, "final")
     env.close()
     headline = replace(Headline.of(spec), held=within)
     sizes = [steady_state(headline.size(one.headline[1:]), final=headline.final) for one in flown]
@@ -78,6 +78,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=100)
+    parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--within", type=float, default=0.05)
     parser.add_argument("--vehicle")
     parser.add_argument("--beside", choices=sorted(CONTROLLERS), nargs="+", default=[],
@@ -93,12 +94,13 @@ def main() -> None:
             row = {"seed": seed, **train(words, seed, Path(folder) / "run")}
             kept = load(Path(folder) / "run" / "checkpoint.safetensors")
         row["env_steps"] = kept.position.env_steps
-        row |= evaluate(kept, kept.env_id, args.within, args.vehicle)
+        row |= evaluate(kept, kept.env_id, args.within, args.vehicle, args.episodes)
         row["load_average"] = round(os.getloadavg()[0], 1)
         rows.append(row)
         print(row, flush=True)
         beside = beside or {
-            name: evaluate(name, kept.env_id, args.within, args.vehicle) for name in args.beside
+            name: evaluate(name, kept.env_id, args.within, args.vehicle, args.episodes)
+            for name in args.beside
         }
         write(args.out, words, args.within, rows, beside)
     print(f"{sum(row['holds'] for row in rows)} of {len(rows)} hold {args.within}")

@@ -224,6 +224,8 @@ class BoardRow(EnvConfig):
             usual = find_preset(self.agent, self.preset, self.env_id)
             for name in ("env_steps", "num_envs"):
                 object.__setattr__(self, name, getattr(self, name) or getattr(usual, name))
+            if self.agent == "apg":  # which flies no other
+                object.__setattr__(self, "backend", usual.backend)
         expect(is_known(self.env_id), "env_id", "a registered id", self.env_id)
         expect(env_spec(**self.env).headline, "env_id", "one that names a metric", self.env_id)
         if not self.controller:
@@ -251,7 +253,6 @@ class BoardRow(EnvConfig):
 
     def run(self, seed: int) -> Run:
         """The training of a seed."""
-        _check_wired(self.agent)
         names = ("env_steps", "num_envs", "backend")
         shared = {**{name: getattr(self, name) for name in names}, **self.env}
         config = preset(self.agent, self.preset, self.env_id)
