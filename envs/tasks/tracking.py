@@ -217,10 +217,10 @@ class Tracking(Flight):
         vehicle = self.vehicle
         lift = float(vehicle.allocation[0] @ vehicle.thrust_high) / vehicle.mass
         free = math.sqrt(max(lift**2 - vehicle.gravity**2, 1e-12))
-        return len(times) * self.options.control_period * math.sqrt(largest / free)
+        return float(len(times) * self.options.control_period * math.sqrt(largest / free))
 
     def _asked(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Times, s, shape (L,), and accelerations, m/s², shape (L, 3), of what may have to be flown.
+        """Times, s, shape (L,), and accelerations, m/s², shape (L, 3), that may have to be flown.
 
         Of a file these are the second differences of its rows. Of a `snap` the acceleration at any
         time, and its change, are largest for points at corners of the box: those are tried.
@@ -254,7 +254,7 @@ class Tracking(Flight):
         if not len(times):
             return
         vehicle = self.vehicle
-        lift = accelerations + (0.0, 0.0, vehicle.gravity)
+        lift = accelerations + np.array((0.0, 0.0, vehicle.gravity))
         sizes = np.linalg.norm(lift, axis=1)
         limits = (vehicle.thrust_low, vehicle.thrust_high)
         low, high = (float(vehicle.allocation[0] @ limit) for limit in limits)
