@@ -10,11 +10,12 @@ from ..envs.spec import ArraySpec, EnvSpec
 from ..models.errors import expect
 from .policies import flat
 
-GRAVITY: Final = 9.81  # m/s²
+DAMPING: Final = 0.5  # Damping ratio of a payload's swing
 FILTER: Final = 20.0  # Filters forget so many times faster than the position loop answers
 OVER: Final = 2.5  # Gain of the velocity loop over the position loop's: `sim/control/gains.py`
 JUMP: Final = 4.0  # A goal that moves so many times as fast as the craft may was put elsewhere
 _ACTION: Final = ("offset x", "offset y", "offset z", "offset of the heading")
+_PAYLOAD: Final = ("payload - position", "payload velocity - velocity")
 _VECTORS: Final = ("goal - position", "velocity", "thrust axis")
 
 
@@ -26,6 +27,9 @@ class Geometric:
     2... over hover, world frame turned by the wanted heading. Goal and velocity give the velocity
     and acceleration of the goal; thrust and velocity give the acceleration that wind or a payload
     causes. Each is filtered, and stands for the offset at which the loops ask for it.
+
+    Where the observation has payload - position and payload velocity - velocity x, y and z, and the
+    env the options payload_share and cable, horizontal offsets come from `swing_gains`.
 
     Raises `InputError` for an env that lacks what it needs.
     """
@@ -39,8 +43,10 @@ class Geometric:
         level = "actions of the level position (--env.action position)"
         expect(names == _ACTION, "geometric", level, f"{', '.join(names) or 'others'}")
         assert isinstance(action, ArraySpec)
-        found = re.search(r"approached at (\S+) /s", action.frame)
-        self._gain = float(found[1]) if found else 1.0
+        found = re.search(r"approached at (\S+) /s, gravity (\S+) m/s²", action.frame)
+        expect(found, "geometric", "gain and gravity in the action's frame", repr(action.frame))
+        assert found is not None
+        self._gain, self._gravity = float(found[1]), float(found[2])
         self._units = np.array([float(unit.split()[0]) for unit in action.unit])
         seen = [name for array in spec.observation for name in _names(array)]
         wanted = [f"{vector} {axis}" for vector in (*_VECTORS, "nose") for axis in "xyz"]
@@ -50,6 +56,13 @@ class Geometric:
         self._at = {v: [seen.index(f"{v} {axis}") for axis in "xyz"] for v in (*_VECTORS, "nose")}
         rotors = [i for i, name in enumerate(seen) if re.fullmatch(r"thrust \d+ over hover", name)]
         self._rotors = rotors
+        self._swing: np.ndarray | None = None
+        self._pull = 0.0  # of the payload on the craft, m/s² per m that it hangs aside
+        share, cable = (spec.options.get(name) for name in ("payload_share", "cable"))
+        if share and cable and all(f"{v} {axis}" in seen for v in _PAYLOAD for axis in "xyz"):
+            self._at |= {v: [seen.index(f"{v} {axis}") for axis in "xyz"] for v in _PAYLOAD}
+            self._swing = swing_gains(self._gain, self._gravity / cable, share)
+            self._pull = share * self._gravity / cable
         self._spec, self._period = spec, spec.control_period
         self._share = -math.expm1(-FILTER * self._gain * self._period)
         self.reset()
@@ -63,18 +76,32 @@ class Geometric:
         """Offset and heading as the env's action, float32, shape (4,)."""
         numbers = flat(observation, self._spec).astype(np.float64)
         now = {name: numbers[at] for name, at in self._at.items()}
-        lift = GRAVITY * (1.0 + (numbers[self._rotors].mean() if self._rotors else 0.0))
-        now["force"] = lift * now["thrust axis"] - (0.0, 0.0, GRAVITY)
-        goes = self._follow(now)
+        lift = self._gravity * (1.0 + (numbers[self._rotors].mean() if self._rotors else 0.0))
+        now["force"] = lift * now["thrust axis"] - (0.0, 0.0, self._gravity)
+        before, goes = self._before or now, self._follow(now)
         self._before = now
         k = self._gain
         offset = now["goal - position"] + self._moving / k + (goes - self._pushed) / (OVER * k * k)
+        if self._swing is not None:
+            offset[:2] = self._steadied(now, before, goes)[:2]
         c, s = (now["nose"] / max(math.hypot(*now["nose"][:2]), 1e-6))[:2]
         x, y, z = offset
         turn = -math.atan2(s, c)
         action = np.array((c * x + s * y, c * y - s * x, z, turn)) / self._units
         action[:2] /= max(1.0, math.hypot(*action[:2]))
         return np.clip(action, -1.0, 1.0).astype(np.float32)
+
+    def _steadied(
+        self, now: dict[str, np.ndarray], before: dict[str, np.ndarray], goes: Any
+    ) -> Any:
+        """The offset at which the loops ask for the acceleration of `swing_gains`, m."""
+        assert self._swing is not None
+        faster = (now["force"] - before["force"]) / self._period
+        from_goal, moves = -now["goal - position"], now["velocity"] - self._moving
+        seen = (from_goal, moves, *(now[name] for name in _PAYLOAD), now["force"], faster)
+        wanted = goes - self._pushed - self._swing @ np.array(seen)
+        k = self._gain
+        return wanted / (OVER * k * k) + now["velocity"] / k
 
     def _follow(self, now: dict[str, np.ndarray]) -> Any:
         """Filter the goal's velocity and what pushes; return the goal's acceleration, m/s²."""
@@ -84,6 +111,8 @@ class Geometric:
         moved, faster = (now[name] - before[name] for name in ("goal - position", "velocity"))
         moving = moved / period + (now["velocity"] + before["velocity"]) / 2
         pushed = faster / period - (now["force"] + before["force"]) / 2
+        if self._swing is not None:
+            pushed[:2] -= self._pull * now[_PAYLOAD[0]][:2]
         self._pushed = self._pushed + self._share * (pushed - self._pushed)
         if np.abs(moving).max() > JUMP * self._units[0] * self._gain:
             self._moving = np.zeros(3)
@@ -91,6 +120,40 @@ class Geometric:
         change = self._share * (moving - self._moving)
         self._moving = self._moving + change
         return change / period
+
+
+def swing_gains(position: float, frequency: float, share: float) -> np.ndarray:
+    """Gains K of the acceleration -K s that a craft with a payload asks for, shape (6,).
+
+    The feedback of F. Goodarzi, D. Lee and T. Lee, "Geometric Stabilization of a Quadrotor UAV with
+    a Payload Connected by Flexible Cable", arXiv 1309.6717, 2014, section III: position, velocity,
+    and direction and rate of the cable, linear about the payload at rest below. Along each
+    horizontal axis, with x of the craft, d of the payload minus x, and the acceleration f of the
+    tilted thrust, which follows the wanted one u in the loops of `sim/control/gains.py`,
+
+        x'' = f + share ω² d,  d'' = -(1 + share) ω² d - f,  f'' = 2 p² (u - f) - 2 p f',
+
+    and s = (x, x', d, d', f, f'). The poles of the craft alone stay where they are, and those of
+    the swing keep their frequency and get the damping ratio `DAMPING` (Ackermann's formula).
+
+    Args:
+        position: Gain kₚ of the position loop, 1/s: p = 5 kₚ.
+        frequency: ω² = gravity over the cable's length, 1/s².
+        share: Mass of the payload over that of the vehicle.
+    """
+    p, swing = 5 * position, (1 + share) * frequency
+    plant = np.zeros((6, 6))
+    plant[(0, 1, 2, 4), (1, 4, 3, 5)] = 1.0
+    plant[1, 2], plant[3, 2], plant[3, 4] = share * frequency, -swing, -1.0
+    plant[5, 4:] = -2 * p * p, -2 * p
+    powers = [np.linalg.matrix_power(plant, n) for n in range(7)]
+    craft, thrust = (1.0, p / 2, p * p / 10), (1.0, 2 * p, 2 * p * p)
+    damped = (1.0, 2 * DAMPING * math.sqrt(swing), swing)
+    polynomial = np.polymul(np.polymul(craft, thrust), damped)
+    reached = 2 * p * p * np.column_stack([power[:, 5] for power in powers[:6]])
+    wanted = sum(c * power for c, power in zip(polynomial, reversed(powers), strict=True))
+    gains: np.ndarray = np.linalg.solve(reached.T, np.eye(6)[5]) @ wanted
+    return gains
 
 
 def _names(array: ArraySpec) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 from .registry import register
-from .spec import ArraySpec, Discrete, EnvSpec, Metric
+from .spec import ArraySpec, Discrete, EnvSpec, Mark, Metric
 
 if TYPE_CHECKING:
     from .loop import Loop
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .vector import LocalVectorEnv
 
 __all__ = [
-    "ArraySpec", "Discrete", "EnvSpec", "LocalVectorEnv", "Loop", "Metric", "Outcome",
+    "ArraySpec", "Discrete", "EnvSpec", "LocalVectorEnv", "Loop", "Mark", "Metric", "Outcome",
     "SingleEnv", "Task", "TaskOptions", "check_choice", "check_number", "register",
 ]  # fmt: skip
 

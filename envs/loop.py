@@ -126,6 +126,7 @@ def spec_of(env_id: str, task: Task) -> EnvSpec:
         action=action,
         telemetry=_telemetry_specs(task),
         metrics=task.metrics,
+        marks=task.marks,
     )
 
 

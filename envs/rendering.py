@@ -92,7 +92,8 @@ def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
 
 def moment(spec: EnvSpec, telemetry: Mapping[str, Any], **rest: Any) -> "Moment":
     """The `Moment` of one drone, with `reward`, `step` and `episode` as `Moment` has them."""
-    from ..rendering import Moment
+    from ..rendering import Mark, Moment
 
+    marks = tuple(Mark(m.shape, m.size, m.position, m.heading, m.moves) for m in spec.marks)
     metrics = [(metric.name, metric.unit, metric.symbol) for metric in spec.metrics]
-    return Moment.of(telemetry, metrics, **rest)
+    return Moment.of(telemetry, metrics, marks=marks, **rest)

@@ -20,6 +20,7 @@ MAX_TOLD: Final = 1 << 14  # numbers of all its telemetry: each has a name in `i
 MAX_DIMENSIONS: Final = 16  # axes of an array
 MAX_ARRAYS: Final = 64  # arrays of an observation or of the telemetry
 MAX_AGENTS: Final = 1024  # drones of one world
+MAX_MARKS: Final = 256  # things that pictures show
 MAX_NAME: Final = 200  # characters of a name, unit or frame
 
 _DTYPES: Final = ("float32", "float64", "uint8", "int32", "int64")
@@ -203,8 +204,38 @@ class Metric(_Part):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Mark(_Part):
+    """Something of a task that pictures show and physics does not know."""
+
+    _optional = ("position", "heading", "moves")
+
+    shape: Literal["gate", "disc", "ball"]
+    """`gate`: an upright square frame; `disc`: level, as a landing pad; `ball`."""
+    size: float
+    """Width of a gate; radius of a disc or a ball, m."""
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of its centre: x, y, z in MuJoCo's world frame (z up), m; from the goal where it moves."""
+    heading: float = 0.0
+    """Direction in which a gate is passed, degrees about z, anticlockwise from x."""
+    moves: bool = False
+    """Whether it moves along with the goal, which telemetry tells."""
+
+    def __post_init__(self) -> None:
+        right = self.shape in ("gate", "disc", "ball")
+        _expect(right, "mark", "the shape 'gate', 'disc' or 'ball'", self.shape)
+        right = _is_number(self.size) and 0 < self.size <= _LARGEST
+        _expect(right, "mark", "a size > 0 m", self.size)
+        numbers = (*self.position, self.heading) if isinstance(self.position, tuple) else ()
+        right = len(numbers) == 4 and all(_is_number(n) and abs(n) <= _LARGEST for n in numbers)
+        _expect(right, "mark", "a position (x, y, z) and a heading", (self.position, self.heading))
+        _expect(type(self.moves) is bool, "mark", "moves to be true or false", self.moves)
+
+
+@dataclass(frozen=True, kw_only=True)
 class EnvSpec(_Part):
     """Everything that an agent must know of an env. Arrays are those of one drone."""
+
+    _optional = ("marks",)
 
     env_id: str
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -222,6 +253,8 @@ class EnvSpec(_Part):
     telemetry: tuple[ArraySpec, ...] = ()
     """Further arrays of a State, for logs and pictures; the last, `metrics`, has the metrics."""
     metrics: tuple[Metric, ...] = ()
+    marks: tuple[Mark, ...] = ()
+    """What pictures show of the task."""
 
     def __post_init__(self) -> None:
         _check_text("env_id", self.env_id)
@@ -236,6 +269,7 @@ class EnvSpec(_Part):
         right = 1 <= len({*agents}) == len(agents) <= MAX_AGENTS
         _expect(right, "agents", f"1 to {MAX_AGENTS} different names", agents)
         _expect(self.observation, "observation", "at least one array", self.observation)
+        _expect(len(self.marks) <= MAX_MARKS, "marks", f"at most {MAX_MARKS}", len(self.marks))
         for what, most in (("observation", MAX_ELEMENTS), ("telemetry", MAX_TOLD)):
             arrays = getattr(self, what)
             listed = [array.name for array in arrays]
@@ -270,7 +304,7 @@ class EnvSpec(_Part):
             raise SpecError(f"spec: expected JSON, got {text[:80]!r}: {error}") from None
         given = cls._fields(content)
         kinds: dict[str, type[_Part]] = {
-            "observation": ArraySpec, "telemetry": ArraySpec, "metrics": Metric
+            "observation": ArraySpec, "telemetry": ArraySpec, "metrics": Metric, "marks": Mark
         }  # fmt: skip
         for name in kinds.keys() & given:
             _expect(isinstance(given[name], tuple), name, "a list", given[name])

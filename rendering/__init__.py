@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ..models.scene import World
     from .gl import NoOpenGL
-    from .stage import CAMERAS, WORLDS, Camera, Canvas, MetricValue, Moment, Stage
+    from .stage import CAMERAS, WORLDS, Camera, Canvas, Mark, MetricValue, Moment, Stage
 
 __all__ = [
-    "CAMERAS", "WORLDS", "Camera", "Canvas", "MetricValue", "Moment", "NoOpenGL", "Stage",
-    "World",
+    "CAMERAS", "WORLDS", "Camera", "Canvas", "Mark", "MetricValue", "Moment", "NoOpenGL",
+    "Stage", "World",
 ]  # fmt: skip
 
 

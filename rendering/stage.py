@@ -29,6 +29,9 @@ _TRAIL, _EVERY = 150, 3  # control steps of a path, and of one piece of it
 _PAYLOAD = (0.96, 0.42, 0.08, 1.0)
 _CABLE = (0.13, 0.14, 0.16, 1.0)
 _DISC = (0.13, 0.78, 0.52, 0.30)
+_DUE = (0.13, 0.78, 0.52, 0.9)  # The gate that is next, and a pad
+_GATE = (0.96, 0.42, 0.08, 0.9)
+_SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 _PATH = (1.0, 0.85, 0.25)
 _ONBOARD: Final = "stage/onboard"
 _ROOM = 10_000  # geoms
@@ -76,6 +79,21 @@ class MetricValue(NamedTuple):
         return f"{number} {self.unit}".strip()
 
 
+class Mark(NamedTuple):
+    """Something of a task that is drawn."""
+
+    shape: str
+    """`gate`, an upright square frame; `disc`, level; or `ball`."""
+    size: float
+    """Width of a gate; radius of a disc or a ball, m."""
+    position: _Vector = (0.0, 0.0, 0.0)
+    """Of its centre, MuJoCo's frame, m; from the goal where it moves."""
+    heading: float = 0.0
+    """Direction in which a gate is passed, degrees about z, anticlockwise from x."""
+    moves: bool = False
+    """Whether it moves along with the goal."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Moment:
     """One craft after one control step. Positions are in the paper's frame."""
@@ -92,6 +110,8 @@ class Moment:
     """Position of what hangs below it on a cable, X, Y, Z, m; None if nothing does."""
     metrics: tuple[MetricValue, ...] = ()
     """The headline first."""
+    marks: tuple[Mark, ...] = ()
+    """What is to be seen of the task; where there is any, no disc is drawn at the goal."""
     reward: float = 0.0
     """Of the step that led here."""
     step: int = 0
@@ -268,7 +288,10 @@ class Stage:
         return np.asarray((np.array(goals) if goals else self._points()).mean(axis=0))
 
     def decorate(self, scene: mujoco.MjvScene, *, goals: bool = True) -> None:
-        """Add the fading paths to a scene, the payloads, and discs at the goals if wanted."""
+        """Add marks, payloads and fading paths to a scene, and discs at the goals if wanted."""
+        for moment, goal, offset in zip(self.moments, self._goals, self._offsets, strict=False):
+            for mark in moment.marks:
+                _draw_mark(scene, mark, offset, goal)
         for payload, here in zip(self._payloads, self._points(), strict=True):
             if payload is not None:
                 size = (0.12 * self.radius,) * 3
@@ -277,8 +300,9 @@ class Stage:
                 cable = _decoration(scene, kind, (1.0, 1.0, 1.0), here, _CABLE)
                 if cable is not None:
                     mujoco.mjv_connector(cable, kind, 0.012 * self.radius, here, payload)
+        marked = any(moment.marks for moment in self.moments)
         for path, goal, here in zip(self._paths, self._goals, self._points(), strict=True):
-            if goals and goal is not None:
+            if goals and goal is not None and not marked:
                 size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
                 _decoration(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, _DISC)
             for number, (start, end) in enumerate(pairwise([*path, here]), 1):
@@ -397,6 +421,33 @@ def _grid(drones: int, spacing: float) -> np.ndarray:
     """Places of the craft, shape (drones, 3), m: nearly a square, the first at the origin."""
     rows, columns = np.divmod(np.arange(drones), math.isqrt(drones - 1) + 1)
     return -spacing * np.stack((rows, columns, np.zeros(drones)), axis=1)
+
+
+def _draw_mark(
+    scene: mujoco.MjvScene, mark: Mark, offset: np.ndarray, goal: np.ndarray | None
+) -> None:
+    """Add a mark; a gate that is the goal has the goal's colour."""
+    if mark.moves and goal is None:
+        return
+    centre = (goal if mark.moves and goal is not None else offset) + mark.position
+    if mark.shape == "gate":
+        due = goal is not None and float(np.abs(goal - centre).max()) < 1e-3
+        turn, half = math.radians(mark.heading), mark.size / 2
+        aside = np.array((-math.sin(turn), math.cos(turn), 0.0))
+        up = np.array((0.0, 0.0, 1.0))
+        corners = [centre + half * (y * aside + z * up) for y, z in _SQUARE]
+        for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
+            kind, rgba = mujoco.mjtGeom.mjGEOM_CAPSULE, _DUE if due else _GATE
+            geom = _decoration(scene, kind, (1.0, 1.0, 1.0), start, rgba)
+            if geom is not None:
+                mujoco.mjv_connector(geom, kind, 0.025 * mark.size, start, end)
+    elif mark.shape == "disc":
+        thick = 0.02 * mark.size  # its lower side lies on the ground: both at one height flicker
+        size = (mark.size, thick, 0.0)
+        above = centre + np.array((0.0, 0.0, thick))
+        _decoration(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, above, _DUE)
+    else:
+        _decoration(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (mark.size,) * 3, centre, _DISC)
 
 
 def _decoration(

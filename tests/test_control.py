@@ -317,7 +317,8 @@ def test_the_spec_tells_names_units_and_frames() -> None:
     action = env_of("position").env_spec.action
     assert action.components == ("offset x", "offset y", "offset z", "offset of the heading")
     assert action.unit == ("6.084548 m", "6.084548 m", "4 m", "3.141593 rad")
-    assert action.frame == "world turned by the heading, approached at 0.8831687 /s"
+    expected = "world turned by the heading, approached at 0.8831687 /s, gravity 9.8 m/s²"
+    assert action.frame == expected
     action = env_of("rates").env_spec.action
     assert action.unit[:2] == ("1", "11.06888 rad/s")
     assert (action.low, action.high, action.shape) == (-1.0, 1.0, (4,))

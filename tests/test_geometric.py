@@ -10,6 +10,7 @@ import pytest
 import rotorgram.envs  # noqa: F401
 from remotes import flying
 from rotorgram.agents import Geometric
+from rotorgram.agents.geometric import swing_gains
 from rotorgram.cli import main
 from rotorgram.envs import register
 from rotorgram.envs.tasks.hover import Hover
@@ -17,6 +18,7 @@ from rotorgram.models import QUAD_XML
 from rotorgram.models.errors import InputError
 from rotorgram.sim import Array, WorldState, component, stack
 
+PAYLOAD = "rotorgram/PayloadHover-v0"
 HOVER, MOVING = "rotorgram/Hover-v0", "Moving-v0"
 DATA = Path(__file__).parent / "data"
 MOCAP = {"noise": 0.001, "angle_noise": 0.002}
@@ -77,6 +79,55 @@ def test_wind_and_a_payload_are_held_against() -> None:
     effects = {"payload": 2.0, "cable": 0.5}
     env = gym.make(HOVER, action="position", effects=effects, goal=(0, 0, 8), episode_length=500)
     assert errors_of(env)[-1][0] < 0.05
+
+
+def test_gravity_is_the_vehicles(tmp_path: Path) -> None:
+    """On the moon twice the thrust of a hover lifts with 1.62 m/s²: nothing else pushes."""
+    file = tmp_path / "moon.toml"
+    text = (QUAD_XML.parent / "vehicles/crazyflie2/vehicle.toml").read_text(encoding="utf-8")
+    file.write_text(f"gravity = 1.62\n{text}", encoding="utf-8")
+    policy = Geometric(gym.make(HOVER, action="position", vehicle=file).unwrapped.env_spec)
+    for time in (0.0, 0.02):
+        below, nose, up = -1.62 * time**2 / 2, (1, 0, 0), (0, 0, 1)
+        seen = [0, 0, below, 0, 0, 1.62 * time, *nose, *up, 0, 0, 0, 1, 1, 1, 1]
+        assert policy.act(np.array(seen)) == pytest.approx([0, 0, below / 4, 0], abs=1e-6)
+
+
+def test_the_poles_of_a_swing() -> None:
+    """p = 5 /s, ω² = 9 /s², a ninth of the mass: the swing's ω² of 10 /s², half damped."""
+    plant = np.array(
+        [
+            [0, 1, 0, 0, 0, 0],
+            [0, 0, 1, 0, 1, 0],
+            [0, 0, 0, 1, 0, 0],
+            [0, 0, -10, 0, -1, 0],
+            [0, 0, 0, 0, 0, 1],
+            [0, 0, 0, 0, -50, -10],
+        ]
+    )
+    closed = plant - np.outer((0, 0, 0, 0, 0, 50), swing_gains(1.0, 9.0, 1 / 9))
+    half = [-1.25 + 0.9682458j, -5 + 5j, -1.5811388 + 2.7386128j]
+    expected = sorted([*half, *np.conj(half)], key=lambda pole: (pole.real, pole.imag))
+    poles = sorted(np.linalg.eigvals(closed), key=lambda pole: (round(pole.real, 6), pole.imag))
+    assert poles == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("vehicle", [None, "crazyflie2"])
+def test_a_payload_swings_no_more(vehicle: str | None) -> None:
+    """The payload alone would swing for minutes: MuJoCo's cable has hardly any damping."""
+    options = {} if vehicle is None else {"vehicle": vehicle}
+    env = gym.make(PAYLOAD, action="position", **options)
+    policy = Geometric(env.get_wrapper_attr("env_spec"))
+    observation, _ = env.reset(seed=100)
+    swings, errors, truncated = [], [], False
+    while not truncated:
+        observation, _, terminated, truncated, info = env.step(policy.act(observation))
+        swings.append(info["swing"])
+        errors.append(info["payload_error"])
+        assert not terminated
+    assert max(swings) > 5.0
+    assert max(swings[200:]) < 1.5
+    assert max(errors[200:]) < 0.1
 
 
 def test_an_estimate_is_flown_by() -> None:

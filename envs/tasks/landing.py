@@ -6,7 +6,7 @@ from typing import Any, Final, Literal, get_args
 
 from ...models.errors import expect
 from ...sim import Array, Draw, Pose, WorldState, component, each, plain, square_root, stack
-from ..spec import Metric
+from ..spec import Mark, Metric
 from .flight import LEAST_TILT_COSINE, RATE_WEIGHT, Flight, length
 from .task import Outcome, TaskOptions, check_choice, check_number, finite
 
@@ -152,6 +152,8 @@ class Landing(Flight):
         )
         self._least_upright = math.cos(math.radians(options.tilt))
         self._height = self.vehicle.rest_height
+        below = (0.0, 0.0, -self._height)
+        self.marks = (Mark(shape="disc", size=options.pad_radius, position=below, moves=True),)
         # The pad: phase (rad), its rate (rad/s), direction of the line, and the side of a circle.
         self._phase = self._rate = self._cosine = self._sine = self._side = 0.0
         # Of the last step: velocity, cosine of the tilt, potential; the first two before contact.

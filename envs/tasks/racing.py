@@ -12,7 +12,7 @@ import numpy as np
 
 from ...models.errors import InputError, expect
 from ...sim import Array, Draw, Pose, WorldState, clip, component, constant, each, plain, stack
-from ..spec import Metric
+from ..spec import Mark, Metric
 from .flight import (
     AIR,
     COURSE_RATE_WEIGHT,
@@ -138,6 +138,10 @@ class Racing(Flight):
         )
         self._total = len(gates) * self.options.laps
         self._count = len(gates)
+        self.marks = tuple(
+            Mark(shape="gate", size=gate.size, position=gate.position, heading=gate.heading)
+            for gate in gates
+        )
         turns = np.radians([gate.heading for gate in gates])
         # Of each gate its centre, the x and y of its direction, and half its size.
         centers = np.array([gate.position for gate in gates])

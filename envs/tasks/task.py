@@ -29,7 +29,7 @@ from ...sim import (
     checked_sensors,
     make_controller,
 )
-from ..spec import ArraySpec, Metric
+from ..spec import ArraySpec, Mark, Metric
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
@@ -143,6 +143,7 @@ class Task:
         controller: Turns actions into thrusts: that of the option `action`, unless `setup` sets
             another.
         observation: Specs of one drone's observation; set by `setup`.
+        marks: What pictures show of the task besides the goal; set by `setup` where there is any.
     """
 
     Options: ClassVar[type[TaskOptions]] = TaskOptions
@@ -151,6 +152,7 @@ class Task:
 
     controller: Controller
     observation: tuple[ArraySpec, ...]
+    marks: tuple[Mark, ...] = ()
 
     def __init__(
         self, options: Any, vehicle: "Vehicle", shape: tuple[int, ...] = (), xp: Any = np

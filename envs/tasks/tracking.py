@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -10,7 +11,19 @@ from typing import Final
 import numpy as np
 
 from ...models.errors import InputError, expect
-from ...sim import Array, Draw, Pose, WorldState, clip, component, constant, each, plain, stack
+from ...sim import (
+    Array,
+    Draw,
+    Gains,
+    Pose,
+    WorldState,
+    clip,
+    component,
+    constant,
+    each,
+    plain,
+    stack,
+)
 from ..spec import Metric
 from .flight import (
     AIR,
@@ -27,6 +40,7 @@ from .task import Outcome, TaskOptions, check_number, check_whole
 
 MOST_SAMPLES: Final = 20_000  # Rows of a file
 MOST_POINTS: Final = 16  # That a minimum-snap trajectory goes through
+PER_PIECE: Final = 32  # Times of a piece of a minimum-snap trajectory at which it is checked
 _KINDS: Final = ("circle", "lemniscate", "snap")
 _EXPECTED: Final = "circle, lemniscate, snap, or a CSV file with columns t, x, y, z"
 
@@ -162,6 +176,8 @@ class Tracking(Flight):
         expect(low[2] >= least, "trajectory", expected, f"{low[2]:.4g}")
         self._box = list(zip(middle.tolist(), box.tolist(), strict=True))
         self._check_speed()
+        for shares, accelerations in self._asked():
+            self._check_rotors(shares, accelerations)
         reach = float(np.linalg.norm(high - low)) + 2 * options.flight_band
         later = [
             (f"reference {number * options.preview_time:g} s later - position {axis}", "m", reach)
@@ -193,13 +209,58 @@ class Tracking(Flight):
         """
         if not self._closed:
             return 0.0
-        step = self.options.control_period
-        after, before = np.roll(self._table, -1, axis=0), np.roll(self._table, 1, axis=0)
-        largest = float(np.linalg.norm(after - 2 * self._table + before, axis=1).max() / step**2)
+        times, accelerations = next(self._asked())
+        largest = float(np.linalg.norm(accelerations, axis=1).max())
         vehicle = self.vehicle
         lift = float(vehicle.allocation[0] @ vehicle.thrust_high) / vehicle.mass
         free = math.sqrt(max(lift**2 - vehicle.gravity**2, 1e-12))
-        return float(len(self._table) * step * math.sqrt(largest / free))
+        return float(len(times) * self.options.control_period * math.sqrt(largest / free))
+
+    def _asked(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Times, s, shape (L,), and accelerations, m/s², shape (L, 3), that may have to be flown.
+
+        Of a file these are the second differences of its rows. Of a `snap` the acceleration at any
+        time, and its change, are largest for points at corners of the box: those are tried.
+        """
+        options, step = self.options, self.options.control_period
+        if self._closed:
+            after, before = np.roll(self._table, -1, axis=0), np.roll(self._table, 1, axis=0)
+            yield np.arange(len(after)) * step, (after - 2 * self._table + before) / step**2
+        elif self._drawn:
+            times = np.linspace(0.0, 1.0, PER_PIECE * (options.points - 1) + 1)
+            shares, changes = (snap_basis(options.points, times, order) for order in (2, 3))
+            signs = np.sign(np.vstack((shares, changes)).round(6))
+            box = [half for _, half in self._box]
+            for corners in np.unique(np.vstack((signs, -signs)), axis=0):
+                accelerations = shares @ np.outer(corners, box) / options.period**2
+                yield times * options.period, accelerations
+        else:
+            rows = read_samples(options.trajectory)
+            times, places = rows[:, 0], rows[:, 1:]
+            velocities = np.diff(places, axis=0) / np.diff(times)[:, np.newaxis]
+            between = (times[2:] - times[:-2])[:, np.newaxis] / 2
+            yield times[1:-1], np.diff(velocities, axis=0) / between
+
+    def _check_rotors(self, times: np.ndarray, accelerations: np.ndarray) -> None:
+        """Raise `InputError` where the rotors cannot give an acceleration, or turn to it in time.
+
+        Position is a flat output (Mellinger and Kumar, ICRA 2011, section III): the acceleration a
+        needs the collective thrust m |a + g e₃| along a + g e₃, and the craft tilts as fast as that
+        direction turns. The largest rate is that of the level `rates`.
+        """
+        if not len(times):
+            return
+        vehicle = self.vehicle
+        lift = accelerations + np.array((0.0, 0.0, vehicle.gravity))
+        sizes = np.linalg.norm(lift, axis=1)
+        limits = (vehicle.thrust_low, vehicle.thrust_high)
+        low, high = (float(vehicle.allocation[0] @ limit) for limit in limits)
+        _check_within("N of thrust", times, vehicle.mass * sizes, low, high)
+        directions = lift / np.maximum(sizes, 1e-9)[:, np.newaxis]
+        chords = np.linalg.norm(np.diff(directions, axis=0), axis=1)
+        rates = 2 * np.arcsin(np.minimum(chords / 2, 1.0)) / np.diff(times)
+        fastest = min(Gains.of(vehicle, vehicle.timestep).most_rate[:2])
+        _check_within("rad/s of tilt rate", times, np.append(rates, 0.0), 0.0, fastest)
 
     def begin(self, mask: Array, draw: Draw) -> Pose:
         """Near the beginning of the trajectory, or anywhere on a closed one, at its velocity."""
@@ -262,6 +323,17 @@ class Tracking(Flight):
         for part in parts[1:]:
             total = total + part
         return total
+
+
+def _check_within(
+    what: str, times: np.ndarray, values: np.ndarray, low: float, high: float
+) -> None:
+    """Raise `InputError` with the time and the value that is furthest outside the limits."""
+    outside = np.maximum(values - high, low - values)
+    worst = int(outside.argmax())
+    expected = f"{low:.4g} to {high:.4g} {what}, which the vehicle has"
+    got = f"{values[worst]:.4g} at {times[worst]:.4g} s"
+    expect(outside[worst] <= 1e-6 * high, "trajectory", expected, got)
 
 
 def _circle(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ from typing import Final
 
 from ...models.errors import expect
 from ...sim import Array, Draw, Pose, WorldState, component, each, plain, stack
-from ..spec import Metric
+from ..spec import Mark, Metric
 from .flight import (
     AIR,
     COURSE_RATE_WEIGHT,
@@ -105,6 +105,7 @@ class Waypoints(Flight):
         least = self.vehicle.rest_height + AIR + options.box[2]
         expected = f"a height of at least {least:g} m above the ground"
         expect(options.center[2] >= least, "center", expected, f"{options.center[2]:g}")
+        self.marks = (Mark(shape="ball", size=options.radius, moves=True),)
         self._sides = tuple(side + options.margin for side in options.box)
         furthest = 2 * math.hypot(*self._sides)
         after = [(f"point after - position {axis}", "m", furthest) for axis in "xyz"]

@@ -210,7 +210,8 @@ class Position(Velocity):
 
     def __init__(self, vehicle: "Vehicle", gains: "Gains") -> None:
         super().__init__(vehicle, gains)
-        self.frame = f"{_HEADING}, approached at {gains.position:.7g} /s"
+        approach = f"approached at {gains.position:.7g} /s, gravity {vehicle.gravity:.7g} m/s²"
+        self.frame = f"{_HEADING}, {approach}"
 
     def ranges(self) -> list[tuple[float, str]]:
         """As of `Rates`."""

@@ -1,0 +1,88 @@
+"""What pictures show of a task: it crosses the wire in the spec, and a stage draws it."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from pictures import at
+from rotorgram.envs.registry import env_spec
+from rotorgram.envs.rendering import moment
+from rotorgram.envs.spec import EnvSpec, Mark, SpecError
+from rotorgram.rendering import Mark as Drawn
+from rotorgram.rendering import Stage
+
+TRACK = (
+    '{"gates":[{"position":[4,0,5],"heading":90,"size":2}],'
+    '"start":{"position":[0,0,5],"heading":0}}'
+)
+CAPSULE, CYLINDER, SPHERE = (
+    int(kind)
+    for kind in (
+        mujoco.mjtGeom.mjGEOM_CAPSULE,
+        mujoco.mjtGeom.mjGEOM_CYLINDER,
+        mujoco.mjtGeom.mjGEOM_SPHERE,
+    )
+)
+
+
+def drawn(**fields: Any) -> list[tuple[int, list[float], list[float]]]:
+    """Kind, place and size of each geom that a moment adds; goals in the paper's frame."""
+    stage = Stage("plain", trail=False)
+    stage.show(at(5.0, **fields))
+    scene = mujoco.MjvScene(stage.model, 100)
+    stage.decorate(scene)
+    geoms = scene.geoms[: scene.ngeom]
+    return [(geom.type, geom.pos.tolist(), geom.size.tolist()) for geom in geoms]
+
+
+def test_tasks_have_their_marks_and_the_wire_keeps_them() -> None:
+    racing = env_spec("rotorgram/Racing-v0", {"track": TRACK})
+    gate = Mark(shape="gate", size=2.0, position=(4.0, 0.0, 5.0), heading=90.0)
+    assert racing.marks == (gate,)
+    assert EnvSpec.from_json(racing.to_json()) == racing
+    waypoints = env_spec("rotorgram/Waypoints-v0", {"radius": 0.4})
+    assert waypoints.marks == (Mark(shape="ball", size=0.4, moves=True),)
+    (pad,) = env_spec("rotorgram/Landing-v0").marks
+    assert (pad.shape, pad.size, pad.moves) == ("disc", 0.5, True)
+    assert "marks" not in env_spec("rotorgram/Hover-v0").to_json()
+
+
+def test_a_moment_has_the_marks_of_its_spec() -> None:
+    spec = env_spec("rotorgram/Racing-v0", {"track": TRACK})
+    telemetry = {array.name: np.zeros(array.shape) for array in spec.telemetry}
+    assert moment(spec, telemetry).marks == (Drawn("gate", 2.0, (4.0, 0.0, 5.0), 90.0),)
+
+
+def test_a_gate_is_a_square_across_its_heading() -> None:
+    """Passed along y: its corners are 1 m from (4, 0, 5) along x and z."""
+    geoms = drawn(goal=None, marks=(Drawn("gate", 2.0, (4.0, 0.0, 5.0), 90.0),))
+    places = sorted(tuple(np.round(place, 6).tolist()) for kind, place, _ in geoms)
+    assert [kind for kind, *_ in geoms] == [CAPSULE] * 4
+    assert places == [(3.0, 0.0, 5.0), (4.0, 0.0, 4.0), (4.0, 0.0, 6.0), (5.0, 0.0, 5.0)]
+
+
+def test_what_moves_is_at_the_goal_in_place_of_its_disc() -> None:
+    """The paper's (1, 0.3, 2) is (2, -1, 0.3) in MuJoCo's frame; the pad lies 0.3 m below."""
+    pad = Drawn("disc", 0.5, (0.0, 0.0, -0.3), moves=True)
+    ((kind, place, size),) = drawn(goal=(1.0, 0.3, 2.0), marks=(pad,))
+    assert (kind, place) == (CYLINDER, pytest.approx([2.0, -1.0, 0.01], abs=1e-6))
+    assert size == pytest.approx([0.5, 0.5, 0.01], abs=1e-6)
+    ((kind, place, _),) = drawn(goal=(1.0, 5.0, 2.0), marks=(Drawn("ball", 0.3, moves=True),))
+    assert (kind, place) == (SPHERE, pytest.approx([2.0, -1.0, 5.0]))
+    assert drawn(goal=None, marks=(pad,)) == []
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({"shape": "cube", "size": 1.0}, "mark: expected the shape 'gate', 'disc' or 'ball'"),
+        ({"shape": "ball", "size": 0.0}, "mark: expected a size > 0 m"),
+        ({"shape": "ball", "size": 1.0, "position": (0.0,)}, "mark: expected a position (x, y, z)"),
+        ({"shape": "ball", "size": 1.0, "moves": 1}, "mark: expected moves to be true or false"),
+    ],
+)
+def test_wrong_marks(fields: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(SpecError) as error:
+        Mark(**fields)
+    assert str(error.value).startswith(sentence)
