@@ -29,7 +29,7 @@ from ..agents.checkpoints import Checkpoint, store
 from ..envs import LocalVectorEnv
 from ..envs.registry import env_spec
 from ..envs.spec import EnvSpec
-from ..models.errors import InputError
+from ..models.errors import InputError, expect
 from . import results
 from .bounds import known_bounds
 from .evaluations import Stage, evaluate_stages, stages_of
@@ -141,6 +141,8 @@ def _fly(config: BenchmarkConfig, job: Job, tell: Tell) -> _Done:
 
 _SETTINGS: Final = ("seeds", "first_seed", "snapshots", "curve_episodes", "episodes")
 _ROW: Final = tuple(field.name for field in fields(BoardRow))
+_ROW_KINDS: Final = dict.fromkeys(_ROW, str) | {"env_steps": int, "num_envs": int, "options": dict}
+_KIND_WORDS: Final = {int: "a whole number", str: "a text", dict: "a table", list: "[[row]] tables"}
 
 
 def _content(config: BenchmarkConfig) -> dict[str, Any]:
@@ -161,11 +163,25 @@ def read_rows_file(path: Path, **changes: Any) -> BenchmarkConfig:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: expected a TOML file of rows, got: {error}") from None
+    _check_table(f"{path}", content, dict.fromkeys(_SETTINGS, int) | {"row": list})
+    tables = content.pop("row", [])
+    for place, table in enumerate(tables, start=1):
+        _check_table(f"{path}: row {place}", table, _ROW_KINDS)
+        expect("agent" in table, f"{path}: row {place}", "an agent", "none")
     try:
-        rows = tuple(BoardRow(**row) for row in content.pop("row", []))
+        rows = tuple(BoardRow(**table) for table in tables)
         return BenchmarkConfig(**content | {"rows": rows} | changes)
     except TypeError as error:
         raise InputError(f"{path}: expected the settings of a board, got: {error}") from None
+
+
+def _check_table(where: str, table: Any, kinds: Mapping[str, type]) -> None:
+    """Raises `InputError` unless every name of a table is known and has a value of its type."""
+    expect(type(table) is dict, where, "a table", f"{table!r:.80}")
+    for name, value in table.items():
+        expect(name in kinds, where, f"some of {', '.join(kinds)}", repr(name))
+        kind = kinds[name]
+        expect(type(value) is kind, f"{where}: {name}", _KIND_WORDS[kind], f"{value!r:.80}")
 
 
 class Board(NamedTuple):
@@ -185,8 +201,8 @@ class Board(NamedTuple):
 def read_board(folder: Path) -> Board:
     """Read a board. Raises `ResultsError`."""
     path = folder / CONFIG_FILE
+    content = results.content_of(folder)
     try:
-        content = results.content_of(folder)
         rows = [BoardRow(**{name: row[name] for name in _ROW}) for row in content["rows"]]
         config = BenchmarkConfig(rows=tuple(rows), **content["board"])
         specs = [EnvSpec.from_json(json.dumps(row["spec"])) for row in content["rows"]]

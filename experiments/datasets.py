@@ -200,14 +200,16 @@ class _Session:
 
 @contextmanager
 def _removed_on_error(path: Path) -> Iterator[None]:
-    """Half a data set is none."""
+    """Half a data set is none. An `OSError` without a file's name gets this one."""
     try:
         yield
-    except BaseException:
+    except BaseException as error:
         if path.is_dir():
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
+        if isinstance(error, OSError) and not error.filename:
+            raise OSError(error.errno, error.strerror or str(error), str(path)) from None
         raise
 
 

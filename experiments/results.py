@@ -307,7 +307,9 @@ def read_steps(
 def _existing(folder: Path | str, name: str) -> Path:
     path = Path(folder) / name
     if not path.is_file():
-        raise ResultsError(f"{path} is missing: is {folder} the folder of a comparison or a sweep?")
+        raise ResultsError(
+            f"{path} is missing: is {folder} the folder of a comparison, a sweep or a board?"
+        )
     return path
 
 

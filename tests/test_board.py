@@ -240,7 +240,15 @@ def test_a_share_of_one_scores_one() -> None:
         ('[[row]]\nagent = "a2c"\n[[row]]\nagent = "a2c"', "row: expected each row once, got a2c"),
         ('[[row]]\nagent = "a2c"\nenv_id = "x/Y-v0"', "env_id: expected a registered id"),
         ('[[row]]\nagent = "apg"\nenv_steps = 9', "env_steps: expected at least"),
-        ('[[row]]\nagent = "a2c"\ncolour = 1', "expected the settings of a board"),
+        ('[[row]]\nagent = "a2c"\ncolour = 1', "row 1: expected some of env_id, options, vehicle"),
+        ("[[row]]\nnum_envs = 8", "row 1: expected an agent, got none"),
+        ('[[row]]\nagent = "a2c"\nenv_steps = "a"', "env_steps: expected a whole number, got 'a'"),
+        ('[[row]]\nagent = "a2c"\noptions = 3', "options: expected a table, got 3"),
+        ("row = [3]", "row 1: expected a table, got 3"),
+        ("row = 3", "row: expected [[row]] tables, got 3"),
+        ('[[rows]]\nagent = "pid"', "expected some of seeds, first_seed"),
+        ('seeds = 1.5\n[[row]]\nagent = "pid"', "seeds: expected a whole number, got 1.5"),
+        ('episodes = true\n[[row]]\nagent = "pid"', "episodes: expected a whole number, got True"),
         ('[[row]]\nagent = "a2c"\nenv_steps = 100', "env_steps: expected at least 256, got 100"),
         ('seeds = 0\n[[row]]\nagent = "pid"', "seeds: expected at least 1, got 0"),
         ("[[row", "expected a TOML file of rows"),
@@ -256,7 +264,7 @@ def test_wrong_rows_are_one_sentence(text: str, sentence: str, tmp_path: Path) -
 
 
 def test_files_that_are_no_board_are_refused(tmp_path: Path, folder: Path) -> None:
-    with pytest.raises(ResultsError, match=r"config\.json is missing"):
+    with pytest.raises(ResultsError, match=r"^\S*config\.json is missing: is \S* the folder"):
         read_board(tmp_path)
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(ResultsError, match="expected a board's settings"):

@@ -1,6 +1,7 @@
 """Data sets of journals: what is in them, what is left out, and that they fly again bit for bit."""
 
 import json
+import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -259,6 +260,22 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "expected a new file that ends in .parquet" in parquet(good, out=there)
     assert there.read_bytes() == b"mine"
     assert "a folder that is there" in parquet(good, out=tmp_path / "no" / "new.parquet")
+
+
+def test_a_write_that_fails_names_the_file_and_leaves_none(tmp_path: Path) -> None:
+    journal = tmp_path / "flight.mcap"
+    with recording(journal, episode_length=5) as remote:
+        fly_one(remote, [1])
+    out, limits = tmp_path / "flight.parquet", resource.getrlimit(resource.RLIMIT_FSIZE)
+    episodes = RecordedEpisodes([journal])
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))  # bytes, of any file
+    try:
+        with pytest.raises(OSError, match="too large") as error:
+            write_parquet(episodes, out)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert error.value.filename == str(out)
+    assert not out.exists()
 
 
 def test_minari_needs_an_id_that_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

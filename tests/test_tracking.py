@@ -132,6 +132,13 @@ def test_a_snap_by_hand() -> None:
         assert task.goal(state_of()) == pytest.approx(place, abs=1e-6)
 
 
+def test_a_file_without_a_column_is_told_its_name(tmp_path: Path) -> None:
+    file = tmp_path / "mine.csv"
+    file.write_text("0,0,0,5\n1,1,0,5\n")
+    with pytest.raises(InputError, match=r"with columns t, x, y, z, got .*: no column 't'$"):
+        make_task(ID, {"trajectory": str(file)})
+
+
 def test_a_file_crosses_the_wire(tmp_path: Path) -> None:
     file = tmp_path / "mine.csv"
     file.write_text("t,x,y,z\n1.0,0,0,5\n2.0,1,0,5\n4.0,1,2,6\n")

@@ -406,8 +406,8 @@ def read_samples(given: str) -> np.ndarray:
                 rows = [[float(row[name]) for name in ("t", "x", "y", "z")] for row in reader]
         samples: np.ndarray = np.array(rows, np.float64)
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        got = f"{str(Path(given[:80]))!r}: {reason:.120}"
+        reason = f"no column {error}" if isinstance(error, KeyError) else str(error)
+        got = f"{str(Path(given[:80]))!r}: {' '.join(reason.split()):.120}"
         raise InputError(f"trajectory: expected {_EXPECTED}, got {got}") from None
     shape = samples.shape
     right = samples.ndim == 2 and shape[1:] == (4,) and 2 <= len(samples) <= MOST_SAMPLES
