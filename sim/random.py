@@ -65,19 +65,21 @@ class Streams:
     def __init__(self, num_worlds: int, use: int | tuple[int, ...] = START) -> None:
         self._key = use if isinstance(use, tuple) else (use,)
         self._generators: list[np.random.Generator | None] = [None] * num_worlds
+        self._seeds: list[int | None] = [None] * num_worlds  # of generators that were not asked yet
 
     def seed(self, ids: Sequence[int], seeds: Sequence[int | None]) -> None:
         """Seed the worlds `ids`; where the seed is None the stream goes on."""
         for world, seed in zip(ids, seeds, strict=True):
             if seed is not None:
-                sequence = np.random.SeedSequence(int(seed), spawn_key=self._key)
-                self._generators[world] = np.random.default_rng(sequence)
+                self._generators[world], self._seeds[world] = None, int(seed)
 
     def of(self, world: int) -> np.random.Generator:
         """The generator of a world."""
         generator = self._generators[world]
         if generator is None:
-            generator = self._generators[world] = np.random.default_rng()
+            seed = self._seeds[world]
+            sequence = None if seed is None else np.random.SeedSequence(seed, spawn_key=self._key)
+            generator = self._generators[world] = np.random.default_rng(sequence)
         return generator
 
 

@@ -217,24 +217,24 @@ def test_whole_episodes_agree_with_mujoco(env_id: str, size: float, file: Any) -
 
 
 def test_a_vector_env_gives_numpy_and_tensors_on_request() -> None:
-    host = gym.make_vec(HOVER, num_envs=N, backend="rigid", device="cpu", episode_length=2)
+    """In float64 both draw the same numbers, and compute the same but for rounding."""
+    shared: Any = {"backend": "rigid", "device": "cpu", "dtype": "float64", "episode_length": 2}
+    host, ours = (gym.make_vec(HOVER, num_envs=N, tensors=x, **shared) for x in (False, True))
     observation, info = host.reset(seed=0)
     assert (type(observation), observation.dtype) == (np.ndarray, np.float32)
     assert info["position_error"].shape == (N,)
     assert {type(value) for value in info.values()} == {np.ndarray}
-    ours = gym.make_vec(
-        HOVER, num_envs=N, backend="rigid", device="cpu", episode_length=2, tensors=True
-    )
-    same = ours.reset(seed=0)[0]
-    assert same.numpy().tolist() == observation.tolist()
+    np.testing.assert_allclose(ours.reset(seed=0)[0], observation, atol=1e-6)
     for _ in range(3):
         actions = np.full((N, 4), 0.1, np.float32)
         told, other = ours.step(torch.from_numpy(actions)), host.step(actions)
         for one, another in zip(told[:4], other[:4], strict=True):
-            assert one.numpy().tolist() == another.tolist()
+            np.testing.assert_allclose(one, another, atol=1e-6)
             assert (type(one), type(another)) == (torch.Tensor, np.ndarray)
     with pytest.raises(InputError, match="tensors: expected False with the backend mujoco"):
         LocalVectorEnv(HOVER, 2, tensors=True)
+    with pytest.raises(InputError, match="gradients: expected False with mujoco, got True"):
+        LocalVectorEnv(HOVER, 2, gradients=True)
 
 
 def test_seeds_repeat_starts_in_float32() -> None:
@@ -331,7 +331,7 @@ def test_actions_keep_their_graph_through_the_loop_until_it_is_detached() -> Non
         ({"dtype": "float16"}, "dtype: expected float32 or float64, got 'float16'"),
         ({"device": "gpu"}, "device: expected 'cpu', or a CUDA device that torch finds, got 'gpu'"),
         ({"compiled": 1}, "compiled: expected true or false, got 1"),
-        ({"num_threads": 2}, "num_threads: expected device or dtype or compiled, the settings"),
+        ({"num_threads": 2}, "num_threads: expected device or dtype or compiled or tensors"),
     ],
 )
 def test_wrong_arguments(arguments: dict[str, Any], expected: str) -> None:
