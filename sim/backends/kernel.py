@@ -24,7 +24,14 @@ from ...models.errors import expect
 from .body import RigidBody, mapped
 
 ROWS: Final = 13
-_FLAGS: Final = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd")
+_FLAGS: Final = (
+    "-O3",
+    "-march=native",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fopenmp-simd",
+    "-ffp-contract=off",
+)
 _TERMS: Final = {"float": 7, "double": 12}  # of the series of a sine, up to a quarter turn
 _SOURCE: Final = """#include <math.h>
 #include <tgmath.h>

@@ -78,7 +78,7 @@ class Rigid(BaseWorld):
         self._low, self._high = (
             constant(x, thrust) for x in (vehicle.thrust_low, vehicle.thrust_high)
         )
-        self._acting = thrust  # mean over the last physics step
+        self._nothing = self._acting = thrust  # mean over the last physics step
         self._wrench: Array = None  # force and torque of effects over it, (6, W)
         self._rows = self._zeros(13, num_worlds) + constant(_LEVEL, thrust)[:, None]
         self.state = WorldState(
@@ -120,9 +120,8 @@ class Rigid(BaseWorld):
     ) -> None:
         """As `World.step`."""
         state = self.state
-        if thrust.shape != state.command.shape:  # one number for all rotors counts for each
-            thrust = self.xp.broadcast_to(thrust, state.command.shape)
-        state.command = self._kept(mask, self._typed(thrust), state.command)
+        # One number for all rotors counts for each.
+        state.command = self._kept(mask, self._typed(thrust + self._nothing), state.command)
         touching = state.touching if again else False
         while substeps > 0:
             self._fly(min(substeps, self._check), mask)
