@@ -105,10 +105,13 @@ def plain(array: Array) -> Array:
 
 
 def square_root(array: Array, xp: Any) -> Array:
-    """Of numbers; of one below 0, as rounding may leave it, 0."""
+    """Of numbers; of one below 0, as rounding may leave it, 0. The derivative at 0 is 0."""
     if isinstance(array, float):
         return math.sqrt(array) if array > 0.0 else 0.0
-    return xp.sqrt(clip(array, 0.0, math.inf))
+    if xp is np:
+        return np.sqrt(np.maximum(array, 0.0))
+    none = array <= 0.0
+    return xp.where(none, 0.0, xp.sqrt(xp.where(none, 1.0, array)))
 
 
 def stack(parts: Sequence[Any]) -> Array:

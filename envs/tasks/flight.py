@@ -114,8 +114,10 @@ def at(point: Sequence[float], state: WorldState) -> Array:
 
 
 def length(xp: Any, vectors: Array) -> Array:
-    """Sizes of vectors, shape (..., 3)."""
-    return xp.sqrt(xp.sum(vectors * vectors, axis=-1))
+    """Sizes of vectors, shape (..., 3); their derivative at 0 is 0."""
+    if xp is np:
+        return np.sqrt(np.sum(vectors * vectors, axis=-1))
+    return xp.linalg.vector_norm(vectors, axis=-1)
 
 
 def axes(quaternion: Array) -> tuple[Array, Array]:
