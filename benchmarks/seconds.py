@@ -5,10 +5,9 @@
 
 After `--` are the words of `rotorgram train`; without any, PPO on the paper's task, with its tuned
 preset. The clock runs from before the process starts to after it has ended, with its checkpoint
-written; `processor` are the seconds of all its processes, which a busy machine disturbs less, though
-waits that look for a message count. Each policy then flies 20 episodes on `mujoco`, of starts that no training has seen. A seed
-holds if the mean of the steady headline metric over the episodes is below `--within`, and none of
-them crashes.
+written; `processor` are the seconds of all its processes, which a busy machine disturbs less. Each
+policy then flies 20 episodes on `mujoco`, of starts that no training has seen. A seed holds if the
+mean of the steady headline metric over the episodes is below `--within`, and none of them crashes.
 """
 
 import argparse

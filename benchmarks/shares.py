@@ -37,7 +37,9 @@ def microseconds(fly: Callable[[], None], times: int) -> float:
 
 
 def simulate(backend: Any, drones: int) -> Callable[[], None]:
-    loop = Loop(HOVER, drones, backend=backend, **({"tensors": False} if backend == "rigid" else {}))
+    loop = Loop(
+        HOVER, drones, backend=backend, **({"tensors": False} if backend == "rigid" else {})
+    )
     actions = np.zeros((drones, 4), np.float32)
     loop.advance(actions, np.ones(drones, bool), range(drones))
 
@@ -71,8 +73,9 @@ class Agent:
         log = EpisodeLog(env, 0)
         self.spent = {"env": 0.0, "learn": 0.0}
         self.agent: Any = make_agent("ppo", log, config, 0)
-        env.advance, self.agent.update = self.timed("env", env.advance), self.timed(
-            "learn", self.agent.update
+        env.advance, self.agent.update = (
+            self.timed("env", env.advance),
+            self.timed("learn", self.agent.update),
         )
         self.log = log
 

@@ -135,10 +135,10 @@ def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
 def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle = Vehicle.load(linear_drag=0.123)
     monkeypatch.setenv("CC", str(shutil.which("false")))
-    with pytest.raises(InputError, match="^compiled: expected .*false to compile the equations"):
+    with pytest.raises(InputError, match=r"^compiled: expected .*false to compile the equations"):
         arrays(vehicle)
     monkeypatch.setattr(shutil, "which", lambda _: None)
-    with pytest.raises(InputError, match="^compiled: expected false where no C compiler is found"):
+    with pytest.raises(InputError, match=r"^compiled: expected false where no C compiler is found"):
         arrays(vehicle, compiled=True)
     world = arrays(vehicle)
     world.reset(EVERY, Pose(position=np.full((N, 1, 3), 9.0), velocity=np.full((N, 1, 3), 1.0)))

@@ -9,7 +9,7 @@ Frames: world, z up, and the body's. Position and velocity are those of the body
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 import mujoco

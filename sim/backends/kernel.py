@@ -141,21 +141,27 @@ class Variable:
         return self._made("fabs({})")
 
     def add(self, other: Any, *, alpha: float) -> "Variable":
+        """Itself and `alpha` times another."""
         return self + other * alpha
 
     def addcmul(self, a: Any, b: Any, *, value: float = 1.0) -> "Variable":
+        """Itself and `value` times a product."""
         return self + (a * b if value == 1.0 else a * b * value)
 
     def clip(self, *, max: float) -> "Variable":
+        """The lesser of itself and a number."""
         return self._made("{0} < {1} ? {0} : {1}", max)
 
     def sqrt(self) -> "Variable":
+        """Square root."""
         return self._made("sqrt({})")
 
     def sin(self) -> "Variable":
+        """Sine."""
         return self._wave(1)
 
     def cos(self) -> "Variable":
+        """Cosine."""
         return self._wave(0)
 
     def _wave(self, first: int) -> "Variable":

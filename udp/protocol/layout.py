@@ -100,7 +100,9 @@ class Layout:
             for slot, end in zip(slots, ends, strict=False)
         )
         self.state_size = ends[-1]
-        self.state_floats = [slot for slot in slots[: len(observation) + 1] if slot.dtype.kind == "f"]
+        self.state_floats = [
+            slot for slot in slots[: len(observation) + 1] if slot.dtype.kind == "f"
+        ]
         if told:  # float64 side by side: one array, for one look at it
             at, end = told[0].at, told[-1].end
             self.state_floats.append(Slot(at, end, ((end - at) // 8,), told[0].dtype))
