@@ -140,11 +140,11 @@ class Variable:
     def __abs__(self) -> "Variable":
         return self._made("fabs({})")
 
-    def add(self, other: Any, *, alpha: float) -> "Variable":
+    def add(self, other: Any, *, alpha: float) -> Any:
         """Itself and `alpha` times another."""
         return self + other * alpha
 
-    def addcmul(self, a: Any, b: Any, *, value: float = 1.0) -> "Variable":
+    def addcmul(self, a: Any, b: Any, *, value: float = 1.0) -> Any:
         """Itself and `value` times a product."""
         return self + (a * b if value == 1.0 else a * b * value)
 
@@ -156,15 +156,15 @@ class Variable:
         """Square root."""
         return self._made("sqrt({})")
 
-    def sin(self) -> "Variable":
+    def sin(self) -> Any:
         """Sine."""
         return self._wave(1)
 
-    def cos(self) -> "Variable":
+    def cos(self) -> Any:
         """Cosine."""
         return self._wave(0)
 
-    def _wave(self, first: int) -> "Variable":
+    def _wave(self, first: int) -> Any:
         """A sine (1) or cosine (0) by its series within a quarter turn of whole half turns.
 
         With a library's functions the compiler would use no vectors.

@@ -41,13 +41,12 @@ def make_rigid(
     right = compiled is None or type(compiled) is bool
     expect(right, "compiled", "true or false", repr(compiled))
     expect(dtype in DTYPES, "dtype", " or ".join(DTYPES), repr(dtype))
-    what: Any = (vehicle, num_worlds, effects, randomize, dtype, compiled)
     if not tensors:
         expect(device in (None, "cpu"), "device", "cpu without tensors", repr(device))
-        return RigidWorld(*what)
+        return RigidWorld(vehicle, num_worlds, effects, randomize, dtype, compiled)
     from .rigid_tensors import RigidTensorWorld
 
-    return RigidTensorWorld(*what, device)
+    return RigidTensorWorld(vehicle, num_worlds, effects, randomize, dtype, compiled, device)
 
 
 class Rigid(BaseWorld):
@@ -241,8 +240,8 @@ class RigidWorld(Rigid, ArrayWorld):
 
     def _flown(self, rows: Array, thrust: Array, wrench: Array, steps: int) -> np.ndarray:
         if self._function is None:
-            new = np.stack(self._body.fly(rows, thrust, wrench, steps)).view(np.ndarray)
-            return self._typed(new)
+            new = self._body.fly(rows, thrust, wrench, steps)
+            return np.array(new, self.dtype)
         return self._function(rows, thrust, wrench, self._varying, steps)
 
     def _vary(self, parameters: dict[str, Array]) -> None:
