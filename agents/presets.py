@@ -262,7 +262,7 @@ _HOVER: Final = PPOConfig(
 )  # fmt: skip
 _OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {
     ("ppo", "tuned", "rotorgram/Hover-v0"): Preset(
-        config=_HOVER, num_envs=128, env_steps=1_000_000
+        config=_HOVER, num_envs=128, env_steps=1_000_000, backend="rigid"
     ),
     ("sac", "tuned", "rotorgram/Hover-v0"): Preset(
         config=SACConfig(

@@ -16,6 +16,7 @@ import json
 import os
 import platform
 import statistics
+import time
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +30,28 @@ from rotorgram.experiments.training import Training
 AGENTS = ("a2c", "vpg", "sb3-a2c")
 
 
-def steps_per_second(algorithm: str, changes: dict[str, int], seed: int, **settings: Any) -> float:
+def processor_seconds() -> float:
+    """Of this process and its simulator, by Linux."""
+    (task,) = Path("/proc/self/task").glob(str(os.getpid()))
+    used = time.process_time()
+    for child in (task / "children").read_text().split():
+        fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+        used += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return used
+
+
+def steps_per_second(
+    algorithm: str, changes: dict[str, int], seed: int, **settings: Any
+) -> tuple[float, float]:
+    """By the clock, and per second of a processor."""
     config = preset(algorithm, "tuned", **changes)
     run = Run(algorithm=algorithm, config=config, seed=seed, **settings)
     with socket_pair(**run.training_env, num_envs=run.num_envs) as env:
         training = Training(run, env)
+        before = processor_seconds()
         training.train()
-        return training.log.env_steps / training.log.seconds
+        used = processor_seconds() - before
+        return training.log.env_steps / training.log.seconds, training.log.env_steps / used
 
 
 def main() -> None:
@@ -51,29 +67,41 @@ def main() -> None:
     changes = {"steps_per_update": args.steps_per_update} if args.steps_per_update else {}
     settings = {name: getattr(args, name) for name in ("env_steps", "num_envs", "backend")}
     rates: dict[str, list[float]] = {agent: [] for agent in args.agents}
+    used: dict[str, list[float]] = {agent: [] for agent in args.agents}
     for repeat in range(args.repeats):
         for agent in args.agents:
-            rate = steps_per_second(agent, changes, repeat, **settings)
+            rate, of_processor = steps_per_second(agent, changes, repeat, **settings)
             rates[agent].append(round(rate, 1))
-            print(f"{agent:8} {rate:8,.0f} env steps/s", flush=True)
+            used[agent].append(round(of_processor, 1))
+            print(f"{agent:8} {rate:8,.0f} env steps/s, {of_processor:8,.0f} of a processor's",
+                  flush=True)  # fmt: skip
     medians = {agent: statistics.median(values) for agent, values in rates.items()}
-    ratios = {
-        agent: round(statistics.median(np.divide(values, rates["sb3-a2c"]).tolist()), 2)
-        for agent, values in rates.items()
-    }
+    ratios, ratios_used = (
+        {
+            agent: round(statistics.median(np.divide(values, told["sb3-a2c"]).tolist()), 2)
+            for agent, values in told.items()
+        }
+        for told in (rates, used)
+    )
     result = {
         **settings,
         "changes": changes,
         "rates": rates,
         "medians": medians,
         "ratio_to_sb3": ratios,
+        "rates_per_processor_second": used,
+        "ratio_to_sb3_per_processor_second": ratios_used,
+        "load_average": round(os.getloadavg()[0], 1),
         "versions": software_versions(),
         "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
     }
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps(result, indent=2) + "\n")
     for agent, median in medians.items():
-        print(f"{agent:8} median {median:8,.0f} env steps/s, {ratios[agent]:.2f} x SB3's A2C")
+        print(
+            f"{agent:8} median {median:8,.0f} env steps/s, {ratios[agent]:.2f} x SB3's A2C, "
+            f"{ratios_used[agent]:.2f} x per second of a processor"
+        )
 
 
 if __name__ == "__main__":

@@ -97,11 +97,16 @@ class NumpyDraw(Draw):
         self._streams, self._ids, self._shape = streams, ids, shape
 
     def _draw(self, kind: str, parameters: tuple[float, float], size: tuple[int, ...]) -> Array:
-        numbers = np.zeros((*self._shape, *size))
+        # A generator scales slowly, number by number, and to the same bits as this.
+        first, second = parameters
+        name, span = (
+            ("random", second - first) if kind == "uniform" else ("standard_normal", second)
+        )
         one_world = (*self._shape[1:], *size)
-        for world in self._ids:
-            place = world if self._shape else ...
-            numbers[place] = getattr(self._streams.of(world), kind)(*parameters, one_world)
+        numbers = np.zeros((*self._shape, *size))
+        if self._ids:
+            drawn = [getattr(self._streams.of(world), name)(one_world) for world in self._ids]
+            numbers[self._ids if self._shape else ...] = first + span * np.array(drawn)
         return numbers[()]
 
 
