@@ -39,7 +39,9 @@ class APG(Learner):
         super().__init__(log, config, seed)
         self._loop: Any = getattr(log.env, "loop", None)
         backend = "rigid" if hasattr(getattr(self._loop, "world", None), "detach") else "another"
-        expect(backend == "rigid", "apg", "an env in this process, on the backend rigid", backend)
+        expect(
+            backend == "rigid", "apg", "an env in this process, on rigid with gradients", backend
+        )
         sensed = "sensors" in log.spec.options
         expect(not sensed, "apg", "an env without sensors, which have no derivative", "some")
         torch.set_num_threads(1)  # such small tensors lose by a second thread

@@ -284,7 +284,7 @@ def _large(env_steps: int, **changes: Any) -> Preset:
 
 
 _OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {
-    ("ppo", "tuned", "rotorgram/Hover-v0"): _HOLD,
+    ("ppo", "tuned", "rotorgram/Hover-v0"): replace(_HOLD, backend="rigid"),
     ("ppo", "tuned", "rotorgram/PayloadHover-v0"): _HOLD,
     ("ppo", "tuned", "rotorgram/Tracking-v0"): _large(1_000_000),
     ("ppo", "tuned", "rotorgram/Racing-v0"): _large(1_500_000),

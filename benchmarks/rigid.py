@@ -1,7 +1,8 @@
-"""Accuracy and speed of the backend `rigid`, and of the ways to compile its physics step.
+"""Accuracy and speed of the backend `rigid`.
 
     python benchmarks/rigid.py accuracy
     python benchmarks/rigid.py speed [--numba PYTHON] [--crazyflow PYTHON]
+    python benchmarks/rigid.py sizes
 
 Accuracy: the largest distance to `mujoco` after 5 s of tumbling flight at random thrusts, of every
 vehicle of the library and of the tests. float64 and float32 begin 1000 m up for `mujoco`, where
@@ -10,10 +11,12 @@ of a flight near the origin.
 
 Speed: control steps of 4,096 drones, per second and per second of a processor (which a busy machine
 disturbs less), in turn, medians: of the world alone for `mujoco`
-and `rigid`, eager and compiled; the same for one env, `Loop.advance` of Hover. With PYTHON of an
+and `rigid`, arrays and tensors; the same for one env, `Loop.advance` of Hover. With PYTHON of an
 environment that has them (pip install numba; pip install crazyflow): the same physics step by
 Numba, and Crazyflow's own step benchmark at the same rates, each in a process of its own.
-Writes docs/results/rigid/{accuracy,speed}.json.
+
+Sizes: the processor's time of `Loop.advance` of Hover with 64 to 4,096 drones.
+Writes docs/results/rigid/{accuracy,speed,sizes}.json.
 """
 
 import argparse
@@ -100,7 +103,7 @@ def world(backend: Any, drones: int, steps: int = 2, **settings: Any) -> Callabl
     thrust = vehicle.hover_thrust * dice.uniform(0.999, 1.001, (drones, 1, vehicle.num_rotors))
     place = np.broadcast_to((0.0, 0.0, 2000.0), (drones, 1, 3))
     every: Any = np.ones((drones, 1), bool)
-    if backend == "mujoco":
+    if made.xp is np:
         made.reset(every, Pose(position=place))
         return lambda: made.step(thrust, steps)
     put = torch.tensor(thrust, dtype=torch.float32)
@@ -113,7 +116,7 @@ def env(backend: Any, drones: int, **settings: Any) -> Callable[[], None]:
     loop = Loop(HOVER, drones, backend=backend, **settings)
     actions: Any = np.random.default_rng(0).uniform(-0.1, 0.1, (drones, 4)).astype(np.float32)
     loop.advance(actions, np.ones(drones, bool), range(drones))
-    actions = actions if backend == "mujoco" else torch.tensor(actions)
+    actions = actions if loop.world.xp is np else torch.tensor(actions)
 
     def fly() -> None:
         loop.advance(actions, loop.done if loop.done.any() else None)
@@ -121,17 +124,39 @@ def env(backend: Any, drones: int, **settings: Any) -> Callable[[], None]:
     return fly
 
 
+def sizes(args: argparse.Namespace) -> None:
+    """Processor microseconds of `Loop.advance` of Hover, by the number of drones."""
+    ways: dict[str, tuple[Any, dict[str, Any]]] = {
+        "mujoco": ("mujoco", {}),
+        "rigid, arrays": ("rigid", {"tensors": False}),
+        "rigid, arrays without a compiler": ("rigid", {"tensors": False, "compiled": False}),
+        "rigid, tensors": ("rigid", {"device": "cpu"}),
+    }
+    table = {}
+    for drones in (64, 128, 1024, 4096):
+        flights = {name: env(kind, drones, **given) for name, (kind, given) in ways.items()}
+        rates: dict[str, list[float]] = {name: [] for name in ways}
+        for _ in range(args.repeats):
+            for name, fly in flights.items():
+                with torch.no_grad():
+                    rates[name].append(rate(fly, drones, args.seconds)[1])
+        row = {name: round(drones / statistics.median(rates[name]) * 1e6) for name in ways}
+        print(drones, row, flush=True)
+        table[str(drones)] = row
+    write("sizes", {"processor_microseconds": table, "repeats": args.repeats})
+
+
 def speed(args: argparse.Namespace) -> None:
     ways: dict[str, Callable[[], None]] = {}
     firsts = {}
     for name, (make, backend, settings) in {
         "world mujoco": (world, "mujoco", {}),
-        "world rigid": (world, "rigid", {"device": "cpu"}),
-        "world rigid compiled": (world, "rigid", {"device": "cpu", "compiled": True}),
-        "world rigid, one physics step": (world, "rigid", {"device": "cpu", "steps": 1}),
+        "world rigid": (world, "rigid", {"tensors": False}),
+        "world rigid, one physics step": (world, "rigid", {"tensors": False, "steps": 1}),
+        "world rigid tensors": (world, "rigid", {"device": "cpu"}),
         "env mujoco": (env, "mujoco", {}),
-        "env rigid": (env, "rigid", {"device": "cpu"}),
-        "env rigid compiled": (env, "rigid", {"device": "cpu", "compiled": True}),
+        "env rigid": (env, "rigid", {"tensors": False}),
+        "env rigid tensors": (env, "rigid", {"device": "cpu"}),
     }.items():
         start = time.perf_counter()
         with torch.no_grad():
@@ -177,14 +202,14 @@ def write(name: str, content: dict[str, Any]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("accuracy", "speed"))
+    parser.add_argument("what", choices=("accuracy", "speed", "sizes"))
     parser.add_argument("--drones", type=int, default=4096)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=1.0, help="of each repeat")
     parser.add_argument("--numba", metavar="PYTHON")
     parser.add_argument("--crazyflow", metavar="PYTHON")
     args = parser.parse_args()
-    accuracy() if args.what == "accuracy" else speed(args)
+    {"accuracy": lambda _: accuracy(), "speed": speed, "sizes": sizes}[args.what](args)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,14 @@
 """Env steps per second of training through the socket: our A2C and VPG beside SB3's A2C.
 
     python benchmarks/training_speed.py [--env-steps 20000] [--repeats 5] [--out FILE.json]
+    python benchmarks/training_speed.py --agents a2c sb3-a2c --num-envs 64 --backend rigid
+        --steps-per-update 320 --env-steps 200000 --out docs/results/rigid/a2c.json
 
 Every training has a simulator process and a socket pair of its own, the same networks, the same
 hyperparameters (preset `tuned`) and the same number of env steps. The agents take turns, so that a
-machine that slows down slows all of them; medians are compared. Imports and the start of the
-simulator are not counted.
+machine that slows down slows all of them; medians are compared, of rates and of the ratios to SB3's
+in the same turn. Imports and the start of the simulator are not counted. 320 env steps of 64 drones
+are five of each for an update, as SB3's default has it.
 """
 
 import argparse
@@ -13,8 +16,11 @@ import json
 import os
 import platform
 import statistics
+import time
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from rotorgram.agents import preset
 from rotorgram.agents.checkpoints import software_versions
 from rotorgram.experiments.pairs import socket_pair
@@ -24,45 +30,78 @@ from rotorgram.experiments.training import Training
 AGENTS = ("a2c", "vpg", "sb3-a2c")
 
 
-def steps_per_second(algorithm: str, env_steps: int, seed: int) -> float:
-    run = Run(
-        algorithm=algorithm,
-        config=preset(algorithm, "tuned"),
-        seed=seed,
-        env_steps=env_steps,
-    )
-    with socket_pair(**run.env) as env:
+def processor_seconds() -> float:
+    """Of this process and its simulator, by Linux."""
+    (task,) = Path("/proc/self/task").glob(str(os.getpid()))
+    used = time.process_time()
+    for child in (task / "children").read_text().split():
+        fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+        used += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return used
+
+
+def steps_per_second(
+    algorithm: str, changes: dict[str, int], seed: int, **settings: Any
+) -> tuple[float, float]:
+    """By the clock, and per second of a processor."""
+    config = preset(algorithm, "tuned", **changes)
+    run = Run(algorithm=algorithm, config=config, seed=seed, **settings)
+    with socket_pair(**run.training_env, num_envs=run.num_envs) as env:
         training = Training(run, env)
+        before = processor_seconds()
         training.train()
-        return training.log.env_steps / training.log.seconds
+        used = processor_seconds() - before
+        return training.log.env_steps / training.log.seconds, training.log.env_steps / used
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env-steps", type=int, default=20_000)
+    parser.add_argument("--agents", nargs="+", default=AGENTS)
+    parser.add_argument("--num-envs", type=int, default=1)
+    parser.add_argument("--backend", default="mujoco")
+    parser.add_argument("--steps-per-update", type=int, help="default: those of the preset")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=Path, default=Path("docs/results/training_speed.json"))
     args = parser.parse_args()
-    rates: dict[str, list[float]] = {agent: [] for agent in AGENTS}
+    changes = {"steps_per_update": args.steps_per_update} if args.steps_per_update else {}
+    settings = {name: getattr(args, name) for name in ("env_steps", "num_envs", "backend")}
+    rates: dict[str, list[float]] = {agent: [] for agent in args.agents}
+    used: dict[str, list[float]] = {agent: [] for agent in args.agents}
     for repeat in range(args.repeats):
-        for agent in AGENTS:
-            rate = steps_per_second(agent, args.env_steps, seed=repeat)
+        for agent in args.agents:
+            rate, of_processor = steps_per_second(agent, changes, repeat, **settings)
             rates[agent].append(round(rate, 1))
-            print(f"{agent:8} {rate:8,.0f} env steps/s", flush=True)
+            used[agent].append(round(of_processor, 1))
+            print(f"{agent:8} {rate:8,.0f} env steps/s, {of_processor:8,.0f} of a processor's",
+                  flush=True)  # fmt: skip
     medians = {agent: statistics.median(values) for agent, values in rates.items()}
-    reference = medians["sb3-a2c"]
+    ratios, ratios_used = (
+        {
+            agent: round(statistics.median(np.divide(values, told["sb3-a2c"]).tolist()), 2)
+            for agent, values in told.items()
+        }
+        for told in (rates, used)
+    )
     result = {
-        "env_steps": args.env_steps,
+        **settings,
+        "changes": changes,
         "rates": rates,
         "medians": medians,
-        "ratio_to_sb3": {agent: round(m / reference, 2) for agent, m in medians.items()},
+        "ratio_to_sb3": ratios,
+        "rates_per_processor_second": used,
+        "ratio_to_sb3_per_processor_second": ratios_used,
+        "load_average": round(os.getloadavg()[0], 1),
         "versions": software_versions(),
         "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
     }
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps(result, indent=2) + "\n")
     for agent, median in medians.items():
-        print(f"{agent:8} median {median:8,.0f} env steps/s, {median / reference:.2f} x SB3's A2C")
+        print(
+            f"{agent:8} median {median:8,.0f} env steps/s, {ratios[agent]:.2f} x SB3's A2C, "
+            f"{ratios_used[agent]:.2f} x per second of a processor"
+        )
 
 
 if __name__ == "__main__":

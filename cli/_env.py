@@ -155,6 +155,7 @@ def local_env(
     from ..envs.vector import LocalVectorEnv
 
     settings: Any = {"vehicle": command.vehicle, "backend": backend, **options}
+    settings["gradients"] = backend == "rigid"
     with closing(LocalVectorEnv(env_id, num_envs, autoreset_mode="Disabled", **settings)) as env:
         yield env
 

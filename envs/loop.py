@@ -221,60 +221,78 @@ class Loop(NotCopied):
         **settings: Any,
     ) -> None:
         draft = make_task(env_id, options or {}, vehicle)
-        effects = EffectOptions.from_options(draft.options.effects_on(draft.vehicle.mass))
-        drawn = draft.options.randomize
-        randomize = Randomization(drawn, effects) if drawn else None
+        chosen, craft = draft.options, draft.vehicle
+        effects = EffectOptions.from_options(chosen.effects_on(craft.mass))
+        randomize = Randomization(chosen.randomize, effects) if chosen.randomize else None
         self.world: World = make_world(
-            draft.vehicle, num_envs, backend, effects=effects, randomize=randomize, **settings
+            craft, num_envs, backend, effects=effects, randomize=randomize, **settings
         )
-        self._xp, lead = self.world.xp, self.world.shape
-        self.task = type(draft)(draft.options, draft.vehicle, lead, self._xp)
+        self._xp = self.world.xp
+        self.task = type(draft)(chosen, craft, self.world.shape, self._xp)
         self.spec = spec_of(canonical_id(env_id), self.task)
-        self.num_envs, self.vehicle = num_envs, draft.vehicle
-        self._substeps = draft.vehicle.substeps(draft.options.control_period)
-        self._length = draft.options.episode_length
-        self._choices = self.task.controller.choices
-        self._width = len(self.task.controller.low)
-        self._action_shape = (*lead, self._width)
-        flat = (1,) if draft.options.history > 1 else ()
-        self._arrays = [
-            (a.name, (num_envs, *(a.shape or flat)), getattr(self._xp, a.dtype))
-            for a in _observed(self.task)
-        ]
-        period, sensors = self.spec.control_period, draft.options.sensors
-        self._sensors = Sensors(sensors, self.world, period) if sensors else None
-        estimated = draft.options.estimated  # it may leave the task's bounds
-        self._limits = {a.name: a.bounds() for a in _observed(self.task) if estimated}
+        self.num_envs, self.vehicle = num_envs, craft
+        self._prepare_step()
+        self._prepare_observations()
+        self._prepare_memory(randomize)
+        self._clear()
+
+    def _prepare_step(self) -> None:
+        """What a step needs to know of actions and times."""
+        controller, options = self.task.controller, self.task.options
+        self._choices, self._width = controller.choices, len(controller.low)
+        self._action_shape = (*self.world.shape, self._width)
+        self._length = options.episode_length
+        self._substeps = self.vehicle.substeps(options.control_period)
         # An estimate is one for a control step, and so are the thrusts of what sees it.
-        often = getattr(self.task.controller, "every_step", False) and not estimated
+        often = getattr(controller, "every_step", False) and not options.estimated
         self._held = 1 if often else self._substeps
-        none = self.world.state.touching != self.world.state.touching  # all False, on its device
-        self._none, self._nobody = none, none.reshape(num_envs)
-        self._everybody: Array = ~none
-        self.terminated = self.truncated = self.done = self._nobody
-        self.rewards: Array = 0.0 * self._nobody
-        self.observations: dict[str, Array] = {}
-        self._steps: Array = plain((0 * self._nobody).reshape(lead))
-        self._waiting, self._anyone_waits = ~self._nobody, True  # for a reset
-        self._begun = self._closed = False
-        self._outcome: Outcome | None = None
-        self.terms: dict[str, Array] = {}
-        self._telemetry: dict[str, np.ndarray] | None = None
+
+    def _prepare_observations(self) -> None:
+        """Arrays of observations and telemetry, and the sensors."""
+        options, observed = self.task.options, _observed(self.task)
+        flat = (1,) if options.history > 1 else ()
+        self._arrays = [
+            (a.name, (self.num_envs, *(a.shape or flat)), getattr(self._xp, a.dtype))
+            for a in observed
+        ]
+        sensors, period = options.sensors, options.control_period
+        self._sensors = Sensors(sensors, self.world, period) if sensors else None
+        # An estimate may leave the task's bounds.
+        self._limits = {a.name: a.bounds() for a in observed if options.estimated}
         ends = np.cumsum([0, *(array.size for array in self.spec.telemetry)]).tolist()
         self._columns = {  # where each array of the telemetry lies in the row of a single drone
             array.name: slice(*ends[i : i + 2]) for i, array in enumerate(self.spec.telemetry)
         }
         self._has_goal = "goal" in self._columns
+
+    def _prepare_memory(self, randomize: Randomization | None) -> None:
+        """Delays that are drawn, and the observations that are kept."""
         self._drawn = () if randomize is None else randomize.names
-        self._late_actions = self._late_observations = None
+
+        names, count = [name for name, *_ in self._arrays], self.task.options.history
+        self._late_actions: Delay | None = None
+        self._late_observations: dict[str, Delay] = {}
         if randomize is not None and "action_delay" in self._drawn:
             self._late_actions = Delay(randomize.most_steps("action_delay"), self._xp)
         if randomize is not None and "observation_delay" in self._drawn:
             most = randomize.most_steps("observation_delay")
-            self._late_observations = {name: Delay(most, self._xp) for name, *_ in self._arrays}
-        self._history: dict[str, Delay] | None = None
-        if (count := draft.options.history) > 1:
-            self._history = {name: Delay(count - 1, self._xp) for name, *_ in self._arrays}
+            self._late_observations = {name: Delay(most, self._xp) for name in names}
+        self._history = {name: Delay(count - 1, self._xp) for name in names if count > 1}
+
+    def _clear(self) -> None:
+        """No episode has begun, and nothing was seen."""
+        none = self.world.state.touching != self.world.state.touching  # all False, on its device
+        self._none, self._nobody = none, none.reshape(self.num_envs)
+        self._everybody: Array = ~none
+        self.terminated = self.truncated = self.done = self._nobody
+        self.rewards: Array = 0.0 * self._nobody
+        self.observations: dict[str, Array] = {}
+        self.terms: dict[str, Array] = {}
+        self._steps: Array = plain((0 * self._nobody).reshape(self.world.shape))
+        self._waiting, self._anyone_waits = ~self._nobody, True  # for a reset
+        self._begun = self._closed = False
+        self._outcome: Outcome | None = None
+        self._telemetry: dict[str, np.ndarray] | None = None
 
     def advance(
         self,
@@ -395,14 +413,13 @@ class Loop(NotCopied):
         self.observations = {}
         for name, shape, dtype in self._arrays:
             self.observations[name] = _as_type(observed[name].reshape(shape), dtype)
-        if self._late_observations is not None:
+        if self._late_observations:
             age = self._per_drone(self.world.parameters["observation_delay"])
             for name, past in self._keep(self._late_observations, flown, begun):
                 ones = (n,) + (1,) * (self.observations[name].ndim - 1)
                 self.observations[name] = past.get(age.reshape(ones))
-        if self._history is not None:
-            for name, past in self._keep(self._history, flown, begun):
-                self.observations[name] = past.row()
+        for name, past in self._keep(self._history, flown, begun):
+            self.observations[name] = past.row()
         self._outcome, self.terms = outcome, outcome.reward
         ended: Array = outcome.terminated
         late = (self._steps >= self._length) > ended  # for truth values a > b is a and not b
@@ -560,10 +577,9 @@ class Loop(NotCopied):
         for name, value in vars(self.task).items():
             if getattr(value, "requires_grad", False):
                 setattr(self.task, name, value.detach())
-        kept = (self._late_actions, *(self._late_observations or {}).values())
-        for past in (*kept, *(self._history or {}).values()):
-            if past is not None:
-                past.detach()
+        actions = () if self._late_actions is None else (self._late_actions,)
+        for past in (*actions, *self._late_observations.values(), *self._history.values()):
+            past.detach()
         self.observations = {name: x.detach() for name, x in self.observations.items()}
         self.rewards = self.rewards.detach()
 

@@ -39,10 +39,13 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         vehicle: As of `Vehicle.load`: a file or a name; None is the paper's.
         backend: `mujoco`, `rigid` or `warp`.
         num_threads: Threads that step `mujoco`; 0 takes one for each processor.
-        device: Of `rigid` and `warp`; None takes a GPU if there is one.
+        device: Of `rigid` and `warp`; None takes a GPU if there is one, but for the arrays of
+            `rigid`, which are computed on the CPU.
         dtype: Of `rigid`: `float32`, or `float64`.
-        compiled: Of `rigid`: whether torch compiles it.
+        compiled: Of `rigid`: None compiles arrays where there is a C compiler; True has torch
+            compile tensors.
         tensors: Give torch tensors, with `rigid` and `warp`.
+        gradients: Of `rigid`: compute tensors that have derivatives, which `loop` gives.
         options: Of the task, by name.
 
     Raises:
@@ -67,6 +70,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         dtype: str | None = None,
         compiled: bool | None = None,
         tensors: bool = False,
+        gradients: bool = False,
         **options: Any,
     ) -> None:
         self.closed = True  # nothing is open yet
@@ -76,6 +80,9 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         right = not tensors or backend != "mujoco"
         expect(right, "tensors", "False with the backend mujoco", repr(tensors))
         given = {name: value for name, value in settings.items() if value is not None}
+        expect(not gradients or backend == "rigid", "gradients", f"False with {backend}", "True")
+        if backend == "rigid":
+            given["tensors"] = tensors or gradients or device not in (None, "cpu")
         self._loop = loop = Loop(
             env_id, num_envs, vehicle=vehicle, backend=backend, options=options, **given
         )
@@ -83,7 +90,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
         self._on_device = tensors
-        self._flown = OnHost(loop) if backend != "mujoco" and not tensors else loop
+        self._flown = loop if tensors or loop.world.xp is np else OnHost(loop)
         self._nobody = self.lost = self.done = self._flown.done
         self._episodes = np.zeros(num_envs, int)
         self.closed = False

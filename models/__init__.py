@@ -26,8 +26,9 @@ SCENE_XML: Final = Path(__file__).parent / "scene.xml"
 AIRPORT_XML: Final = Path(__file__).parent / "airport.xml"
 """The airport that `attach_airport` adds around a scene. It is visual only."""
 Backend = Literal["mujoco", "rigid", "warp"]
-"""What steps vehicles. `mujoco`: threads of this machine, float64. `rigid`: the rigid body in
-torch, no contact. `warp`: MuJoCo Warp, float32. The last two take a GPU if there is one."""
+"""What steps vehicles. `mujoco`: threads of this machine, float64. `rigid`: the rigid body alone,
+no contact, in compiled C or in torch. `warp`: MuJoCo Warp, float32. Tensors of the last two take a
+GPU if there is one."""
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
 MOST_DRAG: Final = 100.0
 """Largest linear drag, 1/s. RK4 at 10 ms is within 0.1 % there, and unstable above 278 /s."""

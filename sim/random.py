@@ -65,19 +65,21 @@ class Streams:
     def __init__(self, num_worlds: int, use: int | tuple[int, ...] = START) -> None:
         self._key = use if isinstance(use, tuple) else (use,)
         self._generators: list[np.random.Generator | None] = [None] * num_worlds
+        self._seeds: list[int | None] = [None] * num_worlds  # of generators that were not asked yet
 
     def seed(self, ids: Sequence[int], seeds: Sequence[int | None]) -> None:
         """Seed the worlds `ids`; where the seed is None the stream goes on."""
         for world, seed in zip(ids, seeds, strict=True):
             if seed is not None:
-                sequence = np.random.SeedSequence(int(seed), spawn_key=self._key)
-                self._generators[world] = np.random.default_rng(sequence)
+                self._generators[world], self._seeds[world] = None, int(seed)
 
     def of(self, world: int) -> np.random.Generator:
         """The generator of a world."""
         generator = self._generators[world]
         if generator is None:
-            generator = self._generators[world] = np.random.default_rng()
+            seed = self._seeds[world]
+            sequence = None if seed is None else np.random.SeedSequence(seed, spawn_key=self._key)
+            generator = self._generators[world] = np.random.default_rng(sequence)
         return generator
 
 
@@ -95,11 +97,16 @@ class NumpyDraw(Draw):
         self._streams, self._ids, self._shape = streams, ids, shape
 
     def _draw(self, kind: str, parameters: tuple[float, float], size: tuple[int, ...]) -> Array:
-        numbers = np.zeros((*self._shape, *size))
+        # A generator scales slowly, number by number, and to the same bits as this.
+        first, second = parameters
+        name, span = (
+            ("random", second - first) if kind == "uniform" else ("standard_normal", second)
+        )
         one_world = (*self._shape[1:], *size)
-        for world in self._ids:
-            place = world if self._shape else ...
-            numbers[place] = getattr(self._streams.of(world), kind)(*parameters, one_world)
+        numbers = np.zeros((*self._shape, *size))
+        if self._ids:
+            drawn = [getattr(self._streams.of(world), name)(one_world) for world in self._ids]
+            numbers[self._ids if self._shape else ...] = first + span * np.array(drawn)
         return numbers[()]
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from ..models.vehicle import Vehicle
 
-_WORLDS: Final = {"mujoco": "MujocoWorld", "rigid": "RigidWorld", "warp": "WarpWorld"}
+_WORLDS: Final = {"mujoco": "MujocoWorld", "rigid": "make_rigid", "warp": "WarpWorld"}
 _PACKAGES: Final = {  # and the extra that has them
     "mujoco": ("", ()),
     "rigid": ("train", ("torch",)),
@@ -24,7 +24,7 @@ _PACKAGES: Final = {  # and the extra that has them
 }
 _SETTINGS: Final = {
     "mujoco": ("num_threads",),
-    "rigid": ("device", "dtype", "compiled"),
+    "rigid": ("device", "dtype", "compiled", "tensors"),
     "warp": ("device",),
 }
 
@@ -130,7 +130,7 @@ def make_world(
     **settings: Any,
 ) -> World:
     """W worlds of one drone each; settings are `num_threads` of `mujoco`, `device` of the others,
-    `dtype` and `compiled` of `rigid`.
+    `dtype`, `compiled` and `tensors` of `rigid`: without the last it has NumPy arrays.
 
     Raises:
         InputError: The backend, the number or a setting is not what it should be.
@@ -149,7 +149,7 @@ def make_world(
                 f"{backend}, got {name}={value!r}"
             )
     extra, packages = _PACKAGES[backend]
-    for package in packages:
+    for package in packages if settings.get("tensors", True) else ():
         require(package, extra, f"the backend {backend}")
     module = import_module(f".backends.{backend}", __package__)
     world: World = getattr(module, _WORLDS[backend])(

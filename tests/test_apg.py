@@ -24,6 +24,7 @@ IMU = {"gyro_noise": 0.0, "accelerometer_noise": 0.0}
 
 def env_of(count: int = 8, **options: Any) -> LocalVectorEnv:
     settings: Any = {"backend": "rigid", "autoreset_mode": "Disabled", **options}
+    settings.setdefault("gradients", settings["backend"] == "rigid")
     return LocalVectorEnv(HOVER, count, **settings)
 
 
@@ -177,14 +178,16 @@ def test_it_flies_as_its_policy_does() -> None:
 @pytest.mark.parametrize(
     ("env_id", "settings", "sentence"),
     [
-        (HOVER, {}, "apg: expected an env in this process, on the backend rigid, got another"),
+        (HOVER, {}, "apg: expected an env in this process, on rigid with gradients, got another"),
         (HOVER, {"backend": "rigid", "sensors": {"imu": IMU}}, "apg: expected an env without"),
         ("rotorgram/Elevation-v0", {"backend": "rigid", "action_type": "discrete"},
          "apg: expected continuous actions, got choices"),
     ],
 )  # fmt: skip
 def test_what_it_cannot_fly(env_id: str, settings: Any, sentence: str) -> None:
-    log = EpisodeLog(LocalVectorEnv(env_id, 2, autoreset_mode="Disabled", **settings), 0)
+    gradients = settings.get("backend") == "rigid"
+    settings = {"autoreset_mode": "Disabled", "gradients": gradients, **settings}
+    log = EpisodeLog(LocalVectorEnv(env_id, 2, **settings), 0)
     with pytest.raises(InputError, match=sentence):
         make_agent("apg", log, APGConfig(), 0)
 

@@ -233,3 +233,17 @@ def test_the_curriculum_is_the_one_that_was_measured() -> None:
     assert len(lines) >= 10
     for row in lines.itertuples(index=False):
         assert f"| {row.row} | {row.seed} | {100 * row.crashes:.0f} % | {row[3]} |" in page
+
+
+def test_the_page_of_rigid_tells_what_the_benchmarks_wrote() -> None:
+    page = (ROOT / "docs" / "rigid.md").read_text()
+    sizes, shares, a2c = (
+        json.loads((RESULTS / "rigid" / f"{name}.json").read_text())
+        for name in ("sizes", "shares", "a2c")
+    )
+    for drones, row in sizes["processor_microseconds"].items():
+        numbers = " | ".join(f"{number:,}" for number in row.values())
+        assert f"| {int(drones):,} | {numbers} |" in page
+    for number in shares["microseconds_per_step"].values():
+        assert f" | {number:,} |" in page
+    assert f"{a2c['ratio_to_sb3']['a2c']:.2f} times as many env steps per second" in page

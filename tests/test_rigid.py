@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from remotes import flying
 from rotorgram.envs import LocalVectorEnv, Loop
+from rotorgram.envs.tasks.flight import length
 from rotorgram.experiments.settings import CompareConfig
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.models.errors import InputError
-from rotorgram.sim import PhysicsError, Pose, World, make_world
+from rotorgram.sim import PhysicsError, Pose, World, make_world, square_root
 
 torch = pytest.importorskip("torch")
+torch_api: Any = pytest.importorskip("array_api_compat.torch")
 
 ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
 DATA = Path(__file__).parent / "data"
@@ -29,6 +31,21 @@ def rigid(vehicle: Vehicle, num_worlds: int = N, dtype: str = "float64", **rest:
     return make_world(vehicle, num_worlds, "rigid", device="cpu", dtype=dtype, **rest)
 
 
+def arrays(vehicle: Vehicle, num_worlds: int = N, dtype: str = "float64", **rest: Any) -> Any:
+    return make_world(vehicle, num_worlds, "rigid", tensors=False, dtype=dtype, **rest)
+
+
+def tumbling(dice: np.random.Generator, count: int = N) -> dict[str, np.ndarray]:
+    """Starts high up, at any attitude."""
+    turned = dice.normal(size=(count, 1, 4))
+    return {
+        "position": dice.uniform(1000.0, 1001.0, (count, 1, 3)),
+        "quaternion": turned / np.linalg.norm(turned, axis=-1, keepdims=True),
+        "velocity": dice.normal(size=(count, 1, 3)),
+        "body_rates": dice.normal(size=(count, 1, 3)),
+    }
+
+
 def begin(world: World, **pose: np.ndarray) -> None:
     put = {name: torch.tensor(values, dtype=world.dtype) for name, values in pose.items()}  # type: ignore[attr-defined]
     world.reset(torch.ones(world.shape, dtype=torch.bool), Pose(**put))
@@ -36,7 +53,7 @@ def begin(world: World, **pose: np.ndarray) -> None:
 
 def angle(ours: Any, theirs: np.ndarray) -> float:
     """Largest angle between attitudes, rad."""
-    q, p = ours.double().numpy(), theirs
+    q, p = np.asarray(ours, np.float64), theirs
     apart = np.minimum(abs(q - p).max(axis=-1), abs(q + p).max(axis=-1))
     return 4 * float(apart.max())
 
@@ -50,26 +67,106 @@ def angle(ours: Any, theirs: np.ndarray) -> float:
 def test_flies_as_mujoco_for_five_seconds(name: str, drag: float) -> None:
     """1e-6 m and 1e-6 rad, from any attitude, tumbling, at random thrusts; measured: 1e-9."""
     vehicle, dice = Vehicle.load(FILES[name], linear_drag=drag), np.random.default_rng(0)
-    turned = dice.normal(size=(N, 1, 4))
-    pose = {
-        "position": dice.uniform(1000.0, 1001.0, (N, 1, 3)),
-        "quaternion": turned / np.linalg.norm(turned, axis=-1, keepdims=True),
-        "velocity": dice.normal(size=(N, 1, 3)),
-        "body_rates": dice.normal(size=(N, 1, 3)),
-    }
-    ours, theirs = rigid(vehicle), make_world(vehicle, N, num_threads=1)
-    begin(ours, **pose)
-    theirs.reset(EVERY, Pose(**pose))
+    pose = tumbling(dice)
+    ours, theirs = arrays(vehicle), make_world(vehicle, N, num_threads=1)
     substeps = vehicle.substeps(0.02)
+    for world in (ours, theirs):
+        world.reset(EVERY, Pose(**pose))
     for _ in range(250):
         thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (N, 1, vehicle.num_rotors))
-        for world, values in ((ours, torch.tensor(thrust)), (theirs, thrust)):
-            world.step(values, substeps)
+        for world in (ours, theirs):
+            world.step(thrust, substeps)
     assert not theirs.state.touching.any()
     assert abs(theirs.state.velocity).max() > 3
-    assert abs(ours.state.position.numpy() - theirs.state.position).max() < 1e-6
+    assert abs(ours.state.position - theirs.state.position).max() < 1e-6
     assert angle(ours.state.quaternion, theirs.state.quaternion) < 1e-6
-    assert abs(ours.acceleration().numpy() - theirs.acceleration()).max() < 1e-6
+    assert abs(ours.acceleration() - theirs.acceleration()).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_arrays_and_tensors_fly_the_same(name: str) -> None:
+    """A C function, if there is a compiler, NumPy and torch: but for rounding."""
+    vehicle, dice = Vehicle.load(FILES[name]), np.random.default_rng(0)
+    pose = tumbling(dice)
+    worlds = [arrays(vehicle, compiled=choice) for choice in (None, False)]
+    for world in worlds:
+        world.reset(EVERY, Pose(**pose))
+    worlds.append(rigid(vehicle))
+    begin(worlds[2], **pose)
+    for _ in range(5):
+        thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (N, 1, vehicle.num_rotors))
+        for world, values in zip(worlds, (thrust, thrust, torch.tensor(thrust)), strict=True):
+            world.step(values, 2)
+    for name in ("position", "quaternion", "velocity", "body_rates"):
+        seen = [np.asarray(getattr(world.state, name)) for world in worlds]
+        np.testing.assert_allclose(seen[0], seen[1], rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(seen[0], seen[2], rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_compiled_a_fast_spin_is_exact(dtype: str) -> None:
+    """Three and a half turns in a control step of two physics steps: half a turn about z."""
+    world = arrays(Vehicle.load(), 1, dtype)
+    rates = np.array([[[0.0, 0.0, 7 * np.pi / 0.02]]])
+    world.reset(EVERY[:1], Pose(position=np.full((1, 1, 3), 5.0), body_rates=rates))
+    world.step(np.zeros((1, 1, 4)), 2)
+    near = 1e-5 if dtype == "float32" else 1e-12
+    w, x, y, z = world.state.quaternion[0, 0].tolist()
+    assert [w, x, y, abs(z)] == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=near)
+
+
+def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
+    vehicle, dice = Vehicle.load(FILES["hexa"]), np.random.default_rng(0)
+    many = 19  # no multiple of what a processor computes at once
+    pose = tumbling(dice, many)
+    thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (many, 1, 6))
+    batch = arrays(vehicle, many, "float32")
+    batch.reset(np.ones((many, 1), bool), Pose(**pose))
+    batch.step(thrust, 2)
+    for i in (0, 18):
+        alone = arrays(vehicle, 1, "float32")
+        alone.reset(EVERY[:1], Pose(**{name: x[i : i + 1] for name, x in pose.items()}))
+        alone.step(thrust[i : i + 1], 2)
+        for name in ("position", "quaternion", "velocity", "body_rates"):
+            one, all_ = getattr(alone.state, name), getattr(batch.state, name)
+            assert one[0].tobytes() == all_[i].tobytes()
+
+
+def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None:
+    vehicle = Vehicle.load(linear_drag=0.123)
+    monkeypatch.setenv("CC", str(shutil.which("false")))
+    with pytest.raises(InputError, match=r"^compiled: expected .*false to compile the equations"):
+        arrays(vehicle)
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    with pytest.raises(InputError, match=r"^compiled: expected false where no C compiler is found"):
+        arrays(vehicle, compiled=True)
+    world = arrays(vehicle)
+    world.reset(EVERY, Pose(position=np.full((N, 1, 3), 9.0), velocity=np.full((N, 1, 3), 1.0)))
+    world.step(np.zeros((N, 1, 4)), 1)
+    # v' = -0.123 v - (0, 0, g) over 0.01 s, solved.
+    left = np.exp(-0.123 * 0.01)
+    expected = (left, left, left - 9.8 / 0.123 * (1 - left))
+    np.testing.assert_allclose(world.state.velocity[0, 0], expected, rtol=1e-9)
+
+
+def test_a_seed_gives_arrays_the_draws_of_mujoco() -> None:
+    ours, theirs = (Loop(HOVER, N, backend=name, **rest) for name, rest in
+                    (("rigid", {"tensors": False}), ("mujoco", {})))  # fmt: skip
+    for loop in (ours, theirs):
+        loop.advance(np.zeros((N, 4), np.float32), EVERY[:, 0], range(N))
+    np.testing.assert_allclose(ours.world.state.position, theirs.world.state.position, rtol=1e-6)
+
+
+def test_sizes_have_a_derivative_where_they_are_0() -> None:
+    """Of |v| it is v / |v|, of a root 1 / (2 root), and 0 at 0: not NaN."""
+    vectors = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]], requires_grad=True)
+    length(torch_api, vectors).sum().backward()
+    assert vectors.grad.tolist() == [[0.0, 0.0, 0.0], pytest.approx([0.6, 0.8, 0.0])]
+    squares = torch.tensor([-1.0, 0.0, 4.0], requires_grad=True)
+    roots = square_root(squares, torch_api)
+    assert roots.tolist() == [0.0, 0.0, 2.0]
+    roots.sum().backward()
+    assert squares.grad.tolist() == [0.0, 0.0, 0.25]
 
 
 def test_a_free_fall_is_exact() -> None:
@@ -217,24 +314,24 @@ def test_whole_episodes_agree_with_mujoco(env_id: str, size: float, file: Any) -
 
 
 def test_a_vector_env_gives_numpy_and_tensors_on_request() -> None:
-    host = gym.make_vec(HOVER, num_envs=N, backend="rigid", device="cpu", episode_length=2)
+    """In float64 both draw the same numbers, and compute the same but for rounding."""
+    shared: Any = {"backend": "rigid", "device": "cpu", "dtype": "float64", "episode_length": 2}
+    host, ours = (gym.make_vec(HOVER, num_envs=N, tensors=x, **shared) for x in (False, True))
     observation, info = host.reset(seed=0)
     assert (type(observation), observation.dtype) == (np.ndarray, np.float32)
     assert info["position_error"].shape == (N,)
     assert {type(value) for value in info.values()} == {np.ndarray}
-    ours = gym.make_vec(
-        HOVER, num_envs=N, backend="rigid", device="cpu", episode_length=2, tensors=True
-    )
-    same = ours.reset(seed=0)[0]
-    assert same.numpy().tolist() == observation.tolist()
+    np.testing.assert_allclose(ours.reset(seed=0)[0], observation, atol=1e-6)
     for _ in range(3):
         actions = np.full((N, 4), 0.1, np.float32)
         told, other = ours.step(torch.from_numpy(actions)), host.step(actions)
         for one, another in zip(told[:4], other[:4], strict=True):
-            assert one.numpy().tolist() == another.tolist()
+            np.testing.assert_allclose(one, another, atol=1e-6)
             assert (type(one), type(another)) == (torch.Tensor, np.ndarray)
     with pytest.raises(InputError, match="tensors: expected False with the backend mujoco"):
         LocalVectorEnv(HOVER, 2, tensors=True)
+    with pytest.raises(InputError, match="gradients: expected False with mujoco, got True"):
+        LocalVectorEnv(HOVER, 2, gradients=True)
 
 
 def test_seeds_repeat_starts_in_float32() -> None:
@@ -351,7 +448,7 @@ def test_actions_keep_their_graph_through_the_loop_until_it_is_detached() -> Non
         ({"dtype": "float16"}, "dtype: expected float32 or float64, got 'float16'"),
         ({"device": "gpu"}, "device: expected 'cpu', or a CUDA device that torch finds, got 'gpu'"),
         ({"compiled": 1}, "compiled: expected true or false, got 1"),
-        ({"num_threads": 2}, "num_threads: expected device or dtype or compiled, the settings"),
+        ({"num_threads": 2}, "num_threads: expected device or dtype or compiled or tensors"),
     ],
 )
 def test_wrong_arguments(arguments: dict[str, Any], expected: str) -> None:

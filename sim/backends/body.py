@@ -2,23 +2,22 @@
 
 Every component is a vector of its own, shape (W,), or a number that counts for all worlds, and a
 number 0.0 costs nothing: a craft whose rotors are parallel and whose center of mass is its origin
-needs a third of the operations of any craft. Nothing is changed in place, so that torch can
-differentiate a flight.
+needs a third of the operations of any craft. Vectors are NumPy's, torch's, whose flights have
+derivatives, since nothing is changed in place, or the variables of a C function (`kernel.py`).
 
 Frames: world, z up, and the body's. Position and velocity are those of the body's origin.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 import mujoco
 import numpy as np
-import torch
 
 from ...models.vehicle import Vehicle, craft_bodies
 from ..randomize import CENTER
-from ..state import Array
+from ..state import Array, constant
 
 Vector = tuple[Any, Any, Any]
 
@@ -61,6 +60,51 @@ class Push(NamedTuple):
     """Force at the body's origin over the mass, world frame, m/s²."""
 
 
+class Varying(NamedTuple):
+    """What may differ between worlds: numbers for all of them, or vectors where it is drawn."""
+
+    mass: Any
+    """kg."""
+    easier: Any
+    """One over the factor of the inertia that all its parts have."""
+    turn: Any
+    """Inverse of the inertia without that factor, three rows."""
+    gyroscopic: Any
+    """Terms of `_euler`."""
+    reaction: Any
+    """Factor of the rotors' torque about their axes, or None."""
+    shift: Vector
+    """Of the center of mass, body frame, m."""
+    center: Vector
+    """The center of mass, body frame, m."""
+    scale: Any
+    """Factor of the sides of the inertia boxes."""
+
+
+class Lanes(np.ndarray):
+    """Numbers of W worlds, with the methods of torch's tensors that a motion needs."""
+
+    def add(self, other: Any, *, alpha: float) -> Any:
+        """Itself and `alpha` times another."""
+        return self + other * alpha
+
+    def addcmul(self, a: Any, b: Any, *, value: float = 1.0) -> Any:
+        """Itself and `value` times a product."""
+        return self + a * b * value
+
+    def sqrt(self) -> Any:
+        """Square roots."""
+        return np.sqrt(self)
+
+    def sin(self) -> Any:
+        """Sines."""
+        return np.sin(self)
+
+    def cos(self) -> Any:
+        """Cosines."""
+        return np.cos(self)
+
+
 class RigidBody:
     """A vehicle's equations of motion, and MuJoCo's RK4 over its physics step.
 
@@ -72,10 +116,15 @@ class RigidBody:
     `linear_drag` acts at the origin; a fluid acts on the inertia boxes of MuJoCo's bodies. The
     stages of the classical Runge-Kutta method add up for rotation vectors, not for quaternions, so
     it integrates the former (Munthe-Kaas, BIT 38, 1998).
+
+    Attributes:
+        varying: As the last `vary` left it.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        model, rotors = vehicle.model, vehicle.rotors
+    varying: Varying
+
+    def __init__(self, vehicle: Vehicle, xp: Any = np) -> None:
+        model, rotors, self._xp = vehicle.model, vehicle.rotors, xp
         self._step, self._gravity, self._drag = (
             vehicle.timestep, vehicle.gravity, vehicle.linear_drag
         )  # fmt: skip
@@ -92,6 +141,7 @@ class RigidBody:
         self._inertias = _own_and_far(vehicle, boxes)
         fluid = model.opt.density or model.opt.viscosity
         self._fluid = _Fluid(model, boxes) if fluid else None
+        self._of_inertia = _euler(vehicle.inertia)
         self.vary({})
 
     def vary(self, parameters: Mapping[str, Array]) -> None:
@@ -99,67 +149,77 @@ class RigidBody:
         (mass, center), (own, far) = self._least, self._inertias
         inertia: Any
         factor, more = parameters.get("mass", 1.0), parameters.get("inertia", 1.0)
-        self._mass = mass * factor
-        self._easier = 1.0 / factor
+        easier = 1.0 / factor
         if isinstance(more, float) or not far.any():
-            self._easier, inertia = self._easier / more, own + far
+            easier, inertia = easier / more, own + far
         else:
-            inertia = sum(
-                torch.as_tensor(x, dtype=more.dtype, device=more.device) * share
-                for x, share in ((own, more[:, None, None]), (far, 1.0))
-            )
-        self._turn, self._gyroscopic = _euler(inertia)
-        self._reaction = parameters.get("reaction")
-        self._shift: Vector = tuple(parameters.get(name, 0.0) for name in CENTER)
-        self._center: Vector = _plus(self._shift, center)
-        if self._fluid is not None:
-            self._fluid.vary(more, self._shift)
+            parts = (constant(own, more), more), (constant(far, more), 1.0 + 0.0 * more)
+            inertia = sum(part * share[:, None, None] for part, share in parts)
+        shift: Vector = tuple(parameters.get(name, 0.0) for name in CENTER)
+        varying = Varying(
+            mass=mass * factor,
+            easier=easier,
+            turn=self._of_inertia[0],
+            gyroscopic=self._of_inertia[1],
+            reaction=parameters.get("reaction"),
+            shift=shift,
+            center=tuple(a + b for a, b in zip(shift, center, strict=True)),
+            scale=more**0.5,
+        )
+        if not isinstance(inertia, np.ndarray) or inertia.ndim == 3:
+            turn, gyroscopic = _euler_of_each(inertia, self._xp)
+            varying = varying._replace(turn=turn, gyroscopic=gyroscopic)
+        self.varying = mapped(varying, _lanes)
 
-    def fly(
-        self, rows: torch.Tensor, thrust: torch.Tensor, wrench: Sequence[Any] | None, steps: int
-    ) -> torch.Tensor:
-        """States (13, W) after physics steps; the rows of a state are those of `Motion`."""
+    def fly(self, rows: Any, thrust: Any, wrench: Any = None, steps: int = 1) -> list[Any]:
+        """The 13 rows of a state after physics steps, (W,) each, from those of `motion`.
+
+        With thrusts (R, W), N, and None, or a force and a torque as of `Effects.step`, (6, W).
+        """
         push, now = self.push(thrust, wrench), motion(rows)
         for _ in range(steps):
             now = self.advance(now, push)
-        return torch.stack((*now.position, *now.quaternion, *now.velocity, *now.rates))
+        return [*now.position, *now.quaternion, *now.velocity, *now.rates]
 
-    def push(self, thrust: torch.Tensor, wrench: Sequence[Any] | None = None) -> Push:
-        """Of thrusts (R, W), N, and a force and torque, six as `Effects.step` gives them."""
-        force = _times(self._axes, thrust)
-        if self._reaction is None:
-            torque = _times(self._torques, thrust)
+    def push(self, thrust: Any, wrench: Any = None) -> Push:
+        """Of thrusts, and a force and a torque, as of `fly`."""
+        rotors, varying = [_lanes(row) for row in thrust], self.varying
+        force = _times(self._axes, rotors)
+        if varying.reaction is None:
+            torque = _times(self._torques, rotors)
         else:
-            both = zip(_times(self._levers, thrust), _times(self._reactions, thrust), strict=True)
-            torque = tuple(_sum(a, (b, self._reaction)) for a, b in both)
-        torque = _plus(torque, _cross(force, self._shift))
+            both = zip(_times(self._levers, rotors), _times(self._reactions, rotors), strict=True)
+            torque = tuple(_sum(a, (b, varying.reaction)) for a, b in both)
+        torque = _plus(torque, _cross(force, varying.shift))
         outer = _ZERO
         if wrench is not None:
-            outer = _scaled(wrench[:3], 1.0 / self._mass)
-            torque = _plus(torque, wrench[3:])
-        return Push(_scaled(force, 1.0 / self._mass), self._turned(torque), outer)
+            parts = [_lanes(row) for row in wrench]
+            outer = _scaled(parts[:3], 1.0 / varying.mass)
+            torque = _plus(torque, parts[3:])
+        return Push(_scaled(force, 1.0 / varying.mass), self._turned(torque), outer)
 
     def acceleration(self, now: Motion, push: Push) -> tuple[Vector, Vector]:
         """Of the body's origin, world frame, m/s², and angular, body frame, rad/s²."""
         _, quaternion, velocity, rates = now
         inner, turning, outer = push
-        center, off = self._center, _is_there(self._center)
+        varying = self.varying
+        center, off = varying.center, _is_there(varying.center)
         matrix: Any = None
         if self._drag:
             outer = _plus(outer, velocity, -self._drag)
         if self._fluid is not None:
             matrix = _matrix(quaternion)
-            force, torque = self._fluid.push(matrix, velocity, rates)
-            inner = _plus(inner, _scaled(force, 1.0 / self._mass))
+            force, torque = self._fluid.push(matrix, velocity, rates, varying)
+            inner = _plus(inner, _scaled(force, 1.0 / varying.mass))
             turning = _plus(turning, self._turned(_plus(torque, _cross(force, center))))
         if off and _is_there(outer):
             matrix = matrix or _matrix(quaternion)
             # The force at the origin has the torque -c × F about the center of mass.
-            lever = _cross(_scaled(_back(matrix, outer), self._mass), center)
+            lever = _cross(_scaled(_back(matrix, outer), varying.mass), center)
             turning = _plus(turning, self._turned(lever))
         turning = tuple(
             _sum(start, *((k, rates[i], rates[j]) for i, j, k in terms))
-            for start, terms in zip(turning, self._gyroscopic, strict=True)
+            for start, terms in zip(turning, varying.gyroscopic, strict=True)
         )
         if off:
             inner = _plus(inner, _cross(center, turning))
@@ -194,7 +254,7 @@ class RigidBody:
 
     def _turned(self, torque: Vector) -> Vector:
         """Angular acceleration by a torque about the center of mass, N·m."""
-        return _scaled(_forth(self._turn, torque), self._easier)
+        return _scaled(_forth(self.varying.turn, torque), self.varying.easier)
 
 
 class _Fluid:
@@ -206,19 +266,19 @@ class _Fluid:
         for mass, (x, y, z), axes, place in boxes:
             sides = np.sqrt(6 / mass * np.maximum((y + z - x, x + z - y, x + y - z), 1e-15))
             self._boxes.append((sides.tolist(), axes.tolist(), place.tolist()))
-        self.vary(1.0, _ZERO)
 
-    def vary(self, inertia: Any, shift: Vector) -> None:
-        """A box's sides grow with the square root of its inertia over its mass."""
-        self._scale, self._shift = inertia**0.5, shift
+    def push(
+        self, matrix: Any, velocity: Vector, rates: Vector, varying: Varying
+    ) -> tuple[Vector, Vector]:
+        """Force, N, and torque about the body's origin, N·m; both in the body frame.
 
-    def push(self, matrix: Any, velocity: Vector, rates: Vector) -> tuple[Vector, Vector]:
-        """Force, N, and torque about the body's origin, N·m; both in the body frame."""
+        A box's sides grow with the square root of its inertia over its mass.
+        """
         air = _back(matrix, _plus(velocity, self._wind))
-        scale, force, torque = self._scale, _ZERO, _ZERO
+        scale, force, torque = varying.scale, _ZERO, _ZERO
         area, volume = scale * scale, scale * scale * scale
         for sides, axes, place in self._boxes:
-            center = _plus(self._shift, place)
+            center = _plus(varying.shift, place)
             through = _back(axes, _plus(air, _cross(rates, center)))
             spin, mean = _back(axes, rates), sum(sides) / 3
             pushes, twists = [], []
@@ -236,10 +296,22 @@ class _Fluid:
         return force, torque
 
 
-def motion(rows: torch.Tensor) -> Motion:
+def motion(rows: Any) -> Motion:
     """The motion of states (13, W)."""
-    x = rows.unbind(0)
+    x = [_lanes(row) for row in rows]
     return Motion(x[:3], x[3:7], x[7:10], x[10:])
+
+
+def mapped(tree: Any, change: Callable[[Any], Any]) -> Any:
+    """Tuples and lists in each other with every vector changed, in a fixed order."""
+    if isinstance(tree, tuple | list):
+        parts = [mapped(one, change) for one in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    return change(tree) if hasattr(tree, "shape") else tree
+
+
+def _lanes(vector: Any) -> Any:
+    return vector.view(Lanes) if isinstance(vector, np.ndarray) else vector
 
 
 def _boxes(model: mujoco.MjModel) -> list[Any]:
@@ -264,18 +336,11 @@ def _own_and_far(vehicle: Vehicle, boxes: list[Any]) -> tuple[np.ndarray, np.nda
     return vehicle.inertia - far, far
 
 
-def _euler(inertia: Any) -> tuple[Any, Any]:
-    """Of an inertia, (3, 3) or (W, 3, 3): its inverse, and -I⁻¹ (ω × I ω) as terms (i, j, k).
+def _euler(inertia: np.ndarray) -> tuple[Any, Any]:
+    """Of an inertia: its inverse, and -I⁻¹ (ω × I ω) as terms (i, j, k).
 
     Each axis has its list of terms: k times component i times component j of the rates.
     """
-    if not isinstance(inertia, np.ndarray):
-        cross = torch.as_tensor(_CROSS, dtype=inertia.dtype, device=inertia.device)
-        turn = torch.linalg.inv(inertia)
-        products = -torch.einsum("wil,ljm,wmk->ijkw", turn, cross, inertia)
-        pairs = [(j, k) for j in range(3) for k in range(3)]
-        found = [[(j, k, axis[j, k]) for j, k in pairs] for axis in products]
-        return list(turn.permute(1, 2, 0)), found
     inverse = np.linalg.inv(inertia)
     terms = -np.einsum("il,ljm,mk->ijk", inverse, _CROSS, inertia)
     least, found = _NOTHING * abs(terms).max(), []
@@ -284,6 +349,15 @@ def _euler(inertia: Any) -> tuple[Any, Any]:
         places = np.argwhere(abs(folded) > least).tolist()
         found.append([(j, k, float(folded[j, k])) for j, k in places])
     return _sparse(inverse), found
+
+
+def _euler_of_each(inertia: Any, xp: Any) -> tuple[Any, Any]:
+    """The same of inertias (W, 3, 3): vectors."""
+    cross, turn = constant(_CROSS, inertia), xp.linalg.inv(inertia)
+    products = -xp.einsum("wil,ljm,wmk->ijkw", turn, cross, inertia)
+    pairs = [(j, k) for j in range(3) for k in range(3)]
+    rows = [[turn[:, i, j] for j in range(3)] for i in range(3)]
+    return rows, [[(j, k, axis[j, k]) for j, k in pairs] for axis in products]
 
 
 def _sparse(matrix: np.ndarray, size: float | None = None) -> list[list[float]]:
@@ -314,18 +388,17 @@ def _sum(total: Any, *products: tuple[Any, ...]) -> Any:
             last = last if share == 1.0 else last * share
             total = last if total == 0.0 else last + total
         elif not rest:
-            total = torch.add(total, last, alpha=share)
+            total = total.add(last, alpha=share)
         else:
             first = rest[0]
             for one in rest[1:]:
                 first = first * one
-            total = torch.addcmul(total, first, last, value=share)
+            total = total.addcmul(first, last, value=share)
     return total
 
 
-def _times(matrix: list[list[float]], thrust: torch.Tensor) -> Vector:
-    """A matrix (3, R) and thrusts (R, W): three vectors."""
-    rotors = thrust.unbind(0)
+def _times(matrix: list[list[float]], rotors: list[Any]) -> Vector:
+    """A matrix (3, R) and thrusts of R rotors: three vectors."""
     return tuple(_sum(0.0, *zip(row, rotors, strict=True)) for row in matrix)
 
 
@@ -381,9 +454,9 @@ def _to_world(quaternion: Any, matrix: Any, vector: Vector) -> Vector:
     up = vector[2]
     twice = up + up
     return (
-        torch.addcmul(x * z, w, y) * twice,
-        torch.addcmul(y * z, w, x, value=-1) * twice,
-        _sum(up, (-1.0, torch.addcmul(x * x, y, y), twice)),
+        (x * z).addcmul(w, y) * twice,
+        (y * z).addcmul(w, x, value=-1.0) * twice,
+        _sum(up, (-1.0, (x * x).addcmul(y, y), twice)),
     )
 
 
@@ -391,7 +464,7 @@ def _rotated(quaternion: Any, rates: Vector, time: float) -> tuple[Any, Any]:
     """A quaternion turned for a time at body rates, and the square of the angle."""
     w, x, y, z = quaternion
     a, b, c = rates
-    square = torch.addcmul(torch.addcmul(a * a, b, b), c, c) * (time * time)
+    square = (a * a).addcmul(b, b).addcmul(c, c) * (time * time)
     half = _sum(_TINY, (0.25, square)).sqrt()
     share = half.sin() / half * (0.5 * time)
     a, b, c, d = half.cos(), a * share, b * share, c * share
@@ -425,6 +498,6 @@ def _of_rotation_vector(spin: Vector, time: float, square: Any, rates: Vector) -
 def _normalized(quaternion: Any) -> Any:
     """A quaternion whose size is nearly 1: Newton's step towards 1."""
     w, x, y, z = quaternion
-    square = torch.addcmul(torch.addcmul(torch.addcmul(w * w, x, x), y, y), z, z)
+    square = (w * w).addcmul(x, x).addcmul(y, y).addcmul(z, z)
     share = _sum(1.5, (-0.5, square))
     return w * share, x * share, y * share, z * share

@@ -4,9 +4,9 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
-import torch
 
 from ...models.vehicle import Vehicle, craft_bodies
+from ..state import Array, constant
 
 _ROUNDED: Final = 1e-6  # m: what is no margin of a contact
 
@@ -22,41 +22,37 @@ class Hull:
         ground: Height at which a level craft of no depth would touch, m: 0 but for margins.
     """
 
-    def __init__(self, vehicle: Vehicle, dtype: torch.dtype, device: torch.device) -> None:
+    def __init__(self, vehicle: Vehicle, xp: Any) -> None:
         shapes = _shapes(vehicle.model)
-        self._any = bool(shapes)
+        self._xp, self._reach, self.ground = xp, -np.inf, 0.0
         if not shapes:
-            self.ground = 0.0
             return
         centers, radii, axes, flat, rounded = map(np.array, zip(*shapes, strict=True))
-
-        def put(array: np.ndarray) -> torch.Tensor:
-            return torch.tensor(array, dtype=dtype, device=device)
-
-        self._centers, self._radii = put(centers), put(radii)[:, None]
-        self._axes = put(axes.transpose(0, 2, 1).reshape(-1, 3))
-        self._flat, self._rounded = put(flat)[..., None], put(rounded)[..., None]
+        columns = axes.transpose(0, 2, 1).reshape(-1, 3)
+        self._shapes = centers, radii[:, None], columns, flat[..., None], rounded[..., None]
         sizes = np.linalg.norm(flat, axis=1) + np.linalg.norm(rounded, axis=1)
         self._reach = float((np.linalg.norm(centers, axis=1) + radii + sizes).max())
-        level = float(self._depth(put(np.array((0.0, 0.0, -1.0)))[:, None]))
-        margin = vehicle.rest_height - level
+        margin = vehicle.rest_height - float(self._depth(np.array([[0.0], [0.0], [-1.0]]), np)[0])
         self.ground = margin if abs(margin) > _ROUNDED else 0.0
 
-    def touches(self, height: torch.Tensor, quaternion: Any) -> torch.Tensor:
+    def touches(self, height: Array, quaternion: Any) -> Array:
         """Whether crafts at such heights and attitudes (four vectors) touch the ground, (W,)."""
-        height = height.detach() - self.ground
-        if not self._any or not (height < self._reach).any():
-            return torch.zeros_like(height, dtype=torch.bool)
-        w, x, y, z = (part.detach() for part in quaternion)
-        down = torch.stack((2 * (w * y - x * z), -2 * (y * z + w * x), 2 * (x * x + y * y) - 1))
-        return height < self._depth(down)
+        height = height - self.ground
+        near = height < self._reach
+        if not near.any():
+            return near
+        w, x, y, z = quaternion
+        down = (2 * (w * y - x * z), -2 * (y * z + w * x), 2 * (x * x + y * y) - 1)
+        depth: Array = self._depth(self._xp.stack(down), self._xp)
+        return height < depth
 
-    def _depth(self, down: torch.Tensor) -> torch.Tensor:
+    def _depth(self, down: Array, xp: Any) -> Array:
         """How far the craft reaches along unit vectors, body frame, (3, W): m, (W,)."""
-        along = (self._axes @ down).reshape(-1, 3, down.shape[1])
-        straight = (self._flat * along.abs()).sum(dim=1)
-        round_ = (self._rounded * along).square().sum(dim=1).sqrt()
-        return (self._centers @ down + self._radii + straight + round_).amax(dim=0)
+        centers, radii, axes, flat, rounded = (constant(x, down) for x in self._shapes)
+        along = (axes @ down).reshape(-1, 3, down.shape[1])
+        straight, round_ = flat * abs(along), rounded * along
+        sizes = xp.sum(straight, axis=1) + xp.sqrt(xp.sum(round_ * round_, axis=1))
+        return xp.max(centers @ down + radii + sizes, axis=0)
 
 
 def _shapes(model: mujoco.MjModel) -> list[tuple[Any, ...]]:

@@ -6,7 +6,6 @@ of threads.
 
 import copy
 import os
-from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import mujoco
@@ -16,19 +15,18 @@ from mujoco.batch import Batch, SimulationError
 from ...models.errors import InputError
 from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
 from ..effects import EffectOptions, Effects
-from ..random import RANDOMIZATION, Draw, Noise, NumpyDraw, NumpyNoise, Streams
 from ..randomize import Randomization
 from ..rotations import body_z
-from ..state import Array, Pose, WorldState, plain
-from ..world import PhysicsError, check_hung, contact_check, flown_model
+from ..state import Array, Pose, WorldState
+from ..world import PhysicsError, check_hung, flown_model
+from .base import ArrayWorld
 from .varied import Varied
 
 _FEW: Final = 8
-_ONLY: Final = np.zeros(1, int)
 _SEEN: Final = np.array(SURROUNDINGS, np.uint8)
 
 
-class MujocoWorld:
+class MujocoWorld(ArrayWorld):
     """W worlds of one drone over ground of its own: `World`.
 
     MuJoCo answers a bad state with a reset and a line in MUJOCO_LOG.TXT. Here it raises
@@ -38,8 +36,6 @@ class MujocoWorld:
     A single world has no leading axes: NumPy's scalars are ten times faster than its arrays of one.
     So many threads step the worlds; 0 takes one for each processor.
     """
-
-    xp: Any = np
 
     def __init__(
         self,
@@ -52,20 +48,11 @@ class MujocoWorld:
     ) -> None:
         if type(num_threads) is not int or num_threads < 0:
             raise InputError(f"num_threads: expected 0 or more, got {num_threads!r}")
-        self.vehicle = vehicle
-        self.shape: tuple[int, ...] = (num_worlds, 1) if num_worlds > 1 else ()
-        self._streams = Streams(num_worlds)
-        self._noises: list[Noise] = []
-        self._randomize, self.parameters = randomize, dict[str, Array]()
-        self._draws = Streams(num_worlds, RANDOMIZATION)
-        drawn = () if randomize is None else randomize.names
-        options = effects or EffectOptions()
-        acting = Effects(vehicle, options, self.noise, np, drawn)
-        self.effects = acting if acting.works else None
-        self._check = contact_check(vehicle.timestep)
+        super().__init__(vehicle, (num_worlds, 1) if num_worlds > 1 else (), effects, randomize)
+        options, drawn = self._options, self._drawn
         threads = 1 if num_worlds == 1 else num_threads
         model = flown_model(vehicle, options, drawn)
-        if acting.on_rotors:  # commands are within their limits; thrusts need not be
+        if self._on_rotors:  # commands are within their limits; thrusts need not be
             model = copy.copy(model)
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         self._batch = batch = Batch(model, num_worlds, threads)
@@ -86,7 +73,7 @@ class MujocoWorld:
         # Where controls are newtons, they are the thrusts, and without effects the commands too.
         alike = self._newtons is None and self.effects is None
         self._command = self._ctrl if alike else np.zeros_like(self._ctrl)
-        self._thrust = np.zeros_like(self._ctrl) if acting.on_rotors else self._command
+        self._thrust = np.zeros_like(self._ctrl) if self._on_rotors else self._command
         self._applied: np.ndarray = batch.bind("qfrc_applied")
         self._touching = np.zeros(num_worlds, bool)
         self._qacc: np.ndarray | None = None  # bound by what first asks for it
@@ -123,17 +110,12 @@ class MujocoWorld:
             given = getattr(pose, name)
             getattr(state, name)[here] = default if given is None else given[here]
         state.command[here] = state.thrust[here]
-        if self._randomize is not None:
-            draw = NumpyDraw(self._draws, ids.tolist(), self.shape)
-            for name, values in self._randomize.draw(draw, np).items():
-                old = self.parameters.get(name)
-                kept = values if old is None else np.where(mask, values, old)
-                self.parameters[name] = plain(kept)
-            if self._varied.fields:
-                values = {name: np.reshape(x, -1)[ids] for name, x in self.parameters.items()}
-                for field, rows in self._varied.values(values).items():
-                    self._batch.expand(field)[ids] = rows
-                self._batch.set_const(ids)
+        self._draw_parameters(mask)
+        if self._varied.fields:
+            values = {name: np.reshape(x, -1)[ids] for name, x in self.parameters.items()}
+            for field, rows in self._varied.values(values).items():
+                self._batch.expand(field)[ids] = rows
+            self._batch.set_const(ids)
         if self.effects is not None:
             state.thrust[here] = self.effects.begin(mask, state, self.parameters)[here]
         self._place_payload(ids)
@@ -186,19 +168,6 @@ class MujocoWorld:
         if wrench is not None:
             self._applied[some, :6] = wrench.reshape(-1, 6)[some]
 
-    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
-        """As `World.seed`."""
-        ids = self._ids(mask).tolist()
-        given = [seeds[i] for i in ids]
-        self._streams.seed(ids, given)
-        self._draws.seed(ids, given)
-        for noise in self._noises:
-            noise.seed(ids, given)
-
-    def draw(self, mask: Array, chosen: Mapping[str, Any] | None = None) -> Draw:
-        """As `World.draw`."""
-        return NumpyDraw(self._streams, self._ids(mask).tolist(), self.shape, chosen)
-
     def acceleration(self) -> Array:
         """As `World.acceleration`: of a `mj_forward` that leaves the state as it was."""
         if self._qacc is None:
@@ -218,11 +187,6 @@ class MujocoWorld:
         distance = self._batch.ray(origin, down, geomgroup=_SEEN)[0]
         return np.where(distance < 0, np.inf, distance).reshape(self.shape)[()]
 
-    def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
-        """As `World.noise`."""
-        self._noises.append(NumpyNoise(self.shape, size, use))
-        return self._noises[-1]
-
     def close(self) -> None:
         """As `World.close`."""
         if self._owner not in (None, os.getpid()):
@@ -234,10 +198,6 @@ class MujocoWorld:
         )
         for view in views.split():
             vars(self).pop(view, None)
-
-    def _ids(self, mask: Array) -> np.ndarray:
-        """The worlds of a mask; of a single one it is always true."""
-        return np.flatnonzero(mask) if self.shape else _ONLY
 
     def _check_process(self) -> None:
         if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever

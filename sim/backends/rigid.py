@@ -1,4 +1,4 @@
-"""The rigid body of a vehicle in torch: no contact, on a CPU or a GPU, differentiable.
+"""The rigid body of a vehicle: no contact, in NumPy's arrays or torch's tensors.
 
 It flies as `mujoco` does until a part touches the ground, of which it tells.
 """
@@ -7,168 +7,170 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
-import torch
 
 from ...models.errors import expect
 from ...models.vehicle import Vehicle
-from ..effects import EffectOptions, Effects
+from ..effects import EffectOptions
 from ..randomize import Randomization
-from ..state import Array, Pose, WorldState, clip
-from ..world import PhysicsError, contact_check
+from ..state import Array, Pose, WorldState, clip, constant
+from ..world import PhysicsError
+from . import kernel
+from .base import ArrayWorld, BaseWorld
 from .body import RigidBody, motion
 from .hull import Hull
-from .tensors import TensorWorld, torch_device
 
-DTYPES: Final = {"float32": torch.float32, "float64": torch.float64}
+DTYPES: Final = ("float32", "float64")
+_LEVEL: Final = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # rows of a craft at rest
 
 
-class RigidWorld(TensorWorld):
+def make_rigid(
+    vehicle: Vehicle,
+    num_worlds: int,
+    *,
+    effects: EffectOptions | None = None,
+    randomize: Randomization | None = None,
+    tensors: bool = True,
+    device: str | None = None,
+    dtype: str = "float32",
+    compiled: bool | None = None,
+) -> "Rigid":
+    """W worlds of torch tensors; or of NumPy arrays, on the CPU alone.
+
+    `device` is `cpu`, `cuda`, `cuda:1`...; with tensors None takes a CUDA device if there is one.
+    """
+    right = compiled is None or type(compiled) is bool
+    expect(right, "compiled", "true or false", repr(compiled))
+    expect(dtype in DTYPES, "dtype", " or ".join(DTYPES), repr(dtype))
+    if not tensors:
+        expect(device in (None, "cpu"), "device", "cpu without tensors", repr(device))
+        return RigidWorld(vehicle, num_worlds, effects, randomize, dtype, compiled)
+    from .rigid_tensors import RigidTensorWorld
+
+    return RigidTensorWorld(vehicle, num_worlds, effects, randomize, dtype, compiled, device)
+
+
+class Rigid(BaseWorld):
     """W worlds of one drone over level ground: `World`, without contact.
 
     A craft that reaches the ground is `touching`, and flies on through it: a task ends an episode
-    there. `device` is `cpu`, `cuda`, `cuda:1`...; None takes a CUDA device if there is one. With
-    `dtype` float64 a seed gives the draws that it gives `mujoco`, one stream for each world.
-
-    A step makes new tensors for the state. Where thrusts require a gradient, the state has it;
-    `detach` ends it.
-
-    `compiled` has torch compile a physics step at the first one: it needs a C++ compiler, and takes
-    half a minute, or some seconds where torch's cache has it. Small batches gain most.
+    there. A step makes new arrays for the state.
     """
+
+    dtype: Any
 
     def __init__(
         self,
         vehicle: Vehicle,
         num_worlds: int,
-        *,
-        effects: EffectOptions | None = None,
-        randomize: Randomization | None = None,
-        device: str | None = None,
-        dtype: str = "float32",
-        compiled: bool = False,
+        effects: EffectOptions | None,
+        randomize: Randomization | None,
+        *base: Any,
     ) -> None:
-        expect(type(compiled) is bool, "compiled", "true or false", repr(compiled))
-        expect(dtype in DTYPES, "dtype", " or ".join(DTYPES), repr(dtype))
-        super().__init__(num_worlds, randomize, torch_device(device), DTYPES[dtype])
-        self.vehicle = vehicle
-        options = effects or EffectOptions()
+        payload = 0.0 if effects is None else effects.payload
         expected = "none with the backend rigid, which has no cable: fly it with mujoco"
-        expect(not options.payload, "effects: payload", expected, f"{options.payload:g} kg")
-        drawn = () if randomize is None else randomize.names
-        acting = Effects(vehicle, options, self.noise, self.xp, drawn)
-        self.effects = acting if acting.works else None
-        self._check = contact_check(vehicle.timestep)
-        self._body, self._hull = RigidBody(vehicle), Hull(vehicle, self.dtype, self.device)
-        _check_forces(vehicle, self._body)
-        self._advance: Any = torch.compile(self._body.fly) if compiled else self._body.fly
-        self._at_once = 1 if compiled else None  # physics steps of a call
-        put: Any = {"dtype": self.dtype, "device": self.device}
-        self._hover, self._low, self._high = (
-            torch.tensor(x, **put)
-            for x in (vehicle.hover_thrust, vehicle.thrust_low, vehicle.thrust_high)
+        expect(not payload, "effects: payload", expected, f"{payload:g} kg")
+        super().__init__(vehicle, (num_worlds, 1), effects, randomize, *base)
+        _check_forces(vehicle)
+        self._body, self._hull = RigidBody(vehicle, self.xp), Hull(vehicle, self.xp)
+        self._at_once = None if self.effects is None else 1  # physics steps of a call
+        thrust = self._zeros(num_worlds, 1, vehicle.num_rotors)
+        self._low, self._high = (
+            constant(x, thrust) for x in (vehicle.thrust_low, vehicle.thrust_high)
         )
-        thrust = torch.zeros((num_worlds, 1, vehicle.num_rotors), **put)
-        self._acting = thrust  # mean over the last physics step
-        self._wrench: torch.Tensor | None = None
-        level = torch.tensor((0.0, 0.0, 0.0, 1.0, *[0.0] * 9), **put)
-        self._rows = level[:, None].expand(13, num_worlds)
+        self._nothing = self._acting = thrust  # mean over the last physics step
+        self._wrench: Array = None  # force and torque of effects over it, (6, W)
+        self._rows = self._zeros(13, num_worlds) + constant(_LEVEL, thrust)[:, None]
         self.state = WorldState(
-            **self._shown(),
-            command=thrust,
-            thrust=thrust,
-            touching=torch.zeros(self.shape, dtype=torch.bool, device=self.device),
+            **self._shown(), command=thrust, thrust=thrust, touching=thrust[..., 0] > 0
         )
+
+    def _zeros(self, *shape: int) -> Array:
+        """Zeros of this dtype."""
+        raise NotImplementedError
+
+    def _flown(self, rows: Array, thrust: Array, wrench: Array, steps: int) -> Array:
+        """New rows after physics steps: see `RigidBody.fly`."""
+        raise NotImplementedError
 
     def reset(self, mask: Array, pose: Pose) -> None:
         """As `World.reset`."""
-        state, rows = self.state, mask[..., None]
-        begun = self._begun(mask, pose, self._hover)
+        xp, state, rows = self.xp, self.state, mask[..., None]
+        begun = self._begun(mask, pose)
         turn = begun["quaternion"]
-        turn = turn / turn.square().sum(dim=-1, keepdim=True).sqrt()
-        self._rows = torch.cat(
-            (begun["position"], turn, begun["velocity"], begun["body_rates"]), dim=-1
-        )[:, 0].T.contiguous()
+        turn = turn / xp.sqrt(xp.sum(turn * turn, axis=-1, keepdims=True))
+        parts = (begun["position"], turn, begun["velocity"], begun["body_rates"])
+        self._rows = self._as_rows(xp.concat(parts, axis=-1))
         self._show()
-        state.thrust = begun["thrust"]
-        state.command = torch.where(rows, state.thrust, state.command)
+        state.thrust = self._typed(begun["thrust"])
+        state.command = xp.where(rows, state.thrust, state.command)
         self._draw_parameters(mask)
         if self.parameters:
-            self._body.vary({name: values[:, 0] for name, values in self.parameters.items()})
+            self._vary({name: values[:, 0] for name, values in self.parameters.items()})
         if self.effects is not None:
             thrust = self.effects.begin(mask, state, self.parameters)
-            state.thrust = torch.where(rows, thrust, state.thrust)
-        self._acting = torch.where(rows, state.thrust, self._acting)
+            state.thrust = self._typed(xp.where(rows, thrust, state.thrust))
+        self._acting = xp.where(rows, state.thrust, self._acting)
         if self._wrench is not None:
-            self._wrench = torch.where(mask[:, 0], 0.0, self._wrench)
-        state.touching = torch.where(mask, self._touches(), state.touching)
+            self._wrench = xp.where(mask[:, 0], 0.0 * self._wrench, self._wrench)
+        state.touching = xp.where(mask, self._touches(), state.touching)
 
     def step(
         self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
     ) -> None:
         """As `World.step`."""
         state = self.state
-        command = thrust.expand(state.command.shape)  # one number for all rotors counts for each
-        state.command = _kept(mask, command, state.command)
-        touching = state.touching if again else torch.zeros_like(state.touching)
+        # One number for all rotors counts for each.
+        state.command = self._kept(mask, self._typed(thrust + self._nothing), state.command)
+        touching = state.touching if again else False
         while substeps > 0:
             self._fly(min(substeps, self._check), mask)
-            touching = touching | self._touches()
+            touching = self._touches() | touching
             substeps -= self._check
-        if self.effects is None or not self.effects.on_rotors:
+        if not self._on_rotors:
             state.thrust = state.command
-        state.touching = touching if mask is None else torch.where(mask, touching, state.touching)
+        state.touching = touching if mask is None else self.xp.where(mask, touching, state.touching)
         self._refuse_bad()
 
-    def _fly(self, steps: int, mask: torch.Tensor | None) -> None:
+    def _fly(self, steps: int, mask: Array | None) -> None:
         """Fly some physics steps, between which nobody looks for contact."""
-        state, effects = self.state, self.effects
-        acting, wrench, parts = state.command, None, None
-        at_once = self._at_once or (steps if effects is None else 1)
+        state, effects, acting, wrench = self.state, self.effects, self.state.command, None
+        at_once = self._at_once or steps
         for _ in range(steps // at_once):
             if effects is not None:
                 acting, end, push = effects.step(state, mask)
-                if effects.on_rotors:
-                    state.thrust = _kept(mask, end, state.thrust)
-                if push is not None:
-                    wrench = push[:, 0].T
-                    parts = wrench.unbind(0)
-            if effects is None or not effects.on_rotors:  # as MuJoCo clamps controls
+                if self._on_rotors:
+                    state.thrust = self._kept(mask, self._typed(end), state.thrust)
+                wrench = None if push is None else self._as_rows(push)
+            if not self._on_rotors:  # as MuJoCo clamps controls
                 acting = clip(acting, self._low, self._high)
-            new = self._advance(self._rows, acting[:, 0].T.contiguous(), parts, at_once)
-            self._rows = new if mask is None else torch.where(mask[:, 0], new, self._rows)
+            new = self._flown(self._rows, self._as_rows(acting), wrench, at_once)
+            self._rows = new if mask is None else self.xp.where(mask[:, 0], new, self._rows)
             self._show()
-        self._acting = _kept(mask, acting, self._acting)
+        self._acting = self._kept(mask, acting, self._acting)
         if wrench is not None:
-            old = torch.zeros_like(wrench) if self._wrench is None else self._wrench
-            self._wrench = wrench if mask is None else torch.where(mask[:, 0], wrench, old)
-
-    def detach(self) -> None:
-        """End the graph of gradients: what comes next does not depend on what was before."""
-        state = self.state
-        self._rows, self._acting = self._rows.detach(), self._acting.detach()
-        state.command, state.thrust = state.command.detach(), state.thrust.detach()
-        self._wrench = None if self._wrench is None else self._wrench.detach()
-        self._show()
-        if self.effects is not None:
-            self.effects.detach()
+            old = 0.0 * wrench if self._wrench is None else self._wrench
+            self._wrench = wrench if mask is None else self.xp.where(mask[:, 0], wrench, old)
 
     def acceleration(self) -> Array:
         """As `World.acceleration`."""
-        wrench = None if self._wrench is None else self._wrench.unbind(0)
-        push = self._body.push(self._acting[:, 0].T, wrench)
-        return torch.stack(self._body.acceleration(motion(self._rows), push)[0], dim=-1)[:, None]
+        push = self._body.push(self._as_rows(self._acting), self._wrench)
+        linear, _ = self._body.acceleration(motion(self._rows), push)
+        return self.xp.stack(list(linear), axis=-1)[:, None]
 
     def below(self) -> Array:
         """As `World.below`: the ground is the only surface."""
         height = self.state.position[..., 2] - self._hull.ground
-        cosine = self.state.tilt_cosine
-        seen = (cosine > 0) & (height >= 0)
-        return torch.where(seen, height / torch.where(seen, cosine, 1.0), torch.inf)
+        cosine, where = self.state.tilt_cosine, self.xp.where
+        seen, one = (cosine > 0) & (height >= 0), 1.0 + 0.0 * cosine
+        return where(seen, height / where(seen, cosine, one), self.xp.inf * one)
 
     def close(self) -> None:
         """Nothing is to be released."""
 
-    def _shown(self) -> dict[str, torch.Tensor]:
+    def _vary(self, parameters: dict[str, Array]) -> None:
+        self._body.vary(parameters)
+
+    def _shown(self) -> dict[str, Array]:
         """The rows as arrays of the state."""
         columns = self._rows.T[:, None]
         return {
@@ -182,23 +184,72 @@ class RigidWorld(TensorWorld):
         for name, values in self._shown().items():
             setattr(self.state, name, values)
 
-    def _touches(self) -> torch.Tensor:
-        now = motion(self._rows)
-        return self._hull.touches(now.position[2], now.quaternion)[:, None]
+    def _typed(self, values: Array) -> Array:
+        return self.xp.astype(values, self.dtype, copy=False)
+
+    def _as_rows(self, values: Array) -> Array:
+        """Vectors (W, 1, k) as rows (k, W) of this dtype, one after the other in memory."""
+        return self.xp.asarray(self._typed(values)[:, 0].T, order="C")
+
+    def _kept(self, mask: Array | None, new: Array, old: Array) -> Array:
+        return new if mask is None else self.xp.where(mask[..., None], new, old)
+
+    def _touches(self) -> Array:
+        return self._hull.touches(self._rows[2], self._rows[3:7])[:, None]
 
     def _refuse_bad(self) -> None:
-        if self._rows.detach().abs().amax() < mujoco.mjMAXVAL:  # not of NaN
+        if abs(self._rows).max() < mujoco.mjMAXVAL:  # not of NaN
             return
-        bad = ~(self._rows.abs() < mujoco.mjMAXVAL).all(dim=0)
-        ids = bad.nonzero().flatten().tolist()
+        bad = ~self.xp.all(abs(self._rows) < mujoco.mjMAXVAL, axis=0)
+        ids = bad.nonzero()[0].flatten().tolist()
         raise PhysicsError(f"the rigid body has bad states in envs {ids[:5]}: reset the env")
 
 
-def _kept(mask: torch.Tensor | None, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
-    return new if mask is None else torch.where(mask[..., None], new, old)
+class RigidWorld(Rigid, ArrayWorld):
+    """`Rigid` in NumPy arrays: a seed gives the draws that it gives `mujoco`.
+
+    A step is a C function where there is a C compiler (`kernel.py`), unless `compiled` is False.
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        num_worlds: int,
+        effects: EffectOptions | None,
+        randomize: Randomization | None,
+        dtype: str,
+        compiled: bool | None,
+    ) -> None:
+        found = kernel.compiler()
+        expected = "false where no C compiler is found (cc, gcc, clang or the variable CC)"
+        expect(found or not compiled, "compiled", expected, "true")
+        self.dtype = np.dtype(dtype)
+        super().__init__(vehicle, num_worlds, effects, randomize)
+        self._varying: np.ndarray | None = None
+        self._function: kernel.Fly | None = None
+        if found and compiled is not False:
+            one = np.ones(num_worlds)
+            self._vary(dict.fromkeys(self._drawn, one))
+            pushed = self.effects is not None and self.effects.on_body
+            self._function = kernel.compiled(
+                self._body, vehicle.num_rotors, self.dtype, wrench=pushed
+            )
+
+    def _zeros(self, *shape: int) -> np.ndarray:
+        return np.zeros(shape, self.dtype)
+
+    def _flown(self, rows: Array, thrust: Array, wrench: Array, steps: int) -> np.ndarray:
+        if self._function is None:
+            new = self._body.fly(rows, thrust, wrench, steps)
+            return np.array(new, self.dtype)
+        return self._function(rows, thrust, wrench, self._varying, steps)
+
+    def _vary(self, parameters: dict[str, Array]) -> None:
+        super()._vary(parameters)
+        self._varying = kernel.packed(self._body, self.dtype)
 
 
-def _check_forces(vehicle: Vehicle, body: RigidBody) -> None:
+def _check_forces(vehicle: Vehicle) -> None:
     """Refuse a vehicle that MuJoCo would move in another way: its joint, its integrator."""
     model, data = vehicle.model, mujoco.MjData(vehicle.model)
     data.qpos[2:7] = (vehicle.rest_height + 1e3, 0.8, 0.36, -0.36, 0.3168596)
@@ -207,11 +258,10 @@ def _check_forces(vehicle: Vehicle, body: RigidBody) -> None:
     thrust[0] = 0.5 * (vehicle.thrust_low[0] + vehicle.hover_thrust[0])
     data.ctrl[:] = thrust / [rotor.newtons for rotor in vehicle.rotors]
     data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
-    rows = torch.tensor(np.concatenate((data.qpos, data.qvel)))[:, None]
-    new = body.fly(rows, torch.tensor(thrust)[:, None], None, 1)[:, 0].numpy()
-    change = new - rows[:, 0].numpy()
+    rows = np.concatenate((data.qpos, data.qvel))
+    ours = np.concatenate(RigidBody(vehicle).fly(rows[:, None], thrust[:, None])) - rows
     mujoco.mj_step(model, data)
-    theirs = np.concatenate((data.qpos, data.qvel)) - rows[:, 0].numpy()
-    right = np.abs(change - theirs).max() <= 1e-9 * max(1.0, np.abs(theirs).max())
+    theirs = np.concatenate((data.qpos, data.qvel)) - rows
+    right = np.abs(ours - theirs).max() <= 1e-9 * max(1.0, np.abs(theirs).max())
     expected = "RK4, and no forces but gravity, rotors, linear_drag and a fluid's on inertia boxes"
     expect(bool(right), "vehicle", f"{expected} (the backend rigid)", f"others in {vehicle.name}")

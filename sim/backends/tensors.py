@@ -8,48 +8,36 @@ import numpy as np
 import torch
 
 from ...models.errors import InputError
-from ..random import RANDOMIZATION, START, Draw, Noise, NumpyDraw, NumpyNoise, Streams
+from ...models.vehicle import Vehicle
+from ..effects import EffectOptions
+from ..random import Draw, Noise, NumpyDraw, NumpyNoise, Streams
 from ..randomize import Randomization
-from ..state import Array, Pose, WorldState
+from ..state import Array
+from .base import BaseWorld
 
 
-class TensorWorld:
+class TensorWorld(BaseWorld):
     """Base of worlds whose state is torch tensors of one dtype on one device.
 
     In float32 one generator draws the numbers of all worlds on the device: the host need not know
     which of them draw. In float64 each world has its stream on the host, and a seed gives the
     numbers that it gives `mujoco`: slower, for comparisons.
-
-    A derived class calls this constructor first, and sets `state`.
     """
 
     xp: Any = torch_api
-    state: WorldState
 
     def __init__(
         self,
-        num_worlds: int,
+        vehicle: Vehicle,
+        shape: tuple[int, int],
+        effects: EffectOptions | None,
         randomize: Randomization | None,
         device: torch.device,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        self.shape, self.device, self.dtype = (num_worlds, 1), device, dtype
-        self.parameters: dict[str, Array] = {}
-        self._randomize = randomize
+        self.device, self.dtype = device, dtype
         self._exact = dtype == torch.float64
-        self._starts, self._draws = self._source(START), self._source(RANDOMIZATION)
-        self._noises: list[Noise] = []
-
-    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
-        """As `World.seed`; a generator of all worlds takes the seeds of the mask together."""
-        ids = mask.flatten().nonzero().flatten().tolist()
-        given = [seeds[i] for i in ids]
-        for one in (self._starts, self._draws, *self._noises):
-            one.seed(ids, given)
-
-    def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
-        """As `World.draw`; in float32 a seed does not give the numbers that it gives `mujoco`."""
-        return self._drawing(self._starts, mask, chosen or {})
+        super().__init__(vehicle, shape, effects, randomize)
 
     def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
         """As `World.noise`."""
@@ -69,9 +57,11 @@ class TensorWorld:
             for name, values in chosen.items()
         }
         if self._exact:
-            ids = mask.flatten().nonzero().flatten().tolist()
-            return _HostDraw(source, ids, self.shape, put, self.device)
+            return _HostDraw(source, self._ids(mask).tolist(), self.shape, put, self.device)
         return TorchDraw(source, mask, put)
+
+    def _ids(self, mask: torch.Tensor) -> torch.Tensor:
+        return mask.flatten().nonzero().flatten()
 
     def checked(self, actions: Array, width: int, choices: int, flown: Array | None) -> Array:
         """As `World.checked`: a tensor on `device` or a NumPy array, rounded to float32.
@@ -107,30 +97,6 @@ class TensorWorld:
             got = values[first].tolist()
             raise InputError(f"actions: expected {expected}, got {got} for env {first}")
         return torch.where(right, values, 0.0).to(self.dtype)
-
-    def _begun(self, mask: torch.Tensor, pose: Pose, hover: torch.Tensor) -> dict[str, Array]:
-        """The pose's arrays by their names; those of the state for worlds out of the mask."""
-        level = torch.tensor((1.0, 0.0, 0.0, 0.0), dtype=self.dtype, device=self.device)
-        begun = {}
-        for name, default in (
-            ("position", 0.0),
-            ("quaternion", level),
-            ("velocity", 0.0),
-            ("body_rates", 0.0),
-            ("thrust", hover),
-        ):
-            given, old = getattr(pose, name), getattr(self.state, name)
-            values = default if given is None else given.to(self.dtype)
-            begun[name] = torch.where(mask[..., None], values, old)
-        return begun
-
-    def _draw_parameters(self, mask: torch.Tensor) -> None:
-        """Draw the parameters of the worlds of a mask."""
-        if self._randomize is not None:
-            draw = self._drawing(self._draws, mask, {})
-            for name, new in self._randomize.draw(draw, self.xp).items():
-                old = self.parameters.get(name)
-                self.parameters[name] = new if old is None else torch.where(mask, new, old)
 
 
 class TorchDraw(Draw):

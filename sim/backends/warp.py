@@ -16,7 +16,7 @@ from ..effects import EffectOptions, Effects
 from ..randomize import Randomization
 from ..rotations import body_z
 from ..state import Array, Pose, WorldState, constant
-from ..world import PhysicsError, check_hung, contact_check, flown_model
+from ..world import PhysicsError, check_hung, flown_model
 from .tensors import TensorWorld
 from .varied import Varied
 
@@ -54,18 +54,13 @@ class WarpWorld(TensorWorld):
         device: str | None = None,
     ) -> None:
         theirs, self._name = _device(device)
-        super().__init__(num_worlds, randomize, theirs)
-        self.vehicle = vehicle
-        self._check = contact_check(vehicle.timestep)
-        options = effects or EffectOptions()
-        drawn = () if randomize is None else randomize.names
-        acting = Effects(vehicle, options, self.noise, self.xp, drawn)
-        self.effects = acting if acting.works else None
+        super().__init__(vehicle, (num_worlds, 1), effects, randomize, theirs)
+        options, drawn = self._options, self._drawn
         self._cable = options.cable if options.payload else None
         self._least_height = options.cable + payload_radius(options.payload)
         model = copy.copy(flown_model(vehicle, options, drawn))
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nothing reads them
-        if acting.on_rotors:  # commands are within their limits; thrusts need not be
+        if self._on_rotors:  # commands are within their limits; thrusts need not be
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         solid = (model.geom_contype | model.geom_conaffinity) != 0
         contacts = CONTACTS_PER_GEOM * int(solid.sum())
@@ -99,7 +94,6 @@ class WarpWorld(TensorWorld):
         self._steps: dict[int, Any] = {}
         newtons = np.array([rotor.newtons for rotor in vehicle.rotors])
         self._newtons = constant(newtons, self.ctrl)
-        self._hover = constant(vehicle.hover_thrust, self.ctrl)
         command = torch.zeros((num_worlds, 1, vehicle.num_rotors), device=self.device)
         self.state = WorldState(
             position=self.qpos[:, None, :3],
@@ -107,7 +101,7 @@ class WarpWorld(TensorWorld):
             velocity=self.qvel[:, None, :3],
             body_rates=self.qvel[:, None, 3:6],
             command=command,
-            thrust=torch.zeros_like(command) if acting.on_rotors else command,
+            thrust=torch.zeros_like(command) if self._on_rotors else command,
             touching=torch.zeros(self.shape, dtype=torch.bool, device=self.device),
             payload=None if self._cable is None else self.qpos[:, None, 7:10],
             payload_velocity=None if self._cable is None else self.qvel[:, None, 6:9],
@@ -129,7 +123,7 @@ class WarpWorld(TensorWorld):
             )
         if self._cable is not None and mask.any():
             check_hung(float(pose.position[mask][:, 2].min()), self._least_height)
-        for name, values in self._begun(mask, pose, self._hover).items():
+        for name, values in self._begun(mask, pose).items():
             getattr(state, name).copy_(values)
         state.command.copy_(torch.where(rows, state.thrust, state.command))
         self._warmstart.masked_fill_(mask, 0.0)

@@ -61,7 +61,7 @@ class Layout:
         telemetry_slots: Of each telemetry array in a State, float64.
         state_slots: Every array of a State in its order: shape, dtype, first byte, and the zeros
             before. Plain tuples, for they are looked at in each message.
-        state_floats: Slots of those that have to be finite.
+        state_floats: Where its numbers lie that have to be finite: of the telemetry all together.
         state_numbers: Reads every float of a State after its header, for a quick look at whether
             all are finite. None where there are so many that NumPy is faster.
         actions: Of the actions in a Command: (N, *shape), or int64 of shape (N,) if discrete.
@@ -100,7 +100,12 @@ class Layout:
             for slot, end in zip(slots, ends, strict=False)
         )
         self.state_size = ends[-1]
-        self.state_floats = [slot for slot in slots if slot.dtype.kind == "f"]
+        self.state_floats = [
+            slot for slot in slots[: len(observation) + 1] if slot.dtype.kind == "f"
+        ]
+        if told:  # float64 side by side: one array, for one look at it
+            at, end = told[0].at, told[-1].end
+            self.state_floats.append(Slot(at, end, ((end - at) // 8,), told[0].dtype))
         self.state_numbers = _numbers("d8x", STATE_ARRAYS_AT, self.state_floats)
 
         actions = action or ArrayLayout((), "int64")

@@ -47,8 +47,9 @@ def make_stepped(
             from ...envs.loop import Loop, OnHost
 
             name, chosen = canonical_id(env), cast(Any, backend)
-            loop = Loop(name, num_envs, vehicle=vehicle, backend=chosen, options=options)
-            return loop if backend == "mujoco" else OnHost(loop)
+            given = {"tensors": False} if backend == "rigid" else {}
+            loop = Loop(name, num_envs, vehicle=vehicle, backend=chosen, options=options, **given)
+            return OnHost(loop) if backend == "warp" else loop
         try:
             envs = [gym.make(env, disable_env_checker=True, **options) for _ in range(num_envs)]
         except (gym.error.Error, ImportError) as error:

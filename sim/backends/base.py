@@ -1,0 +1,107 @@
+"""What backends share: effects, draws and noise, and the streams of NumPy's numbers."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from ...models.vehicle import Vehicle
+from ..effects import EffectOptions, Effects
+from ..random import RANDOMIZATION, START, Draw, Noise, NumpyDraw, NumpyNoise, Streams
+from ..randomize import Randomization
+from ..state import Array, Pose, WorldState, constant, plain
+from ..world import contact_check
+
+_ONLY: Final = np.zeros(1, int)
+_LEVEL: Final = np.array((1.0, 0.0, 0.0, 0.0))
+
+
+class BaseWorld:
+    """Base of all worlds. A derived class sets `state`, and says what draws numbers."""
+
+    xp: Any
+    state: WorldState
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        shape: tuple[int, ...],
+        effects: EffectOptions | None,
+        randomize: Randomization | None,
+    ) -> None:
+        self.vehicle, self.shape = vehicle, shape
+        self.parameters: dict[str, Array] = {}
+        self._options, self._randomize = effects or EffectOptions(), randomize
+        self._drawn = () if randomize is None else randomize.names
+        self._noises: list[Noise] = []
+        self._starts, self._draws = self._source(START), self._source(RANDOMIZATION)
+        acting = Effects(vehicle, self._options, self.noise, self.xp, self._drawn)
+        self.effects = acting if acting.works else None
+        self._on_rotors = acting.on_rotors
+        self._check = contact_check(vehicle.timestep)
+
+    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
+        """As `World.seed`."""
+        ids = self._ids(mask).tolist()
+        given = [seeds[i] for i in ids]
+        for one in (self._starts, self._draws, *self._noises):
+            one.seed(ids, given)
+
+    def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
+        """As `World.draw`."""
+        return self._drawing(self._starts, mask, chosen or {})
+
+    def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
+        """As `World.noise`."""
+        raise NotImplementedError
+
+    def _source(self, use: int | tuple[int, ...]) -> Any:
+        """What draws the numbers of a use."""
+        raise NotImplementedError
+
+    def _drawing(self, source: Any, mask: Array, chosen: Mapping[str, Array]) -> Draw:
+        raise NotImplementedError
+
+    def _ids(self, mask: Array) -> Any:
+        """The worlds of a mask."""
+        raise NotImplementedError
+
+    def _draw_parameters(self, mask: Array) -> None:
+        """Draw the parameters of the worlds of a mask."""
+        if self._randomize is not None:
+            draw = self._drawing(self._draws, mask, {})
+            for name, new in self._randomize.draw(draw, self.xp).items():
+                old = self.parameters.get(name)
+                self.parameters[name] = plain(new if old is None else self.xp.where(mask, new, old))
+
+    def _begun(self, mask: Array, pose: Pose) -> dict[str, Array]:
+        """The pose's arrays by their names; those of the state for worlds out of the mask."""
+        hover = constant(self.vehicle.hover_thrust, self.state.thrust)
+        level = constant(_LEVEL, self.state.thrust)
+        usual = {"position": 0.0, "quaternion": level, "velocity": 0.0, "body_rates": 0.0}
+        begun = {}
+        for name, default in (usual | {"thrust": hover}).items():
+            given, old = getattr(pose, name), getattr(self.state, name)
+            begun[name] = self.xp.where(mask[..., None], default if given is None else given, old)
+        return begun
+
+
+class ArrayWorld(BaseWorld):
+    """Base of worlds of NumPy arrays: on all of them a seed gives the same draws."""
+
+    xp: Any = np
+
+    def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
+        """As `World.noise`."""
+        self._noises.append(NumpyNoise(self.shape, size, use))
+        return self._noises[-1]
+
+    def _source(self, use: int | tuple[int, ...]) -> Streams:
+        return Streams(self.shape[0] if self.shape else 1, use)
+
+    def _drawing(self, source: Any, mask: Array, chosen: Mapping[str, Array]) -> Draw:
+        return NumpyDraw(source, self._ids(mask).tolist(), self.shape, chosen)
+
+    def _ids(self, mask: Array) -> np.ndarray:
+        """The worlds of a mask; of a single one it is always true."""
+        return np.flatnonzero(mask) if self.shape else _ONLY
