@@ -111,8 +111,9 @@ def _training_env(row: BoardRow) -> AbstractContextManager[Any]:
     """Over the wire; of apg in this process, for derivatives do not cross the wire."""
     if row.agent != "apg":
         return shared_pair(**row.training_env, num_envs=row.num_envs)
-    settings: Any = {"vehicle": row.vehicle, "backend": row.backend, **row.options}
-    return closing(LocalVectorEnv(row.env_id, row.num_envs, autoreset_mode="Disabled", **settings))
+    settings: Any = {"vehicle": row.vehicle, "backend": row.backend, "gradients": True}
+    return closing(LocalVectorEnv(row.env_id, row.num_envs, autoreset_mode="Disabled", **settings,
+                                  **row.options))  # fmt: skip
 
 
 def _fly(config: BenchmarkConfig, job: Job, tell: Tell) -> _Done:

@@ -76,9 +76,8 @@ def climbed(steps: int, tail: int, **options: Any) -> tuple[Any, np.ndarray]:
     """
     register("test/Climb-v0", Climb)
     level = {"start_tilt": 0.0, "start_heading": 0.0, **options}
-    env = LocalVectorEnv(
-        "test/Climb-v0", 3, autoreset_mode="Disabled", backend="rigid", dtype="float64", **level
-    )
+    env = LocalVectorEnv("test/Climb-v0", 3, autoreset_mode="Disabled", backend="rigid",
+                         gradients=True, dtype="float64", **level)  # fmt: skip
     config = APGConfig(gamma=0.5, tail=tail, horizon=8, crash_cost=0.0, minibatches=1,
                        normalize_observations=False)  # fmt: skip
     agent: Any = make_agent("apg", log := EpisodeLog(env, 0), config, 0)
