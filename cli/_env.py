@@ -21,18 +21,20 @@ _CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simu
 
 
 def load_checkpoint(name: str) -> Checkpoint | Controller:
-    """The checkpoint of a file or a training's folder, or one of `CONTROLLERS`. Raises
-    `InputError`.
+    """One of `CONTROLLERS`, or what `trained` gives. Raises `InputError`."""
+    return CONTROLLERS[name] if name in CONTROLLERS else trained(name, *CONTROLLERS)
+
+
+def trained(name: str, *others: str) -> Checkpoint:
+    """The checkpoint of a file or a training's folder. Raises `InputError`, whose sentence names
+    the others that are right.
     """
-    if name in CONTROLLERS:
-        return CONTROLLERS[name]
     path = Path(name)
-    file, others = path / CHECKPOINT if path.is_dir() else path, path / "checkpoints"
+    file, several = path / CHECKPOINT if path.is_dir() else path, path / "checkpoints"
     got = f"{name}, where there is no file {file}"
-    got += f": look into {others}" if others.is_dir() else ""
-    expect(
-        file.is_file(), "policy", "pid, geometric, a checkpoint or the folder of a training", got
-    )
+    got += f": look into {several}" if several.is_dir() else ""
+    expected = ", ".join([*others, "a checkpoint or the folder of a training"])
+    expect(file.is_file(), "policy", expected, got)
     return load(file)
 
 

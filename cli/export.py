@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from ..models.errors import InputError, expect
+from ..models.errors import expect
 from ._flags import Command
 
 
@@ -24,17 +24,13 @@ class Export(Command):
 
     def run(self) -> int:
         """Write it."""
-        from ..agents.checkpoints import Checkpoint, write_whole
+        from ..agents.checkpoints import write_whole
         from ..agents.export import TARGETS, export
-        from ._env import load_checkpoint
+        from ._env import trained
 
         out = self.out or Path(TARGETS[self.to])
         expect(not out.exists(), "out", "the name of a new file", f"{out}, which is there")
-        checkpoint = load_checkpoint(self.policy)
-        if not isinstance(checkpoint, Checkpoint):
-            expected = "a checkpoint or the folder of a training"
-            raise InputError(f"policy: expected {expected}, got {self.policy}")
-        content = export(checkpoint, self.to)
+        content = export(trained(self.policy), self.to)
         write_whole(out, content)
         print(f"policy: {out} ({len(content):,} bytes)")
         return 0
