@@ -287,7 +287,7 @@ _OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {
     ("ppo", "tuned", "rotorgram/Hover-v0"): replace(_HOLD, backend="rigid"),
     ("ppo", "tuned", "rotorgram/PayloadHover-v0"): _HOLD,
     ("ppo", "tuned", "rotorgram/Tracking-v0"): _large(1_000_000),
-    ("ppo", "tuned", "rotorgram/Racing-v0"): _large(1_500_000),
+    ("ppo", "tuned", "rotorgram/Racing-v0"): _large(2_500_000),
     ("ppo", "tuned", "rotorgram/Waypoints-v0"): _large(3_000_000),
     ("ppo", "tuned", "rotorgram/Landing-v0"): _large(4_000_000, gamma=0.99),
     ("ppo", "tuned", "rotorgram/Recovery-v0"): _large(

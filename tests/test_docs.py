@@ -247,3 +247,12 @@ def test_the_page_of_rigid_tells_what_the_benchmarks_wrote() -> None:
     for number in shares["microseconds_per_step"].values():
         assert f" | {number:,} |" in page
     assert f"{a2c['ratio_to_sb3']['a2c']:.2f} times as many env steps per second" in page
+
+
+@pytest.mark.parametrize("task", ["Elevation", "Hover", "Tracking", "Waypoints", "Racing"])
+def test_the_readme_tells_how_long_a_training_took(task: str) -> None:
+    found = json.loads((RESULTS / f"seconds_{task.lower()}.json").read_text())
+    cells = f" | {found['hold']} of {found['of']} | {found['seconds']['median']:.3g} s |"
+    lines = (ROOT / "README.md").read_text().splitlines()
+    (line,) = (line for line in lines if line.startswith(f"| `{task}-v0`"))
+    assert line.endswith(cells)
