@@ -128,10 +128,11 @@ def _cells(row: BoardRow, own: pd.DataFrame, headline: Headline, link: str) -> l
     seconds = iqm(own["seconds_to_hold"].to_numpy())
     some = f" ({len(reached)} of {len(own)})" if len(reached) < len(own) else ""
     trained = not row.controller
-    name = agent_label(row.agent) + (f", `{row.preset}`" if trained else "")
+    told = [row.preset] if trained else [f"{name}={value}" for name, value in row.brought.items()]
+    agent = ", ".join([agent_label(row.agent), *(f"`{word}`" for word in told)])
     crashed = f"{own['crashed'].sum()} of {own['episodes'].sum()}"
     return [
-        name,
+        agent,
         _estimate(own["steady"]),
         _NOTHING if headline.held is None else f"{own['held'].sum()} of {len(own)}",
         crashed,

@@ -22,7 +22,7 @@ from ..agents.presets import (
 )  # fmt: skip
 from ..envs.registry import env_spec, is_known, options_type, task_type
 from ..models import BACKENDS, Backend
-from ..models.errors import expect
+from ..models.errors import InputError, expect
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,6 +206,8 @@ class BoardRow(EnvConfig):
 
     agent: str
     """An algorithm, or a controller, which needs no training and has no seeds."""
+    backend: Backend | None = None  # type: ignore[assignment]  # never None once made
+    """What steps it in training; None: what the preset says. Flown and evaluated on `mujoco`."""
     preset: PresetName = "tuned"
     """Hyperparameters of an algorithm."""
     env_steps: int = 0
@@ -217,19 +219,21 @@ class BoardRow(EnvConfig):
         known = (*CONTROLLERS, *PRESETS)
         expect(self.agent in known, "agent", f"one of {', '.join(known)}", self.agent)
         if self.controller:
-            options = {**CONTROLLERS[self.agent].options, **self.options}
-            object.__setattr__(self, "options", options)
+            usual: Any = {"options": {**self.brought, **self.options}, "backend": "mujoco"}
+        else:
+            found = find_preset(self.agent, self.preset, self.env_id)
+            names = ("env_steps", "num_envs", "backend")
+            usual = {name: getattr(self, name) or getattr(found, name) for name in names}
+        for name, value in usual.items():
+            object.__setattr__(self, name, value)
         super().__post_init__()
-        if not self.controller:
-            usual = find_preset(self.agent, self.preset, self.env_id)
-            for name in ("env_steps", "num_envs"):
-                object.__setattr__(self, name, getattr(self, name) or getattr(usual, name))
-            if self.agent == "apg":  # which flies no other
-                object.__setattr__(self, "backend", usual.backend)
         expect(is_known(self.env_id), "env_id", "a registered id", self.env_id)
         expect(env_spec(**self.env).headline, "env_id", "one that names a metric", self.env_id)
         if not self.controller:
-            self.run(0)  # wrong names and numbers are told before anything is trained
+            try:  # wrong names and numbers are told before anything is trained
+                self.run(0)
+            except InputError as error:
+                raise InputError(f"{self.name}: {error}") from None
 
     @property
     def controller(self) -> bool:
@@ -237,9 +241,17 @@ class BoardRow(EnvConfig):
         return self.agent in CONTROLLERS
 
     @property
+    def brought(self) -> Mapping[str, Any]:
+        """Options that a controller brings along."""
+        return CONTROLLERS[self.agent].options if self.controller else {}
+
+    @property
     def task(self) -> str:
-        """The env in words: its name, the options that are not the default, the vehicle."""
+        """The env in words: its name, the options that are not the default nor a controller's, the
+        vehicle.
+        """
         usual = json.loads(json.dumps(options_type(self.env_id)().to_options()))
+        usual |= self.brought
         other = {name: value for name, value in self.options.items() if value != usual[name]}
         words = [self.env_id.rpartition("/")[2]]
         words += [f"{name}={json.dumps(value)}" for name, value in other.items()]

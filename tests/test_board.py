@@ -318,4 +318,21 @@ def test_a_row_of_apg_trains_in_process_on_rigid(tmp_path: Path) -> None:
 def test_a_controller_brings_its_options() -> None:
     row = BoardRow(agent="geometric", env_id="rotorgram/Hover-v0", options={"episode_length": 9})
     assert (row.options["action"], row.options["episode_length"]) == ("position", 9)
-    assert row.name == "geometric Hover-v0 episode_length=9 action=position"
+    assert row.name == "geometric Hover-v0 episode_length=9"
+
+
+def test_a_controller_stands_in_the_table_of_its_task() -> None:
+    hover = {"env_id": "rotorgram/Hover-v0"}
+    flown, trained = BoardRow(agent="geometric", **hover), BoardRow(agent="ppo", **hover)
+    assert flown.task == trained.task == "Hover-v0"
+    other = BoardRow(agent="geometric", options={"action": "velocity"}, **hover)
+    assert other.task == "Hover-v0 action=velocity"
+
+
+def test_a_row_trains_on_the_backend_of_its_preset_or_its_own() -> None:
+    hover = {"agent": "ppo", "env_id": "rotorgram/Hover-v0"}
+    assert BoardRow(**hover).run(0).backend == "rigid"
+    assert BoardRow(**hover, backend="mujoco").run(0).backend == "mujoco"
+    assert BoardRow(agent="geometric", env_id="rotorgram/Hover-v0").backend == "mujoco"
+    with pytest.raises(InputError, match=r"ppo tuned Hover-v0: env_steps: expected at least 4096"):
+        BoardRow(**hover, env_steps=4000)
