@@ -7,8 +7,18 @@ from typing import Any, Final
 import numpy as np
 
 from ...models.errors import expect
-from ...sim import Array, WorldState, clip, component, constant, each, plain, stack
-from ...sim.rotations import to_body, world_z
+from ...sim import (
+    Array,
+    WorldState,
+    clip,
+    component,
+    constant,
+    each,
+    plain,
+    stack,
+    to_body,
+    world_z,
+)
 from ..spec import ArraySpec
 from .task import Task, finite
 
