@@ -290,9 +290,7 @@ _OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {
     ("ppo", "tuned", "rotorgram/Racing-v0"): _large(2_500_000),
     ("ppo", "tuned", "rotorgram/Waypoints-v0"): _large(3_000_000),
     ("ppo", "tuned", "rotorgram/Landing-v0"): _large(4_000_000, gamma=0.99),
-    ("ppo", "tuned", "rotorgram/Recovery-v0"): _large(
-        3_000_000, log_std=0.0, normalize_observations=True
-    ),
+    ("ppo", "tuned", "rotorgram/Recovery-v0"): _large(2_000_000, log_std=-0.5, gae_lambda=0.97),
     ("sac", "tuned", "rotorgram/Hover-v0"): Preset(
         config=SACConfig(
             hidden=(64, 64), learning_rate=0.003, anneal=True, gamma=0.98, batch_size=128,

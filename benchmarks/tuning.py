@@ -40,6 +40,26 @@ _HALF: Final = {**_LARGE, "drones": 256, "steps_per_update": 8192, "env_steps": 
 _FAR: Final = {**_LARGE, "gamma": 0.99}
 _THROWN: Final = {**_LARGE, "log_std": 0.0, "normalize_observations": True}
 _COURSE: Final = {"options": "", **_LARGE}
+_IN_WORLD: Final[list[dict[str, Any]]] = [
+    {**_WIDE, "env_steps": 300_000},
+    {**_HALF, "env_steps": 300_000, "minibatches": 16},
+    {**_HALF, "normalize_observations": True},
+    {**_HALF, "normalize_observations": True, "gamma": 0.99},
+    {**_HALF, "log_std": 0.0},
+    {**_HALF, "log_std": 0.0, "normalize_observations": True},
+    _THROWN,
+    {**_THROWN, "learning_rate": 0.005},
+    {**_THROWN, "gamma": 0.97},
+    {**_THROWN, "gamma": 0.99},
+    {**_THROWN, "env_steps": 1_500_000},
+    {**_THROWN, "env_steps": 1_500_000, "vf_coef": 0.005},
+    {**_THROWN, "env_steps": 2_500_000},
+    {**_THROWN, "env_steps": 2_500_000, "activation": "relu"},
+    {**_THROWN, "env_steps": 3_000_000},
+    {**_THROWN, "env_steps": 3_000_000, "gamma": 0.99},
+    {**_THROWN, "env_steps": 5_000_000},
+]
+"""Of Recovery-v0, with its observation in the world frame."""
 POINTS: Final[dict[tuple[str, str], list[dict[str, Any]]]] = {
     ("ppo", "Hover-v0"): [
         {},
@@ -74,23 +94,8 @@ POINTS: Final[dict[tuple[str, str], list[dict[str, Any]]]] = {
         {**_FAR, "env_steps": 1_500_000, "vf_coef": 0.02, "normalize_observations": True},
     ],
     ("ppo", "Recovery-v0"): [
-        {**_WIDE, "env_steps": 300_000},
-        {**_HALF, "env_steps": 300_000, "minibatches": 16},
-        {**_HALF, "normalize_observations": True},
-        {**_HALF, "normalize_observations": True, "gamma": 0.99},
-        {**_HALF, "log_std": 0.0},
-        {**_HALF, "log_std": 0.0, "normalize_observations": True},
-        _THROWN,
-        {**_THROWN, "learning_rate": 0.005},
-        {**_THROWN, "gamma": 0.97},
-        {**_THROWN, "gamma": 0.99},
-        {**_THROWN, "env_steps": 1_500_000},
-        {**_THROWN, "env_steps": 1_500_000, "vf_coef": 0.005},
-        {**_THROWN, "env_steps": 2_500_000},
-        {**_THROWN, "env_steps": 2_500_000, "activation": "relu"},
-        {**_THROWN, "env_steps": 3_000_000},
-        {**_THROWN, "env_steps": 3_000_000, "gamma": 0.99},
-        {**_THROWN, "env_steps": 5_000_000},
+        *({"options": "frame=world", **point} for point in _IN_WORLD),
+        {**_COURSE, "env_steps": 2_000_000, "log_std": -0.5, "gae_lambda": 0.97},
     ],
     ("ppo", "PayloadHover-v0"): [
         {**_WIDE, "env_steps": 300_000},

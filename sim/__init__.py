@@ -8,6 +8,7 @@ from .control import LEVELS, CollectiveThrust, Controller, Gains, RotorThrust, m
 from .effects import EffectOptions
 from .random import Draw
 from .randomize import PARAMETERS, Randomization
+from .rotations import to_body, world_z
 from .sensors import checked_sensors
 from .state import (
     Array,
@@ -28,5 +29,6 @@ __all__ = [
     "BACKENDS", "LEVELS", "PARAMETERS", "Array", "Backend", "CollectiveThrust", "Controller",
     "Draw", "EffectOptions", "Gains", "PhysicsError", "Pose", "Randomization", "RotorThrust",
     "World", "WorldState", "checked_sensors", "clip", "component", "constant", "each",
-    "make_controller", "make_world", "on_host", "plain", "square_root", "stack",
+    "make_controller", "make_world", "on_host", "plain", "square_root", "stack", "to_body",
+    "world_z",
 ]  # fmt: skip

@@ -231,22 +231,21 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "backend", "drones", "gamma", "log_std", "normalized"),
+    ("task", "backend", "drones", "gamma", "gae_lambda", "log_std"),
     [
-        ("PayloadHover", "mujoco", 128, 0.98, -1.0, False),  # `rigid` has no payload
-        ("Landing", "rigid", 512, 0.99, -1.0, False),
-        ("Recovery", "rigid", 512, 0.98, 0.0, True),
+        ("PayloadHover", "mujoco", 128, 0.98, 0.95, -1.0),  # `rigid` has no payload
+        ("Landing", "rigid", 512, 0.99, 0.95, -1.0),
+        ("Recovery", "rigid", 512, 0.98, 0.97, -0.5),
     ],
 )
 def test_presets_of_flights_are_variations_of_hover_s(
-    task: str, backend: str, drones: int, gamma: float, log_std: float, normalized: bool
+    task: str, backend: str, drones: int, gamma: float, gae_lambda: float, log_std: float
 ) -> None:
     found = find_preset("ppo", "tuned", f"rotorgram/{task}-v0")
     config = found.config
     assert isinstance(config, PPOConfig)
     assert (found.backend, found.num_envs) == (backend, drones)
-    assert (config.gamma, config.log_std) == (gamma, log_std)
-    assert config.normalize_observations == normalized
+    assert (config.gamma, config.gae_lambda, config.log_std) == (gamma, gae_lambda, log_std)
     assert config.rollout_size(drones) == 32 * drones
 
 

@@ -105,11 +105,36 @@ def test_observation_by_hand() -> None:
         position=(1.0, -2.0, 15.0), velocity=(1.0, 2.0, -3.0), body_rates=(0.1, 0.2, 0.3),
         quaternion=about((0, 1, 0), 180.0), thrust=(49.0, 98.0, 0.0, 24.5),
     )  # fmt: skip
-    seen = begun().observe(state)["observation"]
+    seen = begun(frame="world").observe(state)["observation"]
     expected = [-1, 2, 5, 1, 2, -3, -1, 0, 0, 0, 0, -1, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
     assert seen == pytest.approx(expected, abs=1e-12)
+
+
+def test_observation_in_the_body_frame_by_hand() -> None:
+    """Turned left by 90° and then rolled by 90°, right side down: body x is world y, body y is
+    world z, and body z is world x."""
+    state = state_of(
+        position=(1.0, -2.0, 15.0), velocity=(1.0, 2.0, -3.0), body_rates=(0.1, 0.2, 0.3),
+        quaternion=(0.5, 0.5, 0.5, 0.5), thrust=(49.0, 98.0, 0.0, 24.5),
+    )  # fmt: skip
+    seen = begun().observe(state)["observation"]
+    expected = [2, 5, -1, 2, -3, 1, 0, 1, 0, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
+    assert seen == pytest.approx(expected, abs=1e-12)
     (spec,) = make_task(ID, {}).observation
-    assert spec.components[:3] == ("goal - position x", "goal - position y", "goal - position z")
+    assert spec.components[5:8] == ("velocity z", "up x", "up y")
+    assert spec.frame == "body"
+
+
+@pytest.mark.parametrize(
+    ("action", "frame"),
+    [("rotors", "body"), ("rates", "body"), ("attitude", "world"), ("position", "world")],
+)
+def test_the_frame_is_by_default_that_of_the_action(action: str, frame: str) -> None:
+    options = env_spec(ID, {"action": action}).options
+    assert options["frame"] == frame
+    assert env_spec(ID, {"action": action, "frame": "world"}).options["frame"] == "world"
+    with pytest.raises(InputError, match=r"^frame: expected 'body' or 'world', got 'nose'"):
+        env_spec(ID, {"frame": "nose"})
 
 
 PLACE = {"position": (0.0, 0.0, 20.0)}
@@ -180,7 +205,9 @@ def test_time_and_height_lost_by_hand() -> None:
 def test_a_pilot_recovers_and_a_stone_does_not(vehicle: str) -> None:
     """All of 32 throws, in 8 s, and it loses more height than the bound of each."""
     craft, n = Vehicle.load(vehicle), 32
-    env: Any = gym.make_vec(ID, num_envs=n, autoreset_mode="Disabled", vehicle=vehicle)
+    env: Any = gym.make_vec(
+        ID, num_envs=n, autoreset_mode="Disabled", vehicle=vehicle, frame="world"
+    )
     env.reset(seed=0)
     pilot, seen = Pilot(craft), env.observations.astype(float)
     # What the throws lose at least, by their tilts, climbs and spins about x and y.

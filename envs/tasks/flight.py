@@ -7,7 +7,18 @@ from typing import Any, Final
 import numpy as np
 
 from ...models.errors import expect
-from ...sim import Array, WorldState, clip, component, constant, each, plain, stack
+from ...sim import (
+    Array,
+    WorldState,
+    clip,
+    component,
+    constant,
+    each,
+    plain,
+    stack,
+    to_body,
+    world_z,
+)
 from ..spec import ArraySpec
 from .task import Task, finite
 
@@ -42,10 +53,15 @@ class Flight(Task):
 
     Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
     A derived class calls `describe` in `setup`, `seen` in `observe`, and has `goal`.
+
+    With `body` the first two vectors are in the body frame, and the direction of world z in the
+    body frame takes the place of nose and thrust axis: 12 + R numbers that no heading changes.
     """
 
     wanted = 0.0
     """Heading that the frame of the observation is turned by, rad, anticlockwise from x."""
+    body = False
+    """Whether the observation is in the body frame."""
 
     def describe(self, band: float, more: Sequence[Number] = ()) -> None:
         """Set `observation`: positions up to twice the band, m, and further numbers after them."""
@@ -53,8 +69,7 @@ class Flight(Task):
         vectors = (
             ("goal - position", "m", 2 * band),
             ("velocity", "m/s", MOST_SPEED),
-            ("nose", "1", 1.001),
-            ("thrust axis", "1", 1.001),
+            *((name, "1", 1.001) for name in (("up",) if self.body else ("nose", "thrust axis"))),
             ("body rate", "rad/s", MOST_RATE),
         )
         first: list[Number] = [
@@ -75,7 +90,9 @@ class Flight(Task):
                 low=low,
                 high=high,
                 unit=tuple(unit for _, unit, _ in named),
-                frame="world turned by the wanted heading; body rates: body",
+                frame=(
+                    "body" if self.body else "world turned by the wanted heading; body rates: body"
+                ),
                 components=tuple(name for name, *_ in named),
             ),
         )
@@ -87,11 +104,15 @@ class Flight(Task):
         The goal, world frame, m, shape (..., 3), is by default that of `goal`.
         """
         goal = self.goal(state) if goal is None else goal
-        nose, up = axes(state.quaternion)
-        world = (goal - state.position, state.velocity, nose, up)
+        to_goal, quaternion = goal - state.position, state.quaternion
+        if self.body:
+            turned = [to_body(quaternion, v) for v in (to_goal, state.velocity)]
+            vectors = (*turned, world_z(quaternion))
+        else:
+            vectors = tuple(map(self.turned, (to_goal, state.velocity, *axes(quaternion))))
         thrust = state.thrust / constant(self.vehicle.hover_thrust, state.thrust) - 1.0
         rest = [x if getattr(x, "ndim", 0) == state.position.ndim else stack((x,)) for x in more]
-        parts = (*map(self.turned, world), state.body_rates, thrust, *rest)
+        parts = (*vectors, state.body_rates, thrust, *rest)
         low, high = (constant(bound, state.thrust) for bound in self._bounds)
         return {"observation": clip(self.xp.concat(parts, axis=-1), low, high)}
 

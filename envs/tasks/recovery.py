@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal, get_args
 
 import numpy as np
 
@@ -20,12 +20,13 @@ from ...sim import (
 )
 from ..spec import Metric
 from .flight import AIR, RATE_WEIGHT, Flight, at, check_point, length
-from .task import Outcome, TaskOptions, check_number
+from .task import Outcome, TaskOptions, check_choice, check_number
 
 ERROR_SCALE: Final = 1.0  # Distance at which the reward for nearness crosses zero, m
 TILT_WEIGHT: Final = 0.25  # Cost of a tilt of 90°; upside down it is twice as much
 TERMINATION_REWARD: Final = -100.0  # Added to the reward of the step that terminates an episode
 STOP_TIME: Final = 0.5  # Longest time to stop the spin about an axis by all torque about it, s
+Frame = Literal["body", "world"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +50,9 @@ class RecoveryOptions(TaskOptions):
     """... and tilted by less than this, degrees."""
     flight_band: float = 15.0
     """An episode terminates when the craft is further than this from its goal, m."""
+    frame: Frame | None = None
+    """Frame of the observation; by default that in which the action acts: `body` with the actions
+    `rotors` and `rates`, `world` with the others."""
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
@@ -61,12 +65,29 @@ class RecoveryOptions(TaskOptions):
         check_number(self, "flight_band", 0.1, 1e4, "m")
         expected = f"more than near = {self.near:g} m"
         expect(self.flight_band > self.near, "flight_band", expected, f"{self.flight_band!r}")
+        if self.frame is None:
+            frame = "body" if self.action in ("rotors", "rates") else "world"
+            object.__setattr__(self, "frame", frame)
+        check_choice(self, "frame", get_args(Frame))
 
 
 class Recovery(Flight):
     """Thrown at any attitude, moving and spinning: turn upright and come back to rest.
 
-    ## Observation, `float32`, shape (15 + R,)
+    ## Observation, `float32`, shape (12 + R,) or (15 + R,)
+
+    Which torque turns a craft upright follows from where up is in its body frame, whatever its
+    heading. With `frame="body"`:
+
+    | index | quantity | unit | frame |
+    |---|---|---|---|
+    | 0-2 | goal minus position | m | body |
+    | 3-5 | velocity | m/s | body |
+    | 6-8 | direction of world z, up | 1 | body |
+    | 9-11 | body rates | rad/s | body |
+    | 12... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+
+    With `frame="world"`:
 
     | index | quantity | unit | frame |
     |---|---|---|---|
@@ -128,6 +149,7 @@ class Recovery(Flight):
         expect(options.goal[2] >= least, "goal", expected, f"{options.goal[2]:g}")
         turning = [min(vehicle.turning(axis), vehicle.turning(-axis)) for axis in np.eye(3)]
         self.spin = np.minimum(options.spin, STOP_TIME * np.array(turning))
+        self.body = options.frame == "body"
         self.describe(options.flight_band)
         self._least_upright = math.cos(math.radians(options.upright))
         self._time = self._missed = self._lowest = 0.0  # s, s, m
@@ -164,7 +186,7 @@ class Recovery(Flight):
         self.keep(mask, _lowest=xp.where(height < self._lowest, height, self._lowest))
 
     def observe(self, state: WorldState) -> dict[str, Array]:
-        """See the table of the class."""
+        """See the tables of the class."""
         return self.seen(state)
 
     def outcome(self, state: WorldState) -> Outcome:
