@@ -238,6 +238,7 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
     with recording(short, episode_length=5) as remote:
         fly_one(remote, [1], most=2)
     (text := tmp_path / "notes.mcap").write_text("no journal at all")
+    (cut := tmp_path / "cut.mcap").write_bytes(good.read_bytes()[:100])  # before its first chunk
     (there := tmp_path / "there.parquet").write_bytes(b"mine")
     out = tmp_path / "new.parquet"
 
@@ -257,6 +258,7 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "expected journals of one env, all with the options" in parquet(good, other)
     assert "expected each flight once" in parquet(good, good)
     assert "expected a whole episode, got none of 1" in parquet(short)
+    assert "expected a whole episode, got no step of a flight" in parquet(cut)
     assert "expected a new file that ends in .parquet" in parquet(good, out=there)
     assert there.read_bytes() == b"mine"
     assert "a folder that is there" in parquet(good, out=tmp_path / "no" / "new.parquet")
