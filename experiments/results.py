@@ -223,7 +223,7 @@ def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]
     values = trajectory.headline
     steady = steady_state(headline.size(values[1:]), final=headline.final)
     settled = np.nan
-    crashed = trajectory.terminated and not (headline.final and headline.holds(steady))
+    crashed = trajectory.terminated and not (headline.final and headline.holds([steady]))
     if headline.settles and not crashed:
         settled = settling_time(values, trajectory.spec.control_period, headline.settled or 0.0)
     specs = [array for array in trajectory.spec.telemetry if array.name == "drawn"]
