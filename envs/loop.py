@@ -194,13 +194,11 @@ class Loop(NotCopied):
     backend's: see `sim.make_world`.
 
     Attributes:
-        task: Its arrays have the leading axes of the world.
-        world: Likewise; all other arrays here have one axis of N drones, and are new after each
-            `advance`.
+        task, world: Their arrays have the leading axes of the world; all others here have one axis
+            of N drones, and are new after each `advance`.
         observations: By name, shape (N, *shape), of the declared dtypes.
         rewards: float64, shape (N,); 0 for a drone that did not fly.
-        terminated: bool, shape (N,).
-        truncated: bool, shape (N,).
+        terminated, truncated: bool, shape (N,).
         done: bool, shape (N,): the episode has ended and the next has not begun.
         terms: Terms of the last rewards by name, with the leading axes of the world.
 
