@@ -162,7 +162,10 @@ def discounted_sums(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
 
 
 def rewards_to_go(rewards: np.ndarray, ends: np.ndarray, gamma: float) -> np.ndarray:
-    """R_t = sum of gamma^(t' - t) · r_t' to the episode's end (paper, Algorithm 1, step 2)."""
+    """R_t = sum of gamma^(t' - t) · r_t' to the episode's end (paper, Algorithm 1, step 2).
+
+    Arrays have shape (T, N), as the result; `ends` is bool.
+    """
     return discounted_sums(rewards, gamma * ~ends)
 
 
@@ -180,6 +183,7 @@ def advantages(
 
     A_t = r_t + gamma · V(s_t+1) - V(s_t), where V after a termination is 0, and s_t+1 is the state
     that the step led to, before any reset. `gae_lambda` is the decay of the sum over later errors.
+    Arrays have shape (T, N), as the result; the last two are bool.
     """
     errors: np.ndarray = rewards + gamma * np.where(terminated, 0.0, next_values) - values
     if gae_lambda == 0.0:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from tyro.conf import arg
 
+from ..experiments.folders import FolderBusy
 from ..experiments.settings import RunsConfig
 from ._flags import BackendFlags, Command, folder_to_write, go_on_with
 
@@ -54,8 +55,8 @@ def runs_folder(name: str, command: FolderFlags) -> "Iterator[tuple[Path, OnProg
         try:
             with bars() as progress:
                 yield folder, progress
-        except BaseException:
-            if any(folder.iterdir()):
+        except BaseException as error:
+            if any(folder.iterdir()) and not isinstance(error, FolderBusy):
                 print(go_on_with(command, name, folder, "env", "runner", "address"))
             raise
 

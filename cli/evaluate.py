@@ -5,11 +5,11 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from ._flags import AgentFlags, check_count
+from ._flags import AgentFlags, BackendFlags, check_count
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(AgentFlags):
+class Evaluate(AgentFlags, BackendFlags):
     """Measure a trained policy or a controller over episodes without exploration."""
 
     policy: Positional[Annotated[str, arg(metavar="POLICY")]]
@@ -28,7 +28,7 @@ class Evaluate(AgentFlags):
 
         check_count("episodes", self.episodes)
         checkpoint = load_checkpoint(self.policy)
-        with remote_env(self, *chosen_env(self, checkpoint)) as env:
+        with remote_env(self, *chosen_env(self, checkpoint), backend=self.backend) as env:
             headline = Headline.of(env.env_spec)
             policy = policy_for(self, checkpoint, env.env_spec)
             trajectories = fly_episodes(env, policy, self.episodes, "final")
@@ -37,7 +37,8 @@ class Evaluate(AgentFlags):
         measures = [f"{mean[name]:.4f}" for name in ("steady", "overshoot")]
         steady, overshoot = map(headline.amount, measures)
         print(f"policy     {self.policy} on {trajectories[0].spec.env_id}")
-        print(f"episodes   {len(rows)}, {rows['terminated'].sum()} terminated")
+        crashed = f", {headline.crashed(rows).sum()} crashed" if headline.final else ""
+        print(f"episodes   {len(rows)}, {rows['terminated'].sum()} terminated{crashed}")
         print(f"return     {mean['return']:.1f}")
         print(f"steady     {headline.size_symbol} {steady}")
         if headline.settles:

@@ -1,4 +1,4 @@
-"""Gymnasium environments: `rotorgram/Elevation-v0`, `rotorgram/Hover-v0`, and tasks of your own.
+"""Gymnasium environments: the tasks of `rotorgram.envs.tasks`, and your own.
 
 Importing this package registers them. Gymnasium 1.0 stopped reading the entry point
 `gymnasium.envs`, so one of these makes them known:

@@ -25,7 +25,8 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         control_period: Time of a step, s.
         observations: float32, shape (N, n), where the spec has one array; else a dict of arrays.
         rewards: float64, shape (N,).
-        terminated, truncated: bool, shape (N,).
+        terminated: bool, shape (N,).
+        truncated: bool, shape (N,).
         done: bool, shape (N,): the episode has ended and the next has not begun.
         lost: bool, shape (N,): the episode was truncated because its simulator was lost.
         telemetry: By name, float64, shape (N, *shape).

@@ -84,7 +84,8 @@ class RecordedEpisodes:
         first = next(self._episodes, None)
         names = ", ".join(map(str, paths))
         if first is None:
-            raise InputError(f"{names}: expected a whole episode, got none of {self.left_out}")
+            got = f"none of {self.left_out}" if self.left_out else "no step of a flight"
+            raise InputError(f"{names}: expected a whole episode, got {got}")
         self._episodes = chain([first], self._episodes)
 
     def __iter__(self) -> Iterator[RecordedEpisode]:

@@ -10,6 +10,10 @@ from pathlib import Path
 from ..models.errors import InputError, expect
 
 
+class FolderBusy(InputError):
+    """Another process writes to the folder."""
+
+
 def new_folder(out: Path | None, name: str, runs: Path = Path("runs")) -> Path:
     """Make the folder to write to: `out`, or one in `runs`, named by the command and the time; a
     second one of the same second gets a number.
@@ -36,7 +40,7 @@ def new_folder(out: Path | None, name: str, runs: Path = Path("runs")) -> Path:
 def locked(folder: Path) -> Iterator[None]:
     """Hold a folder's lock, a file in it that stays; the lock ends with its process.
 
-    Raises `InputError` if another process holds it, or the folder cannot be written.
+    Raises `FolderBusy` if another process holds it, `InputError` if it cannot be written.
     """
     try:
         file = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -45,7 +49,8 @@ def locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
     try:
-        expect(_try_lock(file), str(folder), "a folder that no other process writes to")
+        wanted = "a folder that no other process writes to"
+        expect(_try_lock(file), str(folder), wanted, kind=FolderBusy)
         yield
     finally:
         os.close(file)

@@ -240,7 +240,7 @@ def results_table(
     """Tabulate the final evaluations and the training of all agents.
 
     Args:
-        evaluations, runs, headline: As of `results.Results`.
+        evaluations: As of `results.Results`, and so are `runs` and `headline`.
         bounds: Mean returns that no agent reached but physics or idleness gives, by name.
 
     Returns:

@@ -221,8 +221,10 @@ def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]
     What was drawn for the episode follows in columns of its own.
     """
     values = trajectory.headline
+    steady = steady_state(headline.size(values[1:]), final=headline.final)
     settled = np.nan
-    if headline.settles and not trajectory.terminated:  # what crashes has not settled
+    crashed = trajectory.terminated and not (headline.final and headline.holds([steady]))
+    if headline.settles and not crashed:
         settled = settling_time(values, trajectory.spec.control_period, headline.settled or 0.0)
     specs = [array for array in trajectory.spec.telemetry if array.name == "drawn"]
     told = [trajectory.telemetry[array.name][0].tolist() for array in specs]
@@ -232,7 +234,7 @@ def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]
         "length": len(trajectory),
         "return": float(trajectory.rewards.sum()),
         "start": float(values[0]),
-        "steady": steady_state(headline.size(values[1:]), final=headline.final),
+        "steady": steady,
         "settling_time": settled,
         "overshoot": overshoot(values) if headline.signed else np.nan,
         "terminated": trajectory.terminated,

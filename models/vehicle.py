@@ -135,8 +135,8 @@ class Vehicle:
     def turning(self, axis: Sequence[float] | np.ndarray) -> float:
         """Largest angular acceleration about an axis through the center of mass, rad/s².
 
-        The axis is a unit vector in the body frame, and its sign matters. The craft is at rest, and
-        what its rotors do to the other axes and to its height does not count.
+        The axis is a unit vector in the body frame, shape (3,), and its sign matters. The craft is
+        at rest, and what its rotors do to the other axes and to its height does not count.
         """
         per_newton = np.asarray(axis) @ np.linalg.solve(self.inertia, self.allocation[1:])
         return float((per_newton * (self.thrust_low, self.thrust_high)).max(axis=0).sum())
@@ -333,7 +333,7 @@ def mass_properties(model: mujoco.MjModel, data: Any) -> tuple[float, np.ndarray
 
 
 def allocate(rotors: Sequence[Rotor], center: np.ndarray) -> np.ndarray:
-    """`Vehicle.allocation` of rotors about a center of mass."""
+    """`Vehicle.allocation`, shape (4, R), of rotors about a center of mass, body frame, m."""
     arms = [np.array(rotor.position) - center for rotor in rotors]
     torques = [np.cross(a, r.axis) + r.reaction for a, r in zip(arms, rotors, strict=True)]
     return np.array([(r.axis[2], *t) for r, t in zip(rotors, torques, strict=True)]).T

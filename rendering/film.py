@@ -206,7 +206,8 @@ class Overlay:
     Everything scales with the picture. A small one has no graph, a smaller one only the title.
 
     Args:
-        width, height: Of the pictures, pixels.
+        width: Of the pictures, pixels.
+        height: Of the pictures, pixels.
         title: Name of the flight.
         color: Of title and curve, "#RRGGBB"; light, the ground is dark.
         like: A moment of the flight: it says which metrics, goal and rotors there are.

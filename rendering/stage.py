@@ -171,7 +171,8 @@ class Stage:
     Attributes:
         radius: Of a sphere about the body's origin that holds the craft, m. Cameras, goals and
             paths scale with it.
-        model, data: With all visual elements; poses of the last moments.
+        model: With all visual elements.
+        data: Poses of the last moments.
         moments: The last moments.
     """
 

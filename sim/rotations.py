@@ -6,12 +6,12 @@ from .state import Array, component, stack
 
 
 def to_world(quaternion: Array, vector: Array) -> Array:
-    """Body vectors in the world frame; both (..., 4) and (..., 3)."""
+    """Body vectors, shape (..., 3), in the world frame; quaternions have shape (..., 4)."""
     return _turned(quaternion, vector, 1.0)
 
 
 def to_body(quaternion: Array, vector: Array) -> Array:
-    """World vectors in the body frame."""
+    """World vectors in the body frame; shapes as of `to_world`."""
     return _turned(quaternion, vector, -1.0)
 
 
@@ -34,7 +34,7 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def multiplied(a: Array, b: Array) -> Array:
-    """Product of quaternions: b in the frame that a turns."""
+    """Product of quaternions, shape (..., 4): b in the frame that a turns."""
     (aw, ax, ay, az), (bw, bx, by, bz) = ([component(q, i) for i in range(4)] for q in (a, b))
     return stack((
         aw * bw - ax * bx - ay * by - az * bz,
@@ -45,7 +45,7 @@ def multiplied(a: Array, b: Array) -> Array:
 
 
 def between(a: Array, b: Array) -> Array:
-    """Quaternion that turns a into b, seen from a: the product of a's conjugate and b."""
+    """Quaternion that turns a into b, seen from a, shape (..., 4): a's conjugate times b."""
     w, x, y, z = (component(a, i) for i in range(4))
     return multiplied(stack((w, -x, -y, -z)), b)
 

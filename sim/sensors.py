@@ -238,7 +238,7 @@ class Sensor:
         defaults: Coefficients that nobody has to give.
         settings: Names in `Settings`, besides those that every sensor has.
         columns: Normal numbers that a reading takes, and a reset.
-        frame, components, units: Of the reading.
+        frame: Of the reading, and so are `components` and `units`.
     """
 
     name: ClassVar[str]

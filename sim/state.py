@@ -30,7 +30,7 @@ class WorldState:
     position: Array
     """Of each body's origin, world frame, m, shape (W, A, 3)."""
     quaternion: Array
-    """From body to world frame, shape (W, A, 4)."""
+    """From body to world frame, scalar first, shape (W, A, 4)."""
     velocity: Array
     """Of each body's origin, world frame, m/s, shape (W, A, 3)."""
     body_rates: Array
@@ -61,7 +61,7 @@ class Pose:
     position: Array
     """World frame, m, shape (W, A, 3)."""
     quaternion: Array | None = None
-    """Shape (W, A, 4)."""
+    """From body to world frame, scalar first, shape (W, A, 4)."""
     velocity: Array | None = None
     """World frame, m/s, shape (W, A, 3)."""
     body_rates: Array | None = None

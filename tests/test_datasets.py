@@ -238,6 +238,7 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
     with recording(short, episode_length=5) as remote:
         fly_one(remote, [1], most=2)
     (text := tmp_path / "notes.mcap").write_text("no journal at all")
+    (cut := tmp_path / "cut.mcap").write_bytes(good.read_bytes()[:100])  # before its first chunk
     (there := tmp_path / "there.parquet").write_bytes(b"mine")
     out = tmp_path / "new.parquet"
 
@@ -254,6 +255,7 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "at least one file, got none" in parquet()
     assert "No such file" in parquet(tmp_path / "nowhere.mcap")
     assert "expected an MCAP file" in parquet(text)
+    assert "expected a whole episode, got no step of a flight" in parquet(cut)
     assert "expected journals of one env, all with the options" in parquet(good, other)
     assert "expected each flight once" in parquet(good, good)
     assert "expected a whole episode, got none of 1" in parquet(short)

@@ -155,6 +155,10 @@ def test_a_run_that_fails_is_named_and_the_others_are_kept(
     with pytest.raises(RunsFailed, match=r"1 of 1 runs failed: learning_rate=1e\+29 seed 1000"):
         sweep(config, folder, "", nothing)
     assert read_sweep_runs(folder, config)["point"].tolist() == [0]
+    with locked(folder):  # as by another process
+        status, out, err = run(capsys, "sweep", "a2c", "--resume", folder)
+    assert (status, out) == (1, "")
+    assert err.endswith(f"{folder}: expected a folder that no other process writes to\n")
 
 
 def _dies(job: int, _: object) -> int:

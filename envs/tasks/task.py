@@ -137,7 +137,8 @@ class Task:
         choices: Names of draws that a reset's options may choose.
 
     Attributes:
-        options, vehicle: As given.
+        options: As given.
+        vehicle: As given.
         shape: (W, A), or () for a single drone.
         xp: Namespace of the array API standard.
         controller: Turns actions into thrusts: that of the option `action`, unless `setup` sets

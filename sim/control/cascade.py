@@ -72,7 +72,7 @@ class Rates:
         return self.turn(self._collective(share), rates, state)
 
     def turn(self, collective: Any, rates: Parts, state: WorldState) -> Array:
-        """Thrusts for a collective thrust, N, and body rates, rad/s."""
+        """Thrusts, N, shape (..., R), for a collective thrust, N, and body rates, rad/s."""
         p, q, r = _parts(state.body_rates)
         about_x, about_y, about_z = self.gains.rate
         wanted = about_x * (rates[0] - p), about_y * (rates[1] - q), about_z * (rates[2] - r)
@@ -148,7 +148,7 @@ class Attitude(Rates):
     def point(
         self, collective: Any, axis: Parts, yaw_rate: Any, axes: Sequence[Parts], state: WorldState
     ) -> Array:
-        """Thrusts for a collective thrust, N, and a thrust axis, a unit vector of the world.
+        """As `turn`, for a collective thrust, N, and a thrust axis, a unit vector of the world.
 
         `axes` are the body's axes in the world frame; the yaw rate is about the vertical, rad/s.
         """
@@ -184,7 +184,7 @@ class Velocity(Attitude):
     def fly(
         self, velocity: Parts, yaw_rate: Any, axes: Sequence[Parts], state: WorldState
     ) -> Array:
-        """Thrusts for a velocity in the world frame, m/s; the others as of `point`."""
+        """As `point`, for a velocity in the world frame, m/s."""
         gains, gravity = self.gains, self._gravity
         level, up = gains.most_acceleration
         u, v, w = _parts(state.velocity)

@@ -68,7 +68,8 @@ class Layout:
         orders: uint8, shape (N,).
         seeds: uint64, shape (N,), in a Command that has any; others end before.
         command_numbers: Reads every float of a Command, as `state_numbers`.
-        state_size, command_size: Bytes of a State, and of a Command with seeds.
+        state_size: Bytes of a State.
+        command_size: Bytes of a Command with seeds.
 
     Raises:
         InputError: The drones are too many, or a message would be larger than `MAX_MESSAGE`.

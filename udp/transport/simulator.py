@@ -42,9 +42,10 @@ class Simulator(NotCopied):
         num_envs: Number of worlds.
         bind: Address of this side; port 0 takes a free port.
         codec: `binary`, or the paper's `text`.
-        vehicle, backend: As `make_stepped`.
+        vehicle: As `make_stepped`.
+        backend: As `make_stepped`.
         config: Times of the exchange.
-        key_file, insecure, record: As `AgentSettings`.
+        key_file: As `AgentSettings`, and so are `insecure` and `record`.
         options: Options of the env, by name.
 
     Attributes:
