@@ -96,6 +96,7 @@ POINTS: Final[dict[tuple[str, str], list[dict[str, Any]]]] = {
     ("ppo", "Recovery-v0"): [
         *({"options": "frame=world", **point} for point in _IN_WORLD),
         {**_COURSE, "env_steps": 2_000_000, "log_std": -0.5, "gae_lambda": 0.97},
+        {**_COURSE, **_THROWN, "env_steps": 3_000_000},
     ],
     ("ppo", "PayloadHover-v0"): [
         {**_WIDE, "env_steps": 300_000},
