@@ -222,7 +222,7 @@ def test_agent_answers_by_the_rules(agent: list[str]) -> None:
             stranger.send(line)
         assert stranger.recv(2048) == b"43,close"
         assert ask(state("43,0.25,0,0,-0.5,0,0") + b"\n") == b"43,-1"
-        assert ask(state("44,-0.125,0,1,-0.25,0,0")) == b"44,close"
+        assert ask(state("44,-0.125,0,1,-0.25,0,0") + b"\r") == b"44,close"
         assert ask(state("44,-0.125,0,1,-0.25,0,0")) == b"44,close"
         assert sock.recv(2048) == b"44,close"  # repeated, until it is answered
         sock.send(b"44,close")
