@@ -5,6 +5,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from ..models import Backend
 from ._flags import Command
 
 
@@ -22,6 +23,8 @@ class Replay(Command):
     task. An id in a journal is never imported."""
     vehicle: str | None = None
     """TOML or MJCF file that was flown, or its name. Default: the paper's quadcopter."""
+    backend: Backend = "mujoco"
+    """What stepped the drones."""
 
     def run(self) -> int:
         """Print the summary and the verdict."""
@@ -35,6 +38,6 @@ class Replay(Command):
             from ..envs import registry
 
             registry.load(self.env)
-        verdict = Verification(self.file, vehicle=self.vehicle)
+        verdict = Verification(self.file, vehicle=self.vehicle, backend=self.backend)
         print(verdict)
         return 0 if verdict.identical and not verdict.ending.startswith("damaged") else 1

@@ -92,9 +92,12 @@ def _connect(env: RemoteEnv | RemoteVectorEnv, process: subprocess.Popen[bytes])
     while True:
         try:
             return env.connect()
-        except PeerSilent:
-            if process.poll() is not None or time.monotonic() > deadline:
+        except PeerSilent as error:
+            if process.poll() is not None:
                 raise
+            if time.monotonic() > deadline:
+                said = f"the simulator runs, and did not connect in {_START_TIMEOUT:g} s"
+                raise PeerSilent(said) from error
 
 
 _shared: dict[str, tuple[Any, ExitStack]] = {}

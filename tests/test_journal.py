@@ -239,6 +239,15 @@ def test_what_acts_is_drawn_and_is_measured_is_repeated(drones: int, tmp_path: P
         assert Verification(getattr(both, side), vehicle="crazyflie2").identical
 
 
+def test_a_flight_on_rigid_is_repeated_on_rigid(tmp_path: Path) -> None:
+    with pair(tmp_path, drones=3, env="rotorgram/Hover-v0", backend="rigid") as both:
+        assert fly(both.remote, 100).episodes > 1
+    for side in ("agent", "simulator"):
+        path = getattr(both, side)
+        assert Verification(path, backend="rigid").identical
+        assert not Verification(path).identical  # mujoco computes in float64
+
+
 def test_both_sides_write_the_same_datagrams(flight: SimpleNamespace) -> None:
     everything = State, Command, Hello, Welcome
     ours, theirs = datagrams(flight.agent, *everything), datagrams(flight.simulator, *everything)

@@ -11,6 +11,7 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -222,7 +223,7 @@ def test_agent_answers_by_the_rules(agent: list[str]) -> None:
             stranger.send(line)
         assert stranger.recv(2048) == b"43,close"
         assert ask(state("43,0.25,0,0,-0.5,0,0") + b"\n") == b"43,-1"
-        assert ask(state("44,-0.125,0,1,-0.25,0,0")) == b"44,close"
+        assert ask(state("44,-0.125,0,1,-0.25,0,0") + b"\r") == b"44,close"
         assert ask(state("44,-0.125,0,1,-0.25,0,0")) == b"44,close"
         assert sock.recv(2048) == b"44,close"  # repeated, until it is answered
         sock.send(b"44,close")
@@ -634,6 +635,19 @@ def test_simulator_ends_as_the_rules_say(simulator: list[str]) -> None:
     ):
         status, out, _ = ended(process)
         assert (status, out.splitlines()[0]) == (1, "no answer from the agent for 0.3 s")
+    with (
+        udp() as sock,
+        running(simulator, place(sock.getsockname()), "--timeout", "1.5") as process,
+    ):
+        hand = Hand(sock)
+        hand.hello()
+        hand.send(welcome(hand.session))
+        hand.state(1)
+        for _ in range(10):  # 2 s: the agent waits for another simulator
+            time.sleep(0.2)
+            hand.send(datagram(9, hand.session, 1))
+        hand.send(command(hand.session, 1, 0.0))
+        hand.state(2)
 
 
 UNITY = """

@@ -141,6 +141,7 @@ namespace Rotorgram
                 case MessageType.Welcome: return Welcomed();
                 case MessageType.Refuse: Refused(); return false;
                 case MessageType.Wait: ToldToWait(); return false;
+                case MessageType.Alive: StillThere(); return false;
                 case MessageType.Command: return Commanded();
                 case MessageType.Unknown: NotKnown(); return false;
                 case MessageType.Close: Closed(); return false;
@@ -194,6 +195,14 @@ namespace Rotorgram
             if (!input.IsHeaderAlone() || input.Sequence != 0) { Malformed++; return; }
             if (State != LinkState.Hello) { Stale++; return; }
             giveUpAt = Now() + timeout; // the Hello goes on by its timer
+        }
+
+        /// <summary>The agent waits for other simulators.</summary>
+        void StillThere()
+        {
+            if (!input.IsHeaderAlone()) { Malformed++; return; }
+            if (State != LinkState.Waiting || input.Sequence != sequence) { Stale++; return; }
+            giveUpAt = Now() + timeout; // the State goes on by its timer
         }
 
         void NotKnown()

@@ -129,8 +129,8 @@ static bool parse(char *line, ssize_t length, Message *m)
     const char *at = line;
     if (length > MOST_BYTES)
         return false;
-    if (length > 0 && line[length - 1] == '\n')
-        length -= length > 1 && line[length - 2] == '\r' ? 2 : 1;
+    length -= length > 0 && line[length - 1] == '\n';
+    length -= length > 0 && line[length - 1] == '\r';
     line[length] = 0;
     if (!whole(&at, &m->sequence) || !one_of(&at, ","))
         return false;

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.loop import Loop
 from ...envs.registry import is_known
 from ...envs.spec import component_names
+from ...models import Backend
 from ...models.errors import InputError
 from ...models.vehicle import Vehicle
 from ..protocol.messages import Command, State
-from ..transport.stepped import reset_all
+from ..transport.stepped import Stepped, make_stepped, reset_all
 from .reader import Item, Recording, Session, count_of, printable
 from .writer import software
 
@@ -41,6 +41,8 @@ class SessionVerdict:
     session: Session
     vehicle: Path | str | None = None
     """File or name of the vehicle that was flown; None: the paper's."""
+    backend: Backend = "mujoco"
+    """What stepped the drones."""
     same: int = 0
     """States that are the same in every bit."""
     unchecked: int = 0
@@ -53,7 +55,7 @@ class SessionVerdict:
     """Reason if it cannot be repeated, or not to its end."""
     notes: list[str] = field(default_factory=list)
     """Other things that have changed."""
-    _loop: Loop | None = None
+    _loop: "Stepped | None" = None
     _sequence: int | None = None
     _command: Command | None = None
     _known: bool = False  # whether the simulated drones are where the recorded ones were
@@ -108,7 +110,7 @@ class SessionVerdict:
             self._known = True
         self._sequence = sequence
 
-    def _make(self) -> Loop:
+    def _make(self) -> Stepped:
         """The drones. Raises `InputError` unless their arrays are those of the recorded spec."""
         spec = self.session.spec
         if not is_known(spec.env_id):
@@ -121,7 +123,9 @@ class SessionVerdict:
         other = bool(was.strip("0")) and was != now
         hint = f"; the vehicle was {was}, and is {now} here: --vehicle names its file" * other
         try:
-            loop = Loop(spec.env_id, count, vehicle=self.vehicle, options=spec.options)
+            loop = make_stepped(
+                spec.env_id, count, vehicle=self.vehicle, backend=self.backend, options=spec.options
+            )
         except InputError as error:
             raise InputError(f"{error}{hint}") from None
         for name in ("observation", "action", "telemetry", "control_period"):
@@ -151,13 +155,20 @@ class Verification(Recording):
     Args:
         path: The journal.
         vehicle: File or name of the vehicle that was flown; None: the paper's.
+        backend: What stepped the drones.
 
     Attributes:
         notes: Versions that have changed.
         sessions: The verdict on each.
     """
 
-    def __init__(self, path: Path | str, *, vehicle: Path | str | None = None) -> None:
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        vehicle: Path | str | None = None,
+        backend: Backend = "mujoco",
+    ) -> None:
         super().__init__(path)
         self.notes = _other_versions(self.about)
         self.sessions: list[SessionVerdict] = []
@@ -168,7 +179,7 @@ class Verification(Recording):
                 if verdict is None or verdict.session is not item.session:
                     if verdict:
                         verdict.close()
-                    verdict = SessionVerdict(session=item.session, vehicle=vehicle)
+                    verdict = SessionVerdict(session=item.session, vehicle=vehicle, backend=backend)
                     flying[item.session.slot] = verdict
                     self.sessions.append(verdict)
                 verdict.take(item)
@@ -199,7 +210,7 @@ class Verification(Recording):
         return printable(lines)
 
 
-def _difference(recorded: State, loop: Loop) -> Difference | None:
+def _difference(recorded: State, loop: Stepped) -> Difference | None:
     """The first number of the first drone that differs in any bit; None if none does."""
     pairs = [pair for pair in _arrays(recorded, loop) if pair[1].tobytes() != pair[2].tobytes()]
     differences = (
@@ -212,7 +223,7 @@ def _difference(recorded: State, loop: Loop) -> Difference | None:
     return next(differences, None)
 
 
-def _arrays(recorded: State, loop: Loop) -> Iterator[tuple[list[str], np.ndarray, np.ndarray]]:
+def _arrays(recorded: State, loop: Stepped) -> Iterator[tuple[list[str], np.ndarray, np.ndarray]]:
     """Names of the numbers of one drone, the recorded array and the replayed one."""
     yield ["reward"], recorded.rewards, loop.rewards
     yield ["terminated"], recorded.terminated, loop.terminated

@@ -379,11 +379,14 @@ class McapFile:
         with self._lock:
             if self.closed:
                 return
-            self.closed = True
             raw = self._file.raw  # its buffer still holds the bytes that a full device refused
-            with suppress(OSError):
+            try:
                 raw.truncate(self.size)
-            raw.close()
+            except (OSError, ValueError):  # ValueError: a second interrupt found it closed
+                pass
+            finally:
+                raw.close()
+                self.closed = True
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
