@@ -17,7 +17,7 @@ def test_the_table_is_the_one_of_the_comparison(page: str) -> None:
     assert table in (ROOT / page).read_text()
 
 
-@pytest.mark.parametrize("preset", ["tuned", "paper"])
+@pytest.mark.parametrize("preset", ["tuned", "paper", "error"])
 def test_the_verdicts_are_those_of_the_comparison(preset: str) -> None:
     page = (ROOT / "docs" / "results.md").read_text()
     for verdict in json.loads((RESULTS / preset / "claims.json").read_text()):
