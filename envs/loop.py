@@ -37,7 +37,7 @@ from ..sim import (
 )  # fmt: skip
 from ..sim.sensors import Sensors, readings_of
 from . import registry
-from .autoreset import Seeds, checked_seeds
+from .autoreset import Seeds, checked_seeds, worlds_done
 from .delay import Delay
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
@@ -476,12 +476,9 @@ class Loop(NotCopied):
     def _end(self, ends: Array) -> None:
         """Take in the ends of episodes, bool, shape (N,)."""
         self.out = self.out | ends
-        done = self.out
-        if self._drones > 1:
-            worlds = self._xp.all(self.out.reshape(self.world.shape), axis=-1)[:, None]
-            done = (worlds | self._none).reshape(self.num_envs)
-            self._anyone_out = True
-        self._waiting, self.done = self._waiting | done, self.done | done
+        self.done = worlds_done(self.out, self._drones)
+        self._anyone_out = self._drones > 1
+        self._waiting = self._waiting | self.done
         self._anyone_waits = bool(self._waiting.any())
 
     def _check_together(self, *masks: Array | None) -> None:
@@ -669,7 +666,7 @@ class OnHost:
         }
         self.rewards = on_host(loop.rewards)
         self.terminated, self.truncated = on_host(loop.terminated), on_host(loop.truncated)
-        self.done = on_host(loop.done)
+        self.done, self.out = on_host(loop.done), on_host(loop.out)
 
     @property
     def telemetry(self) -> dict[str, np.ndarray]:
