@@ -38,7 +38,8 @@ class AdvancingParallelEnv(NotCopied, ParallelEnv[str, Any, Any]):  # type: igno
         fps = world.metadata["render_fps"]
         self.metadata = {"render_modes": [], "render_fps": fps, "name": self.env_spec.env_id,
                          "is_parallelizable": True}  # fmt: skip
-        self.possible_agents, self.agents = list(names), []
+        self.possible_agents = list(names)
+        self.agents: list[str] = []
         self._rows = {agent: row for row, agent in enumerate(names)}
         self.observation_spaces = {agent: observation_space(self.env_spec) for agent in names}
         self.action_spaces = {agent: action_space(self.env_spec) for agent in names}
@@ -74,13 +75,13 @@ class AdvancingParallelEnv(NotCopied, ParallelEnv[str, Any, Any]):  # type: igno
         for agent in flown:
             given[self._rows[agent]] = self._checked(agent, actions[agent])
         seen, rewards, terminated, truncated, info = world.step(given)
-        self.agents = [agent for agent in flown if not world.out[self._rows[agent]]]
-        ends = (
+        left, scores, ends, cuts = (
             {agent: values[self._rows[agent]].item() for agent in flown}
-            for values in (rewards, terminated, truncated)
+            for values in (world.out, rewards, terminated, truncated)
         )
+        self.agents = [agent for agent in flown if not left[agent]]
         observations, infos = self._told(seen, info, flown)
-        return observations, *ends, infos
+        return observations, scores, ends, cuts, infos
 
     def render(self) -> Any:
         """A picture of the world, uint8, shape (360, 480, 3), with `rgb_array`; None otherwise."""
