@@ -20,8 +20,10 @@ class Sim(BackendFlags):
     """Address of the agent, HOST:PORT."""
     bind: str = "127.0.0.1:8000"
     """Address of this side, HOST:PORT; port 0 takes a free one."""
-    num_envs: int = 1
-    """Drones."""
+    num_envs: int | None = None
+    """Drones in all. Default: those of one world."""
+    drones: int = 1
+    """Drones of each world, for a task of several."""
     codec: Literal["binary", "text"] = "binary"
     """binary, or the paper's text."""
     timeout: float = 120.0
@@ -50,6 +52,7 @@ class Sim(BackendFlags):
             self.env_id,
             server=parse_address(self.server),
             num_envs=self.num_envs,
+            drones=self.drones,
             bind=parse_address(self.bind),
             codec=self.codec,
             vehicle=self.vehicle,

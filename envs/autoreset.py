@@ -27,7 +27,9 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         rewards: float64, shape (N,).
         terminated: bool, shape (N,).
         truncated: bool, shape (N,).
-        done: bool, shape (N,): the episode has ended and the next has not begun.
+        done: bool, shape (N,): the episode of the drone's world has ended and the next has not
+            begun.
+        out: bool, shape (N,): the drone's own has ended.
         lost: bool, shape (N,): the episode was truncated because its simulator was lost.
         telemetry: By name, float64, shape (N, *shape).
     """
@@ -39,6 +41,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
     terminated: np.ndarray
     truncated: np.ndarray
     done: np.ndarray
+    out: np.ndarray
     lost: np.ndarray
     telemetry: Mapping[str, np.ndarray]
 
@@ -59,9 +62,11 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         """Reset some drones, freeze some, and fly the others for one control period.
 
         Rewards and flags of a drone that is reset or frozen are 0, and its action is ignored. One
-        that is frozen is afterwards as it was before. Actions have shape (N, k), discrete ones (N,)
-        or (N, 1); masks are bool, shape (N,), or None; a drone of both masks is reset. Seeds, shape
-        (N,), are of those that are reset; None leaves their streams as they are.
+        that is frozen is afterwards as it was before. Drones of one world are reset and frozen
+        together; one that is out gets no reward while the others fly on. Actions have shape (N, k),
+        discrete ones (N,) or (N, 1); masks are bool, shape (N,), or None; a drone of both masks is
+        reset. Seeds, shape (N,), are of those that are reset; None leaves their streams as they
+        are.
         """
 
     def step(self, actions: Any) -> Step:
@@ -129,6 +134,14 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         columns = info_columns(self.env_spec, self.telemetry)
         info: dict[str, Any] = {name: column.copy() for name, column in columns.items()}
         return info | {f"_{name}": mask for name in info} | self._losses()
+
+
+def worlds_done(out: Any, drones: int) -> Any:
+    """Of drones that are out, bool, shape (N,), those of whose world all so many are."""
+    if drones == 1 or not out.any():
+        return out
+    all_out = out.reshape(-1, drones).all(-1)
+    return (all_out[:, None] & out.reshape(-1, drones)).reshape(out.shape)
 
 
 def checked_mode(mode: AutoresetMode | str) -> AutoresetMode:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..models.errors import InputError, NotCopied, expect
 from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
+from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
 from ..sim import (
     PARAMETERS,
@@ -36,7 +37,7 @@ from ..sim import (
 )  # fmt: skip
 from ..sim.sensors import Sensors, readings_of
 from . import registry
-from .autoreset import Seeds, checked_seeds
+from .autoreset import Seeds, checked_seeds, worlds_done
 from .delay import Delay
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
@@ -99,8 +100,8 @@ def _check_returned(
     expect("bool" in str(kind), env_id, "terminated as truth values", f"{kind}")
 
 
-def spec_of(env_id: str, task: Task) -> EnvSpec:
-    """The `EnvSpec` of a task's env."""
+def spec_of(env_id: str, task: Task, drones: int = 1) -> EnvSpec:
+    """The `EnvSpec` of a task's env with so many drones in a world."""
     vehicle, controller = task.vehicle, task.controller
     names, low, high = controller.components, controller.low, controller.high
     action: ArraySpec | Discrete = (
@@ -122,6 +123,7 @@ def spec_of(env_id: str, task: Task) -> EnvSpec:
         control_period=task.options.control_period,
         vehicle=vehicle.name,
         vehicle_hash=vehicle.hash,
+        agents=drone_names(drones),
         observation=tuple(_repeated(a, task.options.history) for a in _observed(task)),
         action=action,
         telemetry=_telemetry_specs(task),
@@ -188,18 +190,24 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
 
 
 class Loop(NotCopied):
-    """N drones of one env, each in a world of its own.
+    """N drones of one env, each in a world of its own, or so many together.
+
+    Drones of one world begin together. One whose episode ends before those of the others is *out*:
+    its rotors stand still, it gets no reward and no second end, and the others fly on. The world is
+    done when all are out. Masks and seeds have an element for each drone, and those of one world
+    are alike; its first one's seed counts.
 
     The vehicle is a file, None the paper's; options are the task's, by name; settings the
     backend's: see `sim.make_world`.
 
     Attributes:
         task, world: Their arrays have the leading axes of the world; all others here have one axis
-            of N drones, and are new after each `advance`.
+            of N drones, world by world, and are new after each `advance`.
         observations: By name, shape (N, *shape), of the declared dtypes.
         rewards: float64, shape (N,); 0 for a drone that did not fly.
         terminated, truncated: bool, shape (N,).
-        done: bool, shape (N,): the episode has ended and the next has not begun.
+        done: bool, shape (N,): the world's episode has ended and the next has not begun.
+        out: bool, shape (N,): its own has ended.
         terms: Terms of the last rewards by name, with the leading axes of the world.
 
     Raises:
@@ -213,8 +221,9 @@ class Loop(NotCopied):
     def __init__(
         self,
         env_id: str,
-        num_envs: int = 1,
+        num_worlds: int = 1,
         *,
+        drones: int = 1,
         vehicle: Path | str | None = None,
         backend: Backend = "mujoco",
         options: Mapping[str, Any] | None = None,
@@ -225,12 +234,14 @@ class Loop(NotCopied):
         effects = EffectOptions.from_options(chosen.effects_on(craft.mass))
         randomize = Randomization(chosen.randomize, effects) if chosen.randomize else None
         self.world: World = make_world(
-            craft, num_envs, backend, effects=effects, randomize=randomize, **settings
-        )
+            craft, num_worlds, backend, drones=drones, effects=effects, randomize=randomize,
+            **settings,
+        )  # fmt: skip
         self._xp = self.world.xp
         self.task = type(draft)(chosen, craft, self.world.shape, self._xp)
-        self.spec = spec_of(canonical_id(env_id), self.task)
-        self.num_envs, self.vehicle = num_envs, craft
+        self.spec = spec_of(canonical_id(env_id), self.task, drones)
+        self.num_envs, self.vehicle = num_worlds * drones, craft
+        self._drones = drones
         self._prepare_step()
         self._prepare_observations()
         self._prepare_memory(randomize)
@@ -284,13 +295,15 @@ class Loop(NotCopied):
         none = self.world.state.touching != self.world.state.touching  # all False, on its device
         self._none, self._nobody = none, none.reshape(self.num_envs)
         self._everybody: Array = ~none
-        self.terminated = self.truncated = self.done = self._nobody
+        self.terminated = self.truncated = self.done = self.out = self._nobody
         self.rewards: Array = 0.0 * self._nobody
         self.observations: dict[str, Array] = {}
         self.terms: dict[str, Array] = {}
         self._steps: Array = plain((0 * self._nobody).reshape(self.world.shape))
         self._waiting, self._anyone_waits = ~self._nobody, True  # for a reset
-        self._begun = self._closed = False
+        self._begun = self._closed = self._anyone_out = False
+        least = np.clip(0.0, self.vehicle.thrust_low, self.vehicle.thrust_high)
+        self._rest = constant(least, self.world.state.thrust)  # of rotors that stand still
         self._outcome: Outcome | None = None
         self._telemetry: dict[str, np.ndarray] | None = None
 
@@ -310,6 +323,8 @@ class Loop(NotCopied):
         """
         resets = None if resets is None else self.ours(resets)
         frozen = None if frozen is None else self.ours(frozen)
+        if self._drones > 1:
+            self._check_together(resets, frozen)
         idle = resets if frozen is None else frozen if resets is None else resets | frozen
         flown = None if idle is None or not idle.any() else ~idle
         if self._anyone_waits:  # always after `close`
@@ -339,10 +354,12 @@ class Loop(NotCopied):
         if self._late_actions is not None:
             self._late_actions.push(None if some is None else some[..., None], values)
             values = self._late_actions.get(each(world.parameters["action_delay"]))
-        controller = self.task.controller
+        controller, rest = self.task.controller, self._rest
         try:
             for step in range(0, self._substeps, self._held):
                 thrust = controller.thrust(values, self._seen())
+                if self._anyone_out:
+                    thrust = self._xp.where(self.out.reshape(world.shape)[..., None], rest, thrust)
                 world.step(thrust, self._held, some, again=step > 0)
         except PhysicsError:
             self._waiting = self._waiting | (~self._nobody if flown is None else flown)
@@ -362,7 +379,7 @@ class Loop(NotCopied):
             self._reset(everybody, self._start(everybody, world.draw(everybody)))
         some = mask.reshape(lead)[()]
         if seeds is not None:
-            world.seed(some, seeds)
+            world.seed(some, seeds if self._drones == 1 else seeds[:: self._drones])
         draws = {name: values.reshape(lead)[()] for name, values in chosen.items()}
         self._reset(some, self._start(some, world.draw(some, draws)))
         self._begun = True
@@ -374,7 +391,8 @@ class Loop(NotCopied):
         self._steps = plain(self._xp.where(some, 0, self._steps))
         self._waiting = self._waiting & ~mask
         self._anyone_waits = bool(self._waiting.any())
-        self.done = self.done & ~mask
+        self.done, self.out = self.done & ~mask, self.out & ~mask
+        self._anyone_out = bool(self.out.any())
 
     def _reset(self, mask: Array, pose: Pose) -> None:
         self.world.reset(mask, pose)
@@ -444,6 +462,8 @@ class Loop(NotCopied):
             may_end = True
         if self._xp is np and not (finite and all(map(_is_finite, self.observations.values()))):
             self._refuse_not_finite()
+        if self._anyone_out:
+            flown = ~self.out if flown is None else flown & ~self.out
         if flown is not None:
             # A drone that did not fly gets no reward: nothing has ended, nothing was won.
             self.rewards = self._xp.where(flown, self.rewards, 0.0)
@@ -451,8 +471,24 @@ class Loop(NotCopied):
         if may_end:
             ends = self.terminated | self.truncated
             if ends.any():
-                self._waiting, self._anyone_waits = self._waiting | ends, True
-                self.done = self.done | ends
+                self._end(ends)
+
+    def _end(self, ends: Array) -> None:
+        """Take in the ends of episodes, bool, shape (N,)."""
+        self.out = self.out | ends
+        self.done = worlds_done(self.out, self._drones)
+        self._anyone_out = self._drones > 1
+        self._waiting = self._waiting | self.done
+        self._anyone_waits = bool(self._waiting.any())
+
+    def _check_together(self, *masks: Array | None) -> None:
+        """Raise `InputError` for a mask that has some of a world's drones."""
+        for mask in masks:
+            if mask is not None:
+                rows = mask.reshape(self.world.shape)
+                right = bool((rows == rows[:, :1]).all())
+                expect(right, "resets, frozen", f"all {self._drones} drones of a world or none",
+                       "some of them")  # fmt: skip
 
     def _keep(
         self, past: dict[str, Delay], flown: Array | None, begun: Array | None
@@ -630,7 +666,7 @@ class OnHost:
         }
         self.rewards = on_host(loop.rewards)
         self.terminated, self.truncated = on_host(loop.terminated), on_host(loop.truncated)
-        self.done = on_host(loop.done)
+        self.done, self.out = on_host(loop.done), on_host(loop.out)
 
     @property
     def telemetry(self) -> dict[str, np.ndarray]:

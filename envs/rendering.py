@@ -18,7 +18,7 @@ RENDER_MODES: Final = ["human", "rgb_array"]
 
 
 class Renderer:
-    """`render` of an env: a picture of each drone, or a window that shows them in real time."""
+    """`render` of an env: a picture of each world, or a window that shows them in real time."""
 
     def __init__(self, mode: str | None, loop: "Loop") -> None:
         right = mode is None or mode in RENDER_MODES
@@ -44,13 +44,14 @@ class Renderer:
             return None
         from ..rendering import Canvas, Stage
 
+        drones = len(self._loop.spec.agents)
         if self._canvas is None:
-            one = len(now) == 1
-            stage = Stage(vehicle=self._loop.vehicle.path, trail=one)
+            one = len(now) == drones
+            stage = Stage(drones=drones, vehicle=self._loop.vehicle.path, trail=one)
             self._canvas = Canvas(stage, *((480, 360) if one else (240, 180)))
         canvas, pictures = self._canvas, []
-        for one_drone in now:
-            canvas.stage.show(one_drone)
+        for first in range(0, len(now), drones):
+            canvas.stage.show(*now[first : first + drones])
             pictures.append(canvas.draw())
         return tuple(pictures)
 

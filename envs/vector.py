@@ -18,6 +18,9 @@ from .spaces import joined
 class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
     """N drones that fly a task in process, bit for bit as N single ones do.
 
+    With several `drones` to a world, N is a multiple of them. One whose episode ends is `out`, with
+    reward 0, until those of its world have all ended; then they begin together.
+
     Spaces, reward, start and ends are those of the task, with the drone as the first axis. `info`
     holds an array of shape (N,) for each component of the telemetry and each `reward_<term>`.
 
@@ -34,6 +37,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
     Args:
         env_id: Of a registered task.
         num_envs: N.
+        drones: Of a world.
         render_mode: None, `rgb_array` (N pictures) or `human` (a window shows sixteen of them).
         autoreset_mode: `AutoresetMode`, or its value.
         vehicle: As of `Vehicle.load`: a file or a name; None is the paper's.
@@ -62,6 +66,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         num_envs: int = 1,
         render_mode: str | None = None,
         *,
+        drones: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         vehicle: Path | str | None = None,
         backend: Backend = "mujoco",
@@ -83,15 +88,20 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         expect(not gradients or backend == "rigid", "gradients", f"False with {backend}", "True")
         if backend == "rigid":
             given["tensors"] = tensors or gradients or device not in (None, "cpu")
+        right = type(drones) is int and drones >= 1
+        expect(right, "drones", "1 or more", repr(drones))
+        right = type(num_envs) is int and num_envs % drones == 0
+        expect(right, "num_envs", f"a multiple of drones = {drones}", repr(num_envs))
         self._loop = loop = Loop(
-            env_id, num_envs, vehicle=vehicle, backend=backend, options=options, **given
-        )
+            env_id, num_envs // drones, drones=drones, vehicle=vehicle, backend=backend,
+            options=options, **given,
+        )  # fmt: skip
         self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
         self._on_device = tensors
         self._flown = loop if tensors or loop.world.xp is np else OnHost(loop)
-        self._nobody = self.lost = self.done = self._flown.done
+        self._nobody = self.lost = self.done = self.out = self._flown.done
         self._episodes = np.zeros(num_envs, int)
         self.closed = False
 
@@ -143,7 +153,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         loop.advance(actions, resets, seeds, frozen, chosen)
         self.observations = joined(loop.spec, loop.observations)
         self.rewards, self.terminated = loop.rewards, loop.terminated
-        self.truncated, self.done = loop.truncated, loop.done
+        self.truncated, self.done, self.out = loop.truncated, loop.done, loop.out
         if self.render_mode is not None:
             self._episodes = self._episodes + (0 if resets is None else on_host(resets))
             if self.render_mode == "human":

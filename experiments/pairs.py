@@ -28,13 +28,15 @@ def socket_pair(
     options: Mapping[str, Any] | None = None,
     *,
     num_envs: int = 1,
+    drones: int = 1,
     vehicle: str | Path | None = None,
     backend: Backend = "mujoco",
     record: Path | None = None,
 ) -> Iterator[Any]:
     """A connected remote env, on free ports of the loopback interface: of a task that is registered
     here, with a vehicle by file or name, or the paper's, on a backend. One drone makes a
-    `RemoteEnv`, more make a `RemoteVectorEnv` without autoreset. `record` is the MCAP file of the
+    `RemoteEnv`, more make a `RemoteVectorEnv` without autoreset, with so many `drones` to a world.
+    `record` is the MCAP file of the
     agent's journal.
 
     The simulator ends with this process, however this one ends.
@@ -56,6 +58,7 @@ def socket_pair(
     else:
         env = RemoteVectorEnv(here, num_envs=num_envs, autoreset_mode="Disabled", **settings)
     arguments = {"server": env.address, "bind": here, "num_envs": num_envs, "env": env_id}
+    arguments |= {"drones": drones} if drones > 1 else {}
     arguments |= {"vehicle": file, "backend": backend, "options": config.options}
     arguments |= {"module": config.module} if config.module else {}
     # -P: no folder of the working directory stands for the package.

@@ -1,6 +1,7 @@
 """The scene around a vehicle: what its file lacks of ground, sky and light; a visual airport."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal
 from xml.etree import ElementTree
@@ -51,6 +52,28 @@ def build_scene(
         attach_airport(spec)
     spec.compiler.discardvisual = not visual
     return spec
+
+
+def build_swarm(
+    vehicles: Sequence[Path], names: Sequence[str], world: World = "plain", *, visual: bool = True
+) -> mujoco.MjSpec:
+    """One world with a craft of each vehicle's file, to be compiled.
+
+    The parts of a craft have its name and a slash before theirs. Ground, sky, light and options are
+    those of the first vehicle. Raises as `build_scene`.
+    """
+    spec = build_scene(vehicles[0], world, visual=visual)
+    spec.delete(free_body(spec))
+    for path, name in zip(vehicles, names, strict=True):
+        own = read_spec(path)  # as long as it has a name, its craft lives
+        spec.worldbody.add_frame().attach_body(free_body(own), f"{name}/", "")
+    return spec
+
+
+def free_body(spec: mujoco.MjSpec) -> mujoco.MjsBody:
+    """The first body with a free joint: the craft of a vehicle's spec."""
+    free = mujoco.mjtJoint.mjJNT_FREE
+    return next(body for body in spec.bodies if any(j.type == free for j in body.joints))
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:

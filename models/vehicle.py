@@ -29,6 +29,8 @@ _MOST_HEIGHT: Final = 1e4  # m: above it no craft may touch anything
 _RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves
 _ROUNDED: Final = 1e-5  # of the weight, sideways: what a file's six digits leave
 
+_PAYLOAD: Final = "rotorgram/payload"  # the body's name
+
 SURROUNDINGS: Final = (True, False, False, False, False, False)
 """Of a vehicle's model the groups of geoms that are not the craft's, for rays."""
 
@@ -160,7 +162,7 @@ class Vehicle:
         spec, craft = self._spec()
         radius = payload_radius(mass)
         hook = craft.add_site(name="rotorgram/hook")
-        ball = spec.worldbody.add_body(name="rotorgram/payload")
+        ball = spec.worldbody.add_body(name=_PAYLOAD)
         ball.pos = craft.pos - (0.0, 0.0, cable)
         ball.add_freejoint()
         ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], mass=mass)
@@ -238,8 +240,17 @@ def payload_radius(mass: float) -> float:
 
 
 def craft_bodies(model: mujoco.MjModel) -> np.ndarray:
-    """Ids of the free body, which has the first joint, and of what is welded to it."""
-    return np.flatnonzero(model.body_rootid == model.jnt_bodyid[0])
+    """Ids of the first free body, and of what is welded to it."""
+    return np.flatnonzero(owners(model) == 0)
+
+
+def owners(model: mujoco.MjModel) -> np.ndarray:
+    """The number of the craft of which each body is a part, -1 of none, shape (B,)."""
+    owner = np.full(model.nbody, -1)
+    for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist():
+        if model.body(body).name != _PAYLOAD:
+            owner[model.body_rootid == body] = owner.max() + 1
+    return owner
 
 
 def _group(model: mujoco.MjModel) -> None:
@@ -249,15 +260,15 @@ def _group(model: mujoco.MjModel) -> None:
 
 def payload_body(model: mujoco.MjModel) -> int:
     """Id of the payload of a model from `Vehicle.with_payload`."""
-    return int(model.body("rotorgram/payload").id)
+    return int(model.body(_PAYLOAD).id)
 
 
 def body_axes(model: mujoco.MjModel) -> np.ndarray:
-    """Axes of each of `craft_bodies` in the craft's body frame, as columns, shape (B, 3, 3)."""
+    """Axes of each body in the frame of the free body that it is of, as columns, (B, 3, 3)."""
     data = mujoco.MjData(model)
-    data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
+    data.qpos.reshape(-1, 7)[:] = (0, 0, 0, 1, 0, 0, 0)
     mujoco.mj_kinematics(model, data)
-    axes: np.ndarray = data.xmat[craft_bodies(model)].reshape(-1, 3, 3)
+    axes: np.ndarray = data.xmat.reshape(-1, 3, 3).copy()
     return axes
 
 

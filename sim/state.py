@@ -42,6 +42,8 @@ class WorldState:
     is the command."""
     touching: Array
     """Whether any part was in contact since the last step or reset, bool, shape (W, A)."""
+    colliding: Array = None
+    """Whether it was so with another drone; None where drones are alone."""
     payload: Array = None
     """Position of each payload, world frame, m, shape (W, A, 3); None without payloads."""
     payload_velocity: Array = None

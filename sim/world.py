@@ -29,6 +29,7 @@ _SETTINGS: Final = {
 }
 
 MAX_WORLDS: Final = 1 << 16  # Most worlds of a batch
+MAX_DRONES: Final = 1024  # Most drones of a world
 CONTACT_CHECK: Final = 0.02
 """Longest time between two checks for contact, s. A bounce of the paper's craft at full thrust
 lasts longer, unless its skids dip less than half a millimetre."""
@@ -56,7 +57,10 @@ class World(Protocol):
     xp: Any
 
     def reset(self, mask: Array, pose: Pose) -> None:
-        """Reset the worlds of the mask, bool, shape (W, A), to their rows of `pose`."""
+        """Reset the worlds of the mask, bool, shape (W, A), to their rows of `pose`.
+
+        Here and in all masks the drones of a world have the same truth value.
+        """
 
     def step(
         self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
@@ -106,12 +110,20 @@ def contact_check(timestep: float) -> int:
 
 
 def flown_model(
-    vehicle: "Vehicle", effects: EffectOptions, drawn: Sequence[str]
+    vehicle: "Vehicle", drones: int, effects: EffectOptions, drawn: Sequence[str]
 ) -> "mujoco.MjModel":
-    """The vehicle's model, or one of its own with a payload or for a drawn center of mass."""
+    """The model of a world: the vehicle's, or one with more crafts, with a payload or for a drawn
+    center of mass. Raises `InputError` for a payload of each of several drones.
+    """
+    movable = bool(set(drawn) & set(CENTER))
+    if drones > 1:
+        expect(not effects.payload, "effects: payload", "one drone in a world", f"{drones}")
+        from ..models.swarm import swarm_model  # which imports MuJoCo
+
+        return swarm_model([vehicle] * drones, movable=movable)
     if effects.payload:
         return vehicle.with_payload(effects.payload, effects.cable)
-    return vehicle.with_movable_center() if set(drawn) & set(CENTER) else vehicle.model
+    return vehicle.with_movable_center() if movable else vehicle.model
 
 
 def check_hung(height: float, least: float) -> None:
@@ -125,12 +137,15 @@ def make_world(
     num_worlds: int,
     backend: Backend = "mujoco",
     *,
+    drones: int = 1,
     effects: EffectOptions | None = None,
     randomize: Randomization | None = None,
     **settings: Any,
 ) -> World:
-    """W worlds of one drone each; settings are `num_threads` of `mujoco`, `device` of the others,
-    `dtype`, `compiled` and `tensors` of `rigid`: without the last it has NumPy arrays.
+    """W worlds of so many drones each; only `mujoco` has several in one.
+
+    Settings are `num_threads` of `mujoco`, `device` of the others, `dtype`, `compiled` and
+    `tensors` of `rigid`: without the last it has NumPy arrays.
 
     Raises:
         InputError: The backend, the number or a setting is not what it should be.
@@ -140,6 +155,10 @@ def make_world(
         raise InputError(f"backend: expected {' or '.join(BACKENDS)}, got {backend!r}")
     if type(num_worlds) is not int or not 1 <= num_worlds <= MAX_WORLDS:
         raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
+    if type(drones) is not int or not 1 <= drones <= MAX_DRONES:
+        raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {drones!r}")
+    if drones > 1:
+        expect(backend == "mujoco", "drones", f"1 with the backend {backend}", f"{drones}")
     for name, value in settings.items():
         known = _SETTINGS[backend]
         if name not in known:
@@ -148,6 +167,8 @@ def make_world(
                 f"{name}: expected {' or '.join(known)}, the setting{plural} of the backend "
                 f"{backend}, got {name}={value!r}"
             )
+    if drones > 1:
+        settings["drones"] = drones
     extra, packages = _PACKAGES[backend]
     for package in packages if settings.get("tensors", True) else ():
         require(package, extra, f"the backend {backend}")

@@ -25,7 +25,7 @@ _KINDS: Final[dict[str, tuple[Any, str]]] = {
     "env": (str, "an id"),
     "module": (str, "the name of a module"),
     "options": (dict, "an object"),
-    "num_envs": (int, "a number"),
+    **dict.fromkeys(("num_envs", "drones"), (int, "a number")),
     **dict.fromkeys(("backend", "codec"), (str, "a name")),
     **dict.fromkeys(("server", "bind"), (list, "[host, port]")),
     **dict.fromkeys(("vehicle", "key_file", "record"), (str | None, "a path")),

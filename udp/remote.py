@@ -7,7 +7,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from ..envs.autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_mode, checked_seeds
+from ..envs.autoreset import (
+    AdvancingVectorEnv,
+    Seeds,
+    checked_mask,
+    checked_mode,
+    checked_seeds,
+    worlds_done,
+)
 from ..envs.spaces import action_space, joined, observation_space, telemetry_names
 from ..envs.spec import Discrete, EnvSpec
 from ..models.errors import InputError, NotCopied, expect
@@ -249,7 +256,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         self._take_actions(spec.action, num_envs)
         self._shape = self.num_simulators, num_envs // self.num_simulators
         if not self._flying:
-            self.done = np.zeros(num_envs, bool)
+            self.done = self.out = np.zeros(num_envs, bool)
             self._idle = np.ones(num_envs, bool)  # those that no reset has begun
 
     def reset(
@@ -278,6 +285,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
             self._flying = False
             self._reset_until_done(mask, seeds)
             self.done, self._idle = np.zeros(self.num_envs, bool), ~mask
+            self.out = self.done
             self._flying = True
             self._take_states(np.ones(self.num_envs, bool))
         return self.observations, self._info(mask)
@@ -320,7 +328,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         before, telemetry = self._arrays, self.telemetry
         self._take_states(resets | frozen)
         reasons = np.repeat(np.array(lost, object), self._shape[1])
-        broken = (reasons != "") & ~resets & ~grounded
+        broken = (reasons != "") & ~(resets | grounded | self.out)
         if broken.any():  # these States are the start of the next episodes
             for now, then in ((self._arrays, before), (self.telemetry, telemetry)):
                 for name, array in now.items():
@@ -331,7 +339,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
             earlier, told = self._broken or (np.array(None), self._nobody)  # earlier in this step
             self._broken = np.where(broken, reasons, earlier), broken | told
             self.lost = broken
-        self.done = self.terminated | self.truncated | (self.done & ~resets)
+        self.out = self.terminated | self.truncated | (self.out & ~resets)
+        self.done = worlds_done(self.out, len(self.env_spec.agents))
         self._idle = self._idle & ~resets
         self._flying = True
 

@@ -104,4 +104,4 @@ class ArrayWorld(BaseWorld):
 
     def _ids(self, mask: Array) -> np.ndarray:
         """The worlds of a mask; of a single one it is always true."""
-        return np.flatnonzero(mask) if self.shape else _ONLY
+        return np.flatnonzero(mask[:, 0]) if self.shape else _ONLY

@@ -13,6 +13,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from ...models.errors import InputError
+from ...models.swarm import CONTACTS, GROUNDED, contact_columns
 from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
 from ..effects import EffectOptions, Effects
 from ..randomize import Randomization
@@ -27,7 +28,7 @@ _SEEN: Final = np.array(SURROUNDINGS, np.uint8)
 
 
 class MujocoWorld(ArrayWorld):
-    """W worlds of one drone over ground of its own: `World`.
+    """W worlds of A drones over ground of their own: `World`. Drones of a world may collide.
 
     MuJoCo answers a bad state with a reset and a line in MUJOCO_LOG.TXT. Here it raises
     `PhysicsError`, because an agent would learn from a silent reset, and switches that file off for
@@ -42,16 +43,18 @@ class MujocoWorld(ArrayWorld):
         vehicle: Vehicle,
         num_worlds: int,
         *,
+        drones: int = 1,
         effects: EffectOptions | None = None,
         randomize: Randomization | None = None,
         num_threads: int = 0,
     ) -> None:
         if type(num_threads) is not int or num_threads < 0:
             raise InputError(f"num_threads: expected 0 or more, got {num_threads!r}")
-        super().__init__(vehicle, (num_worlds, 1) if num_worlds > 1 else (), effects, randomize)
+        lead = (num_worlds, drones) if num_worlds * drones > 1 else ()
+        super().__init__(vehicle, lead, effects, randomize)
         options, drawn = self._options, self._drawn
         threads = 1 if num_worlds == 1 else num_threads
-        model = flown_model(vehicle, options, drawn)
+        model = flown_model(vehicle, drones, options, drawn)
         if self._on_rotors:  # commands are within their limits; thrusts need not be
             model = copy.copy(model)
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
@@ -62,32 +65,38 @@ class MujocoWorld(ArrayWorld):
         self._owner = None if threads == 1 else os.getpid()
         self._initial = batch.state[0].copy()
         # Live views of simulator memory, made once.
-        qpos: np.ndarray = batch.bind("qpos")
-        qvel: np.ndarray = batch.bind("qvel")
+        own = (*lead, -1)  # of each craft, and of its payload after it
+        qpos, qvel, applied = (
+            batch.bind(name).reshape(own) for name in ("qpos", "qvel", "qfrc_applied")
+        )
+        self._applied = applied[..., :6]
         self._ctrl: np.ndarray = batch.bind("ctrl")
         self._contacts: np.ndarray = batch.bind("ncon")
         self._warnings = batch.warning  # of each kind the last info, and how many
         self._no_warnings, self._no_contacts = self._warnings.tobytes(), self._contacts.tobytes()
-        newtons = np.array([rotor.newtons for rotor in vehicle.rotors])
+        newtons = np.array([rotor.newtons for rotor in vehicle.rotors] * drones)
         self._newtons = None if (newtons == 1.0).all() else newtons
         # Where controls are newtons, they are the thrusts, and without effects the commands too.
         alike = self._newtons is None and self.effects is None
         self._command = self._ctrl if alike else np.zeros_like(self._ctrl)
         self._thrust = np.zeros_like(self._ctrl) if self._on_rotors else self._command
-        self._applied: np.ndarray = batch.bind("qfrc_applied")
-        self._touching = np.zeros(num_worlds, bool)
+        self._touching = np.zeros((num_worlds, drones), bool)
+        self._colliding: np.ndarray | None = None
+        if drones > 1:
+            self._colliding, self._counts = self._touching.copy(), batch.bind("sensordata")
+            self._columns = [contact_columns(model, name) for name in (CONTACTS, GROUNDED)]
         self._qacc: np.ndarray | None = None  # bound by what first asks for it
-        lead = self.shape
         self.state = WorldState(
-            position=qpos[:, :3].reshape((*lead, 3)),
-            quaternion=qpos[:, 3:7].reshape((*lead, 4)),
-            velocity=qvel[:, :3].reshape((*lead, 3)),
-            body_rates=qvel[:, 3:6].reshape((*lead, 3)),
-            command=self._command.reshape((*lead, -1)),
-            thrust=self._thrust.reshape((*lead, -1)),
+            position=qpos[..., :3],
+            quaternion=qpos[..., 3:7],
+            velocity=qvel[..., :3],
+            body_rates=qvel[..., 3:6],
+            command=self._command.reshape(own),
+            thrust=self._thrust.reshape(own),
             touching=self._touching.reshape(lead),
-            payload=None if self._cable is None else qpos[:, 7:10].reshape((*lead, 3)),
-            payload_velocity=None if self._cable is None else qvel[:, 6:9].reshape((*lead, 3)),
+            colliding=self._colliding,
+            payload=None if self._cable is None else qpos[..., 7:10],
+            payload_velocity=None if self._cable is None else qvel[..., 6:9],
         )
         assert np.shares_memory(self.state.position, qpos)
 
@@ -112,7 +121,8 @@ class MujocoWorld(ArrayWorld):
         state.command[here] = state.thrust[here]
         self._draw_parameters(mask)
         if self._varied.fields:
-            values = {name: np.reshape(x, -1)[ids] for name, x in self.parameters.items()}
+            shape = self._touching.shape
+            values = {name: np.reshape(x, shape)[ids] for name, x in self.parameters.items()}
             for field, rows in self._varied.values(values).items():
                 self._batch.expand(field)[ids] = rows
             self._batch.set_const(ids)
@@ -123,7 +133,8 @@ class MujocoWorld(ArrayWorld):
         # To wake the threads takes longer than a few worlds.
         for some in (ids,) if len(ids) > _FEW else ids[:, None]:
             self._batch.forward(some if self.shape else None)
-        self._touching[ids] = self._contacts[ids] > 0
+        self._clear_contacts(ids)
+        self._add_contacts(ids)
 
     def step(
         self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
@@ -136,9 +147,8 @@ class MujocoWorld(ArrayWorld):
         self.state.command[here] = thrust if here is ... else thrust[here]
         if self.effects is None:
             self._apply_thrust(self._command)
-        touching = self._touching
         if not again:
-            touching[some] = False
+            self._clear_contacts(some)
         while substeps > 0:
             steps = min(substeps, self._check)
             try:
@@ -152,7 +162,7 @@ class MujocoWorld(ArrayWorld):
                 self._warnings.fill(0)  # of the other worlds: a reset is due all the same
                 raise PhysicsError(f"{error}: reset the env") from None
             if self._contacts.tobytes() != self._no_contacts:  # faster than to count
-                touching[some] |= self._contacts[some] > 0
+                self._add_contacts(some)
             substeps -= self._check
         if self._warnings.tobytes() != self._no_warnings:
             raise PhysicsError(self._describe_warnings())
@@ -166,7 +176,23 @@ class MujocoWorld(ArrayWorld):
         thrust = np.reshape(mean, self._ctrl.shape)
         self._ctrl[some] = (thrust if self._newtons is None else thrust / self._newtons)[some]
         if wrench is not None:
-            self._applied[some, :6] = wrench.reshape(-1, 6)[some]
+            here = some if self.shape else ...
+            self._applied[here] = wrench[here]
+
+    def _clear_contacts(self, some: Any) -> None:
+        """No contact of some worlds yet."""
+        self._touching[some] = False
+        if self._colliding is not None:
+            self._colliding[some] = False
+
+    def _add_contacts(self, some: Any) -> None:
+        """Add the contacts of some worlds to those that they had."""
+        if self._colliding is None:
+            self._touching[some] |= self._contacts[some, None] > 0
+        else:
+            of_all, of_ground = (self._counts[some][..., columns] for columns in self._columns)
+            self._touching[some] |= of_all > 0
+            self._colliding[some] |= of_all > of_ground
 
     def acceleration(self) -> Array:
         """As `World.acceleration`: of a `mj_forward` that leaves the state as it was."""
@@ -176,13 +202,14 @@ class MujocoWorld(ArrayWorld):
         before = self._warmstart.copy()
         self._batch.forward()
         self._warmstart[:] = before
-        return self._qacc[:, :3].reshape((*self.shape, 3)).copy()
+        return self._qacc.reshape((*self.shape, -1))[..., :3].copy()
 
     def below(self) -> Array:
         """As `World.below`, by `mj_ray`."""
         state = self.state
         origin, down = (
-            array.reshape(-1, 1, 3) for array in (state.position, -body_z(state.quaternion))
+            array.reshape((*self._touching.shape, 3))
+            for array in (state.position, -body_z(state.quaternion))
         )
         distance = self._batch.ray(origin, down, geomgroup=_SEEN)[0]
         return np.where(distance < 0, np.inf, distance).reshape(self.shape)[()]
@@ -194,7 +221,8 @@ class MujocoWorld(ArrayWorld):
         state = {name: copy.copy(getattr(self.state, name)) for name in WorldState.__slots__}
         self.state = WorldState(**state)
         views = (
-            "_batch _ctrl _command _thrust _applied _contacts _warnings _varied _qacc _warmstart"
+            "_batch _ctrl _command _thrust _applied _contacts _counts _warnings _varied _qacc "
+            "_warmstart"
         )
         for view in views.split():
             vars(self).pop(view, None)

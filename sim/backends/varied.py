@@ -6,7 +6,7 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from ...models.vehicle import body_axes, craft_bodies, payload_body
+from ...models.vehicle import body_axes, owners, payload_body
 from ..randomize import CENTER
 from ..state import Array, constant, stack
 
@@ -30,37 +30,43 @@ class Varied:
         self._names, self._xp = [name for name in drawn if name in _FIELDS], xp
         self.fields = tuple(dict.fromkeys(f for name in self._names for f in _FIELDS[name]))
         self._base = {name: getattr(model, name).copy() for name in self.fields}
-        self._craft, self._hung = np.zeros(model.nbody), np.zeros(model.nbody)
-        self._craft[craft_bodies(model)] = 1.0
+        owner = owners(model)
+        self._craft, self._hung = owner >= 0, np.zeros(model.nbody, bool)
         if "payload" in self._names:
-            self._hung[payload_body(model)] = 1.0
-        self._linear = np.arange(model.nv) < 3  # degrees of freedom of the craft's translation
+            self._hung[payload_body(model)] = True
+        # Of each craft the first of six degrees of freedom are those of its translation.
+        self._linear = self._craft[model.dof_bodyid] & (np.arange(model.nv) % 6 < 3)
         self._torque = np.arange(6) >= 3  # of a gear
-        self._axes = np.zeros((model.nbody, 3, 3))
-        self._axes[craft_bodies(model)] = body_axes(model)
+        self._axes = body_axes(model) * self._craft[:, None, None]
+        of_sites = owner[model.site_bodyid[model.actuator_trnid[:, 0]]]
+        self._of_bodies, self._of_dofs, self._of_rotors = (
+            np.maximum(one, 0) for one in (owner, owner[model.dof_bodyid], of_sites)
+        )
 
     def values(self, parameters: Mapping[str, Array]) -> dict[str, Array]:
-        """The fields by name, each (N, ...), of N worlds with these parameters, each (N,)."""
+        """The fields by name, each (N, ...), of N worlds with these parameters, each (N, A)."""
         where = self._xp.where
         given = {name: parameters[name] for name in self._names}
         like = next(iter(given.values()))
         told = {name: constant(base, like) for name, base in self._base.items()}
         ones = 1.0 + 0.0 * like
-        craft, hung = (constant(x, like) > 0.5 for x in (self._craft, self._hung))
-        mass, payload = (given.get(name, ones)[:, None] for name in ("mass", "payload"))
-        inertia = mass * given.get("inertia", ones)[:, None]
-        loads = where(hung, payload, 1.0)
-        linear, torque = (constant(x, like) > 0.5 for x in (self._linear, self._torque))
-        reaction = given.get("reaction", ones)[:, None, None]
+        craft, hung, linear, torque = (
+            constant(1.0 * x, like) > 0.5
+            for x in (self._craft, self._hung, self._linear, self._torque)
+        )
+        mass, payload = (given.get(name, ones) for name in ("mass", "payload"))
+        inertia = mass * given.get("inertia", ones)
+        loads = where(hung, payload[:, :1], 1.0)
+        reaction = given.get("reaction", ones)[:, self._of_rotors, None]
         factors = {
-            "body_mass": where(craft, mass, loads),
-            "body_inertia": where(craft, inertia, loads)[..., None],
-            "dof_damping": where(linear, mass, 1.0),
+            "body_mass": where(craft, mass[:, self._of_bodies], loads),
+            "body_inertia": where(craft, inertia[:, self._of_bodies], loads)[..., None],
+            "dof_damping": where(linear, mass[:, self._of_dofs], 1.0),
             "actuator_gear": where(torque, reaction, 1.0),
         }
         values = {name: factors[name] * base for name, base in told.items() if name in factors}
         if "body_ipos" in told:
-            shift = stack([given.get(name, 0.0 * ones) for name in CENTER])
+            shift = stack([given.get(name, 0.0 * ones) for name in CENTER])[:, self._of_bodies]
             axes = constant(self._axes, like)
-            values["body_ipos"] = told["body_ipos"] + self._xp.einsum("bji,wj->wbi", axes, shift)
+            values["body_ipos"] = told["body_ipos"] + self._xp.einsum("bji,wbj->wbi", axes, shift)
         return values

@@ -58,7 +58,7 @@ class WarpWorld(TensorWorld):
         options, drawn = self._options, self._drawn
         self._cable = options.cable if options.payload else None
         self._least_height = options.cable + payload_radius(options.payload)
-        model = copy.copy(flown_model(vehicle, options, drawn))
+        model = copy.copy(flown_model(vehicle, 1, options, drawn))
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nothing reads them
         if self._on_rotors:  # commands are within their limits; thrusts need not be
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
@@ -131,8 +131,7 @@ class WarpWorld(TensorWorld):
         self._draw_parameters(mask)
         if self._varied.fields:
             with wp.ScopedDevice(self._name), wp.ScopedStream(self._stream()):
-                values = {name: x[:, 0] for name, x in self.parameters.items()}
-                for name, changed in self._varied.values(values).items():
+                for name, changed in self._varied.values(self.parameters).items():
                     wp.to_torch(getattr(self._model, name)).copy_(changed)
                 mjw.set_const(self._model, self._data)
         if self.effects is not None:

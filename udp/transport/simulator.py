@@ -39,7 +39,8 @@ class Simulator(NotCopied):
         env: Id of a registered env, or one Gymnasium env itself: observations are a Box or a Dict
             of Box, actions a Box or `Discrete`.
         server: Address (host, port) of the agent.
-        num_envs: Number of worlds.
+        num_envs: Drones in all; None: those of one world.
+        drones: Of each world.
         bind: Address of this side; port 0 takes a free port.
         codec: `binary`, or the paper's `text`.
         vehicle: As `make_stepped`.
@@ -65,7 +66,8 @@ class Simulator(NotCopied):
         env: str | gym.Env[Any, Any] = "rotorgram/Elevation-v0",
         *,
         server: Address = DEFAULT_AGENT,
-        num_envs: int = 1,
+        num_envs: int | None = None,
+        drones: int = 1,
         bind: Address = DEFAULT_SIMULATOR,
         codec: Literal["binary", "text"] = "binary",
         vehicle: Path | str | None = None,
@@ -90,14 +92,16 @@ class Simulator(NotCopied):
         self._began_at: float | None = None  # when the step began that is being computed
         with ExitStack() as failing:  # closes what is open if a later step fails
             self.stepped: Stepped = make_stepped(
-                env, num_envs, vehicle=vehicle, backend=backend, options=options
-            )
+                env, drones if num_envs is None else num_envs, drones=drones, vehicle=vehicle,
+                backend=backend, options=options,
+            )  # fmt: skip
             failing.callback(self.stepped.close)
             self.spec = self.stepped.spec
-            hello = Hello(session=new_session(), spec=self.spec.to_json(), worlds=num_envs)
+            worlds = self.stepped.num_envs // drones
+            hello = Hello(session=new_session(), spec=self.spec.to_json(), worlds=worlds)
             self.link = Client(
                 hello,
-                layout_of(self.spec, num_envs),
+                layout_of(self.spec, worlds),
                 self.config,
                 largest=largest_datagram(self.server, self.config.max_datagram),
                 by_text=self._text,

@@ -27,6 +27,7 @@ def make_stepped(
     env: str | gym.Env[Any, Any],
     num_envs: int,
     *,
+    drones: int = 1,
     vehicle: Path | str | None = None,
     backend: str = "mujoco",
     options: Mapping[str, Any],
@@ -35,20 +36,24 @@ def make_stepped(
 
     Args:
         env: Id of a registered task, of an env of Gymnasium, or one env itself.
-        num_envs: N.
+        num_envs: N, a multiple of `drones`.
+        drones: Of each world, for a registered task.
         vehicle: File or name, for a registered task; None is the paper's.
         backend: One of `sim.BACKENDS`, for a registered task.
         options: Of the env, by name.
     """
     right = type(num_envs) is int and 1 <= num_envs <= MAX_DRONES
     expect(right, "num_envs", f"1 to {MAX_DRONES}", f"{num_envs!r}")
+    right = type(drones) is int and drones >= 1 and num_envs % drones == 0
+    expect(right, "drones", f"a divisor of num_envs = {num_envs}", f"{drones!r}")
     if isinstance(env, str):
         if registry.is_known(env):
             from ...envs.loop import Loop, OnHost
 
             name, chosen = canonical_id(env), cast(Any, backend)
             given = {"tensors": False} if backend == "rigid" else {}
-            loop = Loop(name, num_envs, vehicle=vehicle, backend=chosen, options=options, **given)
+            loop = Loop(name, num_envs // drones, drones=drones, vehicle=vehicle, backend=chosen,
+                        options=options, **given)  # fmt: skip
             return OnHost(loop) if backend == "warp" else loop
         try:
             envs = [gym.make(env, disable_env_checker=True, **options) for _ in range(num_envs)]
@@ -60,8 +65,8 @@ def make_stepped(
         expect(not options, f"options {sorted(options)}", "none with an env already made")
         expect(num_envs == 1, "num_envs", "1 with an env already made", f"{num_envs}")
         envs = [env]
-    ours = vehicle is not None or backend != "mujoco"
-    expect(not ours, "vehicle, backend", f"none for {env!r}, which is no task of ours")
+    ours = vehicle is not None or backend != "mujoco" or drones > 1
+    expect(not ours, "vehicle, backend, drones", f"none for {env!r}, which is no task of ours")
     return _Singles(envs, options)
 
 

@@ -1,0 +1,150 @@
+"""The drones of one world as PettingZoo's agents: a vector env behind the parallel signature."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..models.errors import NotCopied, expect, require
+from ..sim import Backend
+from .autoreset import AdvancingVectorEnv
+from .rendering import RENDER_MODES
+from .spaces import action_space, observation_space
+from .vector import LocalVectorEnv
+
+require("pettingzoo", "swarm", "the parallel env")
+
+from pettingzoo import ParallelEnv  # noqa: E402  # where it is missing, one sentence says so
+
+Told = dict[str, Any]
+"""By the names of agents."""
+
+
+class AdvancingParallelEnv(NotCopied, ParallelEnv[str, Any, Any]):  # type: ignore[misc]
+    """Base of local and remote parallel envs: one world of an `AdvancingVectorEnv`.
+
+    One whose episode ends leaves `agents`: its rotors stand still, and the others fly on. Spaces,
+    rewards, ends and `info` are those of a single env of the task.
+
+    Attributes:
+        control_period: Time of a step, s.
+    """
+
+    def __init__(self, world: AdvancingVectorEnv) -> None:
+        self._world, self.env_spec = world, world.env_spec
+        names, self.control_period = self.env_spec.agents, world.control_period
+        same = world.num_envs == len(names)
+        expect(same, "worlds", "one", f"{world.num_envs // len(names)}")
+        fps = world.metadata["render_fps"]
+        self.metadata = {"render_modes": [], "render_fps": fps, "name": self.env_spec.env_id,
+                         "is_parallelizable": True}  # fmt: skip
+        self.possible_agents = list(names)
+        self.agents: list[str] = []
+        self._rows = {agent: row for row, agent in enumerate(names)}
+        self.observation_spaces = {agent: observation_space(self.env_spec) for agent in names}
+        self.action_spaces = {agent: action_space(self.env_spec) for agent in names}
+
+    def observation_space(self, agent: str) -> Any:
+        """The same object for an agent in every call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Any:
+        """The same object for an agent in every call."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Told, Told]:
+        """Begin an episode with all agents; a seed makes it reproducible. `options` are ignored."""
+        seen, info = self._world.reset(seed=seed)
+        self.agents = list(self.possible_agents)
+        return self._told(seen, info, self.agents)
+
+    def step(self, actions: Told) -> tuple[Told, Told, Told, Told, Told]:
+        """Fly for one control period with an action of each of `agents`.
+
+        Gives observations, rewards, terminated, truncated and infos of those agents; one that ends
+        is not among `agents` any more. Actions of others are ignored.
+        """
+        flown, world = self.agents, self._world
+        right = isinstance(actions, dict) and actions.keys() >= set(flown)
+        got = sorted(actions) if isinstance(actions, dict) else type(actions).__name__
+        expect(right, "actions", f"a dict with {', '.join(flown)}", f"{got}")
+        space = world.action_space
+        given = np.zeros(space.shape or (), space.dtype)
+        for agent in flown:
+            given[self._rows[agent]] = self._checked(agent, actions[agent])
+        seen, rewards, terminated, truncated, info = world.step(given)
+        left, scores, ends, cuts = (
+            {agent: values[self._rows[agent]].item() for agent in flown}
+            for values in (world.out, rewards, terminated, truncated)
+        )
+        self.agents = [agent for agent in flown if not left[agent]]
+        observations, infos = self._told(seen, info, flown)
+        return observations, scores, ends, cuts, infos
+
+    def render(self) -> Any:
+        """A picture of the world, uint8, shape (360, 480, 3), with `rgb_array`; None otherwise."""
+        pictures = self._world.render()
+        return pictures[0] if pictures else None
+
+    def close(self) -> None:
+        """Close the window or tell the simulator; release memory."""
+        self._world.close()
+
+    def _checked(self, agent: str, action: Any) -> np.ndarray:
+        try:
+            array = np.asarray(action)
+        except ValueError:
+            array = np.asarray(None)
+        shape = self.action_spaces[agent].shape
+        right = array.dtype.kind in "iuf" and array.shape == shape
+        expected = f"an array of real numbers of shape {shape} for {agent}"
+        expect(right, "actions", expected, f"{action!r:.80}")
+        return array
+
+    def _told(self, seen: Any, info: dict[str, Any], agents: list[str]) -> tuple[Told, Told]:
+        """Observations and infos of some agents."""
+        names = [name for name in info if not name.startswith("_")]
+        observations, infos = {}, {}
+        for agent in agents:
+            row = self._rows[agent]
+            several = isinstance(seen, dict)
+            observations[agent] = {n: x[row] for n, x in seen.items()} if several else seen[row]
+            infos[agent] = {name: info[name][row] for name in names if info[f"_{name}"][row]}
+        return observations, infos
+
+
+class LocalParallelEnv(AdvancingParallelEnv):
+    """Drones that fly a task in one world, in process: agents `drone_0` and so on.
+
+    Args:
+        env_id: Of a registered task for several drones.
+        drones: How many.
+        render_mode: None, `rgb_array` (a picture of the world) or `human` (a window).
+        vehicle: As of `Vehicle.load`: a file or a name; None is the paper's.
+        backend: What steps the world.
+        options: Of the task, by name.
+
+    Raises:
+        InputError: An option, seed or action is not what it should be; the env is as before.
+        PhysicsError: The physics reported a bad state; `reset` makes the env usable again.
+        gymnasium.error.ResetNeeded: A step before a reset, or after the last agent left.
+        gymnasium.error.ClosedEnvironmentError: A step or a reset after `close`.
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        drones: int = 2,
+        render_mode: str | None = None,
+        *,
+        vehicle: Path | str | None = None,
+        backend: Backend = "mujoco",
+        **options: Any,
+    ) -> None:
+        world = LocalVectorEnv(env_id, drones, render_mode, drones=drones, vehicle=vehicle,
+                               autoreset_mode="Disabled", backend=backend, **options)  # fmt: skip
+        super().__init__(world)
+        self.render_mode = render_mode
+        self.metadata["render_modes"] = RENDER_MODES

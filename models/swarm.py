@@ -1,0 +1,66 @@
+"""Several crafts in one world: its compiled model, and what of it is whose."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import mujoco
+import numpy as np
+
+from .errors import expect
+from .scene import build_swarm
+from .vehicle import Vehicle, owners
+
+SHARED: Final = ("timestep", "gravity", "integrator", "density", "viscosity", "wind", "magnetic")
+"""Options that a world has once, so that its vehicles have to agree."""
+CONTACTS, GROUNDED = "rotorgram/contacts", "rotorgram/grounded"
+"""Sensors of a craft: how many contacts it has, and how many of them with the world."""
+
+
+def drone_names(count: int) -> tuple[str, ...]:
+    """Names of so many drones of a world."""
+    return tuple(f"drone_{i}" for i in range(count))
+
+
+def swarm_model(vehicles: Sequence[Vehicle], *, movable: bool = False) -> mujoco.MjModel:
+    """A world with a craft of each vehicle, without visual elements.
+
+    Free joints and rotors come craft by craft, and two sensors of each count its contacts. With
+    `movable`, centers of mass may be moved. Raises `InputError` where vehicles do not agree in
+    `SHARED`.
+    """
+    first, names = vehicles[0], drone_names(len(vehicles))
+    for vehicle in vehicles:
+        for name in SHARED:
+            ours, its = (getattr(one.model.opt, name) for one in (first, vehicle))
+            same, got = np.array_equal(ours, its), f"{its} of {vehicle.name}"
+            expect(same, "vehicle", f"a {name} of {ours} as of {first.name}", got)
+    spec = build_swarm([vehicle.path for vehicle in vehicles], names, visual=False)
+    crafts = [body for body in spec.worldbody.bodies if body.name.partition("/")[0] in names]
+    for name, craft in zip(names, crafts, strict=True):
+        if movable:
+            craft.simple = False
+        _count_contacts(spec, f"{name}/{CONTACTS}", craft.name)
+        _count_contacts(spec, f"{name}/{GROUNDED}", craft.name, spec.worldbody.name)
+    model = spec.compile()
+    owner = owners(model)
+    model.geom_group[:] = owner[model.geom_bodyid] >= 0
+    dofs = owner[model.dof_bodyid]
+    for drone, vehicle in enumerate(vehicles):
+        model.dof_damping[np.flatnonzero(dofs == drone)[:3]] = vehicle.model.dof_damping[:3]
+    return model
+
+
+def _count_contacts(spec: mujoco.MjSpec, name: str, craft: str, other: str = "") -> None:
+    """A sensor of how many contacts a craft has, with anything or with one other body."""
+    kinds, count = mujoco.mjtObj, 1 << mujoco.mjtConDataField.mjCONDATA_FOUND.value
+    spec.add_sensor(
+        name=name, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=kinds.mjOBJ_XBODY, objname=craft,
+        reftype=kinds.mjOBJ_BODY if other else kinds.mjOBJ_UNKNOWN, refname=other,
+        intprm=[count, 0, 1],
+    )  # fmt: skip
+
+
+def contact_columns(model: mujoco.MjModel, sensor: str) -> np.ndarray:
+    """Where `sensordata` has a sensor of each craft, shape (A,)."""
+    names = drone_names(int(owners(model).max()) + 1)
+    return np.array([model.sensor(f"{name}/{sensor}").adr[0] for name in names])
