@@ -231,6 +231,8 @@ class Loop(NotCopied):
     ) -> None:
         draft = make_task(env_id, options or {}, vehicle)
         chosen, craft = draft.options, draft.vehicle
+        one = f"1 with {canonical_id(env_id)}, which is flown alone"
+        expect(drones == 1 or draft.several, "drones", one, f"{drones!r}")
         effects = EffectOptions.from_options(chosen.effects_on(craft.mass))
         randomize = Randomization(chosen.randomize, effects) if chosen.randomize else None
         self.world: World = make_world(

@@ -21,7 +21,7 @@ class Options(TaskOptions):
 class Rise(Task):
     """Drones in a row, 5 m apart. One that is 0.5 m above or below its start is out."""
 
-    Options = Options
+    Options, several = Options, True
     metrics = (Metric(name="risen", unit="m"),)
 
     def setup(self):
