@@ -313,7 +313,7 @@ def find_preset(algorithm: str, name: str, env_id: str = "") -> Preset:
     """The preset of an algorithm for a task. Raises `InputError` if there is no such one."""
     expect(algorithm in PRESETS, "algorithm", f"one of {', '.join(PRESETS)}", f"{algorithm!r}")
     presets = PRESETS[algorithm]
-    those = f"{' or '.join(presets)} of {algorithm}"
+    those = f"{' or '.join(presets)} for {algorithm}"
     expect(name in presets, "preset", those, f"{name!r}")
     own = algorithm.removeprefix("sb3-"), name, env_id
     return _OF_TASKS.get(own, presets[name])

@@ -261,6 +261,8 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
         good, out=there
     )
     assert there.read_bytes() == b"mine"
+    wrong = ("--to", "minari", "--out", "some/flight-v0", "--vehicle", "nobodys.toml")
+    assert "vehicle: cannot read nobodys.toml: No such file" in told(good, *wrong)
     assert "a folder that is there" in parquet(good, out=tmp_path / "no" / "new.parquet")
 
 
