@@ -123,7 +123,7 @@ class Racing(Flight):
 
     Options = RacingOptions
     metrics = (
-        Metric(name="gates_left", unit="1", settled=0.5, held=0.5, final=True),
+        Metric(name="gates_left", unit="", settled=0.5, held=0.5, final=True),
         Metric(name="flight_time", unit="s", final=True),
         Metric(name="lap_time", unit="s", final=True),
     )
