@@ -150,8 +150,14 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
     kept.check_resumable()
     for name in ("env_id", "options", "vehicle_hash", "observation", "action"):
         expected, got = getattr(kept.spec, name), getattr(log.spec, name)
-        if expected != got and got != "0" * 32:  # the hash of a peer that tells none
-            raise ResumeError(f"resume: expected an env with {name} {expected}, got {got}")
+        if expected == got or got == "0" * 32:  # the hash of a peer that tells none
+            continue
+        if name == "vehicle_hash":
+            then, now = (f"{s.vehicle} (model {s.vehicle_hash[:8]})" for s in (kept.spec, log.spec))
+            raise ResumeError(
+                f"resume: expected {then}, got {now}; name the vehicle with --vehicle"
+            )
+        raise ResumeError(f"resume: expected an env with {name} {expected}, got {got}")
     try:
         config = preset(kept.algorithm, "tuned", **kept.config)
         layers = kept.policy().layers

@@ -152,7 +152,7 @@ def load(path: Path) -> Checkpoint:
     """Read a checkpoint. Raises `CheckpointError` or `MissingPackage`."""
     numpy = require("safetensors.numpy", "train", "reading checkpoints")
     if not path.is_file():
-        raise CheckpointError(f"checkpoint: no file {path}")
+        raise CheckpointError(f"checkpoint: expected a file, got {path}, where there is none")
     try:
         return _read(path.read_bytes(), numpy.load)
     except OSError as error:

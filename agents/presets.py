@@ -309,10 +309,10 @@ SQUASHED: Final = ("sac", "sb3-sac")
 
 def find_preset(algorithm: str, name: str, env_id: str = "") -> Preset:
     """The preset of an algorithm for a task. Raises `InputError` if there is no such one."""
-    names = sorted(PRESETS)
-    expect(algorithm in PRESETS, "algorithm", f"one of {names}", f"{algorithm!r}")
+    expect(algorithm in PRESETS, "algorithm", f"one of {', '.join(PRESETS)}", f"{algorithm!r}")
     presets = PRESETS[algorithm]
-    expect(name in presets, "preset", f"one of {sorted(presets)}", f"{name!r}")
+    those = f"{' or '.join(presets)} for {algorithm}"
+    expect(name in presets, "preset", those, f"{name!r}")
     own = algorithm.removeprefix("sb3-"), name, env_id
     return _OF_TASKS.get(own, presets[name])
 
@@ -321,7 +321,8 @@ def preset(algorithm: str, name: str, env_id: str = "", **changes: Any) -> Confi
     """Hyperparameters of a preset, with some of them changed. Raises `InputError`."""
     base = find_preset(algorithm, name, env_id).config
     unknown = sorted({*changes} - {*vars(base)})
-    expect(not unknown, "hyperparameters", f"some of {sorted(vars(base))}", f"{unknown}")
+    known = ", ".join(sorted(vars(base)))
+    expect(not unknown, "hyperparameters", f"some of {known}", ", ".join(unknown))
     return replace(base, **changes)
 
 

@@ -32,8 +32,11 @@ class Dataset(Command):
     def run(self) -> int:
         """Write it; print what it holds."""
         from ..experiments.datasets import RecordedEpisodes, env_of, write_minari, write_parquet
+        from ..models import Vehicle
         from ..udp.journal.reader import count_of
 
+        if self.vehicle:
+            Vehicle.load(self.vehicle)  # before a journal is read: a wrong name is no other env
         if self.env:
             from ..envs import registry
 

@@ -11,7 +11,7 @@ from ._flags import AgentFlags, check_count
 
 @dataclass(frozen=True, kw_only=True)
 class Serve(AgentFlags):
-    """Fly each simulator that connects, one after the other, with a trained policy or the PID.
+    """Fly each simulator that connects, one after the other, with a trained policy or a controller.
 
     The first decides the number of drones: each flies an episode of its own at the same time.
     """

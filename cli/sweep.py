@@ -23,7 +23,7 @@ class Sweep(RunsFlags):
     """
 
     algorithm: Positional[AlgorithmName]
-    """vpg, a2c or sb3-a2c."""
+    """One that learns over the wire: any but apg."""
     grid: UseAppendAction[
         Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE,... ...")]
     ] = ()

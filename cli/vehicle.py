@@ -103,6 +103,7 @@ class Vehicle(Command):
         path = Path(self.file)
         right = path.suffix.lower() == ".toml"
         expect(right, "file", "a name that ends in .toml", self.file)
+        expect(not path.exists(), "file", "the name of a new file", f"{path}, which is there")
         count = {"hexa": 6, "octo": 8}.get(self.frame, 4)
         listed, space = self.frame == "list", " " * (24 - len(self.frame))
         text = _NEW.format(

@@ -162,7 +162,9 @@ def read_rows_file(path: Path, **changes: Any) -> BenchmarkConfig:
     """Settings of a board from its TOML file, with some of them changed. Raises `InputError`."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise InputError(f"{path}: expected a TOML file of rows: {error.strerror}") from None
+    except ValueError as error:
         raise InputError(f"{path}: expected a TOML file of rows, got: {error}") from None
     _check_table(f"{path}", content, dict.fromkeys(_SETTINGS, int) | {"row": list})
     tables = content.pop("row", [])

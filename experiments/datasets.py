@@ -229,8 +229,8 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> tuple[int, int]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    right = out.suffix == ".parquet" and not out.exists()
-    expect(right, "out", "a new file that ends in .parquet", str(out))
+    expect(out.suffix == ".parquet", "out", "a file that ends in .parquet", str(out))
+    expect(not out.exists(), "out", "the name of a new file", f"{out}, which is there")
     expect(out.absolute().parent.is_dir(), "out", "a folder that is there for it", str(out))
     metadata = {"env_spec": episodes.spec.to_json()}
     count = steps = waiting = 0

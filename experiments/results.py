@@ -309,9 +309,8 @@ def read_steps(
 def _existing(folder: Path | str, name: str) -> Path:
     path = Path(folder) / name
     if not path.is_file():
-        raise ResultsError(
-            f"{path} is missing: is {folder} the folder of a comparison, a sweep or a board?"
-        )
+        wanted = "the folder of a comparison, a sweep or a board"
+        raise ResultsError(f"{folder}: expected {wanted}, got one without {name}")
     return path
 
 

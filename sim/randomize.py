@@ -128,7 +128,8 @@ class Randomization:
 def _distribution(name: str, text: Any) -> tuple[str, tuple[float, ...]]:
     limits = PARAMETERS[name]
     within = f"numbers from {limits.low:g} to {limits.high:g} {limits.unit}".rstrip()
-    expected = f"{', '.join(f'{k}(...)' for k in _KINDS)} or a number, with {within}"
+    kinds = "uniform(low,high), loguniform(low,high), normal(mean,deviation), choice(a,b,...)"
+    expected = f"{kinds} or a number, with low <= high and {within}"
     match = _TEXT.fullmatch(text) if isinstance(text, str) else None
     kind, inside = match.groups() if match else ("choice", str(text))
     try:

@@ -264,7 +264,10 @@ def test_wrong_rows_are_one_sentence(text: str, sentence: str, tmp_path: Path) -
 
 
 def test_files_that_are_no_board_are_refused(tmp_path: Path, folder: Path) -> None:
-    with pytest.raises(ResultsError, match=r"^\S*config\.json is missing: is \S* the folder"):
+    with pytest.raises(
+        ResultsError,
+        match=r"^\S*: expected the folder of .* a board, got one without config\.json$",
+    ):
         read_board(tmp_path)
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(ResultsError, match="expected a board's settings"):

@@ -259,8 +259,12 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "expected journals of one env, all with the options" in parquet(good, other)
     assert "expected each flight once" in parquet(good, good)
     assert "expected a whole episode, got none of 1" in parquet(short)
-    assert "expected a new file that ends in .parquet" in parquet(good, out=there)
+    assert f"expected the name of a new file, got {there}, which is there" in parquet(
+        good, out=there
+    )
     assert there.read_bytes() == b"mine"
+    wrong = ("--to", "minari", "--out", "some/flight-v0", "--vehicle", "nobodys.toml")
+    assert "vehicle: cannot read nobodys.toml: No such file" in told(good, *wrong)
     assert "a folder that is there" in parquet(good, out=tmp_path / "no" / "new.parquet")
 
 

@@ -144,6 +144,11 @@ def test_what_cannot_be_resumed_is_refused() -> None:
     kept = training.checkpoint()
     with pytest.raises(ResumeError, match="resume: expected an env with options"):
         Training.resume(kept, env_of(run, linear_drag=0.5))
+    with pytest.raises(
+        ResumeError,
+        match=r"resume: expected rotorgram quadcopter .*, got Crazyflie 2.* with --vehicle$",
+    ):
+        Training.resume(kept, env_of(run, vehicle="crazyflie2"))
     with pytest.raises(CheckpointError, match="its parts do not fit together"):
         Training.resume(replace(kept, config={**kept.config, "hidden": 8}), env_of(run))
     with pytest.raises(CheckpointError, match="its parts do not fit together: seed: expected"):

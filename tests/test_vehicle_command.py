@@ -119,7 +119,7 @@ def test_export(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ("words", "sentence"),
     [
         (["new", "mine.xml"], "file: expected a name that ends in .toml, got mine.xml"),
-        (["new", "there.toml"], "there.toml: File exists"),
+        (["new", "there.toml"], "file: expected the name of a new file, got there.toml"),
         (["export", "there.toml"], "vehicle: expected two files, .*, got one"),
         (["export", "there.toml", "x.txt"], "out: expected a name that ends in .xml, got x.txt"),
         (

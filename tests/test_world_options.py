@@ -162,7 +162,7 @@ def test_flags(capsys: pytest.CaptureFixture[str]) -> None:
         (["--effects", "lag"], "effects: expected some of motor_lag, "),
         (["--effects", "wind=3"], "effects: wind: expected 3 numbers"),
         (["--effects", "motor-lag", "motor_lag"], "effects: expected each name once, got 'motor_l"),
-        (["--randomize", "mass=heavy"], "randomize: mass: expected uniform(...)"),
+        (["--randomize", "mass=heavy"], "randomize: mass: expected uniform(low,high)"),
         (["--sensors", "imu"], "sensors.imu: expected gyro_noise here, or "),
         (["--sensors", 'gps={"rat":10}'], "sensors.gps: expected some of noise, "),
     ):

@@ -123,7 +123,7 @@ class Racing(Flight):
 
     Options = RacingOptions
     metrics = (
-        Metric(name="gates_left", unit="1", settled=0.5, held=0.5, final=True),
+        Metric(name="gates_left", unit="", settled=0.5, held=0.5, final=True),
         Metric(name="flight_time", unit="s", final=True),
         Metric(name="lap_time", unit="s", final=True),
     )
@@ -260,7 +260,7 @@ def read_track(given: Any) -> tuple[list[Gate], Gate]:
             content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         names = ", ".join(sorted(path.stem for path in TRACKS.glob("*.toml")))
-        reason = " ".join(str(error).split())
+        reason = " ".join((getattr(error, "strerror", None) or str(error)).split())
         raise InputError(
             f"track: expected {_WAY} ({names}), got {given!r:.80}: {reason:.120}"
         ) from None

@@ -406,7 +406,8 @@ def read_samples(given: str) -> np.ndarray:
                 rows = [[float(row[name]) for name in ("t", "x", "y", "z")] for row in reader]
         samples: np.ndarray = np.array(rows, np.float64)
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        reason = f"no column {error}" if isinstance(error, KeyError) else str(error)
+        reason = getattr(error, "strerror", None) or str(error)  # without the file's name
+        reason = f"no column {error}" if isinstance(error, KeyError) else reason
         got = f"{str(Path(given[:80]))!r}: {' '.join(reason.split()):.120}"
         raise InputError(f"trajectory: expected {_EXPECTED}, got {got}") from None
     shape = samples.shape

@@ -95,7 +95,7 @@ class Waypoints(Flight):
 
     Options = WaypointsOptions
     metrics = (
-        Metric(name="points_left", unit="1", settled=0.5, held=0.5, final=True),
+        Metric(name="points_left", unit="", settled=0.5, held=0.5, final=True),
         Metric(name="flight_time", unit="s", final=True),
     )
 

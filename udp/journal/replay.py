@@ -121,20 +121,20 @@ class SessionVerdict:
         count, drag = self.session.num_envs, spec.options.get("linear_drag", 0.0)
         was, now = spec.vehicle_hash, Vehicle.load(self.vehicle, linear_drag=drag).hash
         other = bool(was.strip("0")) and was != now
-        hint = f"; the vehicle was {was}, and is {now} here: --vehicle names its file" * other
+        hint = f"the vehicle was {was}, and is {now} here: --vehicle names its file" * other
         try:
             loop = make_stepped(
                 spec.env_id, count, vehicle=self.vehicle, backend=self.backend, options=spec.options
             )
         except InputError as error:
-            raise InputError(f"{error}{hint}") from None
+            raise InputError(hint or str(error)) from None
         for name in ("observation", "action", "telemetry", "control_period"):
             was, now = getattr(spec, name), getattr(loop.spec, name)
             if was != now:
                 loop.close()
-                raise InputError(f"expected an env of the {name} {was}, got one of {now}{hint}")
+                raise InputError(hint or f"expected an env of the {name} {was}, got one of {now}")
         if other:
-            self.notes.append(hint.removeprefix("; "))
+            self.notes.append(hint)
         return loop
 
     def _compare(self, recorded: State) -> None:
