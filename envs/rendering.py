@@ -47,7 +47,7 @@ class Renderer:
         drones = len(self._loop.spec.agents)
         if self._canvas is None:
             one = len(now) == drones
-            stage = Stage(drones=drones, vehicle=self._loop.vehicle.path, trail=one)
+            stage = Stage(drones=drones, vehicle=self._loop.vehicle.path, trail=one, together=True)
             self._canvas = Canvas(stage, *((480, 360) if one else (240, 180)))
         canvas, pictures = self._canvas, []
         for first in range(0, len(now), drones):
@@ -58,9 +58,12 @@ class Renderer:
     def _show(self, now: "list[Moment]") -> None:
         from ..rendering import Stage, live
 
-        shown = now[: live.MOST_DRONES]
+        drones = len(self._loop.spec.agents)
+        together = drones > 1  # then the window shows the first world
+        shown = now[: drones if together else live.MOST_DRONES]
         if self._view is None:
-            stage = Stage(drones=len(shown), vehicle=self._loop.vehicle.path)
+            path = self._loop.vehicle.path
+            stage = Stage(drones=len(shown), vehicle=path, together=together)
             pace = live.Pace(self._loop.spec.control_period)
             surface = live.open_surface("window", stage, pace)
             self._view = live.LiveView(stage, surface, pace, of=len(now))

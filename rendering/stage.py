@@ -164,8 +164,9 @@ class Moment:
 
 
 class Stage:
-    """Craft over an airport or a plain floor, side by side, each with a goal and a path if wanted.
+    """Craft over an airport or a plain floor, each with a goal and a path if wanted.
 
+    They are of different worlds and stand side by side, or are `together` in one, each where it is.
     It simulates nothing: it shows moments. What is wrong raises `InputError`.
 
     Attributes:
@@ -183,9 +184,10 @@ class Stage:
         *,
         vehicle: Path | str | None = None,
         trail: bool = True,
+        together: bool = False,
     ) -> None:
         expect(drones >= 1, "drones", "1 or more", f"{drones}")
-        self.drones, self.vehicle = drones, Vehicle.load(vehicle)
+        self.drones, self.vehicle, self._together = drones, Vehicle.load(vehicle), together
         try:
             spec = build_scene(self.vehicle.path, world)
             self.radius, top = _size(spec.compile())
@@ -194,20 +196,20 @@ class Stage:
         except ValueError as error:  # a texture is missing, which the physics does not need
             reason = " ".join(str(error).split())
             raise InputError(f"vehicle: expected a file that can be drawn, got: {reason}") from None
-        self._offsets = _grid(drones, _SPACING * self.radius)
-        self._spread = float(np.ptp(self._offsets, axis=0).max())
+        grid = _grid(drones, _SPACING * self.radius)
+        self._offsets = 0.0 * grid if together else grid
         _free_body(spec).add_camera(  # sees nose, front rotors and horizon
             name=_ONBOARD,
             pos=(0.03 * self.radius, 0.0, top + 0.154 * self.radius),
             xyaxes=(0, -1, 0, 0.30, 0, 0.954),
             fovy=70,
         )
-        for number, offset in enumerate(self._offsets[1:], 1):
+        for number, offset in enumerate(grid[1:], 1):
             frame = spec.worldbody.add_frame(pos=offset)
             craft = read_spec(self.vehicle.path)  # must outlive its body
             frame.attach_body(_free_body(craft), f"{number}/", "")
         self.model = spec.compile()
-        _scale_drawing(self.model, self.radius, self._spread)
+        _scale_drawing(self.model, self.radius, float(np.ptp(grid, axis=0).max()))
         self._length = _TRAIL // _EVERY if trail else 0
         self._clear()
 
@@ -272,7 +274,8 @@ class Stage:
             return camera
         expect(name in _VIEWS, "camera", f"one of {', '.join(CAMERAS)}", f"{name!r}")
         camera.azimuth, camera.elevation, distance, holds = _VIEWS[name]
-        camera.distance = distance * self.radius + self._spread
+        places = self._points() if self._together else self._offsets
+        camera.distance = distance * self.radius + float(np.ptp(places, axis=0).max())
         if holds == math.inf:
             camera.lookat[:] = self._points().mean(axis=0)
         else:
@@ -290,9 +293,12 @@ class Stage:
 
     def decorate(self, scene: mujoco.MjvScene, *, goals: bool = True) -> None:
         """Add marks, payloads and fading paths to a scene, and discs at the goals if wanted."""
+        drawn: set[Mark] = set()  # those of a world that all its drones tell
         for moment, goal, offset in zip(self.moments, self._goals, self._offsets, strict=False):
             for mark in moment.marks:
-                _draw_mark(scene, mark, offset, goal)
+                if mark.moves or not self._together or mark not in drawn:
+                    drawn.add(mark)
+                    _draw_mark(scene, mark, offset, goal)
         for payload, here in zip(self._payloads, self._points(), strict=True):
             if payload is not None:
                 size = (0.12 * self.radius,) * 3

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from pictures import HEXA, at
 from rotorgram.envs import LocalVectorEnv, SingleEnv
+from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.models import InputError
 from rotorgram.rendering import Moment, NoOpenGL, live
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.rendering.stage import Stage
+from swarms import RISE
 
 try:
     offscreen_context(16, 16).free()
@@ -164,3 +166,18 @@ def test_many_stand_side_by_side() -> None:
 def test_wrong_stages(arguments: dict[str, Any], expected: str) -> None:
     with pytest.raises(InputError, match=expected):
         Stage(**arguments)
+
+
+def test_drones_of_one_world_are_in_one_picture_where_they_are() -> None:
+    env = LocalParallelEnv(RISE, 3, "rgb_array")
+    env.reset(seed=1)
+    picture = env.render()
+    assert (picture.shape, picture.dtype) == ((360, 480, 3), np.uint8)
+    env.close()
+    stage, still = (
+        Stage("plain", 2, together=True),
+        {"attitude": (0.0,) * 3, "thrusts": (49.0,) * 4},
+    )
+    stage.show(*(Moment(position=(x, 9.0, 2.0 * x), **still) for x in (1.0, 4.0)))
+    places = stage.data.qpos.reshape(2, 7)[:, :3]
+    assert places == pytest.approx(np.array([[2.0, -1.0, 9.0], [8.0, -4.0, 9.0]]))
