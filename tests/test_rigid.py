@@ -14,6 +14,7 @@ from rotorgram.experiments.settings import CompareConfig
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError, Pose, World, make_world, square_root
+from rotorgram.sim.backends import kernel
 
 torch = pytest.importorskip("torch")
 torch_api: Any = pytest.importorskip("array_api_compat.torch")
@@ -130,6 +131,27 @@ def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
         for name in ("position", "quaternion", "velocity", "body_rates"):
             one, all_ = getattr(alone.state, name), getattr(batch.state, name)
             assert one[0].tobytes() == all_[i].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("script", "reason"),
+    [
+        (b"#!/bin/sh\nexec sleep 30", "timed out after 0.2 seconds"),
+        (b"#!/bin/sh\nfor f; do case $f in *.so) echo > $f;; esac; done", "file too short"),
+        (b"#!/no/interpreter", "No such file"),
+        (b"#!/bin/sh\nprintf '\\377 no' >&2; exit 1", "\ufffd no"),
+    ],
+)
+def test_a_compiler_that_misbehaves_is_told_in_one_sentence(
+    script: bytes, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tool = tmp_path / "cc"
+    tool.write_bytes(script)
+    tool.chmod(0o755)
+    monkeypatch.setenv("CC", str(tool))
+    monkeypatch.setattr(kernel, "COMPILE_SECONDS", 0.2 if b"sleep" in script else 60.0)
+    with pytest.raises(InputError, match=rf"^compiled: expected [^\n]*{reason}"):
+        arrays(Vehicle.load(linear_drag=0.124))
 
 
 def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None:

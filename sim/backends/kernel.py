@@ -20,10 +20,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError, expect
 from .body import RigidBody, mapped
 
 ROWS: Final = 13
+COMPILE_SECONDS: Final = 60.0
+"""Time limit of the compiler, s."""
+
 _FLAGS: Final = (
     "-O3",
     "-march=native",
@@ -198,13 +201,19 @@ def _source(body: RigidBody, rotors: int, kind: str, wrench: bool) -> str:
 
 @lru_cache
 def _library(source: str) -> Any:
-    """The compiled source. Raises `InputError` if the compiler fails."""
+    """The compiled source. Raises `InputError` if it cannot be compiled or loaded."""
     tool = str(compiler())
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        given, made = Path(folder) / "fly.c", Path(folder) / "fly.so"
-        given.write_text(source)
-        words = [tool, *_FLAGS, "-shared", "-fPIC", "-o", str(made), str(given), "-lm"]
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
-        said = (done.stderr.strip().splitlines() or ["nothing"])[0]
-        expect(done.returncode == 0, "compiled", f"{tool} to compile the equations", said)
-        return ctypes.CDLL(str(made))
+    try:
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            given, made = Path(folder) / "fly.c", Path(folder) / "fly.so"
+            given.write_text(source)
+            words = [tool, *_FLAGS, "-shared", "-fPIC", "-o", str(made), str(given), "-lm"]
+            done = subprocess.run(
+                words, capture_output=True, check=False, errors="replace", timeout=COMPILE_SECONDS
+            )
+            said = (done.stderr.strip().splitlines() or ["nothing"])[0]
+            expect(done.returncode == 0, "compiled", f"{tool} to compile the equations", said)
+            return ctypes.CDLL(str(made))
+    except (OSError, subprocess.TimeoutExpired) as error:
+        expected = f"{tool} to make a library that loads from the folder for temporary files"
+        raise InputError(f"compiled: expected {expected}, got {error}") from error
