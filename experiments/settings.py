@@ -6,8 +6,9 @@ Imports neither torch nor pandas.
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from hashlib import blake2b
 from itertools import product
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from ..agents import CONTROLLERS
 from ..agents.presets import (
@@ -23,6 +24,8 @@ from ..agents.presets import (
 from ..envs.registry import env_spec, is_known, options_type, task_type
 from ..models import BACKENDS, Backend
 from ..models.errors import InputError, expect
+
+_LONGEST_WORD: Final = 60  # characters of an option's value in a name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,9 +257,9 @@ class BoardRow(EnvConfig):
         usual |= self.brought
         other = {name: value for name, value in self.options.items() if value != usual[name]}
         words = [self.env_id.rpartition("/")[2]]
-        words += [f"{name}={json.dumps(value)}" for name, value in other.items()]
+        words += [f"{name}={_word(json.dumps(value))}" for name, value in other.items()]
         words += [f"with {self.vehicle}"] if self.vehicle else []
-        return " ".join(words).replace('"', "")
+        return " ".join(words)
 
     @property
     def name(self) -> str:
@@ -269,6 +272,12 @@ class BoardRow(EnvConfig):
         shared = {**{name: getattr(self, name) for name in names}, **self.env}
         config = preset(self.agent, self.preset, self.env_id)
         return Run(algorithm=self.agent, config=config, seed=seed, **shared)
+
+
+def _word(text: str) -> str:
+    """A value for a name: without quotes, and of a long one, as a track, its digest."""
+    long = len(text) > _LONGEST_WORD
+    return blake2b(text.encode(), digest_size=4).hexdigest() if long else text.replace('"', "")
 
 
 @dataclass(frozen=True, kw_only=True)

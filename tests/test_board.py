@@ -1,6 +1,7 @@
 """The baselines board: its runs, its page, and the policies that are committed with it."""
 
 import json
+import re
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -330,6 +331,13 @@ def test_a_controller_stands_in_the_table_of_its_task() -> None:
     assert flown.task == trained.task == "Hover-v0"
     other = BoardRow(agent="geometric", options={"action": "velocity"}, **hover)
     assert other.task == "Hover-v0 action=velocity"
+
+
+def test_an_option_that_is_long_is_named_by_its_digest() -> None:
+    racing = {"agent": "ppo", "env_id": "rotorgram/Racing-v0"}
+    names = [BoardRow(**racing, options={"track": name}).task for name in ("oval", "dive")]
+    assert names[0] == "Racing-v0"
+    assert re.fullmatch("Racing-v0 track=[0-9a-f]{8}", names[1])
 
 
 def test_a_row_trains_on_the_backend_of_its_preset_or_its_own() -> None:
