@@ -31,7 +31,8 @@ def states(dice: np.random.Generator) -> WorldState:
 
 
 def as_tensors(state: WorldState) -> WorldState:
-    fields = {name: getattr(state, name) for name in WorldState.__slots__}
+    both = {name: getattr(state, name) for name in WorldState.__slots__}
+    fields = {name: array for name, array in both.items() if array is not None}
     return WorldState(**{name: torch.from_numpy(array) for name, array in fields.items()})
 
 

@@ -353,7 +353,7 @@ def test_a_comparison_without_opengl_has_no_film(
 
 
 def test_what_is_no_comparison_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"config\.json is missing"):
+    with pytest.raises(InputError, match=r"got one without config\.json"):
         film_comparison(tmp_path, tmp_path / "video.mp4")
     (tmp_path / "config.json").write_text(json.dumps({}))
     with pytest.raises(InputError, match=r"config\.json"):

@@ -78,7 +78,7 @@ def test_steps_are_read_by_phase_and_column(comparison):
 def test_a_missing_file_is_named(tmp_path, name):
     folder = synthetic_folder(tmp_path, agents=("a2c",), seeds=1, env_steps=300)
     (folder / name).unlink()
-    with pytest.raises(ResultsError, match=f"{name} is missing"):
+    with pytest.raises(ResultsError, match=f"got one without {name}"):
         write_report(folder)
 
 

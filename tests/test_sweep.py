@@ -330,7 +330,7 @@ def test_the_grid_is_read_by_name() -> None:
         (["--grid", "gamma=0.9", "--address", "a:1"], "address: expected it with runner ray"),
         (["--grid", "gamma=0.9", "--env.target", "1"], "target: expected"),
         (["--grid", "gamma=0.9", "--out", "."], "exists already"),
-        (["--resume", "nowhere"], "config.json is missing"),
+        (["--resume", "nowhere"], "got one without config.json"),
     ],
 )
 def test_wrong_input_is_one_sentence(
