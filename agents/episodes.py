@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from ..envs.autoreset import AdvancingVectorEnv
+from ..envs.autoreset import AdvancingVectorEnv, worlds_done
 from ..envs.spec import EnvSpec, component_names
 from ..models.errors import InputError
 from .policies import ActionMap, flat
@@ -82,10 +82,15 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     make the log a vector env of Gymnasium's SAME_STEP, whatever the autoreset of `env`. Its
     observations are flat, and its continuous actions are in the units of `ActionMap`.
 
+    Drones of one world begin together. One whose episode ends before those of the others is out:
+    it flies no env steps until the world begins anew.
+
     `seed` is that of the run. With `keep_steps` every step is kept, for `steps`.
 
     Attributes:
         env_steps: Control steps of all drones together.
+        out: Whose episode has ended and the next has not begun: bool, shape (N,).
+        done: Those of them in whose world all are out: these are to begin.
         episodes: Ended episodes, in the order of their ends.
         drawn: For each that ended since the log was made, what was drawn for it, by name.
     """
@@ -116,6 +121,8 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._rewards, self._sizes = np.zeros(count), np.zeros(count)
         self._seeds = np.zeros(count, np.uint64)
         self._all, self._nothing = np.ones(count, bool), np.full(count, np.nan)
+        self._together = len(self.spec.agents)
+        self.out = self.done = ~self._all
         self._flown: list[np.ndarray] = []  # actions; at least those of the running episodes
         self._steps: list[np.ndarray] | None = [] if keep_steps else None
         self._still = actions.to_envs(np.zeros((count, actions.size), np.float32))
@@ -159,10 +166,10 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """The same with actions of the env, shape (N, k), or (N,) if discrete; or with a tensor, to
         an env that takes those.
         """
-        env, seeds, idle = self.env, None, frozen
+        env, seeds, idle = self.env, None, self._idle(frozen)
         if begins is not None:
             self._number(begins)
-            seeds, idle = self._seeds, begins if frozen is None else begins | frozen
+            seeds, idle = self._seeds, begins if idle is None else begins | idle
         env.advance(sent, begins, seeds, frozen)
         self._flown.append(sent.detach().numpy() if hasattr(sent, "detach") else sent)
         self._keep_step(idle)
@@ -171,8 +178,14 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if np.count_nonzero(ended):  # of few drones faster than `any`
             self._keep_episodes(ended)
 
+    def _idle(self, frozen: np.ndarray | None) -> np.ndarray | None:
+        """Who flies no env step now: frozen drones, and those that are out while others fly on."""
+        if self._together == 1:
+            return frozen
+        return self.out if frozen is None else frozen | self.out
+
     def begin(self, drones: np.ndarray) -> np.ndarray:
-        """Begin the next episodes of some drones, bool, shape (N,), while the others are frozen.
+        """Begin the next episodes of whole worlds, bool, shape (N,), while the others are frozen.
 
         If a simulator is lost meanwhile, the episodes of its frozen drones are truncated: these
         begin their next as well, and are returned, bool, shape (N,).
@@ -196,15 +209,23 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Fly one step. `info` has `final_obs` where an episode ended."""
+        """Fly one step. `info` has `final_obs` where an episode ended.
+
+        One that is out observes zeros, with no reward, and terminates once more with its world.
+        """
         env, info = self.env, {}
         self.fly(np.asarray(actions, np.float32).reshape(self.num_envs, -1))
         last, rewards = self.observations, env.rewards
         terminated, truncated = env.terminated, env.truncated
+        if self.done.any():
+            begun = self.done
+            truncated = truncated | self.begin(begun)
+            terminated = terminated | (begun & ~truncated)  # for those out, a world ends once more
         if (terminated | truncated).any():
-            truncated = truncated | self.begin(terminated | truncated)
             info = {"final_obs": last, "_final_obs": terminated | truncated}
-        return self.observations, rewards, terminated, truncated, info
+        observations = self.observations
+        observations[self.out] = 0.0
+        return observations, rewards, terminated, truncated, info
 
     def position(self) -> Position:
         """The current position of the run."""
@@ -254,14 +275,17 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._forget(self._all)
         self._flown, self._steps = [], None if self._steps is None else []
         self.env.reset(seed=self._seeds.tolist())
+        lengths = position.lengths.reshape(-1, self._together).max(1).repeat(self._together)
         for step, actions in enumerate(position.actions):
-            frozen = position.lengths < len(position.actions) - step
+            frozen = lengths < len(position.actions) - step
+            idle = self._idle(frozen)
             self.env.advance(actions, None, None, frozen)
             if self.env.lost.any():
                 return True
             self._flown.append(actions)
-            self._keep_step(frozen)
-            if (self.env.terminated | self.env.truncated).any():
+            self._keep_step(idle)
+            self._take_out(self.env.terminated | self.env.truncated)
+            if self.done.any():
                 break  # too early: the lengths differ
         return False
 
@@ -287,6 +311,11 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _forget(self, drones: np.ndarray) -> None:
         self._lengths[drones] = self._rewards[drones] = self._sizes[drones] = 0
+        self.out, self.done = self.out & ~drones, self.done & ~drones
+
+    def _take_out(self, ended: np.ndarray) -> None:
+        self.out = self.out | ended
+        self.done = worlds_done(self.out, self._together)
 
     def _draw_seeds(self, drones: np.ndarray) -> None:
         for drone in np.flatnonzero(drones).tolist():
@@ -306,6 +335,7 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _keep_episodes(self, ended: np.ndarray) -> None:
         env = self.env
+        self._take_out(ended)
         for drone in np.flatnonzero(ended).tolist():
             if not (length := int(self._lengths[drone])):  # lost before its first step
                 continue

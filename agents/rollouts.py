@@ -114,10 +114,9 @@ class Collector:
         log, env, count = self._log, self._log.env, self._log.num_envs
         log.start()
         stop = None if most_steps is None else log.env_steps + most_steps
-        done, waiting = np.zeros(count, bool), 0
         block = length or max(256 // count, 1)
         rows: list[tuple[np.ndarray, ...]] = []
-        observations = log.observations
+        observations, waiting = log.observations, int(np.count_nonzero(log.done))
         while len(rows) != length and (stop is None or log.env_steps < stop):
             if not len(rows) % block:
                 noise = policy.draw_noise(self._rng, block * count).reshape(block, count, -1)
@@ -125,21 +124,19 @@ class Collector:
             if not np.isfinite(actions).all():
                 hint = "try a lower learning_rate"
                 raise Diverged(f"training diverged: actions are not finite; {hint}")
-            idle = done if waiting else None
+            flying, idle = ~log.out, log.done if waiting else None
             log.fly(actions, idle) if stop is None else log.fly(actions, None, idle)
-            after, terminated, truncated = log.observations, env.terminated, env.truncated
-            ends = (terminated, truncated, ~done, env.lost)
-            rows.append((observations, actions, env.rewards, after, *ends))
-            observations, ended = after, terminated | truncated
-            done = ended if stop is None else done | ended
-            waiting = int(np.count_nonzero(done))  # of few drones faster than `any`
+            ends = (env.terminated, env.truncated, flying, env.lost)
+            rows.append((observations, actions, env.rewards, log.observations, *ends))
+            observations = rows[-1][3]
+            waiting = int(np.count_nonzero(log.done))  # of few drones faster than `any`
             if waiting == count:
                 if stop is not None:
                     break
-                log.begin(done)
-                observations, done, waiting = log.observations, np.zeros(count, bool), 0
+                log.begin(log.done)
+                observations, waiting = log.observations, 0
         if waiting and (stop is None or waiting == count):
-            log.begin(done)
+            log.begin(log.done)
         *columns, lost = (np.array(column) for column in zip(*rows, strict=True))
         return Rollout(*columns), lost, waiting == count
 
