@@ -61,10 +61,14 @@ def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> "A
             from .apg import APG
 
             return APG(log, config, seed)
-        case "ppo", PPOConfig():
+        case "ppo" | "ippo", PPOConfig():
             from .ppo import PPO
 
             return PPO(log, config, seed)
+        case "mappo", PPOConfig():
+            from .mappo import MAPPO
+
+            return MAPPO(log, config, seed)
         case "a2c", A2CConfig() if not isinstance(config, PPOConfig):
             from .a2c import A2C
 
@@ -87,7 +91,7 @@ def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> "A
     )
 
 
-_ALIKE: Final = {"vpg", "a2c", "ppo", "apg"}
+_ALIKE: Final = {"vpg", "a2c", "ppo", "ippo", "mappo", "apg"}
 """Algorithms whose policies are the same network."""
 
 
@@ -96,9 +100,9 @@ def start_agent(
 ) -> "Agent":
     """A new agent that begins with the networks of a checkpoint; all else of it is fresh.
 
-    The checkpoint is of the same algorithm; `vpg`, `a2c`, `ppo` and `apg` take each other's policy
-    too, and `a2c` and `ppo` each other's critic. Its task, vehicle and effects may be others, its
-    observation and action may not.
+    The checkpoint is of the same algorithm; `vpg`, `a2c`, `ppo`, `ippo`, `mappo` and `apg` take
+    each other's policy too, and `a2c`, `ppo` and `ippo` each other's critic. Its task, vehicle and
+    effects may be others, its observation and action may not.
 
     Raises:
         InputError: The checkpoint has other networks, or is a policy alone.

@@ -38,13 +38,15 @@ class A2C(Learner):
         self.terms = {"gain": gain, "entropy": entropy, "value_loss": value_loss}
         self.terms |= {"values": values, "targets": targets}
 
-    def advantages(self, rollout: Rollout) -> tuple[np.ndarray, np.ndarray]:
-        """A_t and V(s_t) of every row, float64, shape (T, N)."""
-        values = self.values(rollout.observations)
+    def advantages(self, rollout: Rollout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A_t and V(s_t) of every row, float64, shape (T, N), and what the critic saw of it."""
+        seen = self.seen(rollout.observations, rollout.kept)
+        after = self.seen(rollout.next_observations, rollout.kept & ~rollout.terminated)
+        values = self._values(seen)
         following, new = np.empty_like(values), rollout.ends.copy()
         following[:-1], new[-1] = values[1:], True
         # The next row has the same observation, unless an episode ends between them.
-        following[new] = self.values(rollout.next_observations[new])
+        following[new] = self._values(after[new])
         estimates = advantages(
             rollout.rewards,
             values,
@@ -54,10 +56,16 @@ class A2C(Learner):
             gamma=self.config.gamma,
             gae_lambda=self.config.gae_lambda,
         )
-        return estimates, values
+        return estimates, values, seen
 
-    def values(self, observations: np.ndarray) -> np.ndarray:
-        """V(s), float64, shape (...), of observations, shape (..., n)."""
-        *lead, size = observations.shape
-        values = self._critic.forward(self.inputs(observations.reshape(-1, size)))
-        return values.reshape(lead).astype(np.float64)
+    def seen(self, observations: np.ndarray, flying: np.ndarray) -> np.ndarray:
+        """Inputs of the critic, shape (T, N, m), from observations (T, N, n): here the same.
+
+        Of drones that are not `flying`, bool, shape (T, N), another drone may not learn.
+        """
+        return self.inputs(observations)
+
+    def _values(self, seen: np.ndarray) -> np.ndarray:
+        """V(s), float64, shape (...), of inputs of the critic, shape (..., m)."""
+        *lead, size = seen.shape
+        return self._critic.forward(seen.reshape(-1, size)).reshape(lead).astype(np.float64)

@@ -35,6 +35,8 @@ class Learner:
     """
 
     has_critic: ClassVar[bool] = False
+    central: ClassVar[bool] = False
+    """Whether the critic sees the observations of all drones of a world."""
 
     def __init__(self, log: EpisodeLog, config: Any, seed: int) -> None:
         weights_seed, self._rng = seeds_of(seed)
@@ -44,7 +46,8 @@ class Learner:
         if not actions.discrete:
             shapes["actor.log_std"] = (actions.outputs,)
         if self.has_critic:
-            shapes |= named("critic.", mlp_shapes((inputs, *config.hidden, 1)))
+            seen = inputs * (len(log.spec.agents) if self.central else 1)
+            shapes |= named("critic.", mlp_shapes((seen, *config.hidden, 1)))
         self.weights = Weights.zeros(shapes)
         dice = np.random.default_rng(weights_seed)
         self._actor = Actor(self.weights.part("actor."), config.activation)

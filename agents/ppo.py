@@ -61,8 +61,11 @@ class PPO(A2C):
         before: np.ndarray,
         advantage: np.ndarray,
         targets: np.ndarray,
+        seen: np.ndarray | None = None,
     ) -> tuple[float, ...]:
         """Set the gradients of the loss of B transitions; its terms, by the names of `terms`.
+
+        A central critic has `seen` more than the observations.
 
         Log-probabilities `before`, shape (B,), are those of the policy that flew, as `advantage`,
         and `targets` of V(s). The objective is the mean of min(r A, clip(r, 1 - c, 1 + c) A) for
@@ -78,7 +81,8 @@ class PPO(A2C):
         gains = ratio * advantage
         bounded = np.minimum(np.maximum(ratio, 1 - config.clip), 1 + config.clip) * advantage
         self._actor.backward(gains * (gains <= bounded) / -count, -config.ent_coef)
-        errors = self._critic.forward(observations)[:, 0] - targets
+        inputs = observations if seen is None else seen
+        errors = self._critic.forward(inputs)[:, 0] - targets
         self._critic.backward((2 * config.vf_coef / count * errors)[:, np.newaxis])
         clipped = np.count_nonzero(np.abs(ratio - 1) > config.clip) / count
         distance = float((ratio - 1 - change).mean())  # of KL, as SB3 estimates it
@@ -89,10 +93,12 @@ class PPO(A2C):
         """Arguments of `minibatch` for all transitions of a rollout."""
         observations = self.inputs(rollout.rows(rollout.observations))
         actions = rollout.rows(rollout.actions)
+        estimates, judged, seen = self.advantages(rollout)
         advantage, values = (
-            rollout.rows(array).astype(np.float32) for array in self.advantages(rollout)
+            rollout.rows(array).astype(np.float32) for array in (estimates, judged)
         )
         targets = values + advantage
         before, _ = self._actor.score(observations, actions)
         self.terms = {"values": values, "targets": targets}
-        return observations, actions, before, advantage, targets
+        more = (rollout.rows(seen),) if self.central else ()
+        return observations, actions, before, advantage, targets, *more

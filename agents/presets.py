@@ -11,7 +11,9 @@ from typing import Any, Final, Literal
 
 from ..models.errors import expect
 
-AlgorithmName = Literal["vpg", "a2c", "ppo", "sac", "apg", "sb3-a2c", "sb3-ppo", "sb3-sac"]
+AlgorithmName = Literal[
+    "vpg", "a2c", "ppo", "ippo", "mappo", "sac", "apg", "sb3-a2c", "sb3-ppo", "sb3-sac"
+]
 PresetName = Literal["paper", "tuned"]
 
 
@@ -267,8 +269,8 @@ _APGS: Final = {
 }
 # The references get the very same settings: only the implementation differs.
 PRESETS: Final[dict[str, dict[str, Preset]]] = {
-    "vpg": _VPG, "a2c": _A2C, "ppo": _PPOS, "sac": _SACS, "apg": _APGS, "sb3-a2c": _A2C,
-    "sb3-ppo": _PPOS, "sb3-sac": _SACS,
+    "vpg": _VPG, "a2c": _A2C, "ppo": _PPOS, "ippo": _PPOS, "mappo": _PPOS, "sac": _SACS,
+    "apg": _APGS, "sb3-a2c": _A2C, "sb3-ppo": _PPOS, "sb3-sac": _SACS,
 }  # fmt: skip
 """By algorithm and name: of the paper's task, and of all others that `_OF_TASKS` does not have."""
 _HOVER: Final = PPOConfig(

@@ -51,7 +51,7 @@ class Train(AgentFlags, BackendFlags):
     """
 
     algorithm: Positional[AlgorithmName]
-    """vpg, a2c, ppo, sac, apg, sb3-a2c, sb3-ppo or sb3-sac."""
+    """vpg, a2c, ppo, ippo, mappo, sac, apg, sb3-a2c, sb3-ppo or sb3-sac."""
     preset: PresetName = "tuned"
     """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
     set: UseAppendAction[Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE …")]] = ()
