@@ -76,9 +76,9 @@ def watched(simulator: Simulator, command: "Sim") -> Iterator[None]:
     with ExitStack() as opened:
         if command.view is not None:
             pace, drones = Pace(0.0), simulator.stepped.num_envs
-            together = len(simulator.spec.agents)  # of the first world
-            shown = together if together > 1 else min(drones, MOST_DRONES)
-            stage = Stage(command.world, shown, vehicle=command.vehicle, together=together > 1)
+            names = simulator.spec.agents if len(simulator.spec.agents) > 1 else ()
+            shown = len(names) or min(drones, MOST_DRONES)  # of the first world
+            stage = Stage(command.world, shown, vehicle=command.vehicle, names=names)
             surface = open_surface(command.view, stage, pace, command.view_port)
             live = opened.enter_context(LiveView(stage, surface, pace, of=drones))
             print(f"shown {surface.where}", flush=True)

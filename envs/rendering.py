@@ -44,10 +44,11 @@ class Renderer:
             return None
         from ..rendering import Canvas, Stage
 
-        drones = len(self._loop.spec.agents)
+        names = self._loop.spec.agents
+        drones = len(names)
         if self._canvas is None:
             one = len(now) == drones
-            stage = Stage(drones=drones, vehicle=self._loop.vehicle.path, trail=one, together=True)
+            stage = Stage(drones=drones, vehicle=self._loop.vehicle.path, trail=one, names=names)
             self._canvas = Canvas(stage, *((480, 360) if one else (240, 180)))
         canvas, pictures = self._canvas, []
         for first in range(0, len(now), drones):
@@ -58,12 +59,11 @@ class Renderer:
     def _show(self, now: "list[Moment]") -> None:
         from ..rendering import Stage, live
 
-        drones = len(self._loop.spec.agents)
-        together = drones > 1  # then the window shows the first world
-        shown = now[: drones if together else live.MOST_DRONES]
+        names = self._loop.spec.agents if len(self._loop.spec.agents) > 1 else ()
+        shown = now[: len(names) or live.MOST_DRONES]  # of the first world
         if self._view is None:
             path = self._loop.vehicle.path
-            stage = Stage(drones=len(shown), vehicle=path, together=together)
+            stage = Stage(drones=len(shown), vehicle=path, names=names)
             pace = live.Pace(self._loop.spec.control_period)
             surface = live.open_surface("window", stage, pace)
             self._view = live.LiveView(stage, surface, pace, of=len(now))

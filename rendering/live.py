@@ -192,12 +192,24 @@ class LiveView(AbstractContextManager["LiveView"]):
         if fresh:
             self.stage.show(*moments)
         high = float(self.stage.vehicle.thrust_high.max())
-        self.surface.show(lines_over(moments, high, self._said, self._of))
+        lines = lines_over(moments, high, self._said, self._of, self.stage.least_distance)
+        self.surface.show(lines)
 
 
-def lines_over(moments: tuple[Moment, ...], thrust_high: float, pace: str, drones: int) -> Lines:
-    """The lines of an overlay of so many drones: those of the first; its `thrust_high` is in N."""
+def lines_over(
+    moments: tuple[Moment, ...],
+    thrust_high: float,
+    pace: str,
+    drones: int,
+    least_distance: float | None = None,
+) -> Lines:
+    """The lines of an overlay of so many drones: those of the first; its `thrust_high` is in N.
+
+    Drones of one world have a least distance of two of them, m.
+    """
     lines = [*moments[0].lines(thrust_high), ("speed", pace)]
+    if least_distance is not None:
+        lines.insert(0, ("least distance", f"{least_distance:.2f} m"))
     if drones > 1:
         shown = f"{len(moments)} of {drones}" if drones > len(moments) else str(drones)
         lines.insert(0, ("drones", f"{shown} shown, numbers of the first"))

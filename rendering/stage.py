@@ -33,6 +33,12 @@ _DUE = (0.13, 0.78, 0.52, 0.9)  # The gate that is next, and a pad
 _GATE = (0.96, 0.42, 0.08, 0.9)
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 _PATH = (1.0, 0.85, 0.25)
+# Of drones of one world, their paths and goals: Okabe and Ito's, told apart with colour-blindness.
+_COLORS = (
+    _PATH, (0.34, 0.71, 0.91), (0.90, 0.62, 0.0), (0.0, 0.62, 0.45), (0.80, 0.47, 0.65),
+    (0.0, 0.45, 0.70), (0.84, 0.37, 0.0), (0.55, 0.34, 0.29),
+)  # fmt: skip
+_MOST_NAMES = 16  # of drones of one world: more hide them
 _ONBOARD: Final = "stage/onboard"
 _ROOM = 10_000  # geoms
 _SAMPLES = 4  # of every pixel, for smooth edges; software has no more
@@ -166,8 +172,9 @@ class Moment:
 class Stage:
     """Craft over an airport or a plain floor, each with a goal and a path if wanted.
 
-    They are of different worlds and stand side by side, or are `together` in one, each where it is.
-    It simulates nothing: it shows moments. What is wrong raises `InputError`.
+    They are of different worlds and stand side by side. Those of one world have `names`, which the
+    pictures show; each is where it is, with path and goal in a colour of its own. It simulates
+    nothing: it shows moments. What is wrong raises `InputError`.
 
     Attributes:
         radius: Of a sphere about the body's origin that holds the craft, m. Cameras, goals and
@@ -184,10 +191,11 @@ class Stage:
         *,
         vehicle: Path | str | None = None,
         trail: bool = True,
-        together: bool = False,
+        names: Sequence[str] = (),
     ) -> None:
         expect(drones >= 1, "drones", "1 or more", f"{drones}")
-        self.drones, self.vehicle, self._together = drones, Vehicle.load(vehicle), together
+        expect(len(names) in (0, drones), "names", f"one for each of {drones} drones", f"{names}")
+        self.drones, self.vehicle, self.names = drones, Vehicle.load(vehicle), tuple(names)
         try:
             spec = build_scene(self.vehicle.path, world)
             self.radius, top = _size(spec.compile())
@@ -197,7 +205,7 @@ class Stage:
             reason = " ".join(str(error).split())
             raise InputError(f"vehicle: expected a file that can be drawn, got: {reason}") from None
         grid = _grid(drones, _SPACING * self.radius)
-        self._offsets = 0.0 * grid if together else grid
+        self._offsets = 0.0 * grid if names else grid
         _free_body(spec).add_camera(  # sees nose, front rotors and horizon
             name=_ONBOARD,
             pos=(0.03 * self.radius, 0.0, top + 0.154 * self.radius),
@@ -209,7 +217,8 @@ class Stage:
             craft = read_spec(self.vehicle.path)  # must outlive its body
             frame.attach_body(_free_body(craft), f"{number}/", "")
         self.model = spec.compile()
-        _scale_drawing(self.model, self.radius, float(np.ptp(grid, axis=0).max()))
+        apart = float(np.ptp(grid, axis=0).max())  # drones of one world fly further apart
+        _scale_drawing(self.model, self.radius, 4.0 * apart if names else apart)
         self._length = _TRAIL // _EVERY if trail else 0
         self._clear()
 
@@ -274,7 +283,7 @@ class Stage:
             return camera
         expect(name in _VIEWS, "camera", f"one of {', '.join(CAMERAS)}", f"{name!r}")
         camera.azimuth, camera.elevation, distance, holds = _VIEWS[name]
-        places = self._points() if self._together else self._offsets
+        places = self._points() if self.names else self._offsets
         camera.distance = distance * self.radius + float(np.ptp(places, axis=0).max())
         if holds == math.inf:
             camera.lookat[:] = self._points().mean(axis=0)
@@ -296,7 +305,7 @@ class Stage:
         drawn: set[Mark] = set()  # those of a world that all its drones tell
         for moment, goal, offset in zip(self.moments, self._goals, self._offsets, strict=False):
             for mark in moment.marks:
-                if mark.moves or not self._together or mark not in drawn:
+                if mark.moves or not self.names or mark not in drawn:
                     drawn.add(mark)
                     _draw_mark(scene, mark, offset, goal)
         for payload, here in zip(self._payloads, self._points(), strict=True):
@@ -308,17 +317,35 @@ class Stage:
                 if cable is not None:
                     mujoco.mjv_connector(cable, kind, 0.012 * self.radius, here, payload)
         marked = any(moment.marks for moment in self.moments)
-        for path, goal, here in zip(self._paths, self._goals, self._points(), strict=True):
+        if 1 < len(self.names) <= _MOST_NAMES:
+            self._write_names(scene)
+        lines = zip(self._paths, self._goals, self._points(), strict=True)
+        for drone, (path, goal, here) in enumerate(lines):
+            color = _COLORS[drone % len(_COLORS)] if self.names else _PATH
             if goals and goal is not None and not marked:
                 size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
-                _decoration(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, _DISC)
+                disc = (*color, _DISC[3]) if len(self.names) > 1 else _DISC
+                _decoration(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, disc)
             for number, (start, end) in enumerate(pairwise([*path, here]), 1):
                 if np.array_equal(start, end):
                     continue
-                kind, rgba = mujoco.mjtGeom.mjGEOM_CAPSULE, (*_PATH, 0.85 * number / len(path))
+                kind, rgba = mujoco.mjtGeom.mjGEOM_CAPSULE, (*color, 0.85 * number / len(path))
                 geom = _decoration(scene, kind, (1.0, 1.0, 1.0), start, rgba)
                 if geom is not None:
                     mujoco.mjv_connector(geom, kind, 0.019 * self.radius, start, end)
+
+    @property
+    def least_distance(self) -> float | None:
+        """Least distance between the origins of two drones of the world now, m; None of one."""
+        return least_distance(self._points()) if len(self.names) > 1 else None
+
+    def _write_names(self, scene: mujoco.MjvScene) -> None:
+        """A name over each craft."""
+        for name, here in zip(self.names, self._points(), strict=True):
+            above = here + np.array((0.0, 0.0, 0.9 * self.radius))
+            label = _decoration(scene, mujoco.mjtGeom.mjGEOM_LABEL, (0.1,) * 3, above, _CABLE)
+            if label is not None:
+                label.label = f"{name} "  # without the space its end would be cut off
 
     def _points(self) -> np.ndarray:
         """Positions of the craft, MuJoCo's frame, shape (drones, 3), m."""
@@ -385,6 +412,12 @@ class Canvas(AbstractContextManager["Canvas"]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def least_distance(positions: np.ndarray) -> float:
+    """Least distance between two of some points, shape (A, 3), at least two."""
+    apart = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    return float(apart[np.triu_indices(len(positions), 1)].min())
 
 
 def _free_body(spec: mujoco.MjSpec) -> Any:

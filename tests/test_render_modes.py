@@ -1,5 +1,6 @@
 """Gymnasium's render modes: pictures of what flies, and the same physics with and without."""
 
+import math
 from threading import Thread
 from typing import Any
 
@@ -174,10 +175,33 @@ def test_drones_of_one_world_are_in_one_picture_where_they_are() -> None:
     picture = env.render()
     assert (picture.shape, picture.dtype) == ((360, 480, 3), np.uint8)
     env.close()
-    stage, still = (
-        Stage("plain", 2, together=True),
-        {"attitude": (0.0,) * 3, "thrusts": (49.0,) * 4},
-    )
+    stage = Stage("plain", 2, names=("a", "b"))
+    still: Any = {"attitude": (0.0,) * 3, "thrusts": (49.0,) * 4}
     stage.show(*(Moment(position=(x, 9.0, 2.0 * x), **still) for x in (1.0, 4.0)))
     places = stage.data.qpos.reshape(2, 7)[:, :3]
     assert places == pytest.approx(np.array([[2.0, -1.0, 9.0], [8.0, -4.0, 9.0]]))
+    assert stage.least_distance == pytest.approx(math.hypot(6.0, 3.0))
+    assert Stage("plain", 2).least_distance is None  # of different worlds
+
+
+def test_drones_of_one_world_are_named_and_have_paths_and_goals_of_their_own_colour() -> None:
+    stage = Stage("plain", 2, names=("a", "b"))
+    for step in range(10):
+        stage.show(*(
+            Moment(position=(x, 9.0, 0.1 * step), goal=(x, 9.0, 5.0), attitude=(0.0,) * 3,
+                   thrusts=(49.0,) * 4, step=step)
+            for x in (1.0, 4.0)
+        ))  # fmt: skip
+    scene = mujoco.MjvScene(stage.model, 1000)
+    stage.decorate(scene)
+    geoms = scene.geoms[: scene.ngeom]
+    kinds = mujoco.mjtGeom
+    labels = [geom for geom in geoms if geom.type == kinds.mjGEOM_LABEL]
+    assert [geom.label.strip() for geom in labels] == ["a", "b"]
+    assert [geom.pos[1] for geom in labels] == pytest.approx([-1.0, -4.0])  # over their crafts
+    colors: dict[float, set[tuple[float, ...]]] = {-1.0: set(), -4.0: set()}
+    for geom in geoms:
+        if geom.type in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER):
+            colors[round(float(geom.pos[1]), 6)].add(tuple(geom.rgba[:3].tolist()))
+    assert [len(own) for own in colors.values()] == [1, 1]
+    assert colors[-1.0] != colors[-4.0]

@@ -210,6 +210,11 @@ def test_lines_over_many_drones(drones: int, said: str) -> None:
     assert ("step", "1") in lines
 
 
+def test_lines_over_drones_of_one_world_tell_how_near_they_are() -> None:
+    lines = lines_over((moment(1), moment(2)), 100.0, "1 x", 2, 1.234)
+    assert lines[:2] == [("drones", "2 shown, numbers of the first"), ("least distance", "1.23 m")]
+
+
 def test_the_camera_goes_with_the_goal_and_leaves_the_mouse_its_turn(stage: Stage) -> None:
     aim, camera = Aim(stage), mujoco.MjvCamera()
     stage.show(moment(height=4.5, error=0.5))
