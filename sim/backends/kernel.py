@@ -153,7 +153,7 @@ class Variable:
 
     def clip(self, *, max: float) -> "Variable":
         """The lesser of itself and a number."""
-        return self._made("{0} < {1} ? {0} : {1}", max)
+        return self._made("{0} > {1} ? {1} : {0}", max)  # NaN stays NaN
 
     def sqrt(self) -> "Variable":
         """Square root."""
