@@ -11,6 +11,7 @@ from ..models.errors import InputError, expect
 from .checkpoints import Checkpoint, CheckpointError, load, store
 from .episodes import Episode, EpisodeLog, ResumeError, episode_seed
 from .geometric import Geometric
+from .orca import Orca
 from .pid import PID
 from .policies import NetworkPolicy, Policy
 from .presets import (
@@ -34,12 +35,14 @@ if TYPE_CHECKING:
 
     Agent = Learner | SAC | SB3Agent
 
-CONTROLLERS: Final[dict[str, type[PID] | type[Geometric]]] = {"pid": PID, "geometric": Geometric}
+CONTROLLERS: Final[dict[str, type[PID] | type[Geometric] | type[Orca]]] = {
+    "pid": PID, "geometric": Geometric, "orca": Orca,
+}  # fmt: skip
 """Agents that need no training, made of an env's spec."""
 
 __all__ = [
     "CONTROLLERS", "PID", "PRESETS", "A2CConfig", "APGConfig", "AlgorithmName", "Checkpoint",
-    "CheckpointError", "Episode", "EpisodeLog", "Geometric", "NetworkPolicy", "PPOConfig",
+    "CheckpointError", "Episode", "EpisodeLog", "Geometric", "NetworkPolicy", "Orca", "PPOConfig",
     "Policy", "ResumeError", "SACConfig", "VPGConfig", "episode_seed", "load", "make_agent",
     "preset", "resume_agent", "start_agent", "store",
 ]  # fmt: skip

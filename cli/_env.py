@@ -5,7 +5,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from ..agents import CONTROLLERS, PID, Checkpoint, Geometric, Policy, load
+from ..agents import CONTROLLERS, PID, Checkpoint, Geometric, Orca, Policy, load
 from ..envs.registry import env_spec, is_known
 from ..envs.spec import EnvSpec
 from ..experiments.pairs import socket_pair
@@ -16,7 +16,7 @@ from ..udp import RemoteEnv, RemoteVectorEnv
 from ._flags import AgentFlags, EnvFlags, parse_address
 
 CHECKPOINT: Final = "checkpoint.safetensors"
-Controller = type[PID] | type[Geometric]
+Controller = type[PID] | type[Geometric] | type[Orca]
 _CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
 
 
@@ -62,6 +62,14 @@ def chosen_env(
     return env
 
 
+def chosen_drones(command: EnvFlags, checkpoint: Checkpoint | Controller | None) -> int:
+    """Drones of each world: those of the flag, or with which the checkpoint was trained."""
+    if isinstance(checkpoint, Checkpoint) and "drones" not in command.given:
+        same = "env" not in command.given or command.env_id == checkpoint.env_id
+        return len(checkpoint.spec.agents) if same else command.drones
+    return command.drones
+
+
 def policy_for(command: EnvFlags, checkpoint: Checkpoint | Controller, spec: EnvSpec) -> Policy:
     """The policy of a checkpoint, or a controller. Raises `InputError` if it does not fit the env,
     or was trained on another vehicle and the user has not named one.
@@ -91,7 +99,7 @@ def pilot_of(
         return None, None, chosen_env(command)
     checkpoint = load_checkpoint(what)
     env = chosen_env(command, checkpoint)
-    spec = env_spec(*env, vehicle=command.vehicle)
+    spec = env_spec(*env, command.vehicle, chosen_drones(command, checkpoint))
     policy = policy_for(command, checkpoint, spec)
     return None if isinstance(checkpoint, type) else checkpoint, policy, env
 
@@ -114,6 +122,7 @@ def remote_env(
     required: bool = True,
     num_envs: int | None = 1,
     num_simulators: int = 1,
+    drones: int = 1,
     backend: Backend = "mujoco",
 ) -> Iterator[Any]:
     """A remote env with a simulator of its own, on a backend, or those that come to
@@ -137,8 +146,8 @@ def remote_env(
         reason = "the task is not known here without the module that registers it"
         expect(is_known(env_id), "env", f"--env MODULE:{env_id}, for {reason}")
         opened = socket_pair(
-            env_id, options, num_envs=num_envs or 1, vehicle=command.vehicle, backend=backend,
-            record=command.record,
+            env_id, options, num_envs=num_envs or drones, drones=drones, vehicle=command.vehicle,
+            backend=backend, record=command.record,
         )  # fmt: skip
     with opened as env:
         try:

@@ -58,6 +58,8 @@ class EnvFlags(Command):
     sensors: tuple[str, ...] = ()
     """Sensors whose readings are observed, each NAME or NAME=SETTINGS: imu gps={"rate":10}, and
     observe=estimate. docs/sensors.md lists them."""
+    drones: int = 1
+    """Drones of each world, for a task of several."""
     options: Suppress[Fixed[dict]] = field(default_factory=dict)  # type: ignore[type-arg]
     """Options of the task. A checkpoint brings those that it was trained with."""
 

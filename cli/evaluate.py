@@ -13,7 +13,7 @@ class Evaluate(AgentFlags, BackendFlags):
     """Measure a trained policy or a controller over episodes without exploration."""
 
     policy: Positional[Annotated[str, arg(metavar="POLICY")]]
-    """Checkpoint, folder of a training, pid or geometric."""
+    """Checkpoint, folder of a training, pid, geometric or orca."""
     episodes: int = 20
     """Episodes to fly, from seeds that no training uses."""
 
@@ -24,11 +24,15 @@ class Evaluate(AgentFlags, BackendFlags):
         from ..experiments.metrics import Headline
         from ..experiments.results import evaluation_row
         from ..experiments.trajectories import fly_episodes
-        from ._env import chosen_env, load_checkpoint, policy_for, remote_env
+        from ._env import chosen_drones, chosen_env, load_checkpoint, policy_for, remote_env
 
         check_count("episodes", self.episodes)
         checkpoint = load_checkpoint(self.policy)
-        with remote_env(self, *chosen_env(self, checkpoint), backend=self.backend) as env:
+        drones = chosen_drones(self, checkpoint)
+        env_id, options = chosen_env(self, checkpoint)
+        with remote_env(
+            self, env_id, options, num_envs=drones, drones=drones, backend=self.backend
+        ) as env:
             headline = Headline.of(env.env_spec)
             policy = policy_for(self, checkpoint, env.env_spec)
             trajectories = fly_episodes(env, policy, self.episodes, "final")

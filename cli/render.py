@@ -13,7 +13,7 @@ from ..experiments.trajectories import Trajectory, flown_trajectories, recorded_
 from ..models.errors import expect
 from ._flags import EnvFlags, check_count
 
-_ALIKE: Final = ("pid", "geometric", "random")  # their words tell no two of them apart
+_ALIKE: Final = ("pid", "geometric", "orca", "random")  # their words tell no two of them apart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,8 +24,8 @@ class Render(EnvFlags):
     """
 
     what: Positional[tuple[str, ...]]
-    """Checkpoint, folder of a training, pid, geometric, random, or a journal (.mcap). Policies fly
-    evaluation episodes without exploration."""
+    """Checkpoint, folder of a training, pid, geometric, orca, random, or a journal (.mcap).
+    Policies fly evaluation episodes without exploration."""
     out: Path
     """film.mp4, film.gif, picture.png, or a folder for pictures 0001.png and so on. It must not
     exist."""
@@ -70,11 +70,11 @@ class Render(EnvFlags):
         self._check()
         offscreen_context(16, 16).free()  # flying takes longer than finding no OpenGL
         found = [self._find(what) for what in self.what]
-        names = self.names or _told_apart([name for _, name, _ in found], self.what)
-        colors = _colors([agent for agent, _, _ in found])
+        names = self.names or _told_apart([name for _, name, *_ in found], self.what)
+        colors = _colors([agent for agent, *_ in found])
         shots = [
-            Shot(name=name, color=color, trajectories=flown)
-            for name, color, (_, _, flown) in zip(names, colors, found, strict=True)
+            Shot(name=name, color=color, trajectories=flown, drones=drones)
+            for name, color, (_, _, flown, drones) in zip(names, colors, found, strict=True)
         ]
         longest = max(shot.trajectories[0].seconds for shot in shots)
         right, end = self.at is None or self.at <= longest, f"{longest:g} s, the flight's end"
@@ -99,19 +99,22 @@ class Render(EnvFlags):
         right = not (self.options and all(journals))
         expect(right, "env", "no options with a journal, which has its own")
 
-    def _find(self, what: str) -> tuple[str, str, list[Trajectory]]:
-        """Agent, name and trajectories of a policy or journal."""
-        from ._env import pilot_of
+    def _find(self, what: str) -> tuple[str, str, list[Trajectory], int]:
+        """Agent, name, trajectories and drones of a world, of a policy or journal."""
+        from ._env import chosen_drones, pilot_of
 
         episodes = range(self.episode, self.episode + self.episodes)
         path = Path(what)
         if path.suffix == ".mcap":
             recorded = recorded_trajectories(path, episodes, session=self.session, drone=self.drone)
-            return path.stem, path.stem, recorded
+            return path.stem, path.stem, recorded, 1
         checkpoint, policy, env = pilot_of(self, what)
+        drones = chosen_drones(self, checkpoint)
         agent = checkpoint.algorithm if checkpoint else what
-        flown = flown_trajectories(policy, *env, episodes, vehicle=self.vehicle, of="final")
-        return agent, what if what == "random" else agent_label(agent), flown
+        flown = flown_trajectories(
+            policy, *env, episodes, vehicle=self.vehicle, of="final", drones=drones
+        )
+        return agent, what if what == "random" else agent_label(agent), flown, drones
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -17,7 +17,7 @@ class Serve(AgentFlags):
     """
 
     policy: Positional[str]
-    """Checkpoint, folder of a training, pid or geometric."""
+    """Checkpoint, folder of a training, pid, geometric or orca."""
     listen: Annotated[str | None, arg(metavar="HOST:PORT")] = "127.0.0.1:8001"
     """Address to wait at."""
     episodes: int | None = None
@@ -34,13 +34,16 @@ class Serve(AgentFlags):
         episode = 0
         with remote_env(self, *chosen_env(self, checkpoint), num_envs=None) as env:
             policy = policy_for(self, checkpoint, env.env_spec)
-            drones = getattr(env, "num_envs", 1)
+            names = env.env_spec.agents
+            worlds = getattr(env, "num_envs", 1) // len(names)
             while self.episodes is None or episode < self.episodes:
-                count = min(drones, (self.episodes or math.inf) - episode)
+                count = int(min(worlds, (self.episodes or math.inf) - episode))
                 try:
-                    for flown in fly_episodes(env, policy, int(count), first=episode):
-                        print(f"episode {episode}: {words_of(flown)}", flush=True)
-                        episode += 1
+                    found = fly_episodes(env, policy, count, first=episode)
+                    for number, flown in enumerate(found):
+                        of = f" of {names[number % len(names)]}" if len(names) > 1 else ""
+                        print(f"episode {flown.episode}{of}: {words_of(flown)}", flush=True)
+                    episode += count
                 except LinkError as error:  # one that leaves is no error: another may come
                     print(error, flush=True)
         return 0

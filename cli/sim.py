@@ -22,8 +22,6 @@ class Sim(BackendFlags):
     """Address of this side, HOST:PORT; port 0 takes a free one."""
     num_envs: int | None = None
     """Drones in all. Default: those of one world."""
-    drones: int = 1
-    """Drones of each world, for a task of several."""
     codec: Literal["binary", "text"] = "binary"
     """binary, or the paper's text."""
     timeout: float = 120.0

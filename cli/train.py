@@ -95,6 +95,8 @@ class Train(AgentFlags, BackendFlags):
         named: dict[str, Any] = {"num_envs": self.num_envs, "env_steps": self.env_steps}
         named["backend"] = self.backend if "backend" in self.given else None
         chosen = {name: getattr(base, name) if n is None else n for name, n in named.items()}
+        if self.num_envs is None:  # whole worlds
+            chosen["num_envs"] = max(base.num_envs // self.drones, 1) * self.drones
         run = Run(config=config, **{**self.settings(Run), **chosen})
         if advice := _advice(run):
             print(f"note: {advice}", flush=True)
@@ -102,7 +104,7 @@ class Train(AgentFlags, BackendFlags):
         with (
             folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
             self._env(self.env_id, self.options, required=required, num_envs=run.num_envs,
-                      backend=run.backend) as env,
+                      drones=run.drones, backend=run.backend) as env,
             locked(folder),
         ):  # fmt: skip
             spec = env.env_spec  # of the simulator that came
@@ -143,7 +145,7 @@ class Train(AgentFlags, BackendFlags):
             for name, (then, now) in kept.other_versions().items():
                 print(f"note: {name} was {then} and is {now}: the numbers may differ", flush=True)
             with self._env(kept.env_id, kept.options, required=True, num_envs=kept.num_envs,
-                           backend=kept.backend) as env:  # fmt: skip
+                           drones=len(kept.spec.agents), backend=kept.backend) as env:  # fmt: skip
                 return self._train(Training.resume(kept, env), folder)
 
     def _env(self, env_id: str, options: dict[str, Any], **settings: Any) -> Any:
@@ -151,6 +153,7 @@ class Train(AgentFlags, BackendFlags):
         from ._env import local_env, remote_env
 
         if self.algorithm == "apg":
+            expect(settings["drones"] == 1, "drones", "1 with apg", f"{settings['drones']}")
             return local_env(self, env_id, options, settings["num_envs"], settings["backend"])
         return remote_env(self, env_id, options, num_simulators=self.num_simulators, **settings)
 

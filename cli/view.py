@@ -22,7 +22,7 @@ class View(EnvFlags):
     """
 
     what: Positional[str]
-    """Checkpoint, folder of a training, pid, geometric, random, or a journal (.mcap)."""
+    """Checkpoint, folder of a training, pid, geometric, orca, random, or a journal (.mcap)."""
     web: bool = False
     """Serve a page for browsers, for a machine without a display."""
     port: int = 8080
@@ -42,31 +42,41 @@ class View(EnvFlags):
         from ._env import words_of
 
         check_count("episodes", self.episodes)
-        trajectories = islice(self._trajectories(), self.episodes)
-        first = next(trajectories)
-        pace = Pace(first.spec.control_period, self.speed)
-        stage = Stage(self.world, vehicle=self.vehicle)
+        flights = islice(self._flights(), self.episodes)
+        first = next(flights)
+        spec, drones = first[0].spec, len(first)
+        pace = Pace(spec.control_period, self.speed)
+        names = spec.agents if drones > 1 else ()
+        stage = Stage(self.world, drones, vehicle=self.vehicle, names=names)
         surface = open_surface("web" if self.web else "window", stage, pace, self.port)
         with LiveView(stage, surface, pace) as live:
             print(f"showing {self.what} {surface.where} (Ctrl-C ends)", flush=True)
             while live.is_running and not live.surface.is_watched():
                 time.sleep(0.02)
-            for trajectory in chain((first,), trajectories):
-                if not all(live.draw_in_time(moment) for moment in moments(trajectory)):
+            for flight in chain((first,), flights):
+                told = [moments(one) for one in flight]
+                longest = max(map(len, told))
+                frames = zip(*(own + [own[-1]] * (longest - len(own)) for own in told), strict=True)
+                if not all(live.draw_in_time(*frame) for frame in frames):
                     break
-                print(f"episode {trajectory.episode}: {words_of(trajectory)}", flush=True)
+                for one, name in zip(flight, names or ("",), strict=True):
+                    of = f" of {name}" if name else ""
+                    print(f"episode {one.episode}{of}: {words_of(one)}", flush=True)
             while live.is_running and not live.wants:  # the last picture is still to come
                 time.sleep(0.02)
         return 0
 
-    def _trajectories(self) -> Iterator[Trajectory]:
-        """Episode after episode, as long as there are any."""
-        from ._env import pilot_of
+    def _flights(self) -> Iterator[list[Trajectory]]:
+        """Episode after episode, as long as there are any, each with a trajectory of each drone."""
+        from ._env import chosen_drones, pilot_of
 
         if (path := Path(self.what)).suffix == ".mcap":
             expect(not self.options, "env", "no options with a journal, which has its own")
-            yield from recorded_trajectories(path)
+            yield from ([one] for one in recorded_trajectories(path))
             return
-        _, policy, env = pilot_of(self, self.what)
+        checkpoint, policy, env = pilot_of(self, self.what)
+        drones = chosen_drones(self, checkpoint)
         for episode in count():
-            yield from flown_trajectories(policy, *env, [episode], vehicle=self.vehicle, of="final")
+            yield flown_trajectories(
+                policy, *env, [episode], vehicle=self.vehicle, of="final", drones=drones
+            )

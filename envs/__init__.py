@@ -45,5 +45,8 @@ for _module, _name in (
     ("landing", "Landing"),
     ("recovery", "Recovery"),
     ("payload_hover", "PayloadHover"),
+    ("formation", "Formation"),
+    ("crossing", "Crossing"),
+    ("escort", "Escort"),
 ):
     register(f"rotorgram/{_name}-v0", f"rotorgram.envs.tasks.{_module}:{_name}")

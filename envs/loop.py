@@ -60,6 +60,10 @@ def make_task(
     checked = kind.Options.from_options(options)
     craft = Vehicle.load(vehicle, linear_drag=checked.linear_drag)
     craft.substeps(checked.control_period)  # raises where they do not go together
+    most = f"at most {kind.drones}" if kind.drones > 1 else "1"
+    drones = shape[1]
+    right = type(drones) is int and 1 <= drones <= kind.drones
+    expect(right, "drones", f"{most} with {canonical_id(env_id)}", f"{drones!r}")
     task = kind(checked, craft, shape, xp)
     for name in ("controller", "observation"):
         if not hasattr(task, name):
@@ -229,10 +233,8 @@ class Loop(NotCopied):
         options: Mapping[str, Any] | None = None,
         **settings: Any,
     ) -> None:
-        draft = make_task(env_id, options or {}, vehicle)
+        draft = make_task(env_id, options or {}, vehicle, (1, drones))
         chosen, craft = draft.options, draft.vehicle
-        one = f"1 with {canonical_id(env_id)}, which is flown alone"
-        expect(drones == 1 or draft.several, "drones", one, f"{drones!r}")
         effects = EffectOptions.from_options(chosen.effects_on(craft.mass))
         randomize = Randomization(chosen.randomize, effects) if chosen.randomize else None
         self.world: World = make_world(

@@ -82,8 +82,12 @@ def options_type(env_id: str) -> "type[TaskOptions]":
     return task_type(env_id).Options
 
 
-def env_spec(env_id: str, options: Any = None, vehicle: Any = None) -> EnvSpec:
-    """The spec of an env with these options and this vehicle. Raises `InputError`."""
+def env_spec(env_id: str, options: Any = None, vehicle: Any = None, drones: int = 1) -> EnvSpec:
+    """The spec of an env with these options, this vehicle and so many drones in a world.
+
+    Raises `InputError`.
+    """
     from .loop import make_task, spec_of
 
-    return spec_of(canonical_id(env_id), make_task(env_id, options or {}, vehicle))
+    task = make_task(env_id, options or {}, vehicle, (1, drones))
+    return spec_of(canonical_id(env_id), task, drones)

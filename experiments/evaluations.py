@@ -62,5 +62,6 @@ def evaluate_stages(
 
 
 def _pair(config: EnvConfig, episodes: int) -> AbstractContextManager[Any]:
-    """A remote env that flies that many episodes at a time, or `MAX_BATCH`."""
-    return shared_pair(**config.env, num_envs=min(episodes, MAX_BATCH))
+    """A remote env that flies that many episodes at a time, or with `MAX_BATCH` drones."""
+    worlds = min(episodes, max(MAX_BATCH // config.drones, 1))
+    return shared_pair(**config.env, num_envs=worlds * config.drones)

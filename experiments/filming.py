@@ -58,12 +58,21 @@ class Shot:
     color: str
     """Of name and curve, "#RRGGBB"."""
     trajectories: list[Trajectory]
-    """One after the other."""
+    """One after the other; with several drones those of each episode, in the order of the drones.
+    """
+    drones: int = 1
+    """Of the world of each episode."""
 
     @cached_property
-    def moments(self) -> list[list[Moment]]:
-        """Of each trajectory."""
-        return [moments(one) for one in self.trajectories]
+    def episodes(self) -> list[list[Trajectory]]:
+        """The trajectories of each episode, one of each drone."""
+        flown, drones = self.trajectories, self.drones
+        return [flown[first : first + drones] for first in range(0, len(flown), drones)]
+
+    @cached_property
+    def moments(self) -> list[list[list[Moment]]]:
+        """Of each episode and drone."""
+        return [[moments(one) for one in world] for world in self.episodes]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,11 +127,11 @@ def film(
 
 def _times(shots: Sequence[Shot], config: Film, *, still: bool) -> list[tuple[int, float]]:
     """Episode and time of flight of every frame, from its start to its end."""
-    counts = {len(shot.trajectories) for shot in shots}
-    right = len(counts) == 1 and 0 not in counts
-    expect(right, "shots", "one or more, with as many episodes each")
-    episodes = zip(*(shot.trajectories for shot in shots), strict=True)
-    lengths = [max(one.seconds for one in flown) for flown in episodes]
+    counts = {(len(shot.episodes), shot.drones) for shot in shots}
+    right = len(counts) == 1 and min(counts)[0]
+    expect(right, "shots", "one or more, with as many episodes and drones each")
+    episodes = zip(*(shot.episodes for shot in shots), strict=True)
+    lengths = [max(one.seconds for world in flown for one in world) for flown in episodes]
     if config.at is not None:
         return [(0, config.at)]
     if still:
@@ -155,7 +164,9 @@ def _frames(
     columns, rows = grid(len(shots), config.width, config.height)
     width = (config.width - _SPACE * (columns - 1)) // columns
     height = (config.height - _SPACE * (rows - 1)) // rows
-    stage = Stage(config.world, vehicle=config.vehicle)
+    drones = shots[0].drones
+    names = shots[0].trajectories[0].spec.agents if drones > 1 else ()
+    stage = Stage(config.world, drones, vehicle=config.vehicle, names=names)
     flown = [one for shot in shots for one in shot.trajectories]
     with Canvas(stage, width, height, fast=config.fast) as canvas:
         panes = [_pane(shot, config, canvas, stage.twin(), flown, len(shots) > 1) for shot in shots]
@@ -175,27 +186,28 @@ def _pane(
 ) -> Generator[np.ndarray, tuple[int, float], None]:
     """Pictures of one flight, for each episode and time that are sent; drawn where they change."""
     overlay = Overlay(
-        canvas.width, canvas.height, title=shot.name, color=shot.color, like=shot.moments[0][0],
+        canvas.width, canvas.height, title=shot.name, color=shot.color, like=shot.moments[0][0][0],
         vehicle=stage.vehicle, period=shot.trajectories[0].spec.control_period,
         seconds=max(one.seconds for one in flown), scale=_scale(flown), numbers=config.overlay,
     )  # fmt: skip
     picture, shown = np.empty(0, np.uint8), (-1, -1)  # episode and step
     while True:
         episode, seconds = yield picture
-        trajectory, told = shot.trajectories[episode], shot.moments[episode]
-        step = trajectory.step_at(seconds)
+        world, told = shot.episodes[episode], shot.moments[episode]
+        trajectory = max(world, key=len)  # that of one that flew to the end
+        first, step = world[0], trajectory.step_at(seconds)
         if (episode, step) == shown:
             continue
         begin = shown[1] + 1 if episode == shown[0] else 0
-        for one in told[begin : step + 1]:  # its path has no gaps
-            stage.show(one)
+        for now in range(begin, step + 1):  # paths have no gaps
+            stage.show(*(own[min(now, len(own) - 1)] for own in told))
         shown = episode, step
         picture = canvas.draw(config.camera, stage)
         if config.overlay or named:
-            ended = config.overlay and step == len(trajectory)
-            note = trajectory.ending if ended and trajectory.ending != "truncated" else ""
-            values = trajectory.headline[: step + 1].tolist()
-            picture = overlay.draw(picture, told[step], values, note)
+            ended = config.overlay and step >= len(first)
+            note = first.ending if ended and first.ending != "truncated" else ""
+            values = first.headline[: step + 1].tolist()
+            picture = overlay.draw(picture, told[0][min(step, len(first))], values, note)
 
 
 def _scale(flown: Sequence[Trajectory]) -> tuple[float, float]:

@@ -36,8 +36,7 @@ def socket_pair(
     """A connected remote env, on free ports of the loopback interface: of a task that is registered
     here, with a vehicle by file or name, or the paper's, on a backend. One drone makes a
     `RemoteEnv`, more make a `RemoteVectorEnv` without autoreset, with so many `drones` to a world.
-    `record` is the MCAP file of the
-    agent's journal.
+    `record` is the MCAP file of the agent's journal.
 
     The simulator ends with this process, however this one ends.
 
@@ -46,7 +45,9 @@ def socket_pair(
         PeerSilent: The simulator runs and does not answer.
     """
     file = None if vehicle is None else str(vehicle)
-    config = EnvConfig(env_id=env_id, options=options or {}, vehicle=file, backend=backend)
+    config = EnvConfig(
+        env_id=env_id, options=options or {}, vehicle=file, backend=backend, drones=drones
+    )
     settings: dict[str, Any] = {
         "env_id": env_id, "options": config.options, "connect": False, "connect_timeout": _POLL,
         "timeout": _ANSWER_TIMEOUT, "record": record,

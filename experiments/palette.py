@@ -6,7 +6,7 @@ from typing import Final
 _LABELS: Final = {
     "vpg": "VPG", "a2c": "A2C", "ppo": "PPO", "ippo": "IPPO", "mappo": "MAPPO", "sac": "SAC",
     "apg": "APG", "sb3-a2c": "SB3 A2C", "sb3-ppo": "SB3 PPO", "sb3-sac": "SB3 SAC", "pid": "PID",
-    "geometric": "Geometric",
+    "geometric": "Geometric", "orca": "ORCA",
 }  # fmt: skip
 # Okabe and Ito's palette: told apart by readers with colour-blindness. The second of a pair is the
 # same hue, lighter, for a dark ground.
@@ -16,6 +16,7 @@ _COLORS: Final = {
     "sb3-a2c": ("#009E73", "#2CC998"),
     "pid": ("#555555", "#B4BCC4"),
     "geometric": ("#555555", "#B4BCC4"),
+    "orca": ("#555555", "#B4BCC4"),
 }
 _SPARE: Final = (
     ("#CC79A7", "#E29AC3"),

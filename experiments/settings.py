@@ -40,6 +40,8 @@ class EnvConfig:
     """File or name of the vehicle; None: the paper's."""
     backend: Backend = "mujoco"
     """What steps it in training. A trained policy is always evaluated on `mujoco`."""
+    drones: int = 1
+    """Drones of each world, for a task of several."""
 
     def __post_init__(self) -> None:
         expect(self.backend in BACKENDS, "backend", " or ".join(BACKENDS), repr(self.backend))
@@ -51,7 +53,8 @@ class EnvConfig:
     @property
     def env(self) -> dict[str, Any]:
         """Keyword arguments of `EnvConfig` and `pairs.socket_pair`, on `mujoco`."""
-        return {"env_id": self.env_id, "options": self.options, "vehicle": self.vehicle}
+        env = {"env_id": self.env_id, "options": self.options, "vehicle": self.vehicle}
+        return {**env, "drones": self.drones}
 
     @property
     def training_env(self) -> dict[str, Any]:
@@ -81,6 +84,8 @@ class Run(EnvConfig):
         super().__post_init__()
         expect(self.seed >= 0, "seed", "0 or more", str(self.seed))
         expect(self.num_envs >= 1, "num_envs", "1 or more", str(self.num_envs))
+        whole = self.num_envs % self.drones == 0
+        expect(whole, "num_envs", f"a multiple of drones = {self.drones}", str(self.num_envs))
         least = 1
         if isinstance(self.config, A2CConfig | SACConfig | APGConfig):
             least = self.config.rollout_size(self.num_envs)

@@ -82,7 +82,8 @@ class Training:
         try:
             names = ("algorithm", "env_id", "options", "backend", "seed", "env_steps", "num_envs")
             config = agents.preset(kept.algorithm, "tuned", **kept.config)
-            run = Run(config=config, **{name: getattr(kept, name) for name in names})
+            kept_settings = {name: getattr(kept, name) for name in names}
+            run = Run(config=config, drones=len(kept.spec.agents), **kept_settings)
         except (InputError, TypeError, ValueError) as error:
             raise CheckpointError(f"checkpoint: its parts do not fit together: {error}") from None
         return cls(run, env, kept=kept)

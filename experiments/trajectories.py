@@ -12,8 +12,9 @@ import numpy as np
 
 from ..agents.episodes import LOST
 from ..agents.policies import Policy
-from ..envs.autoreset import AdvancingVectorEnv
+from ..envs.autoreset import AdvancingVectorEnv, worlds_done
 from ..envs.spec import Discrete, EnvSpec, canonical_id, component_names
+from ..envs.vector import LocalVectorEnv
 from ..models.errors import InputError, expect
 from ..udp.protocol.messages import Command, State
 
@@ -119,46 +120,52 @@ def fly(env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int =
 
 
 def fly_episodes(
-    env: Any, policy: Policy, episodes: int, of: EpisodeSet = "curve", first: int = 0
+    env: Any, policy: Policy | None, episodes: int, of: EpisodeSet = "curve", first: int = 0
 ) -> list[Trajectory]:
     """So many evaluation episodes of a set, from the number `first` on, in their order.
 
     The env has one drone, or is a vector env without autoreset. That one flies as many at a time as
-    it has drones, each with a copy of the policy and to the same bits as one after the other.
+    it has worlds, each drone with a copy of the policy and to the same bits as one after the other.
+    Without a policy actions are random. An episode of several drones of one world gives a
+    trajectory for each, in their order.
     """
     seeds = {first + i: evaluation_seed(first + i, of) for i in range(episodes)}
     if not isinstance(env, AdvancingVectorEnv):
         return [fly(env, policy, seed, episode) for episode, seed in seeds.items()]
-    found: dict[int, Trajectory] = {}
+    found: dict[int, list[Trajectory]] = {}
     while missing := [episode for episode in seeds if episode not in found]:
-        batch = missing[: env.num_envs]  # again, where a simulator was lost
+        batch = missing[: env.num_envs // len(env.env_spec.agents)]  # again those that were lost
         found |= _fly_batch(env, policy, {episode: seeds[episode] for episode in batch})
-    return [found[episode] for episode in seeds]
+    return [trajectory for episode in seeds for trajectory in found[episode]]
 
 
 def _fly_batch(
-    env: AdvancingVectorEnv, policy: Policy, seeds: Mapping[int, int]
-) -> dict[int, Trajectory]:
-    """At most N episodes, one in each drone; those of a lost simulator are missing."""
+    env: AdvancingVectorEnv, policy: Policy | None, seeds: Mapping[int, int]
+) -> dict[int, list[Trajectory]]:
+    """At most W episodes, one in each world; those of a lost simulator are missing."""
     spec, count = env.env_spec, env.num_envs
-    policies = [copy.deepcopy(policy) for _ in seeds]
+    drones = len(spec.agents)
+    policies = [copy.deepcopy(policy) for _ in range(len(seeds) * len(spec.agents))]
     for one in policies:
-        one.reset()
+        if one is not None:
+            one.reset()
     if isinstance(spec.action, Discrete):
         actions: np.ndarray = np.zeros(count, np.int64)
     else:
         actions = np.zeros((count, *spec.action.shape), np.float32)
-    env.reset(seed=[*seeds.values(), *[0] * (count - len(seeds))])
+    given = [seed for seed in seeds.values() for _ in spec.agents]
+    env.reset(seed=[*given, *[0] * (count - len(given))])
     rows, rewards = [env.telemetry], []
     lengths, terminated = np.zeros(count, int), np.zeros(count, bool)
     lost = env.lost.copy()
-    done = lost | (np.arange(count) >= len(seeds))
+    done = lost | (np.arange(count) >= len(given))
     while not done.all():
         told: Any = env.observations
         for drone in np.flatnonzero(~done).tolist():
             own = {k: v[drone] for k, v in told.items()} if isinstance(told, dict) else told[drone]
-            actions[drone] = policies[drone].act(own)
-        env.advance(actions, np.zeros(count, bool), None, done)
+            one = policies[drone]
+            actions[drone] = env.single_action_space.sample() if one is None else one.act(own)
+        env.advance(actions, np.zeros(count, bool), None, worlds_done(done, drones))
         rows.append(env.telemetry)
         rewards.append(env.rewards)
         lengths += ~done
@@ -167,16 +174,20 @@ def _fly_batch(
         done = done | env.terminated | env.truncated
     arrays = _stacked(rows)
     totals = np.array(rewards, np.float64).reshape(len(rewards), count)
-    return {
-        episode: Trajectory(
+
+    def flown(drone: int, episode: int) -> Trajectory:
+        return Trajectory(
             spec=spec,
             telemetry={name: array[: lengths[drone] + 1, drone] for name, array in arrays.items()},
             rewards=totals[: lengths[drone], drone],
             ending="terminated" if terminated[drone] else "truncated",
             episode=episode,
         )
-        for drone, episode in enumerate(seeds)
-        if not lost[drone]
+
+    return {
+        episode: [flown(drone, episode) for drone in range(world * drones, (world + 1) * drones)]
+        for world, episode in enumerate(seeds)
+        if not lost[world * drones]
     }
 
 
@@ -192,11 +203,17 @@ def flown_trajectories(
     *,
     vehicle: str | Path | None = None,
     of: EpisodeSet = "curve",
+    drones: int = 1,
 ) -> list[Trajectory]:
-    """Evaluation episodes of a set by number, flown in process: see `fly`. The vehicle is a
-    file or a name, None the paper's.
+    """Evaluation episodes of a set by number, flown in process: see `fly` and, for several drones
+    of one world, `fly_episodes`. The vehicle is a file or a name, None the paper's.
     """
     name = canonical_id(env_id)  # a checkpoint may name a module, which is not to be imported
+    if drones > 1:
+        settings: dict[str, Any] = {"drones": drones, "vehicle": vehicle, **options}
+        with closing(LocalVectorEnv(name, drones, autoreset_mode="Disabled", **settings)) as world:
+            found = [fly_episodes(world, policy, 1, of, first=episode) for episode in episodes]
+            return [trajectory for flown in found for trajectory in flown]
     made = gym.make(name, disable_env_checker=True, vehicle=vehicle, **options)
     with closing(made.unwrapped) as env:
         return [fly(env, policy, evaluation_seed(episode, of), episode) for episode in episodes]

@@ -122,6 +122,17 @@ class Vehicle:
         """Largest thrust of each rotor, shape (R,), N."""
         return np.array([rotor.high for rotor in self.rotors])
 
+    @cached_property
+    def radius(self) -> float:
+        """Of a sphere about the body's origin that holds all that can collide, m."""
+        model, data = self.model, mujoco.MjData(self.model)
+        data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
+        mujoco.mj_kinematics(model, data)
+        solid = (model.geom_contype | model.geom_conaffinity) > 0
+        solid &= np.isin(model.geom_bodyid, craft_bodies(model))
+        reach = np.linalg.norm(data.geom_xpos, axis=1) + model.geom_rbound
+        return float(reach[solid].max(initial=0.0))
+
     @property
     def timestep(self) -> float:
         """Physics step, s."""

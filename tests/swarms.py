@@ -21,7 +21,7 @@ class Options(TaskOptions):
 class Rise(Task):
     """Drones in a row, 5 m apart. One that is 0.5 m above or below its start is out."""
 
-    Options, several = Options, True
+    Options, drones = Options, 64
     metrics = (Metric(name="risen", unit="m"),)
 
     def setup(self):

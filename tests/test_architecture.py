@@ -81,8 +81,10 @@ def test_a_task_knows_the_world_and_the_spec() -> None:
     ours = {name for name in names if name.startswith("rotorgram.")}
     assert packages(names) == {"envs", "models", "sim"}
     assert {name for name in ours if ".envs." in name} == {
+        "rotorgram.envs.delay",
         "rotorgram.envs.spec",
         "rotorgram.envs.tasks.flight",
+        "rotorgram.envs.tasks.swarm",
         "rotorgram.envs.tasks.task",
     }
     assert {name for name in ours if ".sim" in name} == {"rotorgram.sim"}

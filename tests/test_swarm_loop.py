@@ -75,6 +75,6 @@ def test_half_a_world_cannot_be_reset_or_frozen() -> None:
 
 
 def test_a_task_that_is_flown_alone_refuses_more() -> None:
-    expected = "drones: expected 1 with rotorgram/Hover-v0, which is flown alone, got 2"
+    expected = "drones: expected 1 with rotorgram/Hover-v0, got 2"
     with pytest.raises(InputError, match=expected):
         Loop("rotorgram/Hover-v0", drones=2)

@@ -135,8 +135,7 @@ class Task:
         Options: Dataclass of the task's options.
         metrics: Measures of how well it is done. The first is the headline.
         choices: Names of draws that a reset's options may choose.
-        several: Whether it is flown by several drones of one world, which it has to keep apart at
-            the start.
+        drones: Most drones of one world, which it has to keep apart at the start.
 
     Attributes:
         options: As given.
@@ -152,7 +151,7 @@ class Task:
     Options: ClassVar[type[TaskOptions]] = TaskOptions
     metrics: ClassVar[tuple[Metric, ...]] = ()
     choices: ClassVar[tuple[str, ...]] = ()
-    several: ClassVar[bool] = False
+    drones: ClassVar[int] = 1
 
     controller: Controller
     observation: tuple[ArraySpec, ...]

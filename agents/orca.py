@@ -1,0 +1,158 @@
+"""Optimal reciprocal collision avoidance: each drone for itself, from what it hears of others.
+
+J. van den Berg, S. J. Guy, M. Lin and D. Manocha, "Reciprocal n-Body Collision Avoidance",
+Robotics Research, STAR 70, Springer 2011, in three dimensions.
+"""
+
+import math
+import re
+from typing import Any, ClassVar, Final
+
+import numpy as np
+
+from ..envs.spec import ArraySpec, EnvSpec
+from ..models.errors import expect
+from .policies import flat
+
+HORIZON: Final = 3.0  # Time ahead for which nothing may touch, s
+ROOM: Final = 1.15  # Spheres are taken for larger, since a velocity is not reached at once
+APPROACH: Final = 0.8  # Wanted velocity over the distance from the goal, 1/s
+SPEED: Final = 0.6  # Share of the range of the velocity that is asked for
+_ROUNDS: Final = 60  # Most rounds of projections
+_DONE: Final = 1e-6  # m/s
+
+Vector = tuple[float, float, float]
+Plane = tuple[Vector, float]
+"""A normal n and a number c: velocities v with n · v >= c are allowed."""
+
+
+class Orca:
+    """Flies straight to the goal, with the nearest velocity that avoids all neighbours.
+
+    Each of two drones takes half of the change of velocity that keeps their spheres apart for
+    `HORIZON` seconds, and relies on the other for the rest. That is a half-space of velocities for
+    each neighbour; of those that all allow, within the range of speed, the nearest to the wanted
+    one is flown. The simulator flies it: the env's action is that of the level `velocity`.
+
+    The observation has to be that of a task for several drones (`envs/tasks/swarm.py`). Raises
+    `InputError` for an env that lacks what it needs.
+    """
+
+    options: ClassVar[dict[str, Any]] = {"action": "velocity"}
+    """Options of the env that it flies."""
+
+    def __init__(self, spec: EnvSpec) -> None:
+        action, seen = spec.action, spec.observation[0]
+        right = isinstance(action, ArraySpec) and action.components[:1] == ("velocity x",)
+        level = "actions of the level velocity (--env.action velocity)"
+        expect(right, "orca", level, ", ".join(action.components) or "others")
+        assert isinstance(action, ArraySpec)
+        found = re.search(r"drones with a radius of (\S+) m", seen.frame)
+        expect(found, "orca", "a task for several drones", spec.env_id)
+        assert found is not None
+        self._radius = 2 * ROOM * float(found[1])
+        self._units = [float(unit.split()[0]) for unit in action.unit]
+        names = list(seen.components)
+        first = "neighbour 1 - position x"
+        self._goal, self._velocity, self._nose = (
+            names.index(f"{name} x") for name in ("goal - position", "velocity", "nose")
+        )
+        self._others = range(names.index(first), len(names), 7) if first in names else range(0)
+        ahead = "target velocity x"
+        self._ahead = names.index(ahead) if ahead in names else None
+        self._spec = spec
+
+    def reset(self) -> None:
+        """Nothing of an episode is kept."""
+
+    def act(self, observation: Any) -> Any:
+        """Velocity and yaw rate as the env's action, float32, shape (4,)."""
+        numbers = flat(observation, self._spec).astype(np.float64).tolist()
+
+        def vector(first: int) -> Vector:
+            return numbers[first], numbers[first + 1], numbers[first + 2]
+
+        own, goal = vector(self._velocity), vector(self._goal)
+        moves = (0.0, 0.0, 0.0) if self._ahead is None else vector(self._ahead)
+        most = SPEED * self._units[0]
+        wanted = _within(_sum(moves, goal, APPROACH), most)
+        planes = [
+            avoiding(vector(at), vector(at + 3), own, self._radius, self._spec.control_period)
+            for at in self._others
+            if numbers[at + 6]
+        ]
+        x, y, z = nearest(wanted, planes, most)
+        c, s, _ = vector(self._nose)
+        size = math.hypot(c, s) or 1.0
+        c, s = c / size, s / size
+        action = np.array((c * x + s * y, c * y - s * x, z, 0.0)) / self._units
+        return np.clip(action, -1.0, 1.0).astype(np.float32)
+
+
+def avoiding(there: Vector, moves: Vector, own: Vector, radius: float, period: float) -> Plane:
+    """Own velocities that take half of the care for a neighbour: the paper's Equation 5.
+
+    Args:
+        there: Position of the neighbour minus the own, m.
+        moves: Its velocity minus the own, m/s.
+        own: Velocity, m/s.
+        radius: Distance that the positions have to keep, m.
+        period: Time in which spheres that overlap have to part, s.
+    """
+    approach = (-moves[0], -moves[1], -moves[2])
+    square = _dot(there, there)
+    apart = square > radius * radius
+    horizon = HORIZON if apart else period
+    # The obstacle is a cone along `there`, cut off by a sphere about `there` / horizon.
+    to_cap = _sum(approach, there, -1.0 / horizon)
+    size, along = math.sqrt(_dot(to_cap, to_cap)), _dot(to_cap, there)
+    if not apart or (along < 0.0 and along * along > radius * radius * size * size):
+        away, change = to_cap, radius / horizon - size
+    else:
+        # The point t · `there` of the axis whose sphere, of radius t R, is nearest on its side.
+        leg = square - radius * radius
+        cross = square * _dot(approach, approach) - _dot(there, approach) ** 2
+        share = (_dot(there, approach) + radius * math.sqrt(max(cross, 0.0) / leg)) / square
+        away = _sum(approach, there, -share)
+        size = math.sqrt(_dot(away, away))
+        change = radius * share - size
+    if size < 1e-9:  # straight at the middle: to the right, as at sea
+        away, size = (there[1], -there[0], 1e-9), math.hypot(there[0], there[1]) or 1e-9
+    normal = (away[0] / size, away[1] / size, away[2] / size)
+    return normal, _dot(normal, own) + 0.5 * change
+
+
+def nearest(wanted: Vector, planes: list[Plane], most: float) -> Vector:
+    """The allowed velocity next to the wanted one and no faster than `most`, m/s.
+
+    Dykstra's alternating projections. Where nothing is allowed, it ends between the planes.
+    """
+    found = wanted
+    left: list[Vector] = [(0.0, 0.0, 0.0)] * (len(planes) + 1)
+    for _ in range(_ROUNDS):
+        before = found
+        for place in range(len(left)):
+            point = _sum(found, left[place], 1.0)
+            if place == len(planes):
+                found = _within(point, most)
+            else:
+                normal, least = planes[place]
+                found = _sum(point, normal, max(0.0, least - _dot(normal, point)))
+            left[place] = _sum(point, found, -1.0)
+        change = _sum(found, before, -1.0)
+        if _dot(change, change) < _DONE * _DONE:
+            break
+    return found
+
+
+def _within(velocity: Vector, most: float) -> Vector:
+    size = math.sqrt(_dot(velocity, velocity))
+    return velocity if size <= most else _sum((0.0, 0.0, 0.0), velocity, most / size)
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _sum(a: Vector, b: Vector, times: float) -> Vector:
+    return a[0] + times * b[0], a[1] + times * b[1], a[2] + times * b[2]

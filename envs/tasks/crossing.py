@@ -1,0 +1,102 @@
+"""`rotorgram/Crossing-v0`: drones on a ring change to the opposite places without touching."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...sim import Array, Draw, Pose, WorldState, constant, stack
+from ..spec import Metric
+from .swarm import JITTER, Swarm, SwarmOptions, ring
+
+
+@dataclass(frozen=True, kw_only=True)
+class CrossingOptions(SwarmOptions):
+    """Options of `rotorgram/Crossing-v0`."""
+
+    episode_length: int = 1000
+    """Control steps after which an episode is truncated."""
+
+
+class Crossing(Swarm):
+    """Each drone flies from its place on a ring to the opposite one: all meet in the middle.
+
+    ## Observation, `float32`, shape (15 + R + 7 k,), k = 7 (`neighbours`)
+
+    | index | quantity | unit | frame |
+    |---|---|---|---|
+    | 0-2 | goal minus position | m | world |
+    | 3-5 | velocity | m/s | world |
+    | 6-8 | direction of body x, the nose | 1 | world |
+    | 9-11 | direction of body z, the thrust | 1 | world |
+    | 12-14 | body rates | rad/s | body |
+    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+    | then, of each neighbour, the nearest first: 3 | its position minus the own | m | world |
+    | 3 | its velocity minus the own | m/s | world |
+    | 1 | 1; 0, as the six before, where no further drone is heard | 1 | |
+
+    ## Action, `Box(-1, 1, (4,), float32)`
+
+    Velocity in the frame turned by the heading, and yaw rate, as shares of their ranges (the level
+    `velocity`).
+
+    ## Reward
+
+    (s - d) / (s + d) for the distance d to the goal with s = 0.5 m; -0.02 s/rad times the size of
+    the body rates; with less than a diameter between the drone's sphere and another, down to -0.5
+    where they touch and further below; and -20 on the step that terminates.
+
+    ## Start, termination, truncation
+
+    At rest, level, at hover thrust, on a level ring that is turned by lot, neighbours three
+    diameters (`spacing`) apart, moved by up to 0.2 of that along each axis. The ring is no smaller
+    than one of six drones.
+
+    *Terminated*, for this drone alone: contact, a tilt above 90°, or 10 m (`margin`) further from
+    its goal than any start. Its rotors stand still, and the others fly on. *Truncated*: after
+    1000 steps of 0.02 s.
+    """
+
+    Options = CrossingOptions
+    metrics = (
+        Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e"),
+        Metric(name="clearance", unit="m", goal="high"),
+    )
+
+    def setup(self) -> None:
+        """See the class."""
+        count = self.shape[1] if self.shape else 1
+        places = ring(count)
+        radius = max(float(np.linalg.norm(places[0])), 1.0)  # of six
+        angle = 2 * math.pi * np.arange(count) / count
+        self._angles, self._radius = angle if self.shape else 0.0, radius * self.gap
+        self.reach = 2 * self._radius + 2 * JITTER * self.gap
+        self._turn: Array = 0.0
+        self.prepare()
+
+    def begin(self, mask: Array, draw: Draw) -> Pose:
+        """At rest, level, on the ring."""
+        turn = draw.uniform(-math.pi, math.pi)
+        jitter = draw.uniform(-JITTER, JITTER, (3,)) * self.gap
+        if self.count > 1:
+            turn = turn[:, :1]  # one for all
+        self.keep(mask, _turn=turn + 0.0 * jitter[..., 0])
+        position = self._opposite(turn + math.pi) + jitter
+        self.hear(mask, draw, position)
+        return Pose(position=position)
+
+    def _opposite(self, turn: Array) -> Array:
+        """Where drones fly to from a ring turned by an angle, rad: world frame, m, (W, A, 3)."""
+        xp = self.xp
+        angle = turn + constant(self._angles, turn) + math.pi
+        x, y = self._radius * xp.cos(angle), self._radius * xp.sin(angle)
+        cx, cy, cz = self.options.center
+        return stack((x + cx, y + cy, 0.0 * x + cz))
+
+    def observe(self, state: WorldState) -> dict[str, Array]:
+        """See the table of the class."""
+        return self.seen(state, *self.around(state))
+
+    def goal(self, state: WorldState) -> Array:
+        """The place opposite to the start of each drone."""
+        return self._opposite(self._turn)

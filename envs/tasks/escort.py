@@ -1,0 +1,122 @@
+"""`rotorgram/Escort-v0`: drones fly around a target that moves."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...sim import Array, Draw, Pose, WorldState, stack
+from ..spec import Metric
+from .flight import FURTHEST, MOST_SPEED
+from .swarm import JITTER, Swarm, SwarmOptions, grid, ring
+from .task import check_number
+
+
+@dataclass(frozen=True, kw_only=True)
+class EscortOptions(SwarmOptions):
+    """Options of `rotorgram/Escort-v0`."""
+
+    target_speed: float = 1.0
+    """Largest speed of the target, m/s."""
+    target_path: float = 5.0
+    """Furthest distance of the target from the center along x and y, m."""
+
+    def check(self) -> None:
+        """Check the options of this task. Raises `InputError`."""
+        super().check()
+        check_number(self, "target_speed", 0.0, MOST_SPEED, "m/s")
+        check_number(self, "target_path", 0.01, FURTHEST, "m")
+
+
+class Escort(Swarm):
+    """Each drone keeps its place on a ring about a target that moves on a smooth path.
+
+    With amplitude a (`target_path`) and largest speed v (`target_speed`) the target is at
+    a (sin(ω t + α), sin(c ω t + β)) from the center, level, with ω = v / (a sqrt(1 + c²)). The
+    ratio c, from 0.5 to 2, and the phases are drawn for each episode.
+
+    ## Observation, `float32`, shape (18 + R + 7 k,), k = 7 (`neighbours`)
+
+    | index | quantity | unit | frame |
+    |---|---|---|---|
+    | 0-2 | own place minus position | m | world |
+    | 3-5 | velocity | m/s | world |
+    | 6-8 | direction of body x, the nose | 1 | world |
+    | 9-11 | direction of body z, the thrust | 1 | world |
+    | 12-14 | body rates | rad/s | body |
+    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+    | 15 + R... | velocity of the target | m/s | world |
+    | then, of each neighbour, the nearest first: 3 | its position minus the own | m | world |
+    | 3 | its velocity minus the own | m/s | world |
+    | 1 | 1; 0, as the six before, where no further drone is heard | 1 | |
+
+    ## Action, `Box(-1, 1, (4,), float32)`
+
+    Velocity in the frame turned by the heading, and yaw rate, as shares of their ranges (the level
+    `velocity`).
+
+    ## Reward
+
+    (s - d) / (s + d) for the distance d to the own place with s = 0.5 m; -0.02 s/rad times the size
+    of the body rates; with less than a diameter between the drone's sphere and another, down to
+    -0.5 where they touch and further below; and -20 on the step that terminates.
+
+    ## Start, termination, truncation
+
+    At rest, level, at hover thrust, in the cells of a grid about the target by lot, moved by up to
+    0.2 of the distance between cells along each axis.
+
+    *Terminated*, for this drone alone: contact, a tilt above 90°, or 10 m (`margin`) further from
+    its place than any start. Its rotors stand still, and the others fly on. *Truncated*: after 500
+    steps of 0.02 s.
+    """
+
+    Options = EscortOptions
+    metrics = (
+        Metric(name="position_error", unit="m", settled=0.3, held=0.3, symbol="e"),
+        Metric(name="clearance", unit="m", goal="high"),
+    )
+
+    def setup(self) -> None:
+        """See the class."""
+        count = self.shape[1] if self.shape else 1
+        self._slots = ring(count) * self.gap
+        starts = np.abs(grid(count)).max(axis=0) * self.gap + JITTER * self.gap
+        self.reach = float(np.linalg.norm(np.abs(self._slots).max(axis=0) + starts))
+        self._time = self._ratio = self._alpha = self._beta = 0.0
+        speeds = tuple((f"target velocity {axis}", "m/s", MOST_SPEED) for axis in "xyz")
+        self.prepare(speeds)
+
+    def begin(self, mask: Array, draw: Draw) -> Pose:
+        """At rest, level, in the cells of a grid about the target, by lot."""
+        ratio = draw.uniform(0.5, 2.0)
+        alpha, beta = (draw.uniform(-math.pi, math.pi) for _ in range(2))
+        if self.count > 1:  # one for all
+            ratio, alpha, beta = (x[:, :1] + 0.0 * x for x in (ratio, alpha, beta))
+        self.keep(mask, _ratio=ratio, _alpha=alpha, _beta=beta, _time=0.0 * ratio)
+        position = self.cells(draw) + self.target()[0]
+        self.hear(mask, draw, position)
+        return Pose(position=position)
+
+    def target(self) -> tuple[Array, Array]:
+        """Position from the center and velocity of the target: world frame, m, m/s, (W, A, 3)."""
+        xp, a = self.xp, self.options.target_path
+        slow = self.options.target_speed / (a * xp.sqrt(1.0 + self._ratio * self._ratio))
+        fast = self._ratio * slow
+        first, second = slow * self._time + self._alpha, fast * self._time + self._beta
+        zero = 0.0 * first
+        place = stack((a * xp.sin(first), a * xp.sin(second), zero))
+        return place, stack((a * slow * xp.cos(first), a * fast * xp.cos(second), zero))
+
+    def remember(self, state: WorldState, mask: Array) -> None:
+        """Move the target; listen."""
+        self.keep(mask, _time=self._time + self.options.control_period)
+        super().remember(state, mask)
+
+    def observe(self, state: WorldState) -> dict[str, Array]:
+        """See the table of the class."""
+        return self.seen(state, self.target()[1], *self.around(state))
+
+    def goal(self, state: WorldState) -> Array:
+        """The place of each drone about the target."""
+        return self.slots_at(self._slots, state) + self.target()[0]

@@ -1,0 +1,291 @@
+"""What tasks for several drones share: who hears whom by radio, and the room between drones."""
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Final
+
+import numpy as np
+
+from ...models.errors import expect
+from ...sim import Array, Draw, WorldState, constant
+from ..delay import Delay
+from .flight import (
+    AIR,
+    ERROR_SCALE,
+    FURTHEST,
+    LEAST_TILT_COSINE,
+    MOST_SPEED,
+    RATE_WEIGHT,
+    TERMINATION_REWARD,
+    Flight,
+    check_point,
+    length,
+)
+from .task import Outcome, TaskOptions, check_number, check_whole
+
+MOST_DRONES: Final = 128
+FORGOTTEN: Final = 1.0  # A drone that was not heard for so long is no neighbour any more, s
+ROOM_WEIGHT: Final = 0.5  # Cost of spheres that touch; nothing from a diameter apart on
+JITTER: Final = 0.2  # Of a start, in each axis, over the distance between starts
+
+
+@dataclass(frozen=True, kw_only=True)
+class SwarmOptions(TaskOptions):
+    """Options that the tasks for several drones share."""
+
+    action: str = "velocity"
+    episode_length: int = 500
+    """Control steps after which an episode is truncated."""
+    center: tuple[float, float, float] = (0.0, 0.0, 10.0)
+    """Middle of starts and goals: x, y, z in MuJoCo's world frame (z up), m."""
+    spacing: float = 3.0
+    """Distance between neighbouring starts, and goals, over the diameter of the vehicle."""
+    margin: float = 10.0
+    """An episode terminates for a drone that is so much further from its goal than any start, m."""
+    neighbours: int = 7
+    """Drones in the observation of each: the nearest that it hears."""
+    radio_range: float = 100.0
+    """Furthest distance at which a drone is heard, m."""
+    radio_delay: int = 0
+    """Control steps from what a drone says to where it is heard."""
+    radio_loss: float = 0.0
+    """Share of messages that are lost, each for itself: of one drone to another in one step."""
+
+    def check(self) -> None:
+        """Check the options that all share. Raises `InputError`."""
+        check_point(self, "center")
+        check_number(self, "spacing", 2.0, 1e3, "diameters")
+        check_number(self, "margin", 0.1, FURTHEST, "m")
+        check_whole(self, "neighbours", 0, 16, " of drones")
+        check_number(self, "radio_range", 0.0, FURTHEST, "m")
+        check_whole(self, "radio_delay", 0, 100, " of control steps")
+        check_number(self, "radio_loss", 0.0, 1.0)
+
+
+class Swarm(Flight):
+    """Base of tasks that several drones fly, each to a goal of its own, without touching.
+
+    The observation is that of `Flight`, further numbers of the task, and of each neighbour, the
+    nearest first, seven numbers:
+
+    | quantity | unit | frame |
+    |---|---|---|
+    | its position minus the own, as far as it was heard | m | world |
+    | its velocity minus the own | m/s | world |
+    | 1; 0, as all numbers before, where there is none | 1 | |
+
+    A derived class sets `reach` before `prepare`, calls `hear` in `begin`, and has `goal`.
+    """
+
+    drones: ClassVar[int] = MOST_DRONES
+    reach = 0.0
+    """Furthest distance of a start from its goal, m."""
+
+    def prepare(self, more: tuple[tuple[str, str, float], ...] = ()) -> None:
+        """Set `observation`: that of `Flight`, further numbers, and the neighbours."""
+        options, vehicle = self.options, self.vehicle
+        self.count = self.shape[1] if self.shape else 1
+        lowest = options.center[2] - JITTER * self.gap
+        least = vehicle.rest_height + AIR
+        expected = f"a height of at least {least + JITTER * self.gap:.4g} m above the ground"
+        expect(lowest >= least, "center", expected, f"{options.center[2]:g}")
+        self.band = self.reach + options.margin
+        names = [f"neighbour {n}" for n in range(1, options.neighbours + 1)]
+        told: list[tuple[str, str, float]] = []
+        for name in names:
+            told += [(f"{name} - position {axis}", "m", options.radio_range) for axis in "xyz"]
+            told += [(f"{name} velocity - velocity {axis}", "m/s", MOST_SPEED) for axis in "xyz"]
+            told.append((f"{name} is there", "1", 1.0))
+        self.describe(self.band, [*more, *told])
+        spheres = f"; drones with a radius of {vehicle.radius:.7g} m"
+        self.observation = tuple(replace(a, frame=a.frame + spheres) for a in self.observation)
+        period = options.control_period
+        self.radio = Radio(options, period, self.shape) if self.count > 1 else None
+        self._down: Array = False
+
+    @property
+    def gap(self) -> float:
+        """Distance between neighbouring starts, and goals, m."""
+        spacing: float = self.options.spacing
+        return 2 * spacing * self.vehicle.radius
+
+    def cells(self, draw: Draw) -> Array:
+        """Starts: cells of a level grid about the center, one for each drone by lot, shape (W, A,
+        3), world frame, m.
+        """
+        jitter = draw.uniform(-JITTER, JITTER, (3,)) * self.gap
+        lots = draw.uniform(0.0, 1.0)
+        start = jitter + constant(np.array(self.options.center), jitter)
+        if self.count == 1:
+            return start
+        places = np.argsort(lots, axis=-1, kind="stable")
+        return start + grid(self.count)[places] * self.gap
+
+    def hear(self, mask: Array, draw: Draw, position: Array) -> None:
+        """Begin episodes: each drone has heard where those in range start, at rest."""
+        lots = draw.uniform(0.0, 1.0)  # drawn with and without a loss: it moves no start
+        if self.radio is not None:
+            self.radio.begin(mask[..., 0], position, lots)
+            self._down = np.where(mask, False, self._down)
+
+    def remember(self, state: WorldState, mask: Array) -> None:
+        """Listen. One that has crashed is silent."""
+        if self.radio is not None:
+            self._down = np.where(mask, self._down | self.ended(state), self._down)
+            self.radio.step(mask[..., 0], state.position, state.velocity, self._down)
+
+    def around(self, state: WorldState) -> list[Array]:
+        """The numbers of the neighbours, shape (W, A, 7 k) in all."""
+        k = self.options.neighbours
+        if not k:
+            return []
+        if self.radio is None:
+            nothing = 0.0 * state.position[..., :1]
+            return [self.xp.concat([nothing] * (7 * k), axis=-1)]
+        return [self.radio.nearest(state.position, state.velocity, k)]
+
+    def ended(self, state: WorldState) -> Array:
+        """Whether a drone has touched anything, flipped over, or left for good, bool, (W, A)."""
+        outside = length(self.xp, self.goal(state) - state.position) > self.band
+        return outside | state.touching[()] | (state.tilt_cosine < LEAST_TILT_COSINE)
+
+    def outcome(self, state: WorldState) -> Outcome:
+        """Nearness to the goal and room; the end at a crash, a flip-over, or outside the band."""
+        distance = length(self.xp, self.goal(state) - state.position)
+        room, ended = self.clearance(state), self.ended(state)
+        narrow = 1.0 - room / (2 * self.vehicle.radius)
+        return Outcome(
+            reward={
+                "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
+                "room": -ROOM_WEIGHT * narrow * (narrow > 0),
+                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
+                "termination": ended * TERMINATION_REWARD + 0.0,
+            },
+            terminated=ended,
+            metrics={"position_error": distance, "clearance": room},
+        )
+
+    def clearance(self, state: WorldState) -> Array:
+        """Distance between a drone's sphere, of `Vehicle.radius`, and the nearest other, m, (W, A).
+
+        Below 0 spheres overlap. A drone alone has the range of its radio.
+        """
+        if self.radio is None:
+            return self.options.radio_range + 0.0 * length(self.xp, state.velocity)
+        apart = length(np, state.position[:, :, None] - state.position[:, None])
+        apart[:, np.arange(self.count), np.arange(self.count)] = np.inf
+        return apart.min(axis=-1) - 2 * self.vehicle.radius
+
+    def slots_at(self, slots: np.ndarray, state: WorldState) -> Array:
+        """Offsets of each drone, shape (A, 3), from the center, in the world: (W, A, 3)."""
+        places = np.array(self.options.center) + (slots if self.shape else slots[0])
+        return constant(places, state.position) + 0.0 * state.position
+
+
+class Radio:
+    """What each drone of W worlds has heard last of each other.
+
+    Every drone says in every step where it is and how fast it flies. That arrives after
+    `radio_delay` steps, at those within `radio_range` then, unless it is lost. The receiver knows
+    how old it is, and takes it that the sender flew on straight; after `FORGOTTEN` seconds it knows
+    nothing.
+    """
+
+    def __init__(self, options: Any, period: float, shape: tuple[int, ...]) -> None:
+        worlds, count = shape
+        self._options, self._period = options, period
+        self._said = Delay(options.radio_delay, np)  # position, velocity, silent
+        self._heard = np.zeros((worlds, count, count, 6))  # of receiver and sender
+        self._age = np.full((worlds, count, count), np.inf)  # control steps
+        self._keys = np.zeros((worlds, count), np.uint64)
+        self._steps = np.zeros(worlds, np.uint64)
+        self._own = np.eye(count, dtype=bool)
+
+    def begin(self, mask: np.ndarray, position: np.ndarray, lots: np.ndarray) -> None:
+        """Begin episodes of the worlds of a mask, bool, shape (W,), at rest at these positions.
+
+        Lots, uniform from 0 to 1, shape (W, A), are the keys of what gets lost.
+        """
+        rest = np.concatenate((position, 0.0 * position, 0.0 * position[..., :1]), axis=-1)
+        self._said.begin(mask[:, None, None], rest)
+        near = self._in_range(position, position)
+        self._age[mask] = np.where(near, 0.0, np.inf)[mask]
+        self._heard[mask] = np.broadcast_to(rest[:, None, :, :6], self._heard.shape)[mask]
+        self._keys[mask] = (lots * 2.0**53).astype(np.uint64)[mask]
+        self._steps[mask] = 0
+
+    def step(
+        self, mask: np.ndarray, position: np.ndarray, velocity: np.ndarray, silent: np.ndarray
+    ) -> None:
+        """Let the drones of the worlds of a mask speak and listen."""
+        saying = np.concatenate((position, velocity, silent[..., None]), axis=-1)
+        self._said.push(None if mask.all() else mask[:, None, None], saying)
+        delay = self._options.radio_delay
+        said = self._said.get(np.full(1, delay))
+        arrives = self._in_range(position, said[..., :3]) & (said[:, None, :, 6] == 0)
+        if self._options.radio_loss:
+            arrives &= self._chances() >= self._options.radio_loss
+        arrives &= mask[:, None, None]
+        self._heard = np.where(arrives[..., None], said[:, None, :, :6], self._heard)
+        older = self._age + mask[:, None, None]
+        self._age = np.where(arrives, float(delay), older)
+        self._steps += mask.astype(np.uint64)
+
+    def nearest(self, position: np.ndarray, velocity: np.ndarray, count: int) -> np.ndarray:
+        """Of the nearest that are known: relative position, relative velocity, and 1; else zeros.
+
+        Shape (W, A, 7 count).
+        """
+        time = self._age[..., None] * self._period
+        known = (time[..., 0] <= FORGOTTEN) & ~self._own
+        passed = np.where(known[..., None], time, 0.0)
+        there = self._heard[..., :3] + self._heard[..., 3:] * passed - position[:, :, None]
+        moves = self._heard[..., 3:] - velocity[:, :, None]
+        distance = np.where(known, length(np, there), np.inf)
+        order = np.argsort(distance, axis=-1, kind="stable")[..., :count, None]
+        told = np.concatenate((there, moves, np.ones_like(there[..., :1])), axis=-1)
+        told = np.where(known[..., None], told, 0.0)
+        chosen = np.take_along_axis(told, order, axis=2)
+        worlds, drones, found, _ = chosen.shape
+        numbers = np.zeros((worlds, drones, count, 7))
+        numbers[:, :, :found] = chosen
+        return numbers.reshape(worlds, drones, 7 * count)
+
+    def _in_range(self, receivers: np.ndarray, senders: np.ndarray) -> np.ndarray:
+        apart = length(np, senders[:, None] - receivers[:, :, None])
+        return np.asarray(apart <= self._options.radio_range)
+
+    def _chances(self) -> np.ndarray:
+        """Numbers from 0 to 1 of each message of this step, (W, A, A): SplitMix64 of receiver's
+        key, step and sender.
+        """
+        count = self._own.shape[0]
+        senders = np.arange(count, dtype=np.uint64)
+        place = self._steps[:, None, None] * np.uint64(count) + senders
+        x = self._keys[..., None] + (place + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return np.asarray(((x ^ (x >> np.uint64(31))) >> np.uint64(11)) * 2.0**-53)
+
+
+def ring(count: int) -> np.ndarray:
+    """Places on a level ring, neighbours 1 apart, shape (A, 3); of two drones they are 1 apart."""
+    if count == 1:
+        return np.zeros((1, 3))
+    angle = 2 * np.pi * np.arange(count) / count
+    places = np.stack((np.cos(angle), np.sin(angle), 0.0 * angle), axis=-1)
+    return np.asarray(places * (0.5 / np.sin(np.pi / count)))
+
+
+def line(count: int) -> np.ndarray:
+    """Places on a line along y, 1 apart, shape (A, 3)."""
+    zero = np.zeros(count)
+    return np.stack((zero, np.arange(count) - (count - 1) / 2, zero), axis=-1)
+
+
+def grid(count: int) -> np.ndarray:
+    """Places of a level grid, nearly a square, 1 apart, shape (A, 3)."""
+    side = int(np.ceil(np.sqrt(count)))
+    rows, columns = np.divmod(np.arange(count), side)
+    places = np.stack((rows, columns, 0 * rows), axis=-1).astype(float)
+    middle: np.ndarray = places - (places.min(axis=0) + places.max(axis=0)) / 2
+    return middle
