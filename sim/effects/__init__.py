@@ -17,6 +17,7 @@ from ...models.errors import expect
 from ..random import GUSTS, Noise
 from ..state import Array, WorldState, component
 from .air import AirEffects
+from .downwash import Downwash
 from .gusts import NUMBERS, Gusts
 from .options import EffectOptions
 from .rotors import RotorEffects
@@ -62,6 +63,7 @@ class Effects:
         self._wind: list[Array] = [0.0, 0.0, 0.0]
         needed = not options.wind_blows or moved
         expect(needed, "effects", "body_drag or rotor_drag, on which wind acts", "neither")
+        self._downwash = Downwash(vehicle) if options.downwash else None
         self._gusts: Gusts | None = None
         if options.gusts:
             self._gusts = Gusts(options.gusts, options.wind, vehicle.timestep, xp)
@@ -102,6 +104,8 @@ class Effects:
         if self._gusts is not None:
             gust = self._gusts.step(mask, self._noise.normal(mask))
             wind = [a + b for a, b in zip(wind, gust, strict=True)]
+        if self._downwash is not None and state.position.ndim > 2 and state.position.shape[1] > 1:
+            wind = [a + b for a, b in zip(wind, self._downwash.air(state), strict=True)]
         return mean, end, self._air.step(state, mean, root, wind, mask)
 
     def detach(self) -> None:

@@ -29,6 +29,8 @@ class EffectOptions:
     """Drag, inflow and lift of rotors in moving air (`rotors.drag`, `inflow` and `lift`)."""
     ground_effect: bool = False
     """More thrust near the ground, after Cheeseman and Bennett (`rotors.radius`)."""
+    downwash: bool = False
+    """Air that the other drones of the world blow down (`rotors.radius`); it acts as wind does."""
     wind: tuple[float, ...] = (0.0, 0.0, 0.0)
     """Velocity of the air: x, y, z in MuJoCo's world frame, m/s."""
     gusts: float = 0.0
@@ -43,7 +45,8 @@ class EffectOptions:
     def __post_init__(self) -> None:
         for name in ("motor_lag", "thrust_curve", "battery", "body_drag", "rotor_drag"):
             self._check(name, "true or false", type(getattr(self, name)) is bool)
-        self._check("ground_effect", "true or false", type(self.ground_effect) is bool)
+        for name in ("ground_effect", "downwash"):
+            self._check(name, "true or false", type(getattr(self, name)) is bool)
         self._keep("wind", -MOST_WIND, MOST_WIND, "m/s", 3)
         self._keep("efficiency", 0.0, 1.0, "for each rotor")
         self._keep("gusts", 0.0, MOST_WIND, "m/s", 1)
@@ -86,7 +89,7 @@ class EffectOptions:
     @property
     def wind_blows(self) -> bool:
         """Whether the air moves."""
-        return self.gusts > 0 or any(self.wind)
+        return self.gusts > 0 or self.downwash or any(self.wind)
 
 
 def _is_number(value: Any, low: float, high: float) -> bool:

@@ -1,0 +1,80 @@
+"""The air that other drones of a world blow down: a turbulent jet below each.
+
+L. Bauersfeld, K. Muller, D. Ziegler, F. Coletti and D. Scaramuzza, "Robotics meets Fluid Dynamics:
+A Characterization of the Induced Airflow below a Quadrotor as a Turbulent Jet", IEEE Robotics and
+Automation Letters 2025, arXiv 2403.13321, measured below hovering drones of several sizes.
+"""
+
+import math
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from ...models.errors import expect
+from ..rotations import body_z
+from ..state import Array, WorldState
+
+if TYPE_CHECKING:
+    from ...models.vehicle import Vehicle
+
+DECAY: Final = 10.11
+"""B_d: velocity on the axis over that at the rotors in hover, times the distance from the jet's
+origin in lengths of the craft. It and the two below are those that the authors of GADEN, a gas
+simulator, use with the paper's equations; we could not read the paper's own table."""
+SPREAD: Final = 0.07668
+"""S: radius at which the velocity has halved, over the distance from the jet's origin."""
+ORIGIN: Final = -5.817
+"""s₀: of the jet, in lengths below the craft."""
+NEAR: Final = 2.5
+"""Lengths below the craft from which on the flow is a jet, by the paper. Nearer, the jets of single
+rotors merge; there we take the profile of this distance, with a speed that grows from 0 beside the
+rotors in proportion to the distance below them."""
+DENSITY: Final = 1.225
+"""Of the air at sea level (ICAO standard atmosphere, ISO 2533), kg/m³."""
+
+
+class Downwash:
+    """The jets of all drones of W worlds.
+
+    With T the thrust of a craft, R the radius of its n rotors and l its length, the largest
+    distance between two rotors, the air moves along the craft's -z axis, at the distance s below it
+    and r from that axis, with
+
+        U = sqrt(T / (2 ρ n π R²)),  V = U B_d / (s / l - s₀) / (1 + (√2 - 1) (r / h)²)²,
+
+    and h = l S (s / l - s₀). Jets of several drones add up, which is ours. Raises `InputError` for
+    a vehicle without `rotors.radius`, or with a single rotor, which has no length.
+    """
+
+    def __init__(self, vehicle: "Vehicle") -> None:
+        (radius,) = vehicle.coefficients.need("rotors.radius", "downwash")
+        places = np.array([rotor.position for rotor in vehicle.rotors])
+        self.length = float(np.linalg.norm(places[:, None] - places, axis=-1).max())
+        expect(self.length > 0, "vehicle", "two rotors or more, for downwash", "one")
+        self._area = vehicle.num_rotors * math.pi * radius**2
+
+    def velocity(self, thrust: Array, below: Array, beside: Array) -> Array:
+        """Speed of the air of a jet, m/s, of craft with such a thrust, N.
+
+        At distances below it and from its axis, m; all of one shape.
+        """
+        hover = (thrust.clip(0.0) / (2 * DENSITY * self._area)) ** 0.5
+        depth = below / self.length
+        share = (depth / NEAR).clip(0.0, 1.0)
+        away = depth.clip(NEAR) - ORIGIN
+        half = self.length * SPREAD * away
+        ratio = beside / half
+        return share * hover * DECAY / away / (1 + (math.sqrt(2) - 1) * ratio * ratio) ** 2
+
+    def air(self, state: WorldState) -> list[Array]:
+        """Velocity of the air at each drone by the jets of the others, world frame, m/s: three of
+        shape (W, A).
+        """
+        down = -body_z(state.quaternion)  # of each jet
+        offset = state.position[:, :, None] - state.position[:, None]  # to a drone, from a jet
+        below = (offset * down[:, None]).sum(-1)
+        square = (offset * offset).sum(-1) - below * below
+        thrust = state.thrust.sum(-1)[:, None] + 0.0 * below
+        speed = self.velocity(thrust, below, square.clip(0.0) ** 0.5)
+        air: Any = (speed[..., None] * down[:, None]).sum(2)  # a drone's own has the depth 0
+        return [air[..., axis] for axis in range(3)]
