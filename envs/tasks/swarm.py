@@ -24,7 +24,9 @@ from .task import Outcome, TaskOptions, check_number, check_whole
 
 MOST_DRONES: Final = 128
 FORGOTTEN: Final = 1.0  # A drone that was not heard for so long is no neighbour any more, s
+APPROACH_WEIGHT: Final = 0.1  # Of a speed of 1 m/s towards the goal, in each step
 ROOM_WEIGHT: Final = 0.5  # Cost of spheres that touch; nothing from a diameter apart on
+_TINY: Final = 1e-9  # m
 JITTER: Final = 0.2  # Of a start, in each axis, over the distance between starts
 
 
@@ -149,13 +151,19 @@ class Swarm(Flight):
         return outside | state.touching[()] | (state.tilt_cosine < LEAST_TILT_COSINE)
 
     def outcome(self, state: WorldState) -> Outcome:
-        """Nearness to the goal and room; the end at a crash, a flip-over, or outside the band."""
-        distance = length(self.xp, self.goal(state) - state.position)
+        """Nearness to the goal, approach and room; the end at a crash, a flip-over, or outside the
+        band.
+        """
+        to_goal = self.goal(state) - state.position
+        distance = length(self.xp, to_goal)
+        along = to_goal * (state.velocity - self.goal_velocity())
+        closing = along[..., 0] + along[..., 1] + along[..., 2]
         room, ended = self.clearance(state), self.ended(state)
         narrow = 1.0 - room / (2 * self.vehicle.radius)
         return Outcome(
             reward={
                 "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
+                "approach": APPROACH_WEIGHT * closing / (distance + _TINY),
                 "room": -ROOM_WEIGHT * narrow * (narrow > 0),
                 "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
                 "termination": ended * TERMINATION_REWARD + 0.0,
@@ -163,6 +171,10 @@ class Swarm(Flight):
             terminated=ended,
             metrics={"position_error": distance, "clearance": room},
         )
+
+    def goal_velocity(self) -> Array:
+        """Velocity of each drone's goal, world frame, m/s, shape (W, A, 3), or 0."""
+        return 0.0
 
     def clearance(self, state: WorldState) -> Array:
         """Distance between a drone's sphere, of `Vehicle.radius`, and the nearest other, m, (W, A).
