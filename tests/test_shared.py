@@ -6,6 +6,7 @@ import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,16 @@ import pytest
 from peers import ANY, Running, launch, relaying
 from rotorgram.envs.loop import Loop
 from rotorgram.models import InputError
-from rotorgram.udp import LinkConfig, PeerSilent, Refused, RemoteEnv, SharedSimulator
+from rotorgram.udp import (
+    LinkConfig,
+    PeerClosed,
+    PeerSilent,
+    Refused,
+    RemoteEnv,
+    RemoteVectorEnv,
+    SharedSimulator,
+)
+from rotorgram.udp.protocol.auth import write_key
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
 from rotorgram.udp.transport.relay import FaultConfig
 from rotorgram.udp.transport.shared import Presence
@@ -215,7 +225,7 @@ def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> No
     for process in (victim, again):
         process.kill()
         process.communicate()
-    loss, *later = running.simulator.losses
+    loss, *later = running.simulator.absences
     assert (loss.agent, loss.episode) == (1, 1)
     assert 20 <= loss.step < LONG - 1
     assert loss.presence in (Presence.SILENT, Presence.COMING)
@@ -232,7 +242,7 @@ def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:
         other.start()
         heard(victim, "20")
         victim.send_signal(signal.SIGSTOP)
-        while not running.simulator.losses:
+        while not running.simulator.absences:
             assert running.thread.is_alive()
         victim.send_signal(signal.SIGCONT)
         heard(victim, "cut")
@@ -242,10 +252,88 @@ def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:
         victim.kill()
         victim.communicate()
         running.join()
-    loss = running.simulator.losses[0]
+    loss = running.simulator.absences[0]
     assert (loss.agent, loss.episode, loss.presence) == (1, 1, Presence.SILENT)
     expected = in_process(2, 3, calm, (1, loss.step, "hold"), episode_length=LONG)
     assert seen[0][0] == expected[0][0]
+
+
+def test_with_a_key_they_are_the_world_in_process(tmp_path: Path) -> None:
+    agents, seen, key = free_ports(2), {}, tmp_path / "key"
+    write_key(key)
+    with shared(agents, 2, LOSSY, key_file=key):
+        in_threads([
+            lambda a=a, i=i: fly_one(a, i, 1, seen, key_file=key) for i, a in enumerate(agents)
+        ])  # fmt: skip
+    assert seen == in_process(2, 1)
+
+
+def test_one_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
+    agents, seen, starts = free_ports(2), {}, []
+
+    def impatient() -> None:
+        env = RemoteEnv(agents[0], connect_timeout=60)
+        starts.append(env.reset(seed=0)[0].tobytes())
+        for step in range(5):
+            env.step(calm(0, 0, step))
+        starts.append(env.reset(seed=1)[0].tobytes())
+        env.step(calm(0, 1, 0))
+        env.close()
+
+    with shared(agents, 2, episode_length=LONG) as running:
+        in_threads([impatient, lambda: fly_one(agents[1], 1, 2, seen, calm)])
+        running.join()
+        waits, closes = running.simulator.absences
+        assert waits == (0, 1, 5, Presence.WAITING)
+        assert closes == (0, 2, 1, Presence.LEFT)
+    expected = in_process(2, 2, calm, (0, 5, "hold"), episode_length=LONG)
+    assert seen[1][0] == expected[1][0]
+    assert starts == [expected[0][0][0][0], expected[0][1][0][0]]
+    assert seen[1][1][0] == expected[1][1][0]
+
+
+def test_one_that_resets_a_start_gets_it_again() -> None:
+    agents, starts = free_ports(2), []
+    done = threading.Event()
+
+    def twice() -> None:
+        env = RemoteEnv(agents[0], connect_timeout=60)
+        for seed in (1, 2):
+            observation, info = env.reset(seed=seed)
+            starts.append((observation.tobytes(), info))
+        env.step(calm(0, 0, 0))
+        done.wait(60)
+        env.close()
+
+    def once() -> None:
+        env = RemoteEnv(agents[1], connect_timeout=60)
+        env.reset(seed=3)
+        env.step(calm(1, 0, 0))
+        done.set()
+        env.close()
+
+    with shared(agents, 2) as running:
+        in_threads([twice, once])
+        running.join()
+        assert (running.simulator.seed, running.simulator.episodes) == (1, 1)
+    assert starts[0] == starts[1]
+
+
+def test_orders_that_the_world_cannot_follow_end_the_session_of_that_agent_alone() -> None:
+    agents, seen = free_ports(2), {}
+
+    def wrong() -> None:
+        env = RemoteVectorEnv(agents[0], connect_timeout=60)
+        env.reset(seed=0)
+        with pytest.raises(PeerClosed, match="orders: expected the same for all 2 drones"):
+            env.advance(np.zeros((2, 1), np.float32), None, None, np.array([True, False]))
+        env.close()
+
+    with shared({agents[0]: ["drone_0", "drone_1"], agents[1]: ["drone_2"]}, 3):
+        in_threads([wrong, lambda: fly_one(agents[1], 2, 1, seen)])
+    nothing = np.zeros(1, np.float32)
+    others = in_process(3, 1, lambda i, *at: action_of(i, *at) if i == 2 else nothing)
+    assert seen == {2: others[2]}
 
 
 def test_an_agent_of_each_own_names() -> None:

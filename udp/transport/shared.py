@@ -59,15 +59,16 @@ class Presence(Enum):
     """It closed, or was silent for too long."""
 
 
-class Loss(NamedTuple):
-    """An agent that no longer flies its drones, and since when."""
+class Absence(NamedTuple):
+    """An agent whose drones its policy flies, until the end of an episode."""
 
     agent: int
     """Its number, from 0."""
     episode: int
     """Number of the episode, from 1 at the first State."""
     step: int
-    """Control steps that its drones had flown in that episode by its Commands."""
+    """Control steps that its drones had flown in that episode by its Commands; 0 too if it takes no
+    part at all."""
     presence: Presence
     """`WAITING`: it asked for a reset while others flew on."""
 
@@ -138,9 +139,10 @@ class SharedSimulator(NotCopied):
         parties: The agents.
         observer: As of a `Simulator`, with Commands and States of the whole world, after a step or
             a reset (None); None at first.
-        losses: Every `Loss` so far.
+        absences: Every `Absence` so far: with the seeds and the actions they determine each number.
         episodes: Begun so far; a reset before anything was flown begins the same anew.
         steps: Control steps of the running episode.
+        seed: Of the running episode; None: the streams of the one before went on.
 
     Raises:
         InputError: An argument is not what it should be.
@@ -170,9 +172,10 @@ class SharedSimulator(NotCopied):
         )
         key = Key(read_keys(key_file)[0], "simulator") if key_file else None
         anywhere, self.config = insecure or key is not None, config or LinkConfig()
-        self.patience, self.losses, self.episodes, self.steps = patience, list[Loss](), 0, 0
+        self.patience, self.absences, self.episodes, self.steps = patience, list[Absence](), 0, 0
         self.observer: Observer | None = None
-        self._stopped = self._ran = False
+        self.seed: int | None = None
+        self._when_lost, self._stopped, self._ran = when_lost, False, False
         with ExitStack() as failing:
             self.stepped: Any = make_stepped(
                 env, drones, drones=drones, vehicle=vehicle, backend=backend, options=options
@@ -292,6 +295,7 @@ class SharedSimulator(NotCopied):
             seeds = np.array([(seed + i) & MAX_UINT64 for i in range(count)], np.uint64)
         elif party.command is not None and party.command.seeds is not None:
             seeds = np.full(count, party.command.seeds[party.rows.argmin()], np.uint64)
+        self.seed = None if seeds is None else int(seeds[0])
         nothing = np.zeros(layout.actions.shape, layout.actions.dtype)
         self.stepped.advance(nothing, np.ones(count, bool), seeds, None)
         self.episodes, self.steps = self.episodes + (first or self.steps > 0), 0
@@ -369,7 +373,6 @@ class SharedSimulator(NotCopied):
             party.command = None
         flew = was is Presence.FLYING and not self._out(party).all()
         if flew:
-            self.losses.append(Loss(party.number, self.episodes, self.steps, presence))
             self._let_go(party)
         if presence is Presence.LEFT:
             self._left = why
@@ -379,6 +382,8 @@ class SharedSimulator(NotCopied):
 
     def _let_go(self, party: Party) -> None:
         """Leave its drones to its policy."""
+        absence = Absence(party.number, self.episodes, self.steps, party.presence)
+        self.absences.append(absence)
         if party.when_lost != "hold":
             mask = np.zeros(self._layout.drones, bool)
             mask[party.rows] = True
@@ -490,6 +495,7 @@ class SharedSimulator(NotCopied):
                 self._take_late(party)
 
     def _take_policy(self, party: Party, welcome: Welcome) -> None:
+        party.when_lost = self._when_lost
         for extension in welcome.extensions:
             if extension.number == WHEN_LOST:
                 policy = extension.value.decode("ascii", "replace")
