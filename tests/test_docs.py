@@ -123,7 +123,8 @@ def test_the_reliability_page_tells_what_the_benchmarks_wrote() -> None:
     network, absences = hundred["network"], ", ".join(str(eight[f"absent_{k}"]) for k in kinds)
     for sentence in (
         f"{eight['killed']} kills and {eight['stopped']} stops of {eight['agents']} agent "
-        f"processes: {eight['states_that_differ']} of {eight['control_steps']:,} control steps differ",
+        f"processes: {eight['states_that_differ']} of {eight['control_steps']:,} control steps "
+        "differ",
         f"| episodes | {eight['episodes']} |",
         f"by Commands of their agents | {eight['drone_steps_by_commands']:,} |",
         f"| absences: silent, started anew, late | {absences} |",

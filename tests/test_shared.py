@@ -219,9 +219,9 @@ def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> No
         heard(victim, "20")
         victim.send_signal(signal.SIGKILL)
         again = launch(VICTIM, agents[1][1], policy)
+        heard(again, "20")  # of a later episode
         for thread in others:
             thread.join(60)
-        running.join()
     for process in (victim, again):
         process.kill()
         process.communicate()
@@ -251,7 +251,6 @@ def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:
         other.join(60)
         victim.kill()
         victim.communicate()
-        running.join()
     loss = running.simulator.absences[0]
     assert (loss.agent, loss.episode, loss.presence) == (1, 1, Presence.SILENT)
     expected = in_process(2, 3, calm, (1, loss.step, "hold"), episode_length=LONG)
