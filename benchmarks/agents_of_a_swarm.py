@@ -146,6 +146,7 @@ class Twin:
             seed = simulator.seed
             loop.advance(nothing, everybody, None if seed is None else [seed] * AGENTS)
             self.absent = ~everybody
+            self.taken = sum(one.episode < simulator.episodes for one in simulator.absences)
         for absence in simulator.absences[self.taken :]:
             self.absent = self.absent | (np.arange(AGENTS) == absence.agent)
             policy = POLICIES[absence.agent % 3]

@@ -3,6 +3,7 @@
 import signal
 import socket
 import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -333,6 +334,24 @@ def test_orders_that_the_world_cannot_follow_end_the_session_of_that_agent_alone
     nothing = np.zeros(1, np.float32)
     others = in_process(3, 1, lambda i, *at: action_of(i, *at) if i == 2 else nothing)
     assert seen == {2: others[2]}
+
+
+def test_the_command_flies_the_world_of_several_agents() -> None:
+    agents, seen = free_ports(2), {}
+    where = [f"127.0.0.1:{port}" for _, port in agents]
+    command = [sys.executable, "-m", "rotorgram.cli", "sim", "--env", "swarms:swarm/Rise-v0",
+               "--drones", "2", "--bind", "127.0.0.1:0", "--agents", *where]  # fmt: skip
+    pipe, here = subprocess.PIPE, Path(__file__).parent
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, cwd=here) as simulator:
+        in_threads([lambda a=a, i=i: fly_one(a, i, 1, seen) for i, a in enumerate(agents)])
+        out, err = simulator.communicate(timeout=30)
+    assert (simulator.returncode, err) == (0, "")
+    first, closed, *wires = out.splitlines()
+    assert first.startswith("simulating at 127.0.0.1:")
+    assert first.endswith(" for 2 agents (Ctrl-C ends)")
+    assert closed == "the agent closed"
+    assert [wire.split(": ")[0] for wire in wires] == [f"wire to {one}" for one in where]
+    assert seen == in_process(2, 1)
 
 
 def test_an_agent_of_each_own_names() -> None:

@@ -299,6 +299,8 @@ class SharedSimulator(NotCopied):
         nothing = np.zeros(layout.actions.shape, layout.actions.dtype)
         self.stepped.advance(nothing, np.ones(count, bool), seeds, None)
         self.episodes, self.steps = self.episodes + (first or self.steps > 0), 0
+        # Those of a start that nobody flew are told anew.
+        self.absences = [one for one in self.absences if one.episode < self.episodes]
         for absent in self.parties:
             if absent not in joining:
                 self._let_go(absent)
