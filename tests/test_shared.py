@@ -336,6 +336,32 @@ def test_orders_that_the_world_cannot_follow_end_the_session_of_that_agent_alone
     assert seen == {2: others[2]}
 
 
+def test_a_late_agent_is_told_the_end_of_the_drones_that_were_in_flight() -> None:
+    agents, seen, ends = free_ports(2), {}, []
+    done = threading.Event()
+
+    def late() -> None:
+        env = RemoteVectorEnv(agents[0], connect_timeout=60, autoreset_mode="Disabled")
+        env.reset(seed=0)
+        while not env.out.any():
+            env.step(np.array([[1.0], [0.0]], np.float32))
+        assert env.terminated.tolist() == [True, False]
+        done.wait(60)
+        _, rewards, *flags, _ = env.step(np.zeros((2, 1), np.float32))
+        ends.append((rewards.tolist(), *(flag.tolist() for flag in flags)))
+        env.close()
+
+    def other() -> None:
+        fly_one(agents[1], 2, 1, seen, calm)
+        done.set()
+
+    shares = {agents[0]: ["drone_0", "drone_1"], agents[1]: ["drone_2"]}
+    with shared(shares, 3, episode_length=LONG, patience=0.5):
+        in_threads([late, other])
+    assert ends == [([0.0, 0.0], [False, False], [False, True])]
+    assert len(seen[2][0]) == LONG + 1
+
+
 def test_the_command_flies_the_world_of_several_agents() -> None:
     agents, seen = free_ports(2), {}
     where = [f"127.0.0.1:{port}" for _, port in agents]

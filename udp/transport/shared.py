@@ -97,6 +97,7 @@ class Party:
         self.command: Command | None = None  # that the next step or reset takes
         self.patient_until = 0.0
         self.seed: int | None = None  # of the Welcome
+        self.in_flight = np.zeros(len(rows), bool)  # drones, when it was lost
         self.shown: tuple[Any, ...] = ()  # observations and telemetry of its last State
 
     @property
@@ -373,7 +374,9 @@ class SharedSimulator(NotCopied):
         was, party.presence = party.presence, presence
         if presence is not Presence.WAITING:
             party.command = None
-        flew = was is Presence.FLYING and not self._out(party).all()
+        if was is Presence.FLYING:
+            party.in_flight = ~self._out(party)
+        flew = was is Presence.FLYING and party.in_flight.any()
         if flew:
             self._let_go(party)
         if presence is Presence.LEFT:
@@ -423,7 +426,7 @@ class SharedSimulator(NotCopied):
             observations,
             stepped.rewards[rows] if flew else np.zeros(len(rows)),
             stepped.terminated[rows] if flew else nothing,
-            stepped.truncated[rows] if flew else ~nothing if cut else nothing,
+            stepped.truncated[rows] if flew else party.in_flight if cut else nothing,
             telemetry,
             now,
         )
@@ -510,11 +513,11 @@ class SharedSimulator(NotCopied):
         """A Command of an agent that does not take part in the running episode."""
         if party.order == RESET:
             party.presence = Presence.WAITING
-        elif party.presence is Presence.SILENT:
-            party.presence = Presence.LATE
-            self._send(party, cut=True)
         elif party.order == FREEZE:
             self._send(party, again=True)
+        elif party.presence is Presence.SILENT and party.in_flight.any():
+            party.presence = Presence.LATE
+            self._send(party, cut=True)
         else:
             wrong = "an action came after the end of an episode: expected a reset"
             party.link.close(wrong, time.monotonic())
