@@ -136,7 +136,8 @@ class Twin:
         self.simulator, self.loop = simulator, Loop(ENV_ID, drones=AGENTS)
         self.taken = 0  # absences that were repeated
         self.absent = np.zeros(AGENTS, bool)
-        self.counts: Counter[str] = Counter()
+        kinds = ("silent", "coming", "late", "waiting", "left")
+        self.counts = Counter({f"absent_{kind}": 0 for kind in kinds})
         self.shown = np.zeros((AGENTS, 3), np.float32)
 
     def __call__(self, cause: Message | None, state: State) -> None:

@@ -120,7 +120,10 @@ def test_the_reliability_page_tells_what_the_benchmarks_wrote() -> None:
     swarm = json.loads((RESULTS / "reliability" / "swarm.json").read_text())
     eight, hundred = swarm["agent_processes"], swarm["hundred_drones"]
     kinds = ("silent", "coming", "late")
-    network, absences = hundred["network"], ", ".join(str(eight[f"absent_{k}"]) for k in kinds)
+    network, absences = (
+        hundred["network"],
+        ", ".join(str(eight.get(f"absent_{k}", 0)) for k in kinds),
+    )
     for sentence in (
         f"{eight['killed']} kills and {eight['stopped']} stops of {eight['agents']} agent "
         f"processes: {eight['states_that_differ']} of {eight['control_steps']:,} control steps "
