@@ -12,6 +12,7 @@ from ..envs.rendering import moments
 from ..rendering.live import MOST_DRONES, LiveView, Pace, open_surface
 from ..rendering.stage import Stage
 from ..udp.protocol.messages import Command, Message, State
+from ..udp.transport.shared import SharedSimulator
 from ..udp.transport.simulator import Observer, Simulator
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ class Watcher:
     would take the simulator for lost. If the view is closed or fails, the simulator goes on.
     """
 
-    def __init__(self, live: LiveView, simulator: Simulator) -> None:
+    def __init__(self, live: LiveView, simulator: Simulator | SharedSimulator) -> None:
         self._live: LiveView | None = live
         self._loop: Any = simulator.stepped  # the command flies registered tasks alone
         self._steps = np.zeros(live.stage.drones, np.int64)
@@ -70,7 +71,7 @@ class Realtime:
 
 
 @contextmanager
-def watched(simulator: Simulator, command: "Sim") -> Iterator[None]:
+def watched(simulator: Simulator | SharedSimulator, command: "Sim") -> Iterator[None]:
     """Show a simulator, or hold it to real time, during the block, as the command says."""
     observers: list[Observer] = []
     with ExitStack() as opened:

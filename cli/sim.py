@@ -3,9 +3,13 @@
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from ..models.errors import expect
 from ._flags import BackendFlags, parse_address
+
+if TYPE_CHECKING:
+    from ..udp import SharedSimulator, Simulator
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,6 +26,14 @@ class Sim(BackendFlags):
     """Address of this side, HOST:PORT; port 0 takes a free one."""
     num_envs: int | None = None
     """Drones in all. Default: those of one world."""
+    agents: tuple[str, ...] = ()
+    """Several agents in place of one --server: HOST:PORT of each. They fly one world, and share its
+    drones evenly in their order; HOST:PORT=drone_0,drone_2 names those of one."""
+    when_lost: Literal["hold", "land", "end"] = "hold"
+    """What drones do whose agent is lost to --agents, unless it says so itself: hold, land or end
+    (rotors stand still)."""
+    patience: float = 10.0
+    """Seconds that the world waits for the command of one of --agents."""
     codec: Literal["binary", "text"] = "binary"
     """binary, or the paper's text."""
     timeout: float = 120.0
@@ -44,6 +56,8 @@ class Sim(BackendFlags):
 
     def run(self) -> int:
         """Simulate until the agent closes."""
+        if self.agents:
+            return self._run_shared()
         from ..udp import LinkConfig, Simulator
 
         simulator = Simulator(
@@ -51,22 +65,12 @@ class Sim(BackendFlags):
             server=parse_address(self.server),
             num_envs=self.num_envs,
             drones=self.drones,
-            bind=parse_address(self.bind),
             codec=self.codec,
-            vehicle=self.vehicle,
-            backend=self.backend,
             config=LinkConfig(timeout=self.timeout),
-            key_file=self.key_file,
-            insecure=self.insecure,
             record=self.record,
-            **self.options,
+            **self._common(),
         )
-        shown: AbstractContextManager[None] = nullcontext()
-        if self.view is not None or self.realtime:  # otherwise nothing that draws is imported
-            from ._watch import watched
-
-            shown = watched(simulator, self)
-        with simulator, shown:
+        with simulator, self._shown(simulator):
             here = "{}:{}".format(*simulator.address)
             print(f"simulating at {here} for the agent at {self.server} (Ctrl-C ends)", flush=True)
             try:
@@ -74,3 +78,49 @@ class Sim(BackendFlags):
             finally:
                 print(f"wire: {simulator.link.statistics}", flush=True)
         return 0
+
+    def _run_shared(self) -> int:
+        """Simulate one world until all its agents have closed."""
+        from ..udp import LinkConfig, SharedSimulator
+
+        for name in ("server", "num_envs", "codec", "record"):
+            flag = f"--{name.replace('_', '-')}"
+            expect(name not in self.given, flag, "none with --agents", f"{getattr(self, name)}")
+        named = {address: names.split(",") for address, _, names in
+                 (agent.partition("=") for agent in self.agents) if names}  # fmt: skip
+        right = len(named) in (0, len(self.agents))
+        expect(right, "--agents", "drones of each agent or of none", " ".join(self.agents))
+        shares = {parse_address(address): names for address, names in named.items()}
+        simulator = SharedSimulator(
+            self.env_id,
+            shares or [parse_address(agent) for agent in self.agents],
+            drones=self.drones,
+            when_lost=self.when_lost,
+            patience=self.patience,
+            config=LinkConfig(timeout=self.timeout),
+            **self._common(),
+        )
+        with simulator, self._shown(simulator):
+            here = "{}:{}".format(*simulator.address)
+            print(f"simulating at {here} for {len(self.agents)} agents (Ctrl-C ends)", flush=True)
+            try:
+                print(simulator.run())
+            finally:
+                for party in simulator.parties:
+                    where = "{}:{}".format(*party.address)
+                    print(f"wire to {where}: {party.link.statistics}", flush=True)
+        return 0
+
+    def _common(self) -> dict[str, Any]:
+        """Settings of both simulators."""
+        return {
+            "bind": parse_address(self.bind), "vehicle": self.vehicle, "backend": self.backend,
+            "key_file": self.key_file, "insecure": self.insecure, **self.options,
+        }  # fmt: skip
+
+    def _shown(self, simulator: "Simulator | SharedSimulator") -> AbstractContextManager[None]:
+        if self.view is None and not self.realtime:  # nothing that draws is imported
+            return nullcontext()
+        from ._watch import watched
+
+        return watched(simulator, self)

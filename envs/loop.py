@@ -31,6 +31,7 @@ from ..sim import (
     clip,
     constant,
     each,
+    make_controller,
     make_world,
     on_host,
     plain,
@@ -42,6 +43,7 @@ from .delay import Delay
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
 
+_DESCENT: Final = 0.7  # of `Loop.land`, m/s: PX4's default of MPC_LAND_SPEED
 _SMALL: Final = 64  # Up to this many numbers Python's loop is faster than NumPy's call
 
 
@@ -308,6 +310,7 @@ class Loop(NotCopied):
         self._begun = self._closed = self._anyone_out = False
         least = np.clip(0.0, self.vehicle.thrust_low, self.vehicle.thrust_high)
         self._rest = constant(least, self.world.state.thrust)  # of rotors that stand still
+        self._landing: Array | None = None  # bool, shape (N,): those that `land` brings down
         self._outcome: Outcome | None = None
         self._telemetry: dict[str, np.ndarray] | None = None
 
@@ -362,6 +365,10 @@ class Loop(NotCopied):
         try:
             for step in range(0, self._substeps, self._held):
                 thrust = controller.thrust(values, self._seen())
+                if self._landing is not None:
+                    coming = self._landing.reshape(world.shape)[..., None]
+                    down = self._lander.thrust(self._descent, self._seen())
+                    thrust = self._xp.where(coming, down, thrust)
                 if self._anyone_out:
                     thrust = self._xp.where(self.out.reshape(world.shape)[..., None], rest, thrust)
                 world.step(thrust, self._held, some, again=step > 0)
@@ -374,6 +381,34 @@ class Loop(NotCopied):
         if self._sensors is not None:
             self._sensors.sample(flying)
         self.task.remember(world.state, flying)
+        if self._landing is not None:
+            self.retire(self._landing & world.state.touching.reshape(self.num_envs))
+
+    def retire(self, drones: Array) -> None:
+        """Take drones out of the running episode, bool, shape (N,).
+
+        Their rotors stand still until the world begins anew. They get no reward and no flag.
+        """
+        if (some := self.ours(drones) & ~self.out).any():
+            self._end(some)
+
+    def land(self, drones: Array) -> None:
+        """Bring drones down until they touch something, then retire them; bool, shape (N,).
+
+        From the next step on their actions are ignored: they hold their place over the ground and
+        sink at 0.7 m/s, as far as the vehicle can, by the level `velocity`. Raises `InputError`
+        where the vehicle cannot be flown at that level.
+        """
+        if not hasattr(self, "_lander"):
+            period, lag = self._held * self.vehicle.timestep, self.task.lag
+            lander: Any = make_controller("velocity", self.vehicle, period, lag=lag)
+            self._lander, fastest = lander, lander.ranges()[2][0]
+            action = np.array([0.0, 0.0, -min(1.0, _DESCENT / fastest), 0.0])
+            like = self.world.state.thrust
+            self._descent = constant(action, like) + 0.0 * like[..., :1]
+        some = self.ours(drones)
+        if some.any():
+            self._landing = some if self._landing is None else self._landing | some
 
     def _begin(self, mask: Array, seeds: Any, chosen: Mapping[str, np.ndarray]) -> None:
         """Begin the episodes of the drones of a mask, bool, shape (N,)."""
@@ -396,6 +431,9 @@ class Loop(NotCopied):
         self._waiting = self._waiting & ~mask
         self._anyone_waits = bool(self._waiting.any())
         self.done, self.out = self.done & ~mask, self.out & ~mask
+        if self._landing is not None:
+            left = self._landing & ~mask
+            self._landing = left if left.any() else None
         self._anyone_out = bool(self.out.any())
 
     def _reset(self, mask: Array, pose: Pose) -> None:
@@ -661,6 +699,15 @@ class OnHost:
         """As `Loop.advance`."""
         self.loop.advance(*command, **named)
         self._take()
+
+    def retire(self, drones: np.ndarray) -> None:
+        """As `Loop.retire`."""
+        self.loop.retire(drones)
+        self._take()
+
+    def land(self, drones: np.ndarray) -> None:
+        """As `Loop.land`."""
+        self.loop.land(drones)
 
     def _take(self) -> None:
         loop = self.loop

@@ -115,6 +115,14 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["sim", "--num-envs", "0", "--bind", "127.0.0.1:0"], "num_envs: expected 1 to 65536"),
         (["sim", "--num-envs", "2", "--codec", "text"], "text codec: expected one drone, got 2"),
         (["sim", "--key-file", "nowhere"], "key file: cannot read nowhere"),
+        (
+            ["sim", "--agents", "here:1", "--server", "here:2"],
+            "--server: expected none with --agents, got here:2",
+        ),
+        (
+            ["sim", "--agents", "here:1=drone_0", "here:2"],
+            "--agents: expected drones of each agent or of none, got here:1=drone_0 here:2",
+        ),
         (["train", "a2c", "--key-file", "nowhere"], "key-file, insecure: expected them with"),
         (["train", "a2c", "--store-every", "0"], "store-every: expected seconds > 0, got 0"),
         (["serve", "pid", "--listen", "0.0.0.0:0"], "--key-file), or insecure=True (--insecure)"),

@@ -117,6 +117,27 @@ def test_the_reliability_page_tells_what_the_benchmarks_wrote() -> None:
     assert kills["agent_killed"]["identical_to_unbroken"]
     assert flood["identical"]
     assert soak["control_steps"] >= 1_000_000
+    swarm = json.loads((RESULTS / "reliability" / "swarm.json").read_text())
+    eight, hundred = swarm["agent_processes"], swarm["hundred_drones"]
+    kinds = ("silent", "coming", "late")
+    network, absences = (
+        hundred["network"],
+        ", ".join(str(eight.get(f"absent_{k}", 0)) for k in kinds),
+    )
+    for sentence in (
+        f"{eight['killed']} kills and {eight['stopped']} stops of {eight['agents']} agent "
+        f"processes: {eight['states_that_differ']} of {eight['control_steps']:,} control steps "
+        "differ",
+        f"| episodes | {eight['episodes']} |",
+        f"by Commands of their agents | {eight['drone_steps_by_commands']:,} |",
+        f"| absences: silent, started anew, late | {absences} |",
+        f"| agents that did not come back | {eight['agents_lost_for_good']} |",
+        f"{hundred['drone_steps']:,} drone steps, States of {hundred['bytes_of_a_state']:,} bytes, "
+        f"{network['dropped']:,} of {network['received']:,} datagrams lost, and "
+        f"{hundred['steps_that_differ']} steps with a bit that differs",
+    ):
+        assert sentence in page
+    assert eight["actions_that_differ"] == 0
     for flight in json.loads((RESULTS / "reliability" / "link.json").read_text())["flights"]:
         start = f"| {flight['drones']:,} | {flight['mtu']:,} |"
         row = next(line for line in page.splitlines() if line.startswith(start))

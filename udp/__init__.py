@@ -12,6 +12,7 @@ from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Ref
 
 if TYPE_CHECKING:
     from .remote import LOST, RemoteEnv, RemoteVectorEnv
+    from .transport.shared import SharedSimulator
     from .transport.simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, Simulator
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "Refused",
     "RemoteEnv",
     "RemoteVectorEnv",
+    "SharedSimulator",
     "Simulator",
 ]
 
@@ -36,5 +38,6 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     is_remote = name == "LOST" or name.startswith("Remote")
-    module = import_module(".remote" if is_remote else ".transport.simulator", __name__)
+    transport = ".transport.shared" if name == "SharedSimulator" else ".transport.simulator"
+    module = import_module(".remote" if is_remote else transport, __name__)
     return getattr(module, name)

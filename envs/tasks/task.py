@@ -170,12 +170,16 @@ class Task:
 
     def _of_level(self) -> Controller:
         """The controller of the option `action`."""
-        options, told = self.options, self.vehicle.coefficients.rotors
-        lags = options.effects.get("motor_lag", False)
-        times = (told.time_constant, told.time_constant_down) if lags else ()
-        lag = max((time for time in times if time), default=0.0)
+        options = self.options
         period = options.control_period if options.estimated else self.vehicle.timestep
-        return make_controller(options.action, self.vehicle, period, lag=lag)
+        return make_controller(options.action, self.vehicle, period, lag=self.lag)
+
+    @property
+    def lag(self) -> float:
+        """Longest time constant of the rotors, s; 0 without the effect `motor_lag`."""
+        told, lags = self.vehicle.coefficients.rotors, self.options.effects.get("motor_lag", False)
+        times = (told.time_constant, told.time_constant_down) if lags else ()
+        return max((time for time in times if time), default=0.0)
 
     def setup(self) -> None:
         """Set `observation`, from `options` and `vehicle`.

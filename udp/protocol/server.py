@@ -102,6 +102,7 @@ class Server:
             gives the layout to read it by. None, or a result of None: text is not flown.
         slots: Simulators to fly at the same time. Others wait until a slot is free.
         keys: Shared with the simulators, any of them. Then nothing unsealed is taken.
+        extensions: Of each Welcome.
         draw_nonce: Gives a random 64-bit number for each Welcome.
 
     Attributes:
@@ -118,6 +119,7 @@ class Server:
         slots: int = 1,
         keys: Sequence[Key] = (),
         max_datagram: int | None = None,
+        extensions: tuple[m.Extension, ...] = (),
         draw_nonce: Callable[[], int] = lambda: secrets.randbits(64),
     ) -> None:
         self.slots: list[Session | None] = [None] * slots
@@ -128,6 +130,7 @@ class Server:
         self._text_layout = text_layout or (lambda: None)
         self._keys = {key.id: key for key in keys}
         self._max_datagram = max_datagram
+        self._extensions = extensions
         self.tap: Tap | None = None
         self._draw_nonce = draw_nonce
         self._slot_of: dict[Address, int] = {}
@@ -338,7 +341,8 @@ class Server:
 
     def _welcome(self, hello: m.Hello, layout: Layout, address: Address, key: Key | None) -> None:
         self._queue.pop(address, None)
-        welcome = m.Welcome(session=hello.session, nonce=self._draw_nonce())
+        nonce = self._draw_nonce()
+        welcome = m.Welcome(session=hello.session, nonce=nonce, extensions=self._extensions)
         opening = Session(address, hello.session, layout, hello, key=key, welcome=welcome)
         opening.move(Way.SENT, m.Welcome)
         opening.reply = self._transfer(binary.encode(welcome), opening)

@@ -25,7 +25,7 @@ from ..protocol.client import Address
 from ..protocol.errors import PeerClosed, PeerSilent
 from ..protocol.fragments import check_largest
 from ..protocol.layout import Layout
-from ..protocol.messages import Close, Hello, State
+from ..protocol.messages import POLICIES, WHEN_LOST, Close, Extension, Hello, State
 from ..protocol.server import Event, Server
 from ..protocol.transitions import AgentState
 from .sockets import LONGEST_WAIT, PAUSE, Port, address_text, log_notices
@@ -45,6 +45,7 @@ class AgentSettings(TypedDict, total=False):
     connect_timeout: float
     timeout: float
     max_datagram: int | None
+    when_lost: str | None
     key_file: Path | str | None
     insecure: bool
     record: Path | str | None
@@ -63,6 +64,7 @@ class AgentConfig:
     connect_timeout: float = 60.0
     timeout: float = 30.0
     max_datagram: int | None = None
+    when_lost: str | None = None
     key_file: Path | str | None = None
     insecure: bool = False
     record: Path | str | None = None
@@ -78,9 +80,17 @@ class AgentConfig:
             seconds = getattr(self, name)
             expect(math.isfinite(seconds) and seconds > 0, name, "seconds > 0", f"{seconds}")
         check_largest(self.max_datagram)
+        right = self.when_lost is None or self.when_lost in POLICIES
+        expect(right, "when_lost", f"one of {', '.join(POLICIES)}", f"{self.when_lost!r}")
         if self.env_id is not None:
             self.env_id = canonical_id(self.env_id)
             self._expected_options(self.env_id)
+
+    @property
+    def extensions(self) -> tuple[Extension, ...]:
+        """Of a Welcome."""
+        said = self.when_lost
+        return (Extension(number=WHEN_LOST, value=said.encode()),) if said else ()
 
     def accept(self, hello: Hello) -> Layout | str:
         """The layout of a simulator, or why it is refused."""
@@ -159,6 +169,7 @@ class Agent:
             slots=config.slots,
             keys=[Key(key, "agent") for key in keys],
             max_datagram=config.max_datagram,
+            extensions=config.extensions,
         )
         self.states: dict[int, State] = {}
         self.lost = [""] * config.slots

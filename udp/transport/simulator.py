@@ -24,7 +24,7 @@ from .stepped import Stepped, make_stepped, reset_all
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
 
-_ALIVE_EVERY: Final = 0.5  # period of the message Alive while a long step is computed, s
+ALIVE_EVERY: Final = 0.5  # period of the message Alive while a long step is computed, s
 _COMPLAIN_AFTER: Final = 1.0  # A wait for the agent that is told, once, s
 
 Observer = Callable[[Message | None, State], None]
@@ -137,7 +137,7 @@ class Simulator(NotCopied):
         reason = "the simulator was stopped"
         finished = threading.Event()
         heart = threading.Thread(target=self._say_alive, args=(finished,), daemon=True)
-        with _deferred_interrupt(self.stop) as interrupted:
+        with deferred_interrupt(self.stop) as interrupted:
             heart.start()
             try:
                 return self._fly() or reason
@@ -310,9 +310,9 @@ class Simulator(NotCopied):
 
     def _say_alive(self, finished: threading.Event) -> None:
         """In a thread: tell the agent of a long step that it is being computed."""
-        while not finished.wait(_ALIVE_EVERY):
+        while not finished.wait(ALIVE_EVERY):
             began_at = self._began_at
-            if began_at is not None and time.monotonic() - began_at > _ALIVE_EVERY / 2:
+            if began_at is not None and time.monotonic() - began_at > ALIVE_EVERY / 2:
                 for datagram in self.link.alive():
                     self._send(datagram)
 
@@ -330,7 +330,7 @@ class Simulator(NotCopied):
 
 
 @contextmanager
-def _deferred_interrupt(stop: Callable[[], None]) -> Iterator[list[bool]]:
+def deferred_interrupt(stop: Callable[[], None]) -> Iterator[list[bool]]:
     """Have Ctrl-C call `stop`, and only a second one interrupt. The list says whether it came."""
     came: list[bool] = []
     is_main = threading.current_thread() is threading.main_thread()

@@ -228,6 +228,11 @@ class Port:
                 return
         self._everybody.sendto(datagram, address)
 
+    @property
+    def closed(self) -> bool:
+        """Whether it was, maybe by another thread."""
+        return self._everybody.fileno() < 0
+
     def close(self) -> None:
         """Close every socket."""
         self.keep(())
