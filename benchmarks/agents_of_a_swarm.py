@@ -88,7 +88,7 @@ class Options(TaskOptions):
 class Row(Task):
     """Drones in a row, 5 m apart and 2 m high. One that rises by 5 cm is out."""
 
-    Options, several = Options, True
+    Options, drones = Options, 128
 
     def setup(self) -> None:
         self.observation = (ArraySpec(name="observation", shape=(3,)),)

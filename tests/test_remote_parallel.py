@@ -3,6 +3,7 @@
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.models import InputError
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
+from rotorgram.udp.journal.replay import Verification
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
 from rotorgram.udp.transport.relay import FaultConfig
 from swarms import RISE
@@ -94,3 +96,17 @@ def test_drones_that_do_not_fill_their_worlds_are_refused() -> None:
         Simulator(RISE, bind=ANY, num_envs=3, drones=2)
     with pytest.raises(InputError, match="num_envs: expected a multiple of drones = 2, got 3"):
         LocalVectorEnv(RISE, 3, drones=2)
+
+
+def test_a_journal_of_a_swarm_is_simulated_again(tmp_path: Path) -> None:
+    journal = tmp_path / "swarm.mcap"
+    with flying(3, 3) as address:
+        remote = RemoteParallelEnv(address, record=journal)
+        remote.reset(seed=4)
+        dice = np.random.default_rng(0)
+        while remote.agents:
+            remote.step({agent: dice.uniform(-1, 1, 1).astype("f") for agent in remote.agents})
+        remote.close()
+    verdict = Verification(journal)
+    assert verdict.identical
+    assert verdict.sessions[0].same > 20

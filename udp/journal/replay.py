@@ -124,11 +124,12 @@ class SessionVerdict:
         hint = f"the vehicle was {was}, and is {now} here: --vehicle names its file" * other
         try:
             loop = make_stepped(
-                spec.env_id, count, vehicle=self.vehicle, backend=self.backend, options=spec.options
-            )
+                spec.env_id, count, drones=len(spec.agents), vehicle=self.vehicle,
+                backend=self.backend, options=spec.options,
+            )  # fmt: skip
         except InputError as error:
             raise InputError(hint or str(error)) from None
-        for name in ("observation", "action", "telemetry", "control_period"):
+        for name in ("agents", "observation", "action", "telemetry", "control_period"):
             was, now = getattr(spec, name), getattr(loop.spec, name)
             if was != now:
                 loop.close()
