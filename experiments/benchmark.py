@@ -142,7 +142,9 @@ def _fly(config: BenchmarkConfig, job: Job, tell: Tell) -> _Done:
 
 _SETTINGS: Final = ("seeds", "first_seed", "snapshots", "curve_episodes", "episodes")
 _ROW: Final = tuple(field.name for field in fields(BoardRow))
-_ROW_KINDS: Final = dict.fromkeys(_ROW, str) | {"env_steps": int, "num_envs": int, "options": dict}
+_ROW_KINDS: Final = dict.fromkeys(_ROW, str) | {
+    "env_steps": int, "num_envs": int, "drones": int, "options": dict
+}  # fmt: skip
 _KIND_WORDS: Final = {int: "a whole number", str: "a text", dict: "a table", list: "[[row]] tables"}
 
 

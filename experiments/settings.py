@@ -263,6 +263,7 @@ class BoardRow(EnvConfig):
         other = {name: value for name, value in self.options.items() if value != usual[name]}
         words = [self.env_id.rpartition("/")[2]]
         words += [f"{name}={_word(json.dumps(value))}" for name, value in other.items()]
+        words += [f"of {self.drones}"] if self.drones > 1 else []
         words += [f"with {self.vehicle}"] if self.vehicle else []
         return " ".join(words)
 

@@ -14,7 +14,6 @@ from ..agents.episodes import LOST
 from ..agents.policies import Policy
 from ..envs.autoreset import AdvancingVectorEnv, worlds_done
 from ..envs.spec import Discrete, EnvSpec, canonical_id, component_names
-from ..envs.vector import LocalVectorEnv
 from ..models.errors import InputError, expect
 from ..udp.protocol.messages import Command, State
 
@@ -210,6 +209,8 @@ def flown_trajectories(
     """
     name = canonical_id(env_id)  # a checkpoint may name a module, which is not to be imported
     if drones > 1:
+        from ..envs.vector import LocalVectorEnv  # which imports MuJoCo
+
         settings: dict[str, Any] = {"drones": drones, "vehicle": vehicle, **options}
         with closing(LocalVectorEnv(name, drones, autoreset_mode="Disabled", **settings)) as world:
             found = [fly_episodes(world, policy, 1, of, first=episode) for episode in episodes]

@@ -270,7 +270,7 @@ def test_the_scale_holds_crashes_if_there_is_nothing_else(opengl: None, tmp_path
     size = {"height": 240, "overlay": True, "fps": 0.5}
     alone = filmed(tmp_path, shot(crash), width=320, **size)[-1]
     beside = filmed(tmp_path, shot(crash), shot(hovers), width=642, **size)[-1][:, :320]
-    (first, *_), vehicle = shot(hovers).moments[0], Vehicle.load()
+    ((first, *_),), vehicle = shot(hovers).moments[0], Vehicle.load()
     strip = Overlay(320, 240, title="PID", like=first, vehicle=vehicle, period=0.02, seconds=2.0,
                     scale=(0.0, 3.0)).plot  # fmt: skip
     columns = [

@@ -152,7 +152,7 @@ def test_panes_of_the_same_have_names_of_their_own(
         (["pid", "--out", "film.mp4", "--names", "a", "b"], "names: expected one for each of 1"),
         (["pid", "--out", "film.mp4", "--at", "-1"], "at: expected"),
         (["--out", "film.mp4"], "what: expected a checkpoint, pid, geometric, random or a journal"),
-        (["nowhere", "--out", "film.mp4"], "policy: expected pid, geometric, a checkpoint"),
+        (["nowhere", "--out", "film.mp4"], "policy: expected pid, geometric, orca, a checkpoint"),
         (["nowhere.mcap", "--out", "film.mp4"], "nowhere.mcap"),
         (["pid", "--out", "film.mp4", "--env.observation", "error"], "pid: expected"),
     ],
