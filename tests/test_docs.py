@@ -39,6 +39,21 @@ def test_the_other_tables_are_those_of_their_comparisons(folder: str) -> None:
     assert json.loads((RESULTS / folder / "config.json").read_text())["command"] in page
 
 
+@pytest.mark.parametrize("file", sorted(RESULTS.glob("*/mujoco.csv")), ids=lambda f: f.parent.name)
+def test_the_check_on_mujoco_is_the_one_that_was_measured(file: Path) -> None:
+    page = (ROOT / "docs" / "results.md").read_text()
+
+    def text(number: float) -> str:
+        return f"{number:,.0f}" if abs(number) >= 1000 else f"{number:.3g}"
+
+    for row in pd.read_csv(file).itertuples():
+        assert row.low < 0 < row.high  # as the page says
+        assert (
+            f"| {text(row.rigid)} | {text(row.mujoco)} "
+            f"| {text(row.difference)} ({text(row.low)} to {text(row.high)}) |"
+        ) in page
+
+
 @pytest.mark.parametrize("agent", ["vpg", "a2c"])
 def test_the_tuning_trials_are_those_of_the_sweeps(agent: str) -> None:
     page = (ROOT / "docs" / "results.md").read_text()
