@@ -45,6 +45,7 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         expect(self.backend in BACKENDS, "backend", " or ".join(BACKENDS), repr(self.backend))
+        expect(self.drones >= 1, "drones", "1 or more", str(self.drones))
         options: dict[str, Any] = dict(self.options)
         if is_known(self.env_id):
             options = options_type(self.env_id).from_options(options).to_options()
