@@ -62,7 +62,7 @@ def make_task(
     checked = kind.Options.from_options(options)
     craft = Vehicle.load(vehicle, linear_drag=checked.linear_drag)
     craft.substeps(checked.control_period)  # raises where they do not go together
-    most = f"at most {kind.drones}" if kind.drones > 1 else "1"
+    most = f"1 to {kind.drones}" if kind.drones > 1 else "1"
     drones = shape[1]
     right = type(drones) is int and 1 <= drones <= kind.drones
     expect(right, "drones", f"{most} with {canonical_id(env_id)}", f"{drones!r}")
