@@ -285,6 +285,18 @@ def _large(env_steps: int, **changes: Any) -> Preset:
     return Preset(config=config, num_envs=512, env_steps=env_steps, backend="rigid")
 
 
+# Rollouts as long as an episode: worlds begin together, and shorter ones show one phase of it.
+_SWARM: Final = Preset(
+    config=replace(_HOVER, gamma=0.99, log_std=-0.5, steps_per_update=16_384, minibatches=32),
+    num_envs=32,
+    env_steps=1_000_000,
+)
+_SWARMS: Final = {
+    (algorithm, "tuned", f"rotorgram/{task}-v0"): _SWARM
+    for algorithm in ("ppo", "ippo", "mappo")
+    for task in ("Formation", "Crossing", "Escort")
+}
+
 _OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {
     ("ppo", "tuned", "rotorgram/Hover-v0"): replace(_HOLD, backend="rigid"),
     ("ppo", "tuned", "rotorgram/PayloadHover-v0"): _HOLD,
@@ -301,6 +313,7 @@ _OF_TASKS: Final[dict[tuple[str, str, str], Preset]] = {
         num_envs=64,
         env_steps=200_000,
     ),
+    **_SWARMS,
 }  # fmt: skip
 """By algorithm without `sb3-`, name and id of the env."""
 

@@ -10,7 +10,6 @@ from ...sim import Array, Draw, WorldState, constant
 from ..delay import Delay
 from .flight import (
     AIR,
-    ERROR_SCALE,
     FURTHEST,
     LEAST_TILT_COSINE,
     MOST_SPEED,
@@ -158,11 +157,11 @@ class Swarm(Flight):
         distance = length(self.xp, to_goal)
         along = to_goal * (state.velocity - self.goal_velocity())
         closing = along[..., 0] + along[..., 1] + along[..., 2]
-        room, ended = self.clearance(state), self.ended(state)
+        room, ended, near = self.clearance(state), self.ended(state), self.gap / 2
         narrow = 1.0 - room / (2 * self.vehicle.radius)
         return Outcome(
             reward={
-                "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
+                "position": (near - distance) / (near + distance),
                 "approach": APPROACH_WEIGHT * closing / (distance + _TINY),
                 "room": -ROOM_WEIGHT * narrow * (narrow > 0),
                 "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
