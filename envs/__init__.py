@@ -48,5 +48,6 @@ for _module, _name in (
     ("formation", "Formation"),
     ("crossing", "Crossing"),
     ("escort", "Escort"),
+    ("cable", "Cable"),
 ):
     register(f"rotorgram/{_name}-v0", f"rotorgram.envs.tasks.{_module}:{_name}")

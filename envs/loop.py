@@ -62,10 +62,10 @@ def make_task(
     checked = kind.Options.from_options(options)
     craft = Vehicle.load(vehicle, linear_drag=checked.linear_drag)
     craft.substeps(checked.control_period)  # raises where they do not go together
-    most = f"1 to {kind.drones}" if kind.drones > 1 else "1"
-    drones = shape[1]
-    right = type(drones) is int and 1 <= drones <= kind.drones
-    expect(right, "drones", f"{most} with {canonical_id(env_id)}", f"{drones!r}")
+    least, most, drones = kind.fewest, kind.drones, shape[1]
+    range_told = f"{least} to {most}" if most > least else f"{most}"
+    right = type(drones) is int and least <= drones <= most
+    expect(right, "drones", f"{range_told} with {canonical_id(env_id)}", f"{drones!r}")
     task = kind(checked, craft, shape, xp)
     for name in ("controller", "observation"):
         if not hasattr(task, name):
@@ -183,7 +183,7 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
     if drawn := Randomization(task.options.randomize, None).names:
         units = tuple(PARAMETERS[name].unit for name in drawn)
         specs.append(numbers("drawn", [f"drawn_{name}" for name in drawn], unit=units))
-    if task.options.effects_on(vehicle.mass).get("payload"):
+    if task.effects.get("payload"):
         names = ("X_payload", "Y_payload", "Z_payload")
         specs.append(numbers("payload", names, unit="m", frame="paper"))
     if type(task).goal is not Task.goal:
@@ -237,7 +237,7 @@ class Loop(NotCopied):
     ) -> None:
         draft = make_task(env_id, options or {}, vehicle, (1, drones))
         chosen, craft = draft.options, draft.vehicle
-        effects = EffectOptions.from_options(chosen.effects_on(craft.mass))
+        effects = EffectOptions.from_options(draft.effects)
         randomize = Randomization(chosen.randomize, effects) if chosen.randomize else None
         self.world: World = make_world(
             craft, num_worlds, backend, drones=drones, effects=effects, randomize=randomize,

@@ -8,7 +8,7 @@ import numpy as np
 
 from .errors import expect
 from .scene import build_swarm
-from .vehicle import Vehicle, owners
+from .vehicle import Vehicle, hang_payload, owners
 
 SHARED: Final = ("timestep", "gravity", "integrator", "density", "viscosity", "wind", "magnetic")
 """Options that a world has once, so that its vehicles have to agree."""
@@ -21,12 +21,15 @@ def drone_names(count: int) -> tuple[str, ...]:
     return tuple(f"drone_{i}" for i in range(count))
 
 
-def swarm_model(vehicles: Sequence[Vehicle], *, movable: bool = False) -> mujoco.MjModel:
+def swarm_model(
+    vehicles: Sequence[Vehicle], *, movable: bool = False, payload: float = 0.0, cable: float = 0.0
+) -> mujoco.MjModel:
     """A world with a craft of each vehicle, without visual elements.
 
     Free joints and rotors come craft by craft, and two sensors of each count its contacts. With
-    `movable`, centers of mass may be moved. Raises `InputError` where vehicles do not agree in
-    `SHARED`.
+    `movable`, centers of mass may be moved. A payload, kg, is a ball on a cable, m, from each
+    craft: its free joint comes last, and centers of mass may be moved too. Raises `InputError`
+    where vehicles do not agree in `SHARED`.
     """
     first, names = vehicles[0], drone_names(len(vehicles))
     for vehicle in vehicles:
@@ -37,10 +40,13 @@ def swarm_model(vehicles: Sequence[Vehicle], *, movable: bool = False) -> mujoco
     spec = build_swarm([vehicle.path for vehicle in vehicles], names, visual=False)
     crafts = [body for body in spec.worldbody.bodies if body.name.partition("/")[0] in names]
     for name, craft in zip(names, crafts, strict=True):
-        if movable:
+        if movable or payload:
             craft.simple = False
         _count_contacts(spec, f"{name}/{CONTACTS}", craft.name)
         _count_contacts(spec, f"{name}/{GROUNDED}", craft.name, spec.worldbody.name)
+    if payload:
+        prefixed = {f"{name}/": craft for name, craft in zip(names, crafts, strict=True)}
+        hang_payload(spec, prefixed, payload, cable)
     model = spec.compile()
     owner = owners(model)
     model.geom_group[:] = owner[model.geom_bodyid] >= 0

@@ -6,7 +6,7 @@ Body frame: that of the free body, x forward, y left, z up; SI units.
 
 import math
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from hashlib import blake2b
@@ -172,15 +172,7 @@ class Vehicle:
         """
         spec, craft = self._spec()
         radius = payload_radius(mass)
-        hook = craft.add_site(name="rotorgram/hook")
-        ball = spec.worldbody.add_body(name=_PAYLOAD)
-        ball.pos = craft.pos - (0.0, 0.0, cable)
-        ball.add_freejoint()
-        ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], mass=mass)
-        end = ball.add_site(name="rotorgram/payload")
-        tendon = spec.add_tendon(name="rotorgram/cable", limited=True, range=[0.0, cable])
-        tendon.wrap_site(hook.name)
-        tendon.wrap_site(end.name)
+        hang_payload(spec, {"": craft}, mass, cable)
         model = self._compiled(spec)
         data = mujoco.MjData(model)
         data.qpos[2] = high = self.rest_height + 2 * (cable + radius)
@@ -248,6 +240,26 @@ def compile_vehicle(
 def payload_radius(mass: float) -> float:
     """Radius of a ball of water of such a mass, m."""
     return float((3 * mass / (4 * math.pi * 1000.0)) ** (1 / 3))
+
+
+def hang_payload(
+    spec: mujoco.MjSpec, crafts: Mapping[str, mujoco.MjsBody], mass: float, cable: float
+) -> None:
+    """Add a ball of a mass, kg, and a cable of a length, m, to it from each craft's origin.
+
+    The crafts have the prefixes of their names as keys. See `Vehicle.with_payload`.
+    """
+    ball = spec.worldbody.add_body(name=_PAYLOAD)
+    ball.pos = next(iter(crafts.values())).pos - (0.0, 0.0, cable)
+    ball.add_freejoint()
+    radius = payload_radius(mass)
+    ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], mass=mass)
+    end = ball.add_site(name=_PAYLOAD)
+    for prefix, craft in crafts.items():
+        hook = craft.add_site(name=f"{prefix}rotorgram/hook")
+        tendon = spec.add_tendon(name=f"{prefix}rotorgram/cable", limited=True, range=[0.0, cable])
+        tendon.wrap_site(hook.name)
+        tendon.wrap_site(end.name)
 
 
 def craft_bodies(model: mujoco.MjModel) -> np.ndarray:

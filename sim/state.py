@@ -45,9 +45,10 @@ class WorldState:
     colliding: Array = None
     """Whether it was so with another drone; None where drones are alone."""
     payload: Array = None
-    """Position of each payload, world frame, m, shape (W, A, 3); None without payloads."""
+    """Position of each drone's payload, world frame, m, shape (W, A, 3), which all drones of a
+    world share; None without payloads."""
     payload_velocity: Array = None
-    """Velocity of each payload, world frame, m/s, shape (W, A, 3); None without payloads."""
+    """Its velocity, world frame, m/s, shape (W, A, 3)."""
 
     @property
     def tilt_cosine(self) -> Array:
@@ -70,6 +71,9 @@ class Pose:
     """Body frame, rad/s, shape (W, A, 3)."""
     thrust: Array | None = None
     """N, shape (W, A, R)."""
+    payload: Array | None = None
+    """Of the payload, world frame, m, shape (W, A, 3), alike for the drones of a world. None means
+    straight below the drone, which has to be alone."""
 
 
 def clip(array: Array, low: Any, high: Any) -> Array:

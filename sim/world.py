@@ -113,14 +113,14 @@ def flown_model(
     vehicle: "Vehicle", drones: int, effects: EffectOptions, drawn: Sequence[str]
 ) -> "mujoco.MjModel":
     """The model of a world: the vehicle's, or one with more crafts, with a payload or for a drawn
-    center of mass. Raises `InputError` for a payload of each of several drones.
+    center of mass.
     """
     movable = bool(set(drawn) & set(CENTER))
     if drones > 1:
-        expect(not effects.payload, "effects: payload", "one drone in a world", f"{drones}")
         from ..models.swarm import swarm_model  # which imports MuJoCo
 
-        return swarm_model([vehicle] * drones, movable=movable)
+        load = effects.payload * drones
+        return swarm_model([vehicle] * drones, movable=movable, payload=load, cable=effects.cable)
     if effects.payload:
         return vehicle.with_payload(effects.payload, effects.cable)
     return vehicle.with_movable_center() if movable else vehicle.model

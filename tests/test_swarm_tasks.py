@@ -16,6 +16,7 @@ from rotorgram.experiments.trajectories import fly_episodes
 from rotorgram.models import InputError, Vehicle
 
 TASKS = ("rotorgram/Formation-v0", "rotorgram/Crossing-v0", "rotorgram/Escort-v0")
+ALL_TASKS = (*TASKS, "rotorgram/Cable-v0")
 ALL = np.ones(1, bool)
 PERIOD = 0.02
 
@@ -115,7 +116,7 @@ def test_the_radius_holds_all_that_collides(vehicle: str | None) -> None:
     assert env.loop.metrics["clearance"] == pytest.approx([distance - 2 * radius] * 2)
 
 
-@pytest.mark.parametrize("env_id", TASKS)
+@pytest.mark.parametrize("env_id", ALL_TASKS)
 def test_worlds_of_a_batch_fly_as_single_ones(env_id: str) -> None:
     lossy = {"radio_loss": 0.4, "radio_delay": 2, "radio_range": 30.0, "neighbours": 2}
     dice = np.random.default_rng(0)
@@ -142,7 +143,7 @@ def test_a_lossy_radio_moves_no_start() -> None:
     assert starts[0] == starts[1]
 
 
-@pytest.mark.parametrize("env_id", TASKS)
+@pytest.mark.parametrize("env_id", ALL_TASKS)
 def test_pettingzoos_own_tests(env_id: str) -> None:
     parallel_api_test(LocalParallelEnv(env_id, 3, episode_length=50), num_cycles=120)
     parallel_seed_test(lambda: LocalParallelEnv(env_id, 2, episode_length=30))

@@ -138,8 +138,9 @@ def test_what_a_swarm_cannot_have_is_one_sentence() -> None:
     with pytest.raises(InputError, match=r"^drones: expected 1 with the backend rigid, got 2$"):
         make_world(vehicle, 1, "rigid", drones=2)
     payload = EffectOptions.from_options({"payload": 1.0, "cable": 1.0})
-    with pytest.raises(InputError, match=r"payload: expected one drone in a world, got 2"):
-        make_world(vehicle, 1, drones=2, effects=payload)
+    world, above = make_world(vehicle, 1, drones=2, effects=payload), np.full((1, 2, 3), 5.0)
+    with pytest.raises(InputError, match=r"payload: expected one drone in a world, or a task .* 2"):
+        world.reset(np.ones((1, 2), bool), Pose(position=above))
     with pytest.raises(InputError, match=r"expected a timestep of 0.01 as of"):
         swarm_model([vehicle, Vehicle.load("crazyflie2")])
 

@@ -25,7 +25,7 @@ MOST_DRONES: Final = 128
 FORGOTTEN: Final = 1.0  # A drone that was not heard for so long is no neighbour any more, s
 APPROACH_WEIGHT: Final = 0.1  # Of a speed of 1 m/s towards the goal, in each step
 ROOM_WEIGHT: Final = 0.5  # Cost of spheres that touch; nothing from a diameter apart on
-_TINY: Final = 1e-9  # m
+TINY: Final = 1e-9  # m
 JITTER: Final = 0.2  # Of a start, in each axis, over the distance between starts
 
 
@@ -158,12 +158,11 @@ class Swarm(Flight):
         along = to_goal * (state.velocity - self.goal_velocity())
         closing = along[..., 0] + along[..., 1] + along[..., 2]
         room, ended, near = self.clearance(state), self.ended(state), self.gap / 2
-        narrow = 1.0 - room / (2 * self.vehicle.radius)
         return Outcome(
             reward={
                 "position": (near - distance) / (near + distance),
-                "approach": APPROACH_WEIGHT * closing / (distance + _TINY),
-                "room": -ROOM_WEIGHT * narrow * (narrow > 0),
+                "approach": APPROACH_WEIGHT * closing / (distance + TINY),
+                "room": self.narrowness(room),
                 "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
                 "termination": ended * TERMINATION_REWARD + 0.0,
             },
@@ -185,6 +184,11 @@ class Swarm(Flight):
         apart = length(np, state.position[:, :, None] - state.position[:, None])
         apart[:, np.arange(self.count), np.arange(self.count)] = np.inf
         return apart.min(axis=-1) - 2 * self.vehicle.radius
+
+    def narrowness(self, room: Array) -> Array:
+        """Reward for a clearance, (W, A): 0 from a diameter on, `-ROOM_WEIGHT` where it is 0."""
+        narrow = 1.0 - room / (2 * self.vehicle.radius)
+        return -ROOM_WEIGHT * narrow * (narrow > 0)
 
     def slots_at(self, slots: np.ndarray, state: WorldState) -> Array:
         """Offsets of each drone, shape (A, 3), from the center, in the world: (W, A, 3)."""

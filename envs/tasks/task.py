@@ -9,7 +9,7 @@ array in place.
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
@@ -69,6 +69,8 @@ class TaskOptions:
 
     actions: ClassVar[tuple[str, ...]] = LEVELS
     """Levels that the task can be flown at; one with a controller of its own may name fewer."""
+    hangs: ClassVar[bool] = False
+    """Whether the task hangs a payload from the vehicle, so that `effects` may not."""
 
     def __post_init__(self) -> None:
         check_choice(self, "action", self.actions)
@@ -77,19 +79,18 @@ class TaskOptions:
         check_number(self, "control_period", 1e-6, LONGEST_CONTROL_PERIOD, "s")
         check_number(self, "linear_drag", 0.0, MOST_DRAG, "/s")
         effects = EffectOptions.from_options(self.effects)
+        hung = [name for name in ("payload", "cable") if self.hangs and name in self.effects]
+        expected = "a payload that the options of the task describe"
+        expect(not hung, "effects", expected, " and ".join(hung))
         object.__setattr__(self, "effects", effects.to_options())
         object.__setattr__(self, "sensors", checked_sensors(self.sensors))
         self.check()
-        acting = EffectOptions.from_options(self.effects_on(1.0))
+        acting = replace(effects, payload=1.0) if self.hangs else effects
         drawn = Randomization(self.randomize, acting)
         object.__setattr__(self, "randomize", drawn.to_options())
 
     def check(self) -> None:
         """Check the options of a derived class; raise `InputError`."""
-
-    def effects_on(self, mass: float) -> Mapping[str, Any]:
-        """Effects on a vehicle of a mass, kg: those of `effects`, and what the task adds."""
-        return self.effects
 
     @property
     def ideal(self) -> bool:
@@ -136,6 +137,7 @@ class Task:
         metrics: Measures of how well it is done. The first is the headline.
         choices: Names of draws that a reset's options may choose.
         drones: Most drones of one world, which it has to keep apart at the start.
+        fewest: Least drones of one world.
 
     Attributes:
         options: As given.
@@ -152,6 +154,7 @@ class Task:
     metrics: ClassVar[tuple[Metric, ...]] = ()
     choices: ClassVar[tuple[str, ...]] = ()
     drones: ClassVar[int] = 1
+    fewest: ClassVar[int] = 1
 
     controller: Controller
     observation: tuple[ArraySpec, ...]
@@ -173,6 +176,12 @@ class Task:
         options = self.options
         period = options.control_period if options.estimated else self.vehicle.timestep
         return make_controller(options.action, self.vehicle, period, lag=self.lag)
+
+    @property
+    def effects(self) -> Mapping[str, Any]:
+        """Effects on the drones by name: those of the options, and what the task adds."""
+        told: Mapping[str, Any] = self.options.effects
+        return told
 
     @property
     def lag(self) -> float:

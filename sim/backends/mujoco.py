@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from ...models.errors import InputError
+from ...models.errors import InputError, expect
 from ...models.swarm import CONTACTS, GROUNDED, contact_columns
 from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
 from ..effects import EffectOptions, Effects
@@ -65,11 +65,11 @@ class MujocoWorld(ArrayWorld):
         self._owner = None if threads == 1 else os.getpid()
         self._initial = batch.state[0].copy()
         # Live views of simulator memory, made once.
-        own = (*lead, -1)  # of each craft, and of its payload after it
-        qpos, qvel, applied = (
-            batch.bind(name).reshape(own) for name in ("qpos", "qvel", "qfrc_applied")
+        own = (*lead, -1)
+        (qpos, ball), (qvel, moves), (self._applied, _) = (
+            _views(batch.bind(name).reshape(num_worlds, -1), drones, size, lead)
+            for name, size in (("qpos", 7), ("qvel", 6), ("qfrc_applied", 6))
         )
-        self._applied = applied[..., :6]
         self._ctrl: np.ndarray = batch.bind("ctrl")
         self._contacts: np.ndarray = batch.bind("ncon")
         self._warnings = batch.warning  # of each kind the last info, and how many
@@ -95,8 +95,8 @@ class MujocoWorld(ArrayWorld):
             thrust=self._thrust.reshape(own),
             touching=self._touching.reshape(lead),
             colliding=self._colliding,
-            payload=None if self._cable is None else qpos[..., 7:10],
-            payload_velocity=None if self._cable is None else qvel[..., 6:9],
+            payload=None if self._cable is None else ball,
+            payload_velocity=None if self._cable is None else moves,
         )
         assert np.shares_memory(self.state.position, qpos)
 
@@ -104,8 +104,9 @@ class MujocoWorld(ArrayWorld):
         """As `World.reset`. Raises `InputError` for a payload that would hang in the ground."""
         self._check_process()
         ids = self._ids(mask)
-        if self._cable is not None and len(ids):
-            check_hung(pose.position.reshape(-1, 3)[ids, 2].min(), self._least_height)
+        hung = self._hung(pose)
+        if hung is not None and len(ids):
+            check_hung(hung[ids, 2].min() + self._options.cable, self._least_height)
         self._batch.state[ids] = self._initial
         self._warnings[ids] = 0
         state, here = self.state, () if self.shape == () else ids
@@ -128,7 +129,8 @@ class MujocoWorld(ArrayWorld):
             self._batch.set_const(ids)
         if self.effects is not None:
             state.thrust[here] = self.effects.begin(mask, state, self.parameters)[here]
-        self._place_payload(ids)
+        if hung is not None:
+            self._place_payload(ids, hung)
         self._apply_thrust(self._thrust)
         # To wake the threads takes longer than a few worlds.
         for some in (ids,) if len(ids) > _FEW else ids[:, None]:
@@ -202,7 +204,9 @@ class MujocoWorld(ArrayWorld):
         before = self._warmstart.copy()
         self._batch.forward()
         self._warmstart[:] = before
-        return self._qacc.reshape((*self.shape, -1))[..., :3].copy()
+        worlds, drones = self._touching.shape
+        own, _ = _views(self._qacc.reshape(worlds, -1), drones, 6, self.shape)
+        return own[..., :3].copy()
 
     def below(self) -> Array:
         """As `World.below`, by `mj_ray`."""
@@ -231,15 +235,22 @@ class MujocoWorld(ArrayWorld):
         if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
             raise RuntimeError("the threads of an env do not follow into a fork: make another env")
 
-    def _place_payload(self, ids: np.ndarray) -> None:
-        """Hang the payload straight below the craft, moving along with it."""
+    def _hung(self, pose: Pose) -> np.ndarray | None:
+        """Where the payload of each world begins, shape (W, 3)."""
         if self._cable is None:
-            return
+            return None
+        drones = self._touching.shape[1]
+        if pose.payload is None:
+            expected = "one drone in a world, or a task whose start places it"
+            expect(drones == 1, "effects: payload", expected, f"{drones} drones")
+        hung = pose.position - (0.0, 0.0, self._cable) if pose.payload is None else pose.payload
+        return np.reshape(hung, (-1, drones, 3))[:, 0]
+
+    def _place_payload(self, ids: np.ndarray, hung: np.ndarray) -> None:
+        """Put payloads there, moving along with the first craft."""
         qpos, qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
-        qpos[ids, 7:10] = qpos[ids, :3] - (0.0, 0.0, self._cable)
-        qpos[ids, 10:14] = (1.0, 0.0, 0.0, 0.0)
-        qvel[ids, 6:9] = qvel[ids, :3]
-        qvel[ids, 9:12] = 0.0
+        qpos[ids, -7:-4], qpos[ids, -4:] = hung[ids], (1.0, 0.0, 0.0, 0.0)
+        qvel[ids, -6:-3], qvel[ids, -3:] = qvel[ids, :3], 0.0
 
     def _apply_thrust(self, thrust: np.ndarray) -> None:
         if self._newtons is not None:
@@ -254,3 +265,15 @@ class MujocoWorld(ArrayWorld):
         names = ", ".join(mujoco.mjtWarning(kind).name for kind in kinds)
         self._warnings.fill(0)  # so that a reset gives usable worlds again
         return f"MuJoCo warned of {names} in envs {ids[:5]}: reset the env"
+
+
+def _views(
+    rows: np.ndarray, drones: int, size: int, lead: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of rows (W, n): so many numbers of each craft, and the place or speed of the payload after
+    them, the same for all crafts of a world.
+    """
+    crafts = drones * size
+    load = rows[:, None, crafts : crafts + 3]
+    shared = np.broadcast_to(load, (len(rows), drones, load.shape[-1]))
+    return rows[:, :crafts].reshape(*lead, size), shared.reshape(*lead, -1)

@@ -38,9 +38,10 @@ class EffectOptions:
     efficiency: tuple[float, ...] = ()
     """Share of its thrust that each rotor gives, 0 to 1; empty: all of it."""
     payload: float = 0.0
-    """Mass that hangs on a cable from the body's origin, kg."""
+    """Mass that hangs on a cable from the body's origin, kg. Several drones of a world carry one
+    ball together, of so much for each."""
     cable: float = 1.0
-    """Length of that cable, m."""
+    """Length of each cable, m."""
 
     def __post_init__(self) -> None:
         for name in ("motor_lag", "thrust_curve", "battery", "body_drag", "rotor_drag"):

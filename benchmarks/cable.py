@@ -1,0 +1,55 @@
+"""How near the agent `geometric` holds a payload that several drones carry.
+
+    python benchmarks/cable.py [--episodes 10] [--out FILE.json]
+
+Of each vehicle of the library and each number of drones, over the evaluation episodes of Cable-v0:
+median and largest of the means of the payload's error over the last quarter of an episode, and
+worlds whose episode terminated.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rotorgram.agents import Geometric
+from rotorgram.agents.checkpoints import software_versions
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.experiments.trajectories import fly_episodes
+from rotorgram.models.library import vehicle_names
+
+CABLE, DRONES = "rotorgram/Cable-v0", (2, 3, 4, 8)
+
+
+def flown(vehicle: str, drones: int, episodes: int) -> dict[str, Any]:
+    """Errors, m, and worlds that terminated."""
+    env = LocalVectorEnv(
+        CABLE, episodes * drones, drones=drones, vehicle=vehicle, action="position",
+        autoreset_mode="Disabled",
+    )  # fmt: skip
+    flights = fly_episodes(env, Geometric(env.env_spec), episodes, "final")[::drones]
+    ends = [one.telemetry["metrics"][-len(one.telemetry["metrics"]) // 4 :, 0] for one in flights]
+    errors = [float(np.mean(end)) for end in ends]
+    return {
+        "error_m": round(float(np.median(errors)), 4),
+        "worst_m": round(max(errors), 4),
+        "terminated": sum(one.ending == "terminated" for one in flights),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--out", type=Path, default=Path("docs/results/control/cable.json"))
+    args = parser.parse_args()
+    told: dict[str, Any] = {"episodes": args.episodes, "software": software_versions()}
+    for name in vehicle_names():
+        told[name] = {str(count): flown(name, count, args.episodes) for count in DRONES}
+        print(name, told[name], flush=True)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(told, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

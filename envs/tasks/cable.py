@@ -1,0 +1,228 @@
+"""`rotorgram/Cable-v0`: drones carry one payload together, each on a cable, to a point."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...models.errors import expect
+from ...sim import Array, Draw, Pose, WorldState, stack
+from ..spec import Metric
+from .flight import AIR, LEAST_TILT_COSINE, MOST_SPEED, RATE_WEIGHT, TERMINATION_REWARD, length
+from .payload_hover import SWING_WEIGHT
+from .swarm import APPROACH_WEIGHT, TINY, Swarm, SwarmOptions, ring
+from .task import Outcome, check_number
+
+
+@dataclass(frozen=True, kw_only=True)
+class CableOptions(SwarmOptions):
+    """Options of `rotorgram/Cable-v0`. `center` is the point for the payload."""
+
+    payload_share: float = 0.2
+    """Mass of the payload over that of all vehicles together."""
+    angle: float = 30.0
+    """Angle of the cables to the vertical at the start, degrees. Their length follows from it and
+    from `spacing`."""
+    start_band: float = 0.5
+    """Largest distance of the payload from the goal along each axis at the start, over the distance
+    between neighbouring drones."""
+
+    hangs = True
+
+    def check(self) -> None:
+        """Check the options of this task. Raises `InputError`."""
+        super().check()
+        check_number(self, "payload_share", 0.001, 10.0)
+        check_number(self, "angle", 5.0, 60.0, "degrees")
+        check_number(self, "start_band", 0.0, 100.0)
+
+
+class Cable(Swarm):
+    """Drones carry a payload, each on a cable from its body's origin, and hold it at a point.
+
+    ## Observation, `float32`, shape (24 + R + 7 k,), k = 7 (`neighbours`)
+
+    | index | quantity | unit | frame |
+    |---|---|---|---|
+    | 0-2 | own place minus position: where the payload would hang still at the goal | m | world |
+    | 3-5 | velocity | m/s | world |
+    | 6-8 | direction of body x, the nose | 1 | world |
+    | 9-11 | direction of body z, the thrust | 1 | world |
+    | 12-14 | body rates | rad/s | body |
+    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+    | 15 + R... | position of the payload minus the own: the direction of the cable | m | world |
+    | 18 + R... | velocity of the payload minus the own | m/s | world |
+    | 21 + R... | goal of the payload minus its position | m | world |
+    | then, of each neighbour, the nearest first: 3 | its position minus the own | m | world |
+    | 3 | its velocity minus the own | m/s | world |
+    | 1 | 1; 0, as the six before, where no further drone is heard | 1 | |
+
+    The payload's numbers are exact, with sensors too: nothing measures them.
+
+    ## Action, `Box(-1, 1, (4,), float32)`
+
+    Velocity in the frame turned by the heading, and yaw rate, as shares of their ranges (the level
+    `velocity`).
+
+    ## Reward, the same for all but for rates and room
+
+    (s - d) / (s + d) for the distance d of the payload to the goal, where s is half the distance
+    between neighbouring drones; 0.1 s/m times the speed of the payload towards it; -0.1 s/m times
+    the speed of the payload relative to the drone; -0.02 s/rad times the size of the body rates;
+    with less than a diameter between the drone's sphere and another, down to -0.5 where they touch
+    and further below; and -20 on the step that terminates.
+
+    ## Start, termination, truncation
+
+    At rest in equilibrium: the drones on a level ring that is turned by lot, neighbours three
+    diameters (`spacing`) apart, each tilted and with the thrusts that carry its share of the
+    payload on a cable 30° (`angle`) off the vertical. The payload is off the goal by up to half
+    the distance between neighbours along each axis (`start_band`).
+
+    *Terminated*, for all drones at once: contact of any, a tilt above 90°, the payload on the
+    ground or 10 m (`margin`) further from the goal than any start. *Truncated*: after 500 steps of
+    0.02 s.
+    """
+
+    Options = CableOptions
+    metrics = (
+        Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e"),
+        Metric(name="clearance", unit="m", goal="high"),
+    )
+    fewest, drones = 2, 32
+
+    def setup(self) -> None:
+        """See the class."""
+        from ...models.vehicle import payload_radius
+
+        options, vehicle, count = self.options, self.vehicle, self.shape[1]
+        self._slant = math.radians(options.angle)
+        self._ring = float(np.linalg.norm(ring(count)[0])) * self.gap
+        self._azimuths = 2 * math.pi * np.arange(count) / count
+        self._height, self._cable = (
+            self._ring / math.tan(self._slant),
+            self._ring / math.sin(self._slant),
+        )
+        self._load = options.payload_share * vehicle.mass * vehicle.gravity
+        lift = vehicle.mass * vehicle.gravity + self._load
+        self._tilt = math.atan2(self._load * math.tan(self._slant), lift)
+        thrust = self.carrying(np.linspace(0.0, 2 * math.pi, 36))
+        able = (vehicle.thrust_low <= thrust).all() and (thrust <= vehicle.thrust_high).all()
+        expected = (
+            f"a load that the rotors of {vehicle.name} carry at an angle of {options.angle:g}°"
+        )
+        expect(bool(able), "payload_share", expected, f"{options.payload_share:g}")
+        self._radius = payload_radius(options.payload_share * vehicle.mass * count)
+        away = options.start_band * self.gap
+        least = self._radius + AIR + away
+        expected = f"a height of at least {least:.4g} m above the ground"
+        expect(options.center[2] >= least, "center", expected, f"{options.center[2]:g}")
+        self.reach = away * math.sqrt(3)
+        self._turn: Array = 0.0
+        self.prepare(
+            tuple(
+                (f"{quantity} {axis}", unit, size)
+                for quantity, unit, size in (
+                    ("payload - position", "m", 2 * self._cable),
+                    ("payload velocity - velocity", "m/s", MOST_SPEED),
+                    ("payload goal - payload", "m", 2 * (self.reach + options.margin)),
+                )
+                for axis in "xyz"
+            )
+        )
+
+    @property
+    def effects(self) -> Mapping[str, Any]:
+        """Those of the options, and the payload's share of each drone on its cable."""
+        options = self.options
+        share = options.payload_share * self.vehicle.mass
+        return {**options.effects, "payload": share, "cable": self._cable}
+
+    def carrying(self, azimuth: np.ndarray) -> np.ndarray:
+        """Thrusts that hold drones at such azimuths from the payload, N, (..., R): rad, (...).
+
+        Each cable pulls at the body's origin, which may be off the center of mass: the rotors turn
+        against that.
+        """
+        vehicle, load = self.vehicle, self._load
+        # The pull in the frame of a drone that is tilted outwards; its height and its way inwards.
+        inwards = load * math.tan(self._slant)
+        c, s = math.cos(self._tilt), math.sin(self._tilt)
+        along, down = s * load - c * inwards, -s * inwards - c * load
+        pull = stack((along * np.cos(azimuth), along * np.sin(azimuth), down))
+        force = np.full(azimuth.shape, math.hypot(inwards, load + vehicle.mass * vehicle.gravity))
+        torque = np.cross(vehicle.center_of_mass, pull)
+        even = force[..., None] * (vehicle.hover_thrust / (vehicle.mass * vehicle.gravity))
+        wanted = np.concatenate((force[..., None], torque), axis=-1)
+        missing = wanted - even @ vehicle.allocation.T
+        thrust: np.ndarray = even + missing @ np.linalg.pinv(vehicle.allocation).T
+        return thrust
+
+    def begin(self, mask: Array, draw: Draw) -> Pose:
+        """At rest in equilibrium, the payload off its goal."""
+        away = self.options.start_band * self.gap
+        turn = draw.uniform(-math.pi, math.pi)[:, :1]  # one for all drones, as what follows
+        offset = draw.uniform(-away, away, (3,))[:, :1]
+        self.keep(mask, _turn=turn + 0.0 * offset[..., 0] + np.zeros(self.shape))
+        ball = np.array(self.options.center) + offset + np.zeros((*self.shape, 3))
+        azimuth = turn + self._azimuths
+        half = self._tilt / 2
+        sine, zero = math.sin(half), 0.0 * azimuth
+        position = ball + self._around(turn)
+        self.hear(mask, draw, position)
+        return Pose(
+            position=position,
+            quaternion=stack(
+                (math.cos(half) + zero, -sine * np.sin(azimuth), sine * np.cos(azimuth), zero)
+            ),
+            thrust=self.carrying(azimuth),
+            payload=ball,
+        )
+
+    def _around(self, turn: Array) -> Array:
+        """Places of the drones from the payload, on the ring turned by an angle, (W, A, 3), m."""
+        azimuth = turn + self._azimuths
+        x, y = self._ring * np.cos(azimuth), self._ring * np.sin(azimuth)
+        return stack((x, y, 0.0 * x + self._height))
+
+    def goal(self, state: WorldState) -> Array:
+        """The place of each drone where the payload hangs still at its goal."""
+        return np.array(self.options.center) + self._around(self._turn)
+
+    def observe(self, state: WorldState) -> dict[str, Array]:
+        """See the table of the class."""
+        hung, moving = state.payload - state.position, state.payload_velocity - state.velocity
+        return self.seen(state, hung, moving, self._missing(state), *self.around(state))
+
+    def _missing(self, state: WorldState) -> Array:
+        """From the payload to its goal, world frame, m, (W, A, 3)."""
+        return np.array(self.options.center) - state.payload
+
+    def ended(self, state: WorldState) -> Array:
+        """Whether the flight of all drones of a world is over, bool, (W, A)."""
+        outside = length(np, self._missing(state)) > self.band
+        down = state.payload[..., 2] < self._radius
+        flipped = state.tilt_cosine < LEAST_TILT_COSINE
+        one = outside | down | flipped | state.touching
+        return np.broadcast_to(one.any(axis=1, keepdims=True), one.shape)
+
+    def outcome(self, state: WorldState) -> Outcome:
+        """Nearness, approach and swing of the payload, and room; see the class."""
+        missing = self._missing(state)
+        distance, room, ended = length(np, missing), self.clearance(state), self.ended(state)
+        near = self.gap / 2
+        closing = np.sum(missing * state.payload_velocity, axis=-1)
+        return Outcome(
+            reward={
+                "payload": (near - distance) / (near + distance),
+                "approach": APPROACH_WEIGHT * closing / (distance + TINY),
+                "swing": -SWING_WEIGHT * length(np, state.payload_velocity - state.velocity),
+                "room": self.narrowness(room),
+                "rates": -RATE_WEIGHT * length(np, state.body_rates),
+                "termination": ended * TERMINATION_REWARD + 0.0,
+            },
+            terminated=ended,
+            metrics={"payload_error": distance, "clearance": room},
+        )
