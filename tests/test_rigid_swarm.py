@@ -4,11 +4,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from remotes import flying
+from fleets import assert_same, simulate
+from peers import ANY
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.models import InputError, Vehicle
 from rotorgram.sim import EffectOptions, PhysicsError, Pose, Randomization, World, make_world
+from rotorgram.udp import RemoteVectorEnv
 
 FORMATION, CROSSING = "rotorgram/Formation-v0", "rotorgram/Crossing-v0"
 MOVED = ("position", "quaternion", "velocity", "body_rates", "thrust")
@@ -336,11 +338,27 @@ def test_one_that_touches_leaves_and_the_others_fly_on() -> None:
 
 
 def test_over_udp_it_flies_as_in_process() -> None:
-    with flying(FORMATION, backend="rigid") as pair:
-        pair.remote.connect()
-        local = LocalVectorEnv(FORMATION, 1, backend="rigid", autoreset_mode="Disabled")
-        seen = pair.remote.reset(seed=4)[0], local.reset(seed=[4])[0]
-        assert seen[0].tobytes() == seen[1].tobytes()
+    """Two worlds of two, until those of one have met."""
+    given: Any = {"drones": 2, "backend": "rigid", "vehicle": "crazyflie2"}
+    local = LocalVectorEnv(CROSSING, 4, autoreset_mode="Disabled", **given)
+    remote = RemoteVectorEnv(ANY, num_envs=4, autoreset_mode="Disabled", connect=False)
+    running = simulate(remote, env=CROSSING, num_envs=4, **given)
+    try:
+        remote.connect()
+        here, there = local.reset(seed=4), remote.reset(seed=4)
+        assert_same(here, there)
+        for _ in range(60):
+            actions = np.zeros((4, 4), np.float32)
+            actions[:, :3] = np.clip(here[0][:, :3], -0.1, 0.1)
+            here, there = local.step(actions), remote.step(actions)
+            assert_same(here, there)
+            assert remote.out.tolist() == local.out.tolist()
+            if local.done.any():
+                break
+    finally:
+        remote.close()
+        running.join()
+    assert local.out.any()
 
 
 def test_tensors_are_refused_in_one_sentence() -> None:
