@@ -1,15 +1,32 @@
 """The backend rigid with several drones in a world: alone as together, as mujoco, and who meets."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pytest
 from fleets import assert_same, simulate
 from peers import ANY
-from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs import (
+    ArraySpec,
+    LocalVectorEnv,
+    Metric,
+    Outcome,
+    Task,
+    TaskOptions,
+    register,
+)
 from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.models import InputError, Vehicle
-from rotorgram.sim import EffectOptions, PhysicsError, Pose, Randomization, World, make_world
+from rotorgram.sim import (
+    EffectOptions,
+    PhysicsError,
+    Pose,
+    Randomization,
+    World,
+    constant,
+    make_world,
+)
 from rotorgram.udp import RemoteVectorEnv
 
 FORMATION, CROSSING = "rotorgram/Formation-v0", "rotorgram/Crossing-v0"
@@ -212,6 +229,7 @@ def test_a_touch_is_told_of_all_looks_of_a_control_step() -> None:
         for i, count in enumerate(steps):
             world.step(none, count, again=i > 0)
         assert world.state.position[0, 0, 0] > 5 * radius
+        world.step(none, 2, np.zeros((1, 2), bool))  # frozen: nothing is forgotten
         assert world.state.colliding.all()
         world.step(none, 2)
         assert not world.state.touching.any()
@@ -368,3 +386,71 @@ def test_tensors_are_refused_in_one_sentence() -> None:
         LocalVectorEnv(FORMATION, 2, drones=2, backend="rigid", device="cpu", tensors=True)
     one = LocalVectorEnv(FORMATION, 2, backend="rigid", device="cpu", tensors=True)
     assert one.reset(seed=0)[0].shape == (2, 68)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Together(TaskOptions):
+    """Options of the task below."""
+
+    action: str = "offset"
+
+
+class Falling(Task):
+    """Drones in a row, written for NumPy and torch: one that touches is out."""
+
+    Options, drones = Together, 8
+    metrics = (Metric(name="height", unit="m"),)
+
+    def setup(self) -> None:
+        """See the class."""
+        self.observation = (ArraySpec(name="observation", shape=(3,), low=-100.0, high=100.0),)
+
+    def begin(self, mask: Any, draw: Any) -> Pose:
+        """Spheres one radius apart, the first at 10 m, and 3 m higher from one to the next."""
+        place = np.zeros((self.shape[1], 3))
+        place[:, 0] = 3 * self.vehicle.radius * np.arange(self.shape[1])
+        place[:, 2] = 10.0 + 3.0 * np.arange(self.shape[1])
+        noise = draw.uniform(-0.1, 0.1, (3,))
+        return Pose(position=noise + constant(place, noise))
+
+    def observe(self, state: Any) -> dict[str, Any]:
+        """Positions."""
+        return {"observation": state.position}
+
+    def outcome(self, state: Any) -> Outcome:
+        """One point a step."""
+        height = state.position[..., 2]
+        return Outcome(
+            reward={"alive": 1.0 + 0.0 * height},
+            terminated=state.touching[()],
+            metrics={"height": height},
+        )
+
+
+register("rigid/Falling-v0", Falling)
+
+
+def test_a_task_of_ones_own_flies_several_drones_in_tensors() -> None:
+    """Two worlds of three: the same starts, flights and ends as arrays, in float64."""
+    pytest.importorskip("torch")
+    shared: Any = {"drones": 3, "backend": "rigid", "dtype": "float64"}
+    host = LocalVectorEnv("rigid/Falling-v0", 6, autoreset_mode="Disabled", **shared)
+    ours = LocalVectorEnv(
+        "rigid/Falling-v0", 6, autoreset_mode="Disabled", device="cpu", tensors=True, **shared
+    )
+    seeds = [5, 5, 5, 6, 6, 6]
+    np.testing.assert_array_equal(*(np.asarray(env.reset(seed=seeds)[0]) for env in (host, ours)))
+    down, outs = np.full((6, 1), -1.0, np.float32), []
+    for step in range(300):
+        some = np.arange(6) < 3 if step == 9 else np.zeros(6, bool)
+        for env in (host, ours):
+            env.advance(down, frozen=some)
+        for one, other in zip(*((e.observations, e.rewards) for e in (host, ours)), strict=True):
+            np.testing.assert_allclose(one, np.asarray(other), atol=1e-9, rtol=0)
+        for name in ("terminated", "out", "done"):
+            assert np.asarray(getattr(ours, name)).tolist() == getattr(host, name).tolist()
+        outs.append(int(host.out.sum()))
+        if host.done.any():
+            break
+    assert outs[-1] > 3
+    assert len(set(outs)) > 4  # one after the other reaches the ground
