@@ -41,7 +41,8 @@ class WorldState:
     """Of each rotor at the end of the last step, N, shape (W, A, R). Without effects on rotors it
     is the command."""
     touching: Array
-    """Whether any part was in contact since the last step or reset, bool, shape (W, A)."""
+    """Whether any part was in contact since the last step or reset, bool, shape (W, A). On the
+    backend `rigid` drones are so with each other where their spheres overlap."""
     colliding: Array = None
     """Whether it was so with another drone; None where drones are alone."""
     payload: Array = None

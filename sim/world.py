@@ -142,7 +142,7 @@ def make_world(
     randomize: Randomization | None = None,
     **settings: Any,
 ) -> World:
-    """W worlds of so many drones each; only `mujoco` has several in one.
+    """W worlds of so many drones each; `warp` has one alone.
 
     Settings are `num_threads` of `mujoco`, `device` of the others, `dtype`, `compiled` and
     `tensors` of `rigid`: without the last it has NumPy arrays.
@@ -158,7 +158,7 @@ def make_world(
     if type(drones) is not int or not 1 <= drones <= MAX_DRONES:
         raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {drones!r}")
     if drones > 1:
-        expect(backend == "mujoco", "drones", f"1 with the backend {backend}", f"{drones}")
+        expect(backend != "warp", "drones", f"1 with the backend {backend}", f"{drones}")
     for name, value in settings.items():
         known = _SETTINGS[backend]
         if name not in known:

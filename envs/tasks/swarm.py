@@ -85,6 +85,9 @@ class Swarm(Flight):
         """Set `observation`: that of `Flight`, further numbers, and the neighbours."""
         options, vehicle = self.options, self.vehicle
         self.count = self.shape[1] if self.shape else 1
+        right = self.count == 1 or self.xp is np
+        expected = "1 with torch tensors, for the radio between several has NumPy arrays"
+        expect(right, "drones", expected, f"{self.count}")
         lowest = options.center[2] - JITTER * self.gap
         least = vehicle.rest_height + AIR
         expected = f"a height of at least {least + JITTER * self.gap:.4g} m above the ground"

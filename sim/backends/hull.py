@@ -1,4 +1,4 @@
-"""Which crafts of W worlds reach level ground, from their solid geoms."""
+"""Which crafts of W worlds reach level ground, by their solid geoms, or each other, by spheres."""
 
 from typing import Any, Final
 
@@ -6,13 +6,13 @@ import mujoco
 import numpy as np
 
 from ...models.vehicle import Vehicle, craft_bodies
-from ..state import Array, constant
+from ..state import Array, clip, constant
 
 _ROUNDED: Final = 1e-6  # m: what is no margin of a contact
 
 
 class Hull:
-    """The solid geoms of a craft.
+    """The solid geoms of a craft, and its sphere.
 
     A geom with center c, radius r and axes aᵢ reaches from the body's origin, along a unit vector u
     downwards, u·c + r + Σ sᵢ |u·aᵢ| + sqrt(Σ (tᵢ u·aᵢ)²): a box has s, a cylinder one s and two t,
@@ -25,6 +25,7 @@ class Hull:
     def __init__(self, vehicle: Vehicle, xp: Any) -> None:
         shapes = _shapes(vehicle.model)
         self._xp, self._reach, self.ground = xp, -np.inf, 0.0
+        self._apart = 2 * vehicle.radius
         if not shapes:
             return
         centers, radii, axes, flat, rounded = map(np.array, zip(*shapes, strict=True))
@@ -45,6 +46,18 @@ class Hull:
         down = (2 * (w * y - x * z), -2 * (y * z + w * x), 2 * (x * x + y * y) - 1)
         depth: Array = self._depth(self._xp.stack(down), self._xp)
         return height < depth
+
+    def collides(self, position: Array) -> Array:
+        """Whether a craft's sphere overlaps another of its world, bool, shape (W, A).
+
+        Of `Vehicle.radius` about the body's origin, at positions (3, W, A), m.
+        """
+        square: Any = 0.0
+        for x in clip(position, -mujoco.mjMAXVAL, mujoco.mjMAXVAL):  # a bad state overflows
+            apart = x[:, :, None] - x[:, None]
+            square = square + apart * apart
+        overlaps: Array = (square < self._apart**2).sum(-1) > 1  # with itself too
+        return overlaps
 
     def _depth(self, down: Array, xp: Any) -> Array:
         """How far the craft reaches along unit vectors, body frame, (3, W): m, (W,)."""

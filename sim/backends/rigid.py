@@ -1,6 +1,6 @@
 """The rigid body of a vehicle: no contact, in NumPy's arrays or torch's tensors.
 
-It flies as `mujoco` does until a part touches the ground, of which it tells.
+It flies as `mujoco` does until a part touches the ground, or another drone, of which it tells.
 """
 
 from typing import Any, Final
@@ -27,6 +27,7 @@ def make_rigid(
     vehicle: Vehicle,
     num_worlds: int,
     *,
+    drones: int = 1,
     effects: EffectOptions | None = None,
     randomize: Randomization | None = None,
     tensors: bool = True,
@@ -34,26 +35,27 @@ def make_rigid(
     dtype: str = "float32",
     compiled: bool | None = None,
 ) -> "Rigid":
-    """W worlds of torch tensors; or of NumPy arrays, on the CPU alone.
+    """W worlds of so many drones in torch tensors; or in NumPy arrays, on the CPU alone.
 
     `device` is `cpu`, `cuda`, `cuda:1`...; with tensors None takes a CUDA device if there is one.
     """
-    right = compiled is None or type(compiled) is bool
+    shape, right = (num_worlds, drones), compiled is None or type(compiled) is bool
     expect(right, "compiled", "true or false", repr(compiled))
     expect(dtype in DTYPES, "dtype", " or ".join(DTYPES), repr(dtype))
     if not tensors:
         expect(device in (None, "cpu"), "device", "cpu without tensors", repr(device))
-        return RigidWorld(vehicle, num_worlds, effects, randomize, dtype, compiled)
+        return RigidWorld(vehicle, shape, effects, randomize, dtype, compiled)
     from .rigid_tensors import RigidTensorWorld
 
-    return RigidTensorWorld(vehicle, num_worlds, effects, randomize, dtype, compiled, device)
+    return RigidTensorWorld(vehicle, shape, effects, randomize, dtype, compiled, device)
 
 
 class Rigid(BaseWorld):
-    """W worlds of one drone over level ground: `World`, without contact.
+    """W worlds of A drones over level ground: `World`, without contact.
 
     A craft that reaches the ground is `touching`, and flies on through it: a task ends an episode
-    there. A step makes new arrays for the state.
+    there. So it is with two crafts whose spheres overlap, of `Vehicle.radius` about their origins:
+    earlier than their geoms would meet. A step makes new arrays for the state.
     """
 
     dtype: Any
@@ -61,7 +63,7 @@ class Rigid(BaseWorld):
     def __init__(
         self,
         vehicle: Vehicle,
-        num_worlds: int,
+        shape: tuple[int, int],
         effects: EffectOptions | None,
         randomize: Randomization | None,
         *base: Any,
@@ -69,20 +71,22 @@ class Rigid(BaseWorld):
         payload = 0.0 if effects is None else effects.payload
         expected = "none with the backend rigid, which has no cable: fly it with mujoco"
         expect(not payload, "effects: payload", expected, f"{payload:g} kg")
-        super().__init__(vehicle, (num_worlds, 1), effects, randomize, *base)
+        super().__init__(vehicle, shape, effects, randomize, *base)
         _check_forces(vehicle)
         self._body, self._hull = RigidBody(vehicle, self.xp), Hull(vehicle, self.xp)
         self._at_once = None if self.effects is None else 1  # physics steps of a call
-        thrust = self._zeros(num_worlds, 1, vehicle.num_rotors)
+        thrust = self._zeros(*shape, vehicle.num_rotors)
         self._low, self._high = (
             constant(x, thrust) for x in (vehicle.thrust_low, vehicle.thrust_high)
         )
         self._nothing = self._acting = thrust  # mean over the last physics step
-        self._wrench: Array = None  # force and torque of effects over it, (6, W)
-        self._rows = self._zeros(13, num_worlds) + constant(_LEVEL, thrust)[:, None]
+        self._wrench: Array = None  # force and torque of effects over it, (6, W A)
+        self._rows = self._zeros(13, shape[0] * shape[1]) + constant(_LEVEL, thrust)[:, None]
+        nobody = thrust[..., 0] > 0
         self.state = WorldState(
-            **self._shown(), command=thrust, thrust=thrust, touching=thrust[..., 0] > 0
-        )
+            **self._shown(), command=thrust, thrust=thrust, touching=nobody,
+            colliding=nobody if shape[1] > 1 else None,
+        )  # fmt: skip
 
     def _zeros(self, *shape: int) -> Array:
         """Zeros of this dtype."""
@@ -105,14 +109,14 @@ class Rigid(BaseWorld):
         state.command = xp.where(rows, state.thrust, state.command)
         self._draw_parameters(mask)
         if self.parameters:
-            self._vary({name: values[:, 0] for name, values in self.parameters.items()})
+            self._vary({name: values.reshape(-1) for name, values in self.parameters.items()})
         if self.effects is not None:
             thrust = self.effects.begin(mask, state, self.parameters)
             state.thrust = self._typed(xp.where(rows, thrust, state.thrust))
         self._acting = xp.where(rows, state.thrust, self._acting)
         if self._wrench is not None:
-            self._wrench = xp.where(mask[:, 0], 0.0 * self._wrench, self._wrench)
-        state.touching = xp.where(mask, self._touches(), state.touching)
+            self._wrench = xp.where(mask.reshape(-1), 0.0 * self._wrench, self._wrench)
+        self._tell(mask, self._contacts())
 
     def step(
         self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
@@ -121,14 +125,14 @@ class Rigid(BaseWorld):
         state = self.state
         # One number for all rotors counts for each.
         state.command = self._kept(mask, self._typed(thrust + self._nothing), state.command)
-        touching = state.touching if again else False
-        while substeps > 0:
-            self._fly(min(substeps, self._check), mask)
-            touching = self._touches() | touching
-            substeps -= self._check
         if not self._on_rotors:
             state.thrust = state.command
-        state.touching = touching if mask is None else self.xp.where(mask, touching, state.touching)
+        found = [state.touching, state.colliding] if again else [False, False]
+        while substeps > 0:
+            self._fly(min(substeps, self._check), mask)
+            found = [now | old for now, old in zip(self._contacts(), found, strict=False)]
+            substeps -= self._check
+        self._tell(mask, found)
         self._refuse_bad()
 
     def _fly(self, steps: int, mask: Array | None) -> None:
@@ -144,18 +148,19 @@ class Rigid(BaseWorld):
             if not self._on_rotors:  # as MuJoCo clamps controls
                 acting = clip(acting, self._low, self._high)
             new = self._flown(self._rows, self._as_rows(acting), wrench, at_once)
-            self._rows = new if mask is None else self.xp.where(mask[:, 0], new, self._rows)
+            self._rows = new if mask is None else self.xp.where(mask.reshape(-1), new, self._rows)
             self._show()
         self._acting = self._kept(mask, acting, self._acting)
         if wrench is not None:
             old = 0.0 * wrench if self._wrench is None else self._wrench
-            self._wrench = wrench if mask is None else self.xp.where(mask[:, 0], wrench, old)
+            new = wrench if mask is None else self.xp.where(mask.reshape(-1), wrench, old)
+            self._wrench = new
 
     def acceleration(self) -> Array:
         """As `World.acceleration`."""
         push = self._body.push(self._as_rows(self._acting), self._wrench)
         linear, _ = self._body.acceleration(motion(self._rows), push)
-        return self.xp.stack(list(linear), axis=-1)[:, None]
+        return self.xp.stack(list(linear), axis=-1).reshape(*self.shape, 3)
 
     def below(self) -> Array:
         """As `World.below`: the ground is the only surface."""
@@ -172,7 +177,7 @@ class Rigid(BaseWorld):
 
     def _shown(self) -> dict[str, Array]:
         """The rows as arrays of the state."""
-        columns = self._rows.T[:, None]
+        columns = self._rows.T.reshape(*self.shape, 13)
         return {
             "position": columns[..., :3],
             "quaternion": columns[..., 3:7],
@@ -188,20 +193,33 @@ class Rigid(BaseWorld):
         return self.xp.astype(values, self.dtype, copy=False)
 
     def _as_rows(self, values: Array) -> Array:
-        """Vectors (W, 1, k) as rows (k, W) of this dtype, one after the other in memory."""
-        return self.xp.asarray(self._typed(values)[:, 0].T, order="C")
+        """Vectors (W, A, k) as rows (k, W A) of this dtype, one after the other in memory."""
+        return self.xp.asarray(self._typed(values).reshape(-1, values.shape[-1]).T, order="C")
 
     def _kept(self, mask: Array | None, new: Array, old: Array) -> Array:
         return new if mask is None else self.xp.where(mask[..., None], new, old)
 
-    def _touches(self) -> Array:
-        return self._hull.touches(self._rows[2], self._rows[3:7])[:, None]
+    def _contacts(self) -> list[Array]:
+        """Which crafts touch anything and, of several, which another, bool, (W, A)."""
+        rows, shape = self._rows, self.shape
+        touching = self._hull.touches(rows[2], rows[3:7]).reshape(shape)
+        if shape[1] == 1:
+            return [touching]
+        colliding = self._hull.collides(rows[:3].reshape(3, *shape))
+        return [touching | colliding, colliding]
+
+    def _tell(self, mask: Array | None, found: list[Array]) -> None:
+        """Set what `_contacts` found, for the worlds of a mask."""
+        for name, new in zip(("touching", "colliding"), found, strict=False):
+            old = getattr(self.state, name)
+            setattr(self.state, name, new if mask is None else self.xp.where(mask, new, old))
 
     def _refuse_bad(self) -> None:
         if abs(self._rows).max() < mujoco.mjMAXVAL:  # not of NaN
             return
         bad = ~self.xp.all(abs(self._rows) < mujoco.mjMAXVAL, axis=0)
-        ids = bad.nonzero()[0].flatten().tolist()
+        worlds = self.xp.any(bad.reshape(self.shape), axis=1)
+        ids = worlds.nonzero()[0].flatten().tolist()
         raise PhysicsError(f"the rigid body has bad states in envs {ids[:5]}: reset the env")
 
 
@@ -214,7 +232,7 @@ class RigidWorld(Rigid, ArrayWorld):
     def __init__(
         self,
         vehicle: Vehicle,
-        num_worlds: int,
+        shape: tuple[int, int],
         effects: EffectOptions | None,
         randomize: Randomization | None,
         dtype: str,
@@ -224,11 +242,11 @@ class RigidWorld(Rigid, ArrayWorld):
         expected = "false where no C compiler is found (cc, gcc, clang or the variable CC)"
         expect(found or not compiled, "compiled", expected, "true")
         self.dtype = np.dtype(dtype)
-        super().__init__(vehicle, num_worlds, effects, randomize)
+        super().__init__(vehicle, shape, effects, randomize)
         self._varying: np.ndarray | None = None
         self._function: kernel.Fly | None = None
         if found and compiled is not False:
-            one = np.ones(num_worlds)
+            one = np.ones(shape[0] * shape[1])
             self._vary(dict.fromkeys(self._drawn, one))
             pushed = self.effects is not None and self.effects.on_body
             self._function = kernel.compiled(

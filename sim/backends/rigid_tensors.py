@@ -24,7 +24,7 @@ class RigidTensorWorld(Rigid, TensorWorld):
     def __init__(
         self,
         vehicle: Vehicle,
-        num_worlds: int,
+        shape: tuple[int, int],
         effects: EffectOptions | None,
         randomize: Randomization | None,
         dtype: str,
@@ -32,7 +32,7 @@ class RigidTensorWorld(Rigid, TensorWorld):
         device: str | None,
     ) -> None:
         kind = getattr(torch, dtype)
-        super().__init__(vehicle, num_worlds, effects, randomize, torch_device(device), kind)
+        super().__init__(vehicle, shape, effects, randomize, torch_device(device), kind)
         body = self._body
 
         def fly(rows: Any, thrust: Any, wrench: Any, steps: int) -> torch.Tensor:
@@ -56,4 +56,4 @@ class RigidTensorWorld(Rigid, TensorWorld):
         return torch.zeros(shape, dtype=self.dtype, device=self.device)
 
     def _as_rows(self, values: torch.Tensor) -> torch.Tensor:
-        return values[:, 0].T.contiguous()
+        return values.reshape(-1, values.shape[-1]).T.contiguous()

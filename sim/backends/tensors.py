@@ -1,6 +1,7 @@
 """What backends of torch tensors share: draws, noise, seeds, and the check of actions."""
 
 from collections.abc import Mapping, Sequence
+from math import prod
 from typing import Any
 
 import array_api_compat.torch as torch_api
@@ -61,7 +62,7 @@ class TensorWorld(BaseWorld):
         return TorchDraw(source, mask, put)
 
     def _ids(self, mask: torch.Tensor) -> torch.Tensor:
-        return mask.flatten().nonzero().flatten()
+        return mask[:, 0].nonzero().flatten()
 
     def checked(self, actions: Array, width: int, choices: int, flown: Array | None) -> Array:
         """As `World.checked`: a tensor on `device` or a NumPy array, rounded to float32.
@@ -76,7 +77,7 @@ class TensorWorld(BaseWorld):
             values = torch.as_tensor(actions, device=self.device)
         except (TypeError, ValueError, RuntimeError):
             raise InputError(f"actions: expected real numbers, got {actions!r:.80}") from None
-        shape = (self.shape[0], width)
+        shape = (prod(self.shape), width)
         if values.is_complex() or values.numel() != shape[0] * width:
             raise InputError(
                 f"actions: expected real numbers of shape {shape}, "

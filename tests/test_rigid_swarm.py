@@ -1,0 +1,456 @@
+"""The backend rigid with several drones in a world: alone as together, as mujoco, and who meets."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from fleets import assert_same, simulate
+from peers import ANY
+from rotorgram.envs import (
+    ArraySpec,
+    LocalVectorEnv,
+    Metric,
+    Outcome,
+    Task,
+    TaskOptions,
+    register,
+)
+from rotorgram.envs.parallel import LocalParallelEnv
+from rotorgram.models import InputError, Vehicle
+from rotorgram.sim import (
+    EffectOptions,
+    PhysicsError,
+    Pose,
+    Randomization,
+    World,
+    constant,
+    make_world,
+)
+from rotorgram.udp import RemoteVectorEnv
+
+FORMATION, CROSSING = "rotorgram/Formation-v0", "rotorgram/Crossing-v0"
+MOVED = ("position", "quaternion", "velocity", "body_rates", "thrust")
+EFFECTS = {"motor_lag": True, "rotor_drag": True, "wind": (3.0, 1.0, 0.0)}
+DRAWN = {
+    "mass": "uniform(0.8, 1.2)", "inertia": "uniform(0.8, 1.2)", "center_x": "uniform(-0.01, 0.01)",
+    "reaction": "uniform(0.5, 1.5)", "thrust_1": "uniform(0.9, 1.1)",
+}  # fmt: skip
+
+
+def arrays(vehicle: Vehicle, worlds: int, drones: int, dtype: str = "float64", **rest: Any) -> Any:
+    given = {"drones": drones, "tensors": False, "dtype": dtype, **rest}
+    return make_world(vehicle, worlds, "rigid", **given)
+
+
+def tumbling(worlds: int, drones: int) -> dict[str, np.ndarray]:
+    """Starts high up, 50 m apart, at any attitude."""
+    dice, shape = np.random.default_rng(0), (worlds, drones)
+    turned = dice.normal(size=(*shape, 4))
+    position = dice.uniform(1000.0, 1001.0, (*shape, 3))
+    position[..., 0] += 50.0 * np.arange(drones)
+    return {
+        "position": position,
+        "quaternion": turned / np.linalg.norm(turned, axis=-1, keepdims=True),
+        "velocity": dice.normal(size=(*shape, 3)),
+        "body_rates": dice.normal(size=(*shape, 3)),
+    }
+
+
+def near_hover(vehicle: Vehicle, steps: int, *shape: int) -> np.ndarray:
+    """Random thrusts, N, shape (steps, *shape, R)."""
+    share = np.random.default_rng(1).uniform(0.9, 1.1, (steps, *shape, vehicle.num_rotors))
+    return share * vehicle.hover_thrust
+
+
+def begin(world: World, mask: Any = None, **pose: np.ndarray) -> None:
+    world.reset(np.ones(world.shape, bool) if mask is None else mask, Pose(**pose))
+
+
+# --- flights --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("compiled", [None, False])
+@pytest.mark.parametrize(
+    ("name", "effects"), [(None, {}), ("crazyflie2", EFFECTS), ("heavy_hexa", {})]
+)
+def test_drones_that_keep_apart_fly_bit_for_bit_as_alone(
+    name: str | None, effects: dict[str, Any], compiled: bool | None
+) -> None:
+    vehicle, shape = Vehicle.load(name), (2, 3)
+    given: Any = {"effects": EffectOptions.from_options(effects), "compiled": compiled}
+    together = arrays(vehicle, *shape, "float32", **given)
+    alone = arrays(vehicle, 6, 1, "float32", **given)
+    pose = tumbling(*shape)
+    begin(together, **pose)
+    begin(alone, **{name: values.reshape(6, 1, -1) for name, values in pose.items()})
+    for step, thrust in enumerate(near_hover(vehicle, 20, *shape)):
+        some = np.array([[True] * 3, [step % 4 > 0] * 3])
+        together.step(thrust, 2, some)
+        alone.step(thrust.reshape(6, 1, -1), 2, some.reshape(6, 1))
+    for field in MOVED:
+        ours, theirs = getattr(together.state, field), getattr(alone.state, field)
+        assert ours.tobytes() == theirs.tobytes(), field
+    assert together.acceleration().tobytes() == alone.acceleration().tobytes()
+    assert not together.state.touching.any()
+    assert not together.state.colliding.any()
+
+
+@pytest.mark.parametrize("name", ["paper", "crazyflie2"])
+def test_flies_as_mujoco_for_five_seconds(name: str) -> None:
+    """1e-6 m and 1e-6 rad from any attitude, tumbling, at random thrusts."""
+    vehicle, shape = Vehicle.load(name), (2, 3)
+    ours, theirs = arrays(vehicle, *shape), make_world(vehicle, 2, drones=3, num_threads=1)
+    substeps = vehicle.substeps(0.02)
+    for world in (ours, theirs):
+        begin(world, **tumbling(*shape))
+    for thrust in near_hover(vehicle, 250, *shape):
+        for world in (ours, theirs):
+            world.step(thrust, substeps)
+    assert not theirs.state.touching.any()
+    assert abs(theirs.state.velocity).max() > 3
+    assert abs(ours.state.position - theirs.state.position).max() < 1e-6
+    q, p = ours.state.quaternion, theirs.state.quaternion
+    apart = np.minimum(abs(q - p).max(axis=-1), abs(q + p).max(axis=-1))
+    assert 4 * apart.max() < 1e-6  # rad
+    assert abs(ours.acceleration() - theirs.acceleration()).max() < 1e-6
+
+
+@pytest.mark.parametrize("tensors", [False, True])
+def test_every_drone_has_the_draws_that_it_has_on_mujoco(tensors: bool) -> None:
+    """Of mass and the like, and of gusts; float64."""
+    if tensors:
+        torch = pytest.importorskip("torch")
+    vehicle, shape = Vehicle.load("crazyflie2"), (2, 3)
+    effects = EffectOptions.from_options({**EFFECTS, "gusts": 6.0})
+    given: Any = {"drones": 3, "effects": effects, "randomize": Randomization(DRAWN, effects)}
+    device = {"device": "cpu"} if tensors else {}
+    ours = make_world(vehicle, 2, "rigid", tensors=tensors, dtype="float64", **device, **given)
+    theirs = make_world(vehicle, 2, **given)
+
+    def like(world: World, values: np.ndarray) -> Any:
+        return torch.tensor(values) if tensors and world is ours else values
+
+    for world in (ours, theirs):
+        every = like(world, np.ones(shape, bool))
+        world.seed(every, [7, 8])
+        begin(world, every, **{name: like(world, x) for name, x in tumbling(*shape).items()})
+    for name in DRAWN:
+        drawn = np.asarray(ours.parameters[name])
+        assert drawn.tolist() == theirs.parameters[name].tolist()
+        assert len(np.unique(drawn)) == 6
+    some = np.array([[True] * 3, [False] * 3])
+    for step, thrust in enumerate(near_hover(vehicle, 20, *shape)):
+        for world in (ours, theirs):
+            mask = like(world, some) if step == 5 else None
+            world.step(like(world, thrust), 2, mask)
+    for field in MOVED:
+        one, other = (np.asarray(getattr(world.state, field)) for world in (ours, theirs))
+        np.testing.assert_allclose(one, other, atol=1e-9, rtol=0, err_msg=field)
+
+
+def test_downwash_is_that_of_mujoco_and_of_a_world_alone() -> None:
+    """Nine drones one above the other, each in the jets of those above it."""
+    vehicle = Vehicle.load("hummingbird")
+    effects = EffectOptions.from_options({"body_drag": True, "downwash": True})
+    place = np.random.default_rng(0).uniform(-0.1, 0.1, (2, 9, 3))
+    place[..., 2] += 20.0 + 1.0 * np.arange(9)
+    thrust = np.broadcast_to(0.95 * vehicle.hover_thrust, (2, 9, 4))
+    ours = arrays(vehicle, 2, 9, effects=effects)
+    theirs = make_world(vehicle, 2, drones=9, effects=effects)
+    alone = arrays(vehicle, 1, 9, effects=effects)
+    begin(ours, position=place)
+    begin(theirs, position=place)
+    begin(alone, position=place[1:])
+    for _ in range(25):
+        ours.step(thrust, 2)
+        theirs.step(thrust, 2)
+        alone.step(thrust[1:], 2)
+    np.testing.assert_allclose(ours.state.position, theirs.state.position, atol=1e-9, rtol=0)
+    assert ours.state.position[1].tobytes() == alone.state.position[0].tobytes()
+    speed = ours.state.velocity[..., 2]
+    assert (speed[:, 0] < speed[:, 8] - 0.1).all()  # the lowest, and that above all jets
+
+
+# --- who meets ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tensors", [False, True])
+@pytest.mark.parametrize("name", [None, "crazyflie2"])
+def test_spheres_touch_at_two_radii_and_fly_on(name: str | None, tensors: bool) -> None:
+    """Two drones of a world fall side by side and towards each other, ten radii a second each.
+
+    Their spheres are one radius apart, and closer by 0.4 radii after every look: they touch at the
+    third, and until 4 radii have passed twice. A third drone, and another world, keep apart.
+    """
+    if tensors:
+        torch = pytest.importorskip("torch")
+    vehicle = Vehicle.load(name, linear_drag=0.0)
+    radius, looks = vehicle.radius, round(0.02 / vehicle.timestep)
+    world = make_world(vehicle, 2, "rigid", drones=3, tensors=tensors, dtype="float64",
+                       **({"device": "cpu"} if tensors else {}))  # fmt: skip
+    position, velocity = np.zeros((2, 3, 3)), np.zeros((2, 3, 3))
+    position[..., 2] = 1000.0
+    position[0, :, 0] = np.array((-1.5, 1.5, 20.0)) * radius
+    position[1, :, 0] = np.array((-1.5, 1.5, 20.0)) * radius
+    velocity[0, :2, 0] = 10 * radius, -10 * radius
+    none = np.zeros((2, 3, vehicle.num_rotors))
+
+    def like(values: np.ndarray) -> Any:
+        return torch.tensor(values) if tensors else values
+
+    pose = {"position": position, "velocity": velocity, "thrust": none}
+    begin(world, like(np.ones((2, 3), bool)), **{name: like(x) for name, x in pose.items()})
+    state, seen = world.state, []
+    assert not state.touching.any()
+    for _ in range(14):
+        world.step(like(none), looks)
+        assert state.touching.tolist() == state.colliding.tolist()
+        assert state.touching[0, 0] == state.touching[0, 1]
+        assert not state.touching[1].any()
+        assert not state.touching[0, 2]
+        seen.append(bool(state.touching[0, 0]))
+    # Apart by 3 - 0.4 n radii: below 2 from n = 3 on, past each other, and until n = 12.
+    assert seen == [False] * 2 + [True] * 10 + [False] * 2
+    expected = 10 * radius * np.array((1.0, -1.0, 0.0))
+    assert np.asarray(state.velocity[0, :, 0]) == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_touch_is_told_of_all_looks_of_a_control_step() -> None:
+    """They pass each other within one step: `again` adds to what was seen before."""
+    vehicle = Vehicle.load(linear_drag=0.0)
+    radius = vehicle.radius
+    position = np.array([[[-3 * radius, 0.0, 900.0], [3 * radius, 0.0, 900.0]]])
+    velocity = np.array([[[50 * radius, 0.0, 0.0], [-50 * radius, 0.0, 0.0]]])
+    none = np.zeros((1, 2, 4))
+    for steps in ([20], [10, 10]):
+        world = arrays(vehicle, 1, 2)
+        begin(world, position=position, velocity=velocity, thrust=none)
+        for i, count in enumerate(steps):
+            world.step(none, count, again=i > 0)
+        assert world.state.position[0, 0, 0] > 5 * radius
+        world.step(none, 2, np.zeros((1, 2), bool))  # frozen: nothing is forgotten
+        assert world.state.colliding.all()
+        world.step(none, 2)
+        assert not world.state.touching.any()
+
+
+def test_of_128_drones_those_that_overlap_are_told() -> None:
+    vehicle = Vehicle.load("crazyflie2")
+    world, radius = arrays(vehicle, 2, 128, "float32"), vehicle.radius
+    position = np.zeros((2, 128, 3))
+    position[..., 0], position[..., 2] = 2.001 * radius * np.arange(128), 100.0
+    position[0, 127, :2] = position[0, 40, 0], 1.999 * radius  # beside the 41st, and near two more
+    position[1, 0, 2] = position[1, 1, 2] = 0.0  # on the ground, no drone among them
+    begin(world, position=position)
+    assert np.flatnonzero(world.state.colliding[0]).tolist() == [40, 127]
+    assert np.flatnonzero(world.state.touching[0]).tolist() == [40, 127]
+    assert np.flatnonzero(world.state.touching[1]).tolist() == [0, 1]
+    assert not world.state.colliding[1].any()
+
+
+def test_it_tells_a_touch_earlier_than_mujoco() -> None:
+    """Frames of 2 m side by side meet at 2 m or later; their spheres do before."""
+    vehicle = Vehicle.load()
+    place = np.array([[[0.0, 0.0, 20.0], [1.99 * vehicle.radius, 0.0, 20.0]]])
+    worlds = arrays(vehicle, 1, 2), make_world(vehicle, 1, drones=2)
+    for world in worlds:
+        begin(world, position=place)
+    assert [world.state.touching.tolist() for world in worlds] == [[[True] * 2], [[False] * 2]]
+
+
+def test_a_mask_moves_and_tells_of_its_worlds_alone() -> None:
+    vehicle, shape = Vehicle.load(), (2, 2)
+    world = arrays(vehicle, *shape)
+    place = np.zeros((2, 2, 3))
+    place[..., 2] = 20.0  # both in one place
+    begin(world, position=place)
+    assert world.state.colliding.all()
+    apart = place + np.array((0.0, 50.0, 0.0)) * np.arange(2)[:, None]
+    first, second = np.array([[True] * 2, [False] * 2]), np.array([[False] * 2, [True] * 2])
+    begin(world, second, position=apart)
+    assert world.state.touching.tolist() == [[True, True], [False, False]]
+    thrust = np.broadcast_to(1.1 * vehicle.hover_thrust, (2, 2, 4))
+    before = world.state.position[0].tobytes()
+    world.step(thrust, 2, second)
+    assert world.state.position[0].tobytes() == before
+    assert world.state.colliding.tolist() == [[True, True], [False, False]]
+    assert world.state.thrust[0] == pytest.approx(np.broadcast_to(vehicle.hover_thrust, (2, 4)))
+    # 0.1 g over 0.02 s.
+    assert world.state.velocity[..., 2] == pytest.approx(
+        np.array([[0.0] * 2, [0.1 * vehicle.gravity * 0.02] * 2])
+    )
+    begin(world, first, position=apart)
+    assert not world.state.touching.any()
+
+
+def test_a_bad_state_names_its_world() -> None:
+    vehicle = Vehicle.load()
+    world = arrays(vehicle, 3, 2, "float32")
+    pose = tumbling(3, 2)
+    pose["velocity"][2, 1] = 1e30
+    begin(world, **pose)
+    thrust = np.broadcast_to(vehicle.hover_thrust, (3, 2, 4))
+    with pytest.raises(PhysicsError, match=r"bad states in envs \[2\]: reset the env"):
+        world.step(thrust, 2)
+    begin(world, np.array([[False] * 2] * 2 + [[True] * 2]), **tumbling(3, 2))
+    world.step(thrust, 2)
+    assert not world.state.touching.any()
+
+
+# --- the tasks ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("vehicle", "fastest"), [(None, 0.5), ("crazyflie2", 0.02)])
+@pytest.mark.parametrize("env_id", [FORMATION, CROSSING])
+def test_whole_episodes_agree_with_mujoco_until_a_touch(
+    env_id: str, vehicle: str | None, fastest: float
+) -> None:
+    """From the same seeds, all straight to their goals: in Crossing they meet in the middle.
+
+    Observations within a float32's rounding, rewards 1e-9; the end is that spheres overlap.
+    """
+    options: Any = {"drones": 4, "vehicle": vehicle, "autoreset_mode": "Disabled"}
+    theirs = LocalVectorEnv(env_id, 8, radio_loss=0.2, **options)
+    ours = LocalVectorEnv(env_id, 8, radio_loss=0.2, backend="rigid", dtype="float64", **options)
+    seen = [env.reset(seed=5)[0] for env in (ours, theirs)]
+    np.testing.assert_array_equal(*seen)
+    met, flown = False, 0
+    for _ in range(500):
+        actions = np.zeros((8, 4), np.float32)
+        actions[:, :3] = np.clip(seen[1][:, :3], -fastest, fastest)
+        for env in (ours, theirs):
+            env.advance(actions)
+        if met := bool(ours.terminated.any()):
+            break
+        flown += 1
+        seen = [env.observations for env in (ours, theirs)]
+        np.testing.assert_array_equal(ours.truncated, theirs.truncated)
+        np.testing.assert_allclose(*seen, atol=1e-6, rtol=1e-6)
+        np.testing.assert_allclose(ours.rewards, theirs.rewards, atol=1e-9, rtol=0)
+        if ours.done.any():
+            break
+    assert flown > 30
+    if env_id == CROSSING:
+        assert met
+    if met:
+        room = ours.loop.metrics["clearance"]
+        assert (ours.terminated == (room < 0)).all()
+        assert theirs.loop.metrics["clearance"] == pytest.approx(room, abs=1e-6)
+        assert not theirs.terminated.any()
+
+
+def test_one_that_touches_leaves_and_the_others_fly_on() -> None:
+    env = LocalParallelEnv(CROSSING, 4, vehicle="crazyflie2", backend="rigid")
+    observations, _ = env.reset(seed=5)  # two that are opposite start at nearly one height
+    left: list[str] = []
+    while len(left) < 2:
+        actions = {name: np.zeros(4, np.float32) for name in env.agents}
+        for name in ("drone_0", "drone_2"):
+            actions[name][:3] = np.clip(observations[name][:3], -0.1, 0.1)
+        observations, _, terminated, _, _ = env.step(actions)
+        left += [name for name, ends in terminated.items() if ends]
+    assert left == ["drone_0", "drone_2"]
+    assert env.agents == ["drone_1", "drone_3"]
+    env.close()
+
+
+def test_over_udp_it_flies_as_in_process() -> None:
+    """Two worlds of two, until those of one have met."""
+    given: Any = {"drones": 2, "backend": "rigid", "vehicle": "crazyflie2"}
+    local = LocalVectorEnv(CROSSING, 4, autoreset_mode="Disabled", **given)
+    remote = RemoteVectorEnv(ANY, num_envs=4, autoreset_mode="Disabled", connect=False)
+    running = simulate(remote, env=CROSSING, num_envs=4, **given)
+    try:
+        remote.connect()
+        here, there = local.reset(seed=4), remote.reset(seed=4)
+        assert_same(here, there)
+        for _ in range(60):
+            actions = np.zeros((4, 4), np.float32)
+            actions[:, :3] = np.clip(here[0][:, :3], -0.1, 0.1)
+            here, there = local.step(actions), remote.step(actions)
+            assert_same(here, there)
+            assert remote.out.tolist() == local.out.tolist()
+            if local.done.any():
+                break
+    finally:
+        remote.close()
+        running.join()
+    assert local.out.any()
+
+
+def test_tensors_are_refused_in_one_sentence() -> None:
+    pytest.importorskip("torch")
+    expected = r"^drones: expected 1 with torch tensors, for the radio .* NumPy arrays, got 2$"
+    with pytest.raises(InputError, match=expected):
+        LocalVectorEnv(FORMATION, 2, drones=2, backend="rigid", device="cpu", tensors=True)
+    one = LocalVectorEnv(FORMATION, 2, backend="rigid", device="cpu", tensors=True)
+    assert one.reset(seed=0)[0].shape == (2, 68)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Together(TaskOptions):
+    """Options of the task below."""
+
+    action: str = "offset"
+
+
+class Falling(Task):
+    """Drones in a row, written for NumPy and torch: one that touches is out."""
+
+    Options, drones = Together, 8
+    metrics = (Metric(name="height", unit="m"),)
+
+    def setup(self) -> None:
+        """See the class."""
+        self.observation = (ArraySpec(name="observation", shape=(3,), low=-100.0, high=100.0),)
+
+    def begin(self, mask: Any, draw: Any) -> Pose:
+        """Spheres one radius apart, the first at 10 m, and 3 m higher from one to the next."""
+        place = np.zeros((self.shape[1], 3))
+        place[:, 0] = 3 * self.vehicle.radius * np.arange(self.shape[1])
+        place[:, 2] = 10.0 + 3.0 * np.arange(self.shape[1])
+        noise = draw.uniform(-0.1, 0.1, (3,))
+        return Pose(position=noise + constant(place, noise))
+
+    def observe(self, state: Any) -> dict[str, Any]:
+        """Positions."""
+        return {"observation": state.position}
+
+    def outcome(self, state: Any) -> Outcome:
+        """One point a step."""
+        height = state.position[..., 2]
+        return Outcome(
+            reward={"alive": 1.0 + 0.0 * height},
+            terminated=state.touching[()],
+            metrics={"height": height},
+        )
+
+
+register("rigid/Falling-v0", Falling)
+
+
+def test_a_task_of_ones_own_flies_several_drones_in_tensors() -> None:
+    """Two worlds of three: the same starts, flights and ends as arrays, in float64."""
+    pytest.importorskip("torch")
+    shared: Any = {"drones": 3, "backend": "rigid", "dtype": "float64"}
+    host = LocalVectorEnv("rigid/Falling-v0", 6, autoreset_mode="Disabled", **shared)
+    ours = LocalVectorEnv(
+        "rigid/Falling-v0", 6, autoreset_mode="Disabled", device="cpu", tensors=True, **shared
+    )
+    seeds = [5, 5, 5, 6, 6, 6]
+    np.testing.assert_array_equal(*(np.asarray(env.reset(seed=seeds)[0]) for env in (host, ours)))
+    down, outs = np.full((6, 1), -1.0, np.float32), []
+    for step in range(300):
+        some = np.arange(6) < 3 if step == 9 else np.zeros(6, bool)
+        for env in (host, ours):
+            env.advance(down, frozen=some)
+        for one, other in zip(*((e.observations, e.rewards) for e in (host, ours)), strict=True):
+            np.testing.assert_allclose(one, np.asarray(other), atol=1e-9, rtol=0)
+        for name in ("terminated", "out", "done"):
+            assert np.asarray(getattr(ours, name)).tolist() == getattr(host, name).tolist()
+        outs.append(int(host.out.sum()))
+        if host.done.any():
+            break
+    assert outs[-1] > 3
+    assert len(set(outs)) > 4  # one after the other reaches the ground
