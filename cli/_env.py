@@ -58,7 +58,8 @@ def chosen_env(
     env = checkpoint.env_id, {**checkpoint.options, **options}
     own = getattr(command, "listen", None) is None  # a simulator of our own flies it
     if own and is_known(env[0]):
-        _check_vehicle(command, checkpoint, env_spec(*env, vehicle=command.vehicle))
+        drones = chosen_drones(command, checkpoint)
+        _check_vehicle(command, checkpoint, env_spec(*env, command.vehicle, drones))
     return env
 
 
@@ -176,9 +177,9 @@ def _waiting(
     command: AgentFlags, listen: str, num_envs: int | None, num_simulators: int, **settings: Any
 ) -> Iterator[RemoteEnv | RemoteVectorEnv]:
     if command.vehicle is not None:
-        from ..models.vehicle import Vehicle  # an agent needs no MuJoCo otherwise
+        from ..models.fleet import load_vehicles  # an agent needs no MuJoCo otherwise
 
-        settings["vehicle_hash"] = Vehicle.load(command.vehicle).hash
+        settings["vehicle_hash"] = load_vehicles(command.vehicle, command.drones).hash
     settings |= {
         "connect": False, "connect_timeout": _CONNECT_TIMEOUT, "key_file": command.key_file,
         "insecure": command.insecure, "record": command.record,

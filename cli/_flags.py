@@ -48,8 +48,8 @@ class EnvFlags(Command):
     """Task by its id, or module:Name-v0 for one that a module of the working directory registers.
     Its options are flags --env.NAME."""
     vehicle: Annotated[str | None, arg(metavar="FILE")] = None
-    """TOML or MJCF file of a multirotor, or the name of one of the library. Default: the paper's
-    quadcopter."""
+    """TOML or MJCF file of a multirotor, or the name of one of the library; several with commas
+    between them, for the drones of a world in turn. Default: the paper's quadcopter."""
     effects: tuple[str, ...] = ()
     """Effects on the vehicle, each NAME or NAME=VALUE: motor_lag wind=3,0,0. `none` switches off
     those of a checkpoint. docs/effects.md lists them."""

@@ -14,9 +14,9 @@ import gymnasium as gym
 import numpy as np
 
 from ..models.errors import InputError, NotCopied, expect
+from ..models.fleet import Fleet, load_vehicles
 from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..models.swarm import drone_names
-from ..models.vehicle import Vehicle
 from ..sim import (
     PARAMETERS,
     Array,
@@ -60,12 +60,14 @@ def make_task(
         own = getattr(kind, name) is not getattr(Task, name)
         expect(own, env_id, f"a task with a method {name}()", f"{kind.__name__} without one")
     checked = kind.Options.from_options(options)
-    craft = Vehicle.load(vehicle, linear_drag=checked.linear_drag)
-    craft.substeps(checked.control_period)  # raises where they do not go together
     least, most, drones = kind.fewest, kind.drones, shape[1]
     range_told = f"{least} to {most}" if most > least else f"{most}"
     right = type(drones) is int and least <= drones <= most
     expect(right, "drones", f"{range_told} with {canonical_id(env_id)}", f"{drones!r}")
+    craft = load_vehicles(vehicle, drones, linear_drag=checked.linear_drag)
+    craft.substeps(checked.control_period)  # raises where they do not go together
+    measured = checked.sensors if isinstance(craft, Fleet) else {}
+    expect(not measured, "sensors", "none with several vehicles", ", ".join(measured))
     task = kind(checked, craft, shape, xp)
     for name in ("controller", "observation"):
         if not hasattr(task, name):
@@ -176,8 +178,8 @@ def _telemetry_specs(task: Task) -> tuple[ArraySpec, ...]:
             "thrust",
             [f"F{i + 1}" for i in range(vehicle.num_rotors)],
             unit="N",
-            low=tuple(vehicle.thrust_low.tolist()),
-            high=tuple(vehicle.thrust_high.tolist()),
+            low=tuple(np.atleast_2d(vehicle.thrust_low).min(axis=0).tolist()),
+            high=tuple(np.atleast_2d(vehicle.thrust_high).max(axis=0).tolist()),
         ),
     ]
     if drawn := Randomization(task.options.randomize, None).names:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 from xml.etree import ElementTree
 
 import mujoco
@@ -65,9 +65,15 @@ def build_swarm(
     spec = build_scene(vehicles[0], world, visual=visual)
     spec.delete(free_body(spec))
     for path, name in zip(vehicles, names, strict=True):
-        own = read_spec(path)  # as long as it has a name, its craft lives
-        spec.worldbody.add_frame().attach_body(free_body(own), f"{name}/", "")
+        attach_craft(spec, path, f"{name}/")
     return spec
+
+
+def attach_craft(spec: mujoco.MjSpec, vehicle: Path, prefix: str, place: Any = (0, 0, 0)) -> None:
+    """Add a file's craft, its names with a prefix; step and gravity are those of the scene."""
+    own = read_spec(vehicle)  # as long as it has a name, its craft lives
+    own.option.timestep, own.option.gravity = spec.option.timestep, spec.option.gravity
+    spec.worldbody.add_frame(pos=place).attach_body(free_body(own), prefix, "")
 
 
 def free_body(spec: mujoco.MjSpec) -> mujoco.MjsBody:

@@ -48,6 +48,8 @@ def swarm_model(
         prefixed = {f"{name}/": craft for name, craft in zip(names, crafts, strict=True)}
         hang_payload(spec, prefixed, payload, cable)
     model = spec.compile()
+    for name in SHARED:  # they may be others than those of the first file
+        setattr(model.opt, name, getattr(first.model.opt, name))
     owner = owners(model)
     model.geom_group[:] = owner[model.geom_bodyid] >= 0
     dofs = owner[model.dof_bodyid]

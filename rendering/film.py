@@ -20,6 +20,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from ..models.errors import InputError, expect, require
+from ..models.fleet import members_of
 from ..models.vehicle import Vehicle
 from .stage import Moment
 
@@ -241,7 +242,8 @@ class Overlay:
         self._size = width, height
         self._title, self._color = title, ImageColor.getrgb(color)[:3]
         self._period, self._seconds, self._scale = period, max(seconds, period), scale
-        self._vehicle, self._high = vehicle, float(vehicle.thrust_high.max())
+        self._vehicle = members_of(vehicle, 1)[0]  # the overlay is of the first drone
+        self._high = float(self._vehicle.thrust_high.max())
         self._widest = replace(  # its lines are as wide as any of the flight
             like,
             position=(0.0, -100.0, 0.0),

@@ -14,9 +14,9 @@ import mujoco
 import numpy as np
 
 from ..models.errors import InputError, expect
+from ..models.fleet import load_vehicles, members_of
 from ..models.frames import pose_in_mujoco_frame
-from ..models.scene import SCENE_PREFIX, World, build_scene, read_spec
-from ..models.vehicle import Vehicle
+from ..models.scene import SCENE_PREFIX, World, attach_craft, build_scene
 from .gl import NoOpenGL, offscreen_context
 
 Camera = Literal["chase", "front", "side", "top", "onboard"]
@@ -195,15 +195,18 @@ class Stage:
     ) -> None:
         expect(drones >= 1, "drones", "1 or more", f"{drones}")
         expect(len(names) in (0, drones), "names", f"one for each of {drones} drones", f"{names}")
-        self.drones, self.vehicle, self.names = drones, Vehicle.load(vehicle), tuple(names)
+        self.drones, self.names = drones, tuple(names)
+        self.vehicle = load_vehicles(vehicle, drones)
+        crafts = members_of(self.vehicle, drones)
         try:
-            spec = build_scene(self.vehicle.path, world)
-            self.radius, top = _size(spec.compile())
+            scenes = [build_scene(path, world) for path in dict.fromkeys(c.path for c in crafts)]
+            spec, sizes = scenes[0], [_size(scene.compile()) for scene in scenes]
         except InputError:
             raise
         except ValueError as error:  # a texture is missing, which the physics does not need
             reason = " ".join(str(error).split())
             raise InputError(f"vehicle: expected a file that can be drawn, got: {reason}") from None
+        self.radius, top = max(radius for radius, _ in sizes), sizes[0][1]
         grid = _grid(drones, _SPACING * self.radius)
         self._offsets = 0.0 * grid if names else grid
         _free_body(spec).add_camera(  # sees nose, front rotors and horizon
@@ -213,9 +216,7 @@ class Stage:
             fovy=70,
         )
         for number, offset in enumerate(grid[1:], 1):
-            frame = spec.worldbody.add_frame(pos=offset)
-            craft = read_spec(self.vehicle.path)  # must outlive its body
-            frame.attach_body(_free_body(craft), f"{number}/", "")
+            attach_craft(spec, crafts[number].path, f"{number}/", offset)
         self.model = spec.compile()
         apart = float(np.ptp(grid, axis=0).max())  # drones of one world fly further apart
         _scale_drawing(self.model, self.radius, 4.0 * apart if names else apart)

@@ -51,6 +51,13 @@ class WorldState:
     payload_velocity: Array = None
     """Its velocity, world frame, m/s, shape (W, A, 3)."""
 
+    def of(self, drones: slice) -> "WorldState":
+        """Of some drones of each world."""
+        arrays = {name: getattr(self, name) for name in self.__slots__}
+        return WorldState(
+            **{name: None if x is None else x[:, drones] for name, x in arrays.items()}
+        )
+
     @property
     def tilt_cosine(self) -> Array:
         """Cosine of the angle between each body's z axis and the vertical, shape (W, A)."""

@@ -117,10 +117,12 @@ def flown_model(
     """
     movable = bool(set(drawn) & set(CENTER))
     if drones > 1:
-        from ..models.swarm import swarm_model  # which imports MuJoCo
+        from ..models.fleet import members_of  # which imports MuJoCo
+        from ..models.swarm import swarm_model
 
         load = effects.payload * drones
-        return swarm_model([vehicle] * drones, movable=movable, payload=load, cable=effects.cable)
+        crafts = members_of(vehicle, drones)
+        return swarm_model(crafts, movable=movable, payload=load, cable=effects.cable)
     if effects.payload:
         return vehicle.with_payload(effects.payload, effects.cable)
     return vehicle.with_movable_center() if movable else vehicle.model
@@ -159,6 +161,14 @@ def make_world(
         raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {drones!r}")
     if drones > 1:
         expect(backend != "warp", "drones", f"1 with the backend {backend}", f"{drones}")
+    if getattr(vehicle, "members", ()):
+        expect(backend == "mujoco", "vehicle", f"one with the backend {backend}", vehicle.name)
+        acting = [
+            *(effects or EffectOptions()).to_options(),
+            *(randomize.names if randomize else ()),
+        ]
+        expected = "none with several vehicles"
+        expect(not acting, "effects and randomize", expected, ", ".join(acting))
     for name, value in settings.items():
         known = _SETTINGS[backend]
         if name not in known:

@@ -11,6 +11,7 @@ import pytest
 from rotorgram.cli import main
 from rotorgram.envs.loop import Loop
 from rotorgram.models import QUAD_XML, InputError, Vehicle
+from rotorgram.models.library import vehicle_names
 from rotorgram.sim import (
     LEVELS,
     EffectOptions,
@@ -416,3 +417,15 @@ def test_the_page_tells_what_the_benchmark_wrote_and_the_code_gives() -> None:
     for level in LEVELS:
         costs = [f"{told['cost'][n]['ratio_to_rotors'][level]:.2f}" for n in ("1", "1024")]
         assert f"| `{level}` | {' | '.join(costs)} |" in page
+
+
+def test_the_page_tells_how_near_a_shared_payload_is_held() -> None:
+    page = (DOCS / "algorithms" / "geometric.md").read_text()
+    told = json.loads((DOCS / "results" / "control" / "cable.json").read_text())
+    for name in vehicle_names():
+        cells = [
+            f"{100 * row['error_m']:.2f} cm"
+            + (f", {row['terminated']} ended" if row["terminated"] else "")
+            for row in told[name].values()
+        ]
+        assert f"| `{name}` | {' | '.join(cells)} |" in page

@@ -10,8 +10,15 @@ import numpy as np
 from ...models.errors import expect
 from ...sim import Array, Draw, Pose, WorldState, stack
 from ..spec import Metric
-from .flight import AIR, LEAST_TILT_COSINE, MOST_SPEED, RATE_WEIGHT, TERMINATION_REWARD, length
-from .payload_hover import SWING_WEIGHT
+from .flight import (
+    AIR,
+    LEAST_TILT_COSINE,
+    MOST_SPEED,
+    RATE_WEIGHT,
+    SWING_WEIGHT,
+    TERMINATION_REWARD,
+    length,
+)
 from .swarm import APPROACH_WEIGHT, TINY, Swarm, SwarmOptions, ring
 from .task import Outcome, check_number
 
@@ -95,9 +102,12 @@ class Cable(Swarm):
 
     def setup(self) -> None:
         """See the class."""
+        from ...models.fleet import Fleet
         from ...models.vehicle import payload_radius
 
         options, vehicle, count = self.options, self.vehicle, self.shape[1]
+        alike = not isinstance(vehicle, Fleet)
+        expect(alike, "vehicle", "one for all drones that carry a payload", vehicle.name)
         self._slant = math.radians(options.angle)
         self._ring = float(np.linalg.norm(ring(count)[0])) * self.gap
         self._azimuths = 2 * math.pi * np.arange(count) / count

@@ -24,6 +24,7 @@ from .task import Task, finite
 
 ERROR_SCALE: Final = 0.5  # Distance at which the reward for nearness crosses zero, m
 RATE_WEIGHT: Final = 0.02  # Cost of a body rate of 1 rad/s
+SWING_WEIGHT: Final = 0.1  # Cost of a payload that moves at 1 m/s relative to the craft
 TERMINATION_REWARD: Final = -20.0  # Added to the reward of the step that terminates an episode
 PASSING_REWARD: Final = 1.0  # Of a course: added in a step in which a point or gate is passed
 COURSE_RATE_WEIGHT: Final = 0.002  # Of a course: cost of a body rate of 1 rad/s in a step
@@ -76,8 +77,9 @@ class Flight(Task):
             (f"{v} {axis}", unit, most) for v, unit, most in vectors for axis in "xyz"
         ]
         rotors = range(1, vehicle.num_rotors + 1)
-        weakest, strongest = (
-            limit / vehicle.hover_thrust - 1 for limit in (vehicle.thrust_low, vehicle.thrust_high)
+        weakest, strongest = (  # of any vehicle, where there are several
+            pick(np.atleast_2d(limit / vehicle.hover_thrust - 1), axis=0)
+            for pick, limit in ((np.min, vehicle.thrust_low), (np.max, vehicle.thrust_high))
         )
         outer, inner = ([most for *_, most in numbers] for numbers in (first, more))
         low = (*(-x for x in outer), *(weakest - 0.001).tolist(), *(-x for x in inner))

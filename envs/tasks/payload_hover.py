@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from ...models.errors import expect
 from ...sim import (
@@ -26,6 +26,7 @@ from .flight import (
     LEAST_TILT_COSINE,
     MOST_SPEED,
     RATE_WEIGHT,
+    SWING_WEIGHT,
     TERMINATION_REWARD,
     Flight,
     at,
@@ -33,8 +34,6 @@ from .flight import (
     length,
 )
 from .task import Outcome, TaskOptions, check_number
-
-SWING_WEIGHT: Final = 0.1  # Cost of a payload that moves at 1 m/s relative to the craft
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -83,6 +83,8 @@ class Swarm(Flight):
 
     def prepare(self, more: tuple[tuple[str, str, float], ...] = ()) -> None:
         """Set `observation`: that of `Flight`, further numbers, and the neighbours."""
+        from ...models.fleet import members_of  # which imports MuJoCo
+
         options, vehicle = self.options, self.vehicle
         self.count = self.shape[1] if self.shape else 1
         right = self.count == 1 or self.xp is np
@@ -103,6 +105,7 @@ class Swarm(Flight):
         spheres = f"; drones with a radius of {vehicle.radius:.7g} m"
         self.observation = tuple(replace(a, frame=a.frame + spheres) for a in self.observation)
         period = options.control_period
+        self._radii = np.array([one.radius for one in members_of(vehicle, self.count)])
         self.radio = Radio(options, period, self.shape) if self.count > 1 else None
         self._down: Array = False
 
@@ -186,11 +189,12 @@ class Swarm(Flight):
             return self.options.radio_range + 0.0 * length(self.xp, state.velocity)
         apart = length(np, state.position[:, :, None] - state.position[:, None])
         apart[:, np.arange(self.count), np.arange(self.count)] = np.inf
-        return apart.min(axis=-1) - 2 * self.vehicle.radius
+        return (apart - (self._radii[:, None] + self._radii)).min(axis=-1)
 
     def narrowness(self, room: Array) -> Array:
         """Reward for a clearance, (W, A): 0 from a diameter on, `-ROOM_WEIGHT` where it is 0."""
-        narrow = 1.0 - room / (2 * self.vehicle.radius)
+        radius = self._radii if self.shape else self.vehicle.radius
+        narrow = 1.0 - room / (2 * constant(radius, room))
         return -ROOM_WEIGHT * narrow * (narrow > 0)
 
     def slots_at(self, slots: np.ndarray, state: WorldState) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from ...models.errors import InputError, expect
+from ...models.fleet import members_of
 from ...models.swarm import CONTACTS, GROUNDED, contact_columns
 from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
 from ..effects import EffectOptions, Effects
@@ -74,7 +75,8 @@ class MujocoWorld(ArrayWorld):
         self._contacts: np.ndarray = batch.bind("ncon")
         self._warnings = batch.warning  # of each kind the last info, and how many
         self._no_warnings, self._no_contacts = self._warnings.tobytes(), self._contacts.tobytes()
-        newtons = np.array([rotor.newtons for rotor in vehicle.rotors] * drones)
+        crafts = members_of(vehicle, drones)
+        newtons = np.array([rotor.newtons for craft in crafts for rotor in craft.rotors])
         self._newtons = None if (newtons == 1.0).all() else newtons
         # Where controls are newtons, they are the thrusts, and without effects the commands too.
         alike = self._newtons is None and self.effects is None

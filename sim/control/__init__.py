@@ -4,12 +4,14 @@ A controller has no memory: what it needs of the past is in the state. An action
 within bounds, or is one of some choices.
 """
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from ...models.errors import expect
 from ..state import Array, WorldState
 from .cascade import Attitude, Position, Rates, Velocity
-from .gains import Gains
+from .gains import Gains, shared_ranges
+from .several import Several
 from .thrusts import CollectiveThrust, RotorThrust
 
 if TYPE_CHECKING:
@@ -66,6 +68,8 @@ def make_controller(
     once. Raises `InputError` if the level is none of them, or the vehicle cannot be flown at it.
     """
     expect(level in LEVELS, "action", f"one of {', '.join(LEVELS)}", repr(level))
+    if members := getattr(vehicle, "members", ()):
+        return _of_several(level, members, period, lag)
     if level == "rotors":
         return RotorThrust(vehicle)
     if level in _CASCADE:
@@ -73,3 +77,14 @@ def make_controller(
         return controller
     newtons = SHARES[level] * float(vehicle.thrust_high.max())
     return CollectiveThrust(vehicle, newtons, increment=level == "increment")
+
+
+def _of_several(level: str, vehicles: Sequence["Vehicle"], period: float, lag: float) -> Controller:
+    """One of a level for each drone's vehicle; an action stands for the same with all."""
+    controllers: list[Controller]
+    if level in _CASCADE:
+        gains = shared_ranges([Gains.of(vehicle, period, lag) for vehicle in vehicles])
+        controllers = [_CASCADE[level](*both) for both in zip(vehicles, gains, strict=True)]
+    else:
+        controllers = [make_controller(level, vehicle, period, lag=lag) for vehicle in vehicles]
+    return Several(controllers)

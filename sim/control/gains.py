@@ -20,7 +20,8 @@ Yaw has a p of its own, by the same rule from its own α.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
@@ -123,6 +124,20 @@ class Gains:
             mix=tuple(map(tuple, mix.tolist())),
             share=tuple(share.tolist()),
         )
+
+
+def shared_ranges(several: Sequence[Gains]) -> list[Gains]:
+    """The gains of several vehicles with the ranges of the least able, so that a number of an
+    action stands for the same with all.
+    """
+    names = ("most_rate", "most_velocity", "most_offset")
+    least: dict[str, Any] = {
+        name: tuple(np.min([getattr(one, name) for one in several], axis=0).tolist())
+        for name in names
+    }
+    for name in ("most_tilt", "position"):
+        least[name] = min(getattr(one, name) for one in several)
+    return [replace(one, **least) for one in several]
 
 
 def _rows(allocation: np.ndarray) -> Any:

@@ -11,7 +11,7 @@ from ...envs.registry import is_known
 from ...envs.spec import component_names
 from ...models import Backend
 from ...models.errors import InputError
-from ...models.vehicle import Vehicle
+from ...models.fleet import load_vehicles
 from ..protocol.messages import Command, State
 from ..transport.stepped import Stepped, make_stepped, reset_all
 from .reader import Item, Recording, Session, count_of, printable
@@ -119,7 +119,8 @@ class SessionVerdict:
                 "--env MODULE:NAME names the module that registers it"
             )
         count, drag = self.session.num_envs, spec.options.get("linear_drag", 0.0)
-        was, now = spec.vehicle_hash, Vehicle.load(self.vehicle, linear_drag=drag).hash
+        craft = load_vehicles(self.vehicle, len(spec.agents), linear_drag=drag)
+        was, now = spec.vehicle_hash, craft.hash
         other = bool(was.strip("0")) and was != now
         hint = f"the vehicle was {was}, and is {now} here: --vehicle names its file" * other
         try:

@@ -1,0 +1,113 @@
+"""Vehicles of the drones of one world, where they are not all alike."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from .errors import expect
+from .vehicle import Vehicle
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fleet(Vehicle):
+    """A vehicle for each of A drones, in the place of one for all.
+
+    What belongs to a drone is an array with the first axis A: `mass` (A,), `center_of_mass` (A, 3),
+    `inertia` (A, 3, 3), `allocation` (A, 4, R), `hover_thrust` (A, R). Radius and height at rest
+    are the largest of all, accelerations the least. The model, its path and the coefficients are
+    those of the first.
+    """
+
+    members: tuple[Vehicle, ...]
+    """Of each drone, under the physics step and the gravity that all share."""
+
+    @classmethod
+    def of(cls, vehicles: Sequence[Vehicle]) -> Self:
+        """Of one vehicle for each drone. The physics step is the shortest of all, and gravity that
+        of the first. Raises `InputError` where they have not the same number of rotors.
+        """
+        first = vehicles[0]
+        for one in vehicles:
+            expected = f"{first.num_rotors} rotors as of {first.name}"
+            expect(
+                one.num_rotors == first.num_rotors,
+                "vehicle",
+                expected,
+                f"{one.num_rotors} of {one.name}",
+            )
+        step = min(one.timestep for one in vehicles)
+        members = tuple(_under(one, step, first.gravity) for one in vehicles)
+        told: dict[str, Any] = {one.name: getattr(members[0], one.name) for one in fields(Vehicle)}
+        for name in ("mass", "center_of_mass", "inertia", "allocation", "hover_thrust"):
+            told[name] = np.array([getattr(one, name) for one in members])
+        told["name"] = ", ".join(dict.fromkeys(one.name for one in members))
+        together = " ".join(one.hash for one in members)
+        told["hash"] = blake2b(together.encode(), digest_size=16).hexdigest()
+        told["rest_height"] = max(one.rest_height for one in members)
+        return cls(**told, members=members)
+
+    @cached_property
+    def thrust_low(self) -> np.ndarray:
+        """Least thrust of each rotor, shape (A, R), N."""
+        return np.array([one.thrust_low for one in self.members])
+
+    @cached_property
+    def thrust_high(self) -> np.ndarray:
+        """Largest thrust of each rotor, shape (A, R), N."""
+        return np.array([one.thrust_high for one in self.members])
+
+    @cached_property
+    def radius(self) -> float:
+        """Of the sphere of the largest, m."""
+        return max(one.radius for one in self.members)
+
+    @property
+    def max_acceleration(self) -> float:
+        """Of the least able, m/s²."""
+        return min(one.max_acceleration for one in self.members)
+
+    def turning(self, axis: Sequence[float] | np.ndarray) -> float:
+        """Of the least able, rad/s²."""
+        return min(one.turning(axis) for one in self.members)
+
+    def __reduce__(self) -> Any:
+        """Loaded again from its files."""
+        paths = ",".join(str(one.path) for one in self.members)
+        return partial(load_vehicles, linear_drag=self.linear_drag), (paths, len(self.members))
+
+
+def load_vehicles(vehicle: Path | str | None, drones: int, *, linear_drag: float = 0.0) -> Vehicle:
+    """The vehicle of all drones of a world; or a `Fleet`, where the text names several.
+
+    These are names or files with commas between them: the vehicles of the drones in their order,
+    and from the first on again where there are more drones. Raises `InputError`.
+    """
+    several = isinstance(vehicle, str) and "," in vehicle and not Path(vehicle).exists()
+    names = [name.strip() for name in str(vehicle).split(",")] if several else [vehicle]
+    expected = f"at most one vehicle for each of {drones} drones"
+    expect(len(names) <= drones, "vehicle", expected, f"{len(names)}: {vehicle}")
+    found = [Vehicle.load(name, linear_drag=linear_drag) for name in names]
+    if len(set(found)) == 1:
+        return found[0]
+    return Fleet.of([found[i % len(found)] for i in range(drones)])
+
+
+def members_of(vehicle: Vehicle, drones: int) -> tuple[Vehicle, ...]:
+    """The vehicle of each drone."""
+    return vehicle.members if isinstance(vehicle, Fleet) else (vehicle,) * drones
+
+
+def _under(vehicle: Vehicle, timestep: float, gravity: float) -> Vehicle:
+    """The vehicle with another physics step, s, and gravity, m/s²."""
+    if (timestep, gravity) == (vehicle.timestep, vehicle.gravity):
+        return vehicle
+    model = copy.copy(vehicle.model)
+    model.opt.timestep, model.opt.gravity[2] = timestep, -gravity
+    hover = vehicle.hover_thrust * (gravity / vehicle.gravity)
+    return replace(vehicle, model=model, gravity=gravity, hover_thrust=hover)

@@ -1,0 +1,34 @@
+"""A controller for each drone of a world whose vehicles are not all alike."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..state import Array, WorldState
+
+if TYPE_CHECKING:
+    from . import Controller
+
+
+class Several:
+    """As `Controller`, for drones that have one each, in their order. Actions mean the same to all.
+
+    Arrays are NumPy's, of shape (W, A, ...).
+    """
+
+    def __init__(self, controllers: Sequence["Controller"]) -> None:
+        first: Any = controllers[0]
+        self.low, self.high = first.low, first.high
+        self.components, self.choices = first.components, first.choices
+        self.every_step = getattr(first, "every_step", False)
+        self.units, self.frame = getattr(first, "units", ""), getattr(first, "frame", "")
+        self._controllers = controllers
+
+    def thrust(self, action: Array, state: WorldState) -> Array:
+        """As `Controller.thrust`."""
+        thrusts = np.empty(state.thrust.shape)
+        for i, controller in enumerate(self._controllers):
+            one = slice(i, i + 1)
+            thrusts[:, one] = controller.thrust(action[:, one], state.of(one))
+        return thrusts
