@@ -10,13 +10,11 @@ They do not compute the same: PyFlyt simulates propellers, motors and a body wit
 Bullet, Crazyflow an analytic model of a Crazyflie in JAX, without contacts.
 """
 
-import argparse
-import json
-import os
-import statistics
 import subprocess
 import sys
 from pathlib import Path
+
+from measuring import RESULTS, medians, options, write
 
 OURS = """
 import gymnasium, numpy as np, rotorgram.envs
@@ -74,14 +72,10 @@ print(count / (time.perf_counter() - start))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--pyflyt", type=Path, help="a Python that has PyFlyt")
-    parser.add_argument("--crazyflow", type=Path, help="a Python that has crazyflow")
-    parser.add_argument("--seconds", type=float, default=2.0)
-    parser.add_argument("--rounds", type=int, default=5)
-    default = Path("docs/results/performance/peers.json")
-    parser.add_argument("--out", type=Path, default=default)
-    args = parser.parse_args()
+    out = RESULTS / "performance" / "peers.json"
+    args = options(
+        __doc__, pyflyt=Path, crazyflow=Path, seconds=2.0, rounds=5, out=out
+    ).parse_args()
     peers = {
         "rotorgram": (sys.executable, OURS, (1, 64, 1024, 4096)),
         "PyFlyt QuadX-Hover-v4": (args.pyflyt, PYFLYT, (1,)),
@@ -94,12 +88,9 @@ def main() -> None:
                 words = [str(python), "-c", script + CLOCK, str(n), str(args.seconds)]
                 said = subprocess.run(words, check=True, capture_output=True, text=True).stdout
                 rates.setdefault(f"{name}, {n}", []).append(round(float(said.split()[-1]), 1))
-    medians = {name: statistics.median(values) for name, values in rates.items()}
-    content = {"env_steps_per_second": medians, "rates": rates, "seconds": args.seconds,
-               "machine": {"cores": os.cpu_count()}}  # fmt: skip
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(content, indent=2) + "\n")
-    for name, rate in medians.items():
+    middle = medians(rates)
+    write(args.out, {"env_steps_per_second": middle, "rates": rates, "seconds": args.seconds})
+    for name, rate in middle.items():
         print(f"{name:36} {rate:12,.0f} env steps/s")
 
 

@@ -1,0 +1,69 @@
+"""What the scripts beside it share: options, measurements in turns, and the file of the result."""
+
+import argparse
+import csv
+import json
+import statistics
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from rotorgram.agents.checkpoints import software_versions
+from rotorgram.experiments.results import machine
+
+RESULTS: Final = Path("docs/results")
+Name, Way, Value = TypeVar("Name"), TypeVar("Way"), TypeVar("Value")
+
+
+def options(doc: str, **defaults: Any) -> argparse.ArgumentParser:
+    """A parser with an option for each name; `doc` is the script's.
+
+    An option takes what its default is, a sequence one value or more. A type stands for an option
+    without a default, and False for a switch.
+    """
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
+    for name, default in defaults.items():
+        flag = f"--{name.replace('_', '-')}"
+        if default is False:
+            parser.add_argument(flag, action="store_true")
+        elif isinstance(default, type):
+            parser.add_argument(flag, type=default)
+        elif isinstance(default, list | tuple | range):
+            parser.add_argument(flag, type=type(default[0]), nargs="+", default=default)
+        else:
+            kind = Path if isinstance(default, Path) else type(default)
+            parser.add_argument(flag, type=kind, default=default)
+    return parser
+
+
+def in_turns(
+    ways: Mapping[Name, Way], rounds: int, measure: Callable[[Way], Value]
+) -> dict[Name, list[Value]]:
+    """Measure each way once a round: a machine that slows down slows all of them."""
+    measured: dict[Name, list[Value]] = {name: [] for name in ways}
+    for _ in range(rounds):
+        for name, way in ways.items():
+            measured[name].append(measure(way))
+    return measured
+
+
+def medians(measured: Mapping[Name, list[float]]) -> dict[Name, float]:
+    """Median of what was measured of each way."""
+    return {name: statistics.median(values) for name, values in measured.items()}
+
+
+def add_row(path: Path, row: Mapping[str, Any]) -> None:
+    """Add a row to a CSV file, which begins with the names of the first one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, row.keys(), lineterminator="\n")
+        if not file.tell():
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def write(path: Path, result: Mapping[str, Any]) -> None:
+    """Write a result as JSON, with the software and the machine on which it depends."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    result = {**result, "versions": software_versions(), "machine": machine()}
+    path.write_text(json.dumps(result, indent=2) + "\n")
