@@ -1,7 +1,7 @@
 """Accuracy and speed of the backend `rigid`.
 
     python benchmarks/rigid.py accuracy
-    python benchmarks/rigid.py speed [--numba PYTHON] [--crazyflow PYTHON]
+    python benchmarks/rigid.py speed [--crazyflow PYTHON]
     python benchmarks/rigid.py sizes
 
 Accuracy: the largest distance to `mujoco` after 5 s of tumbling flight at random thrusts, of every
@@ -12,8 +12,8 @@ of a flight near the origin.
 Speed: control steps of 4,096 drones, per second and per second of a processor (which a busy machine
 disturbs less), in turn, medians: of the world alone for `mujoco`
 and `rigid`, arrays and tensors; the same for one env, `Loop.advance` of Hover. With PYTHON of an
-environment that has them (pip install numba; pip install crazyflow): the same physics step by
-Numba, and Crazyflow's own step benchmark at the same rates, each in a process of its own.
+environment that has Crazyflow (pip install crazyflow): its own step benchmark at the same rates, in
+a process of its own.
 
 Sizes: the processor's time of `Loop.advance` of Hover with 64 to 4,096 drones.
 Writes docs/results/rigid/{accuracy,speed,sizes}.json.
@@ -162,23 +162,17 @@ def speed(args: Namespace) -> None:
             ways[name]()
         firsts[name] = round(time.perf_counter() - start, 2)
     rates: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
-    others = {"numba": args.numba, "crazyflow": args.crazyflow}
-    reports: dict[str, Any] = {}
+    told: dict[str, Any] = {}
     for _ in range(args.repeats):
         for name, fly in ways.items():
             with torch.no_grad():
                 rates[name].append(rate(fly, args.drones, args.seconds))
-        for name, python in others.items():
-            if python:
-                script = str(HERE / f"rigid_{name}.py")
-                command = [python, script, str(args.drones), str(args.seconds)]
-                said = subprocess.run(command, capture_output=True, check=True).stdout
-                told = json.loads(said.splitlines()[-1])  # warnings come before
-                for kind in ("rate", "own_rate"):
-                    if kind in told:
-                        label = name if kind == "rate" else f"{name}, one physics step"
-                        rates.setdefault(label, []).append(tuple(told.pop(kind)))
-                reports[name] = told
+        if args.crazyflow:
+            words = [str(HERE / "rigid_crazyflow.py"), str(args.drones), str(args.seconds)]
+            said = subprocess.run([args.crazyflow, *words], capture_output=True, check=True).stdout
+            told = json.loads(said.splitlines()[-1])  # warnings come before
+            for kind, label in (("rate", "crazyflow"), ("own_rate", "crazyflow, one physics step")):
+                rates.setdefault(label, []).append(tuple(told[kind]))
     clock, processor = (
         {name: round(statistics.median(x[i] for x in values)) for name, values in rates.items()}
         for i in (0, 1)
@@ -188,12 +182,12 @@ def speed(args: Namespace) -> None:
     write(OUT / "speed.json", {
         "drones": args.drones, "repeats": args.repeats, "threads": torch.get_num_threads(),
         "medians": clock, "medians_per_processor_second": processor,
-        "first_step_s": firsts, "others": reports,
+        "first_step_s": firsts, "crazyflow": told.get("versions"),
     })  # fmt: skip
 
 
 def main() -> None:
-    parser = options(__doc__, drones=4096, repeats=5, seconds=1.0, numba=str, crazyflow=str)
+    parser = options(__doc__, drones=4096, repeats=5, seconds=1.0, crazyflow=str)
     parser.add_argument("what", choices=("accuracy", "speed", "sizes"))
     args = parser.parse_args()
     {"accuracy": lambda _: accuracy(), "speed": speed, "sizes": sizes}[args.what](args)
