@@ -4,12 +4,10 @@ import argparse
 import csv
 import json
 import statistics
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final, TypeVar
-
-from rotorgram.agents.checkpoints import software_versions
-from rotorgram.experiments.results import machine
+from typing import Any, Final, TypeVar, get_type_hints
 
 RESULTS: Final = Path("docs/results")
 Name, Way, Value = TypeVar("Name"), TypeVar("Way"), TypeVar("Value")
@@ -62,8 +60,28 @@ def add_row(path: Path, row: Mapping[str, Any]) -> None:
         writer.writerow(row)
 
 
+def write_rows(path: Path, rows: Sequence[Any]) -> None:
+    """Write rows of one dataclass as CSV."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, asdict(rows[0]))
+        writer.writeheader()
+        writer.writerows(map(asdict, rows))
+
+
+def read_rows(path: Path, kind: type[Value]) -> list[Value]:
+    """The rows of a dataclass that `write_rows` wrote."""
+    types = {n: "True".__eq__ if t is bool else t for n, t in get_type_hints(kind).items()}
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return [kind(**{name: types[name](text) for name, text in row.items()}) for row in rows]
+
+
 def write(path: Path, result: Mapping[str, Any]) -> None:
     """Write a result as JSON, with the software and the machine on which it depends."""
+    from rotorgram.agents.checkpoints import software_versions
+    from rotorgram.experiments.results import machine
+
     path.parent.mkdir(parents=True, exist_ok=True)
     result = {**result, "versions": software_versions(), "machine": machine()}
     path.write_text(json.dumps(result, indent=2) + "\n")
