@@ -18,8 +18,6 @@ process: again every bit has to be the same.
 import json
 import random
 import signal
-import socket
-import subprocess
 import sys
 import threading
 import time
@@ -29,7 +27,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from measuring import RESULTS, options, write
+from measuring import RESULTS, free_ports, launch, options, write
 from rotorgram.envs import ArraySpec, LocalVectorEnv, Outcome, Task, TaskOptions, register
 from rotorgram.envs.loop import Loop
 from rotorgram.sim import Pose
@@ -108,22 +106,6 @@ register(ENV_ID, Row)
 def action_of(observation: np.ndarray) -> np.float32:
     """As in an agent above."""
     return np.float32((zlib.crc32(observation.tobytes()) % 2001 - 1000) / 10_000)
-
-
-def launch(code: str, settings: Any) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", code, json.dumps(settings)]
-    pipe = subprocess.PIPE
-    return subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
-
-
-def free_ports(count: int) -> list[int]:
-    socks = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
-    for sock in socks:
-        sock.bind(ANY)
-    ports = [sock.getsockname()[1] for sock in socks]
-    for sock in socks:
-        sock.close()
-    return ports
 
 
 class Twin:

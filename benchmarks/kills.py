@@ -18,7 +18,6 @@ import json
 import random
 import shutil
 import signal
-import socket
 import statistics
 import subprocess
 import sys
@@ -28,18 +27,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pandas as pd
-from measuring import RESULTS, options, write
+from measuring import RESULTS, free_ports, options, write
 from rotorgram.agents.checkpoints import load
 
 COLUMNS = ["episode", "first_step", "length", "total_reward"]
 HANG = 60.0  # s
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
 
 
 class Pair:
@@ -51,7 +43,7 @@ class Pair:
         self.living.append(self)
         self.folder = folder
         self.env_steps = env_steps
-        self.agent_port, self.simulator_port = free_port(), free_port()
+        self.agent_port, self.simulator_port = free_ports(2)
         self.log = open(folder.with_suffix(".log"), "a")  # noqa: SIM115
         self.agent = self.simulator = None
         self.before = pd.DataFrame(columns=COLUMNS)

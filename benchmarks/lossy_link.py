@@ -17,7 +17,6 @@ import random
 import select
 import struct
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -27,7 +26,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from measuring import RESULTS, options, write
+from measuring import RESULTS, launch, options, write
 from rotorgram.udp.protocol.auth import write_key
 
 AGENT_ADDRESS, SIMULATOR_ADDRESS = "10.77.0.1", "10.77.0.2"
@@ -155,20 +154,16 @@ def two_machines(mtu: int) -> Iterator[tuple[tuple[str, int], tuple[str, int]]]:
             run("ip", "netns", "del", name)
 
 
-def launch(namespace: str, code: str, settings: list[Any]) -> subprocess.Popen[str]:
-    words = ["ip", "netns", "exec", namespace, sys.executable, "-c", code, json.dumps(settings)]
-    return subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-
-
 def fly(drones: int, mtu: int, delay: float, loss: float, seconds: float) -> dict[str, Any]:
     """The rate and counts of one flight. Raises `CalledProcessError` if it fails."""
     with tempfile.TemporaryDirectory() as folder, two_machines(mtu) as (here, there):
         key = str(Path(folder) / "key")
         write_key(Path(key))
         wire = Wire((here[1], there[1]), loss, delay)
-        agent = launch(here[0], AGENT, [drones, seconds, key, AGENT_ADDRESS, PORT])
+        settings = [drones, seconds, key, AGENT_ADDRESS, PORT]
+        agent = launch(AGENT, settings, "ip", "netns", "exec", here[0])
         server, bind = (AGENT_ADDRESS, PORT), (SIMULATOR_ADDRESS, 0)
-        simulator = launch(there[0], SIMULATE, [drones, key, server, bind])
+        simulator = launch(SIMULATE, [drones, key, server, bind], "ip", "netns", "exec", there[0])
         try:
             out, _ = agent.communicate(timeout=seconds + 300)
             if agent.returncode == 0:

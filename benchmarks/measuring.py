@@ -3,8 +3,12 @@
 import argparse
 import csv
 import json
+import socket
 import statistics
+import subprocess
+import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, TypeVar, get_type_hints
@@ -32,6 +36,26 @@ def options(doc: str, **defaults: Any) -> argparse.ArgumentParser:
             kind = Path if isinstance(default, Path) else type(default)
             parser.add_argument(flag, type=kind, default=default)
     return parser
+
+
+def launch(code: str, settings: Any, *before: str) -> subprocess.Popen[str]:
+    """Run code in a process of its own, with its settings as JSON in `sys.argv[1]`.
+
+    `before` are the words of a command that runs it.
+    """
+    words = [*before, sys.executable, "-c", code, json.dumps(settings)]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True)
+
+
+def free_ports(count: int) -> list[int]:
+    """UDP ports of this machine that are free now."""
+    with ExitStack() as opened:
+        kind = socket.AF_INET, socket.SOCK_DGRAM
+        socks = [opened.enter_context(socket.socket(*kind)) for _ in range(count)]
+        for sock in socks:
+            sock.bind(("127.0.0.1", 0))
+        return [sock.getsockname()[1] for sock in socks]
 
 
 def in_turns(

@@ -16,39 +16,34 @@ from pathlib import Path
 
 from measuring import RESULTS, medians, options, write
 
-OURS = """
-import gymnasium, numpy as np, rotorgram.envs
-def make(n):
-    if n == 1:
-        env = gymnasium.make("rotorgram/Elevation-v0").unwrapped
-        env.reset(seed=0)
-        action = np.zeros(1, np.float32)
-        def step():
-            r = env.step(action)
-            if r[2] or r[3]:
-                env.reset()
-    else:
-        env = gymnasium.make_vec("rotorgram/Elevation-v0", num_envs=n)
-        env.reset(seed=0)
-        action = np.zeros((n, 1), np.float32)
-        def step():
-            env.step(action)
-    return step
-"""
-PYFLYT = """
-import gymnasium, numpy as np, PyFlyt.gym_envs
-def make(n):
-    env = gymnasium.make("PyFlyt/QuadX-Hover-v4").unwrapped
+ONE = """
+import gymnasium, numpy as np
+def one(env_id, action):
+    env = gymnasium.make(env_id).unwrapped
     env.reset(seed=0)
-    action = np.array([0.0, 0.0, 0.0, 0.3])
     def step():
         r = env.step(action)
         if r[2] or r[3]:
             env.reset()
     return step
 """
+OURS = """
+import rotorgram.envs
+def make(n):
+    if n == 1:
+        return one("rotorgram/Elevation-v0", np.zeros(1, np.float32))
+    env = gymnasium.make_vec("rotorgram/Elevation-v0", num_envs=n)
+    env.reset(seed=0)
+    action = np.zeros((n, 1), np.float32)
+    return lambda: env.step(action)
+"""
+PYFLYT = """
+import PyFlyt.gym_envs
+def make(n):
+    return one("PyFlyt/QuadX-Hover-v4", np.array([0.0, 0.0, 0.0, 0.3]))
+"""
 CRAZYFLOW = """
-import gymnasium, numpy as np, crazyflow.envs, jax
+import crazyflow.envs, jax
 def make(n):
     env = gymnasium.make_vec("DroneReachPos-v0", num_envs=n, device="cpu", freq=50)
     env.reset(seed=0)
@@ -85,7 +80,7 @@ def main() -> None:
     for _ in range(args.rounds):
         for name, (python, script, counts) in peers.items():
             for n in counts if python else ():
-                words = [str(python), "-c", script + CLOCK, str(n), str(args.seconds)]
+                words = [str(python), "-c", ONE + script + CLOCK, str(n), str(args.seconds)]
                 said = subprocess.run(words, check=True, capture_output=True, text=True).stdout
                 rates.setdefault(f"{name}, {n}", []).append(round(float(said.split()[-1]), 1))
     middle = medians(rates)

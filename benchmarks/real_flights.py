@@ -16,7 +16,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -129,7 +129,7 @@ def main() -> int:
     for name, errors in PUBLISHED.items():
         theirs = dict(zip(HORIZONS, errors, strict=True))
         _show({"name": name, "published_formula": theirs}, "theirs")
-    _write(given.out, rows, len(windows.index), given.stride, test)
+    _write(given.out, rows, len(windows.index), given.stride)
     return 0
 
 
@@ -287,21 +287,15 @@ def _show(row: Mapping, whose: str) -> None:
     print(f"{whose:7}{row['name']:46}{text}", flush=True)
 
 
-def _write(
-    out: Path, rows: Sequence[Mapping], starts: int, stride: int, flights: Sequence[Flight]
-) -> None:
+def _write(out: Path, rows: Sequence[Mapping], starts: int, stride: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    kinds: dict[str, Callable[[Mapping], Mapping]] = {
-        "errors": lambda row: row["errors"],
-        "published formula": lambda row: row["published_formula"],
-    }
     with (out / "variants.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["model", "formula", "horizon", *MEASURES])
         for row in rows:
-            for kind, taken in kinds.items():
-                for h in HORIZONS:
-                    writer.writerow([row["name"], kind, h, *(f"{x:.5f}" for x in taken(row)[h])])
+            for kind in ("errors", "published formula"):
+                for h, errors in row[kind.replace(" ", "_")].items():
+                    writer.writerow([row["name"], kind, h, *(f"{x:.5f}" for x in errors)])
         for name, errors in PUBLISHED.items():
             for h, one in zip(HORIZONS, errors, strict=True):
                 writer.writerow([f"published: {name}", "published formula", h, *one])
@@ -309,10 +303,9 @@ def _write(
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["model", "flight", "horizon", *MEASURES])
         for row in rows:
-            for flight in flights:
-                for h in HORIZONS:
-                    errors = row["flights"][flight.name][h]
-                    writer.writerow([row["name"], flight.name, h, *(f"{x:.5f}" for x in errors)])
+            for name, told in row["flights"].items():
+                for h, errors in told.items():
+                    writer.writerow([row["name"], name, h, *(f"{x:.5f}" for x in errors)])
     # Chosen by kinds of flights that the fit had not seen, among the training flights.
     chosen = min(rows[1:], key=lambda row: row["unseen_score"])
     position, attitude, velocity, _ = chosen["errors"][HORIZONS[-1]]

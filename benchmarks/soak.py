@@ -21,7 +21,7 @@ import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401
 from joblib import Parallel, delayed
-from measuring import RESULTS, options, write
+from measuring import RESULTS, launch, options, write
 from rotorgram.udp import RemoteVectorEnv
 from rotorgram.udp.protocol.auth import write_key
 
@@ -51,11 +51,6 @@ with Simulator(server=("127.0.0.1", settings["port"]), bind=("127.0.0.1", 0),
     simulator.run()
     print(json.dumps(simulator.link.statistics.numbers()), flush=True)
 """
-
-
-def launch(code: str, settings: dict[str, Any]) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", code, json.dumps(settings)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
 def said(process: subprocess.Popen[str]) -> Any:
