@@ -199,7 +199,8 @@ class Vehicle:
     def _spec(self) -> tuple[mujoco.MjSpec, mujoco.MjsBody]:
         """Vehicle and ground to be changed, and the free body in them."""
         spec = build_scene(self.path, visual=False)
-        craft = next(body for body in spec.bodies if any(_is_free(j) for j in body.joints))
+        free = mujoco.mjtJoint.mjJNT_FREE
+        craft = next(body for body in spec.bodies if any(j.type == free for j in body.joints))
         craft.simple = False  # its inertia is no diagonal matrix once its center has moved
         return spec, craft
 
@@ -281,10 +282,6 @@ def body_axes(model: mujoco.MjModel) -> np.ndarray:
     mujoco.mj_kinematics(model, data)
     axes: np.ndarray = data.xmat.reshape(-1, 3, 3).copy()
     return axes
-
-
-def _is_free(joint: mujoco.MjsJoint) -> bool:
-    return bool(joint.type == mujoco.mjtJoint.mjJNT_FREE)
 
 
 def _check_structure(model: mujoco.MjModel) -> None:
