@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar, get_type_hints
 
 RESULTS: Final = Path("docs/results")
+IMAGES: Final = Path(__file__).parents[1] / "docs" / "images"
 Name, Way, Value = TypeVar("Name"), TypeVar("Way"), TypeVar("Value")
 
 

@@ -3,25 +3,26 @@
 `python benchmarks/real_flights.py FOLDER [--vehicle FILE] [--out docs/results/real_flights]`
 
 FOLDER has `train/*.csv` and `test/*.csv` of the IDSIA nano-drone benchmark (arXiv 2512.14450;
-`docs/real-flights.md` says how to get them). Every sample of a test flight is a start: its measured
-state flies on in the simulator with the rotor speeds that were measured, and the error after 1, 10
-and 50 steps of 10 ms is the Euclidean distance (attitude: the angle), mean over all starts. What is
-fitted is fitted on the training flights alone. With `--vehicle` that vehicle flies as its file has
-it, with drag of its body and nothing fitted.
+`docs/real-flights.md` says how to get them). Every sample of a test flight, or every `--stride`-th,
+is a start: its measured state flies on in the simulator with the rotor speeds that were measured,
+and the error after 1, 10 and 50 steps of 10 ms is the Euclidean distance (attitude: the angle),
+mean over all starts. What is fitted is fitted on the training flights alone. With `--vehicle` that
+vehicle flies as its file has it, with drag of its body and nothing fitted.
 """
 
-import argparse
 import csv
 import json
 import sys
 import tempfile
 import time
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from measuring import RESULTS, options
 from rotorgram.experiments.flight_logs import read_log
 from rotorgram.experiments.identified_vehicle import vehicle_toml
 from rotorgram.experiments.identify import Group, fit, regressed
@@ -91,11 +92,8 @@ FORCES: Final = ("rotors.thrust_coefficient", *(f"drag.linear.{axis}" for axis i
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, out=RESULTS / "real_flights", stride=1, vehicle=str)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/real_flights"))
-    parser.add_argument("--stride", type=int, default=1, help="of the starts on test flights")
-    parser.add_argument("--vehicle", help="a file, or a name of the library: fit nothing")
     given = parser.parse_args()
     base = Vehicle.load(START)
     if given.vehicle:
@@ -133,7 +131,7 @@ def main() -> int:
     return 0
 
 
-def _measure(given: argparse.Namespace, vehicle: Vehicle) -> int:
+def _measure(given: Namespace, vehicle: Vehicle) -> int:
     """Print and write the errors of a vehicle as its file has it."""
     test = _flights(given.folder / "test", vehicle)
     windows = Windows.cut(test, HORIZONS[-1], given.stride, HORIZONS)

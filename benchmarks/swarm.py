@@ -36,12 +36,11 @@ def physics(drones: int, *, together: bool) -> Step:
 
 
 def advanced(env: Any, drones: int) -> Step:
-    """A step of an env with actions that ask for a standstill."""
-    seeds = list(range(drones))
-    many = drones > 1
-    env.reset(seed=seeds if many else 0)
-    actions = np.zeros((drones, 4) if many else 4, np.float32)
-    return (lambda: env.advance(actions)) if many else (lambda: env.step(actions))
+    """A step of an env, of one drone or a vector env, with actions that ask for a standstill."""
+    vector = hasattr(env, "num_envs")
+    env.reset(seed=list(range(drones)) if vector else 0)
+    actions = np.zeros((drones, 4) if vector else 4, np.float32)
+    return (lambda: env.advance(actions)) if vector else (lambda: env.step(actions))
 
 
 def timed(step: Step, seconds: float) -> float:
@@ -63,20 +62,13 @@ def measure(counts: list[int], seconds: float, repeats: int) -> dict[str, dict[s
             pair = socket_pair(ENV, options, num_envs=drones, drones=drones)
             cases["apart", drones] = physics(drones, together=False)
             cases["one world", drones] = physics(drones, together=True)
-            cases["with the task", drones] = advanced(local, drones) if drones > 1 else _one(local)
+            cases["with the task", drones] = advanced(local, drones)
             cases["over UDP", drones] = advanced(opened.enter_context(pair), drones)
         taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)))
     found: dict[str, dict[str, float]] = {}
     for (name, drones), time in taken.items():
         found.setdefault(name, {})[str(drones)] = round(time / drones * 1e6, 2)
     return found
-
-
-def _one(env: LocalVectorEnv) -> Step:
-    """A step of a vector env of one drone."""
-    env.reset(seed=0)
-    actions = np.zeros((1, 4), np.float32)
-    return lambda: env.advance(actions)
 
 
 def main() -> None:
