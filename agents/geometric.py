@@ -48,7 +48,7 @@ class Geometric:
         assert found is not None
         self._gain, self._gravity = float(found[1]), float(found[2])
         self._units = np.array([float(unit.split()[0]) for unit in action.unit])
-        seen = [name for array in spec.observation for name in _names(array)]
+        seen = [name for one in spec.observation for name in one.components or [""] * one.size]
         wanted = [f"{vector} {axis}" for vector in (*_VECTORS, "nose") for axis in "xyz"]
         missing = [name for name in wanted if name not in seen]
         expected = f"the observation {missing[0]!r}" if missing else ""
@@ -154,7 +154,3 @@ def swing_gains(position: float, frequency: float, share: float) -> np.ndarray:
     wanted = sum(c * power for c, power in zip(polynomial, reversed(powers), strict=True))
     gains: np.ndarray = np.linalg.solve(reached.T, np.eye(6)[5]) @ wanted
     return gains
-
-
-def _names(array: ArraySpec) -> tuple[str, ...]:
-    return array.components or ("",) * array.size

@@ -8,16 +8,16 @@ rest, 1 m above the floor, without thrust; contacts are soft, so that the craft 
 """
 
 import copy
-import csv
 import sys
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import mujoco
 import numpy as np
+from measuring import write_rows
 from numpy.typing import NDArray
 from rotorgram.models import Vehicle
 
@@ -57,9 +57,6 @@ class Accuracy:
     """Wall time of a simulated second of tumbling flight, µs: the machine's, not the model's."""
 
 
-_COLUMNS: Final = [field.name for field in fields(Accuracy)]
-
-
 def accuracy(
     vehicle: Vehicle, integrators: Iterable[str] = INTEGRATORS, steps: Iterable[float] = STEPS
 ) -> list[Accuracy]:
@@ -90,20 +87,6 @@ def markdown(rows: Sequence[Accuracy]) -> str:
             f"| {row.sinks_mm:.1f} | {row.cost_us:,.0f} |"
         )
     return "\n".join(lines)
-
-
-def write(path: Path, rows: Sequence[Accuracy]) -> None:
-    """Write the rows as CSV."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([_COLUMNS, *map(astuple, rows)])
-
-
-def read(path: Path) -> list[Accuracy]:
-    """The rows of a file that `write` wrote."""
-    with path.open(newline="", encoding="utf-8") as file:
-        _, *rows = csv.reader(file)
-    return [Accuracy(integrator, *map(float, numbers)) for integrator, *numbers in rows]
 
 
 def _start(vehicle: Vehicle, integrator: str, step: float, height: float) -> tuple[Any, Any]:
@@ -148,7 +131,7 @@ def _main() -> None:
     rows = accuracy(Vehicle.load())
     print(markdown(rows))
     if len(sys.argv) > 1:
-        write(Path(sys.argv[1]), rows)
+        write_rows(Path(sys.argv[1]), rows)
 
 
 if __name__ == "__main__":

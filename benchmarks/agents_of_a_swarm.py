@@ -15,28 +15,23 @@ Then one agent flies a hundred drones of one world through such a relay, beside 
 process: again every bit has to be the same.
 """
 
-import argparse
 import json
-import os
 import random
 import signal
-import socket
-import subprocess
 import sys
 import threading
 import time
 import zlib
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import RESULTS, free_ports, launch, options, write
 from rotorgram.envs import ArraySpec, LocalVectorEnv, Outcome, Task, TaskOptions, register
 from rotorgram.envs.loop import Loop
 from rotorgram.sim import Pose
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, SharedSimulator, Simulator
-from rotorgram.udp.journal import software
 from rotorgram.udp.protocol.messages import Command, Message, State
 
 ENV_ID = "benchmark/Row-v0"
@@ -111,22 +106,6 @@ register(ENV_ID, Row)
 def action_of(observation: np.ndarray) -> np.float32:
     """As in an agent above."""
     return np.float32((zlib.crc32(observation.tobytes()) % 2001 - 1000) / 10_000)
-
-
-def launch(code: str, settings: Any) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", code, json.dumps(settings)]
-    pipe = subprocess.PIPE
-    return subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
-
-
-def free_ports(count: int) -> list[int]:
-    socks = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
-    for sock in socks:
-        sock.bind(ANY)
-    ports = [sock.getsockname()[1] for sock in socks]
-    for sock in socks:
-        sock.close()
-    return ports
 
 
 class Twin:
@@ -261,20 +240,13 @@ def fly_hundred(steps: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/reliability/swarm.json"))
-    args = parser.parse_args()
+    out = RESULTS / "reliability" / "swarm.json"
+    args = options(__doc__, kills=20, steps=1000, seed=0, out=out).parse_args()
     result = {
         "agent_processes": fly_eight(args.kills, random.Random(args.seed)),
         "hundred_drones": fly_hundred(args.steps),
-        "versions": software(),
-        "machine": {"cores": os.cpu_count()},
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    write(args.out, result)
     print(json.dumps(result, indent=2))
     eight, hundred = result["agent_processes"], result["hundred_drones"]
     differ = eight["states_that_differ"] + eight["actions_that_differ"]

@@ -5,7 +5,6 @@ beside it `FILE.json`, the examination of the paper's vehicle. Each broken vehic
 with one thing wrong.
 """
 
-import csv
 import json
 import math
 import re
@@ -13,10 +12,11 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from measuring import write_rows
 from rotorgram.cli.check_model import expectation
 from rotorgram.models import QUAD_XML
 from rotorgram.models.checks import Check, examine
@@ -247,30 +247,12 @@ def read_report(path: Path) -> tuple[float, list[Check]]:
     return report["seconds"], [Check(**check) for check in report["checks"]]
 
 
-def write(path: Path, told: Sequence[Row]) -> None:
-    """Write the rows as CSV."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        names = [field.name for field in fields(Row)]
-        csv.writer(file).writerows([names, *map(astuple, told)])
-
-
-def read(path: Path) -> list[Row]:
-    """The rows of a file that `write` wrote."""
-    with path.open(newline="", encoding="utf-8") as file:
-        _, *lines = csv.reader(file)
-    return [
-        Row(fault, by, found == "True", measured, meaning, int(bad), int(every), flies == "True")
-        for fault, by, found, measured, meaning, bad, every, flies in lines
-    ]
-
-
 def _main() -> None:
     told = rows()
     print(markdown(told), examination(examine()), sep="\n\n")
     if len(sys.argv) > 1:
         path = Path(sys.argv[1])
-        write(path, told)
+        write_rows(path, told)
         begun = time.perf_counter()
         checks = examine()
         seconds = round(time.perf_counter() - begun, 3)

@@ -7,11 +7,11 @@ the number of seeds. Of the seeds that both have, the file has a row for each ag
 interquartile means, the difference `mujoco` - `rigid`, and its 95 % bootstrap interval.
 """
 
-import argparse
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from measuring import options
 from rotorgram.experiments import claims, metrics, results
 from rotorgram.experiments.statistics import bootstrap_difference, iqm
 from rotorgram.models.errors import expect
@@ -60,7 +60,7 @@ def compared(name: str, rigid: Path, mujoco: Path) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Compare the pairs of the command line, and write the file."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser = options(__doc__)
     parser.add_argument("pairs", nargs="+", metavar="NAME=RIGID,MUJOCO")
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()

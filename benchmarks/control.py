@@ -8,19 +8,16 @@ is flown by the agent `geometric`: the root mean square of its distance from the
 lap. Costs: env steps per second of Hover-v0 over those of `rotors`; the levels take turns.
 """
 
-import argparse
 import json
 import math
-import os
 import statistics
 from collections.abc import Callable
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
+from measuring import RESULTS, medians, options, write
 from rotorgram.agents import Geometric
-from rotorgram.agents.checkpoints import software_versions
 from rotorgram.envs import register
 from rotorgram.envs.loop import Loop
 from rotorgram.envs.tasks.hover import Hover
@@ -150,17 +147,14 @@ def cost(num_drones: int, seconds: float, repeats: int) -> dict[str, Any]:
         for level in LEVELS
     }
     return {
-        "steps_per_second": {k: round(statistics.median(v)) for k, v in rates.items()},
-        "ratio_to_rotors": {k: round(statistics.median(v), 3) for k, v in ratios.items()},
+        "steps_per_second": {level: round(rate) for level, rate in medians(rates).items()},
+        "ratio_to_rotors": {level: round(one, 3) for level, one in medians(ratios).items()},
     }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=0.2)
-    parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/control/control.json"))
-    args = parser.parse_args()
+    out = RESULTS / "control" / "control.json"
+    args = options(__doc__, seconds=0.2, repeats=15, out=out).parse_args()
     register(CIRCLE, Circle)
     library = sorted(path.parent.name for path in QUAD_XML.parent.glob("*/*/vehicle.toml"))
     told = {
@@ -168,11 +162,8 @@ def main() -> None:
         "responses": {n: {level: response(n, level) for level in STEPS} for n in FLOWN},
         "circle_m": {name: tracking(name) for name in FLOWN},
         "cost": {str(n): cost(n, args.seconds, args.repeats) for n in (1, 1024)},
-        "processors": os.cpu_count(),
-        "software": software_versions(),
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(told, indent=2) + "\n")
+    write(args.out, told)
     print(json.dumps({key: told[key] for key in ("responses", "circle_m", "cost")}, indent=1))
 
 

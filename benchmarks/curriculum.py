@@ -9,13 +9,11 @@ that no training has seen. A line for each row and seed is added: share of the f
 out a gate, mean time of the others, s, and processor seconds.
 """
 
-import argparse
-import csv
 import time
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from measuring import RESULTS, add_row, options
 from rotorgram.agents.presets import find_preset
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.experiments.settings import Run
@@ -62,21 +60,13 @@ def measure(row: str, seed: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=range(300, 305))
-    parser.add_argument("--out", type=Path, default=Path("docs/results/transfer/curriculum.csv"))
-    args = parser.parse_args()
-    args.out.parent.mkdir(parents=True, exist_ok=True)
+    out = RESULTS / "transfer" / "curriculum.csv"
+    args = options(__doc__, seeds=range(300, 305), out=out).parse_args()
     for seed in args.seeds:
         for row in ROWS:
             line = measure(row, seed)
             print(line, flush=True)
-            fresh = not args.out.exists()
-            with args.out.open("a", newline="") as file:
-                writer = csv.DictWriter(file, line.keys(), lineterminator="\n")
-                if fresh:
-                    writer.writeheader()
-                writer.writerow(line)
+            add_row(args.out, line)
 
 
 if __name__ == "__main__":

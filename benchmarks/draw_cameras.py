@@ -3,9 +3,7 @@
 Run `python benchmarks/draw_cameras.py`; it needs no display.
 """
 
-import argparse
-from pathlib import Path
-
+from measuring import IMAGES, options
 from PIL import Image, ImageDraw, ImageFont
 from rotorgram.agents import PID
 from rotorgram.envs.registry import env_spec
@@ -47,10 +45,7 @@ def draw() -> Image.Image:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Draw every camera's picture.")
-    images = Path(__file__).parents[1] / "docs" / "images"
-    parser.add_argument("--out", type=Path, default=images / "cameras.jpg")
-    out = parser.parse_args().out
+    out = options(__doc__, out=IMAGES / "cameras.jpg").parse_args().out
     sheet = draw()
     sheet.save(out, quality=84, optimize=True)
     print(f"{out}: {sheet.width} x {sheet.height}, {out.stat().st_size / 1000:.0f} kB")

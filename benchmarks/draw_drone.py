@@ -3,12 +3,11 @@
 Run `python benchmarks/draw_drone.py`; it needs EGL (on Debian: libegl1, libgl1-mesa-dri).
 """
 
-import argparse
 import os
-from pathlib import Path
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported: it chooses once
 import mujoco
+from measuring import IMAGES, options
 from PIL import Image
 from rotorgram.models import build_scene
 
@@ -34,10 +33,7 @@ def draw() -> Image.Image:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Draw the drone.")
-    images = Path(__file__).parents[1] / "docs" / "images"
-    parser.add_argument("--out", type=Path, default=images / "drone.png")
-    out = parser.parse_args().out
+    out = options(__doc__, out=IMAGES / "drone.png").parse_args().out
     out.parent.mkdir(parents=True, exist_ok=True)
     picture = draw()
     picture.save(out, optimize=True)

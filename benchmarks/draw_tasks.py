@@ -4,10 +4,9 @@ Run `python benchmarks/draw_tasks.py [--out FOLDER]`; it needs no display. The
 PID flies the task of the paper, `geometric` the others.
 """
 
-import argparse
-from pathlib import Path
 from typing import Any, NamedTuple
 
+from measuring import IMAGES, options
 from PIL import Image
 from rotorgram.agents import CONTROLLERS
 from rotorgram.envs.registry import env_spec
@@ -54,10 +53,7 @@ def draw(name: str, scene: Scene) -> Image.Image:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Draw a picture of each task.")
-    folder = Path(__file__).parents[1] / "docs" / "images" / "tasks"
-    parser.add_argument("--out", type=Path, default=folder)
-    out = parser.parse_args().out
+    out = options(__doc__, out=IMAGES / "tasks").parse_args().out
     out.mkdir(parents=True, exist_ok=True)
     for name, scene in SCENES.items():
         path = out / f"{name}.png"

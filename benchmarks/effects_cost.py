@@ -7,17 +7,12 @@ physics steps, without a task. The cases take turns within a repeat, in an order
 that a machine that slows down slows all of them; the medians over the repeats are compared.
 """
 
-import argparse
-import json
-import os
-import platform
-import statistics
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from rotorgram.agents.checkpoints import software_versions
+from measuring import RESULTS, medians, options, write
 from rotorgram.models import Vehicle
 from rotorgram.sim import EffectOptions, Pose, Randomization, World, make_world
 
@@ -69,30 +64,20 @@ def measure(num_drones: int, seconds: float, repeats: int) -> dict[str, Any]:
             world = worlds[name]
             commands = np.broadcast_to(vehicle.hover_thrust, (*world.shape, vehicle.num_rotors))
             rates[name].append(round(steps_per_second(world, commands, seconds), 1))
-    medians = {name: statistics.median(values) for name, values in rates.items()}
-    ratios = {name: round(median / medians["none"], 3) for name, median in medians.items()}
-    for name, median in medians.items():
+    middle = medians(rates)
+    ratios = {name: round(median / middle["none"], 3) for name, median in middle.items()}
+    for name, median in middle.items():
         print(f"{num_drones:5} {name:18} {median:10,.0f} steps/s {ratios[name]:6.2f}", flush=True)
     for world in worlds.values():
         world.close()
-    return {"steps_per_second": medians, "ratio_to_none": ratios, "repeats": rates}
+    return {"steps_per_second": middle, "ratio_to_none": ratios, "repeats": rates}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=0.1)
-    parser.add_argument("--repeats", type=int, default=25)
-    parser.add_argument("--out", type=Path, default=ROOT / "docs/results/effects/cost.json")
-    args = parser.parse_args()
+    out = ROOT / RESULTS / "effects" / "cost.json"
+    args = options(__doc__, seconds=0.1, repeats=25, out=out).parse_args()
     drones = {str(n): measure(n, args.seconds, args.repeats) for n in (1, 1024)}
-    result = {
-        "seconds": args.seconds,
-        "drones": drones,
-        "versions": software_versions(),
-        "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
-    }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    write(args.out, {"seconds": args.seconds, "drones": drones})
 
 
 if __name__ == "__main__":

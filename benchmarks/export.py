@@ -6,9 +6,7 @@ the least of several rounds in which the targets take turns. The compiled bytes 
 the code and the constants that gcc -Os makes of a function that calls the policy.
 """
 
-import argparse
 import json
-import platform
 import subprocess
 import tempfile
 import time
@@ -21,6 +19,7 @@ from typing import Any, Final
 import numpy as np
 import onnxruntime
 import torch
+from measuring import RESULTS, in_turns, options, write
 from rotorgram.agents.export import TARGETS, c, csharp, metadata, onnx, torchscript
 from rotorgram.agents.policies import NetworkPolicy, flat_size
 from rotorgram.envs.registry import env_spec
@@ -168,10 +167,7 @@ def clocks(policy: NetworkPolicy, folder: Path) -> tuple[dict[str, Clock], dict[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/export.json"))
-    args = parser.parse_args()
+    args = options(__doc__, rounds=15, out=RESULTS / "export.json").parse_args()
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
     policies = {}
@@ -180,17 +176,13 @@ def main() -> None:
             place = Path(folder) / str(i)
             place.mkdir()
             timed, sizes = clocks(policy_of(*settings), place)
-            rounds: dict[str, list[float]] = {target: [] for target in timed}
-            for _ in range(args.rounds):
-                for target, seconds in timed.items():
-                    rounds[target].append(1e6 * seconds())
+            rounds = in_turns(timed, args.rounds, lambda seconds: 1e6 * seconds())
             least = {target: round(min(all_), 3) for target, all_ in rounds.items()}
             policies[name] = {"microseconds": least, "bytes": sizes}
             print(name, json.dumps(policies[name], indent=2))
     gcc = subprocess.run(["gcc", "-dumpversion"], capture_output=True, text=True).stdout.strip()
-    versions = {"onnxruntime": onnxruntime.__version__, "torch": torch.__version__,
-                "numpy": np.__version__, "gcc": gcc, "machine": platform.machine()}  # fmt: skip
-    args.out.write_text(json.dumps({"policies": policies, "versions": versions}, indent=2) + "\n")
+    tools = {"onnxruntime": onnxruntime.__version__, "gcc": gcc}
+    write(args.out, {"policies": policies, "tools": tools})
 
 
 if __name__ == "__main__":

@@ -7,22 +7,19 @@ the one that is, States of sessions that do not exist, lines of text. The traini
 the very weights, optimizer's state and episodes of one that nobody disturbs.
 """
 
-import argparse
 import json
-import os
 import select
 import subprocess
 import sys
 import time
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
+from measuring import RESULTS, options, write
 from rotorgram.agents import preset
 from rotorgram.experiments.pairs import socket_pair
 from rotorgram.experiments.settings import Run
 from rotorgram.experiments.training import Training
-from rotorgram.udp.journal import software
 
 FLOOD = """
 import json, random, socket, sys, time
@@ -112,11 +109,8 @@ def train(run: Run, flood_seconds: float) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=30)
-    parser.add_argument("--env-steps", type=int, default=200_000)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/reliability/flood.json"))
-    args = parser.parse_args()
+    out = RESULTS / "reliability" / "flood.json"
+    args = options(__doc__, seconds=30.0, env_steps=200_000, out=out).parse_args()
     run = Run(
         algorithm="a2c",
         config=preset("a2c", "tuned"),
@@ -140,11 +134,8 @@ def main() -> None:
         "flooded_seconds": flooded.get("flooded_seconds"),
         "flood": flooded["flood"],
         "agent": flooded["agent"],
-        "versions": software(),
-        "machine": {"cores": os.cpu_count()},
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    write(args.out, result)
     print(json.dumps(result, indent=2))
     if not same:
         sys.exit(1)

@@ -10,13 +10,9 @@ exits with status 2. `--device cpu` tries the script on Warp's CPU device, and w
 unless told where.
 """
 
-import argparse
-import json
-import os
-import platform
-import statistics
 import sys
 import time
+from argparse import Namespace
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
@@ -24,14 +20,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from rotorgram.agents.checkpoints import software_versions
+from measuring import RESULTS, in_turns, medians, options, write
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.models import Vehicle
 from rotorgram.sim import Pose, make_world
 
-OUT = Path("docs/results/performance/gpu.json")
+OUT = RESULTS / "performance" / "gpu.json"
 TASK = "rotorgram/Hover-v0"
-BACKENDS = ("rigid world", "rigid", "warp", "mujoco")
 
 
 def of_rigid_world(worlds: int, device: str) -> Callable[[], None]:
@@ -86,7 +81,7 @@ def rate(fly: Callable[[], None], worlds: int, seconds: float) -> float:
     return 10 * times * worlds / (time.perf_counter() - start)
 
 
-def measure(worlds: int, args: argparse.Namespace) -> dict[str, Any]:
+def measure(worlds: int, args: Namespace) -> dict[str, Any]:
     flown = {
         "rigid world": of_rigid_world(worlds, args.device),
         "rigid": on_device("rigid", worlds, args.device),
@@ -95,40 +90,31 @@ def measure(worlds: int, args: argparse.Namespace) -> dict[str, Any]:
     }
     for fly in flown.values():
         rate(fly, worlds, args.seconds / 10)
-    rates: dict[str, list[float]] = {backend: [] for backend in BACKENDS}
-    for _ in range(args.repeats):
-        for backend in BACKENDS:
-            rates[backend].append(round(rate(flown[backend], worlds, args.seconds)))
-    medians = {backend: statistics.median(values) for backend, values in rates.items()}
-    for backend, median in medians.items():
+    rates = in_turns(flown, args.repeats, lambda fly: round(rate(fly, worlds, args.seconds)))
+    middle = medians(rates)
+    for backend, median in middle.items():
         print(f"{worlds:7,} worlds  {backend:12} {median:14,.0f} env steps/s", flush=True)
-    return {"worlds": worlds, "rates": rates, "medians": medians}
+    return {"worlds": worlds, "rates": rates, "medians": middle}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 4096, 16384, 65536])
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=2.0, help="of each repeat")
-    parser.add_argument("--device", default="cuda")
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
+    worlds = (1024, 4096, 16384, 65536)
+    args = options(
+        __doc__, worlds=worlds, repeats=5, seconds=2.0, device="cuda", out=Path
+    ).parse_args()
     cuda = args.device.startswith("cuda")
     if cuda and not torch.cuda.is_available():
         print("no CUDA device here", file=sys.stderr)
         sys.exit(2)
     rows = [measure(worlds, args) for worlds in args.worlds]
-    packages = ("mujoco-warp", "warp-lang")
     result = {
         "device": torch.cuda.get_device_name(args.device) if cuda else args.device,
         "rows": rows,
-        "versions": software_versions() | {name: version(name) for name in packages},
-        "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
+        "warp": {name: version(name) for name in ("mujoco-warp", "warp-lang")},
     }
     out = args.out or (OUT if cuda else None)
     if out:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps(result, indent=2) + "\n")
+        write(out, result)
 
 
 if __name__ == "__main__":

@@ -15,15 +15,15 @@ can measure, or 30 % where that is less.
 """
 
 import copy
-import csv
 import math
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from measuring import write_rows
 from numpy.typing import NDArray
 from rotorgram.models import QUAD_XML, InputError, Vehicle
 from rotorgram.sim import EffectOptions, Pose, make_world
@@ -83,9 +83,6 @@ class Row:
     def within(self) -> bool:
         """Whether both targets are met."""
         return self.position_m <= MOST_M and self.attitude_deg <= MOST_DEG
-
-
-_COLUMNS: Final = [field.name for field in fields(Row)]
 
 
 @dataclass(frozen=True)
@@ -285,7 +282,8 @@ def compare(
                 continue
             truth = truth or independent(vehicle, commands, chosen)
             own = int(step == vehicle.timestep)
-            rows.append(Row(name, words, step * 1e3, own, *truth.fastest, *flown.apart(truth)))
+            numbers = (float(f"{x:.4g}") for x in (*truth.fastest, *flown.apart(truth)))
+            rows.append(Row(name, words, step * 1e3, own, *numbers))
     return rows
 
 
@@ -316,21 +314,6 @@ def markdown(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def write(path: Path, rows: Sequence[Row]) -> None:
-    """Write the rows as CSV, numbers with four digits."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        lines = [[f"{x:.4g}" if isinstance(x, float) else x for x in astuple(r)] for r in rows]
-        csv.writer(file).writerows([_COLUMNS, *lines])
-
-
-def read(path: Path) -> list[Row]:
-    """The rows of a file that `write` wrote."""
-    with path.open(newline="", encoding="utf-8") as file:
-        _, *rows = csv.reader(file)
-    return [Row(a, b, float(c), int(d), *map(float, rest)) for a, b, c, d, *rest in rows]
-
-
 def _airless(vehicle: Vehicle) -> Vehicle:
     """Without MuJoCo's own air: the equations here have none."""
     model = copy.copy(vehicle.model)
@@ -343,8 +326,8 @@ def _main() -> None:
     rows = []
     for name, vehicle in vehicles().items():
         rows += compare(name, vehicle)
-    write(folder / "flights.csv", rows)
-    print(markdown(read(folder / "flights.csv")))
+    write_rows(folder / "flights.csv", rows)
+    print(markdown(rows))
 
 
 if __name__ == "__main__":

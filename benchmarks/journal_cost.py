@@ -11,10 +11,7 @@ Beside it, less disturbed by others: the processor time of a step on the side th
 that of the same side without a journal, and the journal alone, chunks and writing included.
 """
 
-import argparse
 import json
-import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -26,8 +23,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from measuring import RESULTS, medians, options, write
 from rotorgram.udp import RemoteEnv
-from rotorgram.udp.journal import Journal, Recording, Summary, software
+from rotorgram.udp.journal import Journal, Recording, Summary
 from rotorgram.udp.protocol.messages import Command, Hello, State
 from rotorgram.udp.protocol.statistics import Statistics
 
@@ -143,12 +141,8 @@ def journal_alone(source: Path, target: Path, repeats: int = 9) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=80)
-    parser.add_argument("--seconds", type=float, default=0.25)
-    default = Path("docs/results/reliability/journal.json")
-    parser.add_argument("--out", type=Path, default=default)
-    args = parser.parse_args()
+    out = RESULTS / "reliability" / "journal.json"
+    args = options(__doc__, rounds=80, seconds=0.25, out=out).parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         slices = measure(args.rounds, args.seconds, folder)
@@ -160,16 +154,13 @@ def main() -> None:
     result = {
         "rounds": args.rounds,
         "seconds": args.seconds,
-        "steps_per_second": {name: statistics.median(many) for name, many in rates.items()},
+        "steps_per_second": medians(rates),
         "journal_on": {name: compare(name, slices) for name in list(SIDES)[1:]},
         "journal_alone_microseconds": round(alone, 2),
         "bytes_per_step": sizes,
         "rates": rates,
-        "versions": software(),
-        "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    write(args.out, result)
     print(f"without a journal: {statistics.median(rates['none']):,.0f} steps/s (median)")
     print("| journal on | rate, of that without | quartiles | µs more per step | processor, µs |")
     print("|---|---|---|---|---|")

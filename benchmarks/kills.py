@@ -14,13 +14,10 @@ After every kill the checkpoint has to load, the episodes before it have to be t
 the training has to advance within a minute. Then Ctrl-C: both sides have to end within a second.
 """
 
-import argparse
 import json
-import os
 import random
 import shutil
 import signal
-import socket
 import statistics
 import subprocess
 import sys
@@ -30,18 +27,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pandas as pd
+from measuring import RESULTS, free_ports, options, write
 from rotorgram.agents.checkpoints import load
-from rotorgram.udp.journal import software
 
 COLUMNS = ["episode", "first_step", "length", "total_reward"]
 HANG = 60.0  # s
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
 
 
 class Pair:
@@ -53,7 +43,7 @@ class Pair:
         self.living.append(self)
         self.folder = folder
         self.env_steps = env_steps
-        self.agent_port, self.simulator_port = free_port(), free_port()
+        self.agent_port, self.simulator_port = free_ports(2)
         self.log = open(folder.with_suffix(".log"), "a")  # noqa: SIM115
         self.agent = self.simulator = None
         self.before = pd.DataFrame(columns=COLUMNS)
@@ -187,13 +177,8 @@ def interrupt(folder: Path, side: str, dice: random.Random) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=int, default=100)
-    parser.add_argument("--interrupts", type=int, default=20)
-    parser.add_argument("--env-steps", type=int, default=500_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/reliability/kills.json"))
-    args = parser.parse_args()
+    defaults = {"kills": 100, "interrupts": 20, "env_steps": 500_000, "seed": 0}
+    args = options(__doc__, **defaults, out=RESULTS / "reliability" / "kills.json").parse_args()
     # In a shell's background it is ignored, by the children too.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     dice, root = random.Random(args.seed), Path(tempfile.mkdtemp())
@@ -217,11 +202,8 @@ def main() -> None:
             for side, times in interrupts.items()
             if times
         },
-        "versions": software(),
-        "machine": {"cores": os.cpu_count()},
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    write(args.out, result)
     print(json.dumps(result, indent=2))
     shutil.rmtree(root)
     late = [t for times in interrupts.values() for t in times if t > 1.0]

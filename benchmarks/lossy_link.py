@@ -10,7 +10,6 @@ answer of the simulator is compared with the same flight in process, bit for bit
 one of physics, so that the link is what is measured.
 """
 
-import argparse
 import fcntl
 import json
 import os
@@ -18,7 +17,6 @@ import random
 import select
 import struct
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -27,6 +25,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from measuring import RESULTS, launch, options, write
+from rotorgram.udp.protocol.auth import write_key
 
 AGENT_ADDRESS, SIMULATOR_ADDRESS = "10.77.0.1", "10.77.0.2"
 PORT = 8001
@@ -153,22 +154,16 @@ def two_machines(mtu: int) -> Iterator[tuple[tuple[str, int], tuple[str, int]]]:
             run("ip", "netns", "del", name)
 
 
-def launch(namespace: str, code: str, settings: list[Any]) -> subprocess.Popen[str]:
-    words = ["ip", "netns", "exec", namespace, sys.executable, "-c", code, json.dumps(settings)]
-    return subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-
-
 def fly(drones: int, mtu: int, delay: float, loss: float, seconds: float) -> dict[str, Any]:
     """The rate and counts of one flight. Raises `CalledProcessError` if it fails."""
-    from rotorgram.udp.protocol.auth import write_key
-
     with tempfile.TemporaryDirectory() as folder, two_machines(mtu) as (here, there):
         key = str(Path(folder) / "key")
         write_key(Path(key))
         wire = Wire((here[1], there[1]), loss, delay)
-        agent = launch(here[0], AGENT, [drones, seconds, key, AGENT_ADDRESS, PORT])
+        settings = [drones, seconds, key, AGENT_ADDRESS, PORT]
+        agent = launch(AGENT, settings, "ip", "netns", "exec", here[0])
         server, bind = (AGENT_ADDRESS, PORT), (SIMULATOR_ADDRESS, 0)
-        simulator = launch(there[0], SIMULATE, [drones, key, server, bind])
+        simulator = launch(SIMULATE, [drones, key, server, bind], "ip", "netns", "exec", there[0])
         try:
             out, _ = agent.communicate(timeout=seconds + 300)
             if agent.returncode == 0:
@@ -190,14 +185,9 @@ def fly(drones: int, mtu: int, delay: float, loss: float, seconds: float) -> dic
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--drones", type=int, nargs="+", default=[1, 64, 1024])
-    parser.add_argument("--mtu", type=int, nargs="+", default=[1500, 576])
-    parser.add_argument("--delay", type=float, default=0.001)
-    parser.add_argument("--loss", type=float, nargs="+", default=[0.0, 0.01, 0.05, 0.1])
-    parser.add_argument("--seconds", type=float, default=10)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/reliability/link.json"))
-    args = parser.parse_args()
+    links = {"mtu": (1500, 576), "delay": 0.001, "loss": (0.0, 0.01, 0.05, 0.1)}
+    out = RESULTS / "reliability" / "link.json"
+    args = options(__doc__, drones=(1, 64, 1024), **links, seconds=10.0, out=out).parse_args()
     flights = []
     print("| drones | MTU | loss | steps/s | in process |\n|---:|---:|---:|---:|---:|")
     for drones in args.drones:
@@ -207,9 +197,7 @@ def main() -> None:
                 flights.append(one)
                 rates = f"{one['steps_per_second']} | {one['in_process_steps_per_second']}"
                 print(f"| {drones} | {mtu} | {loss:.0%} | {rates} |", flush=True)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    result = {"flights": flights, "machine": {"cores": os.cpu_count()}}
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    write(args.out, {"flights": flights})
 
 
 if __name__ == "__main__":

@@ -7,15 +7,12 @@ last quarter of an episode, and episodes that terminated. Without: the agent is 
 of the env, and cannot know cable and mass.
 """
 
-import argparse
-import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import RESULTS, options, write
 from rotorgram.agents import Geometric
-from rotorgram.agents.checkpoints import software_versions
 from rotorgram.envs import SingleEnv
 
 PAYLOAD, FLOWN, FIRST = "rotorgram/PayloadHover-v0", ("paper", "crazyflie2", "heavy_hexa"), 100
@@ -40,19 +37,15 @@ def flown(name: str, episodes: int, damped: bool) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/control/payload.json"))
-    args = parser.parse_args()
-    told: dict[str, Any] = {"episodes": args.episodes, "software": software_versions()}
+    args = options(__doc__, episodes=20, out=RESULTS / "control" / "payload.json").parse_args()
+    told: dict[str, Any] = {"episodes": args.episodes}
     for name in FLOWN:
         told[name] = {
             case: flown(name, args.episodes, damped=case == "damped")
             for case in ("without", "damped")
         }
         print(name, told[name], flush=True)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(told, indent=2) + "\n")
+    write(args.out, told)
 
 
 if __name__ == "__main__":

@@ -10,47 +10,40 @@ They do not compute the same: PyFlyt simulates propellers, motors and a body wit
 Bullet, Crazyflow an analytic model of a Crazyflie in JAX, without contacts.
 """
 
-import argparse
-import json
-import os
-import statistics
 import subprocess
 import sys
 from pathlib import Path
 
-OURS = """
-import gymnasium, numpy as np, rotorgram.envs
-def make(n):
-    if n == 1:
-        env = gymnasium.make("rotorgram/Elevation-v0").unwrapped
-        env.reset(seed=0)
-        action = np.zeros(1, np.float32)
-        def step():
-            r = env.step(action)
-            if r[2] or r[3]:
-                env.reset()
-    else:
-        env = gymnasium.make_vec("rotorgram/Elevation-v0", num_envs=n)
-        env.reset(seed=0)
-        action = np.zeros((n, 1), np.float32)
-        def step():
-            env.step(action)
-    return step
-"""
-PYFLYT = """
-import gymnasium, numpy as np, PyFlyt.gym_envs
-def make(n):
-    env = gymnasium.make("PyFlyt/QuadX-Hover-v4").unwrapped
+from measuring import RESULTS, medians, options, write
+
+ONE = """
+import gymnasium, numpy as np
+def one(env_id, action):
+    env = gymnasium.make(env_id).unwrapped
     env.reset(seed=0)
-    action = np.array([0.0, 0.0, 0.0, 0.3])
     def step():
         r = env.step(action)
         if r[2] or r[3]:
             env.reset()
     return step
 """
+OURS = """
+import rotorgram.envs
+def make(n):
+    if n == 1:
+        return one("rotorgram/Elevation-v0", np.zeros(1, np.float32))
+    env = gymnasium.make_vec("rotorgram/Elevation-v0", num_envs=n)
+    env.reset(seed=0)
+    action = np.zeros((n, 1), np.float32)
+    return lambda: env.step(action)
+"""
+PYFLYT = """
+import PyFlyt.gym_envs
+def make(n):
+    return one("PyFlyt/QuadX-Hover-v4", np.array([0.0, 0.0, 0.0, 0.3]))
+"""
 CRAZYFLOW = """
-import gymnasium, numpy as np, crazyflow.envs, jax
+import crazyflow.envs, jax
 def make(n):
     env = gymnasium.make_vec("DroneReachPos-v0", num_envs=n, device="cpu", freq=50)
     env.reset(seed=0)
@@ -74,14 +67,10 @@ print(count / (time.perf_counter() - start))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--pyflyt", type=Path, help="a Python that has PyFlyt")
-    parser.add_argument("--crazyflow", type=Path, help="a Python that has crazyflow")
-    parser.add_argument("--seconds", type=float, default=2.0)
-    parser.add_argument("--rounds", type=int, default=5)
-    default = Path("docs/results/performance/peers.json")
-    parser.add_argument("--out", type=Path, default=default)
-    args = parser.parse_args()
+    out = RESULTS / "performance" / "peers.json"
+    args = options(
+        __doc__, pyflyt=Path, crazyflow=Path, seconds=2.0, rounds=5, out=out
+    ).parse_args()
     peers = {
         "rotorgram": (sys.executable, OURS, (1, 64, 1024, 4096)),
         "PyFlyt QuadX-Hover-v4": (args.pyflyt, PYFLYT, (1,)),
@@ -91,15 +80,12 @@ def main() -> None:
     for _ in range(args.rounds):
         for name, (python, script, counts) in peers.items():
             for n in counts if python else ():
-                words = [str(python), "-c", script + CLOCK, str(n), str(args.seconds)]
+                words = [str(python), "-c", ONE + script + CLOCK, str(n), str(args.seconds)]
                 said = subprocess.run(words, check=True, capture_output=True, text=True).stdout
                 rates.setdefault(f"{name}, {n}", []).append(round(float(said.split()[-1]), 1))
-    medians = {name: statistics.median(values) for name, values in rates.items()}
-    content = {"env_steps_per_second": medians, "rates": rates, "seconds": args.seconds,
-               "machine": {"cores": os.cpu_count()}}  # fmt: skip
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(content, indent=2) + "\n")
-    for name, rate in medians.items():
+    middle = medians(rates)
+    write(args.out, {"env_steps_per_second": middle, "rates": rates, "seconds": args.seconds})
+    for name, rate in middle.items():
         print(f"{name:36} {rate:12,.0f} env steps/s")
 
 

@@ -6,7 +6,6 @@ For each seed: after how many steps the mean return of the last 32 episodes is 1
 most 250. Both train with 16 drones in process and look after each update of 2,048 steps.
 """
 
-import argparse
 import json
 import re
 import subprocess
@@ -18,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 import rotorgram.envs
 import torch
+from measuring import options
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
@@ -65,10 +65,7 @@ def example(seed: int) -> list[tuple[int, float]]:
 
 def main() -> None:
     """Train both with each seed, and write after how many steps they were there."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
+    args = options(__doc__, seeds=3, out=Path).parse_args()
     torch.set_num_threads(1)
     found: dict[str, list[dict[str, Any]]] = {"ppo_loop.py": [], "SB3's PPO": []}
     for seed in range(args.seeds):

@@ -3,25 +3,26 @@
 `python benchmarks/real_flights.py FOLDER [--vehicle FILE] [--out docs/results/real_flights]`
 
 FOLDER has `train/*.csv` and `test/*.csv` of the IDSIA nano-drone benchmark (arXiv 2512.14450;
-`docs/real-flights.md` says how to get them). Every sample of a test flight is a start: its measured
-state flies on in the simulator with the rotor speeds that were measured, and the error after 1, 10
-and 50 steps of 10 ms is the Euclidean distance (attitude: the angle), mean over all starts. What is
-fitted is fitted on the training flights alone. With `--vehicle` that vehicle flies as its file has
-it, with drag of its body and nothing fitted.
+`docs/real-flights.md` says how to get them). Every sample of a test flight, or every `--stride`-th,
+is a start: its measured state flies on in the simulator with the rotor speeds that were measured,
+and the error after 1, 10 and 50 steps of 10 ms is the Euclidean distance (attitude: the angle),
+mean over all starts. What is fitted is fitted on the training flights alone. With `--vehicle` that
+vehicle flies as its file has it, with drag of its body and nothing fitted.
 """
 
-import argparse
 import csv
 import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from measuring import RESULTS, options
 from rotorgram.experiments.flight_logs import read_log
 from rotorgram.experiments.identified_vehicle import vehicle_toml
 from rotorgram.experiments.identify import Group, fit, regressed
@@ -91,11 +92,8 @@ FORCES: Final = ("rotors.thrust_coefficient", *(f"drag.linear.{axis}" for axis i
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, out=RESULTS / "real_flights", stride=1, vehicle=str)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/real_flights"))
-    parser.add_argument("--stride", type=int, default=1, help="of the starts on test flights")
-    parser.add_argument("--vehicle", help="a file, or a name of the library: fit nothing")
     given = parser.parse_args()
     base = Vehicle.load(START)
     if given.vehicle:
@@ -129,11 +127,11 @@ def main() -> int:
     for name, errors in PUBLISHED.items():
         theirs = dict(zip(HORIZONS, errors, strict=True))
         _show({"name": name, "published_formula": theirs}, "theirs")
-    _write(given.out, rows, len(windows.index), given.stride, test)
+    _write(given.out, rows, len(windows.index), given.stride)
     return 0
 
 
-def _measure(given: argparse.Namespace, vehicle: Vehicle) -> int:
+def _measure(given: Namespace, vehicle: Vehicle) -> int:
     """Print and write the errors of a vehicle as its file has it."""
     test = _flights(given.folder / "test", vehicle)
     windows = Windows.cut(test, HORIZONS[-1], given.stride, HORIZONS)
@@ -287,21 +285,15 @@ def _show(row: Mapping, whose: str) -> None:
     print(f"{whose:7}{row['name']:46}{text}", flush=True)
 
 
-def _write(
-    out: Path, rows: Sequence[Mapping], starts: int, stride: int, flights: Sequence[Flight]
-) -> None:
+def _write(out: Path, rows: Sequence[Mapping], starts: int, stride: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    kinds: dict[str, Callable[[Mapping], Mapping]] = {
-        "errors": lambda row: row["errors"],
-        "published formula": lambda row: row["published_formula"],
-    }
     with (out / "variants.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["model", "formula", "horizon", *MEASURES])
         for row in rows:
-            for kind, taken in kinds.items():
-                for h in HORIZONS:
-                    writer.writerow([row["name"], kind, h, *(f"{x:.5f}" for x in taken(row)[h])])
+            for kind in ("errors", "published formula"):
+                for h, errors in row[kind.replace(" ", "_")].items():
+                    writer.writerow([row["name"], kind, h, *(f"{x:.5f}" for x in errors)])
         for name, errors in PUBLISHED.items():
             for h, one in zip(HORIZONS, errors, strict=True):
                 writer.writerow([f"published: {name}", "published formula", h, *one])
@@ -309,10 +301,9 @@ def _write(
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["model", "flight", "horizon", *MEASURES])
         for row in rows:
-            for flight in flights:
-                for h in HORIZONS:
-                    errors = row["flights"][flight.name][h]
-                    writer.writerow([row["name"], flight.name, h, *(f"{x:.5f}" for x in errors)])
+            for name, told in row["flights"].items():
+                for h, errors in told.items():
+                    writer.writerow([row["name"], name, h, *(f"{x:.5f}" for x in errors)])
     # Chosen by kinds of flights that the fit had not seen, among the training flights.
     chosen = min(rows[1:], key=lambda row: row["unseen_score"])
     position, attitude, velocity, _ = chosen["errors"][HORIZONS[-1]]

@@ -6,17 +6,16 @@ Every size and quality is drawn in turns; the fastest round of each counts, sinc
 machine only slows it down. The craft flies: every picture differs from the one before.
 """
 
-import argparse
 import json
 import os
-import platform
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import mujoco
+import numpy as np
+from measuring import RESULTS, options, write
 from rotorgram.agents import PID
 from rotorgram.envs.registry import env_spec
 from rotorgram.experiments.filming import Film, Shot, film, moments
@@ -72,8 +71,6 @@ def driver() -> str:
 
 def overlays(flight: list[Moment], rounds: int, frames: int) -> dict[str, float]:
     """Milliseconds for panel and graph of a picture."""
-    import numpy as np
-
     times, values = {}, [moment.metrics[0].value for moment in flight]
     for width, height in SIZES:
         overlay = Overlay(
@@ -112,12 +109,8 @@ def whole_film(flown: Trajectory) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--frames", type=int, default=20)
-    default = Path("docs/results/performance/rendering.json")
-    parser.add_argument("--out", type=Path, default=default)
-    args = parser.parse_args()
+    out = RESULTS / "performance" / "rendering.json"
+    args = options(__doc__, rounds=5, frames=20, out=out).parse_args()
     (flown,) = flown_trajectories(PID(env_spec(ENV)), ENV, {}, [EPISODE])
     flight = moments(flown)
     rates, renderer = pictures(flight, args.rounds, args.frames)
@@ -128,12 +121,9 @@ def main() -> None:
         "overlay_milliseconds": overlays(flight, args.rounds, args.frames),
         "film": whole_film(flown),
         "renderer": renderer,
-        "versions": {"mujoco": mujoco.__version__},
-        "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
         "load": [round(load, 1) for load in os.getloadavg()],
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    write(args.out, result)
     print(json.dumps(result, indent=2))
 
 

@@ -1,7 +1,7 @@
 """Accuracy and speed of the backend `rigid`.
 
     python benchmarks/rigid.py accuracy
-    python benchmarks/rigid.py speed [--numba PYTHON] [--crazyflow PYTHON]
+    python benchmarks/rigid.py speed [--crazyflow PYTHON]
     python benchmarks/rigid.py sizes
 
 Accuracy: the largest distance to `mujoco` after 5 s of tumbling flight at random thrusts, of every
@@ -12,31 +12,30 @@ of a flight near the origin.
 Speed: control steps of 4,096 drones, per second and per second of a processor (which a busy machine
 disturbs less), in turn, medians: of the world alone for `mujoco`
 and `rigid`, arrays and tensors; the same for one env, `Loop.advance` of Hover. With PYTHON of an
-environment that has them (pip install numba; pip install crazyflow): the same physics step by
-Numba, and Crazyflow's own step benchmark at the same rates, each in a process of its own.
+environment that has Crazyflow (pip install crazyflow): its own step benchmark at the same rates, in
+a process of its own.
 
 Sizes: the processor's time of `Loop.advance` of Hover with 64 to 4,096 drones.
 Writes docs/results/rigid/{accuracy,speed,sizes}.json.
 """
 
-import argparse
 import json
-import os
 import statistics
 import subprocess
 import time
+from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from rotorgram.agents.checkpoints import software_versions
+from measuring import RESULTS, in_turns, medians, options, write
 from rotorgram.envs import Loop
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.sim import Pose, make_world
 
-OUT = Path("docs/results/rigid")
+OUT = RESULTS / "rigid"
 HERE = Path(__file__).parent
 FILES = [*sorted(Path("tests/data").glob("*.xml")), *sorted(Path("tests/data").glob("*.toml"))]
 FILES += sorted(QUAD_XML.parent.glob("vehicles/*/vehicle.toml"))
@@ -52,7 +51,7 @@ def accuracy() -> None:
             row[dtype] = distances(file, dtype)
         print(row, flush=True)
         rows.append(row)
-    write("accuracy", {"seconds": 5.0, "drones": 32, "rows": rows})
+    write(OUT / "accuracy.json", {"seconds": 5.0, "drones": 32, "rows": rows})
 
 
 def distances(file: Path, dtype: str, drones: int = 32) -> dict[str, float]:
@@ -124,7 +123,7 @@ def env(backend: Any, drones: int, **settings: Any) -> Callable[[], None]:
     return fly
 
 
-def sizes(args: argparse.Namespace) -> None:
+def sizes(args: Namespace) -> None:
     """Processor microseconds of `Loop.advance` of Hover, by the number of drones."""
     ways: dict[str, tuple[Any, dict[str, Any]]] = {
         "mujoco": ("mujoco", {}),
@@ -135,18 +134,17 @@ def sizes(args: argparse.Namespace) -> None:
     table = {}
     for drones in (64, 128, 1024, 4096):
         flights = {name: env(kind, drones, **given) for name, (kind, given) in ways.items()}
-        rates: dict[str, list[float]] = {name: [] for name in ways}
-        for _ in range(args.repeats):
-            for name, fly in flights.items():
-                with torch.no_grad():
-                    rates[name].append(rate(fly, drones, args.seconds)[1])
-        row = {name: round(drones / statistics.median(rates[name]) * 1e6) for name in ways}
+        with torch.no_grad():
+            rates = in_turns(
+                flights, args.repeats, lambda fly, n=drones: rate(fly, n, args.seconds)[1]
+            )
+        row = {name: round(drones / median * 1e6) for name, median in medians(rates).items()}
         print(drones, row, flush=True)
         table[str(drones)] = row
-    write("sizes", {"processor_microseconds": table, "repeats": args.repeats})
+    write(OUT / "sizes.json", {"processor_microseconds": table, "repeats": args.repeats})
 
 
-def speed(args: argparse.Namespace) -> None:
+def speed(args: Namespace) -> None:
     ways: dict[str, Callable[[], None]] = {}
     firsts = {}
     for name, (make, backend, settings) in {
@@ -164,50 +162,33 @@ def speed(args: argparse.Namespace) -> None:
             ways[name]()
         firsts[name] = round(time.perf_counter() - start, 2)
     rates: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
-    others = {"numba": args.numba, "crazyflow": args.crazyflow}
-    reports: dict[str, Any] = {}
+    told: dict[str, Any] = {}
     for _ in range(args.repeats):
         for name, fly in ways.items():
             with torch.no_grad():
                 rates[name].append(rate(fly, args.drones, args.seconds))
-        for name, python in others.items():
-            if python:
-                script = str(HERE / f"rigid_{name}.py")
-                command = [python, script, str(args.drones), str(args.seconds)]
-                said = subprocess.run(command, capture_output=True, check=True).stdout
-                told = json.loads(said.splitlines()[-1])  # warnings come before
-                for kind in ("rate", "own_rate"):
-                    if kind in told:
-                        label = name if kind == "rate" else f"{name}, one physics step"
-                        rates.setdefault(label, []).append(tuple(told.pop(kind)))
-                reports[name] = told
-    medians, processor = (
+        if args.crazyflow:
+            words = [str(HERE / "rigid_crazyflow.py"), str(args.drones), str(args.seconds)]
+            said = subprocess.run([args.crazyflow, *words], capture_output=True, check=True).stdout
+            told = json.loads(said.splitlines()[-1])  # warnings come before
+            for kind, label in (("rate", "crazyflow"), ("own_rate", "crazyflow, one physics step")):
+                rates.setdefault(label, []).append(tuple(told[kind]))
+    clock, processor = (
         {name: round(statistics.median(x[i] for x in values)) for name, values in rates.items()}
         for i in (0, 1)
     )
-    for name, median in medians.items():
+    for name, median in clock.items():
         print(f"{name:32} {median:14,} control steps/s, {processor[name]:14,} of a processor's")
-    write("speed", {
+    write(OUT / "speed.json", {
         "drones": args.drones, "repeats": args.repeats, "threads": torch.get_num_threads(),
-        "medians": medians, "medians_per_processor_second": processor,
-        "first_step_s": firsts, "others": reports,
+        "medians": clock, "medians_per_processor_second": processor,
+        "first_step_s": firsts, "crazyflow": told.get("versions"),
     })  # fmt: skip
 
 
-def write(name: str, content: dict[str, Any]) -> None:
-    OUT.mkdir(parents=True, exist_ok=True)
-    content |= {"versions": software_versions(), "cores": os.cpu_count()}
-    (OUT / f"{name}.json").write_text(json.dumps(content, indent=2) + "\n")
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, drones=4096, repeats=5, seconds=1.0, crazyflow=str)
     parser.add_argument("what", choices=("accuracy", "speed", "sizes"))
-    parser.add_argument("--drones", type=int, default=4096)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=1.0, help="of each repeat")
-    parser.add_argument("--numba", metavar="PYTHON")
-    parser.add_argument("--crazyflow", metavar="PYTHON")
     args = parser.parse_args()
     {"accuracy": lambda _: accuracy(), "speed": speed, "sizes": sizes}[args.what](args)
 

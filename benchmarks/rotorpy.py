@@ -12,7 +12,6 @@ become an MJCF file. The motor speeds commanded, the starts and the flights are 
 
 import argparse
 import json
-import runpy
 import subprocess
 import sys
 import tempfile
@@ -21,6 +20,18 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from independent import (
+    CONTROL,
+    EFFECTS,
+    SPIN,
+    STEPS,
+    VELOCITY,
+    Flight,
+    at_step,
+    independent,
+    ours,
+    thrusts,
+)
 from rotorgram.models import Vehicle
 
 HERE: Final = Path(__file__).parent
@@ -28,13 +39,8 @@ RESULTS: Final = HERE.parent / "docs" / "results" / "rotorpy"
 PICTURE: Final = HERE.parent / "docs" / "images" / "rotorpy.png"
 VERSION: Final = "3.0.0"
 """Of RotorPy."""
-STEPS: Final = (0.01, 0.005, 0.002, 0.001)
 SHOWN: Final = 0.002  # s: the physics step of the figure
 _EVERY: Final = 5  # control steps between two points of the figure
-_script: Final = runpy.run_path(str(HERE / "independent.py"))
-Flight, ours, independent, at_step, thrusts = (
-    _script[name] for name in ("Flight", "ours", "independent", "at_step", "thrusts")
-)
 
 
 def mjcf(params: dict[str, Any]) -> str:
@@ -75,7 +81,6 @@ def mjcf(params: dict[str, Any]) -> str:
 
 def compare(python: str) -> dict[str, Any]:
     """Fly every case with RotorPy, by that Python, and with ours; the numbers of the page."""
-    cases = _script["EFFECTS"]
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "hummingbird.xml"
         # Shares of the hover thrust are drawn from the vehicle, which has RotorPy's parameters.
@@ -83,9 +88,9 @@ def compare(python: str) -> dict[str, Any]:
         file.write_text(mjcf(told["params"]), encoding="utf-8")
         vehicle = Vehicle.load(file)
     commands = thrusts(vehicle)
-    told = _theirs(python, cases, (commands / vehicle.hover_thrust).tolist())
+    told = _theirs(python, EFFECTS, (commands / vehicle.hover_thrust).tolist())
     rows, curves = [], {}
-    for name, effects in cases.items():
+    for name, effects in EFFECTS.items():
         tight, usual = (_flight(told["flights"][name][kind]) for kind in ("tight", "default"))
         row = {"effects": name, "metres": {}, "degrees": {}}
         flown = {"independent": independent(vehicle, commands, effects), "RotorPy": usual}
@@ -105,9 +110,9 @@ def _theirs(python: str, cases: dict[str, Any], shares: list[Any]) -> dict[str, 
         "cases": cases,
         "kinds": ("tight", "default"),
         "shares": shares,
-        "period": _script["CONTROL"],
-        "velocity": _script["VELOCITY"],
-        "rates": _script["SPIN"],
+        "period": CONTROL,
+        "velocity": VELOCITY,
+        "rates": SPIN,
     }
     # Isolated: this folder has a rotorpy.py, which is not theirs.
     command = [python, "-I", str(HERE / "rotorpy_flights.py")]
@@ -153,7 +158,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     titles = f"ours, physics step {SHOWN * 1e3:g} ms", "RotorPy, its own tolerances"
     for index, (axis, title) in enumerate(zip(axes, titles, strict=True)):
         for color, (name, curves) in zip(colors, result["curves"].items(), strict=True):
-            times = np.arange(len(curves[index])) * _EVERY * _script["CONTROL"]
+            times = np.arange(len(curves[index])) * _EVERY * CONTROL
             line = "--" if "wind" in name else "-"  # it lies on that of the same drag in still air
             axis.semilogy(
                 times[1:], curves[index][1:], line, color=color, label=name, linewidth=1.4

@@ -15,9 +15,7 @@
   there is no Ray.
 """
 
-import argparse
 import json
-import os
 import statistics
 import subprocess
 import sys
@@ -31,7 +29,7 @@ from tempfile import TemporaryDirectory
 import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401  # makes the envs known
-from rotorgram.agents.checkpoints import software_versions
+from measuring import RESULTS, medians, options, write
 from rotorgram.experiments.compare import compare
 from rotorgram.experiments.folders import new_folder
 from rotorgram.experiments.settings import CompareConfig
@@ -157,19 +155,14 @@ def measure_runs(env_steps, rounds):
     return {
         "env_steps": env_steps,
         "trainings": config.seeds,
-        "seconds": {name: statistics.median(values) for name, values in seconds.items()},
+        "seconds": medians(seconds),
         "rounds": seconds,
     }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=2.0)
-    parser.add_argument("--env-steps", type=int, default=40_000)
-    default = Path("docs/results/performance/scaling.json")
-    parser.add_argument("--out", type=Path, default=default)
-    args = parser.parse_args()
+    out = RESULTS / "performance" / "scaling.json"
+    args = options(__doc__, rounds=5, seconds=2.0, env_steps=40_000, out=out).parse_args()
     threads = measure_threads(args.rounds, args.seconds)
     print("threads:", threads, flush=True)
     measured = measure_simulators(args.rounds, args.seconds)
@@ -184,11 +177,8 @@ def main() -> None:
         "simulators": measured,
         "extrapolated": extrapolated,
         "runs": runs,
-        "versions": software_versions(),
-        "machine": {"cores": os.cpu_count()},
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(content, indent=2) + "\n")
+    write(args.out, content)
 
 
 if __name__ == "__main__":

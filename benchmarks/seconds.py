@@ -11,8 +11,6 @@ mean of the steady headline metric over the episodes is on the good side of `--w
 them crashes; for a metric whose last value counts, as `landed`, the mean alone decides.
 """
 
-import argparse
-import json
 import os
 import resource
 import statistics
@@ -25,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import RESULTS, options, write
 from rotorgram.agents import CONTROLLERS, load
-from rotorgram.agents.checkpoints import software_versions
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.experiments.metrics import Headline, steady_state
 from rotorgram.experiments.trajectories import fly_episodes
@@ -75,15 +73,10 @@ def evaluate(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--first-seed", type=int, default=100)
-    parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--within", type=float, default=0.05)
-    parser.add_argument("--vehicle")
+    parser = options(__doc__, seeds=20, first_seed=100, episodes=20, within=0.05, vehicle=str,
+                     out=RESULTS / "seconds.json")  # fmt: skip
     parser.add_argument("--beside", choices=sorted(CONTROLLERS), nargs="+", default=[],
                         help="controllers that fly the same starts")  # fmt: skip
-    parser.add_argument("--out", type=Path, default=Path("docs/results/seconds.json"))
     parser.add_argument("words", nargs="*", default=["ppo"])
     args = parser.parse_args()
     words = args.words + (["--vehicle", args.vehicle] if args.vehicle else [])
@@ -102,11 +95,11 @@ def main() -> None:
             name: evaluate(name, kept.env_id, args.within, args.vehicle, args.episodes)
             for name in args.beside
         }
-        write(args.out, words, args.within, rows, beside)
+        note(args.out, words, args.within, rows, beside)
     print(f"{sum(row['holds'] for row in rows)} of {len(rows)} hold {args.within}")
 
 
-def write(
+def note(
     path: Path, words: list[str], within: float, rows: list[Any], beside: dict[str, Any]
 ) -> None:
     """After every seed, so that an interrupted measurement has those that were flown."""
@@ -120,11 +113,8 @@ def write(
            for name in ("seconds", "processor_seconds")},
         "seeds": rows,
         **({"beside": beside} if beside else {}),
-        "versions": software_versions(),
-        "machine": {"cores": os.cpu_count()},
     }  # fmt: skip
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(result, indent=2) + "\n")
+    write(path, result)
 
 
 if __name__ == "__main__":

@@ -9,24 +9,20 @@ episodes; `learn` an update, spread over the steps of its rollout. Agent and sim
 the sum is the time of a step where each has a core. Writes docs/results/rigid/shares.json.
 """
 
-import argparse
-import json
-import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 from threading import Thread
 from typing import Any
 
 import numpy as np
+from measuring import RESULTS, medians, options, write
 from rotorgram.agents import EpisodeLog, make_agent, preset
-from rotorgram.agents.checkpoints import software_versions
 from rotorgram.envs import LocalVectorEnv, Loop
 from rotorgram.udp import RemoteVectorEnv, Simulator
 from rotorgram.udp.transport import sockets
 
 HOVER = "rotorgram/Hover-v0"
-OUT = Path("docs/results/rigid/shares.json")
+OUT = RESULTS / "rigid" / "shares.json"
 
 
 def microseconds(fly: Callable[[], None], times: int) -> float:
@@ -98,10 +94,7 @@ class Agent:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--drones", type=int, default=128)
-    parser.add_argument("--rounds", type=int, default=15)
-    args = parser.parse_args()
+    args = options(__doc__, drones=128, rounds=15).parse_args()
     ways = {f"simulate {name}": simulate(name, args.drones) for name in ("mujoco", "rigid")}
     agent, both = Agent(args.drones), exchange(args.drones)
     rows: dict[str, list[float]] = {}
@@ -110,12 +103,9 @@ def main() -> None:
         times["wire"] = microseconds(both, 50) - times["simulate rigid"]
         for name, value in (times | agent.rollout()).items():
             rows.setdefault(name, []).append(value)
-    medians = {name: round(statistics.median(values)) for name, values in rows.items()}
-    OUT.parent.mkdir(parents=True, exist_ok=True)
-    content = {"drones": args.drones, "rounds": args.rounds, "microseconds_per_step": medians,
-               "versions": software_versions()}  # fmt: skip
-    OUT.write_text(json.dumps(content, indent=2) + "\n")
-    for name, value in medians.items():
+    middle = {name: round(value) for name, value in medians(rows).items()}
+    write(OUT, {"drones": args.drones, "rounds": args.rounds, "microseconds_per_step": middle})
+    for name, value in middle.items():
         print(f"{name:16} {value:6,} µs")
 
 

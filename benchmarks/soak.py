@@ -8,9 +8,7 @@ on a local env beside it and compares every bit of every answer. The last job fl
 one before it with a key. One bit that differs ends the soak with the step's number.
 """
 
-import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -23,8 +21,8 @@ import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401
 from joblib import Parallel, delayed
+from measuring import RESULTS, launch, options, write
 from rotorgram.udp import RemoteVectorEnv
-from rotorgram.udp.journal import software
 from rotorgram.udp.protocol.auth import write_key
 
 FAULTS = {"drop": 0.3, "duplicate": 0.1, "reorder": 0.2, "corrupt": 0.05, "truncate": 0.02}
@@ -53,11 +51,6 @@ with Simulator(server=("127.0.0.1", settings["port"]), bind=("127.0.0.1", 0),
     simulator.run()
     print(json.dumps(simulator.link.statistics.numbers()), flush=True)
 """
-
-
-def launch(code: str, settings: dict[str, Any]) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", code, json.dumps(settings)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
 def said(process: subprocess.Popen[str]) -> Any:
@@ -115,11 +108,8 @@ def soak(job: int, steps: int, drones: int, keyed: bool) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=1_000_000)
-    parser.add_argument("--jobs", type=int, default=12)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/reliability/soak.json"))
-    args = parser.parse_args()
+    out = RESULTS / "reliability" / "soak.json"
+    args = options(__doc__, steps=1_000_000, jobs=12, out=out).parse_args()
     # 64 drones: a twentieth of the exchanges, more than half of the drones' steps.
     many = args.steps // 20
     each = -(-(args.steps - many) // (args.jobs - 1))
@@ -136,11 +126,8 @@ def main() -> None:
         "bits_that_differ": sum(job["first_step_that_differs"] is not None for job in jobs),
         "network": dict(network),
         "jobs": jobs,
-        "versions": software(),
-        "machine": {"cores": os.cpu_count()},
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    write(args.out, result)
     for job in jobs:
         rate = job["steps"] / job["seconds"]
         print(f"{job['drones']:3} drones {job['steps']:9,} steps, {rate:6.0f} steps/s, "

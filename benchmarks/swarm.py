@@ -8,9 +8,6 @@ repeat, and the medians over the repeats are told, in microseconds for each dron
 Over UDP the simulator is a process of its own, and the agent asks for a standstill.
 """
 
-import argparse
-import json
-import statistics
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,10 +15,9 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from rotorgram.agents.checkpoints import software_versions
+from measuring import in_turns, medians, options, write
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.experiments.pairs import socket_pair
-from rotorgram.experiments.results import machine
 
 ENV = "rotorgram/Formation-v0"
 EPISODE = 100_000  # control steps: none ends while it is measured
@@ -40,12 +36,11 @@ def physics(drones: int, *, together: bool) -> Step:
 
 
 def advanced(env: Any, drones: int) -> Step:
-    """A step of an env with actions that ask for a standstill."""
-    seeds = list(range(drones))
-    many = drones > 1
-    env.reset(seed=seeds if many else 0)
-    actions = np.zeros((drones, 4) if many else 4, np.float32)
-    return (lambda: env.advance(actions)) if many else (lambda: env.step(actions))
+    """A step of an env, of one drone or a vector env, with actions that ask for a standstill."""
+    vector = hasattr(env, "num_envs")
+    env.reset(seed=list(range(drones)) if vector else 0)
+    actions = np.zeros((drones, 4) if vector else 4, np.float32)
+    return (lambda: env.advance(actions)) if vector else (lambda: env.step(actions))
 
 
 def timed(step: Step, seconds: float) -> float:
@@ -67,42 +62,26 @@ def measure(counts: list[int], seconds: float, repeats: int) -> dict[str, dict[s
             pair = socket_pair(ENV, options, num_envs=drones, drones=drones)
             cases["apart", drones] = physics(drones, together=False)
             cases["one world", drones] = physics(drones, together=True)
-            cases["with the task", drones] = advanced(local, drones) if drones > 1 else _one(local)
+            cases["with the task", drones] = advanced(local, drones)
             cases["over UDP", drones] = advanced(opened.enter_context(pair), drones)
-        taken: dict[tuple[str, int], list[float]] = {case: [] for case in cases}
-        for _ in range(repeats):
-            for case, step in cases.items():
-                taken[case].append(timed(step, seconds))
+        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)))
     found: dict[str, dict[str, float]] = {}
-    for (name, drones), times in taken.items():
-        per_drone = round(statistics.median(times) / drones * 1e6, 2)
-        found.setdefault(name, {})[str(drones)] = per_drone
+    for (name, drones), time in taken.items():
+        found.setdefault(name, {})[str(drones)] = round(time / drones * 1e6, 2)
     return found
-
-
-def _one(env: LocalVectorEnv) -> Step:
-    """A step of a vector env of one drone."""
-    env.reset(seed=0)
-    actions = np.zeros((1, 4), np.float32)
-    return lambda: env.advance(actions)
 
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("--drones", type=int, nargs="+", default=[1, 8, 32, 100])
-    parser.add_argument("--seconds", type=float, default=0.5)
-    parser.add_argument("--repeats", type=int, default=9)
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
+    drones = (1, 8, 32, 100)
+    args = options(__doc__, drones=drones, seconds=0.5, repeats=9, out=Path).parse_args()
     found = measure(args.drones, args.seconds, args.repeats)
     print("| µs for each drone and step | " + " | ".join(map(str, args.drones)) + " |")
     print("|---|" + "---:|" * len(args.drones))
     for name, row in found.items():
         print(f"| {name} | " + " | ".join(f"{x:,.1f}" for x in row.values()) + " |")
     if args.out:
-        content = {"microseconds": found, "machine": machine(), "versions": software_versions()}
-        args.out.write_text(json.dumps(content, indent=2) + "\n")
+        write(args.out, {"microseconds": found})
 
 
 if __name__ == "__main__":

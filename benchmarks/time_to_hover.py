@@ -9,17 +9,14 @@ where every seed holds |E| < 0.05 m; the settings are those that reached it soon
 were tried.
 """
 
-import argparse
 import json
-import os
 import statistics
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
-from rotorgram.agents.checkpoints import software_versions
+from measuring import RESULTS, options, write
 
 FLY = """
 import json, sys
@@ -66,11 +63,8 @@ def measure(setting: dict[str, Any], seed: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=5)
-    default = Path("docs/results/performance/time_to_hover.json")
-    parser.add_argument("--out", type=Path, default=default)
-    args = parser.parse_args()
+    out = RESULTS / "performance" / "time_to_hover.json"
+    args = options(__doc__, seeds=5, out=out).parse_args()
     runs: list[list[dict[str, float]]] = [[] for _ in SETTINGS]
     for seed in range(args.seeds):
         for setting, flown in zip(SETTINGS, runs, strict=True):
@@ -88,10 +82,7 @@ def main() -> None:
         }
         for setting, flown in zip(SETTINGS, runs, strict=True)
     ]
-    content = {"settings": results, "versions": software_versions(),
-               "machine": {"cores": os.cpu_count()}}  # fmt: skip
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(content, indent=2) + "\n")
+    write(args.out, {"settings": results})
     print("| agent | drones | env steps | wall time, s | worst |E|, m |\n|---|---|---|---|---|")
     for r in results:
         print(f"| {r['agent']} | {r['drones']} | {r['env_steps']:,} | {r['wall_seconds']:.1f} | "

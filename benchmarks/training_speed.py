@@ -11,23 +11,18 @@ in the same turn. Imports and the start of the simulator are not counted. 320 en
 are five of each for an update, as SB3's default has it.
 """
 
-import argparse
-import json
 import os
-import platform
 import statistics
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import RESULTS, medians, options, write
 from rotorgram.agents import preset
-from rotorgram.agents.checkpoints import software_versions
 from rotorgram.experiments.pairs import socket_pair
 from rotorgram.experiments.settings import Run
 from rotorgram.experiments.training import Training
-
-AGENTS = ("a2c", "vpg", "sb3-a2c")
 
 
 def processor_seconds() -> float:
@@ -55,15 +50,10 @@ def steps_per_second(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--env-steps", type=int, default=20_000)
-    parser.add_argument("--agents", nargs="+", default=AGENTS)
-    parser.add_argument("--num-envs", type=int, default=1)
-    parser.add_argument("--backend", default="mujoco")
-    parser.add_argument("--steps-per-update", type=int, help="default: those of the preset")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/training_speed.json"))
-    args = parser.parse_args()
+    args = options(
+        __doc__, env_steps=20_000, agents=("a2c", "vpg", "sb3-a2c"), num_envs=1, backend="mujoco",
+        steps_per_update=int, repeats=5, out=RESULTS / "training_speed.json",
+    ).parse_args()  # fmt: skip
     changes = {"steps_per_update": args.steps_per_update} if args.steps_per_update else {}
     settings = {name: getattr(args, name) for name in ("env_steps", "num_envs", "backend")}
     rates: dict[str, list[float]] = {agent: [] for agent in args.agents}
@@ -75,7 +65,7 @@ def main() -> None:
             used[agent].append(round(of_processor, 1))
             print(f"{agent:8} {rate:8,.0f} env steps/s, {of_processor:8,.0f} of a processor's",
                   flush=True)  # fmt: skip
-    medians = {agent: statistics.median(values) for agent, values in rates.items()}
+    middle = medians(rates)
     ratios, ratios_used = (
         {
             agent: round(statistics.median(np.divide(values, told["sb3-a2c"]).tolist()), 2)
@@ -87,17 +77,14 @@ def main() -> None:
         **settings,
         "changes": changes,
         "rates": rates,
-        "medians": medians,
+        "medians": middle,
         "ratio_to_sb3": ratios,
         "rates_per_processor_second": used,
         "ratio_to_sb3_per_processor_second": ratios_used,
         "load_average": round(os.getloadavg()[0], 1),
-        "versions": software_versions(),
-        "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
-    for agent, median in medians.items():
+    write(args.out, result)
+    for agent, median in middle.items():
         print(
             f"{agent:8} median {median:8,.0f} env steps/s, {ratios[agent]:.2f} x SB3's A2C, "
             f"{ratios_used[agent]:.2f} x per second of a processor"

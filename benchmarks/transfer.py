@@ -12,8 +12,6 @@ error over the last quarter of the episodes that did not crash, and the share of
 `config.json` has the settings. `--draw` makes summary and figure anew from `seeds.csv`.
 """
 
-import argparse
-import json
 import math
 import time
 from collections.abc import Mapping
@@ -25,9 +23,9 @@ import numpy as np
 import pandas as pd
 from matplotlib import style
 from matplotlib.figure import Figure
+from measuring import RESULTS, options, write
 from rotorgram import experiments
 from rotorgram.agents import Geometric, load, preset, store
-from rotorgram.agents.checkpoints import software_versions
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.experiments.metrics import steady_state
 from rotorgram.experiments.settings import Run
@@ -178,14 +176,10 @@ def draw(summary: pd.DataFrame, path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=range(100, 105))
-    parser.add_argument("--rows", nargs="+", default=list(ROWS))
-    parser.add_argument("--env-steps", type=int, default=1_000_000)
-    parser.add_argument("--policies", type=Path, default=Path("build/transfer"))
-    parser.add_argument("--out", type=Path, default=Path("docs/results/transfer"))
-    parser.add_argument("--draw", action="store_true")
-    args = parser.parse_args()
+    args = options(
+        __doc__, seeds=range(100, 105), rows=list(ROWS), env_steps=1_000_000,
+        policies=Path("build/transfer"), out=RESULTS / "transfer", draw=False,
+    ).parse_args()  # fmt: skip
     args.out.mkdir(parents=True, exist_ok=True)
     if not args.draw:
         for seed in args.seeds:
@@ -198,9 +192,9 @@ def main() -> None:
         config = {
             "env": ENV, "vehicle": VEHICLE, "effects": EFFECTS, "rows": ROWS,
             "env_steps": args.env_steps, "ppo": asdict(preset("ppo", "tuned", ENV)),
-            "episodes": EPISODES, "versions": software_versions(),
+            "episodes": EPISODES,
         }  # fmt: skip
-        (args.out / "config.json").write_text(json.dumps(config, indent=2) + "\n")
+        write(args.out / "config.json", config)
     summary = summary_of(pd.read_csv(args.out / "seeds.csv"))
     summary.to_csv(args.out / "summary.csv", index=False, lineterminator="\n")
     draw(summary, args.out / "transfer.png")

@@ -10,14 +10,13 @@ docs/results/tuning/ALGORITHM_TASK.csv, or to `--out`. Seconds are of processor 
 machine was busy; early rows have none.
 """
 
-import argparse
-import csv
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from measuring import RESULTS, add_row, options
 from rotorgram.agents import EpisodeLog, make_agent
 from rotorgram.agents.presets import config_type
 from rotorgram.envs import LocalVectorEnv
@@ -152,17 +151,14 @@ def measure(algorithm: str, task: str, settings: dict[str, Any], seed: int) -> d
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, algorithm="ppo", seeds=(0, 1), out=Path)
     parser.add_argument("task", choices=sorted({task for _, task in POINTS}))
-    parser.add_argument("--algorithm", default="ppo")
     parser.add_argument("--points", type=int, nargs="+")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
-    parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     points = POINTS[args.algorithm, args.task]
     names = dict.fromkeys(name for point in points for name in (*PPO, *point))
     name = f"{args.algorithm}_{args.task.split('-')[0].lower()}.csv"
-    out = args.out or Path("docs/results/tuning") / name
+    out = args.out or RESULTS / "tuning" / name
     for point in range(len(points)) if args.points is None else args.points:
         for seed in args.seeds:
             settings = {**PPO, **points[point]}
@@ -170,12 +166,7 @@ def main() -> None:
             result = measure(args.algorithm, args.task, settings, seed)
             row = {"point": point, **names, **settings, "hidden": layers, **result}
             print(row, flush=True)
-            fresh = not out.exists()
-            with out.open("a", newline="") as file:
-                writer = csv.DictWriter(file, row.keys(), lineterminator="\n")
-                if fresh:
-                    writer.writeheader()
-                writer.writerow(row)
+            add_row(out, row)
 
 
 if __name__ == "__main__":

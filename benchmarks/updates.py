@@ -2,24 +2,21 @@
 
     OMP_NUM_THREADS=1 python benchmarks/updates.py [--seconds 3] [--cases ppo] [--out FILE.json]
 
-Networks, batch, epochs and minibatches are the same. A sample is a transition in one step of Adam,
-so an epoch counts each of a rollout once. Ours and SB3's take turns, update by update, in one
-process: set OMP_NUM_THREADS=1; medians are compared. Computing the advantages is part of an update
-of ours, and of SB3's `train` it is not: SB3 does it while it flies. Both SACs draw their batches
-from the buffer within the update.
+`--cases` takes only those whose names begin so. Networks, batch, epochs and minibatches are the
+same. A sample is a transition in one step of Adam, so an epoch counts each of a rollout once. Ours
+and SB3's take turns, update by update, in one process: set OMP_NUM_THREADS=1; medians are compared.
+Computing the advantages is part of an update of ours, and of SB3's `train` it is not: SB3 does it
+while it flies. Both SACs draw their batches from the buffer within the update.
 """
 
-import argparse
-import json
 import os
 import time
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import RESULTS, options, write
 from rotorgram.agents import EpisodeLog, make_agent, preset
-from rotorgram.agents.checkpoints import software_versions
 from rotorgram.agents.rollouts import Rollout
 from rotorgram.envs import LocalVectorEnv
 
@@ -93,11 +90,7 @@ def measure(case: tuple[str, str, int, dict[str, Any]], seconds: float) -> dict[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=3.0)
-    parser.add_argument("--cases", default="", help="only those whose names begin so")
-    parser.add_argument("--out", type=Path, default=Path("docs/results/updates.json"))
-    args = parser.parse_args()
+    args = options(__doc__, seconds=3.0, cases="", out=RESULTS / "updates.json").parse_args()
     cases = {}
     for name, case in CASES.items():
         if not name.startswith(args.cases):
@@ -108,11 +101,7 @@ def main() -> None:
             f"({result['ratio_of_processor_time']} of processor time)",
             flush=True,
         )
-    load = round(os.getloadavg()[0], 1)
-    machine = {"cores": os.cpu_count(), "load_average": load}
-    result = {"cases": cases, "machine": machine, "versions": software_versions()}
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    write(args.out, {"cases": cases, "load_average": round(os.getloadavg()[0], 1)})
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@
 need OpenGL.
 """
 
-import argparse
 import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
+from measuring import options
 from PIL import Image
 from rotorgram.models import InputError, Vehicle, build_scene
 from rotorgram.models.checks import examine
@@ -274,9 +274,7 @@ def draw(name: str) -> Image.Image:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Write the pages of the library of vehicles.")
-    parser.add_argument("--no-pictures", action="store_true", help="write the pages only")
-    pictures = not parser.parse_args().no_pictures
+    pictures = not options(__doc__, no_pictures=False).parse_args().no_pictures
     for name in LIBRARY["vehicles"]:
         (FOLDER / name / "README.md").write_text(readme(name), encoding="utf-8")
         if pictures:

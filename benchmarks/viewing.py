@@ -9,10 +9,7 @@ page is also watched by one, without a screen: it draws on the same processors, 
 would.
 """
 
-import argparse
 import json
-import os
-import platform
 import shutil
 import statistics
 import subprocess
@@ -21,11 +18,10 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
+from measuring import RESULTS, medians, options, write
 from rotorgram.udp import RemoteEnv, RemoteVectorEnv
 
 PORT = 8181
@@ -139,12 +135,8 @@ def ratio(watched: list[float], alone: list[float]) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=3.0)
-    default = Path("docs/results/performance/viewing.json")
-    parser.add_argument("--out", type=Path, default=default)
-    args = parser.parse_args()
+    out = RESULTS / "performance" / "viewing.json"
+    args = options(__doc__, rounds=5, seconds=3.0, out=out).parse_args()
     kinds = KINDS if shutil.which("chromium") else KINDS[:-1]
     renderer = subprocess.run(
         [sys.executable, "-c", RENDERER], capture_output=True, text=True, check=True
@@ -164,16 +156,11 @@ def main() -> None:
                 pictures[str(drones)][kind].append(round(drawn, 1))
                 told = f"{rate:,.0f} control steps/s, {drawn:.1f} pictures/s"
                 print(f"{drones:3} drones, {kind}: {told}", flush=True)
-    medians, drawn_medians = (
-        {drones: {kind: statistics.median(many) for kind, many in of.items()}
-         for drones, of in measured.items()}
-        for measured in (rates, pictures)
-    )  # fmt: skip
     result = {
         "rounds": args.rounds,
         "seconds": args.seconds,
-        "control_steps_per_second": medians,
-        "pictures_per_second": drawn_medians,
+        "control_steps_per_second": {drones: medians(of) for drones, of in rates.items()},
+        "pictures_per_second": {drones: medians(of) for drones, of in pictures.items()},
         "of_that_without": {
             drones: {kind: ratio(many, of["none"]) for kind, many in of.items()}
             for drones, of in rates.items()
@@ -181,11 +168,8 @@ def main() -> None:
         "rates": rates,
         "opengl": renderer,
         "world": "airport",
-        "versions": {"mujoco": mujoco.__version__, "python": platform.python_version()},
-        "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    write(args.out, result)
     print(json.dumps(result["control_steps_per_second"], indent=2))
 
 

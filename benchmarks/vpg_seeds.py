@@ -9,13 +9,13 @@ the craft approaches the target from half a metre at 1 to 3 m/s, from below and 
 negative one lets the craft accelerate. The folder is that of a `rotorgram compare` with VPG.
 """
 
-import argparse
-import csv
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import rotorgram.envs
+from measuring import options
 from rotorgram.agents.checkpoints import load
 from rotorgram.agents.policies import NetworkPolicy
 
@@ -60,9 +60,8 @@ def row(path: Path) -> dict[str, float | str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, out=Path)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     paths = sorted((args.folder / "checkpoints").glob("vpg-seed*.safetensors"))
     if not paths:
@@ -71,10 +70,7 @@ def main() -> None:
     for one in rows:
         print(one)
     if args.out:
-        with args.out.open("w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0])
-            writer.writeheader()
-            writer.writerows(rows)
+        pd.DataFrame(rows).to_csv(args.out, index=False)
 
 
 if __name__ == "__main__":

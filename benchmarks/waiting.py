@@ -7,16 +7,13 @@ A lock-step of one drone over UDP, agent and simulator in a process each. `looks
 and take turns; medians count. Neighbours are endless loops in Python.
 """
 
-import json
-import statistics
 import subprocess
 import sys
 import time
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 
 import numpy as np
-from rotorgram.experiments.results import machine
+from measuring import RESULTS, medians, write
 from rotorgram.udp import RemoteEnv
 from rotorgram.udp.transport import sockets
 
@@ -78,11 +75,10 @@ def main():
                 for way, look in WAYS.items():
                     sockets._LOOK = look
                     times[way].append(round(microseconds(envs[way], actions), 1))
-        medians = {way: statistics.median(times[way]) for way in WAYS}
-        rows.append({"neighbours": neighbours, "medians": medians, "microseconds": times})
-        print(f"{neighbours} neighbours:", ", ".join(f"{w} {t:.0f} µs" for w, t in medians.items()))
-    path = Path("docs/results/performance/waiting.json")
-    path.write_text(json.dumps({"rows": rows, "machine": machine()}, indent=1) + "\n")
+        middle = medians(times)
+        rows.append({"neighbours": neighbours, "medians": middle, "microseconds": times})
+        print(f"{neighbours} neighbours:", ", ".join(f"{w} {t:.0f} µs" for w, t in middle.items()))
+    write(RESULTS / "performance" / "waiting.json", {"rows": rows})
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """Policies of a training, evaluated without exploration: what comparison, sweep and board share."""
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from typing import Any, Final, NamedTuple
 
 from ..agents.policies import Policy
@@ -49,7 +48,8 @@ def evaluate_stages(
     rows: list[dict[str, Any]] = []
     flown: list[Trajectory] = []
     most = max(curve_episodes, episodes) if len(stages) > 1 else episodes
-    with _pair(config, most) as env:
+    worlds = min(most, max(MAX_BATCH // config.drones, 1))
+    with shared_pair(**config.env, num_envs=worlds * config.drones) as env:
         spec = env.env_spec
         headline = Headline.of(spec)
         for stage in stages:
@@ -59,9 +59,3 @@ def evaluate_stages(
             label = {"env_steps": stage.env_steps, "seconds": stage.seconds}
             rows += [label | results.evaluation_row(one, headline) for one in flown]
     return rows, flown
-
-
-def _pair(config: EnvConfig, episodes: int) -> AbstractContextManager[Any]:
-    """A remote env that flies that many episodes at a time, or with `MAX_BATCH` drones."""
-    worlds = min(episodes, max(MAX_BATCH // config.drones, 1))
-    return shared_pair(**config.env, num_envs=worlds * config.drones)

@@ -243,7 +243,7 @@ class _Problem:
 
     def solve(self, start: _Point, free: Sequence[str]) -> tuple[_Point, dict[str, Estimate]]:
         """The point of least cost from a start, and what it tells of the free numbers."""
-        scales = np.array([_scale_at(start, name) for name in free])
+        scales = np.array([start.value(n) if n == LAG else _scale(start.airframe, n) for n in free])
         low = np.array([_lowest(name) for name in free])
         x = np.array([start.value(name) for name in free]) / np.maximum(scales, 1e-300)
         x = np.maximum(x, low + 1e-6)
@@ -500,10 +500,6 @@ def _scale(airframe: Airframe, name: str) -> float:
     }  # fmt: skip
     kind = name if name in typical else name.rpartition(".")[0]
     return typical.get(kind, value) or 1.0
-
-
-def _scale_at(point: _Point, name: str) -> float:
-    return point.value(name) if name == LAG else _scale(point.airframe, name)
 
 
 def _lowest(name: str) -> float:

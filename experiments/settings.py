@@ -132,11 +132,6 @@ class RunsConfig(WorkersConfig):
     """The first of them."""
 
 
-def _check_wired(algorithm: str) -> None:
-    """Raise `InputError` for an algorithm that does not learn over the wire, as many runs do."""
-    expect(algorithm != "apg", "agent", "one that learns over the wire", algorithm)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _ManyRuns(RunsConfig, EnvConfig):
     """Base of comparisons and sweeps."""
@@ -175,7 +170,7 @@ class _ManyRuns(RunsConfig, EnvConfig):
         return kept | {"seeds": len(seeds), "first_seed": seeds[0]}
 
     def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:
-        _check_wired(algorithm)
+        expect(algorithm != "apg", "agent", "one that learns over the wire", algorithm)
         shared = {"env_steps": self.env_steps, "num_envs": self.num_envs, **self.training_env}
         config = preset(algorithm, self.preset, self.env_id, **changes)
         return Run(algorithm=algorithm, config=config, seed=seed, **shared)

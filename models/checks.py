@@ -341,12 +341,12 @@ class _Warned(Exception):
     """MuJoCo warned of something in a flight."""
 
 
-def _fly(model: mujoco.MjModel, data: Any, seconds: float, most: int = _MOST_STEPS) -> float:
-    """Step for `seconds`, as a whole number of steps and not more than `most`; the time flown, s.
+def _fly(model: mujoco.MjModel, data: Any, seconds: float) -> float:
+    """Step for `seconds`, a whole number of steps, `_MOST_STEPS` at most; the time flown, s.
 
     Raises `_Warned`: MuJoCo resets bad states silently otherwise.
     """
-    steps = left = round(min(max(seconds / model.opt.timestep, 1), most))
+    steps = left = round(min(max(seconds / model.opt.timestep, 1), _MOST_STEPS))
     while left > 0:
         mujoco.mj_step(model, data, nstep=min(left, _STEPS_AT_ONCE))
         left -= _STEPS_AT_ONCE

@@ -20,7 +20,7 @@ from . import MOST_DRAG
 from .coefficients import PREFIX, Coefficients
 from .errors import InputError, expect
 from .library import find_vehicle
-from .scene import build_scene
+from .scene import build_scene, free_body
 from .vehicle_file import read_vehicle_file
 
 _LEAST_TIMESTEP: Final = 1e-5  # s: a control step of 0.02 s then takes a hundredth of a second
@@ -191,7 +191,7 @@ class Vehicle:
     def _spec(self) -> tuple[mujoco.MjSpec, mujoco.MjsBody]:
         """Vehicle and ground to be changed, and the free body in them."""
         spec = build_scene(self.path, visual=False)
-        craft = next(body for body in spec.bodies if any(_is_free(j) for j in body.joints))
+        craft = free_body(spec)
         craft.simple = False  # its inertia is no diagonal matrix once its center has moved
         return spec, craft
 
@@ -293,10 +293,6 @@ def body_axes(model: mujoco.MjModel) -> np.ndarray:
     mujoco.mj_kinematics(model, data)
     axes: np.ndarray = data.xmat.reshape(-1, 3, 3).copy()
     return axes
-
-
-def _is_free(joint: mujoco.MjsJoint) -> bool:
-    return bool(joint.type == mujoco.mjtJoint.mjJNT_FREE)
 
 
 def _check_structure(model: mujoco.MjModel) -> None:

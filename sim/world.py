@@ -5,7 +5,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from ..models import BACKENDS, Backend
-from ..models.errors import InputError, expect, require
+from ..models.errors import expect, require
 from .effects import EffectOptions
 from .random import Draw, Noise
 from .randomize import CENTER, Randomization
@@ -153,12 +153,9 @@ def make_world(
         InputError: The backend, the number or a setting is not what it should be.
         MissingPackage: The backend's package is not installed.
     """
-    if backend not in BACKENDS:
-        raise InputError(f"backend: expected {' or '.join(BACKENDS)}, got {backend!r}")
-    if type(num_worlds) is not int or not 1 <= num_worlds <= MAX_WORLDS:
-        raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
-    if type(drones) is not int or not 1 <= drones <= MAX_DRONES:
-        raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {drones!r}")
+    expect(backend in BACKENDS, "backend", " or ".join(BACKENDS), f"{backend!r}")
+    for name, count, most in ("num_envs", num_worlds, MAX_WORLDS), ("drones", drones, MAX_DRONES):
+        expect(type(count) is int and 1 <= count <= most, name, f"1 to {most}", f"{count!r}")
     if drones > 1:
         expect(backend != "warp", "drones", f"1 with the backend {backend}", f"{drones}")
     if getattr(vehicle, "members", ()):
@@ -169,14 +166,10 @@ def make_world(
         ]
         expected = "none with several vehicles"
         expect(not acting, "effects and randomize", expected, ", ".join(acting))
+    known = _SETTINGS[backend]
+    those = f"{' or '.join(known)}, the setting{'s' * (len(known) > 1)} of the backend {backend}"
     for name, value in settings.items():
-        known = _SETTINGS[backend]
-        if name not in known:
-            plural = "s" if len(known) > 1 else ""
-            raise InputError(
-                f"{name}: expected {' or '.join(known)}, the setting{plural} of the backend "
-                f"{backend}, got {name}={value!r}"
-            )
+        expect(name in known, name, those, f"{name}={value!r}")
     if drones > 1:
         settings["drones"] = drones
     extra, packages = _PACKAGES[backend]

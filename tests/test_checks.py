@@ -3,7 +3,6 @@
 import inspect
 import json
 import math
-import runpy
 import time
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,20 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from broken_vehicles import (
+    BROKEN,
+    Row,
+    break_vehicle,
+    examination,
+    inertial,
+    markdown,
+    numeric,
+    reactions,
+    read_report,
+    replace,
+    rows,
+)
+from measuring import read_rows, write_rows
 from rotorgram.cli.check_model import print_checks
 from rotorgram.models import QUAD_XML, InputError, Vehicle, checks
 from rotorgram.models.checks import (
@@ -36,12 +49,6 @@ ROOT = Path(__file__).parent.parent
 DATA = Path(__file__).parent / "data"
 PAGE = (ROOT / "docs" / "physics.md").read_text()
 SOUND = [QUAD_XML, *sorted(DATA.glob("*.xml"))]
-_script = runpy.run_path(str(ROOT / "benchmarks" / "broken_vehicles.py"))
-BROKEN, break_vehicle, markdown, read, rows, write = (
-    _script[n] for n in ("BROKEN", "break_vehicle", "markdown", "read", "rows", "write")
-)
-examination, read_report = _script["examination"], _script["read_report"]
-numeric, replace = _script["numeric"], _script["replace"]
 COMMITTED = ROOT / "docs" / "results" / "physics" / "broken_vehicles.csv"
 
 
@@ -161,7 +168,7 @@ def test_a_fault_fails_nothing_else(fault: str, names: set[str], tmp_path: Path)
 def test_the_rotor_with_the_wrong_sign_is_named(rotor: int, tmp_path: Path) -> None:
     signs = [1, -1, 1, -1]
     signs[rotor - 1] *= -1
-    path = break_vehicle(tmp_path, _script["reactions"](*(0.05 * sign for sign in signs)))
+    path = break_vehicle(tmp_path, reactions(*(0.05 * sign for sign in signs)))
     found = set(by_name(failed(check_turns(path))))
     assert found == {"turns: yaw of equal thrusts", f"turns: neighbours like rotor{rotor}"}
 
@@ -198,7 +205,7 @@ def test_a_wrong_coefficient_is_a_check(tmp_path: Path) -> None:
 
 
 def test_a_negative_moment_is_found_although_mujoco_takes_it(tmp_path: Path) -> None:
-    path = break_vehicle(tmp_path, _script["inertial"]('diaginertia="-5 5 10"'))
+    path = break_vehicle(tmp_path, inertial('diaginertia="-5 5 10"'))
     assert "inertia: smallest / largest moment" in by_name(failed(examine(path)))
 
 
@@ -421,14 +428,14 @@ def test_units_of_coefficients(tmp_path: Path) -> None:
 
 
 def test_the_committed_table_is_true_and_on_the_page(tmp_path: Path) -> None:
-    committed, again = read(COMMITTED), rows()
+    committed, again = read_rows(COMMITTED, Row), rows()
     assert markdown(committed) in PAGE
     assert all(row.found for row in committed)
     for old, new in zip(committed, again, strict=True):
         assert (old.fault, old.found_by, old.failed, old.checks, old.flies) == (
             new.fault, new.found_by, new.failed, new.checks, new.flies)  # fmt: skip
-    write(tmp_path / "new" / "table.csv", again)
-    assert read(tmp_path / "new" / "table.csv") == again
+    write_rows(tmp_path / "new" / "table.csv", again)
+    assert read_rows(tmp_path / "new" / "table.csv", Row) == again
 
 
 def test_the_committed_examination_is_on_the_page() -> None:

@@ -5,7 +5,6 @@ First the independent solution against closed forms, then ours against it, then 
 
 import json
 import math
-import runpy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,15 +16,28 @@ from rotorgram.models.coefficients import Coefficients, Drag
 
 pytest.importorskip("scipy")
 
+import rotorpy
+from independent import (
+    Equations,
+    Row,
+    at_step,
+    compare,
+    independent,
+    markdown,
+    order,
+    ours,
+    rotation,
+    thrusts,
+    vehicles,
+)
+from measuring import read_rows, write_rows
+
 ROOT = Path(__file__).parent.parent
 DATA = ROOT / "tests" / "data"
 PAGE = ROOT / "docs" / "independent.md"
 FLIGHTS = ROOT / "docs" / "results" / "independent" / "flights.csv"
 ROTORPY = ROOT / "docs" / "results" / "rotorpy" / "hummingbird.json"
-_script = runpy.run_path(str(ROOT / "benchmarks" / "independent.py"))
-at_step, compare, independent = (_script[n] for n in ("at_step", "compare", "independent"))
-rotation, thrusts, read, write = (_script[n] for n in ("rotation", "thrusts", "read", "write"))
-VEHICLES: dict[str, Vehicle] = _script["vehicles"]()
+VEHICLES = vehicles()
 RACER = VEHICLES["racer"]
 SPIN, VELOCITY = np.array((0.5, -0.4, 0.3)), np.array((1.0, 2.0, 3.0))  # of its starts
 DOWN = np.array((0.0, 0.0, -9.81))
@@ -66,7 +78,7 @@ def test_linear_drag_alike_in_all_directions_gives_an_exponential() -> None:
 
 def test_a_rotor_lags_and_drags_as_worked_out_by_hand() -> None:
     """The derivative of a level racer at 2 m/s forward; one rotor rises, one falls, two hold."""
-    equations = _script["Equations"](RACER, {"motor_lag": True, "rotor_drag": True})
+    equations = Equations(RACER, {"motor_lag": True, "rotor_drag": True})
     root = np.array((1.0, 1.2, 1.2, 1.2))
     wanted = np.array((1.44, 1.0, 1.44, 1.44))  # roots 1.2, 1.0, 1.2, 1.2
     y = np.concatenate(((0, 0, 0), (2, 0, 0), (1, 0, 0, 0), (0, 0, 0), root))
@@ -126,7 +138,7 @@ def test_effects_are_of_second_order(effects: str, most_m: float, most_deg: floa
     assert [row.step_ms for row in rows] == [5.0, 2.5]
     assert rows[0].position_m < most_m
     assert rows[0].attitude_deg < most_deg
-    assert _script["order"](rows) == pytest.approx(2.0, abs=0.25)
+    assert order(rows) == pytest.approx(2.0, abs=0.25)
 
 
 def test_rotors_that_lag_drag_with_their_mean_speed() -> None:
@@ -135,14 +147,14 @@ def test_rotors_that_lag_drag_with_their_mean_speed() -> None:
     quick = replace(told.rotors, time_constant=0.005, time_constant_down=None)
     craft = replace(RACER, coefficients=replace(told, rotors=quick))
     effects, commands = {"motor_lag": True, "rotor_drag": True}, thrusts(craft, 2.0)
-    flown = _script["ours"](at_step(craft, 0.005), commands, effects)
+    flown = ours(at_step(craft, 0.005), commands, effects)
     _, degrees = flown.apart(independent(craft, commands, effects))
     assert degrees < 0.012
 
 
 def test_the_rigid_body_is_of_fourth_order() -> None:
     rows = compare("tiny", VEHICLES["tiny"], ["none"], [0.01, 0.005], 2.0)
-    assert _script["order"](rows) == pytest.approx(4.0, abs=0.1)
+    assert order(rows) == pytest.approx(4.0, abs=0.1)
 
 
 # --- the page -------------------------------------------------------------------------------------
@@ -150,28 +162,28 @@ def test_the_rigid_body_is_of_fourth_order() -> None:
 
 def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
     rows = compare("racer", RACER, ["none"], [0.01], 0.2)
-    write(tmp_path / "new" / "table.csv", rows)
-    again = read(tmp_path / "new" / "table.csv")
+    write_rows(tmp_path / "new" / "table.csv", rows)
+    again = read_rows(tmp_path / "new" / "table.csv", Row)
     assert [row.vehicle for row in again] == ["racer", "racer"]
     assert [row.step_ms for row in again] == [10.0, 5.0]
     assert again[0].position_m == pytest.approx(rows[0].position_m, rel=1e-3)
 
 
 def test_the_page_shows_the_committed_table_of_every_vehicle() -> None:
-    rows = read(FLIGHTS)
-    assert _script["markdown"](rows) in PAGE.read_text()
+    rows = read_rows(FLIGHTS, Row)
+    assert markdown(rows) in PAGE.read_text()
     assert {row.vehicle for row in rows} >= set(VEHICLES)
 
 
 def test_every_vehicle_meets_the_targets_at_the_step_of_its_file() -> None:
-    own = [row for row in read(FLIGHTS) if row.effects == "none" and row.of_file]
+    own = [row for row in read_rows(FLIGHTS, Row) if row.effects == "none" and row.of_file]
     assert all(row.within for row in own)
     assert max(row.position_m for row in own) < 2e-5
     assert max(row.attitude_deg for row in own) < 1e-4
 
 
 def test_the_committed_flights_fly_again_alike() -> None:
-    (told,) = (r for r in read(FLIGHTS) if r.vehicle == "tiny" and r.of_file)
+    (told,) = (r for r in read_rows(FLIGHTS, Row) if r.vehicle == "tiny" and r.of_file)
     (row,) = compare("tiny", VEHICLES["tiny"], ["none"], [0.005])
     for name in ("fastest_rad_s", "fastest_m_s", "position_m", "attitude_deg"):
         assert getattr(row, name) == pytest.approx(getattr(told, name), rel=0.02)
@@ -179,7 +191,7 @@ def test_the_committed_flights_fly_again_alike() -> None:
 
 def test_the_page_shows_the_committed_flights_beside_rotorpy() -> None:
     result: dict[str, Any] = json.loads(ROTORPY.read_text())
-    shown = runpy.run_path(str(ROOT / "benchmarks" / "rotorpy.py"))["markdown"](result)
+    shown = rotorpy.markdown(result)
     assert shown in PAGE.read_text()
     assert f"RotorPy {result['rotorpy']}" in PAGE.read_text()
     for row in result["rows"]:
@@ -199,7 +211,7 @@ def test_rotorpys_parameters_become_our_vehicle(tmp_path: Path) -> None:
         "c_Dx": 0.01, "c_Dy": 0.02, "c_Dz": 0.03,
     }  # fmt: skip
     file = tmp_path / "made_up.xml"
-    file.write_text(runpy.run_path(str(ROOT / "benchmarks" / "rotorpy.py"))["mjcf"](params))
+    file.write_text(rotorpy.mjcf(params))
     vehicle = Vehicle.load(file)
     told = vehicle.coefficients
     assert (vehicle.mass, vehicle.gravity) == (0.4, 9.81)

@@ -237,8 +237,38 @@ def copy_weights(theirs: Any, ours: A2C) -> None:
     })  # fmt: skip
 
 
+def train_both(
+    theirs: Any, ours: A2C, recorder: Recorder, log: EpisodeLog, env_steps: int
+) -> list[tuple[dict[str, float], dict[str, float]]]:
+    """SB3 flies; ours, from the same weights, is given what it flew: scalars of both by update."""
+    copy_weights(theirs, ours)
+    buffer, seen, told = theirs.model.rollout_buffer, [], []
+    prepare = buffer.compute_returns_and_advantage
+
+    def keep_buffer(*args: Any, **kwargs: Any) -> None:
+        seen[:] = buffer.observations[:, 0].copy(), buffer.actions[:, 0].copy()
+        prepare(*args, **kwargs)
+
+    buffer.compute_returns_and_advantage = keep_buffer
+
+    def follow() -> bool:
+        after, rewards, terminated, truncated, _ = zip(*recorder.results, strict=True)
+        recorder.results.clear()
+        data = rollout(
+            observations=seen[0], actions=seen[1], rewards=np.array(rewards),
+            next_observations=np.array(after), terminated=np.array(terminated),
+            truncated=np.array(truncated), kept=np.ones(len(rewards), bool),
+        )  # fmt: skip
+        ours.update(data)
+        told.append((ours.scalars(), theirs.scalars()))
+        return True
+
+    theirs.train(log, env_steps, follow)
+    return told
+
+
 def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
-    """SB3 flies; our A2C, from the same weights, is given what it flew: ten updates agree."""
+    """Ten updates agree."""
     config = A2CConfig(
         steps_per_update=64, gamma=0.98, gae_lambda=0.95, learning_rate=0.01, ent_coef=0.01,
         normalize=True,
@@ -246,37 +276,8 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
     recorder = Recorder(elevation(episode_length=40, flight_band=1.1))
     log = EpisodeLog(recorder, seed=0)
     theirs: Any = make_agent("sb3-a2c", log, config, 0)
-    model = theirs.model
     ours = A2C(log, config, seed=1)
-    copy_weights(theirs, ours)
-    buffers: list[tuple[np.ndarray, np.ndarray]] = []
-    prepare = model.rollout_buffer.compute_returns_and_advantage
-
-    def keep_buffer(*args: Any, **kwargs: Any) -> None:
-        buffer = model.rollout_buffer
-        buffers.append((buffer.observations[:, 0].copy(), buffer.actions[:, 0].copy()))
-        prepare(*args, **kwargs)
-
-    model.rollout_buffer.compute_returns_and_advantage = keep_buffer
-
-    def follow() -> bool:
-        observations, actions = buffers[-1]
-        after, rewards, terminated, truncated, _ = zip(*recorder.results, strict=True)
-        recorder.results.clear()
-        data = rollout(
-            observations=observations,
-            actions=actions,
-            rewards=np.array(rewards),
-            next_observations=np.array(after),
-            terminated=np.array(terminated),
-            truncated=np.array(truncated),
-            kept=np.ones(len(rewards), bool),
-        )
-        ours.update(data)
-        return True
-
-    theirs.train(log, 640, follow)
-    assert len(buffers) == 10
+    assert len(train_both(theirs, ours, recorder, log, 640)) == 10
     assert any(e.truncated for e in log.episodes)
     assert any(e.terminated for e in log.episodes)
     for name, expected in theirs.actor().items():

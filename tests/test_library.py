@@ -1,11 +1,11 @@
 """The vehicles that come with the package: each flies, and each number has a source."""
 
 import re
-import runpy
 from pathlib import Path
 
 import numpy as np
 import pytest
+import vehicle_pages as pages
 from rotorgram.models import Vehicle
 from rotorgram.models.checks import examine
 from rotorgram.models.library import vehicle_names
@@ -14,7 +14,6 @@ from rotorgram.models.vehicle_file import Number, read_vehicle_file
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "models" / "vehicles"
 NAMES = ["crazyflie2", "crazyflie_brushless", "heavy_hexa", "hummingbird", "paper", "skydio_x2"]
-pages = runpy.run_path(str(ROOT / "benchmarks" / "vehicle_pages.py"))
 
 
 def numbers(name: str) -> dict[str, Number]:
@@ -27,18 +26,18 @@ def test_the_library_has_these_vehicles() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_page_is_what_the_command_would_write(name: str) -> None:
-    assert (FOLDER / name / "README.md").read_text(encoding="utf-8") == pages["readme"](name)
+    assert (FOLDER / name / "README.md").read_text(encoding="utf-8") == pages.readme(name)
 
 
 def test_the_overview_is_what_the_command_would_write() -> None:
-    assert pages["overview"]() in (ROOT / "docs" / "library.md").read_text(encoding="utf-8")
+    assert pages.overview() in (ROOT / "docs" / "library.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_number_has_a_source_that_the_page_names(name: str) -> None:
     for number in numbers(name).values():
-        for source in pages["sources"](number):
-            assert pages["works_of"](source), number.name
+        for source in pages.sources(number):
+            assert pages.works_of(source), number.name
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -52,7 +51,7 @@ def test_a_choice_between_sources_that_differ_by_5_percent_is_explained(name: st
 
 def test_a_source_that_names_no_work_is_refused() -> None:
     with pytest.raises(ValueError, match=r"begins with a work.*'somewhere'"):
-        pages["works_of"]("somewhere")
+        pages.works_of("somewhere")
 
 
 @pytest.mark.parametrize("name", NAMES)

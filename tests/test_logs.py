@@ -31,7 +31,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import VecMonitor
 from tensorboard.backend.event_processing import plugin_event_accumulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_learning import Recorder, copy_weights, log_of, rollout
+from test_learning import Recorder, log_of, rollout, train_both
 
 DOCS = Path(__file__).parent.parent / "docs" / "algorithms"
 AGENTS = ["vpg", "a2c", "sb3-a2c"]
@@ -236,38 +236,14 @@ def test_the_terms_of_vpg_by_hand() -> None:
 
 
 def test_ours_logs_what_sb3_logs_of_the_same_updates() -> None:
-    """SB3 flies; ours, from the same weights, is given the same experience."""
     config = A2CConfig(steps_per_update=64, gae_lambda=0.95, learning_rate=0.01, normalize=True)
     recorder = Recorder(elevation(episode_length=40))
     log = EpisodeLog(recorder, seed=0)
     theirs: Any = make_agent("sb3-a2c", log, config, 0)
-    ours = A2C(log, config, seed=1)
-    copy_weights(theirs, ours)
-    buffer, seen = theirs.model.rollout_buffer, []
-    prepare: Callable[..., None] = buffer.compute_returns_and_advantage
-
-    def keep_buffer(*args: Any, **kwargs: Any) -> None:
-        seen[:] = buffer.observations[:, 0].copy(), buffer.actions[:, 0].copy()
-        prepare(*args, **kwargs)
-
-    buffer.compute_returns_and_advantage = keep_buffer
-
-    def follow() -> bool:
-        after, rewards, terminated, truncated, _ = zip(*recorder.results, strict=True)
-        recorder.results.clear()
-        data = rollout(
-            observations=seen[0], actions=seen[1], rewards=np.array(rewards),
-            next_observations=np.array(after), terminated=np.array(terminated),
-            truncated=np.array(truncated), kept=np.ones(len(rewards), bool),
-        )  # fmt: skip
-        ours.update(data)
-        here, there = ours.scalars(), theirs.scalars()
+    for here, there in train_both(theirs, A2C(log, config, seed=1), recorder, log, 320):
         assert here.keys() == there.keys()
         for name, value in there.items():
             assert here[name] == pytest.approx(value, rel=2e-3, abs=2e-4), name
-        return True
-
-    theirs.train(log, 320, follow)
     assert theirs.scalars()["train/n_updates"] == 5
 
 

@@ -1,13 +1,14 @@
 """The paper's vehicle flies by the paper's numbers and by closed forms; accuracy against cost."""
 
 import math
-import runpy
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from accuracy import Accuracy, accuracy, markdown
+from measuring import read_rows, write_rows
 from rotorgram.models import Vehicle
 
 ROOT = Path(__file__).parent.parent
@@ -133,8 +134,6 @@ def test_linear_drag_slows_a_hover_and_not_its_turn() -> None:
 # --- accuracy against cost ------------------------------------------------------------------------
 
 COMMITTED = ROOT / "docs" / "results" / "physics" / "accuracy.csv"
-_script = runpy.run_path(str(ROOT / "benchmarks" / "accuracy.py"))
-accuracy, markdown, read, write = (_script[n] for n in ("accuracy", "markdown", "read", "write"))
 
 
 def _order(integrator: str, steps: tuple[float, ...]) -> float:
@@ -154,12 +153,12 @@ def test_the_others_are_of_first_order(integrator: str) -> None:
 
 def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
     rows = accuracy(Vehicle.load(DATA / "small.xml"), ["RK4"], [0.01, 0.02])
-    write(tmp_path / "new" / "table.csv", rows)
-    assert read(tmp_path / "new" / "table.csv") == rows
+    write_rows(tmp_path / "new" / "table.csv", rows)
+    assert read_rows(tmp_path / "new" / "table.csv", Accuracy) == rows
 
 
 def test_the_committed_table_is_of_this_vehicle_and_on_the_page() -> None:
-    rows = read(COMMITTED)
+    rows = read_rows(COMMITTED, Accuracy)
     assert markdown(rows) in (ROOT / "docs" / "physics.md").read_text()
     again = accuracy(Vehicle.load(), ["RK4", "Euler"], [0.005, 0.01])
     told = {(row.integrator, row.step_ms): row for row in rows}
@@ -171,7 +170,7 @@ def test_the_committed_table_is_of_this_vehicle_and_on_the_page() -> None:
 
 
 def test_the_step_of_the_papers_vehicle_is_as_true_as_the_page_says() -> None:
-    rows = {(row.integrator, row.step_ms): row for row in read(COMMITTED)}
+    rows = {(row.integrator, row.step_ms): row for row in read_rows(COMMITTED, Accuracy)}
     ours = rows["RK4", Vehicle.load().timestep * 1e3]
     assert ours.position_m < 1e-6
     assert ours.sinks_mm == pytest.approx(rows["RK4", 2].sinks_mm, rel=0.02)

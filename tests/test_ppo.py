@@ -15,7 +15,15 @@ from rotorgram.agents.ppo import PPO
 from rotorgram.agents.presets import find_preset
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.models.errors import InputError
-from test_learning import Recorder, copy_weights, elevation, log_of, rollout, torch_net
+from test_learning import (
+    Recorder,
+    copy_weights,
+    elevation,
+    log_of,
+    rollout,
+    torch_net,
+    train_both,
+)
 
 SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minibatches=1)
 
@@ -133,7 +141,7 @@ def test_every_epoch_takes_every_transition_once() -> None:
 
 
 def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
-    """SB3 flies; ours, from the same weights, is given what it flew, as one minibatch."""
+    """As one minibatch."""
     config = PPOConfig(
         steps_per_update=64, gamma=0.98, gae_lambda=0.95, learning_rate=0.003, ent_coef=0.01,
         critic_learning_rate=0.01, epochs=5, minibatches=1, clip=0.1, max_grad_norm=0.5,
@@ -142,34 +150,12 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
     log = EpisodeLog(recorder, seed=0)
     theirs: Any = make_agent("sb3-ppo", log, config, 0)
     ours = PPO(log, config, seed=1)
-    copy_weights(theirs, ours)
-    buffer, seen = theirs.model.rollout_buffer, []
-    prepare = buffer.compute_returns_and_advantage
-
-    def keep_buffer(*args: Any, **kwargs: Any) -> None:
-        seen[:] = buffer.observations[:, 0].copy(), buffer.actions[:, 0].copy()
-        prepare(*args, **kwargs)
-
-    buffer.compute_returns_and_advantage = keep_buffer
-
-    def follow() -> bool:
-        after, rewards, terminated, truncated, _ = zip(*recorder.results, strict=True)
-        recorder.results.clear()
-        data = rollout(
-            observations=seen[0], actions=seen[1], rewards=np.array(rewards),
-            next_observations=np.array(after), terminated=np.array(terminated),
-            truncated=np.array(truncated), kept=np.ones(len(rewards), bool),
-        )  # fmt: skip
-        ours.update(data)
-        here, there = ours.scalars(), theirs.scalars()
+    for here, there in train_both(theirs, ours, recorder, log, 512):
         assert here["train/clip_fraction"] == pytest.approx(there["train/clip_fraction"], abs=0.02)
         assert here["train/value_loss"] == pytest.approx(there["train/value_loss"], rel=2e-3)
         assert here["train/approx_kl"] == pytest.approx(
             there["train/approx_kl"], rel=0.02, abs=1e-5
         )
-        return True
-
-    theirs.train(log, 512, follow)
     assert any(e.truncated for e in log.episodes)
     assert any(e.terminated for e in log.episodes)
     assert ours.optimizer.steps == 40

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +13,10 @@ from rotorgram.models.vehicle_file import read_vehicle_file
 pytest.importorskip("scipy")
 pytest.importorskip("pandas")
 
+import real_flights
+
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "docs" / "results" / "real_flights"
-sys.path.insert(0, str(ROOT / "benchmarks"))
-import real_flights  # noqa: E402
 
 
 def flight(count: int, velocity: float, start: float = 0.0) -> Flight:

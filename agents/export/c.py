@@ -1,6 +1,6 @@
 """C: one header of C99, and C++ too, without a library and without allocation."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 from ...envs.spec import Discrete
@@ -82,18 +82,10 @@ def _constants(policy: NetworkPolicy, told: Mapping[str, str]) -> Iterator[str]:
     for name in ("algorithm", "env_id", "options", "vehicle", "vehicle_hash"):
         yield f"#define ROTORGRAM_{name.upper()} {_text(told[name])}"
     for name, texts in lists(spec).items():
-        yield f"#define ROTORGRAM_{name.upper()} {{ {_texts(texts)} }}"
-
-
-def _texts(texts: Iterable[str]) -> str:
-    return ", ".join(map(_text, texts))
+        yield f"#define ROTORGRAM_{name.upper()} {{ {', '.join(map(_text, texts))} }}"
 
 
 def _text(text: str) -> str:
     """A literal, in UTF-8. `?` is escaped because of trigraphs; octal escapes have three digits."""
-    escaped = {c: f"\\{chr(c)}" for c in b'"\\?'}
-    return '"' + "".join(escaped.get(c) or _character(c) for c in text.encode()) + '"'
-
-
-def _character(code: int) -> str:
-    return chr(code) if 32 <= code < 127 else f"\\{code:03o}"
+    plain = {c: chr(c) for c in range(32, 127)} | {c: f"\\{chr(c)}" for c in b'"\\?'}
+    return '"' + "".join(plain.get(c, f"\\{c:03o}") for c in text.encode()) + '"'

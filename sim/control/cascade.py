@@ -18,7 +18,7 @@ Array code for NumPy and torch with any leading axes; of a single drone the numb
 
 import math
 from collections.abc import Sequence
-from functools import reduce
+from functools import partial, reduce
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -297,17 +297,12 @@ def _smaller(a: Any, b: Any) -> Any:
     return np.minimum(a, b) if isinstance(a, np.ndarray) else a.minimum(b)
 
 
-def _sin(angle: Any) -> Any:
-    return _by_name("sin", angle)
-
-
-def _cos(angle: Any) -> Any:
-    return _by_name("cos", angle)
-
-
 def _by_name(name: str, angle: Any) -> Any:
     """Of numbers too by NumPy: a batch gets the bits of a single drone."""
     if isinstance(angle, float | np.ndarray):
         found = getattr(np, name)(angle)
         return float(found) if isinstance(angle, float) else found
     return getattr(angle, name)()
+
+
+_sin, _cos = partial(_by_name, "sin"), partial(_by_name, "cos")

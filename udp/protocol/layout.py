@@ -115,9 +115,8 @@ class Layout:
         self.command_size = self.seeds.end
         self.command_numbers = _numbers("", COMMAND_ARRAYS_AT, [self.actions] if action else [])
         if (size := max(self.state_size, self.command_size)) > MAX_MESSAGE:
-            raise InputError(
-                f"expected States and Commands of at most {MAX_MESSAGE} bytes, got {size}"
-            )
+            most = f"States and Commands of at most {MAX_MESSAGE} bytes"
+            raise InputError(f"expected {most}, got {size}")
 
 
 def _slots(at: int, drones: int, arrays: Sequence[ArrayLayout]) -> list[Slot]:

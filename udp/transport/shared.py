@@ -33,7 +33,7 @@ from ..protocol.messages import (
     Welcome,
 )
 from ..protocol.transitions import SimulatorState
-from .simulator import ALIVE_EVERY, DEFAULT_SIMULATOR, Observer, deferred_interrupt
+from .simulator import ALIVE_EVERY, DEFAULT_SIMULATOR, Observer, run_to_the_end
 from .sockets import LONGEST_WAIT, PAUSE, Port, address_text, log_notices, resolve
 from .stepped import make_stepped
 
@@ -214,20 +214,8 @@ class SharedSimulator(NotCopied):
         """
         if self._ran:
             raise ValueError("run: expected one call for each SharedSimulator, got another")
-        self._ran, reason, finished = True, "the simulator was stopped", threading.Event()
-        heart = threading.Thread(target=self._say_alive, args=(finished,), daemon=True)
-        with deferred_interrupt(self.stop) as interrupted:
-            heart.start()
-            try:
-                return self._fly() or reason
-            except Exception as error:
-                reason = f"{type(error).__name__}: {error}"
-                raise
-            finally:
-                finished.set()
-                self._close_links(reason)
-                if interrupted:
-                    raise KeyboardInterrupt
+        self._ran = True
+        return run_to_the_end(self._fly, self._close_links, self._say_alive, self.stop)
 
     def stop(self) -> None:
         """Make `run` tell the agents and return. May be called from another thread."""

@@ -134,24 +134,7 @@ class Simulator(NotCopied):
         """
         if self.link.state is SimulatorState.CLOSED or self.link.sends:
             raise ValueError("run: expected one call for each Simulator, got another")
-        reason = "the simulator was stopped"
-        finished = threading.Event()
-        heart = threading.Thread(target=self._say_alive, args=(finished,), daemon=True)
-        with deferred_interrupt(self.stop) as interrupted:
-            heart.start()
-            try:
-                return self._fly() or reason
-            except Exception as error:
-                reason = f"{type(error).__name__}: {error}"
-                raise
-            finally:
-                finished.set()
-                self.link.close(reason, time.monotonic())
-                self._exchange_until_closed()
-                if self._journal:
-                    self._journal.close()
-                if interrupted:
-                    raise KeyboardInterrupt
+        return run_to_the_end(self._fly, self._end, self._say_alive, self.stop)
 
     def stop(self) -> None:
         """Make `run` tell the agent and return, after the step that is being computed.
@@ -278,8 +261,9 @@ class Simulator(NotCopied):
         self._trouble = ""
         return self.link.receive(datagram, time.monotonic())
 
-    def _exchange_until_closed(self) -> None:
-        """Until the agent has answered our Close, or will not."""
+    def _end(self, reason: str) -> None:
+        """Tell the agent, until it has answered or will not."""
+        self.link.close(reason, time.monotonic())
         self._flush()
         while self._socket.fileno() >= 0 and (timer := self.link.next_timer()) is not None:
             left = timer - time.monotonic()
@@ -288,6 +272,8 @@ class Simulator(NotCopied):
             else:
                 self.link.handle_timer(time.monotonic())
             self._flush()
+        if self._journal:
+            self._journal.close()
 
     def _flush(self) -> None:
         """Send what is due, before any wait."""
@@ -329,8 +315,33 @@ class Simulator(NotCopied):
         )
 
 
+def run_to_the_end(
+    fly: Callable[[], str],
+    end: Callable[[str], None],
+    say_alive: Callable[[threading.Event], None],
+    stop: Callable[[], None],
+) -> str:
+    """The reason for which `fly` ended, `say_alive` beside it in a thread: `end` gets it, or what
+    went wrong. Ctrl-C calls `stop`, and is raised at the end.
+    """
+    reason, finished = "the simulator was stopped", threading.Event()
+    heart = threading.Thread(target=say_alive, args=(finished,), daemon=True)
+    with _deferred_interrupt(stop) as interrupted:
+        heart.start()
+        try:
+            return fly() or reason
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise
+        finally:
+            finished.set()
+            end(reason)
+            if interrupted:
+                raise KeyboardInterrupt
+
+
 @contextmanager
-def deferred_interrupt(stop: Callable[[], None]) -> Iterator[list[bool]]:
+def _deferred_interrupt(stop: Callable[[], None]) -> Iterator[list[bool]]:
     """Have Ctrl-C call `stop`, and only a second one interrupt. The list says whether it came."""
     came: list[bool] = []
     is_main = threading.current_thread() is threading.main_thread()
