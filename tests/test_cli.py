@@ -32,6 +32,8 @@ from rotorgram.models import QUAD_XML, InputError
 from rotorgram.udp import Simulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+SWARM = ("--env", "rotorgram/Formation-v0", "--drones", "2")
+
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
     """Exit status, standard output and standard error of a command."""
@@ -123,6 +125,16 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
             ["sim", "--agents", "here:1=drone_0", "here:2"],
             "--agents: expected drones of each agent or of none, got here:1=drone_0 here:2",
         ),
+        (["sim", "--agents"], "--agents: expected HOST:PORT of each agent, got none"),
+        (
+            ["sim", *SWARM, "--bind", "127.0.0.1:0", "--agents", "127.0.0.1:0"],
+            "agents: expected the port of each agent, 1 to 65535, got 0",
+        ),
+        (["sim", "--patience", "3"], "--patience: expected it with --agents, got 3.0"),
+        (["sim", "--when-lost", "land"], "--when-lost: expected it with --agents, got land"),
+        (["sim", "--drones", "0"], "drones: expected 1 or more, got 0"),
+        (["serve", "pid", "--drones", "0"], "drones: expected at least 1, got 0"),
+        (["train", "mappo", "--drones", "0"], "drones: expected at least 1, got 0"),
         (["train", "a2c", "--key-file", "nowhere"], "key-file, insecure: expected them with"),
         (["train", "a2c", "--store-every", "0"], "store-every: expected seconds > 0, got 0"),
         (["serve", "pid", "--listen", "0.0.0.0:0"], "--key-file), or insecure=True (--insecure)"),
@@ -434,6 +446,27 @@ def test_check_model_of_what_is_no_vehicle(
     status, out, err = run(capsys, "check-model", tmp_path / "drone.xml")
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert err.startswith(f"rotorgram: {sentence}")
+
+
+def test_worlds_of_the_simulator_that_comes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    here = f"127.0.0.1:{free_port()}"
+    swarm = ("sim", *SWARM, "--num-envs", 4, "--server", here, "--bind", "127.0.0.1:0")
+    flags = ("--env", "rotorgram/Formation-v0", "--listen", here)
+    simulator = start(*swarm)
+    status, _, err = run(capsys, "evaluate", "orca", *flags, "--drones", 4, "--episodes", 1)
+    assert (status, err) == (
+        1, "rotorgram: drones: expected a simulator of 4 in each world, got one of 2\n"
+    )  # fmt: skip
+    assert "the agent closed" in simulator.communicate(timeout=10)[0]
+    simulator = start(*swarm)
+    settings = ("--num-envs", 4, "--env-steps", 64, "--set", "steps_per_update=32", "hidden=8")
+    status, *_ = run(capsys, "train", "ippo", *flags, *settings, "--out", tmp_path / "run")
+    simulator.communicate(timeout=10)
+    assert status == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (config["num_envs"], config["drones"]) == (4, 2)
 
 
 def test_train_with_many_drones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -189,6 +189,7 @@ class SharedSimulator(NotCopied):
             self.parties = []
             for number, (address, names) in enumerate(_shares(agents, self.spec.agents)):
                 there = resolve(address, insecure=anywhere)
+                expect(there[1], "agents", "the port of each agent, 1 to 65535", "0")
                 spec = replace(self.spec, agents=names)
                 rows = np.array([self.spec.agents.index(name) for name in names])
                 party = Party(number, there, spec, rows, when_lost, self.config, key)
