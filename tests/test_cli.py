@@ -20,7 +20,7 @@ import pandas as pd
 import pytest
 from rotorgram.agents import load
 from rotorgram.agents.checkpoints import store
-from rotorgram.cli import COMMANDS, main
+from rotorgram.cli import COMMANDS, main, train
 from rotorgram.cli._env import chosen_env
 from rotorgram.cli._flags import parse
 from rotorgram.cli._scalars import ScalarWriter
@@ -106,6 +106,9 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["sim", "--server", "127.0.0.1:99999"], "address: expected HOST:PORT"),
         (["sim", "--bind", "127.0.0.1:0", "--env.target", "1"], "target: expected"),
         (["sim", "--env", "rotorgram/Nothing-v0"], "env: expected a registered id"),
+        (["sim", "--env", ":"], "env: expected MODULE:NAME with the name of a module, got ':'"),
+        (["sim", "--env", "..:x-v0"], "env: expected MODULE:NAME with the name of a module"),
+        (["sim", "--env", "os..x:x-v0"], "env: expected a module os..x here, got none"),
         (["sim", "--env", "nowhere:Nothing-v0"], "env: expected a module nowhere here, got none"),
         (["sim", "--vehicle", "nowhere.xml"], "vehicle: cannot read nowhere.xml"),
         (["compare", "--num-envs", "0"], "num_envs: expected 1 or more, got 0"),
@@ -327,6 +330,34 @@ def test_a_model_with_a_tiny_time_step(tmp_path: Path, capsys: pytest.CaptureFix
     status, out, _ = run(capsys, "check-model", tmp_path / "quad.xml")
     assert status == 1
     assert "expected a physics step of at least" in out
+
+
+@pytest.mark.parametrize(
+    ("command", "file"),
+    [
+        ("vehicle new v.toml", "v.toml"),
+        ("vehicle export crazyflie2 v.xml", "v.xml"),
+        ("evaluate pid --episodes 1 --record r.mcap", "r.mcap"),
+    ],
+)
+def test_a_file_that_cannot_be_written_is_named_and_leaves_its_name_free(
+    command: str, file: str, tmp_path: Path
+) -> None:
+    done = shell(f"cd {tmp_path} && ulimit -f 0 && rotorgram {command}")
+    assert (done.returncode, done.stderr) == (1, f"rotorgram: {file}: File too large\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_training_that_writes_nothing_leaves_the_name_of_its_folder_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(train, "write_whole", full)
+    status, _, err = run(capsys, "train", "a2c", "--out", tmp_path / "run")
+    assert (status, err) == (1, f"rotorgram: {tmp_path}/run/config.json: No space left on device\n")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_key_on_a_full_disk(capsys: pytest.CaptureFixture[str]) -> None:
