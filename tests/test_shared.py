@@ -1,5 +1,6 @@
 """One world flown by several agents over UDP: the bits of the world in process, whoever is lost."""
 
+import re
 import signal
 import socket
 import subprocess
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 from peers import ANY, Running, launch, relaying
 from rotorgram.envs.loop import Loop
-from rotorgram.models import InputError
+from rotorgram.models import QUAD_XML, InputError
 from rotorgram.udp import (
     LinkConfig,
     PeerClosed,
@@ -233,6 +234,35 @@ def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> No
     expected = in_process(3, 3, calm, (1, loss.step, policy), episode_length=LONG)
     assert [seen[i][0] for i in (0, 2)] == [expected[i][0] for i in (0, 2)]
     assert all(loss.agent != 1 or loss.presence is not Presence.LEFT for loss in later)
+
+
+def test_an_agent_that_comes_back_to_land_where_the_vehicle_cannot_ends_nobodys_flight(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    model, agents, seen = tmp_path / "no_yaw.xml", free_ports(2), {}
+    text = QUAD_XML.read_text(encoding="utf-8")
+    for rotor, reaction in (("2", "0.05"), ("3", "-0.05")):  # a yaw is always a roll, too
+        at = rf'(site="rotor{rotor}" gear="0 0 1 0 0) +[-.0-9]+'
+        text = re.sub(at, rf"\1 {reaction}", text)
+    model.write_text(text)
+    other = threading.Thread(target=fly_one, args=(agents[0], 0, 3, seen, calm))
+    victim = launch(VICTIM, agents[1][1], "hold")
+    with shared(agents, 2, episode_length=LONG, patience=4.0, vehicle=model):
+        other.start()
+        heard(victim, "20")
+        victim.kill()
+        again = launch(VICTIM, agents[1][1], "land")
+        heard(again, "20")  # of a later episode
+        again.kill()
+        other.join(60)
+    for process in (victim, again):
+        process.communicate()
+    assert [len(flight) for flight in seen[0]] == [LONG + 1] * 3
+    assert (
+        f"the agent at 127.0.0.1:{agents[1][1]} cannot have land (vehicle: expected a vehicle "
+        "whose rotors roll, pitch and yaw it, for this action, got rotorgram "
+        "quadcopter, an allocation of rank 3): hold"
+    ) in caplog.messages
 
 
 def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:

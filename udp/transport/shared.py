@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from ...envs.spec import EnvSpec
-from ...models.errors import NotCopied, expect
+from ...models.errors import InputError, NotCopied, expect
 from ..layouts import layout_of
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
@@ -507,8 +507,17 @@ class SharedSimulator(NotCopied):
                 policy = extension.value.decode("ascii", "replace")
                 if policy in POLICIES:  # of another version: that of this side
                     party.when_lost = policy
-        if party.when_lost == "land":  # raises now where it cannot
-            self.stepped.land(np.zeros(self._layout.drones, bool))
+        if party.when_lost == "land":
+            try:
+                self.stepped.land(np.zeros(self._layout.drones, bool))
+            except InputError as error:
+                if not self.episodes:
+                    raise
+                party.when_lost = self._when_lost  # one agent does not end the flight of others
+                where = address_text(party.address)
+                party.link.statistics.notice(
+                    f"the agent at {where} cannot have land ({error}): {party.when_lost}"
+                )
 
     def _take_late(self, party: Party) -> None:
         """A Command of an agent that does not take part in the running episode."""
