@@ -10,6 +10,7 @@ import pytest
 from peers import ANY, Running, relaying
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.parallel import LocalParallelEnv
+from rotorgram.experiments.datasets import RecordedEpisodes
 from rotorgram.models import InputError
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
 from rotorgram.udp.journal.replay import Verification
@@ -96,6 +97,18 @@ def test_drones_that_do_not_fill_their_worlds_are_refused() -> None:
         Simulator(RISE, bind=ANY, num_envs=3, drones=2)
     with pytest.raises(InputError, match="num_envs: expected a multiple of drones = 2, got 3"):
         LocalVectorEnv(RISE, 3, drones=2)
+
+
+def test_recorded_episodes_of_a_swarm_have_the_seed_of_their_world(tmp_path: Path) -> None:
+    journal = tmp_path / "swarm.mcap"
+    with flying(4, 2) as address:
+        remote = RemoteVectorEnv(address, autoreset_mode="Disabled", record=journal)
+        remote.reset(seed=5)
+        while not remote.done.all():
+            remote.step(np.zeros((4, 1), np.float32))
+        remote.close()
+    found = [(one.drone, one.seed, len(one)) for one in RecordedEpisodes([journal])]
+    assert sorted(found) == [(0, 5, 30), (1, 5, 30), (2, 7, 30), (3, 7, 30)]
 
 
 def test_a_journal_of_a_swarm_is_simulated_again(tmp_path: Path) -> None:
