@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from rotorgram.udp import (
     RemoteVectorEnv,
     SharedSimulator,
 )
+from rotorgram.udp.journal.replay import Verification
 from rotorgram.udp.protocol.auth import write_key
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
 from rotorgram.udp.transport.relay import FaultConfig
@@ -408,6 +409,26 @@ def test_the_command_flies_the_world_of_several_agents() -> None:
     assert closed == "the agent closed"
     assert [wire.split(": ")[0] for wire in wires] == [f"wire to {one}" for one in where]
     assert seen == in_process(2, 1)
+
+
+def test_a_journal_of_a_part_of_a_world_cannot_be_simulated_and_says_so_briefly(
+    tmp_path: Path,
+) -> None:
+    agents, journal = free_ports(2), tmp_path / "part.mcap"
+
+    def begin(address: tuple[str, int], **settings: Any) -> None:
+        with closing(RemoteVectorEnv(address, connect_timeout=60, **settings)) as env:
+            env.reset(seed=0)
+
+    formation = SharedSimulator("rotorgram/Formation-v0", agents, drones=4, bind=ANY)
+    running = Running(formation)
+    in_threads([lambda: begin(agents[0], record=journal), lambda: begin(agents[1])])
+    assert running.join() == "the agent closed"
+    verdict = Verification(journal)
+    assert not verdict.identical
+    told = str(verdict).splitlines()
+    assert told[1].startswith("  State 1 cannot be repeated: expected an env of the observation (")
+    assert len(told[1]) < 500
 
 
 def test_an_agent_of_each_own_names() -> None:
