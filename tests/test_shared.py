@@ -24,6 +24,7 @@ from rotorgram.udp import (
     RemoteEnv,
     RemoteVectorEnv,
     SharedSimulator,
+    Simulator,
 )
 from rotorgram.udp.journal.replay import Verification
 from rotorgram.udp.protocol.auth import write_key
@@ -455,6 +456,22 @@ def test_an_agent_that_does_not_come_is_named() -> None:
     assert str(result).startswith(expected)
 
 
+def test_who_is_waited_for_is_told_soon(caplog: pytest.LogCaptureFixture) -> None:
+    there, late = free_ports(2)
+    with shared([there, late], 2), closing(RemoteEnv(there, connect=False)) as env:
+        first = threading.Thread(target=env.reset)
+        first.start()
+        while not caplog.messages:
+            assert first.is_alive()
+        with closing(RemoteEnv(late)) as other:
+            other.reset()
+        first.join(60)
+    where = f"127.0.0.1:{late[1]}"
+    assert (
+        caplog.messages[0] == f"no answer from the agent at {where} for 1 s; asking for 60 s in all"
+    )
+
+
 def test_an_agent_that_refuses_is_named() -> None:
     agents = free_ports(2)
     with shared(agents, 2) as running:
@@ -486,6 +503,14 @@ def test_wrong_arguments_are_told(changes: dict[str, Any], sentence: str) -> Non
     with pytest.raises(InputError) as told:
         SharedSimulator(given.pop("env"), given.pop("agents"), **given)
     assert str(told.value).startswith(sentence)
+
+
+def test_this_side_is_no_agent() -> None:
+    (here,) = free_ports(1)
+    with pytest.raises(InputError, match="agents: expected addresses of agents, got that of this"):
+        SharedSimulator(RISE, [here], drones=1, bind=here)
+    with pytest.raises(InputError, match="server: expected the address of the agent, got that of"):
+        Simulator(server=here, bind=here)
 
 
 def test_a_policy_that_does_not_exist_is_told() -> None:

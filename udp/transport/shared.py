@@ -33,7 +33,13 @@ from ..protocol.messages import (
     Welcome,
 )
 from ..protocol.transitions import SimulatorState
-from .simulator import ALIVE_EVERY, DEFAULT_SIMULATOR, Observer, deferred_interrupt
+from .simulator import (
+    ALIVE_EVERY,
+    COMPLAIN_AFTER,
+    DEFAULT_SIMULATOR,
+    Observer,
+    deferred_interrupt,
+)
 from .sockets import LONGEST_WAIT, PAUSE, Port, address_text, log_notices, resolve
 from .stepped import make_stepped
 
@@ -96,6 +102,7 @@ class Party:
         self.presence = Presence.COMING
         self.command: Command | None = None  # that the next step or reset takes
         self.patient_until = 0.0
+        self.complain_at: float | None = None
         self.seed: int | None = None  # of the Welcome
         self.in_flight = np.zeros(len(rows), bool)  # drones, when it was lost
         self.shown: tuple[Any, ...] = ()  # observations and telemetry of its last State
@@ -201,6 +208,8 @@ class SharedSimulator(NotCopied):
             failing.callback(self._port.close)
             self._port.keep(self._by_address)
             self.address: Address = self._port.address
+            others = self.address not in self._by_address
+            expect(others, "agents", "addresses of agents", f"that of this side, {self.address}")
             failing.pop_all()
 
     def run(self) -> str:
@@ -252,6 +261,7 @@ class SharedSimulator(NotCopied):
         now = time.monotonic()
         for party in self.parties:
             party.link.connect(now)
+            party.complain_at = now + COMPLAIN_AFTER
         self._left = ""
         while not self._stopped:
             self._flush()
@@ -473,6 +483,11 @@ class SharedSimulator(NotCopied):
             self._lose(party, Presence.LEFT, why)
             if len(self._who(Presence.LEFT)) == len(self.parties):
                 raise PeerSilent(f"{why}, and no other is left")
+        elif party.presence is Presence.COMING and party.complain_at and now > party.complain_at:
+            why = f"no answer from the agent at {address_text(party.address)} for "
+            why += f"{COMPLAIN_AFTER:g} s; asking for {self.config.timeout:g} s in all"
+            party.link.statistics.notice(why)
+            party.complain_at = None
 
     def _receive(self, party: Party, datagram: bytes) -> None:
         session = party.link.hello.session
