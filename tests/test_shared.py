@@ -267,6 +267,28 @@ def test_an_agent_that_comes_back_to_land_where_the_vehicle_cannot_ends_nobodys_
     ) in caplog.messages
 
 
+def test_one_that_is_started_anew_before_the_others_come_flies_the_first_episode() -> None:
+    agents, seen = free_ports(2), {}
+    with shared(agents, 2, episode_length=60) as running:
+        first = launch(VICTIM, agents[0][1], "end")
+        while running.simulator.parties[0].presence is not Presence.READY:
+            assert running.thread.is_alive()
+        first.kill()
+        again = launch(VICTIM, agents[0][1], "end")
+        fly_one(agents[1], 1, 1, seen, calm)
+        heard(again, "60")
+        again.kill()
+    for process in (first, again):
+        process.communicate()
+    assert [absence.episode for absence in running.simulator.absences] == [2] * len(
+        running.simulator.absences
+    )
+    expected = in_process(
+        2, 1, lambda i, *at: calm(i, *at) if i else np.zeros(1, np.float32), episode_length=60
+    )
+    assert seen[1] == expected[1]
+
+
 def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:
     agents, seen = free_ports(2), {}
     other = threading.Thread(target=fly_one, args=(agents[0], 0, 3, seen, calm))

@@ -278,6 +278,12 @@ class SharedSimulator(NotCopied):
             if len(self._who(Presence.READY)) < len(self.parties):
                 return False
             self._begin(first=True)
+        elif again := self._started_anew():
+            if any(party.presence is Presence.COMING for party in again):
+                return False
+            for party in again:
+                party.presence = Presence.FLYING
+                self._send(party)
         elif not flying:
             if not self._who(Presence.WAITING, Presence.READY):
                 return False
@@ -295,6 +301,19 @@ class SharedSimulator(NotCopied):
         else:
             self._step(flying)
         return True
+
+    @property
+    def _is_first_start(self) -> bool:
+        """Whether the first episode has begun, and nothing was flown."""
+        return self.episodes == 1 and self.steps == 0
+
+    def _started_anew(self) -> list[Party]:
+        """Agents that were started anew before the last one came: the first step waits for them."""
+        if not self._is_first_start:
+            return []
+        lost = {absence.agent for absence in self.absences}
+        coming = self._who(Presence.COMING, Presence.READY)
+        return [party for party in coming if party.number not in lost]
 
     def _begin(self, *, first: bool = False) -> None:
         """Begin an episode for all that take part."""
@@ -493,7 +512,10 @@ class SharedSimulator(NotCopied):
         session = party.link.hello.session
         message = party.link.receive(datagram, time.monotonic())
         if party.link.hello.session != session:  # its answer was Unknown
-            self._lose(party, Presence.COMING, "it was started anew")
+            if self._is_first_start and party.presence is Presence.FLYING:
+                party.presence = Presence.COMING  # before the others came: they wait for it
+            else:
+                self._lose(party, Presence.COMING, "it was started anew")
         elif message is not None and party.presence is not Presence.LEFT:
             self._take(party, message)
 
