@@ -13,6 +13,7 @@ from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.experiments.datasets import RecordedEpisodes
 from rotorgram.models import InputError
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
+from rotorgram.udp.journal.reader import Summary
 from rotorgram.udp.journal.replay import Verification
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
 from rotorgram.udp.transport.relay import FaultConfig
@@ -109,6 +110,22 @@ def test_recorded_episodes_of_a_swarm_have_the_seed_of_their_world(tmp_path: Pat
         remote.close()
     found = [(one.drone, one.seed, len(one)) for one in RecordedEpisodes([journal])]
     assert sorted(found) == [(0, 5, 30), (1, 5, 30), (2, 7, 30), (3, 7, 30)]
+
+
+def test_a_summary_counts_no_steps_of_drones_that_are_out(tmp_path: Path) -> None:
+    journal, flown = tmp_path / "swarm.mcap", 0
+    with flying(3, 3) as address:
+        remote = RemoteParallelEnv(address, record=journal)
+        for seed in (1, 2):
+            remote.reset(seed=seed)
+            while remote.agents:  # the higher its number, the sooner it is out
+                climb = {agent: np.full(1, int(agent[-1]) / 2, "f") for agent in remote.agents}
+                flown += len(climb)
+                remote.step(climb)
+        remote.close()
+    (session,) = Summary(journal).sessions
+    assert (session.steps, session.episodes) == (flown, 6)
+    assert flown < 3 * (session.states - 2)
 
 
 def test_a_journal_of_a_swarm_is_simulated_again(tmp_path: Path) -> None:
