@@ -155,7 +155,7 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
         MissingPackage: SB3 is not installed.
     """
     kept.check_resumable()
-    for name in ("env_id", "options", "vehicle_hash", "observation", "action"):
+    for name in ("env_id", "options", "agents", "vehicle_hash", "observation", "action"):
         expected, got = getattr(kept.spec, name), getattr(log.spec, name)
         if expected == got or got == "0" * 32:  # the hash of a peer that tells none
             continue
@@ -164,7 +164,12 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
             raise ResumeError(
                 f"resume: expected {then}, got {now}; name the vehicle with --vehicle"
             )
-        raise ResumeError(f"resume: expected an env with {name} {expected}, got {got}")
+        if name == "options":  # those that differ
+            names = [one for one in {**expected, **got} if expected.get(one) != got.get(one)]
+            expected, got = ({one: o[one] for one in names if one in o} for o in (expected, got))
+        raise ResumeError(
+            f"resume: expected an env with {name} {expected!s:.300}, got {got!s:.300}"
+        )
     try:
         config = preset(kept.algorithm, "tuned", **kept.config)
         layers = kept.policy().layers

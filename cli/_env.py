@@ -13,7 +13,7 @@ from ..experiments.trajectories import Trajectory
 from ..models import Backend
 from ..models.errors import expect
 from ..udp import RemoteEnv, RemoteVectorEnv
-from ._flags import AgentFlags, EnvFlags, parse_address
+from ._flags import AgentFlags, EnvFlags, check_count, parse_address
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 Controller = type[PID] | type[Geometric] | type[Orca]
@@ -176,6 +176,7 @@ def local_env(
 def _waiting(
     command: AgentFlags, listen: str, num_envs: int | None, num_simulators: int, **settings: Any
 ) -> Iterator[RemoteEnv | RemoteVectorEnv]:
+    check_count("drones", command.drones)
     if command.vehicle is not None:
         from ..models.fleet import load_vehicles  # an agent needs no MuJoCo otherwise
 
@@ -198,4 +199,7 @@ def _waiting(
         here = "{}:{}".format(*remote.address)
         print(f"waiting for {waited} at {here} (Ctrl-C ends)", flush=True)
         remote.connect()
+        came = len(remote.env_spec.agents)
+        right = "drones" not in command.given or came == command.drones
+        expect(right, "drones", f"a simulator of {command.drones} in each world", f"one of {came}")
         yield remote

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, TypeVar, Union, cast, get_args, get_or
 import tyro
 from tyro.conf import Fixed, Suppress, arg
 
-from ..experiments.folders import new_folder
+from ..experiments.folders import LOCK, new_folder
 from ..models import Backend
 from ..models.errors import InputError, expect
 
@@ -229,6 +229,8 @@ def folder_to_write(out: Path | None, name: str) -> Iterator[Path]:
         yield folder
     except BaseException:
         with suppress(OSError):  # it holds something
+            if {file.name for file in folder.iterdir()} == {LOCK}:
+                (folder / LOCK).unlink()
             folder.rmdir()
         raise
 

@@ -42,6 +42,7 @@ class Identify(Command):
         from ..experiments.identified_vehicle import identified_toml
         from ..experiments.identify import DEFAULT, SEGMENT, identify
         from ..models.errors import expect, require
+        from ..models.files import write_new
         from ..models.vehicle import Vehicle
 
         require("scipy", "identify", "system identification")
@@ -70,6 +71,6 @@ class Identify(Command):
         errors = ", ".join(f"{name} {b:.3g} -> {a:.3g} {unit}" for (name, unit), b, a in pairs)
         print(f"mean error of {found.windows} predictions over {self.window:g} s: {errors}")
         print(f"intervals: sandwich, clustered over {found.segments} segments of {SEGMENT:g} s")
-        self.out.write_text(identified_toml(vehicle, found), encoding="utf-8")
+        write_new(self.out, identified_toml(vehicle, found))
         print(self.out)
         return 0

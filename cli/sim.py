@@ -56,8 +56,11 @@ class Sim(BackendFlags):
 
     def run(self) -> int:
         """Simulate until the agent closes."""
-        if self.agents:
+        if "agents" in self.given:
             return self._run_shared()
+        for name in ("when_lost", "patience"):
+            flag = f"--{name.replace('_', '-')}"
+            expect(name not in self.given, flag, "it with --agents", f"{getattr(self, name)}")
         from ..udp import LinkConfig, Simulator
 
         simulator = Simulator(
@@ -86,6 +89,7 @@ class Sim(BackendFlags):
         for name in ("server", "num_envs", "codec", "record"):
             flag = f"--{name.replace('_', '-')}"
             expect(name not in self.given, flag, "none with --agents", f"{getattr(self, name)}")
+        expect(self.agents, "--agents", "HOST:PORT of each agent", "none")
         named = {address: names.split(",") for address, _, names in
                  (agent.partition("=") for agent in self.agents) if names}  # fmt: skip
         right = len(named) in (0, len(self.agents))

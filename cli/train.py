@@ -24,6 +24,7 @@ from ..models.errors import expect, require
 from ._flags import (
     AgentFlags,
     BackendFlags,
+    check_count,
     folder_to_write,
     go_on_with,
     parse_value,
@@ -87,6 +88,7 @@ class Train(AgentFlags, BackendFlags):
     def _begin(self) -> int:
         from ..experiments.training import Training
 
+        check_count("drones", self.drones)
         start, told = self._start()
         changes = {name: start.config[name] for name in NETWORKS} if start else {}
         changes |= dict(_change(word) for words in self.set for word in words)
@@ -108,7 +110,7 @@ class Train(AgentFlags, BackendFlags):
             locked(folder),
         ):  # fmt: skip
             spec = env.env_spec  # of the simulator that came
-            run = replace(run, env_id=spec.env_id, options=spec.options)
+            run = replace(run, env_id=spec.env_id, options=spec.options, drones=len(spec.agents))
             training = Training(run, env, start=start)
             about = {"vehicle_hash": spec.vehicle_hash, "versions": software_versions()}
             content = json.dumps({**asdict(run), **told, **about}, indent=2) + "\n"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 from tyro.conf import Positional, arg
 
 from ..models.errors import expect
+from ..models.files import write_new
 from ._flags import Command
 
 if TYPE_CHECKING:
@@ -111,8 +112,7 @@ class Vehicle(Command):
             thrust=f"[0.0, {30.0 / count}]",  # twice the weight
             listed=_LIST if listed else "",
         )
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
+        write_new(path, text)
         print(f"vehicle: {path} (rotorgram vehicle check {path} examines it)")
 
     def _show(self) -> None:

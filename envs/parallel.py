@@ -72,8 +72,9 @@ class AdvancingParallelEnv(NotCopied, ParallelEnv[str, Any, Any]):  # type: igno
         expect(right, "actions", f"a dict with {', '.join(flown)}", f"{got}")
         space = world.action_space
         given = np.zeros(space.shape or (), space.dtype)
-        for agent in flown:
-            given[self._rows[agent]] = self._checked(agent, actions[agent])
+        with np.errstate(over="ignore"):  # an overflow is infinite, and refused as such
+            for agent in flown:
+                given[self._rows[agent]] = self._checked(agent, actions[agent])
         seen, rewards, terminated, truncated, info = world.step(given)
         left, scores, ends, cuts = (
             {agent: values[self._rows[agent]].item() for agent in flown}

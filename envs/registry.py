@@ -49,10 +49,12 @@ def load(env_id: str) -> str:
     if colon:
         if "" not in sys.path:
             sys.path.append("")  # last: no file there takes the place of an installed package
+        right = module and not module.startswith(".")
+        expect(right, "env", "MODULE:NAME with the name of a module", repr(env_id))
         try:
             import_module(module)
         except ModuleNotFoundError as error:
-            if error.name != module.partition(".")[0] and error.name != module:
+            if not module.startswith(error.name or "?"):
                 raise
             raise InputError(f"env: expected a module {module} here, got none") from None
         if not is_known(name):

@@ -40,7 +40,7 @@ class RecordedEpisode:
     drone: int
     """Of the session, from 0."""
     seed: int | None
-    """Of the reset that began it; None where that went on with the drone's random numbers."""
+    """Of the reset that began its world; None where that went on with its random numbers."""
     observations: dict[str, np.ndarray]
     """By name, shape (T + 1, *shape), of the spec's dtypes: as on the wire."""
     actions: np.ndarray
@@ -132,7 +132,7 @@ class _Session:
         self.left_out = 0
         self._journal = journal
         self._sequence: int | None = None
-        count = session.num_envs
+        count, self._drones = session.num_envs, len(session.spec.agents)
         self._rows: list[list[tuple[State, Any]]] = [[] for _ in range(count)]
         """Of each drone: the States of its episode, each with the actions before it."""
         self._seeds: list[int | None] = [None] * count
@@ -173,7 +173,8 @@ class _Session:
         for drone in np.flatnonzero(drones).tolist():
             self.left_out += len(self._rows[drone]) > 1
             self._rows[drone] = [(state, None)]
-            self._seeds[drone] = None if seeds is None else seeds[drone]
+            first = drone - drone % self._drones  # of its world: its seed counts
+            self._seeds[drone] = None if seeds is None else seeds[first]
 
     def _episode(self, drone: int) -> RecordedEpisode:
         spec, rows = self.session.spec, self._rows[drone]

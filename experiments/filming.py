@@ -258,6 +258,7 @@ def _comparison_shots(folder: Path, results: "Results") -> list[Shot]:
     from .metrics import final_evaluations, final_per_run
 
     spec, vehicle = results.spec, results.config["vehicle"]
+    drones = len(spec.agents)
     final = final_per_run(results.evaluations, results.headline)
     shown = final_evaluations(results.evaluations)
     starts = results.headline.size(shown["start"].to_numpy())
@@ -271,7 +272,8 @@ def _comparison_shots(folder: Path, results: "Results") -> list[Shot]:
         file = folder / "checkpoints" / f"{agent}-seed{seed}.safetensors"
         policy: Policy = PID(spec) if agent == "pid" else load(file).policy()
         flown = flown_trajectories(
-            policy, spec.env_id, spec.options, [episode], vehicle=vehicle, of="final"
+            policy, spec.env_id, spec.options, [episode], vehicle=vehicle, of="final", drones=drones
         )
-        shots.append(Shot(name=name, color=agent_color(agent, dark=True), trajectories=flown))
+        color = agent_color(agent, dark=True)
+        shots.append(Shot(name=name, color=color, trajectories=flown, drones=drones))
     return shots

@@ -6,8 +6,12 @@ from contextlib import contextmanager
 from datetime import datetime
 from itertools import count
 from pathlib import Path
+from typing import Final
 
 from ..models.errors import InputError, expect
+
+LOCK: Final = ".lock"
+"""File in a folder that its writer holds locked."""
 
 
 class FolderBusy(InputError):
@@ -43,7 +47,7 @@ def locked(folder: Path) -> Iterator[None]:
     Raises `FolderBusy` if another process holds it, `InputError` if it cannot be written.
     """
     try:
-        file = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        file = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except FileNotFoundError:
         raise InputError(f"{folder}: expected a folder, there is none") from None
     except OSError as error:

@@ -166,7 +166,7 @@ class _ManyRuns(RunsConfig, EnvConfig):
         seeds, spec = content["seeds"], content["spec"]
         kept = {name: content[name] for name in ("preset", "env_steps", "num_envs", "vehicle")}
         kept |= {name: spec[name] for name in ("env_id", "options")}
-        kept["backend"] = content.get("backend", "mujoco")
+        kept |= {"backend": content.get("backend", "mujoco"), "drones": len(spec["agents"])}
         return kept | {"seeds": len(seeds), "first_seed": seeds[0]}
 
     def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:

@@ -5,6 +5,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from .errors import InputError, expect
+from .files import write_new
 from .library import find_vehicle
 from .scene import read_spec
 from .vehicle import Vehicle
@@ -24,7 +25,7 @@ def export_mjcf(vehicle: Path | str, out: Path) -> str:
     if path.suffix.lower() == ".toml":
         file = read_vehicle_file(path)
         if file.model is None:
-            out.write_text(file.mjcf(), encoding="utf-8")
+            write_new(out, file.mjcf())
             return "every number with all its digits"
         path = file.model
     try:
@@ -36,5 +37,5 @@ def export_mjcf(vehicle: Path | str, out: Path) -> str:
             folder = path.parent / compiler.get(key, "")
             compiler.set(key, os.path.relpath(folder, out.resolve().parent))
     text = ElementTree.tostring(root, encoding="unicode") + "\n"
-    out.write_text(text, encoding="utf-8")
+    write_new(out, text)
     return "numbers with the six digits that MuJoCo writes"

@@ -94,22 +94,27 @@ def write_film(
                 raise ValueError(f"film: expected frames of uint8, shape {shape}, {got}")
             yield frame
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-        unfinished = Path(folder) / path.name
-        match path.suffix.lower():
-            case ".mp4":
-                _write_mp4(unfinished, counted(), first.shape, fps, quality)
-            case ".gif":
-                _write_gif(unfinished, counted(), fps)
-            case ".png":
-                last = deque(counted(), maxlen=1).pop()
-                Image.fromarray(last).save(unfinished)
-            case _:
-                unfinished.mkdir()
-                for number, frame in enumerate(counted(), 1):
-                    Image.fromarray(frame).save(unfinished / f"{number:04}.png")
-        unfinished.rename(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+            unfinished = Path(folder) / path.name
+            match path.suffix.lower():
+                case ".mp4":
+                    _write_mp4(unfinished, counted(), first.shape, fps, quality)
+                case ".gif":
+                    _write_gif(unfinished, counted(), fps)
+                case ".png":
+                    last = deque(counted(), maxlen=1).pop()
+                    Image.fromarray(last).save(unfinished)
+                case _:
+                    unfinished.mkdir()
+                    for number, frame in enumerate(counted(), 1):
+                        Image.fromarray(frame).save(unfinished / f"{number:04}.png")
+            unfinished.rename(path)
+    except OSError as error:
+        if error.errno is None:  # FFmpeg's words
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from None
     return count
 
 

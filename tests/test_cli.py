@@ -20,7 +20,7 @@ import pandas as pd
 import pytest
 from rotorgram.agents import load
 from rotorgram.agents.checkpoints import store
-from rotorgram.cli import COMMANDS, main
+from rotorgram.cli import COMMANDS, main, train
 from rotorgram.cli._env import chosen_env
 from rotorgram.cli._flags import parse
 from rotorgram.cli._scalars import ScalarWriter
@@ -31,6 +31,8 @@ from rotorgram.experiments.trajectories import flown_trajectories
 from rotorgram.models import QUAD_XML, InputError
 from rotorgram.udp import Simulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+SWARM = ("--env", "rotorgram/Formation-v0", "--drones", "2")
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -104,6 +106,9 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["sim", "--server", "127.0.0.1:99999"], "address: expected HOST:PORT"),
         (["sim", "--bind", "127.0.0.1:0", "--env.target", "1"], "target: expected"),
         (["sim", "--env", "rotorgram/Nothing-v0"], "env: expected a registered id"),
+        (["sim", "--env", ":"], "env: expected MODULE:NAME with the name of a module, got ':'"),
+        (["sim", "--env", "..:x-v0"], "env: expected MODULE:NAME with the name of a module"),
+        (["sim", "--env", "os..x:x-v0"], "env: expected a module os..x here, got none"),
         (["sim", "--env", "nowhere:Nothing-v0"], "env: expected a module nowhere here, got none"),
         (["sim", "--vehicle", "nowhere.xml"], "vehicle: cannot read nowhere.xml"),
         (["compare", "--num-envs", "0"], "num_envs: expected 1 or more, got 0"),
@@ -123,6 +128,16 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
             ["sim", "--agents", "here:1=drone_0", "here:2"],
             "--agents: expected drones of each agent or of none, got here:1=drone_0 here:2",
         ),
+        (["sim", "--agents"], "--agents: expected HOST:PORT of each agent, got none"),
+        (
+            ["sim", *SWARM, "--bind", "127.0.0.1:0", "--agents", "127.0.0.1:0"],
+            "agents: expected the port of each agent, 1 to 65535, got 0",
+        ),
+        (["sim", "--patience", "3"], "--patience: expected it with --agents, got 3.0"),
+        (["sim", "--when-lost", "land"], "--when-lost: expected it with --agents, got land"),
+        (["sim", "--drones", "0"], "drones: expected 1 or more, got 0"),
+        (["serve", "pid", "--drones", "0"], "drones: expected at least 1, got 0"),
+        (["train", "mappo", "--drones", "0"], "drones: expected at least 1, got 0"),
         (["train", "a2c", "--key-file", "nowhere"], "key-file, insecure: expected them with"),
         (["train", "a2c", "--store-every", "0"], "store-every: expected seconds > 0, got 0"),
         (["serve", "pid", "--listen", "0.0.0.0:0"], "--key-file), or insecure=True (--insecure)"),
@@ -317,6 +332,34 @@ def test_a_model_with_a_tiny_time_step(tmp_path: Path, capsys: pytest.CaptureFix
     assert "expected a physics step of at least" in out
 
 
+@pytest.mark.parametrize(
+    ("command", "file"),
+    [
+        ("vehicle new v.toml", "v.toml"),
+        ("vehicle export crazyflie2 v.xml", "v.xml"),
+        ("evaluate pid --episodes 1 --record r.mcap", "r.mcap"),
+    ],
+)
+def test_a_file_that_cannot_be_written_is_named_and_leaves_its_name_free(
+    command: str, file: str, tmp_path: Path
+) -> None:
+    done = shell(f"cd {tmp_path} && ulimit -f 0 && rotorgram {command}")
+    assert (done.returncode, done.stderr) == (1, f"rotorgram: {file}: File too large\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_training_that_writes_nothing_leaves_the_name_of_its_folder_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(train, "write_whole", full)
+    status, _, err = run(capsys, "train", "a2c", "--out", tmp_path / "run")
+    assert (status, err) == (1, f"rotorgram: {tmp_path}/run/config.json: No space left on device\n")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_key_on_a_full_disk(capsys: pytest.CaptureFixture[str]) -> None:
     status, _, err = run(capsys, "key", "/dev/full")
     assert (status, err.count("\n")) == (1, 1)
@@ -434,6 +477,27 @@ def test_check_model_of_what_is_no_vehicle(
     status, out, err = run(capsys, "check-model", tmp_path / "drone.xml")
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert err.startswith(f"rotorgram: {sentence}")
+
+
+def test_worlds_of_the_simulator_that_comes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    here = f"127.0.0.1:{free_port()}"
+    swarm = ("sim", *SWARM, "--num-envs", 4, "--server", here, "--bind", "127.0.0.1:0")
+    flags = ("--env", "rotorgram/Formation-v0", "--listen", here)
+    simulator = start(*swarm)
+    status, _, err = run(capsys, "evaluate", "orca", *flags, "--drones", 4, "--episodes", 1)
+    assert (status, err) == (
+        1, "rotorgram: drones: expected a simulator of 4 in each world, got one of 2\n"
+    )  # fmt: skip
+    assert "the agent closed" in simulator.communicate(timeout=10)[0]
+    simulator = start(*swarm)
+    settings = ("--num-envs", 4, "--env-steps", 64, "--set", "steps_per_update=32", "hidden=8")
+    status, *_ = run(capsys, "train", "ippo", *flags, *settings, "--out", tmp_path / "run")
+    simulator.communicate(timeout=10)
+    assert status == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (config["num_envs"], config["drones"]) == (4, 2)
 
 
 def test_train_with_many_drones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

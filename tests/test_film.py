@@ -169,6 +169,17 @@ def test_what_is_no_film_is_one_sentence(
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 
+def test_a_picture_on_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", full)
+    with pytest.raises(OSError, match="No space left on device") as told:
+        write_film(tmp_path / "a.png", greys(1), 25.0)
+    assert told.value.filename == str(tmp_path / "a.png")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_encoder_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
     with pytest.raises(OSError, match="ffmpeg: the film could not be written"):

@@ -47,3 +47,5 @@ def test_a_missing_or_wrong_action_is_one_sentence() -> None:
     wrong = {"drone_0": np.zeros(1, np.float32), "drone_1": "up"}
     with pytest.raises(InputError, match=r"of shape \(1,\) for drone_1, got 'up'"):
         env.step(wrong)
+    with pytest.raises(InputError, match=r"actions: expected finite numbers, got \[inf\]"):
+        env.step(dict.fromkeys(env.agents, np.full(1, 1e39)))

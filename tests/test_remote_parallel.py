@@ -10,8 +10,10 @@ import pytest
 from peers import ANY, Running, relaying
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.parallel import LocalParallelEnv
+from rotorgram.experiments.datasets import RecordedEpisodes
 from rotorgram.models import InputError
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
+from rotorgram.udp.journal.reader import Summary
 from rotorgram.udp.journal.replay import Verification
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
 from rotorgram.udp.transport.relay import FaultConfig
@@ -96,6 +98,34 @@ def test_drones_that_do_not_fill_their_worlds_are_refused() -> None:
         Simulator(RISE, bind=ANY, num_envs=3, drones=2)
     with pytest.raises(InputError, match="num_envs: expected a multiple of drones = 2, got 3"):
         LocalVectorEnv(RISE, 3, drones=2)
+
+
+def test_recorded_episodes_of_a_swarm_have_the_seed_of_their_world(tmp_path: Path) -> None:
+    journal = tmp_path / "swarm.mcap"
+    with flying(4, 2) as address:
+        remote = RemoteVectorEnv(address, autoreset_mode="Disabled", record=journal)
+        remote.reset(seed=5)
+        while not remote.done.all():
+            remote.step(np.zeros((4, 1), np.float32))
+        remote.close()
+    found = [(one.drone, one.seed, len(one)) for one in RecordedEpisodes([journal])]
+    assert sorted(found) == [(0, 5, 30), (1, 5, 30), (2, 7, 30), (3, 7, 30)]
+
+
+def test_a_summary_counts_no_steps_of_drones_that_are_out(tmp_path: Path) -> None:
+    journal, flown = tmp_path / "swarm.mcap", 0
+    with flying(3, 3) as address:
+        remote = RemoteParallelEnv(address, record=journal)
+        for seed in (1, 2):
+            remote.reset(seed=seed)
+            while remote.agents:  # the higher its number, the sooner it is out
+                climb = {agent: np.full(1, int(agent[-1]) / 2, "f") for agent in remote.agents}
+                flown += len(climb)
+                remote.step(climb)
+        remote.close()
+    (session,) = Summary(journal).sessions
+    assert (session.steps, session.episodes) == (flown, 6)
+    assert flown < 3 * (session.states - 2)
 
 
 def test_a_journal_of_a_swarm_is_simulated_again(tmp_path: Path) -> None:

@@ -1,12 +1,13 @@
 """One world flown by several agents over UDP: the bits of the world in process, whoever is lost."""
 
+import re
 import signal
 import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 from peers import ANY, Running, launch, relaying
 from rotorgram.envs.loop import Loop
-from rotorgram.models import InputError
+from rotorgram.models import QUAD_XML, InputError
 from rotorgram.udp import (
     LinkConfig,
     PeerClosed,
@@ -23,7 +24,9 @@ from rotorgram.udp import (
     RemoteEnv,
     RemoteVectorEnv,
     SharedSimulator,
+    Simulator,
 )
+from rotorgram.udp.journal.replay import Verification
 from rotorgram.udp.protocol.auth import write_key
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
 from rotorgram.udp.transport.relay import FaultConfig
@@ -235,6 +238,57 @@ def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> No
     assert all(loss.agent != 1 or loss.presence is not Presence.LEFT for loss in later)
 
 
+def test_an_agent_that_comes_back_to_land_where_the_vehicle_cannot_ends_nobodys_flight(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    model, agents, seen = tmp_path / "no_yaw.xml", free_ports(2), {}
+    text = QUAD_XML.read_text(encoding="utf-8")
+    for rotor, reaction in (("2", "0.05"), ("3", "-0.05")):  # a yaw is always a roll, too
+        at = rf'(site="rotor{rotor}" gear="0 0 1 0 0) +[-.0-9]+'
+        text = re.sub(at, rf"\1 {reaction}", text)
+    model.write_text(text)
+    other = threading.Thread(target=fly_one, args=(agents[0], 0, 3, seen, calm))
+    victim = launch(VICTIM, agents[1][1], "hold")
+    with shared(agents, 2, episode_length=LONG, patience=4.0, vehicle=model):
+        other.start()
+        heard(victim, "20")
+        victim.kill()
+        again = launch(VICTIM, agents[1][1], "land")
+        heard(again, "20")  # of a later episode
+        again.kill()
+        other.join(60)
+    for process in (victim, again):
+        process.communicate()
+    assert [len(flight) for flight in seen[0]] == [LONG + 1] * 3
+    assert (
+        f"the agent at 127.0.0.1:{agents[1][1]} cannot have land (vehicle: expected a vehicle "
+        "whose rotors roll, pitch and yaw it, for this action, got rotorgram "
+        "quadcopter, an allocation of rank 3): hold"
+    ) in caplog.messages
+
+
+def test_one_that_is_started_anew_before_the_others_come_flies_the_first_episode() -> None:
+    agents, seen = free_ports(2), {}
+    with shared(agents, 2, episode_length=60) as running:
+        first = launch(VICTIM, agents[0][1], "end")
+        while running.simulator.parties[0].presence is not Presence.READY:
+            assert running.thread.is_alive()
+        first.kill()
+        again = launch(VICTIM, agents[0][1], "end")
+        fly_one(agents[1], 1, 1, seen, calm)
+        heard(again, "60")
+        again.kill()
+    for process in (first, again):
+        process.communicate()
+    assert [absence.episode for absence in running.simulator.absences] == [2] * len(
+        running.simulator.absences
+    )
+    expected = in_process(
+        2, 1, lambda i, *at: calm(i, *at) if i else np.zeros(1, np.float32), episode_length=60
+    )
+    assert seen[1] == expected[1]
+
+
 def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:
     agents, seen = free_ports(2), {}
     other = threading.Thread(target=fly_one, args=(agents[0], 0, 3, seen, calm))
@@ -380,6 +434,26 @@ def test_the_command_flies_the_world_of_several_agents() -> None:
     assert seen == in_process(2, 1)
 
 
+def test_a_journal_of_a_part_of_a_world_cannot_be_simulated_and_says_so_briefly(
+    tmp_path: Path,
+) -> None:
+    agents, journal = free_ports(2), tmp_path / "part.mcap"
+
+    def begin(address: tuple[str, int], **settings: Any) -> None:
+        with closing(RemoteVectorEnv(address, connect_timeout=60, **settings)) as env:
+            env.reset(seed=0)
+
+    formation = SharedSimulator("rotorgram/Formation-v0", agents, drones=4, bind=ANY)
+    running = Running(formation)
+    in_threads([lambda: begin(agents[0], record=journal), lambda: begin(agents[1])])
+    assert running.join() == "the agent closed"
+    verdict = Verification(journal)
+    assert not verdict.identical
+    told = str(verdict).splitlines()
+    assert told[1].startswith("  State 1 cannot be repeated: expected an env of the observation (")
+    assert len(told[1]) < 500
+
+
 def test_an_agent_of_each_own_names() -> None:
     agents, seen = free_ports(2), {}
     shares = {agents[0]: ["drone_2", "drone_0"], agents[1]: ["drone_1"]}
@@ -402,6 +476,22 @@ def test_an_agent_that_does_not_come_is_named() -> None:
     assert isinstance(result, PeerSilent)
     expected = f"no answer from the agent at 127.0.0.1:{nowhere[1]} for 1 s, and the world begins"
     assert str(result).startswith(expected)
+
+
+def test_who_is_waited_for_is_told_soon(caplog: pytest.LogCaptureFixture) -> None:
+    there, late = free_ports(2)
+    with shared([there, late], 2), closing(RemoteEnv(there, connect=False)) as env:
+        first = threading.Thread(target=env.reset)
+        first.start()
+        while not caplog.messages:
+            assert first.is_alive()
+        with closing(RemoteEnv(late)) as other:
+            other.reset()
+        first.join(60)
+    where = f"127.0.0.1:{late[1]}"
+    assert (
+        caplog.messages[0] == f"no answer from the agent at {where} for 1 s; asking for 60 s in all"
+    )
 
 
 def test_an_agent_that_refuses_is_named() -> None:
@@ -435,6 +525,14 @@ def test_wrong_arguments_are_told(changes: dict[str, Any], sentence: str) -> Non
     with pytest.raises(InputError) as told:
         SharedSimulator(given.pop("env"), given.pop("agents"), **given)
     assert str(told.value).startswith(sentence)
+
+
+def test_this_side_is_no_agent() -> None:
+    (here,) = free_ports(1)
+    with pytest.raises(InputError, match="agents: expected addresses of agents, got that of this"):
+        SharedSimulator(RISE, [here], drones=1, bind=here)
+    with pytest.raises(InputError, match="server: expected the address of the agent, got that of"):
+        Simulator(server=here, bind=here)
 
 
 def test_a_policy_that_does_not_exist_is_told() -> None:

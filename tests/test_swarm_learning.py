@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rotorgram.agents import EpisodeLog, make_agent, preset
+from rotorgram.agents import EpisodeLog, ResumeError, make_agent, preset
 from rotorgram.agents.rollouts import Collector, Rollout
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.experiments.settings import Run
@@ -135,6 +135,29 @@ def test_a_training_that_stops_anywhere_ends_with_the_same_bits(algorithm: str) 
     assert all(ours[name].tobytes() == theirs[name].tobytes() for name in theirs)
     lengths = [[e.length for e in one.log.episodes] for one in (training, whole)]
     assert lengths[0] == lengths[1]
+
+
+def test_a_training_of_other_worlds_is_not_resumed() -> None:
+    def env(drones: int, **options: Any) -> LocalVectorEnv:
+        options = {"episode_length": 90, **options}
+        return LocalVectorEnv(RISE, 6, drones=drones, autoreset_mode="Disabled", **options)
+
+    run = Run(algorithm="mappo", config=preset("mappo", "tuned", **SMALL), env_id=RISE, seed=1,
+              env_steps=1200, num_envs=6, options={"episode_length": 90})  # fmt: skip
+    training = Training(run, env(3))
+    assert not training.train(lambda: False)
+    kept = training.checkpoint()
+    with pytest.raises(ResumeError) as told:
+        Training.resume(kept, env(2))
+    assert str(told.value) == (
+        "resume: expected an env with agents ('drone_0', 'drone_1', 'drone_2'), "
+        "got ('drone_0', 'drone_1')"
+    )
+    with pytest.raises(ResumeError) as told:
+        Training.resume(kept, env(3, episode_length=80))
+    assert str(told.value) == (
+        "resume: expected an env with options {'episode_length': 90}, got {'episode_length': 80}"
+    )
 
 
 def test_sb3_sees_zeros_of_one_that_is_out_until_its_world_ends() -> None:

@@ -18,6 +18,7 @@ from comparisons import GATES, HEADLINE, spec_of
 from rotorgram.agents import preset
 from rotorgram.cli import main
 from rotorgram.cli.sweep import parse_grid
+from rotorgram.experiments import filming
 from rotorgram.experiments.compare import compare, read_compare_config
 from rotorgram.experiments.folders import locked
 from rotorgram.experiments.metrics import Headline
@@ -118,6 +119,28 @@ def test_files_tell_settings_and_software(folder: Path) -> None:
     assert read_sweep_config(folder) == CONFIG
     with pytest.raises(ResultsError, match="expected a comparison's"):
         read_compare_config(folder)
+
+
+def test_a_comparison_of_swarms_goes_on_and_is_filmed_with_all_drones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = CompareConfig(
+        agents=("ippo",), env_id="rotorgram/Formation-v0", options={"episode_length": 4},
+        drones=2, num_envs=2, env_steps=1024, seeds=1, snapshots=1, curve_episodes=1, episodes=1,
+    )  # fmt: skip
+    compare(config, tmp_path, "rotorgram compare", nothing)
+    assert read_compare_config(tmp_path) == config
+    filmed: list[Any] = []
+
+    def film(fresh: Path, shots: list[Any], *_: object) -> None:
+        filmed.extend(shots)
+        fresh.touch()
+
+    monkeypatch.setattr(filming, "film", film)
+    assert filming.film_comparison(tmp_path, tmp_path / "film.mp4")
+    (shot,) = filmed
+    assert [len(drones) for drones in shot.episodes] == [2]
+    assert shot.trajectories[0].spec.agents == ("drone_0", "drone_1")
 
 
 def test_what_is_missing_is_flown_to_the_same_numbers(folder: Path, tmp_path: Path) -> None:

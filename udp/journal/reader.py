@@ -239,6 +239,7 @@ class SessionSummary:
 
     def __post_init__(self) -> None:
         self._returns = np.zeros(self.session.num_envs)
+        self._out = np.zeros(self.session.num_envs, bool)  # ended, while its world flies on
 
     def __str__(self) -> str:
         session = self.session
@@ -272,11 +273,12 @@ class SessionSummary:
         command = self._command
         self.states += 1
         resets = np.ones(len(state.rewards), bool) if command is None else command.resets
-        stepped = ~resets if command is None else command.orders == FLY
+        stepped = ~resets if command is None else (command.orders == FLY) & ~self._out
         self._returns[resets] = 0.0
         self._returns += np.where(stepped, state.rewards, 0.0)
         self.steps += int(stepped.sum())
         ended = (state.terminated | state.truncated) & stepped
+        self._out = (self._out | ended) & ~resets
         self.episodes += int(ended.sum())
         self.returns += float(self._returns[ended].sum())
 

@@ -134,7 +134,8 @@ class SessionVerdict:
             was, now = getattr(spec, name), getattr(loop.spec, name)
             if was != now:
                 loop.close()
-                raise InputError(hint or f"expected an env of the {name} {was}, got one of {now}")
+                words = f"expected an env of the {name} {was!s:.200}, got one of {now!s:.200}"
+                raise InputError(hint or words)
         if other:
             self.notes.append(hint)
         return loop

@@ -102,9 +102,11 @@ class Journal:
             file.add_metadata(ABOUT, {"format": FORMAT, "side": side, **about})
             if model:
                 file.add_attachment("model.xml", "application/xml", model.encode(), now)
-        except BaseException:
+        except BaseException as error:
             file.abandon()
             Path(path).unlink()
+            if isinstance(error, OSError):
+                raise OSError(error.errno, error.strerror, str(path)) from None
             raise
         self._file, self._pending = file, file.pending
         weakref.finalize(self, file.close)

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from ...envs.spec import EnvSpec
-from ...models.errors import NotCopied, expect
+from ...models.errors import InputError, NotCopied, expect
 from ..layouts import layout_of
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
@@ -33,7 +33,13 @@ from ..protocol.messages import (
     Welcome,
 )
 from ..protocol.transitions import SimulatorState
-from .simulator import ALIVE_EVERY, DEFAULT_SIMULATOR, Observer, run_to_the_end
+from .simulator import (
+    ALIVE_EVERY,
+    COMPLAIN_AFTER,
+    DEFAULT_SIMULATOR,
+    Observer,
+    run_to_the_end,
+)
 from .sockets import LONGEST_WAIT, PAUSE, Port, address_text, log_notices, resolve
 from .stepped import make_stepped
 
@@ -96,6 +102,7 @@ class Party:
         self.presence = Presence.COMING
         self.command: Command | None = None  # that the next step or reset takes
         self.patient_until = 0.0
+        self.complain_at: float | None = None
         self.seed: int | None = None  # of the Welcome
         self.in_flight = np.zeros(len(rows), bool)  # drones, when it was lost
         self.shown: tuple[Any, ...] = ()  # observations and telemetry of its last State
@@ -189,6 +196,7 @@ class SharedSimulator(NotCopied):
             self.parties = []
             for number, (address, names) in enumerate(_shares(agents, self.spec.agents)):
                 there = resolve(address, insecure=anywhere)
+                expect(there[1], "agents", "the port of each agent, 1 to 65535", "0")
                 spec = replace(self.spec, agents=names)
                 rows = np.array([self.spec.agents.index(name) for name in names])
                 party = Party(number, there, spec, rows, when_lost, self.config, key)
@@ -200,6 +208,8 @@ class SharedSimulator(NotCopied):
             failing.callback(self._port.close)
             self._port.keep(self._by_address)
             self.address: Address = self._port.address
+            others = self.address not in self._by_address
+            expect(others, "agents", "addresses of agents", f"that of this side, {self.address}")
             failing.pop_all()
 
     def run(self) -> str:
@@ -239,6 +249,7 @@ class SharedSimulator(NotCopied):
         now = time.monotonic()
         for party in self.parties:
             party.link.connect(now)
+            party.complain_at = now + COMPLAIN_AFTER
         self._left = ""
         while not self._stopped:
             self._flush()
@@ -255,6 +266,12 @@ class SharedSimulator(NotCopied):
             if len(self._who(Presence.READY)) < len(self.parties):
                 return False
             self._begin(first=True)
+        elif again := self._started_anew():
+            if any(party.presence is Presence.COMING for party in again):
+                return False
+            for party in again:
+                party.presence = Presence.FLYING
+                self._send(party)
         elif not flying:
             if not self._who(Presence.WAITING, Presence.READY):
                 return False
@@ -272,6 +289,19 @@ class SharedSimulator(NotCopied):
         else:
             self._step(flying)
         return True
+
+    @property
+    def _is_first_start(self) -> bool:
+        """Whether the first episode has begun, and nothing was flown."""
+        return self.episodes == 1 and self.steps == 0
+
+    def _started_anew(self) -> list[Party]:
+        """Agents that were started anew before the last one came: the first step waits for them."""
+        if not self._is_first_start:
+            return []
+        lost = {absence.agent for absence in self.absences}
+        coming = self._who(Presence.COMING, Presence.READY)
+        return [party for party in coming if party.number not in lost]
 
     def _begin(self, *, first: bool = False) -> None:
         """Begin an episode for all that take part."""
@@ -460,12 +490,20 @@ class SharedSimulator(NotCopied):
             self._lose(party, Presence.LEFT, why)
             if len(self._who(Presence.LEFT)) == len(self.parties):
                 raise PeerSilent(f"{why}, and no other is left")
+        elif party.presence is Presence.COMING and party.complain_at and now > party.complain_at:
+            why = f"no answer from the agent at {address_text(party.address)} for "
+            why += f"{COMPLAIN_AFTER:g} s; asking for {self.config.timeout:g} s in all"
+            party.link.statistics.notice(why)
+            party.complain_at = None
 
     def _receive(self, party: Party, datagram: bytes) -> None:
         session = party.link.hello.session
         message = party.link.receive(datagram, time.monotonic())
         if party.link.hello.session != session:  # its answer was Unknown
-            self._lose(party, Presence.COMING, "it was started anew")
+            if self._is_first_start and party.presence is Presence.FLYING:
+                party.presence = Presence.COMING  # before the others came: they wait for it
+            else:
+                self._lose(party, Presence.COMING, "it was started anew")
         elif message is not None and party.presence is not Presence.LEFT:
             self._take(party, message)
 
@@ -494,8 +532,17 @@ class SharedSimulator(NotCopied):
                 policy = extension.value.decode("ascii", "replace")
                 if policy in POLICIES:  # of another version: that of this side
                     party.when_lost = policy
-        if party.when_lost == "land":  # raises now where it cannot
-            self.stepped.land(np.zeros(self._layout.drones, bool))
+        if party.when_lost == "land":
+            try:
+                self.stepped.land(np.zeros(self._layout.drones, bool))
+            except InputError as error:
+                if not self.episodes:
+                    raise
+                party.when_lost = self._when_lost  # one agent does not end the flight of others
+                where = address_text(party.address)
+                party.link.statistics.notice(
+                    f"the agent at {where} cannot have land ({error}): {party.when_lost}"
+                )
 
     def _take_late(self, party: Party) -> None:
         """A Command of an agent that does not take part in the running episode."""

@@ -25,7 +25,7 @@ DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
 
 ALIVE_EVERY: Final = 0.5  # period of the message Alive while a long step is computed, s
-_COMPLAIN_AFTER: Final = 1.0  # A wait for the agent that is told, once, s
+COMPLAIN_AFTER: Final = 1.0  # A wait for the agent that is told, once, s
 
 Observer = Callable[[Message | None, State], None]
 """Called with the message that moved the drones, a Command or the Welcome that resets them all, and
@@ -110,6 +110,8 @@ class Simulator(NotCopied):
             self._socket = open_socket(bind, insecure=anywhere, peer=self.server)
             failing.callback(self._socket.close)
             self.address: Address = self._socket.getsockname()
+            another = self.server != self.address
+            expect(another, "server", "the address of the agent", "that of this side")
             self._journal: Any = None
             if record:
                 from ..journal import Journal
@@ -219,7 +221,7 @@ class Simulator(NotCopied):
         link = self.link
         if self._journal:
             self._journal.write()
-        complain_at: float | None = time.monotonic() + _COMPLAIN_AFTER
+        complain_at: float | None = time.monotonic() + COMPLAIN_AFTER
         while not self._stopped:
             timer = link.next_timer()
             assert timer is not None
@@ -230,7 +232,7 @@ class Simulator(NotCopied):
                 if not link.handle_timer(before):
                     raise PeerSilent(self._silence(sends, self.config.timeout))
                 if complain_at and before > complain_at and (self._trouble or not link.sequence):
-                    told = self._silence(link.sends, _COMPLAIN_AFTER)
+                    told = self._silence(link.sends, COMPLAIN_AFTER)
                     link.statistics.notice(f"{told}; asking for {self.config.timeout:g} s in all")
                     complain_at = None
                 self._flush()

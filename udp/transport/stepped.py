@@ -42,10 +42,10 @@ def make_stepped(
         backend: One of `sim.BACKENDS`, for a registered task.
         options: Of the env, by name.
     """
+    expect(type(drones) is int and drones >= 1, "drones", "1 or more", f"{drones!r}")
     right = type(num_envs) is int and 1 <= num_envs <= MAX_DRONES
     expect(right, "num_envs", f"1 to {MAX_DRONES}", f"{num_envs!r}")
-    right = type(drones) is int and drones >= 1 and num_envs % drones == 0
-    expect(right, "drones", f"a divisor of num_envs = {num_envs}", f"{drones!r}")
+    expect(num_envs % drones == 0, "drones", f"a divisor of num_envs = {num_envs}", f"{drones}")
     if isinstance(env, str):
         if registry.is_known(env):
             from ...envs.loop import Loop, OnHost
