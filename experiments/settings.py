@@ -172,6 +172,7 @@ class _ManyRuns(RunsConfig, EnvConfig):
         kept = {name: content[name] for name in ("preset", "env_steps", "num_envs", "vehicle")}
         kept |= {name: spec[name] for name in ("env_id", "options")}
         kept["backend"] = content.get("backend", "mujoco")
+        kept["drones"] = len(spec.get("agents", ("drone_0",)))
         return kept | {"seeds": len(seeds), "first_seed": seeds[0]}
 
     def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:
@@ -186,7 +187,7 @@ class CompareConfig(_ManyRuns):
     """Settings of a comparison and its workers."""
 
     agents: tuple[str, ...] = ("vpg", "a2c", "sb3-a2c")
-    """Agents to train. The PID is always evaluated beside them, where it can fly the env."""
+    """Agents to train. The PID, or ORCA, is evaluated beside them where it can fly the env."""
     snapshots: int = 10
     """Policies kept during each training, for the learning curves."""
     curve_episodes: int = 10
