@@ -280,7 +280,8 @@ def film_comparison(
     results = read_results(folder)
     vehicle = results.config["vehicle"]
     # Small enough for a page that holds the film in itself.
-    config = Film(height=400, camera="front", fast=True, quality=27, world=world, vehicle=vehicle)
+    camera: Camera = "top" if len(results.spec.agents) > 1 else "front"  # no craft hides another
+    config = Film(height=400, camera=camera, fast=True, quality=27, world=world, vehicle=vehicle)
     fresh = out.with_name(f".fresh-{out.name}")
     fresh.unlink(missing_ok=True)
     try:

@@ -272,7 +272,7 @@ class Stage:
         mujoco.mj_camlight(self.model, self.data)
 
     def camera(self, name: Camera | Literal["free"]) -> mujoco.MjvCamera:
-        """A camera for the last moments. All but `onboard` see every craft.
+        """A camera for the last moments. All but `onboard` see every craft, and goals of one world.
 
         `chase` and `top` go with the craft; `front`, `side` and `free`, where a viewer's camera
         begins, look at the goal if there is one, and move back from a craft that is far from it.
@@ -285,12 +285,15 @@ class Stage:
             return camera
         expect(name in _VIEWS, "camera", f"one of {', '.join(CAMERAS)}", f"{name!r}")
         camera.azimuth, camera.elevation, distance, holds = _VIEWS[name]
-        places = self._points() if self.names else self._offsets
+        places, reach = self._offsets, float(self._reach.max())
+        if len(self.names) > 1:  # the goals of one world lie apart, often far from their craft
+            goals = (goal for goal in self._goals if goal is not None)
+            places, reach = np.array([*self._points(), *goals]), 0.0
         camera.distance = distance * self.radius + float(np.ptp(places, axis=0).max())
         if holds == math.inf:
             camera.lookat[:] = self._points().mean(axis=0)
         else:
-            camera.distance += _BACK * max(float(self._reach.max()) - holds * self.radius, 0.0)
+            camera.distance += _BACK * max(reach - holds * self.radius, 0.0)
             camera.lookat[:] = self.focus
         if name in ("front", "side"):  # above the ground
             camera.lookat[2] = max(camera.lookat[2] - _LOWER * camera.distance, 0.0)

@@ -10,8 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 from comparisons import HEADLINE, PERIOD, spec_of, synthetic_folder
 from rotorgram.cli import main
+from rotorgram.experiments import filming
 from rotorgram.experiments.compare import read_compare_config
 from rotorgram.experiments.figures import SWARM_FIGURE, pick_trajectories
+from rotorgram.experiments.filming import Film, Shot
 from rotorgram.experiments.metrics import shown_runs
 from rotorgram.experiments.report import headings, result_rows, table_of, write_report
 from rotorgram.experiments.results import POSITION_SCHEMA, ResultsError, read_results
@@ -191,7 +193,7 @@ def test_wrong_positions_are_one_sentence(tmp_path: Path) -> None:
         read_results(made)
 
 
-def test_a_comparison_of_several_drones(tmp_path: Path) -> None:
+def test_a_comparison_of_several_drones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "out"
     arguments = ["compare", "--env", "rotorgram/Formation-v0", "--vehicle", "crazyflie2"]
     arguments += ["--drones", "2", "--num-envs", "2", "--agents", "ippo", "--seeds", "1"]
@@ -211,3 +213,14 @@ def test_a_comparison_of_several_drones(tmp_path: Path) -> None:
     assert steps.middle[0] == pytest.approx(apart)
     assert results.config["diameter"] < apart  # no two start in touch
     assert read_compare_config(folder).drones == 2
+    filmed = []
+
+    def film(path: Path, shots: list[Shot], config: Film, _: object) -> int:
+        path.touch()
+        filmed.extend((shot.name, shot.drones, len(shot.episodes[0])) for shot in shots)
+        filmed.append(config.camera)
+        return 1
+
+    monkeypatch.setattr(filming, "film", film)
+    assert filming.film_comparison(folder, tmp_path / "film.mp4")
+    assert filmed == [("IPPO", 2, 2), ("ORCA", 2, 2), "top"]
