@@ -18,7 +18,7 @@ class Compare(RunsFlags):
     """
 
     agents: tuple[AlgorithmName, ...] = ("vpg", "a2c", "sb3-a2c")
-    """Algorithms to train; the PID flies beside them."""
+    """Algorithms to train; the PID, or ORCA where a world has several drones, flies beside them."""
     seeds: int = 5
     """Number of seeds, the same for every agent. The paper's claims are decided from 30 on."""
     snapshots: int = 10

@@ -7,11 +7,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from ..agents import CONTROLLERS
 from ..agents.checkpoints import Checkpoint, store
-from ..agents.pid import PID
 from ..envs.registry import env_spec
+from ..envs.spec import EnvSpec
 from ..models.errors import InputError
-from . import results
+from ..models.vehicle import Vehicle
+from . import results, swarms
 from .bounds import known_bounds
 from .evaluations import Stage, evaluate_stages, stages_of
 from .folders import locked
@@ -25,6 +27,8 @@ from .workers import OnProgress, Tell, open_workers
 PARTS: Final = "parts"
 """Folder with the parts of an unfinished comparison, one for each run."""
 _SETTINGS: Final = ("snapshots", "curve_episodes", "episodes")
+_CONTROLLERS: Final = ("pid", "orca")
+"""Flown beside the agents where they can fly the env; they need no training and have no seeds."""
 
 
 def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnProgress) -> None:
@@ -50,15 +54,14 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
             content = config.content(*config.agents)
             content["evaluation"] = {name: getattr(config, name) for name in _SETTINGS}
             content["bounds"] = known_bounds(config, config.episodes)
+            if config.drones > 1:  # distance at which the spheres of two drones touch, m
+                content["diameter"] = 2 * Vehicle.load(config.vehicle).radius
             results.write_config(folder, command, spec, config.vehicle, content)
         for unfinished in parts.glob(".*"):
             shutil.rmtree(unfinished)
-        runs: list[Run | None] = [*config.runs()]
-        with suppress(InputError):
-            PID(spec)  # if it can fly this env; it needs no training and has no seeds
-            runs.append(None)
+        runs: list[Run | str] = [*config.runs(), *filter(partial(_flies, spec), _CONTROLLERS)]
         jobs = {
-            f"{run.algorithm} seed {run.seed}" if run else "pid": run
+            run if isinstance(run, str) else f"{run.algorithm} seed {run.seed}": run
             for run in runs
             if not (parts / _part(run)).exists()
         }
@@ -66,8 +69,15 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
         results.join_parts(parts, folder, metric)
 
 
-def _part(run: Run | None) -> str:
-    return f"{run.algorithm}-seed{run.seed}" if run else "pid-seed0"
+def _flies(spec: EnvSpec, controller: str) -> bool:
+    with suppress(InputError):
+        CONTROLLERS[controller](spec)
+        return True
+    return False
+
+
+def _part(run: Run | str) -> str:
+    return f"{run}-seed0" if isinstance(run, str) else f"{run.algorithm}-seed{run.seed}"
 
 
 class _Done(NamedTuple):
@@ -75,20 +85,21 @@ class _Done(NamedTuple):
 
     rows: results.Rows
     steps: list[Any]  # tables of `steps.parquet`
+    positions: Any = None  # rows of `positions.parquet`
     checkpoint: Checkpoint | None = None
 
 
-def _keep(folder: Path, metric: str, run: Run | None, done: _Done) -> None:
+def _keep(folder: Path, metric: str, run: Run | str, done: _Done) -> None:
     """Write checkpoint and part; the part last, for with it the run is done."""
     if done.checkpoint:
         store(done.checkpoint, folder / "checkpoints" / f"{_part(run)}.safetensors")
-    results.write_part(folder / PARTS / _part(run), metric, done.rows, done.steps)
+    results.write_part(folder / PARTS / _part(run), metric, done.rows, done.steps, done.positions)
 
 
-def _fly(config: CompareConfig, run: Run | None, tell: Tell) -> _Done:
+def _fly(config: CompareConfig, run: Run | str, tell: Tell) -> _Done:
     """Train and evaluate (in a worker process)."""
-    if run is None:
-        return _evaluate("pid", 0, config, [Stage(PID)])
+    if isinstance(run, str):
+        return _evaluate(run, 0, config, [Stage(CONTROLLERS[run])])
     with shared_pair(**run.training_env, num_envs=run.num_envs) as env:
         training, times = train_run(run, env, tell, config.snapshots, keep_steps=True)
         checkpoint, log = training.checkpoint(), training.log
@@ -105,11 +116,11 @@ def _fly(config: CompareConfig, run: Run | None, tell: Tell) -> _Done:
     }
     metric = Headline.of(log.spec).name
     trained = results.step_table(metric, **label, phase="train", **log.steps())
-    return _Done(rows, [trained, *evaluated.steps], checkpoint)
+    return _Done(rows, [trained, *evaluated.steps], evaluated.positions, checkpoint)
 
 
 def _evaluate(agent: str, seed: int, config: CompareConfig, stages: Sequence[Stage]) -> _Done:
-    """Evaluate the stages of a training, or the PID."""
+    """Evaluate the stages of a training, or a controller."""
     rows, flown = evaluate_stages(config, stages, config.episodes, config.curve_episodes)
     label = {"agent": agent, "seed": seed}
     headline = Headline.of(flown[-1].spec)
@@ -120,7 +131,8 @@ def _evaluate(agent: str, seed: int, config: CompareConfig, stages: Sequence[Sta
         )
         for one in flown
     ]  # fmt: skip
-    return _Done({results.EVALUATIONS_FILE: [label | row for row in rows]}, tables)
+    positions = swarms.rows_of(flown).assign(**label) if config.drones > 1 else None
+    return _Done({results.EVALUATIONS_FILE: [label | row for row in rows]}, tables, positions)
 
 
 def read_compare_config(folder: Path) -> CompareConfig:

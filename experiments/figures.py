@@ -19,13 +19,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import EngFormatter
 
+from ..rendering.stage import DRONE_COLORS, MOST_NAMES
 from . import metrics
 from .metrics import Curve, Headline, Spread
 from .palette import agent_color, agent_label, sort_agents
 from .results import Results, read_steps
 from .statistics import Floats, iqm
+from .swarms import World, distance_curves, nearest, worlds
 
 AVERAGING_SHARE: Final = 0.05
 """Share of training over which the average reward is a running mean."""
@@ -66,6 +69,7 @@ class Curves:
     flown_sizes: dict[str, Spread]  # its size there, all trajectories of all seeds together
     learning: dict[str, Spread]  # steady-state size of the snapshots
     levels: dict[str, float]  # steady-state size of the agents that were not trained
+    distances: dict[str, Spread]  # least distance between two drones over time (s), if any
 
 
 def make_curves(folder: Path | str, results: Results) -> Curves:
@@ -85,6 +89,7 @@ def make_curves(folder: Path | str, results: Results) -> Curves:
         flown_sizes={name: flown_sizes(rows, period, results.headline) for name, rows in flown},
         learning=learning,
         levels=levels,
+        distances={} if results.positions is None else distance_curves(results.positions, period),
     )
 
 
@@ -127,7 +132,9 @@ def value_fan(steps: pd.DataFrame) -> Fan:
 
 def pick_trajectories(steps: pd.DataFrame, control_period: float) -> Flown:
     """At most 40 trajectories of an agent's evaluation, at random but always the same ones."""
-    found = [one for _, one in steps.groupby(["seed", "episode"], sort=True)]
+    # Each begins where the step does not grow: an episode may have several drones.
+    flights = (steps["step"].diff() <= 0).cumsum().rename("flight")
+    found = [one for _, one in steps.groupby(["seed", "episode", flights], sort=True)]
     # At random: every n-th would be the same few start positions for every seed.
     order = np.random.default_rng(0).permutation(len(found))[:_MAX_TRAJECTORIES]
     curves = [Curve(one["step"].to_numpy() * control_period, one["value"].to_numpy())
@@ -170,6 +177,8 @@ def learning_curves(evaluations: pd.DataFrame) -> tuple[dict[str, Spread], dict[
 
 FIGURE_FILES: Final = ("fig6_reward.png", "fig7_cumulative_reward.png", "fig8_error.png",
                        "learning_curve.png")  # fmt: skip
+SWARM_FIGURE: Final = "swarm.png"
+"""Drawn too where a world has several drones."""
 
 _MAX_POINTS: Final = 2000
 _OUTER: Final = 0.18  # opacity of the 5–95 % band
@@ -182,7 +191,7 @@ _TIGHT: Final[dict[str, Any]] = {
 
 
 def draw_figures(folder: Path, results: Results, curves: Curves) -> None:
-    """Draw all figures of a comparison, `FIGURE_FILES`, into `figures/` inside its folder.
+    """Draw all figures of a comparison, `FIGURE_FILES` and `SWARM_FIGURE`, into `figures/`.
 
     Agents or runs that are missing are left out of the figures; a panel with nothing in it says so.
     """
@@ -198,6 +207,8 @@ def draw_figures(folder: Path, results: Results, curves: Curves) -> None:
         )
         for name, figure in zip(FIGURE_FILES, figures, strict=True):
             figure.savefig(target / name)
+        if results.positions is not None:
+            _draw_swarm(results, results.positions).savefig(target / SWARM_FIGURE)
 
 
 def _draw_reward(episodes: pd.DataFrame, curves: Curves) -> Figure:
@@ -313,11 +324,63 @@ def _draw_learning_curve(evaluations: pd.DataFrame, curves: Curves, headline: He
     return figure
 
 
+def _draw_swarm(results: Results, positions: pd.DataFrame) -> Figure:
+    """Draw one episode of each agent: paths from above, and each drone's nearest other over time.
+
+    It is the episode of the film: see `metrics.shown_runs`.
+    """
+    seeds, episode = metrics.shown_runs(results.evaluations, results.headline)
+    figure = Figure(figsize=(max(5.0, 4.2 * len(seeds) + 1.2), 7.2), dpi=110)
+    axes = figure.subplots(2, len(seeds), squeeze=False)
+    shown = dict(worlds(positions[positions["episode"] == episode]))
+    diameter = results.config.get("diameter")
+    for (above, below), (agent, seed) in zip(axes.T, seeds.items(), strict=True):
+        world = shown[agent, seed, episode]
+        _paths(above, world, results.spec.agents)
+        _distances(below, world, results.spec.control_period, diameter)
+        above.set_title(metrics.run_label(results.evaluations, agent, seed))
+    axes[0, 0].set_ylabel("Z, forward (m)")
+    axes[1, 0].set_ylabel("distance to the nearest other (m)")
+    lines, names = axes[0, 0].get_legend_handles_labels()
+    figure.legend(lines, names, loc="outside right upper", title="o start   × goal")
+    return figure
+
+
+def _drone_style(drone: int) -> dict[str, Any]:
+    # Yellow is told from white by its edge.
+    edge = withStroke(linewidth=2.2, foreground="#555555")
+    return {"color": DRONE_COLORS[drone % len(DRONE_COLORS)], "lw": 1.3, "path_effects": [edge]}
+
+
+def _paths(axis: Axes, world: World, names: Sequence[str]) -> None:
+    """Draw each drone's path from above, with its start and its last goal."""
+    for drone, name in enumerate(names):
+        x, _, z = world.position[:, drone].T
+        style = _drone_style(drone)
+        axis.plot(x, z, label=name if drone < MOST_NAMES else None, **style)
+        axis.plot(x[:1], z[:1], "o", markersize=5, **style)
+        goal = world.goal[np.isfinite(world.position[:, drone, 0]), drone][-1]
+        axis.plot(goal[0], goal[2], "x", markersize=6, mew=1.4, **style)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("X, right (m)")
+
+
+def _distances(axis: Axes, world: World, control_period: float, diameter: float | None) -> None:
+    """Draw each drone's distance to the nearest other over time; the spheres touch at a line."""
+    time = np.arange(len(world.position)) * control_period
+    for drone, values in enumerate(nearest(world.position).T):
+        axis.plot(time, values, **_drone_style(drone))
+    if diameter is not None:
+        axis.axhline(diameter, color="#333333", lw=0.9, ls=":")
+    axis.set_ylim(bottom=0.0)
+    axis.set_xlabel("time in the episode (s)")
+
+
 def _panels(count: int) -> tuple[Figure, list[Axes]]:
     """Make a figure with some panels, at most three side by side."""
     columns = count if count <= 3 else 2
     rows = -(-count // columns)
-    width = {1: 7.2, 2: 4.6, 3: 3.7}[columns] * columns
+    width = {1: 7.2, 2: 4.6, 3: 4.4}[columns] * columns
     figure = Figure(figsize=(width, (3.6 if columns < 3 else 3.3) * rows), dpi=110)
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
     for unused in axes[count:]:

@@ -4,21 +4,22 @@ import logging
 import math
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ..agents import CONTROLLERS
 from ..agents.checkpoints import load
-from ..agents.pid import PID
 from ..agents.policies import Policy
 from ..envs.rendering import moment
 from ..models.errors import InputError, expect
-from ..rendering import Camera, Canvas, Moment, NoOpenGL, Stage, World
+from ..rendering import Camera, Canvas, MetricValue, Moment, NoOpenGL, Stage, World
 from ..rendering.film import QUALITY, Overlay, check_film, graph_scale, write_film
-from .palette import agent_color, agent_label, sort_agents
+from .palette import agent_color
+from .swarms import least
 from .trajectories import Trajectory, flown_trajectories
 
 if TYPE_CHECKING:
@@ -73,6 +74,41 @@ class Shot:
     def moments(self) -> list[list[list[Moment]]]:
         """Of each episode and drone."""
         return [[moments(one) for one in world] for world in self.episodes]
+
+    @cached_property
+    def distances(self) -> list[np.ndarray]:
+        """Of each episode the least distance between two drones after each control step, m, shape
+        (T + 1,). One that has ended stays where it is, as in the pictures.
+        """
+        found = []
+        for world in self.episodes:
+            told, long = [one.telemetry["position"] for one in world], max(map(len, world)) + 1
+            padded = [np.pad(one, ((0, long - len(one)), (0, 0)), "edge") for one in told]
+            found.append(least(np.stack(padded, axis=1)))
+        return found
+
+    def panel(self, episode: int, step: int) -> Moment:
+        """What the overlay tells: the first drone, and the least distance if there are others."""
+        told = self.moments[episode][0]
+        own = told[min(step, len(told) - 1)]
+        if self.drones == 1:
+            return own
+        distance = MetricValue("least distance", float(self.distances[episode][step]), "m")
+        return replace(own, metrics=(distance, *own.metrics))
+
+    def curve(self, episode: int) -> np.ndarray:
+        """The overlay's graph: the headline metric; of several drones the least distance, m."""
+        if self.drones == 1:
+            return self.episodes[episode][0].headline
+        return self.distances[episode]
+
+    def note(self, episode: int, step: int) -> str:
+        """Which trajectories have ended at a step otherwise than by the clock."""
+        ended = [one.ending for one in self.episodes[episode] if step >= len(one)]
+        early = [ending for ending in ended if ending != "truncated"]
+        if self.drones == 1:
+            return "".join(early)
+        return f"{len(early)} of {self.drones} ended" if early else ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,9 +203,8 @@ def _frames(
     drones = shots[0].drones
     names = shots[0].trajectories[0].spec.agents if drones > 1 else ()
     stage = Stage(config.world, drones, vehicle=config.vehicle, names=names)
-    flown = [one for shot in shots for one in shot.trajectories]
     with Canvas(stage, width, height, fast=config.fast) as canvas:
-        panes = [_pane(shot, config, canvas, stage.twin(), flown, len(shots) > 1) for shot in shots]
+        panes = [_pane(shot, config, canvas, stage.twin(), shots) for shot in shots]
         for pane in panes:
             next(pane)
         for number, now in enumerate(times, 1):
@@ -182,20 +217,23 @@ def _frames(
 
 
 def _pane(
-    shot: Shot, config: Film, canvas: Canvas, stage: Stage, flown: Sequence[Trajectory], named: bool
+    shot: Shot, config: Film, canvas: Canvas, stage: Stage, shots: Sequence[Shot]
 ) -> Generator[np.ndarray, tuple[int, float], None]:
     """Pictures of one flight, for each episode and time that are sent; drawn where they change."""
+    seconds = max(one.seconds for other in shots for one in other.trajectories)
+    of = stage.names[0] if stage.names else ""
+    scale, named = _scale(shots), len(shots) > 1
     overlay = Overlay(
-        canvas.width, canvas.height, title=shot.name, color=shot.color, like=shot.moments[0][0][0],
-        vehicle=stage.vehicle, period=shot.trajectories[0].spec.control_period,
-        seconds=max(one.seconds for one in flown), scale=_scale(flown), numbers=config.overlay,
+        canvas.width, canvas.height, title=shot.name, color=shot.color, like=shot.panel(0, 0),
+        vehicle=stage.vehicle, period=shot.trajectories[0].spec.control_period, of=of,
+        seconds=seconds, scale=scale, numbers=config.overlay,
     )  # fmt: skip
     picture, shown = np.empty(0, np.uint8), (-1, -1)  # episode and step
     while True:
         episode, seconds = yield picture
         world, told = shot.episodes[episode], shot.moments[episode]
         trajectory = max(world, key=len)  # that of one that flew to the end
-        first, step = world[0], trajectory.step_at(seconds)
+        step = trajectory.step_at(seconds)
         if (episode, step) == shown:
             continue
         begin = shown[1] + 1 if episode == shown[0] else 0
@@ -204,14 +242,16 @@ def _pane(
         shown = episode, step
         picture = canvas.draw(config.camera, stage)
         if config.overlay or named:
-            ended = config.overlay and step >= len(first)
-            note = first.ending if ended and first.ending != "truncated" else ""
-            values = first.headline[: step + 1].tolist()
-            picture = overlay.draw(picture, told[0][min(step, len(first))], values, note)
+            note = shot.note(episode, step) if config.overlay else ""
+            values = shot.curve(episode)[: step + 1].tolist()
+            picture = overlay.draw(picture, shot.panel(episode, step), values, note)
 
 
-def _scale(flown: Sequence[Trajectory]) -> tuple[float, float]:
-    """Ends of the graph of the headline metric; of a crash its start, unless all crashed."""
+def _scale(shots: Sequence[Shot]) -> tuple[float, float]:
+    """Ends of the graph. Of the headline metric a crash has its start, unless all crashed."""
+    if shots[0].drones > 1:
+        return graph_scale(np.concatenate([x for shot in shots for x in shot.distances]).tolist())
+    flown = [one for shot in shots for one in shot.trajectories]
     crashed = [one.terminated for one in flown]
     ends = [1 if crash and not all(crashed) else None for crash in crashed]
     shown = [one.headline[:end] for one, end in zip(flown, ends, strict=True)]
@@ -224,11 +264,9 @@ def _scale(flown: Sequence[Trajectory]) -> tuple[float, float]:
 def film_comparison(
     folder: Path, out: Path, on_frame: OnFrame = lambda *_: None, *, world: World = "airport"
 ) -> bool:
-    """Film the agents of a comparison: each agent and the PID, the same episode side by side.
+    """Film a comparison: each agent and the controller, the same episode side by side.
 
-    Of an agent's seeds the middle one flies, by the steady state in the final evaluation (of an
-    even number the better of the two in the middle). Of the episodes of that evaluation they fly
-    the one that starts furthest from its goal.
+    `metrics.shown_runs` says which seeds and which episode.
 
     The folder is one that `rotorgram compare` wrote; a film that exists is replaced. Returns
     whether there is a film: without OpenGL there is none, and a line in the log says why.
@@ -242,7 +280,8 @@ def film_comparison(
     results = read_results(folder)
     vehicle = results.config["vehicle"]
     # Small enough for a page that holds the film in itself.
-    config = Film(height=400, camera="front", fast=True, quality=27, world=world, vehicle=vehicle)
+    camera: Camera = "top" if len(results.spec.agents) > 1 else "front"  # no craft hides another
+    config = Film(height=400, camera=camera, fast=True, quality=27, world=world, vehicle=vehicle)
     fresh = out.with_name(f".fresh-{out.name}")
     fresh.unlink(missing_ok=True)
     try:
@@ -255,25 +294,20 @@ def film_comparison(
 
 
 def _comparison_shots(folder: Path, results: "Results") -> list[Shot]:
-    from .metrics import final_evaluations, final_per_run
+    from .metrics import run_label, shown_runs
 
     spec, vehicle = results.spec, results.config["vehicle"]
-    drones = len(spec.agents)
-    final = final_per_run(results.evaluations, results.headline)
-    shown = final_evaluations(results.evaluations)
-    starts = results.headline.size(shown["start"].to_numpy())
-    episode = int(shown["episode"].iloc[int(np.argmax(starts))])
-    shots = []
-    for agent in sort_agents(final["agent"]):
-        runs = final[final["agent"] == agent]
-        runs = runs.sort_values("steady", ascending=not results.headline.high, kind="stable")
-        seed = int(runs["seed"].iloc[(len(runs) - 1) // 2])
-        name = agent_label(agent) + (f", seed {seed}" if len(runs) > 1 else "")
+    seeds, episode = shown_runs(results.evaluations, results.headline)
+    shots, drones = [], len(spec.agents)
+    for agent, seed in seeds.items():
+        name = run_label(results.evaluations, agent, seed)
         file = folder / "checkpoints" / f"{agent}-seed{seed}.safetensors"
-        policy: Policy = PID(spec) if agent == "pid" else load(file).policy()
+        controller = CONTROLLERS.get(agent)
+        policy: Policy = controller(spec) if controller else load(file).policy()
         flown = flown_trajectories(
-            policy, spec.env_id, spec.options, [episode], vehicle=vehicle, of="final", drones=drones
-        )
+            policy, spec.env_id, spec.options, [episode],
+            vehicle=vehicle, of="final", drones=drones,
+        )  # fmt: skip
         color = agent_color(agent, dark=True)
         shots.append(Shot(name=name, color=color, trajectories=flown, drones=drones))
     return shots

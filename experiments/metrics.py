@@ -21,7 +21,7 @@ import pandas as pd
 
 from ..envs.spec import EnvSpec, Metric
 from ..models.errors import InputError
-from .palette import sort_agents
+from .palette import agent_label, sort_agents
 from .statistics import Floats, Values, bootstrap_interval, iqm, trimmed_mean
 
 _MEASURES: Final = ("steady", "settling_time", "overshoot", "return")
@@ -229,6 +229,30 @@ def final_per_run(evaluations: pd.DataFrame, headline: Headline) -> pd.DataFrame
     ).reset_index()  # fmt: skip
     whole = ((rows["crashed"] == 0) | headline.counts_crashes) & (rows.pop("missing") == 0)
     return rows.assign(held=headline.holds(rows["steady"].to_numpy()) & whole)
+
+
+def shown_runs(evaluations: pd.DataFrame, headline: Headline) -> tuple[dict[str, int], int]:
+    """What a film and a picture of paths show: a seed of each agent, and an episode.
+
+    Of an agent's seeds the middle one, by the steady state in the final evaluation (of an even
+    number the better of the two in the middle); of the episodes of that evaluation the one that
+    starts furthest from its goal.
+    """
+    final = final_per_run(evaluations, headline)
+    shown = final_evaluations(evaluations)
+    starts = headline.size(shown["start"].to_numpy())
+    seeds = {}
+    for agent in sort_agents(final["agent"]):
+        runs = final[final["agent"] == agent]
+        runs = runs.sort_values("steady", ascending=not headline.high, kind="stable")
+        seeds[agent] = int(runs["seed"].iloc[(len(runs) - 1) // 2])
+    return seeds, int(shown["episode"].iloc[int(np.argmax(starts))])
+
+
+def run_label(evaluations: pd.DataFrame, agent: str, seed: int) -> str:
+    """Name of an agent's run: with its seed where there are others."""
+    several = evaluations.loc[evaluations["agent"] == agent, "seed"].nunique() > 1
+    return agent_label(agent) + (f", seed {seed}" if several else "")
 
 
 def results_table(

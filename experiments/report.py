@@ -28,10 +28,11 @@ from ..envs.spec import canonical_id
 from ..models.errors import MissingPackage
 from ..rendering.film import poster
 from .claims import MIN_SEEDS, OURS, Outcome, Verdict, judge_claims, judge_no_worse
-from .figures import AVERAGING_SHARE, Curves, draw_figures, make_curves
+from .figures import AVERAGING_SHARE, SWARM_FIGURE, Curves, draw_figures, make_curves
 from .metrics import Headline, Spread, results_table
 from .palette import agent_color, agent_label, sort_agents
 from .results import Results, read_results
+from .swarms import least_distances
 
 VIDEO_FILE: Final = "video.mp4"
 """The agents side by side; the page has it in itself where it lies in the folder."""
@@ -52,18 +53,26 @@ _ASSETS: Final = {
 
 
 def table_of(results: Results) -> pd.DataFrame:
-    """The table of results, with the bounds of the task behind the agents."""
+    """The table of results, with the bounds of the task behind the agents.
+
+    Where a world has several drones, it has the columns of `swarms.least_distances` too.
+    """
     bounds = results.config.get("bounds")
-    return results_table(results.evaluations, results.runs, results.headline, bounds)
+    table = results_table(results.evaluations, results.runs, results.headline, bounds)
+    if results.positions is None:
+        return table
+    return table.join(least_distances(results.positions)).rename_axis("agent")
 
 
 def _verdicts(results: Results) -> list[Verdict]:
-    """The paper's claims, for the paper's task; and whether our A2C is no worse than SB3's."""
+    """The paper's claims, for the paper's task; and whether our A2C is no worse than SB3's. None of
+    them is of several drones.
+    """
     preset, headline = results.config["preset"], results.headline
     verdicts = []
     if canonical_id(results.spec.env_id) == "rotorgram/Elevation-v0":  # of which the paper is
         verdicts = judge_claims(results.episodes, results.evaluations, preset, headline)
-    if headline.held is not None:
+    if headline.held is not None and len(results.spec.agents) == 1:
         trained = set(results.runs["agent"])
         verdicts.append(judge_no_worse(results.evaluations, trained, preset, headline))
     return verdicts
@@ -89,7 +98,11 @@ def write_report(folder: Path | str, results: Results | None = None) -> Path:
         film = video.read_bytes()
         with suppress(MissingPackage, OSError):  # where FFmpeg is missing, the film has no poster
             picture = poster(video)
+    swarm = b""
+    if results.positions is not None:
+        swarm = (folder / "figures" / SWARM_FIGURE).read_bytes()
     media: dict[str, Any] = {
+        "swarm": base64.b64encode(swarm).decode("ascii"),
         "video": base64.b64encode(film).decode("ascii"),
         "poster": base64.b64encode(picture).decode("ascii"),
         "files": {path.relative_to(folder).as_posix() for path in folder.rglob("*")},
@@ -101,8 +114,8 @@ def write_report(folder: Path | str, results: Results | None = None) -> Path:
 # ---- the table, in words
 
 
-def headings(headline: Headline) -> tuple[str, ...]:
-    """Headings of the columns."""
+def headings(headline: Headline, swarm: bool = False) -> tuple[str, ...]:
+    """Headings of the columns; of a swarm the least distance is in the place of the overshoot."""
     size, goal, settled = headline.size_symbol, headline.held_text, headline.settled
     band = f" to {headline.amount(f'{settled:.2g}')}" if settled is not None else ""
     return (
@@ -110,14 +123,14 @@ def headings(headline: Headline) -> tuple[str, ...]:
         headline.labelled(f"Steady {size}"),
         f"Seeds that hold {goal}".rstrip(),
         f"Settling{band} (s)",
-        headline.labelled("Overshoot"),
+        "Least distance (m)" if swarm else headline.labelled("Overshoot"),
         "Return",
         f"Env steps to {goal or 'hold'}",
         "Env steps per s",
     )
 
 
-def table_note(headline: Headline) -> str:
+def table_note(headline: Headline, swarm: bool = False) -> str:
     """Explanation of the columns."""
     size, goal, settled = headline.size_symbol, headline.held_text, headline.settled
     which = f"{size} at the end" if headline.final else f"mean {size} in the last quarter"
@@ -137,9 +150,12 @@ def table_note(headline: Headline) -> str:
     if headline.settles:
         band = headline.amount(f"{settled:.2g}")
         parts.append(f"Settling: until {size} stays below {band}, over the episodes that settle.")
+    parts.append("A crashed episode counts with what was flown of it and has not settled.")
     parts.append(
-        "A crashed episode counts with what was flown of it and has not settled. Bounds: the "
-        "time-optimal flight of the same episodes, and thrust that stays at hover."
+        "An episode of each drone counts for itself. Least distance: of the centres of two drones "
+        "that fly, in all episodes of a seed."
+        if swarm
+        else "Bounds: the time-optimal flight of the same episodes, and thrust that stays at hover."
     )
     return " ".join(parts)
 
@@ -162,11 +178,13 @@ def terminal_table(table: pd.DataFrame, headline: Headline) -> Table:
         caption_justify="left",
     )
     shown.add_column("Agent", no_wrap=True)
+    overshoot = f"Overshoot\n({headline.unit})" if headline.unit else "Overshoot"
+    overshoot = "Least dis-\ntance (m)" if _is_swarm(table) else overshoot
     for heading in (
         headline.labelled(f"Steady\n{headline.size_symbol}"),
         "Hold\nit",
         "Settling\n(s)",
-        f"Overshoot\n({headline.unit})" if headline.unit else "Overshoot",
+        overshoot,
         "Return",
         f"Env steps to\n{headline.held_text}",
         "Env\nsteps/s",
@@ -206,7 +224,7 @@ def _row(agent: str, row: Mapping[str, Any]) -> tuple[Cell, ...]:
         _measured(row, "steady", crashed),
         _held(row, seeds),
         _measured(row, "settling_time", settled),
-        _measured(row, "overshoot"),
+        _measured(row, "least_distance" if "least_distance" in row else "overshoot"),
         _measured(row, "return"),
         Cell(count_text(row["env_steps_to_reach"]), reached),
         Cell(count_text(row["steps_per_second"])),
@@ -252,12 +270,17 @@ def count_text(value: float) -> str:
 
 def markdown_table(table: pd.DataFrame, headline: Headline) -> str:
     """Make a Markdown table from `metrics.results_table`, with its note below."""
-    titles = headings(headline)
+    swarm = _is_swarm(table)
+    titles = headings(headline, swarm)
     lines = [titles, ("---", *["---:"] * (len(titles) - 1))]
     lines += [tuple(map(_markdown_cell, row)) for row in result_rows(table)]
     # |E| in a cell would end the cell.
     text = ["".join(f"| {cell.replace('|', chr(92) + '|')} " for cell in line) for line in lines]
-    return "".join(f"{line}|\n" for line in text) + f"\n{table_note(headline)}\n"
+    return "".join(f"{line}|\n" for line in text) + f"\n{table_note(headline, swarm)}\n"
+
+
+def _is_swarm(table: pd.DataFrame) -> bool:
+    return "least_distance" in table
 
 
 def _markdown_cell(cell: Cell) -> str:
@@ -271,11 +294,11 @@ def _page(
     results: Results, table: pd.DataFrame, verdicts: Sequence[Verdict], curves: Curves, **media: Any
 ) -> str:
     """The page, with names in the template of the film, its poster and the files beside it."""
-    config, headline = results.config, results.headline
+    config, headline, swarm = results.config, results.headline, _is_swarm(table)
     agents = sort_agents(table.index[table["seeds"] > 0])
     bounds = [name for name in table.index if name not in agents]
     trained = sort_agents(config["agents"])
-    charts = make_charts(curves, headline)
+    charts = make_charts(curves, headline, config.get("diameter"))
     settings = config["agents"]
     annealed = [name for name in ("vpg", "a2c") if settings.get(name, {}).get("anneal")]
     environment = jinja2.Environment(
@@ -292,10 +315,11 @@ def _page(
         outcome=_outcome(table.loc[agents], verdicts, config["env_steps"], headline),
         colors=[agent_color(agent) for agent in agents],
         dark_colors=[agent_color(agent, dark=True) for agent in agents],
-        headings=headings(headline),
+        headings=headings(headline, swarm),
         rows=result_rows(table.loc[[*agents, *bounds]]),
-        note=table_note(headline),
+        note=table_note(headline, swarm),
         verdicts=verdicts,
+        of_paper=any(verdict.source != OURS for verdict in verdicts),
         annealed=[agent_label(name) for name in annealed],
         charts=charts,
         averaging_share=AVERAGING_SHARE,
@@ -367,8 +391,12 @@ class Chart(NamedTuple):
     """Value of y with a dotted line."""
 
 
-def make_charts(curves: Curves, headline: Headline) -> list[Chart]:
-    """Make the charts in the order in which the page shows them; those without data too."""
+def make_charts(curves: Curves, headline: Headline, diameter: float | None = None) -> list[Chart]:
+    """Make the charts in the order in which the page shows them; those without data too.
+
+    That of the distances is there where a world has several drones, whose spheres touch at the
+    `diameter`, m.
+    """
     size, held, log = headline.size_symbol, headline.held, not headline.high
     steps, steady = "env steps", headline.labelled(f"steady-state {size}")
     training = {
@@ -377,9 +405,12 @@ def make_charts(curves: Curves, headline: Headline) -> list[Chart]:
     }
     value, target = headline.labelled(headline.symbol), None if headline.high else 0.0
     total = "cumulative reward"
+    distance = "least distance (m)"
+    near = [Chart("distance", "time (s)", distance, curves.distances, mark=diameter)]
     return [
         Chart("learning", steps, steady, curves.learning, curves.levels, log=log, mark=held),
         Chart("flown", "time (s)", headline.labelled(size), curves.flown_sizes, log=log, mark=held),
+        *(near if curves.distances else ()),
         Chart("reward", steps, "reward per episode", curves.average_return),
         Chart("training-error", steps, value, training, mark=target),
         Chart("total-by-step", steps, total, curves.return_by_step),

@@ -11,6 +11,7 @@ reports.
 | `steps.parquet` | environment step of training and of the final evaluation |
 | `evaluations.csv` | deterministic evaluation episode of a policy snapshot |
 | `runs.csv` | training run (agent and seed) |
+| `positions.parquet` | drone and control step of the final evaluation, where a world has several |
 
 The column of the headline metric has the metric's own name, such as `elevation_error`; its unit
 stands in `config.json`. In data frames its name says what it is: `steady`
@@ -38,6 +39,7 @@ from ..agents.episodes import Episode
 from ..envs.spec import EnvSpec, SpecError
 from ..models.errors import InputError, require
 from .metrics import Headline, overshoot, settling_time, steady_state
+from .swarms import GOAL, POSITION
 from .trajectories import Trajectory
 
 CONFIG_FILE: Final = "config.json"
@@ -45,6 +47,7 @@ EPISODES_FILE: Final = "episodes.csv"
 STEPS_FILE: Final = "steps.parquet"
 EVALUATIONS_FILE: Final = "evaluations.csv"
 RUNS_FILE: Final = "runs.csv"
+POSITIONS_FILE: Final = "positions.parquet"
 
 CONFIG_KEYS: Final = ("created", "command", "preset", "seeds", "env_steps", "spec", "vehicle",
                       "agents", "versions", "machine")  # fmt: skip
@@ -85,6 +88,18 @@ RUN_COLUMNS: Final[Mapping[str, str]] = {
     "seconds": "float64",
     "steps_per_second": "float64",
 }
+
+POSITION_SCHEMA: Final = pa.schema(
+    {
+        "agent": pa.dictionary(pa.int32(), pa.string()),
+        "seed": pa.int32(),
+        "episode": pa.int32(),
+        "drone": pa.int32(),  # its place in the spec's `agents`
+        "step": pa.int32(),  # 0 is the start
+        **dict.fromkeys((*POSITION, *GOAL), pa.float32()),  # paper's frame, m
+    }
+)
+"""Columns of `positions.parquet`."""
 
 _TABLES: Final = {
     EPISODES_FILE: EPISODE_COLUMNS,
@@ -178,7 +193,13 @@ Rows = Mapping[str, list[dict[str, Any]]]
 """Rows by the name of their file."""
 
 
-def write_part(part: Path, metric: str, rows: Rows, steps: list[pa.Table]) -> None:
+def write_part(
+    part: Path,
+    metric: str,
+    rows: Rows,
+    steps: list[pa.Table],
+    positions: pd.DataFrame | None = None,
+) -> None:
     """Write what one run gave: a folder that is there whole or not at all."""
     unfinished = part.with_name(f".{part.name}")
     unfinished.mkdir(parents=True)
@@ -189,6 +210,9 @@ def write_part(part: Path, metric: str, rows: Rows, steps: list[pa.Table]) -> No
         table.columns = [*(_in_file(column, metric) for column in columns), *drawn]
         table.to_csv(unfinished / name, index=False)
     pq.write_table(pa.concat_tables(steps), unfinished / STEPS_FILE, compression="zstd")
+    if positions is not None:
+        table = pa.Table.from_pandas(positions, POSITION_SCHEMA, preserve_index=False)
+        pq.write_table(table, unfinished / POSITIONS_FILE, compression="zstd")
     unfinished.rename(part)
 
 
@@ -200,10 +224,12 @@ def join_parts(parts: Path, folder: Path, metric: str) -> None:
         body = [line for part in lines for line in part[1:]]
         header = max((part[0] for part in lines), key=len)  # one without rows lacks what was drawn
         (folder / table).write_text("".join([header, *body]))
-    schema = step_schema(metric)
-    with pq.ParquetWriter(folder / STEPS_FILE, schema, compression="zstd") as writer:
-        for name in names:
-            writer.write_table(pq.read_table(parts / name / STEPS_FILE, schema=schema))
+    for file, schema in ((STEPS_FILE, step_schema(metric)), (POSITIONS_FILE, POSITION_SCHEMA)):
+        if not (parts / names[0] / file).exists():  # one drone has no positions
+            continue
+        with pq.ParquetWriter(folder / file, schema, compression="zstd") as writer:
+            for name in names:
+                writer.write_table(pq.read_table(parts / name / file, schema=schema))
     # Whole or not at all: a half-removed part would look like one to resume from.
     shutil.rmtree(parts.rename(parts.with_name(f".{parts.name}")))
 
@@ -267,6 +293,8 @@ class Results:
     """Evaluation episodes, `EVALUATION_COLUMNS`."""
     runs: pd.DataFrame
     """Training runs, `RUN_COLUMNS`."""
+    positions: pd.DataFrame | None = None
+    """Of several drones in the final evaluation, `POSITION_SCHEMA`."""
 
 
 def read_results(folder: Path | str) -> Results:
@@ -274,7 +302,21 @@ def read_results(folder: Path | str) -> Results:
     spec = read_spec(folder)
     headline = Headline.of(spec)
     tables = {name.removesuffix(".csv"): _read_csv(folder, name, headline.name) for name in _TABLES}
-    return Results(config=read_config(folder), spec=spec, headline=headline, **tables)
+    positions = _read_positions(Path(folder) / POSITIONS_FILE)
+    return Results(config=read_config(folder), spec=spec, headline=headline, positions=positions,
+                   **tables)  # fmt: skip
+
+
+def _read_positions(path: Path) -> pd.DataFrame | None:
+    if not path.is_file():
+        return None
+    try:
+        table = pq.read_table(path)
+    except pa.ArrowInvalid as error:
+        raise ResultsError(f"{path} is not a Parquet file: {error}") from error
+    _check_names(path, "column", POSITION_SCHEMA.names, table.schema.names)
+    frame: pd.DataFrame = table.unify_dictionaries().to_pandas()
+    return frame
 
 
 def read_steps(

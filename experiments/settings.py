@@ -181,7 +181,7 @@ class CompareConfig(_ManyRuns):
     """Settings of a comparison and its workers."""
 
     agents: tuple[str, ...] = ("vpg", "a2c", "sb3-a2c")
-    """Agents to train. The PID is always evaluated beside them, where it can fly the env."""
+    """Agents to train. The PID, or ORCA, is evaluated beside them where it can fly the env."""
     snapshots: int = 10
     """Policies kept during each training, for the learning curves."""
     curve_episodes: int = 10

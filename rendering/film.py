@@ -223,6 +223,8 @@ class Overlay:
         scale: Lower and upper end of the graph, in the metric's unit. Values beyond are not drawn:
             a triangle marks where the curve leaves.
         numbers: Whether there is more than the title.
+        of: Name of the craft of which the numbers are, all but the first metric, where there are
+            several.
 
     Attributes:
         has_numbers: Whether the panel has numbers.
@@ -243,13 +245,15 @@ class Overlay:
         seconds: float,
         scale: tuple[float, float],
         numbers: bool = True,
+        of: str = "",
     ) -> None:
         self._size = width, height
         self._title, self._color = title, ImageColor.getrgb(color)[:3]
         self._period, self._seconds, self._scale = period, max(seconds, period), scale
         self._vehicle = members_of(vehicle, 1)[0]  # the overlay is of the first drone
         self._high = float(self._vehicle.thrust_high.max())
-        self._widest = replace(  # its lines are as wide as any of the flight
+        self._of = [("numbers of", of)] if of else []
+        widest = replace(  # its lines are as wide as any of the flight
             like,
             position=(0.0, -100.0, 0.0),
             thrusts=(self._high,) * len(like.thrusts),
@@ -258,7 +262,8 @@ class Overlay:
             reward=-10.0,
             step=100_000,
             episode=100_000,
-        ).lines(self._high)
+        )
+        self._widest = self._lines(widest)
         self._metric = like.metrics[0] if like.metrics else None
         unit = max(7.0, min(height / 30, width / 34))
         self._unit, self._gap = unit, max(2, round(0.55 * unit))
@@ -297,6 +302,10 @@ class Overlay:
             _enlarged(image, box, lambda draw: self._write_note(draw, box, note))
         return np.asarray(image)
 
+    def _lines(self, moment: Moment) -> list[tuple[str, str]]:
+        first, *rest = moment.lines(self._high)
+        return [first, *self._of, *rest]
+
     def _numbers_width(self) -> int:
         """Of a panel in which every name and its value fit beside each other."""
         lines = ((name, _spaced(value)) for name, value in self._widest)
@@ -328,7 +337,7 @@ class Overlay:
         title = _fitted(self._title, self._large, right - left - 1.2 * unit)
         draw.text((left + 1.2 * unit, middle), title, self._color, self._large, anchor="lm")
         y += round(1.6 * unit) + gap // 2
-        for name, value in moment.lines(self._high) if self.has_numbers else ():
+        for name, value in self._lines(moment) if self.has_numbers else ():
             draw.text((left, y), name, _NAMES, self._font)
             draw.text((right, y), _spaced(value), _VALUES, self._font, anchor="ra")
             y += line

@@ -33,12 +33,14 @@ _DUE = (0.13, 0.78, 0.52, 0.9)  # The gate that is next, and a pad
 _GATE = (0.96, 0.42, 0.08, 0.9)
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 _PATH = (1.0, 0.85, 0.25)
-# Of drones of one world, their paths and goals: Okabe and Ito's, told apart with colour-blindness.
-_COLORS = (
+DRONE_COLORS: Final = (
     _PATH, (0.34, 0.71, 0.91), (0.90, 0.62, 0.0), (0.0, 0.62, 0.45), (0.80, 0.47, 0.65),
     (0.0, 0.45, 0.70), (0.84, 0.37, 0.0), (0.55, 0.34, 0.29),
 )  # fmt: skip
-_MOST_NAMES = 16  # of drones of one world: more hide them
+"""Red, green and blue, 0 to 1, of the drones of one world, their paths and goals, again from the
+first: Okabe and Ito's, told apart with colour-blindness."""
+MOST_NAMES: Final = 16
+"""Drones of one world whose names are shown; more would hide them."""
 _ONBOARD: Final = "stage/onboard"
 _ROOM = 10_000  # geoms
 _SAMPLES = 4  # of every pixel, for smooth edges; software has no more
@@ -271,7 +273,7 @@ class Stage:
         mujoco.mj_camlight(self.model, self.data)
 
     def camera(self, name: Camera | Literal["free"]) -> mujoco.MjvCamera:
-        """A camera for the last moments. All but `onboard` see every craft.
+        """A camera for the last moments. All but `onboard` see every craft, and goals of one world.
 
         `chase` and `top` go with the craft; `front`, `side` and `free`, where a viewer's camera
         begins, look at the goal if there is one, and move back from a craft that is far from it.
@@ -284,12 +286,15 @@ class Stage:
             return camera
         expect(name in _VIEWS, "camera", f"one of {', '.join(CAMERAS)}", f"{name!r}")
         camera.azimuth, camera.elevation, distance, holds = _VIEWS[name]
-        places = self._points() if self.names else self._offsets
+        places, reach = self._offsets, float(self._reach.max())
+        if len(self.names) > 1:  # the goals of one world lie apart, often far from their craft
+            goals = (goal for goal in self._goals if goal is not None)
+            places, reach = np.array([*self._points(), *goals]), 0.0
         camera.distance = distance * self.radius + float(np.ptp(places, axis=0).max())
         if holds == math.inf:
             camera.lookat[:] = self._points().mean(axis=0)
         else:
-            camera.distance += _BACK * max(float(self._reach.max()) - holds * self.radius, 0.0)
+            camera.distance += _BACK * max(reach - holds * self.radius, 0.0)
             camera.lookat[:] = self.focus
         if name in ("front", "side"):  # above the ground
             camera.lookat[2] = max(camera.lookat[2] - _LOWER * camera.distance, 0.0)
@@ -318,11 +323,11 @@ class Stage:
                 if cable is not None:
                     mujoco.mjv_connector(cable, kind, 0.012 * self.radius, here, payload)
         marked = any(moment.marks for moment in self.moments)
-        if 1 < len(self.names) <= _MOST_NAMES:
+        if 1 < len(self.names) <= MOST_NAMES:
             self._write_names(scene)
         lines = zip(self._paths, self._goals, self._points(), strict=True)
         for drone, (path, goal, here) in enumerate(lines):
-            color = _COLORS[drone % len(_COLORS)] if self.names else _PATH
+            color = DRONE_COLORS[drone % len(DRONE_COLORS)] if self.names else _PATH
             if goals and goal is not None and not marked:
                 size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
                 disc = (*color, _DISC[3]) if len(self.names) > 1 else _DISC
@@ -346,7 +351,7 @@ class Stage:
             above = here + np.array((0.0, 0.0, 0.9 * self.radius))
             label = _decoration(scene, mujoco.mjtGeom.mjGEOM_LABEL, (0.1,) * 3, above, _CABLE)
             if label is not None:
-                label.label = f"{name} "  # without the space its end would be cut off
+                label.label = f"{name}   "  # without the spaces its end would be cut off
 
     def _points(self) -> np.ndarray:
         """Positions of the craft, MuJoCo's frame, shape (drones, 3), m."""

@@ -21,6 +21,7 @@ from rotorgram.envs.registry import env_spec
 from rotorgram.experiments.filming import Film, Shot, film, grid
 from rotorgram.experiments.trajectories import Trajectory
 from rotorgram.models import InputError, Vehicle
+from rotorgram.rendering import MetricValue
 from rotorgram.rendering.film import Overlay, check_film, poster, write_film
 
 FAST = Film(width=WIDTH, height=HEIGHT, world="plain", fast=True, overlay=False)
@@ -290,6 +291,34 @@ def test_the_scale_holds_crashes_if_there_is_nothing_else(opengl: None, tmp_path
     ]
     assert columns[0].max() == pytest.approx(strip.right, abs=4)  # to its end
     assert columns[1].max() < strip.left + 20  # of 0.1 m it is out after 0.08 s
+
+
+def test_several_drones_tell_how_near_they_come() -> None:
+    first, second = trajectory(5.0, 5.0, 5.0, ending="terminated"), trajectory(8.0, 7.0, 6.0, 6.5)
+    both = Shot(name="ORCA", color="#7CC8F2", trajectories=[first, second], drones=2)
+    assert both.curve(0).tolist() == [3.0, 2.0, 1.0, 1.5]  # one that has ended stays there
+    distance, headline = both.panel(0, 1).metrics
+    assert distance == MetricValue("least distance", 2.0, "m")
+    assert (headline.name, headline.value) == ("elevation_error", 0.0)
+    assert both.panel(0, 3).metrics[0].value == 1.5
+    assert [both.note(0, step) for step in range(4)] == ["", "", *["1 of 2 ended"] * 2]
+    alone = shot(second)
+    assert alone.curve(0).tolist() == [-3.0, -2.0, -1.0, -1.5]
+    assert [metric.name for metric in alone.panel(0, 0).metrics] == ["elevation_error"]
+    assert [shot(first).note(0, step) for step in (1, 2)] == ["", "terminated"]
+
+
+def test_a_film_of_several_drones(opengl: None, tmp_path: Path) -> None:
+    spec = replace(trajectory(5.0, 5.0).spec, agents=("a", "b"))
+    pictures = []
+    for heights in ((8.0, 7.5, 7.0), (8.0, 7.5, 8.0)):
+        flights = trajectory(5.0, 5.0, 5.0), trajectory(*heights)
+        world = [replace(one, spec=spec) for one in flights]
+        both = Shot(name="ORCA", color="#7CC8F2", trajectories=world, drones=2)
+        pictures.append(filmed(tmp_path, both, overlay=True))
+    assert [len(frames) for frames in pictures] == [2, 2]
+    assert same(pictures[0][0], pictures[1][0])
+    assert not same(pictures[0][1], pictures[1][1])  # the second is where it is
 
 
 def test_episodes_follow_one_another_and_pictures_are_of_a_time(

@@ -217,6 +217,16 @@ def test_there_is_a_bar_for_each_rotor_with_its_own_limits(file: Path, rotors: i
     assert bars[row].sum() == pytest.approx(rest[row].sum(), rel=0.35)  # half full
 
 
+def test_it_names_the_craft_of_which_the_numbers_are() -> None:
+    without, named = overlay_of(640, 360), overlay_of(640, 360, of="drone_3")
+    assert named.has_numbers
+    assert named.panel.lower - without.panel.lower == 15  # a line: 1.28 of a thirtieth of 360
+    black = np.zeros((360, 640, 3), np.uint8)
+    first, second = (overlay.draw(black, at(5.0), [0.0]) for overlay in (without, named))
+    panel = without.panel
+    assert not np.array_equal(first[: panel.lower, :100], second[: panel.lower, :100])
+
+
 def test_without_metrics_there_is_no_graph() -> None:
     overlay = overlay_of(640, 360, like=at(5.0, metrics=()))
     assert (overlay.has_numbers, overlay.has_strip) == (True, False)

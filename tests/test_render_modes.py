@@ -184,6 +184,21 @@ def test_drones_of_one_world_are_in_one_picture_where_they_are() -> None:
     assert Stage("plain", 2).least_distance is None  # of different worlds
 
 
+def test_cameras_hold_every_craft_and_goal_of_one_world() -> None:
+    stage = Stage("plain", 2, names=("a", "b"))
+    stage.show(*(
+        Moment(position=(x, 9.0, 0.0), goal=(-5.0 * x, 9.0, 0.0), attitude=(0.0,) * 3,
+               thrusts=(49.0,) * 4)
+        for x in (1.0, -4.0)
+    ))  # fmt: skip
+    radii = {"chase": 3.85, "top": 5.5, "front": 6.9, "side": 6.9, "free": 3.85}
+    for name, count in radii.items():  # the goals are at X = -5 and 20 m
+        camera = stage.camera(name)
+        assert camera.distance == pytest.approx(count * stage.radius + 25.0), name
+    assert stage.camera("chase").lookat[1] == pytest.approx(1.5)  # the craft at X = -1.5 m
+    assert stage.camera("free").lookat[1] == pytest.approx(-7.5)  # and the goals at 7.5 m
+
+
 def test_drones_of_one_world_are_named_and_have_paths_and_goals_of_their_own_colour() -> None:
     stage = Stage("plain", 2, names=("a", "b"))
     for step in range(10):

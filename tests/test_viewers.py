@@ -61,6 +61,23 @@ for _ in range(5):
     env.render()  # as many scripts do: shown already, and not again
 print("flown")
 """
+PETTINGZOO = """
+import swarms
+from pettingzoo.test.render_test import render_test
+from pettingzoo.utils import aec_to_parallel, parallel_to_aec
+from rotorgram.envs.parallel import LocalParallelEnv
+
+made = []
+def env(render_mode):
+    made.append(parallel_to_aec(LocalParallelEnv(swarms.RISE, 3, render_mode)))
+    return made[-1]
+
+render_test(env)
+modes = [aec_to_parallel(one).render_mode for one in made]
+for one in made:
+    one.close()
+print(*modes)
+"""
 needs_screen = pytest.mark.skipif(
     shutil.which("Xvfb") is None, reason="no Xvfb to open a window on"
 )
@@ -74,6 +91,13 @@ def test_the_window(tmp_path: Path) -> None:
 @needs_screen
 def test_a_window_that_nobody_closes_ends_with_its_program(tmp_path: Path) -> None:
     assert on_a_screen(FORGOTTEN, tmp_path) == "flown\n"
+
+
+@needs_screen
+def test_pettingzoos_test_of_rendering(tmp_path: Path) -> None:
+    pytest.importorskip("pettingzoo")
+    script = f"import sys; sys.path.append({str(Path(__file__).parent)!r})\n{PETTINGZOO}"
+    assert on_a_screen(script, tmp_path) == "human human rgb_array\n"
 
 
 def on_a_screen(script: str, folder: Path) -> str:
