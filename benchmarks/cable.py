@@ -7,14 +7,11 @@ median and largest of the means of the payload's error over the last quarter of 
 worlds whose episode terminated.
 """
 
-import argparse
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import RESULTS, options, write
 from rotorgram.agents import Geometric
-from rotorgram.agents.checkpoints import software_versions
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.experiments.trajectories import fly_episodes
 from rotorgram.models.library import vehicle_names
@@ -39,16 +36,12 @@ def flown(vehicle: str, drones: int, episodes: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=10)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/control/cable.json"))
-    args = parser.parse_args()
-    told: dict[str, Any] = {"episodes": args.episodes, "software": software_versions()}
+    args = options(__doc__, episodes=10, out=RESULTS / "control" / "cable.json").parse_args()
+    told: dict[str, Any] = {"episodes": args.episodes}
     for name in vehicle_names():
         told[name] = {str(count): flown(name, count, args.episodes) for count in DRONES}
         print(name, told[name], flush=True)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(told, indent=2) + "\n")
+    write(args.out, told)
 
 
 if __name__ == "__main__":

@@ -196,8 +196,8 @@ def test_wrong_positions_are_one_sentence(tmp_path: Path) -> None:
 def test_a_comparison_of_several_drones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "out"
     arguments = ["compare", "--env", "rotorgram/Formation-v0", "--vehicle", "crazyflie2"]
-    arguments += ["--drones", "2", "--num-envs", "2", "--agents", "ippo", "--seeds", "1"]
-    arguments += ["--env-steps", "2048", "--snapshots", "1", "--episodes", "2", "--no-film"]
+    arguments += ["--drones", "2", "--num-envs", "64", "--agents", "ippo", "--seeds", "1"]
+    arguments += ["--env-steps", "16384", "--snapshots", "1", "--episodes", "2", "--no-film"]
     arguments += ["--env.episode-length", "20", "--jobs", "1", "--out", str(folder)]
     assert main(arguments) == 0
     results = read_results(folder)
