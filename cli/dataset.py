@@ -32,11 +32,13 @@ class Dataset(Command):
     def run(self) -> int:
         """Write it; print what it holds."""
         from ..experiments.datasets import RecordedEpisodes, env_of, write_minari, write_parquet
-        from ..models import Vehicle
+        from ..models.fleet import load_vehicles
+        from ..sim.world import MAX_DRONES
         from ..udp.journal.reader import count_of
 
         if self.vehicle:
-            Vehicle.load(self.vehicle)  # before a journal is read: a wrong name is no other env
+            # Before a journal is read: a wrong name is no other env.
+            load_vehicles(self.vehicle, MAX_DRONES)
         if self.env:
             from ..envs import registry
 

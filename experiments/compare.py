@@ -12,7 +12,7 @@ from ..agents.checkpoints import Checkpoint, store
 from ..envs.registry import env_spec
 from ..envs.spec import EnvSpec
 from ..models.errors import InputError
-from ..models.vehicle import Vehicle
+from ..models.fleet import load_vehicles
 from . import results, swarms
 from .bounds import known_bounds
 from .evaluations import Stage, evaluate_stages, stages_of
@@ -55,7 +55,7 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
             content["evaluation"] = {name: getattr(config, name) for name in _SETTINGS}
             content["bounds"] = known_bounds(config, config.episodes)
             if config.drones > 1:  # distance at which the spheres of two drones touch, m
-                content["diameter"] = 2 * Vehicle.load(config.vehicle).radius
+                content["diameter"] = 2 * load_vehicles(config.vehicle, config.drones).radius
             results.write_config(folder, command, spec, config.vehicle, content)
         for unfinished in parts.glob(".*"):
             shutil.rmtree(unfinished)

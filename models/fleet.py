@@ -42,7 +42,8 @@ class Fleet(Vehicle):
                 f"{one.num_rotors} of {one.name}",
             )
         step = min(one.timestep for one in vehicles)
-        members = tuple(_under(one, step, first.gravity) for one in vehicles)
+        kinds = {one: _under(one, step, first.gravity) for one in vehicles}
+        members = tuple(kinds[one] for one in vehicles)
         told: dict[str, Any] = {one.name: getattr(members[0], one.name) for one in fields(Vehicle)}
         for name in ("mass", "center_of_mass", "inertia", "allocation", "hover_thrust"):
             told[name] = np.array([getattr(one, name) for one in members])

@@ -51,7 +51,7 @@ class WorldState:
     payload_velocity: Array = None
     """Its velocity, world frame, m/s, shape (W, A, 3)."""
 
-    def of(self, drones: slice) -> "WorldState":
+    def of(self, drones: Sequence[int]) -> "WorldState":
         """Of some drones of each world."""
         arrays = {name: getattr(self, name) for name in self.__slots__}
         return WorldState(

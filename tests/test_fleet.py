@@ -90,7 +90,7 @@ def test_every_level_is_flown_by_each_vehicle_s_own_controller(level: str) -> No
     if level in ("rotors", "offset", "increment"):
         for i, craft in enumerate(fleet.members):
             own = make_controller(level, craft, fleet.timestep)
-            one = own.thrust(action[:, i : i + 1], state.of(slice(i, i + 1)))
+            one = own.thrust(action[:, i : i + 1], state.of([i]))
             assert thrust[:, i : i + 1] == pytest.approx(one + 0.0 * thrust[:, i : i + 1])
     if level == "velocity":
         gains = [Gains.of(craft, fleet.timestep) for craft in fleet.members]

@@ -80,11 +80,13 @@ def make_controller(
 
 
 def _of_several(level: str, vehicles: Sequence["Vehicle"], period: float, lag: float) -> Controller:
-    """One of a level for each drone's vehicle; an action stands for the same with all."""
+    """One of a level for each vehicle; an action stands for the same with all."""
+    kinds = list(dict.fromkeys(vehicles))
     controllers: list[Controller]
     if level in _CASCADE:
-        gains = shared_ranges([Gains.of(vehicle, period, lag) for vehicle in vehicles])
-        controllers = [_CASCADE[level](*both) for both in zip(vehicles, gains, strict=True)]
+        gains = shared_ranges([Gains.of(vehicle, period, lag) for vehicle in kinds])
+        controllers = [_CASCADE[level](*both) for both in zip(kinds, gains, strict=True)]
     else:
-        controllers = [make_controller(level, vehicle, period, lag=lag) for vehicle in vehicles]
-    return Several(controllers)
+        controllers = [make_controller(level, vehicle, period, lag=lag) for vehicle in kinds]
+    drones = [[i for i, own in enumerate(vehicles) if own is kind] for kind in kinds]
+    return Several(list(zip(controllers, drones, strict=True)))

@@ -1,4 +1,4 @@
-"""A controller for each drone of a world whose vehicles are not all alike."""
+"""Controllers of drones of one world whose vehicles are not all alike."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 
 class Several:
-    """As `Controller`, for drones that have one each, in their order. Actions mean the same to all.
+    """As `Controller`: each flies the drones with its numbers. Actions mean the same to all.
 
     Arrays are NumPy's, of shape (W, A, ...).
     """
 
-    def __init__(self, controllers: Sequence["Controller"]) -> None:
-        first: Any = controllers[0]
+    def __init__(self, controllers: Sequence[tuple["Controller", Sequence[int]]]) -> None:
+        first: Any = controllers[0][0]
         self.low, self.high = first.low, first.high
         self.components, self.choices = first.components, first.choices
         self.every_step = getattr(first, "every_step", False)
@@ -28,7 +28,6 @@ class Several:
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
         thrusts = np.empty(state.thrust.shape)
-        for i, controller in enumerate(self._controllers):
-            one = slice(i, i + 1)
-            thrusts[:, one] = controller.thrust(action[:, one], state.of(one))
+        for controller, drones in self._controllers:
+            thrusts[:, drones] = controller.thrust(action[:, drones], state.of(drones))
         return thrusts
