@@ -288,10 +288,17 @@ def test_our_own_rows_are_right() -> None:
     config = read_rows_file(BOARD)
     assert config.seeds == 10
     assert {"vpg", "a2c", "sb3-a2c", "pid"} <= {row.agent for row in config.rows}
+    swarms = read_rows_file(BOARD.with_name("swarms.toml"))
+    assert swarms.seeds == 5
+    assert {row.drones for row in swarms.rows} == {2, 4, 8}
+    assert {"ippo", "mappo", "sb3-ppo", "orca"} == {row.agent for row in swarms.rows}
 
 
-def test_the_committed_page_is_made_of_the_committed_files() -> None:
-    assert (DOCS / "baselines.md").read_text() == page_of(COMMITTED, DOCS)
+@pytest.mark.parametrize(
+    ("page", "folder"), [("baselines.md", "baselines"), ("swarm_baselines.md", "swarms")]
+)
+def test_a_committed_page_is_made_of_the_committed_files(page: str, folder: str) -> None:
+    assert (DOCS / page).read_text() == page_of(DOCS / "results" / folder, DOCS)
 
 
 def test_the_committed_policies_fly_the_committed_numbers() -> None:

@@ -17,13 +17,17 @@ import rotorgram.envs  # noqa: F401
 from gymnasium.utils.env_checker import check_env
 from remotes import flying
 from rotorgram.agents import PID
-from rotorgram.envs import LocalVectorEnv, SingleEnv
+from rotorgram.envs import LocalVectorEnv, SingleEnv, registry
 from rotorgram.envs.spec import component_names
 from rotorgram.models import QUAD_XML, InputError, Vehicle
 
 DATA = Path(__file__).parent / "data"
 ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
-TASKS = sorted(name for name in gym.registry if name.startswith("rotorgram/"))
+TASKS = sorted(  # that one drone can fly
+    name
+    for name in gym.registry
+    if name.startswith("rotorgram/") and registry.task_type(name).fewest == 1
+)
 FILES = {"quad": QUAD_XML}
 FILES |= {path.stem: path for path in sorted(DATA.glob("*.xml"))}
 FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/vehicle.toml"))}

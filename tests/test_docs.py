@@ -218,6 +218,13 @@ def test_the_scaling_page_tells_what_the_benchmark_wrote() -> None:
     )
 
 
+def test_the_page_of_swarms_tells_what_the_benchmark_wrote() -> None:
+    page = (ROOT / "docs" / "swarms.md").read_text()
+    told = json.loads((RESULTS / "performance" / "swarm.json").read_text())["microseconds"]
+    for case, row in told.items():
+        assert f"| {case} | " + " | ".join(f"{x:,.1f}" for x in row.values()) + " |" in page
+
+
 def test_the_limits_are_those_that_were_measured() -> None:
     page = (ROOT / "docs" / "limits.md").read_text()
     bench, peers = (

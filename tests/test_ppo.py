@@ -212,6 +212,10 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     racing = find_preset("ppo", "tuned", "rotorgram/Racing-v0")
     assert (racing.num_envs, racing.backend, racing.config.hidden) == (512, "rigid", (64, 64))
     assert find_preset("ppo", "tuned", "other/Task-v0") == ours
+    swarm = find_preset("ippo", "tuned", "rotorgram/Formation-v0")
+    assert swarm.config.rollout_size(swarm.num_envs) == swarm.num_envs * 512  # a whole episode
+    for algorithm in ("ppo", "mappo", "sb3-ppo"):
+        assert find_preset(algorithm, "tuned", "rotorgram/Crossing-v0") == swarm
     with pytest.raises(InputError, match="preset: expected tuned for ppo, got 'paper'"):
         find_preset("ppo", "paper")
 

@@ -126,7 +126,7 @@ def test_a_comparison_of_swarms_goes_on_and_is_filmed_with_all_drones(
 ) -> None:
     config = CompareConfig(
         agents=("ippo",), env_id="rotorgram/Formation-v0", options={"episode_length": 4},
-        drones=2, num_envs=2, env_steps=1024, seeds=1, snapshots=1, curve_episodes=1, episodes=1,
+        drones=2, num_envs=128, env_steps=16_384, seeds=1, snapshots=1, curve_episodes=1, episodes=1,
     )  # fmt: skip
     compare(config, tmp_path, "rotorgram compare", nothing)
     assert read_compare_config(tmp_path) == config
