@@ -293,7 +293,9 @@ def test_the_page_of_rigid_tells_what_the_benchmarks_wrote() -> None:
     assert f"{a2c['ratio_to_sb3']['a2c']:.2f} times as many env steps per second" in page
 
 
-@pytest.mark.parametrize("task", ["Elevation", "Hover", "Tracking", "Waypoints", "Racing"])
+@pytest.mark.parametrize(
+    "task", ["Elevation", "Hover", "Tracking", "Waypoints", "Racing", "Recovery"]
+)
 def test_the_readme_tells_how_long_a_training_took(task: str) -> None:
     found = json.loads((RESULTS / f"seconds_{task.lower()}.json").read_text())
     cells = f" | {found['hold']} of {found['of']} | {found['seconds']['median']:.3g} s |"
