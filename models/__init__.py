@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from .vehicle import Rotor, Vehicle
 
 __all__ = [
-    "AIRPORT_XML", "BACKENDS", "MOST_DRAG", "QUAD_XML", "SCENE_XML", "Backend", "InputError",
-    "MissingPackage", "Rotor", "Vehicle", "attach_airport", "build_scene",
+    "AIRPORT_XML", "BACKENDS", "MAX_DRONES", "MOST_DRAG", "QUAD_XML", "SCENE_XML", "Backend",
+    "InputError", "MissingPackage", "Rotor", "Vehicle", "attach_airport", "build_scene",
 ]  # fmt: skip
 
 QUAD_XML: Final = Path(__file__).parent / "quad.xml"
@@ -30,6 +30,8 @@ Backend = Literal["mujoco", "rigid", "warp"]
 no contact, in compiled C or in torch. `warp`: MuJoCo Warp, float32. Tensors of the last two take a
 GPU if there is one."""
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
+MAX_DRONES: Final = 1024
+"""Most drones of a world."""
 MOST_DRAG: Final = 100.0
 """Largest linear drag, 1/s. RK4 at 10 ms is within 0.1 % there, and unstable above 278 /s."""
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from ..models import BACKENDS, Backend
+from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import expect, require
 from .effects import EffectOptions
 from .random import Draw, Noise
@@ -29,7 +29,6 @@ _SETTINGS: Final = {
 }
 
 MAX_WORLDS: Final = 1 << 16  # Most worlds of a batch
-MAX_DRONES: Final = 1024  # Most drones of a world
 CONTACT_CHECK: Final = 0.02
 """Longest time between two checks for contact, s. A bounce of the paper's craft at full thrust
 lasts longer, unless its skids dip less than half a millimetre."""
