@@ -1,7 +1,6 @@
 """Writes golden.json: datagrams for whoever writes a peer, byte by byte, right ones and wrong ones.
 
-python docs/golden.py            write docs/golden.json
-python docs/golden.py --check    fail if it is not what this code writes
+python tests/golden.py    write docs/golden.json
 """
 
 import json
@@ -62,8 +61,17 @@ TWO: Final = EnvSpec(
     ),
     action=ArraySpec(name="action", shape=(1,), low=-1.0, high=1.0),
 )
-WORLDS: Final = {"one": 1, "two": 2}
-SPECS: Final = {"one": ONE, "two": TWO}
+SWARM: Final = EnvSpec(
+    env_id="a/Swarm-v0",
+    control_period=0.1,
+    observation=(ArraySpec(name="observation", shape=(1,), low=-1.0, high=1.0),),
+    action=ArraySpec(name="action", shape=(2,), low=-1.0, high=1.0),
+    telemetry=(ArraySpec(name="metrics", shape=(1,), unit="m", components=("e",)),),
+    metrics=(Metric(name="e", unit="m"),),
+    agents=("left", "right"),
+)
+WORLDS: Final = {"one": 1, "two": 2, "swarm": 2}
+SPECS: Final = {"one": ONE, "two": TWO, "swarm": SWARM}
 LAYOUTS: Final = {name: layout_of(spec, WORLDS[name]) for name, spec in SPECS.items()}
 
 
@@ -90,6 +98,20 @@ def two_state(sequence: int) -> State:
         rewards=np.array([-0.0, 0.1]),
         terminated=np.array([False, True]),
         truncated=np.array([True, False]),
+    )
+
+
+def swarm_state() -> State:
+    """Of two worlds: `right` of the first crashes, the second has flown its time."""
+    return State(
+        session=SESSION,
+        sequence=2,
+        time=0.1,
+        observations=(f4([0.25], [0.5], [-0.25], [-0.5]),),
+        rewards=np.array([0.5, -10.0, 1.0, 1.5]),
+        terminated=np.array([False, True, False, False]),
+        truncated=np.array([False, False, True, True]),
+        telemetry=(np.array([[1.0], [2.0], [3.0], [4.0]]),),
     )
 
 
@@ -142,6 +164,16 @@ def messages() -> list[tuple[str, str, Message]]:
         ("command to reset, with a seed", "one", one_command(1, 0, 1, 2**64 - 1)),
         ("command: fly, freeze", "two", two_command([0, 2])),
         ("command: reset, fly; with seeds", "two", two_command([1, 0], [2**64 - 1, 5])),
+        ("hello of two worlds of two drones", "swarm",
+         Hello(session=SESSION, spec=SWARM.to_json(), worlds=2)),
+        ("welcome of an agent whose drones land when it is lost", "swarm",
+         Welcome(session=SESSION, nonce=NONCE, extensions=(Extension(number=1, value=b"land"),))),
+        ("state of two worlds of two drones", "swarm", swarm_state()),
+        ("command: the first world flies, the second begins anew", "swarm",
+         Command(session=SESSION, sequence=2,
+                 actions=f4([0.5, -0.5], [0, 0], [0, 0], [0, 0]),
+                 orders=np.array([0, 0, 1, 1], np.uint8),
+                 seeds=np.array([0, 0, 7, 8], np.uint64))),
         ("close", "one", Close(session=SESSION, sequence=1, reason="done")),
         ("close, the answer", "one", Close(session=SESSION, sequence=1, reason="")),
     ]  # fmt: skip

@@ -36,9 +36,9 @@ def test_the_file_is_what_the_code_writes() -> None:
 
 
 def test_the_bytes_are_those_of_the_page() -> None:
-    one, two = (
+    one, two, swarm = (
         json.dumps(GOLDEN["envs"][name]["spec"], separators=(",", ":")).encode()
-        for name in ("one", "two")
+        for name in ("one", "two", "swarm")
     )
     nonce = 0xFEDCBA9876543210
     expected = {
@@ -78,6 +78,28 @@ def test_the_bytes_are_those_of_the_page() -> None:
         "command: fly, freeze": by_hand(5, 3, struct.pack("<I4x2f2B", 0, 0.5, -1, 0, 2)),
         "command: reset, fly; with seeds": by_hand(
             5, 3, struct.pack("<I4x2f2B6x2Q", 2, 0.5, -1, 1, 0, 2**64 - 1, 5)
+        ),
+        "hello of two worlds of two drones": by_hand(
+            1, 0, struct.pack("<BBHIII", 2, 2, 0, 2, len(swarm), 0) + swarm
+        ),
+        "welcome of an agent whose drones land when it is lost": by_hand(
+            2, 0, struct.pack("<QQBB6x", nonce, 0, 0, 2) + b"\x01\0\x04\0land"
+        ),
+        # World by world, and in a world left before right.
+        "state of two worlds of two drones": by_hand(
+            4,
+            2,
+            struct.pack("<dQ4f4d", 0.1, 0, 0.25, 0.5, -0.25, -0.5, 0.5, -10, 1, 1.5)
+            + bytes([0, 1, 0, 0])
+            + bytes([0, 0, 1, 1])
+            + struct.pack("<4d", 1, 2, 3, 4),
+        ),
+        "command: the first world flies, the second begins anew": by_hand(
+            5,
+            2,
+            struct.pack("<I4x8f4B", 4, 0.5, -0.5, *[0] * 6, 0, 0, 1, 1)
+            + bytes(4)
+            + struct.pack("<4Q", 0, 0, 7, 8),
         ),
         "close": by_hand(6, 1, b"\x04\0done"),
         "close, the answer": by_hand(6, 1, b"\0\0"),
