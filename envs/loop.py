@@ -40,6 +40,7 @@ from ..sim.sensors import Sensors, readings_of
 from . import registry
 from .autoreset import Seeds, checked_seeds, worlds_done
 from .delay import Delay
+from .sights import Sights, arrays_of, views_of
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
 
@@ -108,8 +109,10 @@ def _check_returned(
     expect("bool" in str(kind), env_id, "terminated as truth values", f"{kind}")
 
 
-def spec_of(env_id: str, task: Task, drones: int = 1) -> EnvSpec:
-    """The `EnvSpec` of a task's env with so many drones in a world."""
+def spec_of(
+    env_id: str, task: Task, drones: int = 1, pictures: tuple[ArraySpec, ...] | None = None
+) -> EnvSpec:
+    """The `EnvSpec` of a task's env with so many drones in a world, and with these pictures."""
     vehicle, controller = task.vehicle, task.controller
     names, low, high = controller.components, controller.low, controller.high
     action: ArraySpec | Discrete = (
@@ -132,7 +135,8 @@ def spec_of(env_id: str, task: Task, drones: int = 1) -> EnvSpec:
         vehicle=vehicle.name,
         vehicle_hash=vehicle.hash,
         agents=drone_names(drones),
-        observation=tuple(_repeated(a, task.options.history) for a in _observed(task)),
+        observation=tuple(_repeated(a, task.options.history) for a in _observed(task))
+        + (_pictures(task, drones) if pictures is None else pictures),
         action=action,
         telemetry=_telemetry_specs(task),
         metrics=task.metrics,
@@ -145,6 +149,19 @@ def _observed(task: Task) -> tuple[ArraySpec, ...]:
     options = task.options
     readings = readings_of(options.sensors, task.vehicle, options.control_period)
     return task.observation + tuple(ArraySpec(**reading._asdict()) for reading in readings)
+
+
+def _pictures(task: Task, drones: int) -> tuple[ArraySpec, ...]:
+    """What cameras add to an observation; nothing is drawn."""
+    if not task.options.cameras:
+        return ()
+    views = views_of(task, drones)
+    if not any(view.kind == "segmentation" for view in views):
+        return arrays_of(views, ())
+    from ..rendering.cameras import objects_of
+
+    hung, world = bool(task.effects.get("payload")), task.options.world
+    return arrays_of(views, objects_of(task.vehicle, drones, world, task.marks, payload=hung))
 
 
 def _repeated(array: ArraySpec, count: int) -> ArraySpec:
@@ -247,7 +264,9 @@ class Loop(NotCopied):
         )  # fmt: skip
         self._xp = self.world.xp
         self.task = type(draft)(chosen, craft, self.world.shape, self._xp)
-        self.spec = spec_of(canonical_id(env_id), self.task, drones)
+        self._sights = Sights(self.task, (num_worlds, drones)) if chosen.cameras else None
+        pictures = self._sights.arrays if self._sights else ()
+        self.spec = spec_of(canonical_id(env_id), self.task, drones, pictures)
         self.num_envs, self.vehicle = num_worlds * drones, craft
         self._drones = drones
         self._prepare_step()
@@ -295,7 +314,8 @@ class Loop(NotCopied):
             self._late_actions = Delay(randomize.most_steps("action_delay"), self._xp)
         if randomize is not None and "observation_delay" in self._drawn:
             most = randomize.most_steps("observation_delay")
-            self._late_observations = {name: Delay(most, self._xp) for name in names}
+            seen = [*names, *(view.name for view in self._sights.views)] if self._sights else names
+            self._late_observations = {name: Delay(most, self._xp) for name in seen}
         self._history = {name: Delay(count - 1, self._xp) for name in names if count > 1}
 
     def _clear(self) -> None:
@@ -475,6 +495,8 @@ class Loop(NotCopied):
         self.observations = {}
         for name, shape, dtype in self._arrays:
             self.observations[name] = _as_type(observed[name].reshape(shape), dtype)
+        if self._sights is not None:
+            self.observations |= self._sights.look(state, self.steps, flown, begun)
         if self._late_observations:
             age = self._per_drone(self.world.parameters["observation_delay"])
             for name, past in self._keep(self._late_observations, flown, begun):
@@ -666,6 +688,8 @@ class Loop(NotCopied):
     def close(self) -> None:
         """Release threads and memory; what the last step gave can be read on."""
         self.world.close()
+        if self._sights is not None:
+            self._sights.close()
         self._closed = self._anyone_waits = True
 
     def ours(self, mask: Array) -> Array:

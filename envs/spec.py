@@ -73,7 +73,7 @@ class _Part:
 class ArraySpec(_Part):
     """An array of one drone. Bounds of the same value are kept as one number."""
 
-    _optional = ("low", "high", "unit", "frame", "components")
+    _optional = ("low", "high", "unit", "frame", "components", "categories")
 
     name: str
     shape: tuple[int, ...]
@@ -87,9 +87,12 @@ class ArraySpec(_Part):
     """Frame of reference; empty where there is none."""
     components: tuple[str, ...] = ()
     """A name for each element, or none."""
+    categories: tuple[str, ...] = ()
+    """What the values 0, 1, 2... stand for, where they are numbers of something; or none."""
 
     def __post_init__(self) -> None:
         _check_text("name", self.name)
+        _check_words(f"{self.name}: categories", self.categories)
         name, shape, units, names = self.name, self.shape, self.unit, self.components
         _expect(name, "name", "a name for an array", name)
         is_shape = isinstance(shape, tuple) and all(type(n) is int and n >= 1 for n in shape)

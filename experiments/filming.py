@@ -15,8 +15,9 @@ from ..agents import CONTROLLERS
 from ..agents.checkpoints import load
 from ..agents.policies import Policy
 from ..envs.rendering import moment
+from ..models import World
 from ..models.errors import InputError, expect
-from ..rendering import Camera, Canvas, MetricValue, Moment, NoOpenGL, Stage, World
+from ..rendering import Camera, Canvas, MetricValue, Moment, NoOpenGL, Stage
 from ..rendering.film import QUALITY, Overlay, check_film, graph_scale, write_film
 from .palette import agent_color
 from .swarms import least

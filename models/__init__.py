@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from .vehicle import Rotor, Vehicle
 
 __all__ = [
-    "AIRPORT_XML", "BACKENDS", "MAX_DRONES", "MOST_DRAG", "QUAD_XML", "SCENE_XML", "Backend",
-    "InputError", "MissingPackage", "Rotor", "Vehicle", "attach_airport", "build_scene",
+    "AIRPORT_XML", "BACKENDS", "MAX_DRONES", "MOST_DRAG", "QUAD_XML", "SCENE_XML", "WORLDS",
+    "Backend", "InputError", "MissingPackage", "Rotor", "Vehicle", "World", "attach_airport",
+    "build_scene",
 ]  # fmt: skip
 
 QUAD_XML: Final = Path(__file__).parent / "quad.xml"
@@ -30,6 +31,9 @@ Backend = Literal["mujoco", "rigid", "warp"]
 no contact, in compiled C or in torch. `warp`: MuJoCo Warp, float32. Tensors of the last two take a
 GPU if there is one."""
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
+World = Literal["plain", "airport"]
+"""Surroundings of the vehicle, which pictures show and physics does not know."""
+WORLDS: Final[tuple[World, ...]] = get_args(World)
 MAX_DRONES: Final = 1024
 """Most drones of a world."""
 MOST_DRAG: Final = 100.0

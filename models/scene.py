@@ -3,18 +3,15 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
-from . import AIRPORT_XML, QUAD_XML, SCENE_XML
+from . import AIRPORT_XML, QUAD_XML, SCENE_XML, World
 from .errors import expect
 from .vehicle_file import read_vehicle_file
-
-World = Literal["plain", "airport"]
-"""Surroundings of the vehicle."""
 
 AIRPORT_PREFIX: Final = "airport/"  # Of all names that `attach_airport` adds
 SCENE_PREFIX: Final = "scene/"  # Of all names that `build_scene` adds

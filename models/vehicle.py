@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from . import MOST_DRAG
+from .cameras import Camera, read_cameras
 from .coefficients import PREFIX, Coefficients
 from .errors import InputError, expect
 from .library import find_vehicle
@@ -85,6 +86,8 @@ class Vehicle:
     """Height of the body's origin when it touches level ground, m."""
     coefficients: Coefficients
     """What effects and sensors need."""
+    cameras: tuple[Camera, ...] = ()
+    """Those of the file; `cameras_of` has ours too."""
 
     @classmethod
     def load(cls, path: Path | str | None = None, *, linear_drag: float = 0.0) -> "Vehicle":
@@ -348,6 +351,7 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
         hover_thrust=_hover(rotors, allocation, mass * gravity),
         rest_height=find_rest_height(model, data),
         coefficients=read_coefficients(model),
+        cameras=read_cameras(spec, model),
     )
 
 

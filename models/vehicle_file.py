@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 
 import mujoco
 
+from .cameras import OUTPUTS, Camera, place_camera, steps_of
 from .coefficients import PREFIX, Limits, checked, coefficient_fields
 from .errors import InputError, expect
 
@@ -50,6 +51,12 @@ ENTRIES: Final[Mapping[str, Field[Any]]] = {
     "rotors.list.position": _entry("m", -100.0, 100.0, 3),
     "rotors.list.axis": _entry("1", -1e3, 1e3, 3),
     **dict(coefficient_fields()),
+    "cameras.position": _entry("m", -100.0, 100.0, 3),
+    "cameras.look": _entry("1", -1e3, 1e3, 3),
+    "cameras.up": _entry("1", -1e3, 1e3, 3),
+    "cameras.fovy": _entry("rad", 1e-3, 3.0),
+    "cameras.resolution": _entry("pixel", 1, 4096, 2),
+    "cameras.rate": _entry("1", 1e-3, 1.0),
     "real_flights.position": _entry("m", 0.0, 1e4),
     "real_flights.velocity": _entry("m/s", 0.0, 1e4),
     "real_flights.attitude": _entry("rad", 0.0, 3.15),
@@ -66,15 +73,27 @@ FRAMES: Final[Mapping[str, tuple[int, float]]] = {
 clockwise seen from above. The first turns clockwise, the next counterclockwise, and so on."""
 
 _WORDS: Final[Mapping[str, tuple[str, ...]]] = {
-    "vehicle": ("name", "model", "body", "rotors", "drag", "battery", "sensors", "real_flights"),
+    "vehicle": (
+        "name",
+        "model",
+        "body",
+        "rotors",
+        "drag",
+        "battery",
+        "sensors",
+        "cameras",
+        "real_flights",
+    ),
     "model": ("file",),
     "body": ("parts",),
     "body.parts": ("shape",),
     "rotors": ("frame", "list"),
     "rotors.list": ("name", "turn", "link", "body", "site"),
+    "cameras": ("name", "kinds", "stands"),
 }
 """Keys of each table besides its numbers."""
 _SHAPES: Final[Mapping[str, tuple[str, ...]]] = {"box": ("size",), "cylinder": ("radius", "length")}
+_AHEAD: Final = (1.0, 0.0, 0.0)
 _UP: Final = (0.0, 0.0, 1.0)
 _MOST_BYTES: Final = 1_000_000  # it is read within a few seconds
 _LEAST_MOMENT: Final = 1e-15  # kg m²: MuJoCo's mjMINVAL
@@ -140,6 +159,7 @@ class VehicleFile:
     """File of the model, URDF or MJCF; None: it is built from the tables."""
     rotors: tuple[PlacedRotor, ...]
     parts: tuple[Part, ...]
+    cameras: tuple[Camera, ...]
 
     def value(self, name: str, default: Any = None) -> Any:
         """A number by its name: a float or a tuple of floats; `default` if the file has none."""
@@ -178,10 +198,14 @@ class VehicleFile:
 
     def build(self, base: mujoco.MjSpec | None = None) -> mujoco.MjSpec:
         """The vehicle alone, without ground; `base` is the spec of `model`, changed in place."""
-        if base is None:
-            return mujoco.MjSpec.from_string(self.mjcf())
-        _complete(base, self)
-        return base
+        spec = mujoco.MjSpec.from_string(self.mjcf()) if base is None else base
+        if base is not None:
+            _complete(base, self)
+        free = mujoco.mjtJoint.mjJNT_FREE
+        crafts = [body for body in spec.bodies if any(j.type == free for j in body.joints)]
+        for camera in self.cameras if crafts else ():
+            place_camera(spec, crafts[0] if camera.carried else spec.worldbody, camera)
+        return spec
 
     def mjcf(self) -> str:
         """MJCF of a vehicle without a model's file. Every number has all its digits."""
@@ -219,6 +243,11 @@ class _Reader:
         model = self._model(path, tree.get("model"))
         parts = self._body(tree.get("body"), model)
         rotors = self._rotors(tree.get("rotors"), model)
+        tables = enumerate(_tables("cameras", tree.get("cameras", []), least=0), 1)
+        cameras = tuple(self._camera(one, f"cameras[{i}]") for i, one in tables)
+        twice = [one.name for one in cameras]
+        twice = [name for name in twice if twice.count(name) > 1]
+        expect(not twice, "cameras", "a name of its own for each", f"{''.join(twice[:1])!r} twice")
         for group in ("drag", "battery", "sensors", "real_flights"):
             self._read(tree.get(group, {}), group)
         physical = {key: value for key, value in tree.items() if key != "real_flights"}
@@ -229,6 +258,7 @@ class _Reader:
             model=model,
             rotors=rotors,
             parts=parts,
+            cameras=cameras,
         )
 
     def _read(self, table: Any, kind: str, name: str = "") -> dict[str, Any]:
@@ -298,6 +328,35 @@ class _Reader:
             position=given.get("position", (0.0, 0.0, 0.0)),
             size=tuple(size),
             turn=given.get(turn, 0.0 if shape == "box" else _UP),
+        )
+
+    def _camera(self, table: Any, name: str) -> Camera:
+        given = self._read(table, "cameras", name)
+        own, kinds, stands = table.get("name"), table.get("kinds", ["rgb"]), table.get("stands")
+        right = isinstance(own, str) and own.isidentifier()
+        expect(right, f"{name}.name", "letters, digits and _", repr(own))
+        right = isinstance(kinds, list) and bool(kinds) and all(kind in OUTPUTS for kind in kinds)
+        expect(right, f"{name}.kinds", f"some of {', '.join(OUTPUTS)}", repr(kinds))
+        right = stands in (None, True, False)
+        expect(right, f"{name}.stands", "true, for one that no drone carries", repr(stands))
+        look, up = given.get("look", _AHEAD), given.get("up", _UP)
+        across = math.hypot(*_crossed(look, up))
+        right = across > 1e-6 * math.hypot(*look) * math.hypot(*up)
+        expect(right, f"{name}.up", "another direction than look", f"{list(up)}")
+        width, height = (round(side) for side in given.get("resolution", (64.0, 64.0)))
+        right = (width, height) == given.get("resolution", (width, height))
+        expect(right, f"{name}.resolution", "whole numbers", f"{given.get('resolution')}")
+        return Camera(
+            name=str(own),
+            width=width,
+            height=height,
+            fovy=given.get("fovy", math.pi / 2),
+            kinds=tuple(kind for kind in OUTPUTS if kind in kinds),
+            every=steps_of(name, given.get("rate", 1.0)),
+            carried=not stands,
+            position=given.get("position", (0.0, 0.0, 0.0)),
+            look=look,
+            up=up,
         )
 
     def _rotors(self, table: Any, model: Path | None) -> tuple[PlacedRotor, ...]:
@@ -652,6 +711,10 @@ class _Mjcf:
 
 def _scaled(vector: Sequence[float], factor: float) -> tuple[float, ...]:
     return tuple(factor * one for one in vector)
+
+
+def _crossed(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def _turned(rotor: PlacedRotor) -> dict[str, str]:

@@ -7,13 +7,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ..models.scene import World
     from .gl import NoOpenGL
-    from .stage import CAMERAS, WORLDS, Camera, Canvas, Mark, MetricValue, Moment, Stage
+    from .stage import CAMERAS, Camera, Canvas, Mark, MetricValue, Moment, Stage
 
 __all__ = [
-    "CAMERAS", "WORLDS", "Camera", "Canvas", "Mark", "MetricValue", "Moment", "NoOpenGL",
-    "Stage", "World",
+    "CAMERAS", "Camera", "Canvas", "Mark", "MetricValue", "Moment", "NoOpenGL", "Stage",
 ]  # fmt: skip
 
 

@@ -13,15 +13,15 @@ from typing import Any, Final, Literal, NamedTuple, Self, get_args
 import mujoco
 import numpy as np
 
+from ..models import World
 from ..models.errors import InputError, expect
 from ..models.fleet import load_vehicles, members_of
 from ..models.frames import pose_in_mujoco_frame
-from ..models.scene import SCENE_PREFIX, World, attach_craft, build_scene
+from ..models.scene import SCENE_PREFIX, attach_craft, build_scene
 from .gl import NoOpenGL, offscreen_context
 
 Camera = Literal["chase", "front", "side", "top", "onboard"]
 CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
-WORLDS: Final[tuple[World, ...]] = get_args(World)
 
 _MOST_METRICS = 4  # with a line of their own
 _MOST_THRUSTS = 4  # rotors with a number of their own
@@ -221,7 +221,7 @@ class Stage:
             attach_craft(spec, crafts[number].path, f"{number}/", offset)
         self.model = spec.compile()
         apart = float(np.ptp(grid, axis=0).max())  # drones of one world fly further apart
-        _scale_drawing(self.model, self.radius, 4.0 * apart if names else apart)
+        scale_drawing(self.model, self.radius, 4.0 * apart if names else apart)
         self._length = _TRAIL // _EVERY if trail else 0
         self._clear()
 
@@ -449,7 +449,7 @@ def _size(model: mujoco.MjModel) -> tuple[float, float]:
     return max(radius, 1e-3), float(tops.max())
 
 
-def _scale_drawing(model: mujoco.MjModel, radius: float, spread: float) -> None:
+def scale_drawing(model: mujoco.MjModel, radius: float, spread: float) -> None:
     """Set the near end of drawing, the shadow's fineness and our floor's squares for the craft."""
     visual, extent = model.vis, model.stat.extent
     visual.global_.fovy = _FOVY

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 import numpy as np
 
-from ...models import MOST_DRAG
+from ...models import MOST_DRAG, WORLDS
 from ...models.errors import expect
 from ...sim import (
     LEVELS,
@@ -66,6 +66,11 @@ class TaskOptions:
     """What is drawn for each episode: names of `sim.PARAMETERS` to distributions, as texts."""
     sensors: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """What the drone measures: by sensor its settings, or true. See `sim/sensors.py`."""
+    cameras: tuple[str, ...] = ()
+    """Pictures that are observed: cameras of the vehicle by name, also as NAME_KIND or
+    NAME@WIDTHxHEIGHT. See `models/cameras.py`."""
+    world: str = "plain"
+    """What the pictures show around the drones: `plain`, `airport`..., as viewers have it."""
 
     actions: ClassVar[tuple[str, ...]] = LEVELS
     """Levels that the task can be flown at; one with a controller of its own may name fewer."""
@@ -84,6 +89,8 @@ class TaskOptions:
         expect(not hung, "effects", expected, " and ".join(hung))
         object.__setattr__(self, "effects", effects.to_options())
         object.__setattr__(self, "sensors", checked_sensors(self.sensors))
+        object.__setattr__(self, "cameras", _words(self.cameras))
+        check_choice(self, "world", WORLDS)
         self.check()
         acting = replace(effects, payload=1.0) if self.hangs else effects
         drawn = Randomization(self.randomize, acting)
@@ -103,9 +110,12 @@ class TaskOptions:
         return bool(self.sensors.get("observe") == "estimate")
 
     def to_options(self) -> dict[str, Any]:
-        """Every option by its name, as a spec has them; of mappings those that are not empty."""
+        """Every option by its name, as a spec has them; of mappings those that are not empty, and
+        of pictures those that there are.
+        """
         told = {one.name: getattr(self, one.name) for one in fields(self)}
-        return {name: value for name, value in told.items() if value != {}}
+        unseen = () if self.cameras else ("cameras", "world")
+        return {name: value for name, value in told.items() if value != {} and name not in unseen}
 
     @classmethod
     def from_options(cls, options: Mapping[str, Any]) -> Self:
@@ -232,6 +242,14 @@ class Task:
     def goal(self, state: WorldState) -> Array:
         """Positions of the goals, for pictures: world frame, m, shape (W, A, 3). Optional."""
         raise NotImplementedError
+
+
+def _words(given: Any) -> tuple[str, ...]:
+    """Words of a text with commas, or of several texts. Raises `InputError`."""
+    texts = [given] if isinstance(given, str) else given
+    right = isinstance(texts, list | tuple) and all(isinstance(one, str) for one in texts)
+    expect(right, "cameras", "names, with commas between them", f"{given!r:.80}")
+    return tuple(word for text in texts for word in text.replace(",", " ").split())
 
 
 def finite(value: Any) -> float | None:

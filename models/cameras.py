@@ -1,0 +1,243 @@
+"""Cameras of a vehicle's file: where they sit, what they take, how often; their kinds of pictures.
+
+An MJCF file has them as its cameras, with `resolution`, `fovy` and `output`; the rate, for which
+MJCF has no word, is a custom text of the name "rotorgram/cameras.NAME.rate". A TOML file has a
+table `[[cameras]]` for each. A file without a `front` or a `down` gets ours.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, Literal, get_args
+
+import mujoco
+import numpy as np
+
+from .coefficients import PREFIX
+from .errors import InputError, expect
+
+if TYPE_CHECKING:
+    from .vehicle import Vehicle
+
+Kind = Literal["rgb", "depth", "segmentation", "flow"]
+KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+"""`rgb`: uint8, 3 channels. `depth`: float32, m, along the camera's axis. `segmentation`: int32, a
+number for each object. `flow`: float32, pixels to the right and down since the step before."""
+FARTHEST: Final = 1000.0
+"""Where drawing ends, and the depth where nothing is seen, m."""
+MOST_PIXELS: Final = 4096  # of a side
+OUTPUTS: Final = {
+    "rgb": mujoco.mjtCamOutBit.mjCAMOUT_RGB,
+    "depth": mujoco.mjtCamOutBit.mjCAMOUT_DEPTH,
+    "segmentation": mujoco.mjtCamOutBit.mjCAMOUT_SEG,
+}
+"""Kinds that a file can name; `flow` is for an option to choose."""
+_RATE: Final = PREFIX + "cameras."
+_SIDE: Final = 64  # Pixels of a side, where the file tells none
+MOST_STEPS: Final = 1000  # from picture to picture
+_Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A camera of a vehicle, or of its world."""
+
+    name: str
+    width: int = _SIDE
+    """Pixels."""
+    height: int = _SIDE
+    """Pixels."""
+    fovy: float = math.pi / 2
+    """Vertical field of view, rad."""
+    kinds: tuple[str, ...] = ("rgb",)
+    """What it takes: some of `KINDS`."""
+    every: int = 1
+    """Control steps from one picture to the next."""
+    carried: bool = True
+    """Whether a drone carries it; else it stands in the world."""
+    position: _Vector = (0.0, 0.0, 0.0)
+    """In the body frame, or the world's if it is not carried, m."""
+    look: _Vector = (1.0, 0.0, 0.0)
+    """Direction in which it looks, in the same frame."""
+    up: _Vector = (0.0, 0.0, 1.0)
+    """Direction of the picture's upper edge, in the same frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Pictures of one kind by one camera: an array of an observation."""
+
+    camera: Camera
+    kind: str
+
+    @property
+    def name(self) -> str:
+        """That of the camera, and of the kind unless it is `rgb`."""
+        return self.camera.name + ("" if self.kind == "rgb" else f"_{self.kind}")
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Rows from the top, columns from the left, channels."""
+        channels = {"rgb": 3, "flow": 2}.get(self.kind, 1)
+        return self.camera.height, self.camera.width, channels
+
+    @property
+    def dtype(self) -> str:
+        """`uint8`, `int32` or `float32`."""
+        return {"rgb": "uint8", "segmentation": "int32"}.get(self.kind, "float32")
+
+    @property
+    def unit(self) -> str:
+        """Of its numbers."""
+        return {"depth": "m", "flow": "pixel"}.get(self.kind, "")
+
+    @property
+    def frame(self) -> str:
+        """Where the camera is and looks, in words."""
+        camera = self.camera
+        where = "the body" if camera.carried else "the world"
+        place, look = (
+            " ".join(f"{one:.4g}" for one in vector) for vector in (camera.position, camera.look)
+        )
+        angle = math.degrees(camera.fovy)
+        return f"at ({place}) m in {where}, looks along ({look}), {angle:.4g} degrees high"
+
+
+def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View, ...]:
+    """The pictures that words choose: CAMERA, all its kinds; CAMERA_KIND; with @WIDTHxHEIGHT behind
+    it in another size. Raises `InputError`.
+    """
+    known = {camera.name: camera for camera in cameras}
+    views: dict[str, View] = {}
+    for word in words:
+        text, at, size = word.partition("@")
+        name, _, kind = text.rpartition("_")
+        alone = text in known
+        right = alone or (name in known and kind in KINDS)
+        expected = f"some of {', '.join(known)}, each with _{', _'.join(KINDS)} behind it or not"
+        expect(right, "cameras", expected, f"{word!r}")
+        camera = known[text if alone else name]
+        if at:
+            width, height = _size(word, size)
+            camera = replace(camera, width=width, height=height)
+        for one in camera.kinds if alone else (kind,):
+            view = View(camera=camera, kind=one)
+            expect(view.name not in views, "cameras", "each picture once", f"{view.name!r} twice")
+            views[view.name] = view
+    return tuple(views.values())
+
+
+def _size(word: str, text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    right = all(side.isascii() and side.isdecimal() and len(side) < 9 for side in (width, height))
+    right = right and all(1 <= int(side) <= MOST_PIXELS for side in (width, height))
+    expected = f"NAME@WIDTHxHEIGHT of 1 to {MOST_PIXELS} pixels each"
+    expect(right, "cameras", expected, f"{word!r}")
+    return int(width), int(height)
+
+
+# ---- of a file
+
+
+def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ...]:
+    """Cameras of a vehicle's spec and of the model that it gave. Raises `InputError`.
+
+    One that follows the craft but does not turn with it, as MuJoCo's mode `trackcom`, counts as
+    standing in the world.
+    """
+    rates = {text.name: text.data for text in spec.texts if text.name.startswith(_RATE)}
+    found = []
+    data = mujoco.MjData(model)
+    data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)
+    fixed = mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+    for number in range(model.ncam):
+        one = model.camera(number)
+        if not one.name:
+            continue
+        width, height = (int(side) for side in model.cam_resolution[number])
+        if (width, height) == (1, 1):  # MJCF's default
+            width = height = _SIDE
+        for side in (width, height):
+            expected = f"1 to {MOST_PIXELS} pixels a side"
+            expect(1 <= side <= MOST_PIXELS, f"camera {one.name}", expected, f"{side}")
+        output, axes = int(model.cam_output[number]), data.cam_xmat[number].reshape(3, 3)
+        mine = model.body_rootid[model.cam_bodyid[number]] == model.jnt_bodyid[0]
+        found.append(
+            Camera(
+                name=one.name,
+                width=width,
+                height=height,
+                fovy=math.radians(float(model.cam_fovy[number])),
+                kinds=tuple(kind for kind, bit in OUTPUTS.items() if output & bit) or ("rgb",),
+                every=steps_of(f"camera {one.name}", rates.pop(f"{_RATE}{one.name}.rate", "1")),
+                carried=bool(mine and model.cam_mode[number] == fixed),
+                position=_vector(data.cam_xpos[number]),
+                look=_vector(-axes[:, 2]),
+                up=_vector(axes[:, 1]),
+            )
+        )
+    for name in rates:
+        raise InputError(f"{name}: expected a camera of that name in the file, got none")
+    return tuple(found)
+
+
+def steps_of(name: str, rate: str | float) -> int:
+    """Control steps between the pictures of a camera at a rate. Raises `InputError`."""
+    try:
+        steps = 1 / float(rate)
+    except (ValueError, ZeroDivisionError):
+        steps = math.nan
+    right = 1 <= steps <= MOST_STEPS and abs(steps - round(steps)) < 1e-6 * steps
+    expected = f"1 over a whole number of control steps up to {MOST_STEPS}"
+    expect(right, f"{name}.rate", expected, f"{rate}")
+    return round(steps)
+
+
+def _vector(values: np.ndarray) -> _Vector:
+    x, y, z = (float(round(one, 9)) + 0.0 for one in values)
+    return x, y, z
+
+
+# ---- ours
+
+
+def cameras_of(vehicle: "Vehicle") -> tuple[Camera, ...]:
+    """All cameras: those of the file, and ours.
+
+    `front` looks ahead from the front of the sphere about the craft, `down` straight down from
+    nearly as low as its landing gear.
+    """
+    ours = (
+        Camera(name="front", position=(vehicle.radius, 0.0, 0.0)),
+        Camera(
+            name="down",
+            position=(0.0, 0.0, -0.9 * vehicle.rest_height),
+            look=(0.0, 0.0, -1.0),
+            up=(1.0, 0.0, 0.0),
+        ),
+    )
+    names = [camera.name for camera in vehicle.cameras]
+    return vehicle.cameras + tuple(camera for camera in ours if camera.name not in names)
+
+
+def add_cameras(spec: mujoco.MjSpec, body: mujoco.MjsBody, vehicle: "Vehicle", prefix: str) -> None:
+    """Add ours to the body of a vehicle in a spec, with a prefix before their names."""
+    own = [camera.name for camera in vehicle.cameras]
+    for camera in cameras_of(vehicle):
+        if camera.name not in own:
+            place_camera(spec, body, replace(camera, name=prefix + camera.name))
+
+
+def place_camera(spec: mujoco.MjSpec, body: mujoco.MjsBody, camera: Camera) -> None:
+    """Add a camera to a body of a spec."""
+    right = np.cross(camera.look, camera.up)
+    added = body.add_camera(name=camera.name, pos=camera.position)
+    added.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
+    added.alt.xyaxes = (*right.tolist(), *np.cross(right, camera.look).tolist())
+    added.fovy, added.resolution = math.degrees(camera.fovy), (camera.width, camera.height)
+    added.output = sum(int(OUTPUTS[kind]) for kind in camera.kinds)
+    if camera.every > 1:
+        spec.add_text(name=f"{_RATE}{camera.name}.rate", data=repr(1 / camera.every))

@@ -1,0 +1,326 @@
+"""Pictures of cameras against rays, known points, known areas, known motion, MuJoCo's drawing."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from rotorgram.envs.spec import Mark
+from rotorgram.models import InputError
+from rotorgram.models.cameras import FARTHEST, Camera, cameras_of, chosen_views
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.rendering.cameras import Cameras, objects_of
+from rotorgram.rendering.gl import offscreen_context
+from rotorgram.sim.rotations import to_world
+
+BELLY = """
+[[cameras]]
+name = "belly"
+position = [0.0, 0.0, -0.02]
+look = [0.5, 0.0, -1.0]
+up = [1.0, 0.0, 0.0]
+resolution = [48, 32]
+fovy = 1.0
+rate = 0.5
+kinds = ["depth", "rgb"]
+
+[[cameras]]
+name = "tower"
+position = [0.3, -0.4, 1.2]
+look = [-0.3, 0.4, -0.2]
+stands = true
+"""
+TILTED = np.array([math.cos(0.2), math.sin(0.2), 0.0, 0.0])  # 0.4 rad about x
+
+
+def vehicle_with(folder: Path, tables: str) -> Vehicle:
+    own = Vehicle.load("crazyflie2").path.read_text("utf-8")
+    file = folder / "own.toml"
+    file.write_text(own + tables, "utf-8")
+    return Vehicle.load(file)
+
+
+def state(*places: Any, quaternion: Any = (1.0, 0.0, 0.0, 0.0), **more: Any) -> dict[str, Any]:
+    turns = np.broadcast_to(np.asarray(quaternion), (len(places), 4))
+    return {"position": np.array(places), "quaternion": turns, **more}
+
+
+def take(cameras: Cameras, fresh: bool = True, **told: Any) -> dict[str, np.ndarray]:
+    count = len(told["position"])
+    everybody = np.ones(count, bool)
+    due = dict.fromkeys(cameras.pictures, everybody)
+    cameras.take(due, everybody if fresh else ~everybody, **told)
+    return {name: picture.copy() for name, picture in cameras.pictures.items()}
+
+
+@pytest.fixture
+def made(opengl: None) -> Iterator[Any]:
+    """Makes cameras, and closes them."""
+    opened: list[Cameras] = []
+
+    def make(words: str, vehicle: Any = None, shape: tuple[int, int] = (1, 1), **more: Any) -> Any:
+        craft = vehicle if isinstance(vehicle, Vehicle) else Vehicle.load(vehicle)
+        views = chosen_views(words.split(), cameras_of(craft))
+        opened.append(Cameras(craft, views, shape, **more))
+        return opened[-1]
+
+    yield make
+    for one in opened:
+        one.close()
+
+
+# ---- files and words
+
+
+def test_cameras_of_a_toml_file(tmp_path: Path) -> None:
+    vehicle = vehicle_with(tmp_path, BELLY)
+    named = {camera.name: camera for camera in cameras_of(vehicle)}
+    assert {*named} == {"belly", "tower", "front", "down"}
+    belly, tower = named["belly"], named["tower"]
+    assert (belly.width, belly.height, belly.every) == (48, 32, 2)
+    assert belly.kinds == ("rgb", "depth")
+    assert belly.fovy == pytest.approx(1.0, rel=1e-6)
+    assert belly.position == (0.0, 0.0, -0.02)
+    assert belly.look == pytest.approx((0.5 / math.sqrt(1.25), 0.0, -1 / math.sqrt(1.25)))
+    assert belly.carried
+    assert not tower.carried
+    assert tower.position == (0.3, -0.4, 1.2)
+    assert Vehicle.load("crazyflie2").hash != vehicle.hash
+
+
+def test_cameras_of_an_mjcf_file(tmp_path: Path) -> None:
+    text = Vehicle.load().path.read_text("utf-8")
+    eye = '<camera name="eye" pos="0.5 0 0" resolution="40 30" output="rgb segmentation"/>'
+    start = text.index("<camera ")
+    text = text[:start] + eye + text[start:]
+    rate = '<custom><text name="rotorgram/cameras.eye.rate" data="0.25"/></custom>'
+    text = text.replace("</mujoco>", f"{rate}</mujoco>")
+    file = tmp_path / "own.xml"
+    file.write_text(text, "utf-8")
+    named = {camera.name: camera for camera in Vehicle.load(file).cameras}
+    assert {*named} == {"eye", "chase", "portrait"}  # the others are those of quad.xml
+    eye = named["eye"]
+    assert (eye.width, eye.height, eye.every) == (40, 30, 4)
+    assert eye.kinds == ("rgb", "segmentation")
+    assert (eye.look, eye.up) == ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0))  # MuJoCo's: along -z
+    file.write_text(text.replace("cameras.eye", "cameras.ear"), "utf-8")
+    with pytest.raises(InputError, match=r"cameras.ear.rate: expected a camera of that name"):
+        Vehicle.load(file)
+
+
+def test_every_vehicle_has_two() -> None:
+    front, down = cameras_of(Vehicle.load("crazyflie2"))
+    assert (front.name, front.look) == ("front", (1.0, 0.0, 0.0))
+    assert (down.name, down.look, down.up) == ("down", (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ('name = "belly"', r"cameras\[1\].name: expected letters, digits and _, got None"),
+        ('kinds = ["depth", "rgb"]', r"kinds: expected some of rgb, depth, segmentation, got"),
+        ("fovy = 1.0", r"cameras\[1\].fovy: expected a number from 0.001 to 3 rad, got 4"),
+        ("rate = 0.5", r"cameras\[1\].rate: expected 1 over a whole number of control steps"),
+        ("up = [1.0, 0.0, 0.0]", r"cameras\[1\].up: expected another direction than look"),
+        ("resolution = [48, 32]", r"cameras\[1\].resolution: expected"),
+        ("stands = true", r"cameras\[2\].stands: expected true, for one that no drone carries"),
+        ('name = "tower"', "cameras: expected a name of its own for each, got 'belly' twice"),
+    ],
+)
+def test_wrong_cameras_of_a_file(tmp_path: Path, change: str, sentence: str) -> None:
+    wrong = {
+        'name = "belly"': "",
+        'kinds = ["depth", "rgb"]': 'kinds = ["heat"]',
+        "fovy = 1.0": "fovy = 4",
+        "rate = 0.5": "rate = 0.3",
+        "up = [1.0, 0.0, 0.0]": "up = [-1.0, 0.0, 2.0]",
+        "resolution = [48, 32]": "resolution = [48.5, 32]",
+        "stands = true": "stands = 1.5",
+        'name = "tower"': 'name = "belly"',
+    }[change]
+    with pytest.raises(InputError, match=sentence):
+        vehicle_with(tmp_path, BELLY.replace(change, wrong))
+
+
+def test_words_choose_views(tmp_path: Path) -> None:
+    cameras = cameras_of(vehicle_with(tmp_path, BELLY))
+    views = chosen_views(["belly", "front_flow@20x10", "down_segmentation"], cameras)
+    assert [(view.name, view.shape, view.dtype) for view in views] == [
+        ("belly", (32, 48, 3), "uint8"),
+        ("belly_depth", (32, 48, 1), "float32"),
+        ("front_flow", (10, 20, 2), "float32"),
+        ("down_segmentation", (64, 64, 1), "int32"),
+    ]
+    for word, sentence in {
+        "rear": "cameras: expected some of .*belly.*, each with _rgb, _depth.* got 'rear'",
+        "front_heat": "got 'front_heat'",
+        "front@0x4": "expected NAME@WIDTHxHEIGHT of 1 to 4096 pixels each, got 'front@0x4'",
+        "front@64": "got 'front@64'",
+        "front@64x5000": "got 'front@64x5000'",
+    }.items():
+        with pytest.raises(InputError, match=sentence):
+            chosen_views([word], cameras)
+    with pytest.raises(InputError, match="expected each picture once, got 'front' twice"):
+        chosen_views(["front", "front_rgb"], cameras)
+
+
+# ---- pictures
+
+
+def test_depth_is_that_of_rays(made: Any) -> None:
+    """1,000 pixels, over ground and another craft, against MuJoCo's rays."""
+    cameras = made("chase_depth@160x120", shape=(1, 2))
+    told = state((0.0, 0.0, 3.0), (-1.5, 0.4, 3.4), quaternion=TILTED)
+    depth = take(cameras, **told)["chase_depth"][0, ..., 0]
+    lens = cameras.lens("chase_depth", **told)
+    dice = np.random.default_rng(3)
+    rows, columns = dice.integers(120, size=1000), dice.integers(160, size=1000)
+    model, data = cameras.model, cameras.data
+    eye, groups = -lens.rotation.T @ lens.translation, np.array([1, 1, 1, 0, 0, 0], np.uint8)
+    errors, seen, hit = [], [], np.zeros(1, np.int32)
+    for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
+        ray = np.linalg.solve(lens.matrix, (column + 0.5, row + 0.5, 1.0))  # 1 m of depth
+        way = lens.rotation.T @ ray
+        length = mujoco.mj_ray(model, data, eye, way, groups, True, -1, hit)
+        if length < 0 or length > FARTHEST:
+            assert depth[row, column] == pytest.approx(FARTHEST, rel=1e-5)
+            continue
+        errors.append(abs(depth[row, column] / length - 1.0))
+        seen.append(int(hit[0]))
+    ground = np.array(seen) == model.geom("scene/floor").id
+    assert 100 < (~ground).sum() < ground.sum()
+    assert np.max(np.array(errors)[ground], initial=0.0) < 1e-4
+    assert np.median(np.array(errors)[~ground]) < 1e-4
+    # Edges of round shapes, which OpenGL draws with flat sides.
+    assert np.mean(np.array(errors)[~ground] < 0.01) > 0.97
+
+
+def test_known_points_come_to_their_pixels(made: Any, tmp_path: Path) -> None:
+    """Rotor tips, drawn as small balls, by their colour; half a pixel."""
+    paper = Vehicle.load()
+    text = paper.path.read_text("utf-8")
+    tips = [np.add(rotor.position, (0.0, 0.0, 0.3)) for rotor in paper.rotors]
+    balls = "".join(
+        f'<geom type="sphere" size="0.04" pos="{x} {y} {z}" rgba="1 0 1 1" mass="0" contype="0" '
+        'conaffinity="0"/>'
+        for x, y, z in tips
+    )
+    start = text.index("<camera ")
+    file = tmp_path / "tips.xml"
+    file.write_text(text[:start] + balls + text[start:], "utf-8")
+    cameras = made("portrait@320x240", file)
+    told = state((1.0, 2.0, 5.0), quaternion=TILTED)
+    picture = take(cameras, **told)["portrait"][0].astype(int)
+    pink = (picture[..., 0] > 2 * picture[..., 1]) & (picture[..., 2] > 2 * picture[..., 1])
+    places = np.argwhere(pink)[:, ::-1] + 0.5
+    lens = cameras.lens("portrait", **told)
+    for tip in tips:
+        point = told["position"][0] + to_world(TILTED, tip)
+        pixel = lens.project(point)
+        near = np.linalg.norm(places - pixel, axis=1) < 8
+        assert near.sum() > 6
+        assert np.abs(places[near].mean(axis=0) - pixel).max() < 0.5
+
+
+def test_segmentation_knows_the_pad_by_its_area(made: Any) -> None:
+    """A disc of 0.5 m below a camera at 2 m: π (r f / h)² pixels."""
+    craft = Vehicle.load("crazyflie2")
+    pad = Mark(shape="disc", size=0.5, moves=True)
+    cameras = made("down_segmentation@128x128", craft, marks=[pad])
+    assert cameras.objects == ("nothing", "scene/floor", "drone_0", "drone_0/disc_0")
+    assert objects_of(craft, 1, "plain", [pad], payload=False) == cameras.objects
+    told = state((0.0, 0.0, 2.0), goal=np.array([[0.1, 0.2, 0.0]]))
+    picture = take(cameras, **told)["down_segmentation"][0, ..., 0]
+    assert set(np.unique(picture)) <= {1, 2, 3}
+    lens = cameras.lens("down_segmentation", **told)
+    height = 2.0 - 0.9 * craft.rest_height - 0.02  # of the camera over the disc's upper side
+    expected = math.pi * (0.5 * lens.matrix[0, 0] / height) ** 2
+    assert (picture == 3).sum() == pytest.approx(expected, rel=0.02)
+    middle = np.argwhere(picture == 3).mean(axis=0)[::-1] + 0.5
+    assert np.abs(middle - lens.project(np.array([0.1, 0.2, 0.02]))).max() < 0.5
+
+
+def test_flow_is_that_of_the_motion(made: Any) -> None:
+    """A camera moves over the ground by (f/h) d pixels, and one that only turns by its turn."""
+    cameras = made("down_flow@64x64", "crazyflie2")
+    low = 0.9 * Vehicle.load("crazyflie2").rest_height
+    first = take(cameras, **state((0.0, 0.0, 2.0)))["down_flow"]
+    assert not first.any()  # before the first step nothing was
+    flow = take(cameras, fresh=False, **state((0.1, -0.05, 2.0)))["down_flow"][0]
+    focal = cameras.lens("down_flow", **state((0.0, 0.0, 2.0))).matrix[0, 0]
+    # The picture's upper edge is ahead: what is ahead comes down, what is at the right (-y) left.
+    assert flow[..., 1] == pytest.approx(focal * 0.1 / (2.0 - low), rel=1e-4)
+    assert flow[..., 0] == pytest.approx(-focal * 0.05 / (2.0 - low), rel=1e-4)
+    still = take(cameras, fresh=False, **state((0.1, -0.05, 2.0)))["down_flow"]
+    assert not still.any()
+
+
+def test_flow_of_another_drone(made: Any) -> None:
+    cameras = made(
+        "front_flow@96x96 front_segmentation@96x96 front_depth@96x96", "paper", shape=(1, 2)
+    )
+    places = (0.0, 0.0, 5.0), (4.0, 0.0, 5.0)
+    take(cameras, **state(*places))
+    seen = take(cameras, fresh=False, **state(places[0], (4.0, 0.2, 5.0)))
+    other = seen["front_segmentation"][0, ..., 0] == cameras.objects.index("drone_1")
+    flow = seen["front_flow"][0]
+    assert other.sum() > 50
+    assert not flow[~other].any()
+    focal = cameras.lens("front_flow", **state(*places)).matrix[0, 0]
+    apart = seen["front_depth"][0, ..., 0][other]
+    assert flow[other][:, 0] == pytest.approx(-0.2 * focal / apart, rel=1e-4)
+    assert np.abs(flow[other][:, 1]).max() < 1e-3
+
+
+def test_colours_are_what_mujoco_draws_of_each_camera_alone(made: Any) -> None:
+    cameras = made("front@80x60 down@80x60", shape=(1, 2))
+    told = state((0.0, 0.0, 3.0), (6.0, 0.5, 3.5), quaternion=TILTED)
+    pictures = take(cameras, **told)
+    model, scene = cameras.model, mujoco.MjvScene(cameras.model, 10_000)
+    scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = False
+    gl, rect = offscreen_context(80, 60), mujoco.MjrRect(0, 0, 80, 60)
+    with gl.as_current():
+        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
+        for name, drone in (("front", 0), ("down", 0), ("front", 1)):
+            view, every = mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL
+            view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+            view.fixedcamid = model.camera(f"drone_{drone}/{name}").id
+            option = mujoco.MjvOption()
+            for _ in range(2):  # the first lays the floor around the camera before this one
+                mujoco.mjv_updateScene(model, cameras.data, option, None, view, every, scene)
+            mujoco.mjr_render(rect, scene, context)
+            pixels = np.zeros((60, 80, 3), np.uint8)
+            mujoco.mjr_readPixels(pixels, None, rect, context)
+            assert len(np.unique(pixels)) > 20
+            assert (pixels[::-1] == pictures[name][drone]).all()
+        context.free()
+    gl.free()
+
+
+def test_one_that_stands_sees_all_drones_alike(made: Any, tmp_path: Path) -> None:
+    cameras = made("tower_segmentation", vehicle_with(tmp_path, BELLY), shape=(2, 2))
+    places = (0.0, 0.0, 1.0), (0.2, 0.2, 1.0), (0.0, 0.0, 1.0), (-0.1, 0.0, 0.8)
+    pictures = take(cameras, **state(*places))["tower_segmentation"]
+    assert (pictures[0] == pictures[1]).all()
+    assert (pictures[2] == pictures[3]).all()
+    assert (pictures[0] != pictures[2]).any()
+    drones = {cameras.objects.index("drone_0"), cameras.objects.index("drone_1")}
+    assert drones < set(np.unique(pictures[0]))
+
+
+def test_a_picture_is_taken_where_it_is_due(made: Any) -> None:
+    cameras = made("down", "crazyflie2", shape=(2, 1))
+    before = take(cameras, **state((0.0, 0.0, 1.0), (0.0, 0.0, 1.0)))["down"]
+    told = state((0.3, 0.0, 2.0), (0.3, 0.0, 2.0))
+    cameras.take({"down": np.array([True, False])}, np.zeros(2, bool), **told)
+    assert (cameras.pictures["down"][0] != before[0]).any()
+    assert (cameras.pictures["down"][1] == before[1]).all()
+
+
+def test_a_camera_can_be_told_apart_from_its_kind() -> None:
+    cameras = [Camera(name="a_depth"), Camera(name="a", kinds=("depth",))]
+    assert [view.name for view in chosen_views(["a_depth"], cameras)] == ["a_depth"]

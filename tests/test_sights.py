@@ -1,0 +1,158 @@
+"""Pictures as observations of envs: local, in vectors, over UDP; the flight stays as it is."""
+
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from fleets import flying
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.parallel import LocalParallelEnv
+from rotorgram.envs.registry import env_spec, options_type
+from rotorgram.models import InputError
+from test_cameras import BELLY, vehicle_with
+
+LANDING = "rotorgram/Landing-v0"
+HOVER = "rotorgram/Hover-v0"
+EYES = "down@16x12,down_depth@16x12,down_segmentation@16x12"
+
+
+def test_the_checker_of_gymnasium(opengl: None) -> None:
+    with closing(gym.make(LANDING, cameras=EYES)) as env:
+        check_env(env.unwrapped, skip_render_check=True)
+        space = env.observation_space
+        assert isinstance(space, spaces.Dict)
+        assert space["down"] == spaces.Box(0, 255, (12, 16, 3), np.uint8)
+        assert space["down_depth"] == spaces.Box(0.0, 1000.0, (12, 16, 1), np.float32)
+        assert space["down_segmentation"] == spaces.Box(0, 3, (12, 16, 1), np.int32)
+
+
+def test_a_spec_tells_of_pictures() -> None:
+    spec = env_spec(LANDING, {"cameras": [EYES]})
+    down, depth, objects = spec.observation[1:]
+    assert objects.categories == ("nothing", "scene/floor", "drone_0", "drone_0/disc_0")
+    assert (down.categories, depth.unit) == ((), "m")
+    assert down.frame.endswith("m in the body, looks along (0 0 -1), 90 degrees high")
+    assert spec.options["cameras"] == EYES.split(",")
+    assert type(spec).from_json(spec.to_json()) == spec
+    assert "cameras" not in env_spec(LANDING).options
+
+
+def test_the_flight_is_that_without_cameras(opengl: None) -> None:
+    more = {"history": 2, "linear_drag": 0.1}
+    with (
+        closing(gym.make(HOVER, **more)) as blind,
+        closing(gym.make(HOVER, cameras="front@8x8", world="airport", **more)) as seeing,
+    ):
+        first, second = blind.reset(seed=3)[0], seeing.reset(seed=3)[0]
+        seeing.action_space.seed(4)
+        for _ in range(60):
+            assert first.tobytes() == second["observation"].tobytes()
+            action = seeing.action_space.sample()
+            first, *rest, info = blind.step(action)
+            second, *others, told = seeing.step(action)
+            assert (rest, info) == (others, told)
+            if rest[1] or rest[2]:
+                break
+
+
+def test_a_vector_has_the_pictures_of_single_envs(opengl: None) -> None:
+    with closing(LocalVectorEnv(LANDING, 3, cameras=EYES)) as several:
+        seen = several.reset(seed=[4, 5, 6])[0]
+        pictures = [{name: array[0] for name, array in seen.items()}]
+        ones = [gym.make(LANDING, cameras=EYES) for _ in range(3)]
+        firsts = [one.reset(seed=seed)[0] for one, seed in zip(ones, (4, 5, 6), strict=True)]
+        assert (pictures[0]["down"] == firsts[0]["down"]).all()
+        for _ in range(5):
+            actions = several.action_space.sample()
+            seen = several.step(actions)[0]
+            for i, one in enumerate(ones):
+                alone = one.step(actions[i])[0]
+                for name, picture in alone.items():
+                    assert picture.tobytes() == seen[name][i].tobytes()
+        for one in ones:
+            one.close()
+
+
+def test_pictures_cross_the_wire(opengl: None) -> None:
+    with (
+        flying(1, 2, LANDING, cameras=EYES.split(",")) as (remote, _),
+        closing(LocalVectorEnv(LANDING, 2, cameras=EYES)) as local,
+    ):
+        here, there = remote.reset(seed=8)[0], local.reset(seed=8)[0]
+        assert remote.observation_space == local.observation_space
+        dice = np.random.default_rng(2)
+        for _ in range(12):
+            assert {*here} == {*there} == {"observation", "down", "down_depth", "down_segmentation"}
+            for name, values in here.items():
+                assert values.tobytes() == there[name].tobytes()
+            actions = dice.uniform(-1, 1, local.action_space.shape).astype(np.float32)
+            here, there = remote.step(actions)[0], local.step(actions)[0]
+
+
+def test_a_slow_camera_holds_its_picture(opengl: None, tmp_path: Path) -> None:
+    """`belly` takes every other step: its pictures are those of the even ones."""
+    vehicle = str(vehicle_with(tmp_path, BELLY).path)
+    words = "belly,down_depth"
+    with closing(gym.make(HOVER, vehicle=vehicle, cameras=words, action="velocity")) as env:
+        seen = [env.reset(seed=1)[0]]
+        seen += [env.step(np.array((1, 0, 0, 0.5), np.float32))[0] for _ in range(6)]
+        for step in range(1, 7):
+            same = (seen[step]["belly"] == seen[step - 1]["belly"]).all()
+            assert same == (step % 2 == 1)
+            assert (seen[step]["down_depth"] != seen[step - 1]["down_depth"]).any()
+        again = env.reset(seed=1)[0]
+        assert (again["belly"] == seen[0]["belly"]).all()
+
+
+def test_drones_of_one_world_see_each_other(opengl: None) -> None:
+    words = "front_segmentation@48x48"
+    with closing(
+        LocalParallelEnv("rotorgram/Formation-v0", drones=3, cameras=words, formation="line")
+    ) as env:
+        seen = env.reset(seed=2)[0]
+        names = env_spec("rotorgram/Formation-v0", {"cameras": [words]}, None, 3)
+        objects = names.observation[1].categories
+        assert {f"drone_{i}" for i in range(3)} < {*objects}
+        assert env.observation_space("drone_1")["front_segmentation"].shape == (48, 48, 1)
+        for name in env.agents:
+            assert objects.index(name) not in np.unique(seen[name]["front_segmentation"])
+
+
+@pytest.mark.parametrize("tensors", [False, True])
+def test_pictures_of_the_backend_rigid(opengl: None, tensors: bool) -> None:
+    pytest.importorskip("torch")
+    with (
+        closing(LocalVectorEnv(HOVER, 2, cameras="down", backend="mujoco")) as usual,
+        closing(
+            LocalVectorEnv(HOVER, 2, cameras="down", backend="rigid", tensors=tensors, device="cpu")
+        ) as rigid,
+    ):
+        first, second = usual.reset(seed=5)[0], rigid.reset(seed=5)[0]
+        pictures = np.asarray(second["down"])
+        assert ("torch" in str(type(second["down"]))) == tensors
+        assert (pictures.dtype, pictures.shape) == (np.uint8, (2, 64, 64, 3))
+        if not tensors:  # which draw other starts
+            assert np.abs(pictures.astype(int) - first["down"]).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"cameras": "rear"}, "cameras: expected some of chase, portrait, front, down, each with"),
+        ({"cameras": 3}, "cameras: expected names, with commas between them, got 3"),
+        ({"cameras": "front", "world": "moon"}, "world: expected 'plain' or 'airport'"),
+    ],
+)
+def test_wrong_options(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        env_spec(HOVER, options)
+
+
+def test_words_may_come_one_by_one() -> None:
+    kind = options_type(HOVER)
+    assert kind(cameras="a,b").cameras == kind(cameras=["a", "b"]).cameras == ("a", "b")
