@@ -1,5 +1,6 @@
 """A hand-tuned PID controller: the classical baseline of `Elevation-v0`."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -43,15 +44,16 @@ class PID:
         share = SHARES[options["action"]]
         self._scale = options["thrust_scale"] or share * float(highest.max())
         self._period = spec.control_period
-        self._integral = 0.0
+        self._name, self._integral = spec.observation[0].name, 0.0
 
     def reset(self) -> None:
         """Forget the integral."""
         self._integral = 0.0
 
-    def act(self, observation: np.ndarray) -> Any:
+    def act(self, observation: Any) -> Any:
         """Change of thrust, or thrust over hover, as the env's action, float32, shape (1,)."""
-        error, rate, thrust = observation.tolist()[-3:]  # the newest of a history
+        own = observation[self._name] if isinstance(observation, Mapping) else observation
+        error, rate, thrust = own.tolist()[-3:]  # the newest of a history
         if abs(error) < INTEGRAL_BAND:
             self._integral += error * self._period
         acceleration = PROPORTIONAL * error + DERIVATIVE * rate + INTEGRAL * self._integral
