@@ -179,13 +179,13 @@ class Cameras:
                 buffers.rgb = self._render(view, camera, objects=False)[0]
             return buffers.rgb
         if buffers.depth is None:
-            colors, depth = self._render(view, camera, objects=True)
-            buffers.objects = self._number(colors)
+            buffers.codes, depth = self._render(view, camera, objects=True)
             buffers.depth = self._meters(depth)
         if view.kind == "depth":
             return buffers.depth[..., None]
         if view.kind == "segmentation":
-            return self._object[buffers.objects][..., None]
+            numbers: np.ndarray = self._object[self._number(buffers.codes)]
+            return numbers[..., None]
         return self._flow(view, camera, buffers, before)
 
     def _render(self, view: View, camera: int, *, objects: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -209,7 +209,7 @@ class Cameras:
         return colors[::-1], depth[::-1]
 
     def _number(self, colors: np.ndarray) -> np.ndarray:
-        """Number of the geom of each pixel, from 1; 0: none."""
+        """Number of the geom of each pixel of the last picture, from 1; 0: none."""
         scene = self._scene
         if len(self._numbers) != scene.ngeom + 1:  # the same geoms in each picture, in one order
             geom = mujoco.mjtObj.mjOBJ_GEOM.value
@@ -236,10 +236,9 @@ class Cameras:
         if before is None:
             return np.zeros(view.shape, np.float32)
         assert buffers.depth is not None
-        assert buffers.objects is not None
         lens = _lens(self.model, self.data, camera, view)
         points = lens.points(buffers.depth.astype(np.float64))
-        bodies = np.append(0, self.model.geom_bodyid)[buffers.objects]
+        bodies = np.append(0, self.model.geom_bodyid)[self._number(buffers.codes)]
         now, moved = self._poses.frames(self.data), points.copy()
         state = self._poses.now(self.data)
         self._poses.restore(self.data, before)
@@ -267,7 +266,8 @@ class _Buffers:
 
     rgb: np.ndarray | None = None
     depth: np.ndarray | None = None
-    objects: np.ndarray | None = None
+    codes: np.ndarray = np.zeros((0, 0, 3), np.uint8)
+    """Colours that are numbers of geoms, uint8 (H, W, 3)."""
 
 
 class _Poses:
@@ -335,7 +335,7 @@ def _model(
             _add(hung, "payload", mujoco.mjtGeom.mjGEOM_SPHERE, (0.12 * craft.radius,) * 3)
     for number, mark in enumerate(marks):
         if not mark.moves:
-            _add_mark(spec.worldbody, f"{mark.shape}_{number}", mark)
+            _add_mark(spec.worldbody, f"task/{mark.shape}_{number}", mark)
             continue
         for name in names:
             goal = spec.body(f"{name}/{_GOAL}")
