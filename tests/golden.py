@@ -1,6 +1,6 @@
 """Writes golden.json: datagrams for whoever writes a peer, byte by byte, right ones and wrong ones.
 
-python tests/golden.py    write docs/golden.json
+python tests/golden.py
 """
 
 import json
@@ -63,12 +63,12 @@ TWO: Final = EnvSpec(
 )
 SWARM: Final = EnvSpec(
     env_id="a/Swarm-v0",
-    control_period=0.1,
-    observation=(ArraySpec(name="observation", shape=(1,), low=-1.0, high=1.0),),
-    action=ArraySpec(name="action", shape=(2,), low=-1.0, high=1.0),
-    telemetry=(ArraySpec(name="metrics", shape=(1,), unit="m", components=("e",)),),
-    metrics=(Metric(name="e", unit="m"),),
-    agents=("left", "right"),
+    control_period=0.02,
+    agents=("drone_0", "drone_1", "drone_2"),
+    observation=(ArraySpec(name="observation", shape=(1,)),),
+    action=ArraySpec(name="action", shape=(1,), low=-1.0, high=1.0),
+    telemetry=(ArraySpec(name="metrics", shape=(1,), components=("error",)),),
+    metrics=(Metric(name="error", unit="m"),),
 )
 WORLDS: Final = {"one": 1, "two": 2, "swarm": 2}
 SPECS: Final = {"one": ONE, "two": TWO, "swarm": SWARM}
@@ -102,16 +102,28 @@ def two_state(sequence: int) -> State:
 
 
 def swarm_state() -> State:
-    """Of two worlds: `right` of the first crashes, the second has flown its time."""
+    """The second drone of the first world crashes; the first of the second world is out."""
+    column = np.arange(6.0)[:, np.newaxis]
     return State(
         session=SESSION,
-        sequence=2,
-        time=0.1,
-        observations=(f4([0.25], [0.5], [-0.25], [-0.5]),),
-        rewards=np.array([0.5, -10.0, 1.0, 1.5]),
-        terminated=np.array([False, True, False, False]),
-        truncated=np.array([False, False, True, True]),
-        telemetry=(np.array([[1.0], [2.0], [3.0], [4.0]]),),
+        sequence=3,
+        time=0.04,
+        observations=(column.astype(np.float32),),
+        rewards=np.array([0.5, -20.0, 0.5, 0.0, 0.5, 0.5]),
+        terminated=np.array([False, True, False, False, False, False]),
+        truncated=np.zeros(6, bool),
+        telemetry=(column / 8,),
+    )
+
+
+def swarm_command() -> Command:
+    """The first world flies, the second is reset; the seed of its first drone counts."""
+    return Command(
+        session=SESSION,
+        sequence=3,
+        actions=f4([0.5], [0.0], [-1.0], [0.0], [0.0], [0.0]),
+        orders=np.repeat(np.array([0, 1], np.uint8), 3),
+        seeds=np.array([0, 0, 0, 7, 8, 9], np.uint64),
     )
 
 
@@ -144,11 +156,16 @@ def messages() -> list[tuple[str, str, Message]]:
         ("hello of two worlds, with an extension", "two",
          Hello(session=SESSION, spec=TWO.to_json(), worlds=2, versions=(2, 3),
                extensions=(extension,))),
+        ("hello of two worlds of three drones", "swarm",
+         Hello(session=SESSION, spec=SWARM.to_json(), worlds=2)),
         ("welcome", "one", Welcome(session=SESSION, nonce=NONCE)),
         ("welcome with a seed", "one", Welcome(session=SESSION, nonce=NONCE, seed=7)),
         ("welcome with a critical extension", "one",
          Welcome(session=SESSION, nonce=NONCE,
                  extensions=(Extension(number=1, value=b"", critical=True), extension))),
+        ("welcome with the policy land", "swarm",
+         Welcome(session=SESSION, nonce=NONCE,
+                 extensions=(Extension(number=1, value=b"land"),))),
         ("refuse", "one", Refuse(session=SESSION, reason="busy")),
         ("wait", "one", Wait(session=SESSION)),
         ("unknown", "one", Unknown(session=SESSION, sequence=1)),
@@ -160,20 +177,12 @@ def messages() -> list[tuple[str, str, Message]]:
         ("state, truncated", "one",
          one_state(2, time=0.02, rewards=np.array([0.5]), truncated=np.array([True]))),
         ("state of two drones with a picture", "two", two_state(3)),
+        ("state of two worlds of three drones: 1 crashes, 3 is out", "swarm", swarm_state()),
         ("command to fly choice 2", "one", one_command(1, 2, 0)),
         ("command to reset, with a seed", "one", one_command(1, 0, 1, 2**64 - 1)),
         ("command: fly, freeze", "two", two_command([0, 2])),
         ("command: reset, fly; with seeds", "two", two_command([1, 0], [2**64 - 1, 5])),
-        ("hello of two worlds of two drones", "swarm",
-         Hello(session=SESSION, spec=SWARM.to_json(), worlds=2)),
-        ("welcome of an agent whose drones land when it is lost", "swarm",
-         Welcome(session=SESSION, nonce=NONCE, extensions=(Extension(number=1, value=b"land"),))),
-        ("state of two worlds of two drones", "swarm", swarm_state()),
-        ("command: the first world flies, the second begins anew", "swarm",
-         Command(session=SESSION, sequence=2,
-                 actions=f4([0.5, -0.5], [0, 0], [0, 0], [0, 0]),
-                 orders=np.array([0, 0, 1, 1], np.uint8),
-                 seeds=np.array([0, 0, 7, 8], np.uint64))),
+        ("command: fly the first world, reset the second", "swarm", swarm_command()),
         ("close", "one", Close(session=SESSION, sequence=1, reason="done")),
         ("close, the answer", "one", Close(session=SESSION, sequence=1, reason="")),
     ]  # fmt: skip

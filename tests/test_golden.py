@@ -46,10 +46,16 @@ def test_the_bytes_are_those_of_the_page() -> None:
         "hello of two worlds, with an extension": by_hand(
             1, 0, struct.pack("<BBHIII", 2, 3, 0, 2, len(two), 0) + two + b"\x07\0\x03\0abc"
         ),
+        "hello of two worlds of three drones": by_hand(
+            1, 0, struct.pack("<BBHIII", 2, 2, 0, 2, len(swarm), 0) + swarm
+        ),
         "welcome": by_hand(2, 0, struct.pack("<QQBB6x", nonce, 0, 0, 2)),
         "welcome with a seed": by_hand(2, 0, struct.pack("<QQBB6x", nonce, 7, 1, 2)),
         "welcome with a critical extension": by_hand(
             2, 0, struct.pack("<QQBB6x", nonce, 0, 0, 2) + b"\x01\x80\0\0" + b"\x07\0\x03\0abc"
+        ),
+        "welcome with the policy land": by_hand(
+            2, 0, struct.pack("<QQBB6x", nonce, 0, 0, 2) + b"\x01\0\x04\0land"
         ),
         "refuse": by_hand(3, 0, b"\x04\0busy"),
         "wait": by_hand(7, 0, b""),
@@ -71,6 +77,16 @@ def test_the_bytes_are_those_of_the_page() -> None:
             + struct.pack("<fI2d", 0.5, 1, -0.0, 0.1)  # 1e-45 is the smallest float32
             + b"\0\1\1\0",
         ),
+        "state of two worlds of three drones: 1 crashes, 3 is out": by_hand(
+            4,
+            3,
+            struct.pack("<dQ6f", 0.04, 0, 0, 1, 2, 3, 4, 5)
+            + struct.pack("<6d", 0.5, -20, 0.5, 0, 0.5, 0.5)
+            + b"\0\1\0\0\0\0"
+            + bytes(6)
+            + bytes(4)
+            + struct.pack("<6d", 0, 0.125, 0.25, 0.375, 0.5, 0.625),
+        ),
         "command to fly choice 2": by_hand(5, 1, struct.pack("<I4xqB", 0, 2, 0)),
         "command to reset, with a seed": by_hand(
             5, 1, struct.pack("<I4xqB7xQ", 1, 0, 1, 2**64 - 1)
@@ -79,27 +95,10 @@ def test_the_bytes_are_those_of_the_page() -> None:
         "command: reset, fly; with seeds": by_hand(
             5, 3, struct.pack("<I4x2f2B6x2Q", 2, 0.5, -1, 1, 0, 2**64 - 1, 5)
         ),
-        "hello of two worlds of two drones": by_hand(
-            1, 0, struct.pack("<BBHIII", 2, 2, 0, 2, len(swarm), 0) + swarm
-        ),
-        "welcome of an agent whose drones land when it is lost": by_hand(
-            2, 0, struct.pack("<QQBB6x", nonce, 0, 0, 2) + b"\x01\0\x04\0land"
-        ),
-        # World by world, and in a world left before right.
-        "state of two worlds of two drones": by_hand(
-            4,
-            2,
-            struct.pack("<dQ4f4d", 0.1, 0, 0.25, 0.5, -0.25, -0.5, 0.5, -10, 1, 1.5)
-            + bytes([0, 1, 0, 0])
-            + bytes([0, 0, 1, 1])
-            + struct.pack("<4d", 1, 2, 3, 4),
-        ),
-        "command: the first world flies, the second begins anew": by_hand(
+        "command: fly the first world, reset the second": by_hand(
             5,
-            2,
-            struct.pack("<I4x8f4B", 4, 0.5, -0.5, *[0] * 6, 0, 0, 1, 1)
-            + bytes(4)
-            + struct.pack("<4Q", 0, 0, 7, 8),
+            3,
+            struct.pack("<I4x6f6B2x6Q", 6, 0.5, 0, -1, 0, 0, 0, 0, 0, 0, 1, 1, 1, 0, 0, 0, 7, 8, 9),
         ),
         "close": by_hand(6, 1, b"\x04\0done"),
         "close, the answer": by_hand(6, 1, b"\0\0"),

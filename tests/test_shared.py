@@ -398,10 +398,13 @@ def test_a_late_agent_is_told_the_end_of_the_drones_that_were_in_flight() -> Non
         env = RemoteVectorEnv(agents[0], connect_timeout=60, autoreset_mode="Disabled")
         env.reset(seed=0)
         while not env.out.any():
-            env.step(np.array([[1.0], [0.0]], np.float32))
+            observations, *_, info = env.step(np.array([[1.0], [0.0]], np.float32))
+            last = observations.tobytes(), info["risen"].tolist()
         assert env.terminated.tolist() == [True, False]
         done.wait(60)
-        _, rewards, *flags, _ = env.step(np.zeros((2, 1), np.float32))
+        observations, rewards, *flags, info = env.step(np.zeros((2, 1), np.float32))
+        # Its own last moment: the world may be in another episode.
+        assert (observations.tobytes(), info["risen"].tolist()) == last
         ends.append((rewards.tolist(), *(flag.tolist() for flag in flags)))
         env.close()
 

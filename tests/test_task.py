@@ -52,6 +52,8 @@ def test_defaults() -> None:
         "effects": {},
         "randomize": {},
         "sensors": {},
+        "cameras": (),
+        "world": "plain",
         "target": 5.0,
         "start_band": 1.0,
         "flight_band": 3.0,

@@ -425,17 +425,16 @@ class SharedSimulator(NotCopied):
     def _send(self, party: Party, *, again: bool = False, cut: bool = False) -> None:
         """Send an agent the State of its drones.
 
-        `again`: nothing has happened to them, and the arrays are those of its last State. `cut`:
-        its episode was truncated.
+        `again`: nothing has happened to them. `cut`: its episode was truncated. The arrays of both
+        are those of its last State: the world may be in another episode.
         """
         stepped, rows, link, now = self.stepped, party.rows, party.link, time.monotonic()
-        if not again:
+        if flew := not (again or cut):
             party.shown = (
                 tuple(array[rows] for array in stepped.observations.values()),
                 tuple(array[rows] for array in stepped.telemetry.values()),
             )
         nothing = np.zeros(len(rows), bool)
-        flew = not (again or cut)
         observations, telemetry = party.shown
         party.command = None
         party.patient_until = now + self.patience
