@@ -46,6 +46,7 @@ COMMANDS: Final = {
     "relay": "Relay",
     "replay": "Replay",
     "dataset": "Dataset",
+    "capture": "Capture",
 }
 """Class of each command, in the module of the command's name."""
 

@@ -26,6 +26,7 @@ NOTHING: Final = "nothing"
 """Name of what a segmentation picture has where it sees no object: number 0."""
 _NEAREST: Final = 0.05  # Where drawing begins, over the vehicle's radius
 _ROOM: Final = 10_000  # geoms
+_UNNAMED: Final = "unnamed"
 _GOAL: Final = "goal"
 _PAYLOAD: Final = "payload"
 _COLOR: Final = {"gate": (0.96, 0.42, 0.08, 1.0), "disc": (0.13, 0.78, 0.52, 1.0)}
@@ -66,6 +67,7 @@ class Cameras:
     shadows, in several times the time.
 
     Attributes:
+        views: As given.
         objects: Names of the numbers of segmentation pictures, in their order.
         pictures: By the names of the views, shape (N, H, W, channels): what each drone took last.
     """
@@ -81,16 +83,16 @@ class Cameras:
         payload: bool = False,
         fine: bool = False,
     ) -> None:
-        self._views, self._shape = tuple(views), shape
+        self.views, self._shape = tuple(views), shape
         self._names = drone_names(shape[1])
         self.model = _model(vehicle, self._names, world, marks, payload=payload)
         self.data = mujoco.MjData(self.model)
         self._poses = _Poses(self.model, self._names)
         self.objects, self._object = _objects(self.model, self._names)
-        self._ids = {view.name: self._camera_ids(view) for view in self._views}
+        self._ids = {view.name: self._camera_ids(view) for view in self.views}
         rows = shape[0] * shape[1]
         self.pictures = {
-            view.name: np.zeros((rows, *view.shape), view.dtype) for view in self._views
+            view.name: np.zeros((rows, *view.shape), view.dtype) for view in self.views
         }
         self._before: list[np.ndarray | None] = [None] * shape[0]
         self._open(fine=fine)
@@ -105,7 +107,7 @@ class Cameras:
 
     def _open(self, *, fine: bool) -> None:
         model = self.model
-        sizes = [view.shape for view in self._views]
+        sizes = [view.shape for view in self.views]
         width, height = max(size[1] for size in sizes), max(size[0] for size in sizes)
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         model.vis.quality.offsamples = 4 if fine else 0
@@ -136,7 +138,7 @@ class Cameras:
         worlds, drones = self._shape
         of_world = {name: np.reshape(mask, (worlds, drones)) for name, mask in due.items()}
         needed = np.stack([mask.max(axis=1) for mask in of_world.values()]).max(axis=0)
-        flows = any(view.kind == "flow" for view in self._views)
+        flows = any(view.kind == "flow" for view in self.views)
         first = fresh.reshape(worlds, drones).max(axis=1)
         with self._gl.as_current():
             for world in range(worlds):
@@ -155,7 +157,7 @@ class Cameras:
         drones = self._shape[1]
         rows = slice(world * drones, (world + 1) * drones)
         self._poses.set(self.data, {name: x[rows] for name, x in state.items()})
-        view = next(view for view in self._views if view.name == name)
+        view = next(view for view in self.views if view.name == name)
         return _lens(self.model, self.data, self._ids[name][drone], view)
 
     def _draw_world(
@@ -163,7 +165,7 @@ class Cameras:
     ) -> None:
         """Pictures of the world that `data` is in."""
         drawn: dict[tuple[int, tuple[int, ...]], _Buffers] = {}
-        for view in self._views:
+        for view in self.views:
             for drone in np.flatnonzero(due[view.name]).tolist():
                 camera = self._ids[view.name][drone]
                 buffers = drawn.setdefault((camera, view.shape[:2]), _Buffers())
@@ -261,6 +263,32 @@ class Cameras:
             self._gl = None
 
 
+def shown(kind: str, picture: np.ndarray) -> np.ndarray:
+    """A picture (H, W, channels) of a kind in colours to look at, uint8, (H, W, 3).
+
+    Depth: near is bright. Objects: a colour for each number. Flow: the hue is its direction.
+    """
+    if kind == "rgb":
+        return picture
+    if kind == "depth":
+        near = np.log(np.maximum(picture, 1e-3))
+        share = 1.0 - (near - near.min()) / max(float(np.ptp(near)), 1e-9)
+        return np.repeat((255 * share).astype(np.uint8), 3, axis=-1)
+    if kind == "segmentation":
+        hue = picture[..., 0] * 0.618034 % 1.0
+        return _hues(hue, np.where(picture[..., 0] > 0, 1.0, 0.0))
+    size = np.linalg.norm(picture, axis=-1)
+    hue = np.arctan2(picture[..., 1], picture[..., 0]) / (2 * np.pi) % 1.0
+    return _hues(hue, size / max(float(size.max()), 1e-9))
+
+
+def _hues(hue: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Colours of hues from 0 to 1 and values from 0 to 1, uint8, with three channels."""
+    steps = (np.array((5.0, 3.0, 1.0)) + 6.0 * hue[..., None]) % 6.0
+    share = value[..., None] * (1.0 - 0.8 * np.clip(np.minimum(steps, 4.0 - steps), 0.0, 1.0))
+    return np.asarray(255 * share, np.uint8)
+
+
 class _Buffers:
     """What was drawn for one camera in one size."""
 
@@ -340,7 +368,7 @@ def _model(
         for name in names:
             goal = spec.body(f"{name}/{_GOAL}")
             goal = goal or spec.worldbody.add_body(name=f"{name}/{_GOAL}", mocap=True)
-            _add_mark(goal, f"{name}/{mark.shape}_{number}", mark)
+            _add_mark(goal, f"task/{mark.shape}_{number} of {name}", mark)
     model = spec.compile()
     scale_drawing(model, vehicle.radius, 0.0)
     extent = model.stat.extent
@@ -382,14 +410,16 @@ def _objects(model: mujoco.MjModel, names: Sequence[str]) -> tuple[tuple[str, ..
     """Names of the objects of a model, and the number of the one of each geom, behind a 0.
 
     All geoms of a craft are one object, and those of the world whose names begin alike up to their
-    last slash, if they have two or more.
+    last slash, if they have two or more. Geoms of the world without a name are told apart by their
+    material.
     """
     known, numbers = {NOTHING: 0}, [0]
     roots = {int(model.body(one).rootid[0]): one.partition("/")[0] for one in _bodies(model, names)}
     for number in range(model.ngeom):
         geom = model.geom(number)
         root = int(model.body_rootid[geom.bodyid[0]])
-        name = geom.name or f"{model.body(geom.bodyid[0]).name or 'world'}/geom_{number}"
+        material = int(geom.matid[0])
+        name = geom.name or (model.material(material).name if material >= 0 else _UNNAMED)
         head, _, _ = name.rpartition("/")
         told = roots.get(root, head if "/" in head else name)
         numbers.append(known.setdefault(told, len(known)))

@@ -230,7 +230,7 @@ def test_segmentation_knows_the_pad_by_its_area(made: Any) -> None:
     craft = Vehicle.load("crazyflie2")
     pad = Mark(shape="disc", size=0.5, moves=True)
     cameras = made("down_segmentation@128x128", craft, marks=[pad])
-    assert cameras.objects == ("nothing", "scene/floor", "drone_0", "drone_0/disc_0")
+    assert cameras.objects == ("nothing", "scene/floor", "drone_0", "task/disc_0 of drone_0")
     assert objects_of(craft, 1, "plain", [pad], payload=False) == cameras.objects
     told = state((0.0, 0.0, 2.0), goal=np.array([[0.1, 0.2, 0.0]]))
     picture = take(cameras, **told)["down_segmentation"][0, ..., 0]

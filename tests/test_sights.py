@@ -34,7 +34,7 @@ def test_the_checker_of_gymnasium(opengl: None) -> None:
 def test_a_spec_tells_of_pictures() -> None:
     spec = env_spec(LANDING, {"cameras": [EYES]})
     down, depth, objects = spec.observation[1:]
-    assert objects.categories == ("nothing", "scene/floor", "drone_0", "drone_0/disc_0")
+    assert objects.categories == ("nothing", "scene/floor", "drone_0", "task/disc_0 of drone_0")
     assert (down.categories, depth.unit) == ((), "m")
     assert down.frame.endswith("m in the body, looks along (0 0 -1), 90 degrees high")
     assert spec.options["cameras"] == EYES.split(",")

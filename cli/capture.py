@@ -1,0 +1,46 @@
+"""`rotorgram capture`: labelled pictures of drones, as a data set."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from ._flags import Command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capture(Command):
+    """Take the pictures of a plan, with depth, objects, boxes and poses, and write a data set.
+
+    Interrupted by Ctrl-C, or by a disk that is full, it keeps what it has: the same line again goes
+    on. Exit status 2 where there is no OpenGL.
+    """
+
+    plan: Positional[Path]
+    """TOML file: cameras, world, where to take pictures from. docs/capture.md has its fields."""
+    out: Path
+    """Folder to write to: a new one, or one of the same plan to go on with."""
+    jobs: int | None = None
+    """Workers. Default: one for each core of this machine, or of the cluster."""
+    runner: Literal["loky", "ray"] = "loky"
+    """loky: processes of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
+    address: str | None = None
+    """The cluster's: ray://HOST:PORT of its client server, or HOST:PORT on one of its machines."""
+
+    def run(self) -> int:
+        """Take them; say where and how many."""
+        from ..experiments.capture import capture
+        from ..experiments.settings import WorkersConfig
+        from ..experiments.viewpoints import Plan
+        from ..rendering.gl import offscreen_context
+        from ._progress import bars
+
+        plan, config = Plan.read(self.plan), WorkersConfig(**self.settings(WorkersConfig))
+        offscreen_context(16, 16).free()
+        self.out.mkdir(parents=True, exist_ok=True)
+        with bars() as progress:
+            frames = capture(plan, self.out, config, progress)
+        print(f"{self.out}: {frames} frames, {frames * len(plan.cameras)} cameras' views")
+        print(f"look at: {self.out / 'contact.png'}, {self.out / 'README.md'}")
+        return 0

@@ -1,0 +1,246 @@
+"""Where the cameras of a data set are: on flights, in journals, at random places.
+
+A plan is a TOML file; `docs/capture.md` has its fields. What it says is the same on every machine:
+random places come from its seed, flights from the evaluation episodes' seeds.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from ..agents import CONTROLLERS
+from ..agents.checkpoints import load
+from ..agents.policies import Policy
+from ..envs.registry import env_spec
+from ..envs.spec import Mark
+from ..envs.tasks.task import finite
+from ..models import WORLDS
+from ..models.cameras import View, cameras_of, chosen_views
+from ..models.errors import InputError, expect
+from ..models.frames import pose_in_mujoco_frame
+from ..models.vehicle import Vehicle
+from .trajectories import Trajectory, flown_trajectories, recorded_trajectories
+
+_KEYS: Final = ("vehicle", "world", "cameras", "seed", "fine", "fps", "poses")
+_SOURCES: Final[Mapping[str, Mapping[str, Any]]] = {
+    "random": {"count": None, "center": (0.0, 0.0, 5.0), "size": (10.0, 10.0, 6.0), "tilt": 0.3},
+    "flight": {
+        "env": "rotorgram/Hover-v0", "agent": "geometric", "options": {}, "episodes": 1, "first": 0,
+        "every": 10, "drones": 1,
+    },
+    "journal": {"file": None, "session": None, "drone": 0, "every": 10},
+}  # fmt: skip
+"""Keys of each source of poses, and their defaults; a `count` and a `file` have to be there."""
+MOST_FRAMES: Final = 1_000_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Walk:
+    """T poses of A drones of one world, one after the other: an episode, or random places.
+
+    MuJoCo's world frame, m.
+    """
+
+    name: str
+    """Of its source."""
+    times: np.ndarray
+    """Since its start, shape (T,), s; those of random places are 0."""
+    position: np.ndarray
+    """Shape (T, A, 3)."""
+    quaternion: np.ndarray
+    """Shape (T, A, 4)."""
+    goal: np.ndarray | None = None
+    """Shape (T, A, 3)."""
+    payload: np.ndarray | None = None
+    """Shape (T, A, 3)."""
+    marks: tuple[Mark, ...] = ()
+
+    def __len__(self) -> int:
+        """T."""
+        return len(self.times)
+
+    def state(self, row: int) -> dict[str, np.ndarray]:
+        """One pose of all drones, as `Cameras.take` has it."""
+        told = {"position": self.position[row], "quaternion": self.quaternion[row]}
+        for name in ("goal", "payload"):
+            values = getattr(self, name)
+            if values is not None:
+                told[name] = values[row]
+        return told
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a data set shows. `Plan.read` checks it."""
+
+    text: str
+    """The TOML file."""
+    cameras: tuple[str, ...]
+    """Words as of the option `cameras` of a task."""
+    poses: tuple[Mapping[str, Any], ...]
+    """Sources of poses."""
+    vehicle: str | None = None
+    world: str = "plain"
+    seed: int = 0
+    fine: bool = True
+    """With shadows and smooth edges."""
+    fps: float = 10.0
+    """Of the videos."""
+
+    @classmethod
+    def read(cls, path: Path) -> "Plan":
+        """Read a TOML file. Raises `InputError`, or `OSError` where it cannot be read."""
+        try:
+            text = path.read_text(encoding="utf-8")
+            table = tomllib.loads(text)
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"plan: expected a TOML file, got {path.name}: {error}") from None
+        for key in table:
+            expect(key in _KEYS, "plan", f"some of {', '.join(_KEYS)}", repr(key))
+        cameras, poses = table.pop("cameras", ["front"]), table.pop("poses", None)
+        right = isinstance(cameras, list) and all(isinstance(one, str) for one in cameras)
+        expect(right and cameras, "plan: cameras", "a list of names", repr(cameras))
+        right = isinstance(poses, list) and all(isinstance(one, dict) for one in poses)
+        expect(right and poses, "plan", "a table [[poses]] or more", "none")
+        plan = cls(
+            text=text, cameras=tuple(cameras),
+            poses=tuple(_source(one, i) for i, one in enumerate(poses, 1)), **table,
+        )  # fmt: skip
+        expect(plan.world in WORLDS, "plan: world", " or ".join(WORLDS), repr(plan.world))
+        right = type(plan.seed) is int and 0 <= plan.seed < 1 << 63
+        expect(right, "plan: seed", "a whole number from 0", repr(plan.seed))
+        expect(type(plan.fine) is bool, "plan: fine", "true or false", repr(plan.fine))
+        right = finite(plan.fps) is not None and 0.1 <= plan.fps <= 1000
+        expect(right, "plan: fps", "0.1 to 1000 pictures a second", repr(plan.fps))
+        for view in plan.views():
+            size = f"{view.shape[1]}x{view.shape[0]}"
+            right = view.kind != "rgb" or not (view.shape[0] % 2 or view.shape[1] % 2)
+            expect(right, f"plan: {view.name}", "even sizes, which its videos need", size)
+        return plan
+
+    def views(self) -> tuple[View, ...]:
+        """The pictures of each pose. Raises `InputError`."""
+        return chosen_views(self.cameras, cameras_of(Vehicle.load(self.vehicle)))
+
+    def walks(self) -> list[Walk]:
+        """All poses. Raises `InputError`."""
+        found: list[Walk] = []
+        for number, source in enumerate(self.poses, 1):
+            name = f"{number} {source['from']}"
+            if source["from"] == "random":
+                found.append(_random(name, source, np.random.default_rng([self.seed, number])))
+            elif source["from"] == "flight":
+                found += _walks(name, _flown(source, self.vehicle), source)
+            else:
+                found += _walks(name, _recorded(source), {**source, "drones": 1})
+        count = sum(map(len, found))
+        expect(count <= MOST_FRAMES, "plan", f"at most {MOST_FRAMES} poses", f"{count}")
+        return found
+
+
+def _source(table: dict[str, Any], number: int) -> dict[str, Any]:
+    """A source of poses with all its keys. Raises `InputError`."""
+    name, kind = f"plan: poses[{number}]", table.get("from")
+    expect(kind in _SOURCES, f"{name}.from", " or ".join(map(repr, _SOURCES)), repr(kind))
+    known = _SOURCES[str(kind)]
+    for key in table:
+        expect(key in known or key == "from", name, f"some of {', '.join(known)}", repr(key))
+    source = {**known, **table}
+    for key in ("count", "episodes", "every", "drones"):
+        if key in source:
+            value = source[key]
+            right = type(value) is int and 1 <= value <= MOST_FRAMES
+            expect(right, f"{name}.{key}", f"1 to {MOST_FRAMES}", repr(value))
+    for key in ("first", "drone"):
+        right = key not in source or (type(source[key]) is int and source[key] >= 0)
+        expect(right, f"{name}.{key}", "a whole number from 0", repr(source.get(key)))
+    for key in ("center", "size"):
+        if key in source:
+            values = source[key]
+            right = isinstance(values, list | tuple) and len(values) == 3
+            right = right and all(finite(one) is not None for one in values)
+            expect(right, f"{name}.{key}", "three numbers, m", repr(values))
+    if kind == "random":
+        right = finite(source["tilt"]) is not None and 0 <= source["tilt"] <= np.pi
+        expect(right, f"{name}.tilt", "0 to 3.14159 rad", repr(source["tilt"]))
+    if kind == "journal":
+        expect(isinstance(source["file"], str), f"{name}.file", "a journal (.mcap)", "none")
+    return source
+
+
+def _random(name: str, source: Mapping[str, Any], dice: np.random.Generator) -> Walk:
+    """Places evenly in a box, any heading, tilted up to an angle about any level axis."""
+    count, size = source["count"], np.array(source["size"], float)
+    position = np.array(source["center"], float) + size * dice.uniform(-0.5, 0.5, (count, 3))
+    heading, axis = dice.uniform(-np.pi, np.pi, (2, count))
+    tilt = source["tilt"] * np.sqrt(dice.uniform(0, 1, count))
+    zero = np.zeros(count)
+    turned = np.stack((np.cos(heading / 2), zero, zero, np.sin(heading / 2)), axis=1)
+    sine = np.sin(tilt / 2)
+    tilted = np.stack((np.cos(tilt / 2), sine * np.cos(axis), sine * np.sin(axis), zero), axis=1)
+    return Walk(
+        name=name,
+        times=zero,
+        position=position[:, None],
+        quaternion=_product(tilted, turned)[:, None],
+    )
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Hamilton's product of quaternions, shape (T, 4)."""
+    w, v, x, u = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    real = w * x - (v * u).sum(axis=1, keepdims=True)
+    return np.concatenate((real, w * u + x * v + np.cross(v, u)), axis=1)
+
+
+def _flown(source: Mapping[str, Any], vehicle: str | None) -> list[Trajectory]:
+    agent, options, drones = source["agent"], source["options"], source["drones"]
+    checkpoint, controller = None, CONTROLLERS.get(agent)
+    if controller is None and agent != "random":
+        checkpoint = load(Path(agent))
+        options = {**checkpoint.spec.options, **options}
+    elif controller is not None:
+        options = {**controller.options, **options}
+    spec = env_spec(source["env"], options, vehicle, drones)
+    policy: Policy | None = controller(spec) if controller else None
+    policy = checkpoint.policy() if checkpoint else policy
+    episodes = range(source["first"], source["first"] + source["episodes"])
+    env_id = source["env"]
+    return flown_trajectories(
+        policy, env_id, options, episodes, vehicle=vehicle, of="final", drones=drones
+    )
+
+
+def _recorded(source: Mapping[str, Any]) -> list[Trajectory]:
+    path = Path(source["file"])
+    return recorded_trajectories(path, session=source["session"], drone=source["drone"])
+
+
+def _walks(name: str, flown: Sequence[Trajectory], source: Mapping[str, Any]) -> list[Walk]:
+    """Every so many steps of trajectories, of so many drones of each world."""
+    found, drones = [], source["drones"]
+    for first in range(0, len(flown), drones):
+        world = flown[first : first + drones]
+        steps = np.arange(0, max(map(len, world)) + 1, source["every"])
+        told: dict[str, list[np.ndarray]] = {}
+        for one in world:
+            rows = np.minimum(steps, len(one))  # one that is out stays where it is
+            arrays = one.telemetry
+            for key in ("position", "attitude"):
+                expect(key in arrays, name, f"telemetry of the {key}", f"{sorted(arrays)}")
+            pose = pose_in_mujoco_frame(arrays["position"][rows], arrays["attitude"][rows])
+            told.setdefault("position", []).append(pose[:, :3])
+            told.setdefault("quaternion", []).append(pose[:, 3:])
+            for key in ("goal", "payload"):
+                if key in arrays:
+                    level = np.zeros_like(arrays[key][rows])
+                    points = pose_in_mujoco_frame(arrays[key][rows], level)[:, :3]
+                    told.setdefault(key, []).append(points)
+        stacked = {key: np.stack(values, axis=1) for key, values in told.items()}
+        period, marks = world[0].spec.control_period, world[0].spec.marks
+        found.append(Walk(name=name, times=steps * period, marks=marks, **stacked))
+    return found
