@@ -1,7 +1,7 @@
 """Find a landing pad in a picture: train a small network on what `rotorgram capture` wrote.
 
     rotorgram capture examples/pad.toml --out runs/pad
-    python examples/pad_detector.py runs/pad [--epochs 20] [--seed 0] [--out FILE.json]
+    python examples/pad_detector.py runs/pad [--epochs 20] [--seeds 1] [--out FILE.json]
 
 It learns from four fifths of the flights whether the pad is in a picture, and where the middle of
 its box is, and is tested on the others, which it never saw.
@@ -59,47 +59,59 @@ def loss_of(out: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     return seen + 10 * nn.functional.smooth_l1_loss(out[there, 1:], target[there, 1:], beta=0.05)
 
 
-def main() -> None:
-    """Train, test, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--epochs", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    torch.manual_seed(args.seed)
-    pictures, targets, flights = read(args.folder)
-    held = torch.from_numpy(flights % 5 == 4)
-    trained = torch.nonzero(~held).ravel()
-    net, begun = network(), time.perf_counter()
+def trained_and_tested(
+    pictures: torch.Tensor, targets: torch.Tensor, held: torch.Tensor, epochs: int, seed: int
+) -> dict[str, float]:
+    """Train on the pictures that are not held back, test on those that are."""
+    torch.manual_seed(seed)
+    rest, net, begun = torch.nonzero(~held).ravel(), network(), time.perf_counter()
     net(pictures[:1])
     optimizer = torch.optim.Adam(net.parameters(), 1e-3)
-    for _ in range(args.epochs):
-        for rows in trained[torch.randperm(len(trained))].split(64):
+    for _ in range(epochs):
+        for rows in rest[torch.randperm(len(rest))].split(64):
             optimizer.zero_grad()
             loss_of(net(pictures[rows]), targets[rows]).backward()
             optimizer.step()
     seconds = time.perf_counter() - begun
     with torch.no_grad():
         out = torch.cat([net(part) for part in pictures[held].split(256)])
-    told, size = targets[held], pictures.shape[-1]
-    there = told[:, 0] > 0
-    error = size * torch.linalg.vector_norm(out[there, 1:] - told[there, 1:], dim=1)
-    mean = targets[trained][targets[trained, 0] > 0, 1:].mean(dim=0)
-    blind = size * torch.linalg.vector_norm(mean - told[there, 1:], dim=1)
-    result = {
-        "pictures": {"trained": len(trained), "tested": len(told), "with a pad": int(there.sum())},
-        "pixels": size,
-        "epochs": args.epochs,
+    told, there = targets[held], targets[held][:, 0] > 0
+    error = pixels_off(out[there, 1:], told[there, 1:], pictures.shape[-1])
+    return {
+        "right about whether": round(float(((out[:, 0] > 0) == there).float().mean()), 4),
+        "median error": round(float(error.median()), 3),
+        "error of 90 %": round(float(error.quantile(0.9)), 3),
         "seconds": round(seconds, 1),
-        "told right whether there is a pad": round(
-            float(((out[:, 0] > 0) == there).float().mean()), 4
-        ),
-        "error of its middle, pixels": {
-            "median": round(float(error.median()), 3),
-            "90 %": round(float(error.quantile(0.9)), 3),
-        },
-        "the same of the mean place": {"median": round(float(blind.median()), 3)},
+    }
+
+
+def pixels_off(told: torch.Tensor, true: torch.Tensor, size: int) -> torch.Tensor:
+    """Distances of places over the size, pixels."""
+    return size * torch.linalg.vector_norm(told - true, dim=1)
+
+
+def main() -> None:
+    """Train, test, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--epochs", type=int, default=20)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    pictures, targets, flights = read(args.folder)
+    held = torch.from_numpy(flights % 5 == 4)
+    seen, true = targets[~held & (targets[:, 0] > 0), 1:], targets[held & (targets[:, 0] > 0), 1:]
+    mean = pixels_off(seen.mean(dim=0), true, pictures.shape[-1])
+    result = {
+        "pictures": {"trained": int((~held).sum()), "tested": int(held.sum())},
+        "tested with a pad": len(true),
+        "pixels of a side": pictures.shape[-1],
+        "epochs": args.epochs,
+        "median error of the mean place": round(float(mean.median()), 3),
+        "seeds": [
+            trained_and_tested(pictures, targets, held, args.epochs, seed)
+            for seed in range(args.seeds)
+        ],
     }
     print(json.dumps(result, indent=2))
     if args.out:

@@ -6,7 +6,7 @@ random places come from its seed, flights from the evaluation episodes' seeds.
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,9 +30,11 @@ _SOURCES: Final[Mapping[str, Mapping[str, Any]]] = {
     "random": {"count": None, "center": (0.0, 0.0, 5.0), "size": (10.0, 10.0, 6.0), "tilt": 0.3},
     "flight": {
         "env": "rotorgram/Hover-v0", "agent": "geometric", "options": {}, "episodes": 1, "first": 0,
-        "every": 10, "drones": 1,
+        "every": 10, "drones": 1, "aside": 0.0, "tilt": 0.0,
     },
-    "journal": {"file": None, "session": None, "drone": 0, "every": 10},
+    "journal": {
+        "file": None, "session": None, "drone": 0, "every": 10, "aside": 0.0, "tilt": 0.0,
+    },
 }  # fmt: skip
 """Keys of each source of poses, and their defaults; a `count` and a `file` have to be there."""
 MOST_FRAMES: Final = 1_000_000
@@ -130,13 +132,14 @@ class Plan:
         """All poses. Raises `InputError`."""
         found: list[Walk] = []
         for number, source in enumerate(self.poses, 1):
-            name = f"{number} {source['from']}"
+            name, dice = f"{number} {source['from']}", np.random.default_rng([self.seed, number])
             if source["from"] == "random":
-                found.append(_random(name, source, np.random.default_rng([self.seed, number])))
-            elif source["from"] == "flight":
-                found += _walks(name, _flown(source, self.vehicle), source)
-            else:
-                found += _walks(name, _recorded(source), {**source, "drones": 1})
+                found.append(_random(name, source, dice))
+                continue
+            flies = source["from"] == "flight"
+            flown = _flown(source, self.vehicle) if flies else _recorded(source)
+            walks = _walks(name, flown, source["every"], source.get("drones", 1))
+            found += [_moved(walk, source["aside"], source["tilt"], dice) for walk in walks]
         count = sum(map(len, found))
         expect(count <= MOST_FRAMES, "plan", f"at most {MOST_FRAMES} poses", f"{count}")
         return found
@@ -164,9 +167,10 @@ def _source(table: dict[str, Any], number: int) -> dict[str, Any]:
             right = isinstance(values, list | tuple) and len(values) == 3
             right = right and all(finite(one) is not None for one in values)
             expect(right, f"{name}.{key}", "three numbers, m", repr(values))
-    if kind == "random":
-        right = finite(source["tilt"]) is not None and 0 <= source["tilt"] <= np.pi
-        expect(right, f"{name}.tilt", "0 to 3.14159 rad", repr(source["tilt"]))
+    for key, most, unit in (("tilt", np.pi, "rad"), ("aside", 1e4, "m")):
+        value = source.get(key, 0.0)
+        right = finite(value) is not None and 0 <= value <= most
+        expect(right, f"{name}.{key}", f"0 to {most:.6g} {unit}", repr(value))
     if kind == "journal":
         expect(isinstance(source["file"], str), f"{name}.file", "a journal (.mcap)", "none")
     return source
@@ -176,25 +180,33 @@ def _random(name: str, source: Mapping[str, Any], dice: np.random.Generator) -> 
     """Places evenly in a box, any heading, tilted up to an angle about any level axis."""
     count, size = source["count"], np.array(source["size"], float)
     position = np.array(source["center"], float) + size * dice.uniform(-0.5, 0.5, (count, 3))
-    heading, axis = dice.uniform(-np.pi, np.pi, (2, count))
-    tilt = source["tilt"] * np.sqrt(dice.uniform(0, 1, count))
-    zero = np.zeros(count)
-    turned = np.stack((np.cos(heading / 2), zero, zero, np.sin(heading / 2)), axis=1)
-    sine = np.sin(tilt / 2)
-    tilted = np.stack((np.cos(tilt / 2), sine * np.cos(axis), sine * np.sin(axis), zero), axis=1)
-    return Walk(
-        name=name,
-        times=zero,
-        position=position[:, None],
-        quaternion=_product(tilted, turned)[:, None],
-    )
+    half, zero = dice.uniform(-np.pi, np.pi, count) / 2, np.zeros(count)
+    turned = np.stack((np.cos(half), zero, zero, np.sin(half)), axis=-1)
+    quaternion = _product(_tilts((count,), source["tilt"], dice), turned)
+    place, turn = position[:, None], quaternion[:, None]
+    return Walk(name=name, times=zero, position=place, quaternion=turn)
+
+
+def _moved(walk: Walk, aside: float, tilt: float, dice: np.random.Generator) -> Walk:
+    """The cameras of a walk up to so far aside, m, or higher, and tilted up to an angle more."""
+    shape = walk.position.shape
+    moves = dice.uniform((-aside, -aside, 0.0), aside, shape)
+    quaternion = _product(_tilts(shape[:-1], tilt, dice), walk.quaternion)
+    return replace(walk, position=walk.position + moves, quaternion=quaternion)
+
+
+def _tilts(shape: tuple[int, ...], most: float, dice: np.random.Generator) -> np.ndarray:
+    """Rotations by up to an angle, rad, about any level axis, quaternions, (*shape, 4)."""
+    axis, half = dice.uniform(-np.pi, np.pi, shape), most * np.sqrt(dice.uniform(0, 1, shape)) / 2
+    parts = np.cos(half), np.sin(half) * np.cos(axis), np.sin(half) * np.sin(axis), 0.0 * half
+    return np.stack(parts, axis=-1)
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton's product of quaternions, shape (T, 4)."""
-    w, v, x, u = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
-    real = w * x - (v * u).sum(axis=1, keepdims=True)
-    return np.concatenate((real, w * u + x * v + np.cross(v, u)), axis=1)
+    """Hamilton's product of quaternions, shape (..., 4)."""
+    w, v, x, u = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    real = w * x - (v * u).sum(axis=-1, keepdims=True)
+    return np.concatenate((real, w * u + x * v + np.cross(v, u)), axis=-1)
 
 
 def _flown(source: Mapping[str, Any], vehicle: str | None) -> list[Trajectory]:
@@ -220,12 +232,12 @@ def _recorded(source: Mapping[str, Any]) -> list[Trajectory]:
     return recorded_trajectories(path, session=source["session"], drone=source["drone"])
 
 
-def _walks(name: str, flown: Sequence[Trajectory], source: Mapping[str, Any]) -> list[Walk]:
+def _walks(name: str, flown: Sequence[Trajectory], every: int, drones: int) -> list[Walk]:
     """Every so many steps of trajectories, of so many drones of each world."""
-    found, drones = [], source["drones"]
+    found = []
     for first in range(0, len(flown), drones):
         world = flown[first : first + drones]
-        steps = np.arange(0, max(map(len, world)) + 1, source["every"])
+        steps = np.arange(0, max(map(len, world)) + 1, every)
         told: dict[str, list[np.ndarray]] = {}
         for one in world:
             rows = np.minimum(steps, len(one))  # one that is out stays where it is

@@ -1,5 +1,6 @@
 """Every script of examples/ runs, with less to do than by default, and says what it should."""
 
+import json
 import re
 import socket
 import subprocess
@@ -43,8 +44,22 @@ def test_the_text_agent_flies_a_simulator(tmp_path: Path) -> None:
     assert all(float(line.split()[-1]) > 150 for line in lines)
 
 
+def test_the_detector_learns_from_pictures(opengl: None, tmp_path: Path) -> None:
+    plan = (EXAMPLES / "pad.toml").read_text("utf-8").replace("episodes = 100", "episodes = 5")
+    plan = plan.replace('"down", "down_segm', '"down@32x32", "down_segm')
+    plan = plan.replace("every = 5", "every = 9")
+    (tmp_path / "pad.toml").write_text(plan.replace('tation"]', 'tation@32x32"]'), "utf-8")
+    command = [sys.executable, "-m", "rotorgram.cli", "capture", "pad.toml", "--out", "pad"]
+    subprocess.run([*command, "--jobs", "1"], cwd=tmp_path, check=True, timeout=110)
+    told = run("pad_detector.py", "pad", "--epochs", "2", "--out", "told.json", cwd=tmp_path)
+    assert json.loads(told) == json.loads((tmp_path / "told.json").read_text())
+    (one,) = json.loads(told)["seeds"]
+    assert 0.0 < one["median error"] < 32
+
+
 def test_every_script_is_run() -> None:
     scripts = {path.name for path in EXAMPLES.glob("*.py")}
-    assert scripts == {*SHORT, "text_agent.py", "landing.py"}  # its tests: test_own_task.py
+    others = {"text_agent.py", "pad_detector.py", "landing.py"}  # its tests: test_own_task.py
+    assert scripts == {*SHORT, *others}
     page = (EXAMPLES / "README.md").read_text()
     assert all(f"({script})" in page for script in scripts)
