@@ -16,6 +16,13 @@ class MissingPackage(ImportError):
     """An optional package is not installed. The message names the `pip install` that brings it."""
 
 
+class NoOpenGL(RuntimeError):
+    """There is no OpenGL to draw with. The sentence names what to install."""
+
+    exit_status = 2
+    """Of a command that had to draw."""
+
+
 class NotCopied:
     """Base of what holds memory of a simulator, or a socket: a copy would fly wrong numbers."""
 

@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .gl import NoOpenGL
+    from ..models.errors import NoOpenGL
     from .stage import CAMERAS, Camera, Canvas, Mark, MetricValue, Moment, Stage
 
 __all__ = [

@@ -15,11 +15,12 @@ import numpy as np
 
 from ..models import World
 from ..models.cameras import FARTHEST, View, add_cameras
+from ..models.errors import NoOpenGL
 from ..models.fleet import members_of
 from ..models.scene import build_swarm
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
-from .gl import NoOpenGL, offscreen_context
+from .gl import offscreen_context
 from .stage import scale_drawing
 
 NOTHING: Final = "nothing"

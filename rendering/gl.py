@@ -8,19 +8,14 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, Final
 
+from ..models.errors import NoOpenGL
+
 _OFF: Final = ("disable", "disabled", "off", "false", "0")
 _ON: Final = ("enable", "enabled", "on", "true", "1", "glfw", "glx", "wgl")
 _LIBRARIES: Final = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "OpenGL"}
 _HIDDEN: Final = "ROTORGRAM_GL"
 """Keeps `MUJOCO_GL` as the user set it while `hidden_gl_setting` hides it from MuJoCo. An
 environment variable, so that the processes that this one starts know it too."""
-
-
-class NoOpenGL(RuntimeError):
-    """There is no OpenGL to draw with. The sentence names what to install."""
-
-    exit_status = 2
-    """Of a command that had to draw."""
 
 
 @contextmanager

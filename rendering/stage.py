@@ -14,11 +14,11 @@ import mujoco
 import numpy as np
 
 from ..models import World
-from ..models.errors import InputError, expect
+from ..models.errors import InputError, NoOpenGL, expect
 from ..models.fleet import load_vehicles, members_of
 from ..models.frames import pose_in_mujoco_frame
 from ..models.scene import SCENE_PREFIX, attach_craft, build_scene
-from .gl import NoOpenGL, offscreen_context
+from .gl import offscreen_context
 
 Camera = Literal["chase", "front", "side", "top", "onboard"]
 CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)

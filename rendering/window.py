@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import mujoco
 
-from .gl import NoOpenGL
+from ..models.errors import NoOpenGL
 from .live import Aim, Lines, Pace, Press
 from .stage import Stage
 

@@ -16,7 +16,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 @pytest.fixture(scope="session")
 def opengl() -> None:
     """What draws."""
-    from rotorgram.rendering.gl import NoOpenGL, offscreen_context
+    from rotorgram.models.errors import NoOpenGL
+    from rotorgram.rendering.gl import offscreen_context
 
     try:
         offscreen_context(16, 16).free()

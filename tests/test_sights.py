@@ -1,5 +1,8 @@
 """Pictures as observations of envs: local, in vectors, over UDP; the flight stays as it is."""
 
+import os
+import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -156,3 +159,17 @@ def test_wrong_options(options: dict[str, Any], sentence: str) -> None:
 def test_words_may_come_one_by_one() -> None:
     kind = options_type(HOVER)
     assert kind(cameras="a,b").cameras == kind(cameras=["a", "b"]).cameras == ("a", "b")
+
+
+def test_a_simulator_without_opengl_says_so_in_a_sentence() -> None:
+    words = ["evaluate", "geometric", "--env", HOVER, "--env.cameras", "front", "--episodes", "1"]
+    done = subprocess.run(
+        [sys.executable, "-m", "rotorgram.cli", *words],
+        env=os.environ | {"MUJOCO_GL": "disable"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 1
+    assert "OpenGL: expected EGL (on Debian and Ubuntu: apt-get install" in done.stderr
+    assert "Traceback" not in done.stderr

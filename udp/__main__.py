@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from ..envs import registry
 from ..envs.spec import canonical_id
-from ..models.errors import InputError, MissingPackage, expect
+from ..models.errors import InputError, MissingPackage, NoOpenGL, expect
 from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
 from .transport.simulator import Simulator
@@ -61,7 +61,7 @@ def main() -> int:
                 Thread(target=stop_with_stdin, daemon=True).start()
             simulator.run()
             return 128 + ended[0] if ended else 0
-    except (LinkError, OSError, InputError, MissingPackage) as error:
+    except (LinkError, OSError, InputError, MissingPackage, NoOpenGL) as error:
         print(f"rotorgram simulator: {error}", file=sys.stderr)
         return 1
 
