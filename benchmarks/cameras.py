@@ -2,6 +2,7 @@
 
     python benchmarks/cameras.py [--seconds 1] [--repeats 7] [--out FILE.json]
     python benchmarks/cameras.py --sheet FILE.png    pictures of every kind, to look at
+    python benchmarks/cameras.py --worlds FILE.png   worlds of two seeds each
 
 Each case draws the plain world with a Crazyflie from its camera `front`. `mujoco.Renderer` draws
 the same model without shadows and smooth edges, and gives the same kind; it has no optical flow:
@@ -21,6 +22,7 @@ import numpy as np
 from measuring import in_turns, medians, options, write
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.experiments.pairs import socket_pair
+from rotorgram.models import SEEDED_WORLDS
 from rotorgram.models.cameras import KINDS, cameras_of, chosen_views
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
@@ -141,11 +143,31 @@ def sheet(path: Path) -> None:
     image.imsave(path, np.vstack(rows))
 
 
+def worlds(path: Path) -> None:
+    """Two seeds of each world that is made from one: from behind the paper's craft, and ahead."""
+    from PIL import Image
+
+    vehicle, rows = Vehicle.load(), []
+    views = chosen_views(["chase@320x240", "front@320x240"], cameras_of(vehicle))
+    state = {"position": np.array([[0.0, 0.0, 5.0]]), "quaternion": np.array([[0.9, 0, 0, 0.436]])}
+    everybody = np.ones(1, bool)
+    for name in SEEDED_WORLDS:
+        row = []
+        for seed in range(2):
+            cameras = Cameras(vehicle, views, world=f"{name}:{seed}", fine=True)
+            cameras.take({view.name: everybody for view in views}, everybody, **state)
+            row += [cameras.pictures[view.name][0] for view in views]
+            cameras.close()
+        rows.append(np.hstack(row))
+    pictures = Image.fromarray(np.vstack(rows)).quantize(128, dither=Image.Dither.NONE)
+    pictures.save(path, optimize=True)
+
+
 def main() -> None:
     """Measure, print and write."""
-    args = options(__doc__, seconds=1.0, repeats=7, out=Path, sheet=Path).parse_args()
-    if args.sheet:
-        sheet(args.sheet)
+    args = options(__doc__, seconds=1.0, repeats=7, out=Path, sheet=Path, worlds=Path).parse_args()
+    if args.sheet or args.worlds:
+        (sheet if args.sheet else worlds)(args.sheet or args.worlds)
         return
     rows = pictures(args.seconds, args.repeats)
     print("| kind | pixels | pictures/s | of `mujoco.Renderer` | ratio |")

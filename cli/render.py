@@ -43,8 +43,9 @@ class Render(EnvFlags):
     """Seconds of flight per second of film: 0.25 is slow motion."""
     at: float | None = None
     """With a .png: the time of the picture in the first episode, s. Default: its end."""
-    world: Literal["airport", "plain"] = "airport"
-    """Surroundings of the drones in the picture; they change no flight."""
+    world: str = "airport"
+    """Surroundings of the drones in the picture; they change no flight:
+    plain, airport, forest, warehouse or gates; the last three from a seed, as forest:3."""
     overlay: bool = True
     """Whether numbers and curves are on the picture. Of several flights the names always are."""
     fast: bool = False

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain, count, islice
 from pathlib import Path
-from typing import Literal
 
 from tyro.conf import Positional
 
 from ..experiments.trajectories import Trajectory, flown_trajectories, recorded_trajectories
+from ..models import parse_world
 from ..models.errors import expect
 from ._flags import EnvFlags, check_count
 
@@ -27,8 +27,9 @@ class View(EnvFlags):
     """Serve a page for browsers, for a machine without a display."""
     port: int = 8080
     """TCP port of the page, on this machine's loopback; 0 takes the first free one."""
-    world: Literal["airport", "plain"] = "airport"
-    """Surroundings of the drone."""
+    world: str = "airport"
+    """Surroundings of the drone:
+    plain, airport, forest, warehouse or gates; the last three from a seed, as forest:3."""
     speed: float = 1.0
     """1 is real time, from 1/16 to 8."""
     episodes: int | None = None
@@ -42,6 +43,7 @@ class View(EnvFlags):
         from ._env import words_of
 
         check_count("episodes", self.episodes)
+        parse_world(self.world)
         flights = islice(self._flights(), self.episodes)
         first = next(flights)
         spec, drones = first[0].spec, len(first)

@@ -122,7 +122,7 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
     frames = []
     with closing(
         Cameras(
-            vehicle, plan.views(), (1, drones), world=plan.world,  # type: ignore[arg-type]
+            vehicle, plan.views(), (1, drones), world=walk.world,
             marks=walk.marks, payload=walk.payload is not None, fine=plan.fine,
         )
     ) as cameras:  # fmt: skip

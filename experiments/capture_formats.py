@@ -263,14 +263,14 @@ def datasheet(plan: Plan, walks: Sequence[Walk], labels: Sequence[Mapping[str, A
     vehicle = Vehicle.load(plan.vehicle)
     sources = Counter[str]()
     for walk in walks:
-        sources[walk.name] += len(walk)
+        sources[f"{walk.name}, world `{walk.world}`"] += len(walk)
     versions = ", ".join(f"{name} {number}" for name, number in software_versions().items())
     return "\n".join(
         [
             "# Labelled pictures of drones",
             "",
-            f"{len(labels)} frames of {vehicle.name} (model {vehicle.hash[:8]}) in the world "
-            f"`{plan.world}`, seed {plan.seed}. Every label is computed from the state that the "
+            f"{len(labels)} frames of {vehicle.name} (model {vehicle.hash[:8]}), seed "
+            f"{plan.seed}. Every label is computed from the state that the "
             "picture shows.",
             "",
             "| frames | from |",

@@ -15,7 +15,7 @@ from ..agents import CONTROLLERS
 from ..agents.checkpoints import load
 from ..agents.policies import Policy
 from ..envs.rendering import moment
-from ..models import World
+from ..models import parse_world
 from ..models.errors import InputError, expect
 from ..rendering import Camera, Canvas, MetricValue, Moment, NoOpenGL, Stage
 from ..rendering.film import QUALITY, Overlay, check_film, graph_scale, write_film
@@ -123,7 +123,7 @@ class Film:
     fps: float = 25.0
     speed: float = 1.0
     """Seconds of flight per second of film."""
-    world: World = "airport"
+    world: str = "airport"
     vehicle: str | None = None
     """File or name of the vehicle; None: the paper's."""
     overlay: bool = True
@@ -136,6 +136,7 @@ class Film:
     """As of `write_film`."""
 
     def __post_init__(self) -> None:
+        parse_world(self.world)
         expect(0.001 <= self.speed <= 1000, "speed", "0.001 to 1000", f"{self.speed:g}")
         right = self.at is None or 0 <= self.at < math.inf
         expect(right, "at", "a time of 0 s or more", f"{self.at or 0:g}")
@@ -263,7 +264,7 @@ def _scale(shots: Sequence[Shot]) -> tuple[float, float]:
 
 
 def film_comparison(
-    folder: Path, out: Path, on_frame: OnFrame = lambda *_: None, *, world: World = "airport"
+    folder: Path, out: Path, on_frame: OnFrame = lambda *_: None, *, world: str = "airport"
 ) -> bool:
     """Film a comparison: each agent and the controller, the same episode side by side.
 

@@ -18,7 +18,7 @@ from ..agents.policies import Policy
 from ..envs.registry import env_spec
 from ..envs.spec import Mark
 from ..envs.tasks.task import finite
-from ..models import WORLDS
+from ..models import parse_world
 from ..models.cameras import View, cameras_of, chosen_views
 from ..models.errors import InputError, expect
 from ..models.frames import pose_in_mujoco_frame
@@ -27,13 +27,17 @@ from .trajectories import Trajectory, flown_trajectories, recorded_trajectories
 
 _KEYS: Final = ("vehicle", "world", "cameras", "seed", "fine", "fps", "poses")
 _SOURCES: Final[Mapping[str, Mapping[str, Any]]] = {
-    "random": {"count": None, "center": (0.0, 0.0, 5.0), "size": (10.0, 10.0, 6.0), "tilt": 0.3},
+    "random": {
+        "count": None, "center": (0.0, 0.0, 5.0), "size": (10.0, 10.0, 6.0), "tilt": 0.3,
+        "world": "",
+    },
     "flight": {
         "env": "rotorgram/Hover-v0", "agent": "geometric", "options": {}, "episodes": 1, "first": 0,
-        "every": 10, "drones": 1, "aside": 0.0, "tilt": 0.0,
+        "every": 10, "drones": 1, "aside": 0.0, "tilt": 0.0, "world": "",
     },
     "journal": {
         "file": None, "session": None, "drone": 0, "every": 10, "aside": 0.0, "tilt": 0.0,
+        "world": "",
     },
 }  # fmt: skip
 """Keys of each source of poses, and their defaults; a `count` and a `file` have to be there."""
@@ -60,6 +64,8 @@ class Walk:
     payload: np.ndarray | None = None
     """Shape (T, A, 3)."""
     marks: tuple[Mark, ...] = ()
+    world: str = "plain"
+    """What surrounds the drones."""
 
     def __len__(self) -> int:
         """T."""
@@ -112,7 +118,7 @@ class Plan:
             text=text, cameras=tuple(cameras),
             poses=tuple(_source(one, i) for i, one in enumerate(poses, 1)), **table,
         )  # fmt: skip
-        expect(plan.world in WORLDS, "plan: world", " or ".join(WORLDS), repr(plan.world))
+        parse_world(plan.world)
         right = type(plan.seed) is int and 0 <= plan.seed < 1 << 63
         expect(right, "plan: seed", "a whole number from 0", repr(plan.seed))
         expect(type(plan.fine) is bool, "plan: fine", "true or false", repr(plan.fine))
@@ -134,12 +140,13 @@ class Plan:
         for number, source in enumerate(self.poses, 1):
             name, dice = f"{number} {source['from']}", np.random.default_rng([self.seed, number])
             if source["from"] == "random":
-                found.append(_random(name, source, dice))
-                continue
-            flies = source["from"] == "flight"
-            flown = _flown(source, self.vehicle) if flies else _recorded(source)
-            walks = _walks(name, flown, source["every"], source.get("drones", 1))
-            found += [_moved(walk, source["aside"], source["tilt"], dice) for walk in walks]
+                walks = [_random(name, source, dice)]
+            else:
+                flies = source["from"] == "flight"
+                flown = _flown(source, self.vehicle) if flies else _recorded(source)
+                walks = _walks(name, flown, source["every"], source.get("drones", 1))
+                walks = [_moved(walk, source["aside"], source["tilt"], dice) for walk in walks]
+            found += [replace(walk, world=source["world"] or self.world) for walk in walks]
         count = sum(map(len, found))
         expect(count <= MOST_FRAMES, "plan", f"at most {MOST_FRAMES} poses", f"{count}")
         return found
@@ -171,6 +178,8 @@ def _source(table: dict[str, Any], number: int) -> dict[str, Any]:
         value = source.get(key, 0.0)
         right = finite(value) is not None and 0 <= value <= most
         expect(right, f"{name}.{key}", f"0 to {most:.6g} {unit}", repr(value))
+    if source["world"]:
+        parse_world(source["world"])
     if kind == "journal":
         expect(isinstance(source["file"], str), f"{name}.file", "a journal (.mcap)", "none")
     return source
@@ -252,7 +261,7 @@ def _walks(name: str, flown: Sequence[Trajectory], every: int, drones: int) -> l
                     level = np.zeros_like(arrays[key][rows])
                     points = pose_in_mujoco_frame(arrays[key][rows], level)[:, :3]
                     told.setdefault(key, []).append(points)
-        stacked = {key: np.stack(values, axis=1) for key, values in told.items()}
+        stacked: dict[str, Any] = {key: np.stack(values, axis=1) for key, values in told.items()}
         period, marks = world[0].spec.control_period, world[0].spec.marks
         found.append(Walk(name=name, times=steps * period, marks=marks, **stacked))
     return found

@@ -8,16 +8,16 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
-from .errors import InputError, MissingPackage
+from .errors import InputError, MissingPackage, expect
 
 if TYPE_CHECKING:
     from .scene import attach_airport, build_scene
     from .vehicle import Rotor, Vehicle
 
 __all__ = [
-    "AIRPORT_XML", "BACKENDS", "MAX_DRONES", "MOST_DRAG", "QUAD_XML", "SCENE_XML", "WORLDS",
-    "Backend", "InputError", "MissingPackage", "Rotor", "Vehicle", "World", "attach_airport",
-    "build_scene",
+    "AIRPORT_XML", "BACKENDS", "MAX_DRONES", "MOST_DRAG", "QUAD_XML", "SCENE_XML", "SEEDED_WORLDS",
+    "WORLDS", "Backend", "InputError", "MissingPackage", "Rotor", "Vehicle", "attach_airport",
+    "build_scene", "parse_world",
 ]  # fmt: skip
 
 QUAD_XML: Final = Path(__file__).parent / "quad.xml"
@@ -31,13 +31,26 @@ Backend = Literal["mujoco", "rigid", "warp"]
 no contact, in compiled C or in torch. `warp`: MuJoCo Warp, float32. Tensors of the last two take a
 GPU if there is one."""
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
-World = Literal["plain", "airport"]
+WORLDS: Final = ("plain", "airport", "forest", "warehouse", "gates")
 """Surroundings of the vehicle, which pictures show and physics does not know."""
-WORLDS: Final[tuple[World, ...]] = get_args(World)
+SEEDED_WORLDS: Final = WORLDS[2:]
+"""Those that are made from a seed."""
 MAX_DRONES: Final = 1024
 """Most drones of a world."""
 MOST_DRAG: Final = 100.0
 """Largest linear drag, 1/s. RK4 at 10 ms is within 0.1 % there, and unstable above 278 /s."""
+
+
+def parse_world(text: str) -> tuple[str, int]:
+    """Name and seed of a world: NAME, or NAME:SEED of one that is made from a seed. Raises
+    `InputError`.
+    """
+    name, colon, number = text.partition(":") if isinstance(text, str) else ("", "", "")
+    expected = f"{' or '.join(map(repr, WORLDS))}, the last three with a seed or not, as 'forest:3'"
+    seed = int(number) if number.isascii() and number.isdecimal() and len(number) < 10 else -1
+    right = name in WORLDS and (not colon or (name in SEEDED_WORLDS and seed >= 0))
+    expect(right, "world", expected, repr(text))
+    return name, max(seed, 0)
 
 
 def __getattr__(name: str) -> Any:

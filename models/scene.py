@@ -9,8 +9,9 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from . import AIRPORT_XML, QUAD_XML, SCENE_XML, World
+from . import AIRPORT_XML, QUAD_XML, SCENE_XML, parse_world
 from .errors import expect
+from .scenery import SCENERIES
 from .vehicle_file import read_vehicle_file
 
 AIRPORT_PREFIX: Final = "airport/"  # Of all names that `attach_airport` adds
@@ -32,27 +33,30 @@ _HAZE_COLOUR: Final = (0.80, 0.88, 0.96, 1.0)  # the sky's colour where it meets
 
 
 def build_scene(
-    vehicle: Path | str | None = None, world: World = "plain", *, visual: bool = True
+    vehicle: Path | str | None = None, world: str = "plain", *, visual: bool = True
 ) -> mujoco.MjSpec:
     """A vehicle's file, None for the paper's, with ground, sky and light, to be compiled.
 
-    Without visual elements the physics is faster and the same, bit for bit. Raises `InputError` if
-    there is no such world, a height field is too large or a TOML file is wrong; `ValueError` if an
-    MJCF file is.
+    The world is one of `WORLDS`, or NAME:SEED for one that is made from a seed. Without visual
+    elements the physics is faster and the same, bit for bit. Raises `InputError` if there is no
+    such world, a height field is too large or a TOML file is wrong; `ValueError` if an MJCF file
+    is.
     """
-    expect(world in ("plain", "airport"), "world", "'plain' or 'airport'", f"{world!r}")
+    name, seed = parse_world(world)
     spec = read_spec(Path(vehicle if vehicle is not None else QUAD_XML))
     has_ground = any(geom.type in _GROUNDS for geom in spec.worldbody.geoms)
     if visual or not has_ground:
         _attach_scene(spec, ground=not has_ground)
-    if world == "airport":
+    if name == "airport":
         attach_airport(spec)
+    elif visual and name in SCENERIES:
+        SCENERIES[name](spec, seed)
     spec.compiler.discardvisual = not visual
     return spec
 
 
 def build_swarm(
-    vehicles: Sequence[Path], names: Sequence[str], world: World = "plain", *, visual: bool = True
+    vehicles: Sequence[Path], names: Sequence[str], world: str = "plain", *, visual: bool = True
 ) -> mujoco.MjSpec:
     """One world with a craft of each vehicle's file, to be compiled.
 

@@ -13,7 +13,6 @@ from typing import Any, Final, NamedTuple
 import mujoco
 import numpy as np
 
-from ..models import World
 from ..models.cameras import FARTHEST, View, add_cameras
 from ..models.errors import NoOpenGL
 from ..models.fleet import members_of
@@ -79,7 +78,7 @@ class Cameras:
         views: Sequence[View],
         shape: tuple[int, int] = (1, 1),
         *,
-        world: World = "plain",
+        world: str = "plain",
         marks: Sequence[Any] = (),
         payload: bool = False,
         fine: bool = False,
@@ -343,7 +342,7 @@ class _Poses:
 
 
 def objects_of(
-    vehicle: Vehicle, drones: int, world: World, marks: Sequence[Any], *, payload: bool
+    vehicle: Vehicle, drones: int, world: str, marks: Sequence[Any], *, payload: bool
 ) -> tuple[str, ...]:
     """`Cameras.objects` of such cameras, without an OpenGL."""
     names = drone_names(drones)
@@ -351,7 +350,7 @@ def objects_of(
 
 
 def _model(
-    vehicle: Vehicle, names: Sequence[str], world: World, marks: Sequence[Any], *, payload: bool
+    vehicle: Vehicle, names: Sequence[str], world: str, marks: Sequence[Any], *, payload: bool
 ) -> mujoco.MjModel:
     """What is drawn: craft with their cameras, what surrounds them, the task's marks."""
     crafts = members_of(vehicle, len(names))

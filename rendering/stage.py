@@ -13,7 +13,6 @@ from typing import Any, Final, Literal, NamedTuple, Self, get_args
 import mujoco
 import numpy as np
 
-from ..models import World
 from ..models.errors import InputError, NoOpenGL, expect
 from ..models.fleet import load_vehicles, members_of
 from ..models.frames import pose_in_mujoco_frame
@@ -188,7 +187,7 @@ class Stage:
 
     def __init__(
         self,
-        world: World = "airport",
+        world: str = "airport",
         drones: int = 1,
         *,
         vehicle: Path | str | None = None,

@@ -112,7 +112,7 @@ def test_discardvisual_drops_all_of_it() -> None:
 def test_a_scene_has_the_airport_that_was_asked_for(visual: bool) -> None:
     model = build_scene(world="airport", visual=visual).compile()
     assert model.ngeom == with_airport(build_scene, discard=not visual).ngeom
-    with pytest.raises(InputError, match="world: expected 'plain' or 'airport', got 'mars'"):
+    with pytest.raises(InputError, match=r"world: expected 'plain' or 'airport' .* got 'mars'"):
         build_scene(world="mars")
 
 

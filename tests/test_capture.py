@@ -85,7 +85,7 @@ def test_a_flight_gives_every_so_many_steps(tmp_path: Path) -> None:
     [
         (("seed = 7", "seed = -1"), "plan: seed: expected a whole number from 0, got -1"),
         (("seed = 7", "sed = 7"), "plan: expected some of vehicle, world, .* got 'sed'"),
-        (("seed = 7", 'world = "moon"'), "plan: world: expected plain or airport, got 'moon'"),
+        (("seed = 7", 'world = "moon"'), "world: expected 'plain' or 'airport' .* got 'moon'"),
         (("count = 5", "count = 0"), r"plan: poses\[1\].count: expected 1 to 1000000, got 0"),
         (("count = 5", ""), r"plan: poses\[1\].count: expected 1 to 1000000, got None"),
         (("tilt = 0.5", "tilt = 4"), r"poses\[1\].tilt: expected 0 to 3.14159 rad, got 4"),
@@ -151,7 +151,7 @@ def test_every_file_is_there(captured: Path) -> None:
             assert all((captured / file).is_file() for file in one["files"])
     text = (captured / "README.md").read_text("utf-8")
     assert "8 frames of Crazyflie 2.x" in text
-    assert "| 5 | 1 random |" in text
+    assert "| 5 | 1 random, world `plain` |" in text
     assert PLAN.strip() in text
     with Image.open(captured / "contact.png") as sheet:
         assert sheet.size == (4 * 160, 8 * 160)  # 32x24 is 160x120, the square flow 160x160

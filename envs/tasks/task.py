@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 import numpy as np
 
-from ...models import MOST_DRAG, WORLDS
+from ...models import MOST_DRAG, parse_world
 from ...models.errors import expect
 from ...sim import (
     LEVELS,
@@ -70,7 +70,8 @@ class TaskOptions:
     """Pictures that are observed: cameras of the vehicle by name, also as NAME_KIND or
     NAME@WIDTHxHEIGHT. See `models/cameras.py`."""
     world: str = "plain"
-    """What the pictures show around the drones: `plain`, `airport`..., as viewers have it."""
+    """What the pictures show around the drones: plain, airport, forest, warehouse or gates; the
+    last three from a seed, as forest:3."""
 
     actions: ClassVar[tuple[str, ...]] = LEVELS
     """Levels that the task can be flown at; one with a controller of its own may name fewer."""
@@ -90,7 +91,7 @@ class TaskOptions:
         object.__setattr__(self, "effects", effects.to_options())
         object.__setattr__(self, "sensors", checked_sensors(self.sensors))
         object.__setattr__(self, "cameras", _words(self.cameras))
-        check_choice(self, "world", WORLDS)
+        parse_world(self.world)
         self.check()
         acting = replace(effects, payload=1.0) if self.hangs else effects
         drawn = Randomization(self.randomize, acting)
