@@ -117,7 +117,9 @@ def avoiding(there: Vector, moves: Vector, own: Vector, radius: float, period: f
         size = math.sqrt(_dot(away, away))
         change = radius * share - size
     if size < 1e-9:  # straight at the middle: to the right, as at sea
-        away, size = (there[1], -there[0], 1e-9), math.hypot(there[0], there[1]) or 1e-9
+        x, y, z = there
+        away = (y, -x, 0.0) if math.hypot(x, y) > 1e-9 else (z or 1.0, 0.0, 0.0)
+        size = math.hypot(*away)
     normal = (away[0] / size, away[1] / size, away[2] / size)
     return normal, _dot(normal, own) + 0.5 * change
 

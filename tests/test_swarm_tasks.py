@@ -251,3 +251,14 @@ def test_what_orca_cannot_fly_is_one_sentence() -> None:
 def test_wrong_options(options: dict[str, Any], expected: str) -> None:
     with pytest.raises(InputError, match=f"^{expected}"):
         LocalVectorEnv(TASKS[0], 2, drones=2, **options)
+
+
+@pytest.mark.parametrize("height", [4.0, -4.0])
+def test_two_that_meet_straight_above_each_other_go_to_opposite_sides(height: float) -> None:
+    """The side step of each is half of the distance to keep; none of it is vertical."""
+    closing = (0.0, 0.0, -height)
+    one, least = avoiding((0.0, 0.0, height), closing, (0.0, 0.0, 0.0), 1.0, PERIOD)
+    other, _ = avoiding((0.0, 0.0, -height), (0.0, 0.0, height), (0.0, 0.0, 0.0), 1.0, PERIOD)
+    assert one == (height / 4, 0.0, 0.0)
+    assert other == (-height / 4, 0.0, 0.0)
+    assert least == pytest.approx(0.5)  # at 4 m/s the middles meet in 1 s: R / 1 s, by halves
