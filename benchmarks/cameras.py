@@ -9,9 +9,12 @@ the same model without shadows and smooth edges, and gives the same kind; it has
 there ours is beside its depth. Cases take turns within a repeat, medians are told.
 """
 
+import json
 import os
-from collections.abc import Callable
-from contextlib import ExitStack
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,7 @@ from rotorgram.models import SEEDED_WORLDS
 from rotorgram.models.cameras import KINDS, cameras_of, chosen_views
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
+from rotorgram.udp import RemoteVectorEnv
 from swarm import advanced, timed
 
 ENV = "rotorgram/Hover-v0"
@@ -106,8 +110,29 @@ def steps(drones: int, seconds: float, repeats: int) -> dict[str, float]:
             pair = socket_pair(ENV, more, num_envs=drones, vehicle=VEHICLE)
             cases[name] = advanced(local, drones)
             cases[f"{name} over UDP"] = advanced(opened.enter_context(pair), drones)
+        if drones > 1:
+            several = opened.enter_context(two_simulators(drones, flown["seeing"]))
+            cases["seeing over UDP, two simulators"] = advanced(several, drones)
         taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)))
     return {name: round(time * 1e3, 3) for name, time in taken.items()}
+
+
+@contextmanager
+def two_simulators(drones: int, settings: dict[str, Any]) -> Iterator[RemoteVectorEnv]:
+    """A vector env of two processes, each of which draws half of the pictures."""
+    here = ("127.0.0.1", 0)
+    env = RemoteVectorEnv(
+        here, env_id=ENV, options=settings, num_simulators=2, num_envs=drones,
+        autoreset_mode="Disabled", connect=False,
+    )  # fmt: skip
+    told = {"server": env.address, "bind": here, "num_envs": drones // 2, "env": ENV}
+    words = json.dumps(told | {"vehicle": VEHICLE, "options": settings})
+    command = [sys.executable, "-P", "-m", "rotorgram.udp", words]
+    with ExitStack() as opened:
+        for _ in range(2):
+            opened.enter_context(subprocess.Popen(command))
+        opened.callback(env.close)
+        yield env
 
 
 def sheet(path: Path) -> None:
@@ -179,8 +204,9 @@ def main() -> None:
     taken = {str(drones): steps(drones, args.seconds, args.repeats) for drones in (1, 16)}
     print("| ms of a step | " + " | ".join(f"{drones} drones" for drones in taken) + " |")
     print("|---|" + "---:|" * len(taken))
-    for name in taken["1"]:
-        print(f"| {name} | " + " | ".join(f"{one[name]:.2f}" for one in taken.values()) + " |")
+    for name in taken["16"]:
+        told = (f"{one[name]:.2f}" if name in one else "–" for one in taken.values())
+        print(f"| {name} | " + " | ".join(told) + " |")
     if args.out:
         write(args.out, {"pictures": rows, "milliseconds of a step": taken})
 

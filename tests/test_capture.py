@@ -2,6 +2,9 @@
 
 import json
 import math
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -296,3 +299,23 @@ def test_flow_is_since_the_pose_before(captured: Path) -> None:
     assert not flows[5].any()  # the first of the flight
     assert all(flow.any() for flow in (flows[1], flows[6], flows[7]))
     assert math.isfinite(float(np.abs(flows[7]).max()))
+
+
+def test_a_run_that_is_killed_goes_on(captured: Path, tmp_path: Path) -> None:
+    """SIGKILL in the middle of it; the same line again makes the folder whole."""
+    (tmp_path / "plan.toml").write_text(PLAN, "utf-8")
+    line = [sys.executable, "-m", "rotorgram.cli", "capture", "plan.toml", "--out", "out"]
+    pipe = subprocess.DEVNULL
+    with subprocess.Popen([*line, "--jobs", "1"], cwd=tmp_path, stdout=pipe) as process:
+        deadline = time.monotonic() + 60
+        while not label_file(tmp_path / "out", 1).exists():
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        process.kill()
+    done = subprocess.run([*line, "--jobs", "1"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    assert done.returncode == 0
+    assert "out: 8 frames" in done.stdout
+    whole, told = contents(captured), contents(tmp_path / "out")
+    left = {name for name in told if name.endswith(".part")}
+    assert {name: told[name] for name in told.keys() - left} == whole

@@ -15,11 +15,13 @@ import pandas as pd
 import pytest
 from rotorgram.agents.checkpoints import load, software_versions
 from rotorgram.experiments import workers as module
+from rotorgram.experiments.capture import capture
 from rotorgram.experiments.compare import compare
 from rotorgram.experiments.folders import new_folder
 from rotorgram.experiments.results import read_results, read_steps
 from rotorgram.experiments.settings import CompareConfig, SweepConfig, WorkersConfig
 from rotorgram.experiments.sweep import read_sweep_runs, sweep
+from rotorgram.experiments.viewpoints import Plan
 from rotorgram.experiments.workers import RunsFailed, open_workers
 
 # Ray listens beyond this machine. It reads these when it is imported.
@@ -34,6 +36,12 @@ CONFIG = CompareConfig(
     agents=("a2c",), seeds=1, env_steps=600, snapshots=1, curve_episodes=1, episodes=1,
     options={"episode_length": 50},
 )  # fmt: skip
+PLAN = """
+cameras = ["front@32x24", "front_depth@32x24"]
+[[poses]]
+from = "random"
+count = 20
+"""
 TIMES = ["seconds", "steps_per_second"]
 
 
@@ -116,6 +124,21 @@ def test_every_node_flies(address: str) -> None:
         ("job 0", 0), ("job 1", 1), ("job 2", 2), ("job 3", 3),
     ]  # fmt: skip
     assert len({result.value[1] for result in results}) == 2
+
+
+def test_pictures_are_taken_on_a_cluster(opengl: None, tmp_path: Path, address: str) -> None:
+    (tmp_path / "plan.toml").write_text(PLAN, "utf-8")
+    plan, found = Plan.read(tmp_path / "plan.toml"), []
+    for name, config in {
+        "here": WorkersConfig(jobs=1),
+        "there": WorkersConfig(runner="ray", address=address),
+    }.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        assert capture(plan, folder, config) == 20
+        found.append({p.relative_to(folder): p.read_bytes() for p in folder.rglob("*.[jpn]*")})
+    assert len(found[0]) > 40
+    assert found[0] == found[1]
 
 
 def test_a_worker_with_other_software_is_refused(
