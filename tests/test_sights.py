@@ -1,9 +1,10 @@
 """Pictures as observations of envs: local, in vectors, over UDP; the flight stays as it is."""
 
 import os
+import socket
 import subprocess
 import sys
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,15 @@ import pytest
 from fleets import flying
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
+from peers import ANY, Running, relaying
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.envs.registry import env_spec, options_type
+from rotorgram.experiments.pairs import socket_pair
 from rotorgram.models import InputError
+from rotorgram.udp import LinkConfig, Simulator
+from rotorgram.udp.remote_parallel import RemoteParallelEnv
+from rotorgram.udp.transport.relay import FaultConfig
 from test_cameras import BELLY, vehicle_with
 
 LANDING = "rotorgram/Landing-v0"
@@ -173,3 +179,63 @@ def test_a_simulator_without_opengl_says_so_in_a_sentence() -> None:
     assert done.returncode == 1
     assert "OpenGL: expected EGL (on Debian and Ubuntu: apt-get install" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_pictures_of_a_swarm_cross_a_lossy_wire(opengl: None) -> None:
+    """One State for the world, 30 % of the datagrams lost: every bit of every drone's picture."""
+    words, name = "front_segmentation@24x16,down@8x8", "rotorgram/Formation-v0"
+    local = LocalParallelEnv(name, 3, cameras=words)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(ANY)
+        agent = taken.getsockname()
+    with relaying(agent, FaultConfig(drop=0.3, duplicate=0.1, reorder=0.1, seed=5)) as relay:
+        simulator = Simulator(
+            name, server=relay.address, bind=ANY, num_envs=3, drones=3, cameras=words.split(","),
+            config=LinkConfig(timeout=60),
+        )  # fmt: skip
+        running = Running(simulator)
+        with closing(RemoteParallelEnv(agent)) as remote, closing(local):
+            assert remote.observation_spaces == local.observation_spaces
+            here, there = remote.reset(seed=4)[0], local.reset(seed=4)[0]
+            dice = np.random.default_rng(6)
+            for _ in range(8):
+                assert here.keys() == there.keys() == {*local.agents}
+                for drone, seen in there.items():
+                    for part, values in seen.items():
+                        assert here[drone][part].tobytes() == values.tobytes()
+                shape = local.action_space("drone_0").shape
+                actions = {one: dice.uniform(-1, 1, shape).astype("f4") for one in local.agents}
+                here, there = remote.step(actions)[0], local.step(actions)[0]
+        running.join()
+
+
+@pytest.mark.parametrize("over_udp", [False, True], ids=["in process", "over UDP"])
+def test_sb3_learns_from_pictures(opengl: None, over_udp: bool) -> None:
+    sb3: Any = pytest.importorskip("stable_baselines3")
+    options = {"cameras": ["down@40x40"], "action": "velocity"}
+    with ExitStack() as opened:
+        if over_udp:
+            env = opened.enter_context(socket_pair(HOVER, options))
+        else:
+            env = opened.enter_context(closing(gym.make(HOVER, **options)))
+        settings = {"n_steps": 16, "batch_size": 16, "n_epochs": 1, "device": "cpu"}
+        model = sb3.PPO("MultiInputPolicy", env, **settings).learn(16)
+        kinds = {k: type(v).__name__ for k, v in model.policy.features_extractor.extractors.items()}
+    assert kinds == {"down": "NatureCNN", "observation": "Flatten"}
+
+
+def test_a_loop_as_cleanrl_has_it(opengl: None) -> None:
+    """Storage by the spaces of a Gymnasium vector env; what a step gives goes in as it is."""
+    envs = gym.make_vec(HOVER, num_envs=3, cameras="down@16x16,down_depth@16x16")
+    space = envs.single_observation_space
+    stored = {name: np.zeros((4, 3, *box.shape), box.dtype) for name, box in space.items()}
+    envs.action_space.seed(1)
+    seen, _ = envs.reset(seed=1)
+    for step in range(4):
+        for name, values in seen.items():
+            assert values.dtype == stored[name].dtype
+            stored[name][step] = values
+        seen, *_ = envs.step(envs.action_space.sample())
+    envs.close()
+    assert stored["down"].any()
+    assert 0 < stored["down_depth"].max() <= 1000
