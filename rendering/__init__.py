@@ -6,8 +6,9 @@ Importing this package imports none of its modules and no OpenGL: training never
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ..models.errors import NoOpenGL
+
 if TYPE_CHECKING:
-    from ..models.errors import NoOpenGL
     from .stage import CAMERAS, Camera, Canvas, Mark, MetricValue, Moment, Stage
 
 __all__ = [

@@ -14,12 +14,11 @@ import mujoco
 import numpy as np
 
 from ..models.cameras import FARTHEST, View, add_cameras
-from ..models.errors import NoOpenGL
 from ..models.fleet import members_of
 from ..models.scene import build_swarm
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
-from .gl import offscreen_context
+from .gl import Offscreen
 from .stage import scale_drawing
 
 NOTHING: Final = "nothing"
@@ -109,18 +108,8 @@ class Cameras:
         model = self.model
         sizes = [view.shape for view in self.views]
         width, height = max(size[1] for size in sizes), max(size[0] for size in sizes)
-        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         model.vis.quality.offsamples = 4 if fine else 0
-        self._gl: Any = offscreen_context(width, height)
-        font, buffer = mujoco.mjtFontScale.mjFONTSCALE_100, mujoco.mjtFramebuffer.mjFB_OFFSCREEN
-        try:
-            with self._gl.as_current():
-                self._context = mujoco.MjrContext(model, font.value)
-                mujoco.mjr_setBuffer(buffer.value, self._context)
-        except mujoco.FatalError as error:
-            self._gl.free()
-            raise NoOpenGL(f"OpenGL: expected one that MuJoCo can draw with, got {error}") from None
-        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
+        self._drawing = Offscreen(model, width, height)
         self._scene = mujoco.MjvScene(model, _ROOM)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = fine
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
@@ -140,7 +129,7 @@ class Cameras:
         needed = np.stack([mask.max(axis=1) for mask in of_world.values()]).max(axis=0)
         flows = any(view.kind == "flow" for view in self.views)
         first = fresh.reshape(worlds, drones).max(axis=1)
-        with self._gl.as_current():
+        with self._drawing.current():
             for world in range(worlds):
                 if not (needed[world] or flows):
                     continue
@@ -200,14 +189,9 @@ class Cameras:
         mujoco.mjv_updateScene(self.model, self.data, self._option, None, view_of, every, scene)
         for flag in mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR:
             scene.flags[flag.value] = objects
-        rect = mujoco.MjrRect(0, 0, width, height)
         colors = np.empty((height, width, 3), np.uint8)
         depth = np.empty((height, width), np.float32)
-        try:
-            mujoco.mjr_render(rect, scene, self._context)
-            mujoco.mjr_readPixels(colors, depth if objects else None, rect, self._context)
-        except (mujoco.FatalError, RuntimeError) as error:  # the driver was restarted
-            raise NoOpenGL(f"OpenGL: expected a context to draw with, lost it: {error}") from None
+        self._drawing.draw(scene, colors, depth if objects else None)
         return colors[::-1], depth[::-1]
 
     def _number(self, colors: np.ndarray) -> np.ndarray:
@@ -256,11 +240,7 @@ class Cameras:
 
     def close(self) -> None:
         """Free the context. A second call does nothing."""
-        if self._gl is not None:
-            with self._gl.as_current():
-                self._context.free()
-            self._gl.free()
-            self._gl = None
+        self._drawing.close()
 
 
 def shown(kind: str, picture: np.ndarray) -> np.ndarray:

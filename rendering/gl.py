@@ -4,9 +4,11 @@ import ctypes.util
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from typing import Any, Final
+
+import numpy as np
 
 from ..models.errors import NoOpenGL
 
@@ -59,6 +61,55 @@ def offscreen_context(width: int, height: int) -> Any:
         "OpenGL: expected EGL (on Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri), "
         f"got none ({'; '.join(reasons) or 'MUJOCO_GL switches it off'})"
     )
+
+
+class Offscreen:
+    """MuJoCo's drawing of a model without a window, from any thread, in pictures of up to a size.
+
+    Raises `NoOpenGL`.
+    """
+
+    def __init__(self, model: Any, width: int, height: int) -> None:
+        import mujoco
+
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        font, buffer = mujoco.mjtFontScale.mjFONTSCALE_100, mujoco.mjtFramebuffer.mjFB_OFFSCREEN
+        self._gl: Any = offscreen_context(width, height)
+        try:
+            with self.current():
+                self._context = mujoco.MjrContext(model, font.value)
+                mujoco.mjr_setBuffer(buffer.value, self._context)
+        except mujoco.FatalError as error:  # an OpenGL that is too old
+            self._gl.free()
+            raise NoOpenGL(f"OpenGL: expected one that MuJoCo can draw with, got {error}") from None
+        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
+
+    def current(self) -> AbstractContextManager[Any]:
+        """Keep OpenGL with this thread for a block: `draw` in it is faster."""
+        block: AbstractContextManager[Any] = self._gl.as_current()
+        return block
+
+    def draw(self, scene: Any, pixels: np.ndarray, depth: np.ndarray | None = None) -> None:
+        """Draw a scene into arrays of one size, the lowest row first: colours, uint8 (H, W, 3), and
+        OpenGL's depth, float32 (H, W), 1 near and 0 far.
+        """
+        import mujoco
+
+        rect = mujoco.MjrRect(0, 0, pixels.shape[1], pixels.shape[0])
+        try:
+            with self.current():
+                mujoco.mjr_render(rect, scene, self._context)
+                mujoco.mjr_readPixels(pixels, depth, rect, self._context)
+        except (mujoco.FatalError, RuntimeError) as error:  # the driver was restarted
+            raise NoOpenGL(f"OpenGL: expected a context to draw with, lost it: {error}") from None
+
+    def close(self) -> None:
+        """Free it. A second call does nothing."""
+        if self._gl is not None:
+            with self.current():
+                self._context.free()
+            self._gl.free()
+            self._gl = None
 
 
 def _wanted() -> str:

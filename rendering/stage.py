@@ -13,11 +13,11 @@ from typing import Any, Final, Literal, NamedTuple, Self, get_args
 import mujoco
 import numpy as np
 
-from ..models.errors import InputError, NoOpenGL, expect
+from ..models.errors import InputError, expect
 from ..models.fleet import load_vehicles, members_of
 from ..models.frames import pose_in_mujoco_frame
 from ..models.scene import SCENE_PREFIX, attach_craft, build_scene
-from .gl import offscreen_context
+from .gl import Offscreen
 
 Camera = Literal["chase", "front", "side", "top", "onboard"]
 CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
@@ -369,21 +369,12 @@ class Canvas(AbstractContextManager["Canvas"]):
         for name, pixels in (("width", width), ("height", height)):
             expect(16 <= pixels <= 8192, name, "16 to 8192 pixels", f"{pixels}")
         self.stage, self.width, self.height = stage, width, height
-        self._gl: Any = offscreen_context(width, height)
         model = stage.model
-        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         model.vis.quality.offsamples = 0 if fast else _SAMPLES
-        font, buffer = mujoco.mjtFontScale.mjFONTSCALE_100, mujoco.mjtFramebuffer.mjFB_OFFSCREEN
-        try:
-            with self._gl.as_current():  # and then no more, so that any thread may draw
-                self._context = mujoco.MjrContext(model, font.value)
-                mujoco.mjr_setBuffer(buffer.value, self._context)
-        except mujoco.FatalError as error:  # an OpenGL that is too old
-            self._gl.free()
-            raise NoOpenGL(f"OpenGL: expected one that MuJoCo can draw with, got {error}") from None
+        self._drawing = Offscreen(model, width, height)
         self._scene = mujoco.MjvScene(model, _ROOM)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = not fast
-        self._option, self._rect = mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
+        self._option = mujoco.MjvOption()
 
     def draw(self, camera: Camera = "chase", stage: Stage | None = None) -> np.ndarray:
         """The stage, or a twin of it, as it is now: a new array, uint8, (height, width, 3)."""
@@ -399,21 +390,12 @@ class Canvas(AbstractContextManager["Canvas"]):
         # From on board, at the goal, its disc would fill the lower half.
         stage.decorate(scene, goals=camera != "onboard")
         pixels = np.empty((self.height, self.width, 3), np.uint8)
-        try:
-            with self._gl.as_current():
-                mujoco.mjr_render(self._rect, scene, self._context)
-                mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
-        except (mujoco.FatalError, RuntimeError) as error:  # the driver was restarted
-            raise NoOpenGL(f"OpenGL: expected a context to draw with, lost it: {error}") from None
+        self._drawing.draw(scene, pixels)
         return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
 
     def close(self) -> None:
         """Free the context. A second call does nothing."""
-        if self._gl is not None:
-            with self._gl.as_current():
-                self._context.free()
-            self._gl.free()
-            self._gl = None
+        self._drawing.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()
