@@ -8,6 +8,7 @@ A camera's frame here: x right, y down, z along its axis, as in computer vision.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import mujoco
@@ -59,7 +60,7 @@ class Lens(NamedTuple):
 
 
 class Cameras:
-    """Cameras of W worlds of A drones. Raises `NoOpenGL` or `InputError`.
+    """Cameras of W worlds of A drones. Raises `InputError`, and `take` raises `NoOpenGL`.
 
     Marks are those of the task's spec: gates, discs and balls of its world, or at each drone's goal
     where they move. Views are what is taken, of one size each; `fine` draws smooth edges and
@@ -94,7 +95,12 @@ class Cameras:
             view.name: np.zeros((rows, *view.shape), view.dtype) for view in self.views
         }
         self._before: list[np.ndarray | None] = [None] * shape[0]
-        self._open(fine=fine)
+        self.model.vis.quality.offsamples = 4 if fine else 0
+        self._scene = mujoco.MjvScene(self.model, _ROOM)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = fine
+        self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._numbers = np.zeros(0, np.int32)
 
     def _camera_ids(self, view: View) -> list[int]:
         """The camera of each drone of a world; of one that stands there the same."""
@@ -104,17 +110,12 @@ class Cameras:
             return [one] * len(self._names)
         return [self.model.camera(f"{drone}/{name}").id for drone in self._names]
 
-    def _open(self, *, fine: bool) -> None:
-        model = self.model
+    @cached_property
+    def _drawing(self) -> Offscreen:
+        """Opened with the first picture, so that a process may be forked before."""
         sizes = [view.shape for view in self.views]
         width, height = max(size[1] for size in sizes), max(size[0] for size in sizes)
-        model.vis.quality.offsamples = 4 if fine else 0
-        self._drawing = Offscreen(model, width, height)
-        self._scene = mujoco.MjvScene(model, _ROOM)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = fine
-        self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._numbers = np.zeros(0, np.int32)
+        return Offscreen(self.model, width, height)
 
     def take(self, due: Mapping[str, np.ndarray], fresh: np.ndarray, **state: Any) -> None:
         """Take pictures of the worlds as they are.
@@ -240,7 +241,8 @@ class Cameras:
 
     def close(self) -> None:
         """Free the context. A second call does nothing."""
-        self._drawing.close()
+        if "_drawing" in vars(self):
+            self._drawing.close()
 
 
 def shown(kind: str, picture: np.ndarray) -> np.ndarray:

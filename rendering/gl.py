@@ -20,6 +20,13 @@ _HIDDEN: Final = "ROTORGRAM_GL"
 environment variable, so that the processes that this one starts know it too."""
 
 
+_state = {"used": False, "forked": False}
+"""Whether this process has opened OpenGL, and whether it was forked from one that had: there it
+would wait for threads that are not."""
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=lambda: _state.update(forked=_state["used"]))
+
+
 @contextmanager
 def hidden_gl_setting() -> Iterator[None]:
     """Let MuJoCo be imported without an OpenGL, also where `MUJOCO_GL` names one that is not there.
@@ -46,6 +53,12 @@ def offscreen_context(width: int, height: int) -> Any:
     `MUJOCO_GL` decides if it is set (egl, osmesa, glfw). Otherwise it is EGL on Linux, or a hidden
     window where there is a display and no EGL; elsewhere the system's own.
     """
+    if _state["forked"]:
+        raise NoOpenGL(
+            "OpenGL: expected a process that was started anew, got one that was forked from one "
+            "that draws; multiprocessing's start method 'spawn' starts it anew"
+        )
+    _state["used"] = True
     reasons = []
     for name in _candidates():
         try:

@@ -239,3 +239,34 @@ def test_a_loop_as_cleanrl_has_it(opengl: None) -> None:
     envs.close()
     assert stored["down"].any()
     assert 0 < stored["down_depth"].max() <= 1000
+
+
+FORKED = """
+import os
+import sys
+import gymnasium as gym
+import rotorgram.envs
+
+make = "rotorgram/Hover-v0"
+envs = gym.make_vec(make, num_envs=2, vectorization_mode="async", cameras="down@8x8")
+print(envs.reset(seed=1)[0]["down"].shape)
+envs.close()
+gym.make(make, cameras="down@8x8").reset(seed=1)
+if os.fork() == 0:
+    try:
+        gym.make(make, cameras="down@8x8").reset(seed=1)
+    except RuntimeError as error:
+        print(error, flush=True)
+    os._exit(0)
+os.wait()
+"""
+
+
+def test_processes_that_are_forked(opengl: None) -> None:
+    """Gymnasium's async vector env draws; who draws before it forks is told, and does not hang."""
+    done = subprocess.run(
+        [sys.executable, "-c", FORKED], capture_output=True, text=True, timeout=60
+    )
+    shape, sentence = done.stdout.splitlines()
+    assert shape == "(2, 8, 8, 3)"
+    assert sentence.startswith("OpenGL: expected a process that was started anew, got one that was")
