@@ -27,6 +27,10 @@ from .workers import OnProgress, Tell, open_workers
 PLAN_FILE: Final = "plan.toml"
 LABELS: Final = "labels"
 _CHUNK: Final = 16  # frames of a job
+_ENDINGS: Final = {
+    "rgb": ("png",), "depth": ("npy", "png"), "segmentation": ("png",), "flow": ("npy",)
+}  # fmt: skip
+"""Of the files of a picture of each kind."""
 _DEEPEST: Final = 65.535  # m: what 16 bits of millimetres hold
 
 
@@ -86,10 +90,21 @@ def _keep_plan(plan: Plan, folder: Path) -> None:
 
 
 def _jobs(plan: Plan, walks: Sequence[Walk], folder: Path) -> Iterator[_Job]:
-    """Runs of frames without labels."""
-    number = 0
+    """Runs of frames of which a file is missing."""
+    number, views = 0, plan.views()
     for walk in walks:
-        missing = [i for i in range(len(walk)) if not label_file(folder, number + i).exists()]
+        drones = walk.position.shape[1]
+        missing = []
+        for row in range(len(walk)):
+            files = [label_file(folder, number + row)]
+            for view in views:
+                files += [
+                    folder / picture_name(view.kind, view.camera.name, number + row, i, drones, end)
+                    for i in range(drones)
+                    for end in _ENDINGS[view.kind]
+                ]
+            if not all(file.exists() for file in files):
+                missing.append(row)
         while missing:
             start = missing[0]
             run = [i for k, i in enumerate(missing[:_CHUNK]) if i == start + k]
@@ -241,7 +256,10 @@ def read_labels(folder: Path) -> list[dict[str, Any]]:
     found = []
     for file in sorted((folder / LABELS).glob("[0-9]*.json")):
         try:
-            found.append(json.loads(file.read_text(encoding="utf-8")))
+            labels = json.loads(file.read_text(encoding="utf-8"))
         except ValueError as error:
             raise InputError(f"{file}: expected labels of a frame, got {error}") from None
+        right = isinstance(labels, dict) and {"frame", "pose", "pictures"} <= labels.keys()
+        expect(right, str(file), "labels of a frame", "others; without this file it is made anew")
+        found.append(labels)
     return found

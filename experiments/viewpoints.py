@@ -180,8 +180,13 @@ def _source(table: dict[str, Any], number: int) -> dict[str, Any]:
         expect(right, f"{name}.{key}", f"0 to {most:.6g} {unit}", repr(value))
     if source["world"]:
         parse_world(source["world"])
-    if kind == "journal":
-        expect(isinstance(source["file"], str), f"{name}.file", "a journal (.mcap)", "none")
+    texts = {"env": "the id of a task", "agent": "a controller or a checkpoint",
+             "file": "a journal (.mcap)"}  # fmt: skip
+    for key, expected in texts.items():
+        value = source.get(key, "")
+        expect(isinstance(value, str), f"{name}.{key}", expected, repr(value))
+    options = source.get("options", {})
+    expect(isinstance(options, dict), f"{name}.options", "options by name", repr(options))
     return source
 
 

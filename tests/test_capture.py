@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import subprocess
 import sys
 import time
@@ -95,6 +96,12 @@ def test_a_flight_gives_every_so_many_steps(tmp_path: Path) -> None:
         (("tilt = 0.5", "tip = 4"), r"poses\[1\]: expected some of count, center, size, tilt"),
         (('from = "random"', 'from = "air"'), r"poses\[1\].from: expected 'random' or 'flight'"),
         (("[4.0, 4.0, 2.0]", "[4.0]"), r"poses\[1\].size: expected three numbers, m, got \[4.0\]"),
+        (
+            ('env = "rotorgram/Landing-v0"', "env = 3"),
+            r"\[2\].env: expected the id of a task, got 3",
+        ),
+        (("every = 40", "agent = 5"), r"\[2\].agent: expected a controller or a checkpoint, got 5"),
+        (("{ episode_length = 100 }", "1"), r"poses\[2\].options: expected options by name, got 1"),
         (("down@32x24", "down@33x24"), "plan: down: expected even sizes, .* got 33x24"),
         (("down@32x24", "rear"), "cameras: expected some of front, down"),
         (("seed = 7", "seed ="), "plan: expected a TOML file, got plan.toml"),
@@ -251,7 +258,7 @@ def test_it_is_the_same_again_and_goes_on(captured: Path, tmp_path: Path) -> Non
     assert {k: v for k, v in contents(folder).items() if k != "plan.toml"} == whole
     kept = folder / "rgb" / "down" / "000001.png"
     kept.write_bytes(whole["rgb/down/000000.png"])
-    for number in (2, 3, 7):
+    for number in (2, 7):
         label_file(folder, number).unlink()
     (folder / "rgb" / "down" / "000003.png").unlink()
     capture(plan_of(tmp_path), folder, ONE)
@@ -261,6 +268,17 @@ def test_it_is_the_same_again_and_goes_on(captured: Path, tmp_path: Path) -> Non
     for name in ("labels/000003.json", "rgb/down/000003.png", "labels/000007.json", "coco.json"):
         assert told[name] == whole[name]
     assert told["flow/front/000007.npy"] == whole["flow/front/000007.npy"]
+
+
+@pytest.mark.parametrize("text", ['{"frame"', "[]", '{"frame": 1}'])
+def test_labels_that_were_altered(captured: Path, tmp_path: Path, text: str) -> None:
+    folder = tmp_path / "altered"
+    shutil.copytree(captured, folder)
+    label_file(folder, 1).write_text(text)
+    with pytest.raises(InputError, match=r"000001.json: expected labels of a frame, got"):
+        capture(plan_of(tmp_path), folder, ONE)
+    label_file(folder, 1).unlink()
+    assert capture(plan_of(tmp_path), folder, ONE) == 8
 
 
 def test_a_folder_of_another_plan(captured: Path, tmp_path: Path) -> None:
