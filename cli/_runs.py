@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tyro.conf import arg
 
@@ -38,6 +38,13 @@ class FolderFlags(Command):
 @dataclass(frozen=True, kw_only=True)
 class RunsFlags(FolderFlags, RunsConfig, BackendFlags):
     """Such a command that flies one task."""
+
+    def settings(self, kind: type[Any]) -> dict[str, Any]:
+        """As of `Command`; of drones that are not told, those of one world."""
+        told = super().settings(kind)
+        if "num_envs" in told and "num_envs" not in self.given:
+            told["num_envs"] = max(self.drones, 1)
+        return told
 
 
 def command_line() -> str:

@@ -123,7 +123,8 @@ class RunsConfig(WorkersConfig):
     """Env steps of each training, of all its drones together; a learning rate that falls, falls
     over all of them."""
     num_envs: int = 1
-    """Drones that fly at the same time, in lock-step, in each training."""
+    """Drones that fly at the same time, in lock-step, in each training; by default one, or those of
+    one world."""
     episodes: int = 20
     """Evaluation episodes of each final policy."""
     seeds: int = 5
