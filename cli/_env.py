@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ..agents import CONTROLLERS, PID, Checkpoint, Geometric, Orca, Policy, load
-from ..envs.registry import env_spec, is_known
+from ..envs.registry import env_spec, is_known, options_type
 from ..envs.spec import EnvSpec
 from ..experiments.pairs import socket_pair
 from ..experiments.trajectories import Trajectory
@@ -49,6 +49,10 @@ def chosen_env(
     """
     env_id, options = command.env_id, command.options
     if isinstance(checkpoint, type):
+        level = checkpoint.options.get("action")
+        if level and "action" not in options and is_known(env_id):
+            right, expected = level in options_type(env_id).actions, f"a task flown by {level}"
+            expect(right, checkpoint.__name__.lower(), expected, f"{env_id}; name one with --env")
         return env_id, {**checkpoint.options, **options}
     if checkpoint is None or ("env" in command.given and env_id != checkpoint.env_id):
         return env_id, options

@@ -159,5 +159,5 @@ def test_evaluate_flies_it_at_its_level(capsys: pytest.CaptureFixture[str]) -> N
     assert main(["evaluate", "geometric", "--env", HOVER, "--episodes", "1"]) == 0
     assert "geometric on rotorgram/Hover-v0\nepisodes   1, 0 terminated" in capsys.readouterr().out
     assert main(["evaluate", "geometric", "--episodes", "1"]) != 0
-    expected = "action: expected 'increment' or 'offset', got 'position'"
+    expected = "geometric: expected a task flown by position, got rotorgram/Elevation-v0"
     assert expected in capsys.readouterr().err
