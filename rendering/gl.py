@@ -6,11 +6,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
-from typing import Any, Final
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, Final
 
 from ..models.errors import NoOpenGL
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _OFF: Final = ("disable", "disabled", "off", "false", "0")
 _ON: Final = ("enable", "enabled", "on", "true", "1", "glfw", "glx", "wgl")
@@ -102,7 +103,7 @@ class Offscreen:
         block: AbstractContextManager[Any] = self._gl.as_current()
         return block
 
-    def draw(self, scene: Any, pixels: np.ndarray, depth: np.ndarray | None = None) -> None:
+    def draw(self, scene: Any, pixels: "np.ndarray", depth: "np.ndarray | None" = None) -> None:
         """Draw a scene into arrays of one size, the lowest row first: colours, uint8 (H, W, 3), and
         OpenGL's depth, float32 (H, W), 1 near and 0 far.
         """
