@@ -50,7 +50,7 @@ def ours(kind: str, width: int, height: int) -> tuple[Step, Cameras]:
 
     def step() -> None:
         place[0, 0] += 1e-3
-        cameras.take(due, ~everybody, position=place, quaternion=turn)
+        cameras.take(due, ~everybody, {"position": place, "quaternion": turn})
 
     step()
     return step, cameras
@@ -180,7 +180,7 @@ def worlds(path: Path) -> None:
         row = []
         for seed in range(2):
             cameras = Cameras(vehicle, views, world=f"{name}:{seed}", fine=True)
-            cameras.take({view.name: everybody for view in views}, everybody, **state)
+            cameras.take({view.name: everybody for view in views}, everybody, state)
             row += [cameras.pictures[view.name][0] for view in views]
             cameras.close()
         rows.append(np.hstack(row))

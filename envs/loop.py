@@ -158,7 +158,7 @@ def _pictures(task: Task, drones: int) -> tuple[ArraySpec, ...]:
     views = views_of(task, drones)
     if not any(view.kind == "segmentation" for view in views):
         return arrays_of(views, ())
-    from ..rendering.cameras import objects_of
+    from ..rendering.seen import objects_of
 
     hung, world = bool(task.effects.get("payload")), task.options.world
     return arrays_of(views, objects_of(task.vehicle, drones, world, task.marks, payload=hung))
@@ -441,6 +441,8 @@ class Loop(NotCopied):
         some = mask.reshape(lead)[()]
         if seeds is not None:
             world.seed(some, seeds if self._drones == 1 else seeds[:: self._drones])
+            if self._sights is not None:
+                self._sights.seed(mask, seeds)
         draws = {name: values.reshape(lead)[()] for name, values in chosen.items()}
         self._reset(some, self._start(some, world.draw(some, draws)))
         self._begun = True

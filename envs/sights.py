@@ -1,7 +1,7 @@
 """Pictures as observations: which drones take which one when, of the state that a step ended in."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -9,11 +9,9 @@ from ..models.cameras import FARTHEST, View, cameras_of, chosen_views
 from ..models.errors import expect
 from ..models.fleet import members_of
 from ..sim import Array, WorldState, on_host
+from ..sim.random import CAMERAS, Streams
 from .spec import ArraySpec
 from .tasks.task import Task
-
-if TYPE_CHECKING:
-    pass
 
 _BOUNDS = {"rgb": (0.0, 255.0), "depth": (0.0, FARTHEST), "flow": (-np.inf, np.inf)}
 
@@ -25,8 +23,11 @@ def views_of(task: Task, drones: int) -> tuple[View, ...]:
     first, *others = (chosen_views(words, cameras_of(one)) for one in kinds)
     for views in others:
         for ours, its in zip(first, views, strict=True):
-            same = (ours.shape, ours.camera.every) == (its.shape, its.camera.every)
-            expect(same, f"camera {ours.name}", "the same size and rate on all vehicles", "others")
+            a, b = ours.camera, its.camera
+            same = (ours.shape, a.every, a.carried) == (its.shape, b.every, b.carried)
+            same &= a.carried or a == b  # of a world there is one alone
+            expected = "one of the same size and rate on all vehicles, or the same in their world"
+            expect(same, f"camera {ours.name}", expected, "others")
     return first
 
 
@@ -53,7 +54,8 @@ class Sights:
     def __init__(self, task: Task, shape: tuple[int, int]) -> None:
         from ..rendering.cameras import Cameras
 
-        self._task, self._rows = task, shape[0] * shape[1]
+        self._task, self._rows, self._drones = task, shape[0] * shape[1], shape[1]
+        self._streams = Streams(shape[0], CAMERAS)
         self.views = views_of(task, shape[1])
         self._cameras: Cameras = Cameras(
             task.vehicle,
@@ -66,6 +68,11 @@ class Sights:
         self._goes = any(mark.moves for mark in task.marks)
         self.arrays = arrays_of(self.views, self._cameras.objects)
         self.close = self._cameras.close
+
+    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
+        """Seed the noise of the drones of a mask, bool, shape (N,); seeds (N,)."""
+        ids = np.flatnonzero(_rows(mask, self._rows)[:: self._drones]).tolist()
+        self._streams.seed(ids, [seeds[world * self._drones] for world in ids])
 
     def look(
         self, state: WorldState, steps: Array, flown: Array | None, begun: Array | None
@@ -83,13 +90,14 @@ class Sights:
         due = {
             view.name: fresh | (flying & (count % view.camera.every == 0)) for view in self.views
         }
-        told: dict[str, Any] = {"position": state.position, "quaternion": state.quaternion}
+        names = "position", "quaternion", "velocity", "body_rates"
+        told: dict[str, Any] = {name: getattr(state, name) for name in names}
         if state.payload is not None:
             told["payload"] = state.payload
         if self._goes:
             told["goal"] = self._task.goal(state)
         rows = {name: _rows(values, n) for name, values in told.items()}
-        self._cameras.take(due, fresh, **rows)
+        self._cameras.take(due, fresh, rows, self._streams.of)
         pictures: dict[str, Array] = {
             name: picture.copy() for name, picture in self._cameras.pictures.items()
         }

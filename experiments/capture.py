@@ -144,10 +144,11 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
         everybody = np.ones(drones, bool)
         if start := job.rows[0]:  # the pose before: what flows, flows from there
             cameras.take(dict.fromkeys(cameras.pictures, ~everybody), ~everybody,
-                         **walk.state(start - 1))  # fmt: skip
+                         walk.state(start - 1))  # fmt: skip
         for row in job.rows:
             state, due = walk.state(row), dict.fromkeys(cameras.pictures, everybody)
-            cameras.take(due, everybody if row == 0 else ~everybody, **state)
+            dice = {0: np.random.default_rng([plan.seed, 0, job.first + row])}  # sources: from 1
+            cameras.take(due, everybody if row == 0 else ~everybody, state, dice.__getitem__)
             frames.append(_frame(job.first + row, cameras, drones, state))
             tell(row - start + 1, len(job.rows), "frames")
     return frames
@@ -160,13 +161,14 @@ def _frame(number: int, cameras: Any, drones: int, state: Mapping[str, np.ndarra
     for view in cameras.views:
         for drone in range(drones):
             picture = cameras.pictures[view.name][drone]
-            lens = cameras.lens(view.name, drone, **state)
+            lens = cameras.lens(view.name, state, drone)
             name = view.camera.name
             told: dict[str, Any] = {
                 "camera": name, "kind": view.kind, "drone": drone_names(drones)[drone],
                 "width": view.shape[1], "height": view.shape[0],
                 "matrix": lens.matrix.tolist(), "rotation": lens.rotation.tolist(),
                 "translation": lens.translation.tolist(),
+                "distortion": list(lens.distortion),
             }  # fmt: skip
             for end, data in _encoded(view.kind, picture):
                 path = picture_name(view.kind, name, number, drone, drones, end)

@@ -4,24 +4,21 @@ pictures to look at, a datasheet. All is made anew from the pictures and the lab
 
 import json
 import re
-import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from ..agents.checkpoints import software_versions
-from ..models.errors import require
 from ..models.vehicle import Vehicle
-from .capture import picture_name, read_labels, write_whole
+from .capture import read_labels, write_whole
+from .capture_lerobot import write_lerobot
 from .viewpoints import Plan, Walk
 
 _SHOWN: Final = 8  # frames on the contact sheet
 _THUMB: Final = 160  # pixels: width of a picture on it
-_LEROBOT: Final = "v2.1"
-_STATE: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def write_formats(plan: Plan, walks: Sequence[Walk], folder: Path) -> None:
@@ -29,7 +26,7 @@ def write_formats(plan: Plan, walks: Sequence[Walk], folder: Path) -> None:
     labels = read_labels(folder)
     _write_json(folder / "coco.json", coco(labels))
     _write_kitti(folder, labels)
-    _write_lerobot(folder, plan, walks)
+    write_lerobot(folder, plan, walks)
     _write_sheet(folder, labels)
     write_whole(folder / "README.md", datasheet(plan, walks, labels).encode())
 
@@ -117,109 +114,6 @@ def _write_kitti(folder: Path, labels: Sequence[Mapping[str, Any]]) -> None:
     write_whole(folder / "calib.txt", text.encode())
 
 
-# ---- LeRobot
-
-
-def _write_lerobot(folder: Path, plan: Plan, walks: Sequence[Walk]) -> None:
-    """Parquet and MP4 in the layout of LeRobot's data sets: an episode for each walk of a drone."""
-    pyarrow: Any = require("pyarrow", "dataset", "LeRobot's layout")
-    from pyarrow import parquet
-
-    from ..rendering.film import QUALITY, write_film
-
-    root, cameras = folder / "lerobot", []
-    shutil.rmtree(root, ignore_errors=True)
-    for view in plan.views():
-        if view.kind == "rgb":
-            cameras.append(view)
-    for name in ("meta", "data/chunk-000", "videos/chunk-000"):
-        (root / name).mkdir(parents=True)
-    first = index = episode = 0
-    episodes, tasks = [], list(dict.fromkeys(walk.name for walk in walks))
-    for walk in walks:
-        drones = walk.position.shape[1]
-        for drone in range(drones):
-            count = len(walk)
-            states = np.concatenate((walk.position[:, drone], walk.quaternion[:, drone]), axis=1)
-            columns = {
-                "observation.state": list(states.astype(np.float32)),
-                "time": walk.times,
-                "timestamp": (np.arange(count) / plan.fps).astype(np.float32),
-                "frame_index": np.arange(count),
-                "episode_index": np.full(count, episode),
-                "index": np.arange(index, index + count),
-                "task_index": np.full(count, tasks.index(walk.name)),
-            }
-            name = f"episode_{episode:06}"
-            file = root / "data" / "chunk-000" / f"{name}.parquet"
-            parquet.write_table(pyarrow.table(columns), file)
-            for view in cameras:
-                videos = root / "videos" / "chunk-000" / f"observation.images.{view.camera.name}"
-                videos.mkdir(exist_ok=True)
-                paths = [
-                    folder / picture_name("rgb", view.camera.name, first + i, drone, drones, "png")
-                    for i in range(count)
-                ]
-                write_film(videos / f"{name}.mp4", _read_all(paths), plan.fps, quality=QUALITY)
-            told = {"episode_index": episode, "tasks": [walk.name], "length": count}
-            episodes.append(told)
-            episode, index = episode + 1, index + count
-        first += len(walk)
-    _write_json(root / "meta" / "info.json", _info(plan, cameras, episodes, tasks))
-    for name, rows in {
-        "episodes": episodes,
-        "tasks": [{"task_index": i, "task": task} for i, task in enumerate(tasks)],
-    }.items():
-        text = "".join(json.dumps(row) + "\n" for row in rows)
-        write_whole(root / "meta" / f"{name}.jsonl", text.encode())
-
-
-def _info(
-    plan: Plan, cameras: Sequence[Any], episodes: Sequence[Mapping[str, Any]], tasks: Sequence[str]
-) -> dict[str, Any]:
-    """LeRobot's meta/info.json."""
-    one = {"shape": [1], "names": None}
-    features: dict[str, Any] = {
-        "observation.state": {"dtype": "float32", "shape": [7], "names": list(_STATE)},
-        "time": {"dtype": "float64", **one},
-        "timestamp": {"dtype": "float32", **one},
-        **{
-            name: {"dtype": "int64", **one}
-            for name in ("frame_index", "episode_index", "index", "task_index")
-        },
-    }
-    for view in cameras:
-        features[f"observation.images.{view.camera.name}"] = {
-            "dtype": "video", "shape": list(view.shape), "names": ["height", "width", "channel"],
-            "info": {"video.fps": plan.fps, "video.codec": "h264", "video.pix_fmt": "yuv420p",
-                     "video.is_depth_map": False, "has_audio": False},
-        }  # fmt: skip
-    return {
-        "codebase_version": _LEROBOT,
-        "robot_type": plan.vehicle or "paper",
-        "total_episodes": len(episodes),
-        "total_frames": sum(one["length"] for one in episodes),
-        "total_tasks": len(tasks),
-        "total_videos": len(episodes) * len(cameras),
-        "total_chunks": 1,
-        "chunks_size": max(len(episodes), 1000),
-        "fps": plan.fps,
-        "splits": {"train": f"0:{len(episodes)}"},
-        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
-        "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/"
-        "episode_{episode_index:06d}.mp4",
-        "features": features,
-    }
-
-
-def _read_all(paths: Sequence[Path]) -> Iterator[np.ndarray]:
-    from PIL import Image
-
-    for path in paths:
-        with Image.open(path) as image:
-            yield np.asarray(image.convert("RGB"))
-
-
 # ---- to look at
 
 
@@ -286,8 +180,9 @@ def datasheet(plan: Plan, walks: Sequence[Walk], labels: Sequence[Mapping[str, A
             *(f"| {count} | {name} |" for name, count in objects.most_common()),
             "",
             _LAYOUT,
-            "Drawn by MuJoCo's renderer: not photographs. Rotors do not turn; there is no lens "
-            "distortion, no noise, no motion blur.",
+            "Drawn by MuJoCo's renderer: not photographs. Rotors do not turn; there is no motion "
+            "blur. The plan's cameras have what lens distortion, noise and readout their file "
+            "tells.",
             "",
             f"Software: {versions}.",
             "",

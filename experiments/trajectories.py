@@ -45,6 +45,8 @@ class Trajectory:
     steps, row 0 the start. Units and frames are those of the spec."""
     rewards: np.ndarray
     """float64, shape (T,)."""
+    actions: np.ndarray
+    """float64, shape (T, *shape): row k is flown from row k of the telemetry."""
     ending: Ending
     episode: int = 0
     """Its number."""
@@ -99,13 +101,14 @@ def fly(env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int =
             env.action_space.seed(seed)
         else:
             policy.reset()
-        told, rewards = [info], []
+        told, rewards, actions = [info], [], []
         terminated = truncated = lost = False
         while not (terminated or truncated or lost):
             action = env.action_space.sample() if policy is None else policy.act(observation)
             observation, reward, terminated, truncated, info = env.step(action)
             told.append(info)
             rewards.append(float(reward))
+            actions.append(np.array(action, np.float64))
             lost = LOST in info
     telemetry = {}
     for array in spec.telemetry:
@@ -114,8 +117,9 @@ def fly(env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int =
         telemetry[array.name] = rows.reshape(len(told), *array.shape)
     ending: Ending = "terminated" if terminated else "truncated"
     return Trajectory(
-        spec=spec, telemetry=telemetry, rewards=np.array(rewards), ending=ending, episode=episode
-    )
+        spec=spec, telemetry=telemetry, rewards=np.array(rewards), actions=np.array(actions),
+        ending=ending, episode=episode,
+    )  # fmt: skip
 
 
 def fly_episodes(
@@ -154,7 +158,7 @@ def _fly_batch(
         actions = np.zeros((count, *spec.action.shape), np.float32)
     given = [seed for seed in seeds.values() for _ in spec.agents]
     env.reset(seed=[*given, *[0] * (count - len(given))])
-    rows, rewards = [env.telemetry], []
+    rows, rewards, taken = [env.telemetry], [], []
     lengths, terminated = np.zeros(count, int), np.zeros(count, bool)
     lost = env.lost.copy()
     done = lost | (np.arange(count) >= len(given))
@@ -167,18 +171,21 @@ def _fly_batch(
         env.advance(actions, np.zeros(count, bool), None, worlds_done(done, drones))
         rows.append(env.telemetry)
         rewards.append(env.rewards)
+        taken.append(actions.astype(np.float64))
         lengths += ~done
         terminated |= env.terminated & ~done
         lost |= env.lost & ~done
         done = done | env.terminated | env.truncated
     arrays = _stacked(rows)
     totals = np.array(rewards, np.float64).reshape(len(rewards), count)
+    chosen = np.array(taken).reshape(len(taken), *actions.shape)
 
     def flown(drone: int, episode: int) -> Trajectory:
         return Trajectory(
             spec=spec,
             telemetry={name: array[: lengths[drone] + 1, drone] for name, array in arrays.items()},
             rewards=totals[: lengths[drone], drone],
+            actions=chosen[: lengths[drone], drone],
             ending="terminated" if terminated[drone] else "truncated",
             episode=episode,
         )
@@ -273,6 +280,7 @@ class _Reader:
         self._command: Any = None
         self._rows: list[dict[str, np.ndarray]] = []
         self._rewards: list[float] = []
+        self._actions: list[np.ndarray] = []
 
     def take(self, message: Any) -> None:
         """The next message of the session."""
@@ -293,14 +301,18 @@ class _Reader:
         self._rows.append({array.name: np.array(told[drone]) for array, told in named})
         if not begins:
             self._rewards.append(float(message.rewards[drone]))
+            self._actions.append(np.array(command.actions[drone], np.float64))
             if message.terminated[drone] or message.truncated[drone]:
                 self.keep("terminated" if message.terminated[drone] else "truncated")
 
     def keep(self, ending: Ending) -> None:
         """The episode has ended; it counts if it has a step."""
         if self._rewards:
-            telemetry, rewards = _stacked(self._rows), np.array(self._rewards)
-            number = len(self.found)
-            self.found.append(Trajectory(spec=self._spec, telemetry=telemetry, rewards=rewards,
-                                         ending=ending, episode=number))  # fmt: skip
-        self._rows, self._rewards = [], []
+            self.found.append(
+                Trajectory(
+                    spec=self._spec, telemetry=_stacked(self._rows), ending=ending,
+                    rewards=np.array(self._rewards), actions=np.array(self._actions),
+                    episode=len(self.found),
+                )
+            )  # fmt: skip
+        self._rows, self._rewards, self._actions = [], [], []

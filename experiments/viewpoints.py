@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import mujoco
 import numpy as np
 
 from ..agents import CONTROLLERS
 from ..agents.checkpoints import load
 from ..agents.policies import Policy
 from ..envs.registry import env_spec
-from ..envs.spec import Mark
+from ..envs.spec import Discrete, Mark, component_names
 from ..envs.tasks.task import finite
 from ..models import parse_world
 from ..models.cameras import View, cameras_of, chosen_views
@@ -59,10 +60,18 @@ class Walk:
     """Shape (T, A, 3)."""
     quaternion: np.ndarray
     """Shape (T, A, 4)."""
+    velocity: np.ndarray | None = None
+    """Mean of the control step before, m/s, shape (T, A, 3)."""
+    body_rates: np.ndarray | None = None
+    """The same, body frame, rad/s, shape (T, A, 3)."""
     goal: np.ndarray | None = None
     """Shape (T, A, 3)."""
     payload: np.ndarray | None = None
     """Shape (T, A, 3)."""
+    actions: np.ndarray | None = None
+    """What is flown from there, shape (T, A, n); nan where an episode has ended."""
+    components: tuple[str, ...] = ()
+    """Names of an action's numbers."""
     marks: tuple[Mark, ...] = ()
     world: str = "plain"
     """What surrounds the drones."""
@@ -74,7 +83,7 @@ class Walk:
     def state(self, row: int) -> dict[str, np.ndarray]:
         """One pose of all drones, as `Cameras.take` has it."""
         told = {"position": self.position[row], "quaternion": self.quaternion[row]}
-        for name in ("goal", "payload"):
+        for name in ("velocity", "body_rates", "goal", "payload"):
             values = getattr(self, name)
             if values is not None:
                 told[name] = values[row]
@@ -252,21 +261,42 @@ def _walks(name: str, flown: Sequence[Trajectory], every: int, drones: int) -> l
     for first in range(0, len(flown), drones):
         world = flown[first : first + drones]
         steps = np.arange(0, max(map(len, world)) + 1, every)
-        told: dict[str, list[np.ndarray]] = {}
-        for one in world:
-            rows = np.minimum(steps, len(one))  # one that is out stays where it is
-            arrays = one.telemetry
-            for key in ("position", "attitude"):
-                expect(key in arrays, name, f"telemetry of the {key}", f"{sorted(arrays)}")
-            pose = pose_in_mujoco_frame(arrays["position"][rows], arrays["attitude"][rows])
-            told.setdefault("position", []).append(pose[:, :3])
-            told.setdefault("quaternion", []).append(pose[:, 3:])
-            for key in ("goal", "payload"):
-                if key in arrays:
-                    level = np.zeros_like(arrays[key][rows])
-                    points = pose_in_mujoco_frame(arrays[key][rows], level)[:, :3]
-                    told.setdefault(key, []).append(points)
-        stacked: dict[str, Any] = {key: np.stack(values, axis=1) for key, values in told.items()}
-        period, marks = world[0].spec.control_period, world[0].spec.marks
-        found.append(Walk(name=name, times=steps * period, marks=marks, **stacked))
+        told = [_after(one, steps, name) for one in world]
+        stacked: dict[str, Any] = {
+            key: np.stack([one[key] for one in told], axis=1) for key in told[0]
+        }
+        spec = world[0].spec
+        own = () if isinstance(spec.action, Discrete) else component_names(spec.action)
+        found.append(
+            Walk(
+                name=name, times=steps * spec.control_period, marks=spec.marks,
+                components=tuple(own) or ("choice",), **stacked,
+            )
+        )  # fmt: skip
     return found
+
+
+def _after(one: Trajectory, steps: np.ndarray, name: str) -> dict[str, np.ndarray]:
+    """Fields of a walk of one drone after so many steps; if it is out, it stays where it is."""
+    arrays, rows = one.telemetry, np.minimum(steps, len(one))
+    for key in ("position", "attitude"):
+        expect(key in arrays, name, f"telemetry of the {key}", f"{sorted(arrays)}")
+    pose = pose_in_mujoco_frame(arrays["position"], arrays["attitude"])
+    now, before = pose[rows], pose[np.maximum(rows - 1, 0)]
+    turned = np.zeros((len(rows), 3))
+    for turn, new, old in zip(turned, now[:, 3:], before[:, 3:], strict=True):
+        mujoco.mju_subQuat(turn, new, old)
+    seconds = np.where(steps <= len(one), one.spec.control_period, np.inf)[:, None]
+    actions = one.actions.reshape(len(one), -1)
+    told = {
+        "position": now[:, :3],
+        "quaternion": now[:, 3:],
+        "velocity": (now[:, :3] - before[:, :3]) / seconds,
+        "body_rates": turned / seconds,
+        "actions": np.append(actions, np.full((1, actions.shape[1]), np.nan), axis=0)[rows],
+    }
+    for key in ("goal", "payload"):
+        if key in arrays:
+            level = np.zeros_like(arrays[key][rows])
+            told[key] = pose_in_mujoco_frame(arrays[key][rows], level)[:, :3]
+    return told

@@ -1,20 +1,21 @@
 """Cameras of a vehicle's file: where they sit, what they take, how often; their kinds of pictures.
 
-An MJCF file has them as its cameras, with `resolution`, `fovy` and `output`; the rate, for which
-MJCF has no word, is a custom text of the name "rotorgram/cameras.NAME.rate". A TOML file has a
-table `[[cameras]]` for each. A file without a `front` or a `down` gets ours.
+An MJCF file has them as its cameras, with `resolution`, `fovy` and `output`; the rate and what
+`Optics` has, for which MJCF has no words, are custom texts: "rotorgram/cameras.NAME.rate". A TOML
+file has a table `[[cameras]]` for each. A file without a `front` or a `down` gets ours.
 """
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import mujoco
 import numpy as np
 
-from .coefficients import PREFIX
+from .coefficients import PREFIX, Limits, checked
 from .errors import InputError, expect
+from .lens import Lens
 
 if TYPE_CHECKING:
     from .vehicle import Vehicle
@@ -32,10 +33,40 @@ OUTPUTS: Final = {
     "segmentation": mujoco.mjtCamOutBit.mjCAMOUT_SEG,
 }
 """Kinds that a file can name; `flow` is for an option to choose."""
-_RATE: Final = PREFIX + "cameras."
+_TEXTS: Final = PREFIX + "cameras."
+_CHECKED: Final = 16  # places along a side at which a lens is tried
 _SIDE: Final = 64  # Pixels of a side, where the file tells none
 MOST_STEPS: Final = 1000  # from picture to picture
 _Vector = tuple[float, float, float]
+
+
+def _number(default: Any, *limits: Any) -> Any:
+    return field(default=default, metadata={"limits": Limits(*limits)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Optics:
+    """What a camera does beyond a pinhole's sharp picture; by default nothing."""
+
+    distortion: tuple[float, ...] = _number((), "1", -1e6, 1e6, 5)
+    """k1, k2, p1, p2, k3 of its lens: see `lens.distorted`."""
+    exposure: float = _number(0.0, "stop", 0.0, 10.0)
+    """Standard deviation of the exposure of a picture: e in light times 2^e, in colours."""
+    noise: tuple[float, ...] = _number((0.0, 0.0), "1", 0.0, 1.0, 2)
+    """a and b in: standard deviation of a colour v, 0 to 1, is √(a² v + b²): the noise of photons
+    and that of reading them, as of EMVA's standard 1288."""
+    readout: float = _number(0.0, "s", 0.0, 0.1)
+    """From the first row to the last, which is read at the moment of the state."""
+
+    @classmethod
+    def read(cls, camera: str, given: Mapping[str, Any]) -> "Optics":
+        """Those of a camera's table. Raises `InputError`."""
+        told: dict[str, Any] = {
+            one.name: checked(f"{camera}.{one.name}", one, given[one.name])
+            for one in fields(cls)
+            if one.name in given
+        }
+        return cls(**told)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +92,16 @@ class Camera:
     """Direction in which it looks, in the same frame."""
     up: _Vector = (0.0, 0.0, 1.0)
     """Direction of the picture's upper edge, in the same frame."""
+    optics: Optics = Optics()
+
+    def __post_init__(self) -> None:
+        """Raises `InputError` where the lens folds the picture."""
+        half = math.tan(self.fovy / 2)
+        focal = _CHECKED / 2 / np.array((half * self.width / self.height, half))
+        middle = np.full(2, _CHECKED / 2)
+        matrix = np.block([[np.diag(focal), middle[:, None]], [np.zeros((1, 2)), np.ones((1, 1))]])
+        lens = Lens(matrix, np.eye(3), np.zeros(3), self.optics.distortion)
+        lens.rays(_CHECKED, _CHECKED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +163,8 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
             camera = replace(camera, width=width, height=height)
         for one in camera.kinds if alone else (kind,):
             view = View(camera=camera, kind=one)
+            right = one != "flow" or not camera.optics.readout
+            expect(right, "cameras", "flow of a camera that reads all rows at once", f"{word!r}")
             expect(view.name not in views, "cameras", "each picture once", f"{view.name!r} twice")
             views[view.name] = view
     return tuple(views.values())
@@ -145,7 +188,7 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
     One that follows the craft but does not turn with it, as MuJoCo's mode `trackcom`, counts as
     standing in the world.
     """
-    rates = {text.name: text.data for text in spec.texts if text.name.startswith(_RATE)}
+    texts = {text.name: text.data for text in spec.texts if text.name.startswith(_TEXTS)}
     found = []
     data = mujoco.MjData(model)
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
@@ -160,9 +203,17 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
         width, height = (int(side) for side in model.cam_resolution[number])
         if (width, height) == (1, 1):  # MJCF's default
             width = height = _SIDE
+        flat = model.cam_projection[number] != mujoco.mjtProjection.mjPROJ_PERSPECTIVE.value
+        expect(not flat, f"camera {one.name}", "a perspective projection", "an orthographic one")
         for side in (width, height):
             expected = f"1 to {MOST_PIXELS} pixels a side"
             expect(1 <= side <= MOST_PIXELS, f"camera {one.name}", expected, f"{side}")
+        told = {
+            key: texts.pop(f"{_TEXTS}{one.name}.{key}")
+            for key in ("rate", *(each.name for each in fields(Optics)))
+            if f"{_TEXTS}{one.name}.{key}" in texts
+        }
+        rate = told.pop("rate", "1")
         output, axes = int(model.cam_output[number]), data.cam_xmat[number].reshape(3, 3)
         mine = model.body_rootid[model.cam_bodyid[number]] == model.jnt_bodyid[0]
         found.append(
@@ -172,16 +223,26 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
                 height=height,
                 fovy=math.radians(float(model.cam_fovy[number])),
                 kinds=tuple(kind for kind, bit in OUTPUTS.items() if output & bit) or ("rgb",),
-                every=steps_of(f"camera {one.name}", rates.pop(f"{_RATE}{one.name}.rate", "1")),
+                every=steps_of(f"camera {one.name}", rate),
                 carried=bool(mine and model.cam_mode[number] == fixed),
                 position=_vector(data.cam_xpos[number]),
                 look=_vector(-axes[:, 2]),
                 up=_vector(axes[:, 1]),
+                optics=Optics.read(f"camera {one.name}", {k: _read(v) for k, v in told.items()}),
             )
         )
-    for name in rates:
-        raise InputError(f"{name}: expected a camera of that name in the file, got none")
+    for name in texts:
+        raise InputError(f"{name}: expected a camera of that name and a key that it can have")
     return tuple(found)
+
+
+def _read(text: str) -> Any:
+    """Numbers of a text; itself where it has others."""
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        return text
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def steps_of(name: str, rate: str | float) -> int:
@@ -208,13 +269,13 @@ def cameras_of(vehicle: "Vehicle") -> tuple[Camera, ...]:
     """All cameras: those of the file, and ours.
 
     `front` looks ahead from the front of the sphere about the craft, `down` straight down from
-    nearly as low as its landing gear.
+    a quarter of the height of its body above its landing gear.
     """
     ours = (
         Camera(name="front", position=(vehicle.radius, 0.0, 0.0)),
         Camera(
             name="down",
-            position=(0.0, 0.0, -0.9 * vehicle.rest_height),
+            position=(0.0, 0.0, -0.75 * vehicle.rest_height),
             look=(0.0, 0.0, -1.0),
             up=(1.0, 0.0, 0.0),
         ),
@@ -239,5 +300,10 @@ def place_camera(spec: mujoco.MjSpec, body: mujoco.MjsBody, camera: Camera) -> N
     added.alt.xyaxes = (*right.tolist(), *np.cross(right, camera.look).tolist())
     added.fovy, added.resolution = math.degrees(camera.fovy), (camera.width, camera.height)
     added.output = sum(int(OUTPUTS[kind]) for kind in camera.kinds)
+    told = {one.name: np.ravel(getattr(camera.optics, one.name)) for one in fields(Optics)}
     if camera.every > 1:
-        spec.add_text(name=f"{_RATE}{camera.name}.rate", data=repr(1 / camera.every))
+        told["rate"] = np.array([1 / camera.every])
+    for key, values in told.items():
+        if values.any():
+            text = " ".join(map(repr, values.tolist()))
+            spec.add_text(name=f"{_TEXTS}{camera.name}.{key}", data=text)

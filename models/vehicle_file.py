@@ -8,14 +8,14 @@ import math
 import os
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import Field, dataclass, field
+from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree
 
 import mujoco
 
-from .cameras import OUTPUTS, Camera, place_camera, steps_of
+from .cameras import OUTPUTS, Camera, Optics, place_camera, steps_of
 from .coefficients import PREFIX, Limits, checked, coefficient_fields
 from .errors import InputError, expect
 
@@ -57,6 +57,7 @@ ENTRIES: Final[Mapping[str, Field[Any]]] = {
     "cameras.fovy": _entry("rad", 1e-3, 3.0),
     "cameras.resolution": _entry("pixel", 1, 4096, 2),
     "cameras.rate": _entry("1", 1e-3, 1.0),
+    **{f"cameras.{one.name}": one for one in fields(Optics)},
     "real_flights.position": _entry("m", 0.0, 1e4),
     "real_flights.velocity": _entry("m/s", 0.0, 1e4),
     "real_flights.attitude": _entry("rad", 0.0, 3.15),
@@ -357,6 +358,7 @@ class _Reader:
             position=given.get("position", (0.0, 0.0, 0.0)),
             look=look,
             up=up,
+            optics=Optics.read(name, given),
         )
 
     def _rotors(self, table: Any, model: Path | None) -> tuple[PlacedRotor, ...]:

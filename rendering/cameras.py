@@ -7,56 +7,27 @@ Pixels: row 0 is the top, column 0 the left; the middle of the first pixel is at
 A camera's frame here: x right, y down, z along its axis, as in computer vision.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from itertools import pairwise
+from typing import Any, Final
 
 import mujoco
 import numpy as np
 
-from ..models.cameras import FARTHEST, View, add_cameras
+from ..models.cameras import FARTHEST, MOST_PIXELS, Camera, Optics, View, cameras_of
+from ..models.errors import expect
 from ..models.fleet import members_of
-from ..models.scene import build_swarm
+from ..models.lens import Lens
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
 from .gl import Offscreen
-from .stage import scale_drawing
+from .seen import GOAL, PAYLOAD, drawn_model, objects_in
 
-NOTHING: Final = "nothing"
-"""Name of what a segmentation picture has where it sees no object: number 0."""
-_NEAREST: Final = 0.05  # Where drawing begins, over the vehicle's radius
 _ROOM: Final = 10_000  # geoms
-_UNNAMED: Final = "unnamed"
-_GOAL: Final = "goal"
-_PAYLOAD: Final = "payload"
-_COLOR: Final = {"gate": (0.96, 0.42, 0.08, 1.0), "disc": (0.13, 0.78, 0.52, 1.0)}
+_FINER: Final = 2  # pixels of a pinhole's picture for one of a lens that distorts
+_STEADY: Final = 0.5  # pixels by which what is seen may move while a strip of rows is read
 _FLIP: Final = np.array((1.0, -1.0, -1.0))  # from MuJoCo's camera frame to that of vision
-
-
-class Lens(NamedTuple):
-    """How points of the world come to pixels: p = K (R x + t), then over its third number."""
-
-    matrix: np.ndarray
-    """K, shape (3, 3), pixels."""
-    rotation: np.ndarray
-    """R, shape (3, 3), from the world's frame to the camera's."""
-    translation: np.ndarray
-    """t, shape (3,), m."""
-
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Columns and rows of points of the world, shape (..., 3), m: shape (..., 2), pixels."""
-        seen = (points @ self.rotation.T + self.translation) @ self.matrix.T
-        pixels: np.ndarray = seen[..., :2] / seen[..., 2:]
-        return pixels
-
-    def points(self, depth: np.ndarray) -> np.ndarray:
-        """Points of the world that the pixels of a depth picture (H, W) see, (H, W, 3), m."""
-        rows, columns = np.indices(depth.shape) + 0.5
-        k = self.matrix
-        x, y = (columns - k[0, 2]) / k[0, 0], (rows - k[1, 2]) / k[1, 1]
-        seen = np.stack((x * depth, y * depth, depth), axis=-1)
-        points: np.ndarray = (seen - self.translation) @ self.rotation
-        return points
 
 
 class Cameras:
@@ -85,11 +56,19 @@ class Cameras:
     ) -> None:
         self.views, self._shape = tuple(views), shape
         self._names = drone_names(shape[1])
-        self.model = _model(vehicle, self._names, world, marks, payload=payload)
+        self.model = drawn_model(vehicle, self._names, world, marks, payload=payload)
         self.data = mujoco.MjData(self.model)
         self._poses = _Poses(self.model, self._names)
-        self.objects, self._object = _objects(self.model, self._names)
-        self._ids = {view.name: self._camera_ids(view) for view in self.views}
+        self.objects, self._object = objects_in(self.model, self._names)
+        eyes: dict[tuple[int, tuple[int, int]], _Eye] = {}
+        crafts = [{one.name: one for one in cameras_of(x)} for x in members_of(vehicle, shape[1])]
+        self._eyes: dict[str, list[_Eye]] = {}
+        for view in self.views:
+            size = view.shape[:2]
+            for number, craft in zip(self._camera_ids(view), crafts, strict=True):
+                if (number, size) not in eyes:
+                    eyes[number, size] = _Eye(self.model, number, size, craft[view.camera.name])
+                self._eyes.setdefault(view.name, []).append(eyes[number, size])
         rows = shape[0] * shape[1]
         self.pictures = {
             view.name: np.zeros((rows, *view.shape), view.dtype) for view in self.views
@@ -113,17 +92,27 @@ class Cameras:
     @cached_property
     def _drawing(self) -> Offscreen:
         """Opened with the first picture, so that a process may be forked before."""
-        sizes = [view.shape for view in self.views]
-        width, height = max(size[1] for size in sizes), max(size[0] for size in sizes)
+        sizes = [eye.drawn for eyes in self._eyes.values() for eye in eyes]
+        height, width = (max(side) for side in zip(*sizes, strict=True))
         return Offscreen(self.model, width, height)
 
-    def take(self, due: Mapping[str, np.ndarray], fresh: np.ndarray, **state: Any) -> None:
+    def take(
+        self,
+        due: Mapping[str, np.ndarray],
+        fresh: np.ndarray,
+        state: Mapping[str, np.ndarray],
+        dice: Callable[[int], np.random.Generator] | None = None,
+    ) -> None:
         """Take pictures of the worlds as they are.
 
         `due` has by the name of a view which drones take one, bool, shape (N,); `fresh` which have
-        just begun an episode, before which there was no other step, so that nothing flows. The
-        state: `position` (N, 3) and `quaternion` (N, 4), and, where there are any, `goal` and
-        `payload` (N, 3): MuJoCo's world frame, m. `flow` is since the last call.
+        just begun an episode, before which there was no other step, so that nothing flows.
+
+        The state has `position` (N, 3) and `quaternion` (N, 4), and, where there are any, `goal`
+        and `payload` (N, 3): MuJoCo's world frame, m. Rows that are read earlier show where craft
+        were by their `velocity` (N, 3), m/s, and `body_rates` (N, 3), rad/s, if it has those.
+        `flow` is since the last call. `dice` gives the generator of a world's noise; without it
+        there is none.
         """
         worlds, drones = self._shape
         of_world = {name: np.reshape(mask, (worlds, drones)) for name, mask in due.items()}
@@ -138,62 +127,111 @@ class Cameras:
                 self._poses.set(self.data, {name: x[rows] for name, x in state.items()})
                 if needed[world]:
                     mine = {name: mask[world] for name, mask in of_world.items()}
-                    self._draw_world(rows, mine, None if first[world] else self._before[world])
+                    before = None if first[world] else self._before[world]
+                    self._draw_world(rows, mine, before, dice and dice(world))
                 if flows:
                     self._before[world] = self._poses.now(self.data)
 
-    def lens(self, name: str, drone: int = 0, world: int = 0, **state: Any) -> Lens:
+    def lens(
+        self, name: str, state: Mapping[str, np.ndarray], drone: int = 0, world: int = 0
+    ) -> Lens:
         """The lens of a view's camera, of a drone of a world, in a state as of `take`."""
         drones = self._shape[1]
         rows = slice(world * drones, (world + 1) * drones)
         self._poses.set(self.data, {name: x[rows] for name, x in state.items()})
-        view = next(view for view in self.views if view.name == name)
-        return _lens(self.model, self.data, self._ids[name][drone], view)
+        return self._eyes[name][drone].lens(self.data)
 
     def _draw_world(
-        self, rows: slice, due: Mapping[str, np.ndarray], before: np.ndarray | None
+        self,
+        rows: slice,
+        due: Mapping[str, np.ndarray],
+        before: np.ndarray | None,
+        dice: np.random.Generator | None,
     ) -> None:
         """Pictures of the world that `data` is in."""
-        drawn: dict[tuple[int, tuple[int, ...]], _Buffers] = {}
+        shots: dict[_Eye, _Shot] = {}
         for view in self.views:
             for drone in np.flatnonzero(due[view.name]).tolist():
-                camera = self._ids[view.name][drone]
-                buffers = drawn.setdefault((camera, view.shape[:2]), _Buffers())
-                picture = self._picture(view, camera, buffers, before)
+                eye = self._eyes[view.name][drone]
+                shot = shots.setdefault(eye, _Shot())
+                picture = self._picture(view, eye, shot, before, dice)
                 self.pictures[view.name][rows.start + drone] = picture
 
     def _picture(
-        self, view: View, camera: int, buffers: "_Buffers", before: np.ndarray | None
+        self,
+        view: View,
+        eye: "_Eye",
+        shot: "_Shot",
+        before: np.ndarray | None,
+        dice: np.random.Generator | None,
     ) -> np.ndarray:
-        """A view's picture by a camera, from what was drawn for others of it and their size."""
+        """A view's picture, from what was drawn of its eye for others."""
         if view.kind == "rgb":
-            if buffers.rgb is None:
-                buffers.rgb = self._render(view, camera, objects=False)[0]
-            return buffers.rgb
-        if buffers.depth is None:
-            buffers.codes, depth = self._render(view, camera, objects=True)
-            buffers.depth = self._meters(depth)
+            if shot.rgb is None:
+                colors, _ = self._read(eye, shot, objects=False)
+                shot.rgb = colors if dice is None else _exposed(colors, eye.optics, dice)
+            return shot.rgb
+        if shot.depth is None:
+            shot.codes, depth = self._read(eye, shot, objects=True)
+            shot.depth = self._meters(depth)
         if view.kind == "depth":
-            return buffers.depth[..., None]
+            return shot.depth[..., None]
         if view.kind == "segmentation":
-            numbers: np.ndarray = self._object[self._number(buffers.codes)]
+            numbers: np.ndarray = self._object[self._number(shot.codes)]
             return numbers[..., None]
-        return self._flow(view, camera, buffers, before)
+        if before is None:
+            return np.zeros(view.shape, np.float32)
+        flow: np.ndarray = np.nan_to_num(self._flow(eye, shot.codes, shot.depth, before))
+        return flow
 
-    def _render(self, view: View, camera: int, *, objects: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _read(self, eye: "_Eye", shot: "_Shot", *, objects: bool) -> tuple[np.ndarray, np.ndarray]:
+        """As `_render`, each strip of rows at its own moment."""
+        shot.strips = shot.strips or self._strips(eye)
+        if not shot.strips[0][0]:
+            return self._render(eye, objects=objects)
+        now, parts = self._poses.now(self.data), []
+        for seconds, rows in shot.strips:
+            self._poses.restore(self.data, self._poses.ago(self.data, now, seconds))
+            parts.append([picture[rows] for picture in self._render(eye, objects=objects)])
+        self._poses.restore(self.data, now)
+        colors, depth = (np.concatenate(strips) for strips in zip(*parts, strict=True))
+        return colors, depth
+
+    def _strips(self, eye: "_Eye") -> list[tuple[float, slice]]:
+        """How long before the state the rows of a picture are read, s, in strips that are so thin
+        that while one is read nothing moves by more than `_STEADY`.
+        """
+        height, readout = eye.size[0], eye.optics.readout
+        if not (readout and self.data.qvel.any()):
+            return [(0.0, slice(height))]
+        colors, depth = self._render(eye, objects=True)
+        past = self._poses.ago(self.data, self._poses.now(self.data), readout)
+        most = np.abs(self._flow(eye, colors, self._meters(depth), past)).max()
+        count = height if not most < _STEADY * height else max(int(np.ceil(most / _STEADY)), 1)
+        ends = np.linspace(0, height, count + 1).round().astype(int).tolist()
+        last = max(height - 1, 1)
+        return [(readout * (1 - (a + b - 1) / 2 / last), slice(a, b)) for a, b in pairwise(ends)]
+
+    def _render(self, eye: "_Eye", *, objects: bool) -> tuple[np.ndarray, np.ndarray]:
         """Colours, uint8 (H, W, 3), and OpenGL's depth, float32 (H, W), the first row on top."""
-        scene, (height, width, _) = self._scene, view.shape
-        view_of, every = self._camera, mujoco.mjtCatBit.mjCAT_ALL.value
-        view_of.fixedcamid = camera
+        scene, view_of, every = self._scene, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value
+        view_of.fixedcamid = eye.camera
         # The scene lays an endless floor around the camera that it had: without this the last one.
         mujoco.mjv_updateCamera(self.model, self.data, view_of, scene)
         mujoco.mjv_updateScene(self.model, self.data, self._option, None, view_of, every, scene)
         for flag in mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR:
             scene.flags[flag.value] = objects
-        colors = np.empty((height, width, 3), np.uint8)
-        depth = np.empty((height, width), np.float32)
+        colors = np.empty((*eye.drawn, 3), np.uint8)
+        depth = np.empty(eye.drawn, np.float32)
+        if eye.source is not None:
+            eye.source.aim(scene)
         self._drawing.draw(scene, colors, depth if objects else None)
-        return colors[::-1], depth[::-1]
+        colors, depth = colors[::-1], depth[::-1]
+        if eye.source is None:
+            return colors, depth
+        if objects:
+            return eye.source.nearest(colors), eye.source.nearest(depth)
+        return eye.source.blended(colors), depth
 
     def _number(self, colors: np.ndarray) -> np.ndarray:
         """Number of the geom of each pixel of the last picture, from 1; 0: none."""
@@ -217,26 +255,33 @@ class Cameras:
         return told
 
     def _flow(
-        self, view: View, camera: int, buffers: "_Buffers", before: np.ndarray | None
+        self, eye: "_Eye", codes: np.ndarray, depth: np.ndarray, before: np.ndarray
     ) -> np.ndarray:
-        """Pixels by which what a pixel sees has moved since before, right and down, (H, W, 2)."""
-        if before is None:
-            return np.zeros(view.shape, np.float32)
-        assert buffers.depth is not None
-        lens = _lens(self.model, self.data, camera, view)
-        points = lens.points(buffers.depth.astype(np.float64))
-        bodies = np.append(0, self.model.geom_bodyid)[self._number(buffers.codes)]
-        now, moved = self._poses.frames(self.data), points.copy()
+        """Pixels by which what a pixel sees has moved since the poses before, right and down.
+
+        What the camera could not see then, since it was beside or behind it: nan.
+        """
+        seen = eye.rays * depth[..., None]
+        now, lens = self._poses.frames(self.data), eye.lens(self.data)
         state = self._poses.now(self.data)
         self._poses.restore(self.data, before)
-        past, old_lens = self._poses.frames(self.data), _lens(self.model, self.data, camera, view)
+        past, old = self._poses.frames(self.data), eye.lens(self.data)
         self._poses.restore(self.data, state)
-        for body in np.unique(bodies).tolist():
-            if not all(map(np.array_equal, now[body], past[body])):
-                (place, axes), (old_place, old_axes) = now[body], past[body]
-                which = bodies == body
-                moved[which] = (points[which] - place) @ axes @ old_axes.T + old_place
-        flow: np.ndarray = (lens.project(points) - old_lens.project(moved)).astype(np.float32)
+        bodies = np.append(0, self.model.geom_bodyid)[self._number(codes)]
+        flow = np.zeros((*eye.size, 2), np.float32)
+        stands = np.array_equal(lens.rotation, old.rotation)
+        stands &= np.array_equal(lens.translation, old.translation)
+        for body in np.flatnonzero(np.bincount(bodies.ravel())).tolist():
+            if stands and all(map(np.array_equal, now[body], past[body])):
+                continue
+            (place, axes), (old_place, old_axes) = now[body], past[body]
+            turn = old.rotation @ old_axes @ axes.T
+            start = turn @ (-lens.rotation.T @ lens.translation - place)
+            start += old.rotation @ old_place + old.translation
+            which = bodies == body
+            was = seen[which] @ (turn @ lens.rotation.T).T + start  # in the camera's frame of then
+            was[was[:, 2] <= 0] = np.nan
+            flow[which] = eye.middles[which] - old.pixels(was)
         return flow
 
     def close(self) -> None:
@@ -266,18 +311,114 @@ def shown(kind: str, picture: np.ndarray) -> np.ndarray:
 
 def _hues(hue: np.ndarray, value: np.ndarray) -> np.ndarray:
     """Colours of hues from 0 to 1 and values from 0 to 1, uint8, with three channels."""
-    steps = (np.array((5.0, 3.0, 1.0)) + 6.0 * hue[..., None]) % 6.0
-    share = value[..., None] * (1.0 - 0.8 * np.clip(np.minimum(steps, 4.0 - steps), 0.0, 1.0))
-    return np.asarray(255 * share, np.uint8)
+    from PIL import Image
+
+    parts = (255 * hue, np.full_like(value, 200), 255 * value)
+    colors = Image.fromarray(np.stack(parts, axis=-1).astype(np.uint8), "HSV").convert("RGB")
+    return np.asarray(colors)
 
 
-class _Buffers:
-    """What was drawn for one camera in one size."""
+def _exposed(colors: np.ndarray, optics: Optics, dice: np.random.Generator) -> np.ndarray:
+    """Colours as a sensor reads them: see `Optics`."""
+    (photons, reading), spread = optics.noise, optics.exposure
+    if not (photons or reading or spread):
+        return colors
+    light = colors / 255 * np.exp2(spread * dice.standard_normal())
+    light += np.sqrt(photons**2 * light + reading**2) * dice.standard_normal(colors.shape)
+    read: np.ndarray = np.rint(255 * np.clip(light, 0.0, 1.0)).astype(np.uint8)
+    return read
+
+
+class _Shot:
+    """What was drawn of an eye in one state."""
 
     rgb: np.ndarray | None = None
     depth: np.ndarray | None = None
     codes: np.ndarray = np.zeros((0, 0, 3), np.uint8)
     """Colours that are numbers of geoms, uint8 (H, W, 3)."""
+    strips: Sequence[tuple[float, slice]] = ()
+
+
+class _Eye:
+    """A camera of a model, in pictures of one size (H, W). Raises `InputError`."""
+
+    def __init__(
+        self, model: mujoco.MjModel, number: int, size: tuple[int, int], camera: Camera
+    ) -> None:
+        self.camera, self.size, self.optics = number, size, camera.optics
+        self._matrix = _matrix(model, number, size)
+        distorts = any(self.optics.distortion)
+        self.source = _Source(self._still, size) if distorts else None
+        self.drawn = self.source.size if self.source else size
+
+    @property
+    def _still(self) -> Lens:
+        return Lens(self._matrix, np.eye(3), np.zeros(3), self.optics.distortion)
+
+    def lens(self, data: mujoco.MjData) -> Lens:
+        """Its lens where the model is."""
+        rotation = (data.cam_xmat[self.camera].reshape(3, 3) * _FLIP).T
+        place = -rotation @ data.cam_xpos[self.camera]
+        return self._still._replace(rotation=rotation, translation=place)
+
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """As of `Lens.rays`."""
+        return self._still.rays(*self.size)
+
+    @cached_property
+    def middles(self) -> np.ndarray:
+        """Columns and rows of the middles of the pixels, shape (H, W, 2)."""
+        rows, columns = np.indices(self.size) + 0.5
+        return np.stack((columns, rows), axis=-1)
+
+
+class _Source:
+    """A pinhole's picture, finer, from which a lens that distorts takes its own (H, W)."""
+
+    def __init__(self, lens: Lens, size: tuple[int, int]) -> None:
+        (height, width), pitch = size, 1 / _FINER / np.diagonal(lens.matrix)[:2]
+        along, down = np.arange(width + 1.0), np.arange(height + 1.0)
+        edges = [(x, y) for x in along for y in (0, height)] + [
+            (x, y) for y in down for x in (0, width)
+        ]
+        seen = lens.rays_of(np.array(edges))[:, :2]
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        width, height = (int(side) for side in np.ceil((high - low) / pitch))
+        expected = f"a lens that needs at most {_FINER * MOST_PIXELS} pixels of a pinhole a side"
+        most = max(width, height)
+        expect(most <= _FINER * MOST_PIXELS, "distortion", expected, f"{most}")
+        self.size = height, width
+        self._low, self._high = low, low + pitch * (width, height)
+        # Columns and rows, from the first pixel's middle.
+        self._at = (lens.rays(*size)[..., :2] - low) / pitch - 0.5
+
+    def aim(self, scene: mujoco.MjvScene) -> None:
+        """Let the scene's camera see as much."""
+        (left, top), (right, bottom) = self._low, self._high
+        for camera in scene.camera:
+            near = camera.frustum_near
+            camera.frustum_center, camera.frustum_width = (
+                near * (left + right) / 2, near * (right - left) / 2
+            )  # fmt: skip
+            camera.frustum_bottom, camera.frustum_top = -near * bottom, -near * top
+
+    def nearest(self, picture: np.ndarray) -> np.ndarray:
+        """What the lens has, of the nearest pixels: numbers that must not be mixed."""
+        columns, rows = np.rint(self._at).astype(int).transpose(2, 0, 1)
+        taken: np.ndarray = picture[rows, columns]
+        return taken
+
+    def blended(self, colors: np.ndarray) -> np.ndarray:
+        """What the lens has of colours, between four pixels."""
+        columns, rows = np.floor(self._at).astype(int).transpose(2, 0, 1)
+        right, down = (self._at % 1.0).transpose(2, 0, 1)[..., None]
+        upper, lower = (
+            (1 - right) * colors[row, columns] + right * colors[row, columns + 1]
+            for row in (rows, rows + 1)
+        )
+        mixed: np.ndarray = np.rint((1 - down) * upper + down * lower).astype(np.uint8)
+        return mixed
 
 
 class _Poses:
@@ -287,24 +428,34 @@ class _Poses:
         self._model = model
         free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
         self._at = model.jnt_qposadr[free][:, None] + np.arange(7)
+        self._speeds_at = model.jnt_dofadr[free][:, None] + np.arange(6)
+        bodies = {GOAL: [f"{name}/{GOAL}" for name in names], PAYLOAD: [PAYLOAD]}
         self._mocap = {
-            kind: [int(model.body(f"{name}/{kind}").mocapid[0]) for name in names]
-            for kind in (_GOAL, _PAYLOAD)
-            if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"{names[0]}/{kind}") >= 0
+            kind: [int(model.body(name).mocapid[0]) for name in own]
+            for kind, own in bodies.items()
+            if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, own[0]) >= 0
         }
 
     def set(self, data: mujoco.MjData, state: Mapping[str, np.ndarray]) -> None:
         """Put them where a state has them."""
         data.qpos[self._at[:, :3]] = state["position"]
         data.qpos[self._at[:, 3:]] = state["quaternion"]
+        data.qvel[self._speeds_at[:, :3]] = state.get("velocity", 0.0)
+        data.qvel[self._speeds_at[:, 3:]] = state.get("body_rates", 0.0)
         for kind, bodies in self._mocap.items():
             if kind in state:
-                data.mocap_pos[bodies] = state[kind]
+                data.mocap_pos[bodies] = state[kind][: len(bodies)]
         self._update(data)
 
     def now(self, data: mujoco.MjData) -> np.ndarray:
         """All numbers of the poses."""
         return np.concatenate((data.qpos, data.mocap_pos.ravel()))
+
+    def ago(self, data: mujoco.MjData, numbers: np.ndarray, seconds: float) -> np.ndarray:
+        """What `now` was so long before it told these numbers, at the speeds of the craft."""
+        then = numbers.copy()
+        mujoco.mj_integratePos(self._model, then[: len(data.qpos)], data.qvel, -seconds)
+        return then
 
     def restore(self, data: mujoco.MjData, numbers: np.ndarray) -> None:
         """Put them where `now` had them."""
@@ -323,108 +474,15 @@ class _Poses:
         mujoco.mj_camlight(self._model, data)
 
 
-def objects_of(
-    vehicle: Vehicle, drones: int, world: str, marks: Sequence[Any], *, payload: bool
-) -> tuple[str, ...]:
-    """`Cameras.objects` of such cameras, without an OpenGL."""
-    names = drone_names(drones)
-    return _objects(_model(vehicle, names, world, marks, payload=payload), names)[0]
-
-
-def _model(
-    vehicle: Vehicle, names: Sequence[str], world: str, marks: Sequence[Any], *, payload: bool
-) -> mujoco.MjModel:
-    """What is drawn: craft with their cameras, what surrounds them, the task's marks."""
-    crafts = members_of(vehicle, len(names))
-    spec = build_swarm([craft.path for craft in crafts], names, world)
-    bodies = [body for body in spec.worldbody.bodies if body.name.partition("/")[0] in names]
-    for name, body, craft in zip(names, bodies, crafts, strict=True):
-        add_cameras(spec, body, craft, f"{name}/")
-        if payload:
-            hung = spec.worldbody.add_body(name=f"{name}/{_PAYLOAD}", mocap=True)
-            _add(hung, "payload", mujoco.mjtGeom.mjGEOM_SPHERE, (0.12 * craft.radius,) * 3)
-    for number, mark in enumerate(marks):
-        if not mark.moves:
-            _add_mark(spec.worldbody, f"task/{mark.shape}_{number}", mark)
-            continue
-        for name in names:
-            goal = spec.body(f"{name}/{_GOAL}")
-            goal = goal or spec.worldbody.add_body(name=f"{name}/{_GOAL}", mocap=True)
-            _add_mark(goal, f"task/{mark.shape}_{number} of {name}", mark)
-    model = spec.compile()
-    scale_drawing(model, vehicle.radius, 0.0)
-    extent = model.stat.extent
-    model.vis.map.znear, model.vis.map.zfar = _NEAREST * vehicle.radius / extent, FARTHEST / extent
-    return model
-
-
-def _add(body: Any, name: str, kind: Any, size: Sequence[float], **more: Any) -> None:
-    """A geom that is only drawn."""
-    geom = body.add_geom(name=name, type=kind, size=size, **more)
-    geom.contype = geom.conaffinity = 0
-    geom.mass, geom.group = 0.0, 1
-
-
-def _add_mark(body: Any, name: str, mark: Any) -> None:
-    """A gate, a disc or a ball of a task, as viewers show it."""
-    kinds, rgba = mujoco.mjtGeom, _COLOR.get(mark.shape, (0.13, 0.78, 0.52, 1.0))
-    centre = np.array(mark.position)
-    if mark.shape == "ball":
-        _add(body, name, kinds.mjGEOM_SPHERE, (mark.size,) * 3, pos=centre, rgba=rgba)
-    elif mark.shape == "disc":
-        half = 0.02 * mark.size  # its lower side lies on the ground: both at one height flicker
-        size, centre = (mark.size, half, 0.0), centre + np.array((0.0, 0.0, half))
-        _add(body, name, kinds.mjGEOM_CYLINDER, size, pos=centre, rgba=rgba)
-    else:
-        turn, half = np.radians(mark.heading), mark.size / 2
-        aside, up = np.array((-np.sin(turn), np.cos(turn), 0.0)), np.array((0.0, 0.0, 1.0))
-        corners = [centre + half * (y * aside + z * up) for y, z in _CORNERS]
-        for i, (start, end) in enumerate(zip(corners, corners[1:] + corners[:1], strict=True)):
-            ends = np.concatenate((start, end))
-            thick = (0.025 * mark.size, 0.0, 0.0)
-            _add(body, f"{name}/{i}", kinds.mjGEOM_CAPSULE, thick, fromto=ends, rgba=rgba)
-
-
-_CORNERS: Final = ((-1, -1), (1, -1), (1, 1), (-1, 1))
-
-
-def _objects(model: mujoco.MjModel, names: Sequence[str]) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names of the objects of a model, and the number of the one of each geom, behind a 0.
-
-    All geoms of a craft are one object, and those of the world whose names begin alike up to their
-    last slash, if they have two or more. Geoms of the world without a name are told apart by their
-    material.
-    """
-    known, numbers = {NOTHING: 0}, [0]
-    roots = {int(model.body(one).rootid[0]): one.partition("/")[0] for one in _bodies(model, names)}
-    for number in range(model.ngeom):
-        geom = model.geom(number)
-        root = int(model.body_rootid[geom.bodyid[0]])
-        material = int(geom.matid[0])
-        name = geom.name or (model.material(material).name if material >= 0 else _UNNAMED)
-        head, _, _ = name.rpartition("/")
-        told = roots.get(root, head if "/" in head else name)
-        numbers.append(known.setdefault(told, len(known)))
-    return tuple(known), np.array(numbers, np.int32)
-
-
-def _bodies(model: mujoco.MjModel, names: Sequence[str]) -> list[str]:
-    """Names of the bodies with a free joint."""
-    free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
-    found = [model.body(int(body)).name for body in free]
-    return [name for name in found if name.partition("/")[0] in names]
-
-
-def _lens(model: mujoco.MjModel, data: mujoco.MjData, camera: int, view: View) -> Lens:
-    height, width, _ = view.shape
+def _matrix(model: mujoco.MjModel, camera: int, size: tuple[int, int]) -> np.ndarray:
+    """K of a camera of a model, shape (3, 3), pixels."""
+    height, width = size
     if model.cam_sensorsize[camera].any():
         focal = model.cam_intrinsic[camera]
         scale = np.array((width, height)) / model.cam_sensorsize[camera]
         fx, fy = focal[:2] * scale
-        cx, cy = width / 2 + focal[2] * scale[0], height / 2 + focal[3] * scale[1]
+        cx, cy = width / 2 - focal[2] * scale[0], height / 2 - focal[3] * scale[1]
     else:
         fx = fy = 0.5 * height / np.tan(np.radians(model.cam_fovy[camera]) / 2)
         cx, cy = width / 2, height / 2
-    matrix = np.array(((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)))
-    rotation = (data.cam_xmat[camera].reshape(3, 3) * _FLIP).T
-    return Lens(matrix, rotation, -rotation @ data.cam_xpos[camera])
+    return np.array(((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)))

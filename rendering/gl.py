@@ -100,6 +100,8 @@ class Offscreen:
 
     def current(self) -> AbstractContextManager[Any]:
         """Keep OpenGL with this thread for a block: `draw` in it is faster."""
+        if self._gl is None:
+            raise NoOpenGL("OpenGL: expected cameras that are open, got closed ones")
         block: AbstractContextManager[Any] = self._gl.as_current()
         return block
 

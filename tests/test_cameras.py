@@ -11,9 +11,13 @@ import pytest
 from rotorgram.envs.spec import Mark
 from rotorgram.models import InputError
 from rotorgram.models.cameras import FARTHEST, Camera, cameras_of, chosen_views
+from rotorgram.models.errors import NoOpenGL
+from rotorgram.models.fleet import load_vehicles
+from rotorgram.models.library import vehicle_names
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.rendering.cameras import Cameras, objects_of
+from rotorgram.rendering.cameras import Cameras
 from rotorgram.rendering.gl import offscreen_context
+from rotorgram.rendering.seen import objects_of
 from rotorgram.sim.rotations import to_world
 
 BELLY = """
@@ -52,7 +56,7 @@ def take(cameras: Cameras, fresh: bool = True, **told: Any) -> dict[str, np.ndar
     count = len(told["position"])
     everybody = np.ones(count, bool)
     due = dict.fromkeys(cameras.pictures, everybody)
-    cameras.take(due, everybody if fresh else ~everybody, **told)
+    cameras.take(due, everybody if fresh else ~everybody, told)
     return {name: picture.copy() for name, picture in cameras.pictures.items()}
 
 
@@ -108,6 +112,16 @@ def test_cameras_of_an_mjcf_file(tmp_path: Path) -> None:
     assert (eye.look, eye.up) == ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0))  # MuJoCo's: along -z
     file.write_text(text.replace("cameras.eye", "cameras.ear"), "utf-8")
     with pytest.raises(InputError, match=r"cameras.ear.rate: expected a camera of that name"):
+        Vehicle.load(file)
+
+
+def test_an_orthographic_camera_is_refused(tmp_path: Path) -> None:
+    text = Vehicle.load().path.read_text("utf-8")
+    flat = '<camera name="flat" projection="orthographic" fovy="6"/>'
+    start = text.index("<camera ")
+    file = tmp_path / "own.xml"
+    file.write_text(text[:start] + flat + text[start:], "utf-8")
+    with pytest.raises(InputError, match="camera flat: expected a perspective projection, got an"):
         Vehicle.load(file)
 
 
@@ -175,7 +189,7 @@ def test_depth_is_that_of_rays(made: Any) -> None:
     cameras = made("chase_depth@160x120", shape=(1, 2))
     told = state((0.0, 0.0, 3.0), (-1.5, 0.4, 3.4), quaternion=TILTED)
     depth = take(cameras, **told)["chase_depth"][0, ..., 0]
-    lens = cameras.lens("chase_depth", **told)
+    lens = cameras.lens("chase_depth", told)
     dice = np.random.default_rng(3)
     rows, columns = dice.integers(120, size=1000), dice.integers(160, size=1000)
     model, data = cameras.model, cameras.data
@@ -198,7 +212,20 @@ def test_depth_is_that_of_rays(made: Any) -> None:
     assert np.mean(np.array(errors)[~ground] < 0.01) > 0.97
 
 
-def test_known_points_come_to_their_pixels(made: Any, tmp_path: Path) -> None:
+DISTORTION = "-0.2 0.05 0.002 -0.003 0.0"
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        'fovy="38"',
+        'resolution="320 240" sensorsize=".0064 .0048" focal=".0075 .0065" '
+        'principal=".0004 -.0003"',
+        f'fovy="44" mark="{DISTORTION}"',
+    ],
+    ids=["fovy", "intrinsics", "distortion"],
+)
+def test_known_points_come_to_their_pixels(made: Any, tmp_path: Path, lens: str) -> None:
     """Rotor tips, drawn as small balls, by their colour; half a pixel."""
     paper = Vehicle.load()
     text = paper.path.read_text("utf-8")
@@ -209,14 +236,19 @@ def test_known_points_come_to_their_pixels(made: Any, tmp_path: Path) -> None:
         for x, y, z in tips
     )
     start = text.index("<camera ")
+    text = text[:start] + balls + text[start:].replace('fovy="38"', lens.partition(" mark")[0])
+    if "mark" in lens:
+        name = "rotorgram/cameras.portrait.distortion"
+        custom = f'<custom><text name="{name}" data="{DISTORTION}"/></custom>'
+        text = text.replace("</mujoco>", f"{custom}</mujoco>")
     file = tmp_path / "tips.xml"
-    file.write_text(text[:start] + balls + text[start:], "utf-8")
+    file.write_text(text, "utf-8")
     cameras = made("portrait@320x240", file)
     told = state((1.0, 2.0, 5.0), quaternion=TILTED)
     picture = take(cameras, **told)["portrait"][0].astype(int)
     pink = (picture[..., 0] > 2 * picture[..., 1]) & (picture[..., 2] > 2 * picture[..., 1])
     places = np.argwhere(pink)[:, ::-1] + 0.5
-    lens = cameras.lens("portrait", **told)
+    lens = cameras.lens("portrait", told)
     for tip in tips:
         point = told["position"][0] + to_world(TILTED, tip)
         pixel = lens.project(point)
@@ -235,27 +267,56 @@ def test_segmentation_knows_the_pad_by_its_area(made: Any) -> None:
     told = state((0.0, 0.0, 2.0), goal=np.array([[0.1, 0.2, 0.0]]))
     picture = take(cameras, **told)["down_segmentation"][0, ..., 0]
     assert set(np.unique(picture)) <= {1, 2, 3}
-    lens = cameras.lens("down_segmentation", **told)
-    height = 2.0 - 0.9 * craft.rest_height - 0.02  # of the camera over the disc's upper side
+    lens = cameras.lens("down_segmentation", told)
+    thick = 0.04 * craft.rest_height
+    height = 2.0 - 0.75 * craft.rest_height - thick  # of the camera over the disc's upper side
     expected = math.pi * (0.5 * lens.matrix[0, 0] / height) ** 2
     assert (picture == 3).sum() == pytest.approx(expected, rel=0.02)
     middle = np.argwhere(picture == 3).mean(axis=0)[::-1] + 0.5
-    assert np.abs(middle - lens.project(np.array([0.1, 0.2, 0.02]))).max() < 0.5
+    assert np.abs(middle - lens.project(np.array([0.1, 0.2, thick]))).max() < 0.5
 
 
 def test_flow_is_that_of_the_motion(made: Any) -> None:
-    """A camera moves over the ground by (f/h) d pixels, and one that only turns by its turn."""
+    """A camera moves over the ground by (f/h) d pixels; what it has not moved by is 0."""
     cameras = made("down_flow@64x64", "crazyflie2")
-    low = 0.9 * Vehicle.load("crazyflie2").rest_height
+    low = 0.75 * Vehicle.load("crazyflie2").rest_height
     first = take(cameras, **state((0.0, 0.0, 2.0)))["down_flow"]
     assert not first.any()  # before the first step nothing was
     flow = take(cameras, fresh=False, **state((0.1, -0.05, 2.0)))["down_flow"][0]
-    focal = cameras.lens("down_flow", **state((0.0, 0.0, 2.0))).matrix[0, 0]
+    focal = cameras.lens("down_flow", state((0.0, 0.0, 2.0))).matrix[0, 0]
     # The picture's upper edge is ahead: what is ahead comes down, what is at the right (-y) left.
     assert flow[..., 1] == pytest.approx(focal * 0.1 / (2.0 - low), rel=1e-4)
     assert flow[..., 0] == pytest.approx(-focal * 0.05 / (2.0 - low), rel=1e-4)
     still = take(cameras, fresh=False, **state((0.1, -0.05, 2.0)))["down_flow"]
     assert not still.any()
+
+
+def test_flow_of_a_camera_that_turns(made: Any) -> None:
+    """About its axis by a small angle: each pixel by that angle about the middle. About another by
+    half a turn: all was behind it, so that there is no flow."""
+    cameras = made("down_flow@64x64 front_flow@64x64", "crazyflie2")
+    place, angle = (0.0, 0.0, 2.0), 0.1
+    take(cameras, **state(place))
+    turned = np.array([math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)])
+    flow = take(cameras, fresh=False, **state(place, quaternion=turned))["down_flow"][0]
+    rows, columns = np.indices((64, 64)) - 31.5
+    # The camera turns to the left, so that the ground turns to the right in its picture.
+    cosine, sine = math.cos(angle), math.sin(angle)
+    before = np.stack((cosine * columns + sine * rows, cosine * rows - sine * columns), axis=-1)
+    assert flow == pytest.approx(np.stack((columns, rows), axis=-1) - before, abs=1e-3)
+    back = np.array([math.cos((angle + math.pi) / 2), 0.0, 0.0, math.sin((angle + math.pi) / 2)])
+    assert not take(cameras, fresh=False, **state(place, quaternion=back))["front_flow"].any()
+
+
+@pytest.mark.parametrize("name", vehicle_names())
+def test_down_sees_the_ground_on_which_a_craft_stands(made: Any, name: str) -> None:
+    craft = Vehicle.load(name)
+    pad = Mark(shape="disc", size=4 * craft.radius, moves=True)
+    cameras = made("down_depth down_segmentation", craft, marks=[pad])
+    goal = np.zeros((1, 3))
+    seen = take(cameras, **state((0.0, 0.0, craft.rest_height), goal=goal))
+    assert (seen["down_segmentation"] == cameras.objects.index("task/disc_0 of drone_0")).all()
+    assert seen["down_depth"].max() < craft.rest_height
 
 
 def test_flow_of_another_drone(made: Any) -> None:
@@ -269,7 +330,7 @@ def test_flow_of_another_drone(made: Any) -> None:
     flow = seen["front_flow"][0]
     assert other.sum() > 50
     assert not flow[~other].any()
-    focal = cameras.lens("front_flow", **state(*places)).matrix[0, 0]
+    focal = cameras.lens("front_flow", state(*places)).matrix[0, 0]
     apart = seen["front_depth"][0, ..., 0][other]
     assert flow[other][:, 0] == pytest.approx(-0.2 * focal / apart, rel=1e-4)
     assert np.abs(flow[other][:, 1]).max() < 1e-3
@@ -316,9 +377,31 @@ def test_a_picture_is_taken_where_it_is_due(made: Any) -> None:
     cameras = made("down", "crazyflie2", shape=(2, 1))
     before = take(cameras, **state((0.0, 0.0, 1.0), (0.0, 0.0, 1.0)))["down"]
     told = state((0.3, 0.0, 2.0), (0.3, 0.0, 2.0))
-    cameras.take({"down": np.array([True, False])}, np.zeros(2, bool), **told)
+    cameras.take({"down": np.array([True, False])}, np.zeros(2, bool), told)
     assert (cameras.pictures["down"][0] != before[0]).any()
     assert (cameras.pictures["down"][1] == before[1]).all()
+
+
+def test_different_vehicles_in_one_world(made: Any, tmp_path: Path) -> None:
+    """Each draws from as near as the smallest needs; `down` of each is its own."""
+    fleet = load_vehicles("crazyflie2,paper", 2)
+    cameras = made("down_depth down_segmentation", fleet, shape=(1, 2))
+    small, large = Vehicle.load("crazyflie2"), Vehicle.load()
+    told = state((0.0, 0.0, small.rest_height), (3.0, 0.0, large.rest_height))
+    seen = take(cameras, **told)
+    for number, craft in enumerate((small, large)):
+        picture = seen["down_depth"][number, ..., 0]
+        expected = 0.25 * craft.rest_height
+        assert picture == pytest.approx(expected, rel=1e-3)
+    assert (seen["down_segmentation"] == cameras.objects.index("scene/floor")).all()
+
+
+def test_cameras_after_their_end(made: Any) -> None:
+    cameras = made("down", "crazyflie2")
+    take(cameras, **state((0.0, 0.0, 1.0)))
+    cameras.close()
+    with pytest.raises(NoOpenGL, match="expected cameras that are open, got closed ones"):
+        take(cameras, **state((0.0, 0.0, 1.0)))
 
 
 def test_a_camera_can_be_told_apart_from_its_kind() -> None:

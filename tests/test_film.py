@@ -42,6 +42,7 @@ def trajectory(*elevations: float, ending: Any = "truncated") -> Trajectory:
         spec=env_spec("rotorgram/Elevation-v0", {}),
         telemetry=telemetry,
         rewards=np.zeros(steps - 1),
+        actions=np.zeros((steps - 1, 1)),
         ending=ending,
     )
 

@@ -154,7 +154,7 @@ def test_cameras_see_its_objects(opengl: None, world: str) -> None:
     with closing(Cameras(vehicle, views, world=f"{world}:1")) as cameras:
         place, turn = np.array([[0.0, 0.0, 5.0]]), np.array([[1.0, 0.0, 0.0, 0.0]])
         due = {view.name: np.ones(1, bool) for view in views}
-        cameras.take(due, np.ones(1, bool), position=place, quaternion=turn)
+        cameras.take(due, np.ones(1, bool), {"position": place, "quaternion": turn})
         seen = np.unique(cameras.pictures["front_segmentation"])
         objects = [cameras.objects[i] for i in seen]
         assert sum(one.startswith(f"{world}/") for one in objects) > 4

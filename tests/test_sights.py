@@ -20,6 +20,9 @@ from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.envs.registry import env_spec, options_type
 from rotorgram.experiments.pairs import socket_pair
 from rotorgram.models import InputError
+from rotorgram.models.cameras import cameras_of, chosen_views
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.rendering.cameras import Cameras
 from rotorgram.udp import LinkConfig, Simulator
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
 from rotorgram.udp.transport.relay import FaultConfig
@@ -128,8 +131,12 @@ def test_drones_of_one_world_see_each_other(opengl: None) -> None:
         objects = names.observation[1].categories
         assert {f"drone_{i}" for i in range(3)} < {*objects}
         assert env.observation_space("drone_1")["front_segmentation"].shape == (48, 48, 1)
+        others = set()
         for name in env.agents:
-            assert objects.index(name) not in np.unique(seen[name]["front_segmentation"])
+            numbers = set(np.unique(seen[name]["front_segmentation"]).tolist())
+            assert objects.index(name) not in numbers
+            others |= {objects[number] for number in numbers}
+        assert {f"drone_{i}" for i in range(3)} & others  # ahead of another
 
 
 @pytest.mark.parametrize("tensors", [False, True])
@@ -147,6 +154,15 @@ def test_pictures_of_the_backend_rigid(opengl: None, tensors: bool) -> None:
         assert (pictures.dtype, pictures.shape) == (np.uint8, (2, 64, 64, 3))
         if not tensors:  # which draw other starts
             assert np.abs(pictures.astype(int) - first["down"]).max() <= 1
+        craft = Vehicle.load()
+        told = rigid.loop.world.state
+        views = chosen_views(["down"], cameras_of(craft))
+        with closing(Cameras(craft, views, (2, 1))) as cameras:
+            names = "position", "quaternion"
+            state = {k: np.asarray(getattr(told, k)).reshape(2, -1) for k in names}
+            cameras.take({"down": np.ones(2, bool)}, np.ones(2, bool), state)
+            assert (pictures == cameras.pictures["down"]).all()
+            assert len(np.unique(pictures)) > 20
 
 
 @pytest.mark.parametrize(

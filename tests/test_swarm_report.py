@@ -83,8 +83,9 @@ def test_rows_of_trajectories_give_the_worlds_back() -> None:
     def flown(*xs: float) -> Trajectory:
         where = np.array([(x, 10.0, 1.0) for x in xs])
         told = {"position": where, "goal": where + 1.0}
-        return Trajectory(spec=spec, telemetry=told, rewards=np.zeros(len(xs) - 1),
-                          ending="terminated", episode=7)  # fmt: skip
+        steps = len(xs) - 1
+        return Trajectory(spec=spec, telemetry=told, rewards=np.zeros(steps),
+                          actions=np.zeros((steps, 1)), ending="terminated", episode=7)  # fmt: skip
 
     rows = rows_of([flown(0.0, 1.0, 2.0), flown(4.0, 5.0)]).assign(agent="ippo", seed=3)
     ((key, world),) = worlds(rows)

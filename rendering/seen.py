@@ -1,0 +1,122 @@
+"""What cameras see: the model that is drawn of a world, and the names of its objects.
+
+It is another than that of the physics, which never knows of it.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from ..models.cameras import FARTHEST, add_cameras
+from ..models.fleet import members_of
+from ..models.scene import build_swarm
+from ..models.swarm import drone_names
+from ..models.vehicle import Vehicle
+from .stage import scale_drawing
+
+NOTHING: Final = "nothing"
+"""Name of what a segmentation picture has where it sees no object: number 0."""
+GOAL: Final = "goal"
+"""Of the body of a drone's marks that move, behind the drone's name and a slash."""
+PAYLOAD: Final = "payload"
+"""Of the body of the payload, which all drones of a world share."""
+_NEAREST: Final = 0.05  # Where drawing begins, over the vehicle's radius
+_THINNEST: Final = 0.04  # Thickness of a disc, over the height at which the lowest craft rests
+_UNNAMED: Final = "unnamed"
+_COLOR: Final = {"gate": (0.96, 0.42, 0.08, 1.0), "disc": (0.13, 0.78, 0.52, 1.0)}
+
+
+def objects_of(
+    vehicle: Vehicle, drones: int, world: str, marks: Sequence[Any], *, payload: bool
+) -> tuple[str, ...]:
+    """`Cameras.objects` of such cameras, without an OpenGL."""
+    names = drone_names(drones)
+    return objects_in(drawn_model(vehicle, names, world, marks, payload=payload), names)[0]
+
+
+def drawn_model(
+    vehicle: Vehicle, names: Sequence[str], world: str, marks: Sequence[Any], *, payload: bool
+) -> mujoco.MjModel:
+    """What is drawn: craft with their cameras, what surrounds them, the task's marks."""
+    crafts = members_of(vehicle, len(names))
+    spec = build_swarm([craft.path for craft in crafts], names, world)
+    bodies = [body for body in spec.worldbody.bodies if body.name.partition("/")[0] in names]
+    for name, body, craft in zip(names, bodies, crafts, strict=True):
+        add_cameras(spec, body, craft, f"{name}/")
+    if payload:
+        hung = spec.worldbody.add_body(name=PAYLOAD, mocap=True)
+        _add(hung, PAYLOAD, mujoco.mjtGeom.mjGEOM_SPHERE, (0.12 * crafts[0].radius,) * 3)
+    thinnest = _THINNEST * min(craft.rest_height for craft in crafts)
+    for number, mark in enumerate(marks):
+        if not mark.moves:
+            _add_mark(spec.worldbody, f"task/{mark.shape}_{number}", mark, thinnest)
+            continue
+        for name in names:
+            goal = spec.body(f"{name}/{GOAL}")
+            goal = goal or spec.worldbody.add_body(name=f"{name}/{GOAL}", mocap=True)
+            _add_mark(goal, f"task/{mark.shape}_{number} of {name}", mark, thinnest)
+    model = spec.compile()
+    scale_drawing(model, vehicle.radius, 0.0)
+    extent = model.stat.extent
+    nearest = _NEAREST * min(craft.radius for craft in crafts)
+    model.vis.map.znear, model.vis.map.zfar = nearest / extent, FARTHEST / extent
+    return model
+
+
+def _add(body: Any, name: str, kind: Any, size: Sequence[float], **more: Any) -> None:
+    """A geom that is only drawn."""
+    geom = body.add_geom(name=name, type=kind, size=size, **more)
+    geom.contype = geom.conaffinity = 0
+    geom.mass, geom.group = 0.0, 1
+
+
+def _add_mark(body: Any, name: str, mark: Any, thickness: float) -> None:
+    """A gate, a disc of a thickness or a ball of a task, as viewers show it."""
+    kinds, rgba = mujoco.mjtGeom, _COLOR.get(mark.shape, (0.13, 0.78, 0.52, 1.0))
+    centre = np.array(mark.position)
+    if mark.shape == "ball":
+        _add(body, name, kinds.mjGEOM_SPHERE, (mark.size,) * 3, pos=centre, rgba=rgba)
+    elif mark.shape == "disc":
+        half = thickness / 2  # its lower side lies on the ground: both at one height flicker
+        size, centre = (mark.size, half, 0.0), centre + np.array((0.0, 0.0, half))
+        _add(body, name, kinds.mjGEOM_CYLINDER, size, pos=centre, rgba=rgba)
+    else:
+        turn, half = np.radians(mark.heading), mark.size / 2
+        aside, up = np.array((-np.sin(turn), np.cos(turn), 0.0)), np.array((0.0, 0.0, 1.0))
+        corners = [centre + half * (y * aside + z * up) for y, z in _CORNERS]
+        for i, (start, end) in enumerate(zip(corners, corners[1:] + corners[:1], strict=True)):
+            ends = np.concatenate((start, end))
+            thick = (0.025 * mark.size, 0.0, 0.0)
+            _add(body, f"{name}/{i}", kinds.mjGEOM_CAPSULE, thick, fromto=ends, rgba=rgba)
+
+
+_CORNERS: Final = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+
+
+def objects_in(model: mujoco.MjModel, names: Sequence[str]) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names of the objects of a model, and the number of the one of each geom, behind a 0.
+
+    All geoms of a craft are one object, and those of the world whose names begin alike up to their
+    last slash, if they have two or more. Geoms of the world without a name are told apart by their
+    material.
+    """
+    known, numbers = {NOTHING: 0}, [0]
+    roots = {int(model.body(one).rootid[0]): one.partition("/")[0] for one in _bodies(model, names)}
+    for number in range(model.ngeom):
+        geom = model.geom(number)
+        root = int(model.body_rootid[geom.bodyid[0]])
+        material = int(geom.matid[0])
+        name = geom.name or (model.material(material).name if material >= 0 else _UNNAMED)
+        head, _, _ = name.rpartition("/")
+        told = roots.get(root, head if "/" in head else name)
+        numbers.append(known.setdefault(told, len(known)))
+    return tuple(known), np.array(numbers, np.int32)
+
+
+def _bodies(model: mujoco.MjModel, names: Sequence[str]) -> list[str]:
+    """Names of the bodies with a free joint."""
+    free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    found = [model.body(int(body)).name for body in free]
+    return [name for name in found if name.partition("/")[0] in names]
