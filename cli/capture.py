@@ -33,14 +33,18 @@ class Capture(Command):
         from ..experiments.capture import capture
         from ..experiments.settings import WorkersConfig
         from ..experiments.viewpoints import Plan
+        from ..models.errors import expect
         from ..rendering.gl import offscreen_context
         from ._progress import bars
 
+        expect(self.out.name, "out", "the name of a folder", repr(str(self.out)))
+        right = self.out.is_dir() or not self.out.exists()
+        expect(right, "out", "a folder, or a new name", f"{self.out}, which is a file")
         plan, config = Plan.read(self.plan), WorkersConfig(**self.settings(WorkersConfig))
         offscreen_context(16, 16).free()
         self.out.mkdir(parents=True, exist_ok=True)
         with bars() as progress:
             frames = capture(plan, self.out, config, progress)
-        print(f"{self.out}: {frames} frames, {frames * len(plan.cameras)} cameras' views")
+        print(f"{self.out}: {frames} frames of {len(plan.views())} pictures a drone")
         print(f"look at: {self.out / 'contact.png'}, {self.out / 'README.md'}")
         return 0

@@ -22,6 +22,10 @@ def views_of(task: Task, drones: int) -> tuple[View, ...]:
     kinds = dict.fromkeys(members_of(task.vehicle, drones))
     first, *others = (chosen_views(words, cameras_of(one)) for one in kinds)
     for views in others:
+        names = [[view.name for view in some] for some in (first, views)]
+        expect(
+            names[0] == names[1], "cameras", f"{', '.join(names[0])} of all vehicles", f"{names[1]}"
+        )
         for ours, its in zip(first, views, strict=True):
             a, b = ours.camera, its.camera
             same = (ours.shape, a.every, a.carried) == (its.shape, b.every, b.carried)

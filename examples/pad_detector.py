@@ -30,18 +30,16 @@ def read(folder: Path) -> tuple[torch.Tensor, torch.Tensor, np.ndarray]:
     boxes = {
         one["image_id"]: one["bbox"] for one in coco["annotations"] if one["category_id"] == pad
     }
-    pictures, targets = [], []
+    pictures, targets, flights = [], [], []
     for image in coco["images"]:
         with Image.open(folder / image["file_name"]) as file:
             pictures.append(np.asarray(file).transpose(2, 0, 1))
         left, top, width, height = boxes.get(image["id"], [np.nan] * 4)
         middle = ((left + width / 2) / image["width"], (top + height / 2) / image["height"])
         targets.append((float(image["id"] in boxes), *middle))
-    lines = (folder / "lerobot" / "meta" / "episodes.jsonl").read_text().splitlines()
-    lengths = [json.loads(line)["length"] for line in lines]
-    flights = np.repeat(np.arange(len(lengths)), lengths)
+        flights.append(image["sequence"])
     stacked = torch.from_numpy(np.stack(pictures)).float() / 255
-    return stacked, torch.tensor(targets, dtype=torch.float32), flights
+    return stacked, torch.tensor(targets, dtype=torch.float32), np.array(flights)
 
 
 def network() -> nn.Sequential:

@@ -5,28 +5,33 @@ writes them, the labels last: a frame that has labels is whole, and is never tak
 `docs/capture.md` has the layout.
 """
 
+import hashlib
 import io
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import mujoco
 import numpy as np
 
-from ..models.errors import InputError, expect
-from ..models.fleet import load_vehicles
+from ..agents.checkpoints import write_whole
+from ..models.cameras import View
+from ..models.errors import expect
 from ..models.swarm import drone_names
+from ..models.vehicle import Vehicle
 from .folders import locked
 from .settings import WorkersConfig
 from .viewpoints import Plan, Walk
 from .workers import OnProgress, Tell, open_workers
 
-PLAN_FILE: Final = "plan.toml"
 LABELS: Final = "labels"
-_CHUNK: Final = 16  # frames of a job
+_KEPT: Final = {"plan.toml": "plan", "made_of.json": "vehicle, flights and MuJoCo"}
+"""Files that tell of what a folder is."""
+_CHUNK: Final = 64  # frames of a job, at most
 _ENDINGS: Final = {
     "rgb": ("png",), "depth": ("npy", "png"), "segmentation": ("png",), "flow": ("npy",)
 }  # fmt: skip
@@ -36,12 +41,17 @@ _DEEPEST: Final = 65.535  # m: what 16 bits of millimetres hold
 
 @dataclass(frozen=True, kw_only=True)
 class _Job:
-    """Some frames of a walk, whose first pose has a number."""
+    """Some frames of a walk, and the pose before them, if there is one."""
 
     plan: Plan
     walk: Walk
+    """Of these poses alone."""
+    sequence: int
+    """Number of the whole walk."""
     first: int
-    rows: range
+    """Number of the first frame."""
+    before: int
+    """1 if the walk has the pose before, else 0."""
 
 
 class Frame(NamedTuple):
@@ -64,13 +74,16 @@ def capture(
     from .capture_formats import write_formats
 
     with locked(folder):
-        _keep_plan(plan, folder)
-        walks = plan.walks()
+        walks, views = plan.walks(), plan.views()
+        for name, content in zip(_KEPT, (plan.text, _made_of(plan, walks, views)), strict=True):
+            _keep(folder / name, content.encode())
+        for left in folder.rglob(".*.tmp"):  # by a run that was killed
+            left.unlink()
         for name in ("rgb", "depth", "segmentation", LABELS):
             (folder / name).mkdir(exist_ok=True)
         jobs = {
-            f"frames {job.first + job.rows[0]} to {job.first + job.rows[-1]}": job
-            for job in _jobs(plan, walks, folder)
+            f"frames {job.first} to {job.first + len(job.walk) - job.before - 1}": job
+            for job in _jobs(plan, walks, views, folder, config.jobs or os.cpu_count() or 1)
         }
         if jobs:
             with open_workers(config, on_progress) as workers:
@@ -79,38 +92,76 @@ def capture(
     return sum(map(len, walks))
 
 
-def _keep_plan(plan: Plan, folder: Path) -> None:
-    """Write the plan, or raise `InputError` if the folder has another."""
-    file = folder / PLAN_FILE
+def _keep(file: Path, content: bytes) -> None:
+    """Write a file that tells of what a folder is, or raise `InputError` if it is of another."""
     if file.exists():
-        same = file.read_text(encoding="utf-8") == plan.text
-        expect(same, str(folder), "a folder of the same plan", "one of another")
-        return
-    write_whole(file, plan.text.encode())
+        same, what = file.read_bytes() == content, _KEPT[file.name]
+        expect(same, str(file.parent), f"a folder of the same {what}", "one of others")
+    else:
+        write_whole(file, content)
 
 
-def _jobs(plan: Plan, walks: Sequence[Walk], folder: Path) -> Iterator[_Job]:
-    """Runs of frames of which a file is missing."""
-    number, views = 0, plan.views()
+def _made_of(plan: Plan, walks: Sequence[Walk], views: Sequence[View]) -> str:
+    """Hashes of what decides the pictures besides the plan, in JSON."""
+    vehicle, digest = Vehicle.load(plan.vehicle), hashlib.blake2b(digest_size=16)
     for walk in walks:
+        for name, value in vars(walk).items():
+            digest.update(name.encode())
+            digest.update(
+                value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+            )
+    made = {
+        "vehicle": vehicle.hash,
+        "cameras": hashlib.blake2b(repr(views).encode(), digest_size=16).hexdigest(),
+        "poses": digest.hexdigest(),
+        "mujoco": mujoco.__version__,
+    }
+    return json.dumps(made, indent=2) + "\n"
+
+
+def _jobs(
+    plan: Plan, walks: Sequence[Walk], views: Sequence[View], folder: Path, workers: int
+) -> Iterator[_Job]:
+    """Runs of frames that are not whole."""
+    number, most = 0, -(-sum(map(len, walks)) // (2 * workers))
+    for sequence, walk in enumerate(walks):
         drones = walk.position.shape[1]
-        missing = []
-        for row in range(len(walk)):
-            files = [label_file(folder, number + row)]
-            for view in views:
-                files += [
-                    folder / picture_name(view.kind, view.camera.name, number + row, i, drones, end)
-                    for i in range(drones)
-                    for end in _ENDINGS[view.kind]
-                ]
-            if not all(file.exists() for file in files):
-                missing.append(row)
+        missing = [
+            row for row in range(len(walk)) if not _is_whole(folder, number + row, views, drones)
+        ]
         while missing:
-            start = missing[0]
-            run = [i for k, i in enumerate(missing[:_CHUNK]) if i == start + k]
-            yield _Job(plan=plan, walk=walk, first=number, rows=range(start, start + len(run)))
-            missing = missing[len(run) :]
+            start, some = missing[0], missing[: min(most, _CHUNK)]
+            count = sum(row == start + i for i, row in enumerate(some))
+            before = min(start, 1)
+            yield _Job(
+                plan=plan, walk=walk.part(start - before, start + count), sequence=sequence,
+                first=number + start, before=before,
+            )  # fmt: skip
+            missing = missing[count:]
         number += len(walk)
+
+
+def _is_whole(folder: Path, number: int, views: Sequence[View], drones: int) -> bool:
+    """Whether a frame's labels and files are there as they were written; by the files' sizes."""
+    try:
+        pictures = json.loads(label_file(folder, number).read_bytes())["pictures"]
+        told = [(one["camera"], one["kind"], one["width"], one["height"]) for one in pictures]
+        sizes = {folder / file: size for one in pictures for file, size in one["files"].items()}
+        right = all(file.stat().st_size == size for file, size in sizes.items())
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return False
+    wanted = [
+        (view.camera.name, view.kind, *view.shape[1::-1])
+        for view in views
+        for _ in range(takers(view, drones))
+    ]
+    files = {
+        folder / picture_name(view, number, drone, drones, end)
+        for view in views
+        for drone in range(takers(view, drones))
+        for end in _ENDINGS[view.kind]
+    }
+    return right and told == wanted and files == sizes.keys()
 
 
 def label_file(folder: Path, number: int) -> Path:
@@ -118,10 +169,15 @@ def label_file(folder: Path, number: int) -> Path:
     return folder / LABELS / f"{number:06}.json"
 
 
-def picture_name(kind: str, camera: str, number: int, drone: int, drones: int, end: str) -> str:
+def takers(view: View, drones: int) -> int:
+    """How many drones of a world have pictures of their own; of one that stands, one."""
+    return drones if view.camera.carried else 1
+
+
+def picture_name(view: View, number: int, drone: int, drones: int, end: str) -> str:
     """Path of a picture in the folder."""
-    which = f"_{drone}" if drones > 1 else ""
-    return f"{kind}/{camera}/{number:06}{which}.{end}"
+    which = f"_{drone}" if takers(view, drones) > 1 else ""
+    return f"{view.kind}/{view.camera.name}/{number:06}{which}.{end}"
 
 
 # ---- in workers
@@ -133,33 +189,41 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
 
     plan, walk = job.plan, job.walk
     drones = walk.position.shape[1]
-    vehicle = load_vehicles(plan.vehicle, drones)
     frames = []
     with closing(
         Cameras(
-            vehicle, plan.views(), (1, drones), world=walk.world,
+            Vehicle.load(plan.vehicle), plan.views(), (1, drones), world=walk.world,
             marks=walk.marks, payload=walk.payload is not None, fine=plan.fine,
         )
     ) as cameras:  # fmt: skip
         everybody = np.ones(drones, bool)
-        if start := job.rows[0]:  # the pose before: what flows, flows from there
-            cameras.take(dict.fromkeys(cameras.pictures, ~everybody), ~everybody,
-                         walk.state(start - 1))  # fmt: skip
-        for row in job.rows:
-            state, due = walk.state(row), dict.fromkeys(cameras.pictures, everybody)
-            dice = {0: np.random.default_rng([plan.seed, 0, job.first + row])}  # sources: from 1
+        for row in range(len(walk)):
+            shown = row >= job.before  # the pose before is not: what flows, flows from there
+            state, due = walk.state(row), dict.fromkeys(cameras.pictures, everybody & shown)
+            number = job.first + row - job.before
+            dice = {0: np.random.default_rng([plan.seed, 0, number])}  # sources count from 1
             cameras.take(due, everybody if row == 0 else ~everybody, state, dice.__getitem__)
-            frames.append(_frame(job.first + row, cameras, drones, state))
-            tell(row - start + 1, len(job.rows), "frames")
+            if shown:
+                labels = {"frame": number, "sequence": job.sequence, "source": walk.name,
+                          "world": walk.world, "time": float(walk.times[row])}  # fmt: skip
+                frames.append(_frame(number, cameras, drones, state, labels, plan.least_area))
+                tell(len(frames), len(walk) - job.before, "frames")
     return frames
 
 
-def _frame(number: int, cameras: Any, drones: int, state: Mapping[str, np.ndarray]) -> Frame:
+def _frame(
+    number: int,
+    cameras: Any,
+    drones: int,
+    state: Mapping[str, np.ndarray],
+    labels: Mapping[str, Any],
+    least_area: int,
+) -> Frame:
     """Files and labels of what cameras have just taken."""
     files: dict[str, bytes] = {}
     pictures = []
     for view in cameras.views:
-        for drone in range(drones):
+        for drone in range(takers(view, drones)):
             picture = cameras.pictures[view.name][drone]
             lens = cameras.lens(view.name, state, drone)
             name = view.camera.name
@@ -171,14 +235,15 @@ def _frame(number: int, cameras: Any, drones: int, state: Mapping[str, np.ndarra
                 "distortion": list(lens.distortion),
             }  # fmt: skip
             for end, data in _encoded(view.kind, picture):
-                path = picture_name(view.kind, name, number, drone, drones, end)
+                path = picture_name(view, number, drone, drones, end)
                 files[path] = data
-                told.setdefault("files", []).append(path)
+                told.setdefault("files", {})[path] = len(data)
             if view.kind == "segmentation":
-                told["objects"] = list(objects_in(picture[..., 0], cameras.objects))
+                found = objects_in(picture[..., 0], cameras.objects)
+                told["objects"] = [one for one in found if one["area"] >= least_area]
             pictures.append(told)
     pose = {name: values.tolist() for name, values in state.items()}
-    return Frame(number, files, {"frame": number, "pose": pose, "pictures": pictures})
+    return Frame(number, files, {**labels, "pose": pose, "pictures": pictures})
 
 
 def _encoded(kind: str, picture: np.ndarray) -> Iterator[tuple[str, bytes]]:
@@ -235,33 +300,12 @@ def _write(folder: Path, frames: Iterable[Frame]) -> None:
     """Write frames, the labels of each last."""
     for frame in frames:
         for name, data in frame.files.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             write_whole(folder / name, data)
         labels = json.dumps(frame.labels, separators=(",", ":"))
         write_whole(label_file(folder, frame.number), labels.encode())
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file: after a crash at any moment it is whole, or as before. Raises `OSError`."""
-    unfinished = path.with_name(f".{path.name}.part")
-    try:
-        unfinished.write_bytes(data)
-        os.replace(unfinished, path)
-    except OSError as error:
-        with suppress(OSError):
-            unfinished.unlink()
-        raise OSError(error.errno, error.strerror, str(path)) from None
-
-
-def read_labels(folder: Path) -> list[dict[str, Any]]:
-    """Labels of all frames in their order. Raises `InputError`."""
-    found = []
-    for file in sorted((folder / LABELS).glob("[0-9]*.json")):
-        try:
-            labels = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise InputError(f"{file}: expected labels of a frame, got {error}") from None
-        right = isinstance(labels, dict) and {"frame", "pose", "pictures"} <= labels.keys()
-        expect(right, str(file), "labels of a frame", "others; without this file it is made anew")
-        found.append(labels)
-    return found
+def read_labels(folder: Path, count: int) -> list[dict[str, Any]]:
+    """Labels of so many frames in their order; all of them have to be whole."""
+    files = (label_file(folder, number) for number in range(count))
+    return [json.loads(file.read_bytes()) for file in files]

@@ -1,9 +1,11 @@
-"""A capture's folder for those who read it: COCO, KITTI-like poses, LeRobot's layout, a sheet of
+"""A capture's folder for those who read it: COCO, poses as KITTI's, LeRobot's layout, a sheet of
 pictures to look at, a datasheet. All is made anew from the pictures and the labels of the frames.
 """
 
+import io
 import json
 import re
+import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,9 +13,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..agents.checkpoints import software_versions
+from ..agents.checkpoints import software_versions, write_whole
 from ..models.vehicle import Vehicle
-from .capture import read_labels, write_whole
+from ..rendering.seen import NOTHING, objects_of
+from .capture import read_labels
 from .capture_lerobot import write_lerobot
 from .viewpoints import Plan, Walk
 
@@ -22,9 +25,9 @@ _THUMB: Final = 160  # pixels: width of a picture on it
 
 
 def write_formats(plan: Plan, walks: Sequence[Walk], folder: Path) -> None:
-    """Write all of them. Raises `OSError`."""
-    labels = read_labels(folder)
-    _write_json(folder / "coco.json", coco(labels))
+    """Write all of them. Raises `OSError`, and `InputError` where one is in the way."""
+    labels = read_labels(folder, sum(map(len, walks)))
+    _write_json(folder / "coco.json", coco(labels, _categories(plan, walks)))
     _write_kitti(folder, labels)
     write_lerobot(folder, plan, walks)
     _write_sheet(folder, labels)
@@ -39,79 +42,92 @@ def category(name: str) -> str:
 # ---- COCO
 
 
-def coco(labels: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _categories(plan: Plan, walks: Sequence[Walk]) -> list[str]:
+    """Kinds of all objects that there are, seen or not, in the order of the alphabet."""
+    vehicle, kinds = Vehicle.load(plan.vehicle), set[str]()
+    worlds = {
+        (walk.position.shape[1], walk.world, walk.marks, walk.payload is not None) for walk in walks
+    }
+    for drones, world, marks, payload in worlds:
+        kinds |= {*map(category, objects_of(vehicle, drones, world, marks, payload=payload))}
+    return sorted(kinds - {NOTHING})
+
+
+def coco(labels: Sequence[Mapping[str, Any]], categories: Sequence[str]) -> dict[str, Any]:
     """The objects in all segmentation pictures, as COCO's object detection has them.
 
-    A picture is named by its colours where there are any, else by its objects.
+    A picture is named by the colours of its camera in the same size, else by its objects.
     """
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
-    kinds: dict[str, int] = {}
+    numbers = {kind: number for number, kind in enumerate(categories, 1)}
     for frame in labels:
         names = {
-            (one["camera"], one["drone"]): one["files"][-1]
+            _taken(one): file
             for one in frame["pictures"]
+            for file in one["files"]
             if one["kind"] == "rgb"
         }
         for one in frame["pictures"]:
             if one["kind"] != "segmentation":
                 continue
             size = {"width": one["width"], "height": one["height"]}
-            file = names.get((one["camera"], one["drone"]), one["files"][-1])
-            images.append({"id": len(images) + 1, "file_name": file, **size})
+            (file,) = one["files"]
+            where = {"file_name": names.get(_taken(one), file), "sequence": frame["sequence"]}
+            images.append({"id": len(images) + 1, **where, **size})
             for thing in one["objects"]:
-                kind = category(thing["name"])
                 annotations.append(
                     {
                         "id": len(annotations) + 1,
                         "image_id": len(images),
-                        "category_id": kinds.setdefault(kind, len(kinds) + 1),
+                        "category_id": numbers[category(thing["name"])],
                         "bbox": thing["box"],
                         "area": thing["area"],
-                        "iscrowd": 1,  # which is how COCO marks run lengths
+                        "iscrowd": 0,
                         "segmentation": {
                             "size": [one["height"], one["width"]], "counts": thing["runs"]
                         },
                         "object": thing["name"],
                     }
                 )  # fmt: skip
-    categories = [{"id": number, "name": name} for name, number in kinds.items()]
-    return {"images": images, "annotations": annotations, "categories": categories}
+    kinds = [{"id": number, "name": name} for name, number in numbers.items()]
+    return {"images": images, "annotations": annotations, "categories": kinds}
+
+
+def _taken(picture: Mapping[str, Any]) -> tuple[Any, ...]:
+    """By whom, and in which size."""
+    return tuple(picture[key] for key in ("camera", "drone", "width", "height"))
 
 
 # ---- KITTI
 
 
-def _by_camera(labels: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
-    """Pictures of each camera of each drone, one for each frame, in their order."""
-    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for frame in labels:
-        seen = set()
-        for one in frame["pictures"]:
-            key = one["camera"], one["drone"]
-            if key not in seen:
-                seen.add(key)
-                found.setdefault(key, []).append(one)
-    return found
-
-
 def _write_kitti(folder: Path, labels: Sequence[Mapping[str, Any]]) -> None:
-    """poses/CAMERA.txt: [R | t] from the camera to the world, 12 numbers for each frame; calib.txt:
-    the projection of each camera.
+    """poses/SEQUENCE_CAMERA_DRONE.txt: [R | t] from the camera to the world, 12 numbers for each
+    frame; calib.txt: the projection of each picture of each drone.
     """
-    (folder / "poses").mkdir(exist_ok=True)
-    projections = {}
-    for (camera, drone), pictures in _by_camera(labels).items():
-        lines = []
-        for one in pictures:
+    shutil.rmtree(folder / "poses", ignore_errors=True)
+    (folder / "poses").mkdir()
+    poses: dict[str, dict[int, str]] = {}
+    projections: dict[str, str] = {}
+    for frame in labels:
+        for one in frame["pictures"]:
             rotation, translation = np.array(one["rotation"]).T, np.array(one["translation"])
-            matrix = np.column_stack((rotation, -rotation @ translation))
-            lines.append(" ".join(f"{value:.9g}" for value in matrix.ravel()))
-        write_whole(folder / "poses" / f"{camera}_{drone}.txt", ("\n".join(lines) + "\n").encode())
-        matrix = np.column_stack((np.array(pictures[0]["matrix"]), np.zeros(3)))
-        projections[camera] = " ".join(f"{value:.9g}" for value in matrix.ravel())
-    text = "".join(f"P_{camera}: {numbers}\n" for camera, numbers in projections.items())
+            pose = _row(np.column_stack((rotation, -rotation @ translation)))
+            name = f"{frame['sequence']:03}_{one['camera']}_{one['drone']}"
+            poses.setdefault(name, {})[frame["frame"]] = pose
+            kind = "" if one["kind"] == "rgb" else f"_{one['kind']}"
+            matrix = np.column_stack((np.array(one["matrix"]), np.zeros(3)))
+            projections[f"P_{one['camera']}{kind}_{one['drone']}"] = _row(matrix)
+    for name, lines in poses.items():
+        text = "".join(f"{line}\n" for line in lines.values())
+        write_whole(folder / "poses" / f"{name}.txt", text.encode())
+    text = "".join(f"{name}: {numbers}\n" for name, numbers in projections.items())
     write_whole(folder / "calib.txt", text.encode())
+
+
+def _row(matrix: np.ndarray) -> str:
+    return " ".join(f"{value:.9g}" for value in matrix.ravel())
 
 
 # ---- to look at
@@ -128,7 +144,7 @@ def _write_sheet(folder: Path, labels: Sequence[Mapping[str, Any]]) -> None:
     for number in chosen:
         row = []
         for one in labels[number]["pictures"]:
-            path = folder / one["files"][0]
+            path = folder / next(iter(one["files"]))
             if path.suffix == ".npy":
                 picture = np.load(path)
             else:
@@ -143,7 +159,9 @@ def _write_sheet(folder: Path, labels: Sequence[Mapping[str, Any]]) -> None:
         rows.append(np.hstack(row))
     wide = max(row.shape[1] for row in rows)
     rows = [np.pad(row, ((0, 0), (0, wide - row.shape[1]), (0, 0))) for row in rows]
-    Image.fromarray(np.vstack(rows)).save(folder / "contact.png")
+    data = io.BytesIO()
+    Image.fromarray(np.vstack(rows)).save(data, "PNG")
+    write_whole(folder / "contact.png", data.getvalue())
 
 
 def datasheet(plan: Plan, walks: Sequence[Walk], labels: Sequence[Mapping[str, Any]]) -> str:
@@ -203,9 +221,10 @@ _LAYOUT: Final = """\
 | `depth/CAMERA/FRAME.npy`, `.png` | m along the axis, float32; mm, 16 bits, 0 beyond 65.535 m |
 | `segmentation/CAMERA/FRAME.png` | numbers of objects, 16 bits; `labels` has their names |
 | `flow/CAMERA/FRAME.npy` | pixels right and down since the pose before, float32 |
-| `labels/FRAME.json` | pose (MuJoCo's frame, m), lenses, objects with boxes and masks |
+| `labels/FRAME.json` | source, time, poses (MuJoCo's frame, m), lenses, boxes and masks |
 | `coco.json` | boxes and masks of all objects, as COCO has them |
-| `poses/CAMERA_DRONE.txt`, `calib.txt` | camera to world, 3 × 4 by rows, and K, as KITTI has them |
+| `poses/SEQUENCE_CAMERA_DRONE.txt` | camera to world, 3 × 4 by rows, a line for each frame |
+| `calib.txt` | projections, 3 × 4 by rows, for points of a camera's frame |
 | `lerobot/` | Parquet and MP4, as LeRobot has them |
 | `contact.png` | some frames to look at |
 """

@@ -1,8 +1,9 @@
 """LeRobot's layout of a captured data set: Parquet, MP4 and statistics, version 2.1.
 
-An episode is a flight of one drone, or the random places of a source.
+An episode is a flight of one drone. Random places are no flight, and are not in it.
 """
 
+import io
 import json
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -11,9 +12,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..agents.checkpoints import write_whole
 from ..models.cameras import View
-from ..models.errors import require
-from .capture import picture_name, write_whole
+from ..models.errors import expect, require
+from .capture import picture_name, takers
 from .viewpoints import Plan, Walk
 
 _VERSION: Final = "v2.1"
@@ -25,8 +27,8 @@ _NUMBERS: Final = ("frame_index", "episode_index", "index", "task_index")
 def write_lerobot(folder: Path, plan: Plan, walks: Sequence[Walk]) -> None:
     """Write `lerobot/`. Raises `OSError`.
 
-    Where all poses are of flights with the same actions, a frame has what was flown from there, and
-    the last of a flight, from which nothing was, is left out.
+    A frame has the action that was flown from there; the end of a flight, from which none was, is
+    left out. All flights have the same actions. Raises `InputError` where a file is in the way.
     """
     pyarrow: Any = require("pyarrow", "dataset", "LeRobot's layout")
     from pyarrow import parquet
@@ -34,19 +36,23 @@ def write_lerobot(folder: Path, plan: Plan, walks: Sequence[Walk]) -> None:
     from ..rendering.film import QUALITY, write_film
 
     root, cameras = folder / "lerobot", [view for view in plan.views() if view.kind == "rgb"]
+    right = not root.is_symlink() and (root.is_dir() or not root.exists())
+    expect(right, str(root), "a folder, or none", "a file or a link")
     shutil.rmtree(root, ignore_errors=True)
+    flights = [walk for walk in walks if walk.actions is not None]
+    if not flights:
+        return
     for name in ("meta", "data/chunk-000", "videos/chunk-000"):
         (root / name).mkdir(parents=True)
-    named = {walk.components for walk in walks}
-    components = named.pop() if len(named) == 1 else ()
-    tasks = list(dict.fromkeys(walk.name for walk in walks))
+    components = flights[0].components
+    tasks = list(dict.fromkeys(walk.name for walk in flights))
     first = index = 0
     episodes: list[dict[str, Any]] = []
     statistics: list[dict[str, Any]] = []
     for walk in walks:
         drones = walk.position.shape[1]
-        for drone in range(drones):
-            columns = _columns(walk, drone, bool(components))
+        for drone in range(drones if walk.actions is not None else 0):
+            columns = _columns(walk, drone)
             count, number = len(columns["observation.state"]), len(episodes)
             columns |= {
                 "timestamp": (np.arange(count) / plan.fps).astype(np.float32),
@@ -58,13 +64,16 @@ def write_lerobot(folder: Path, plan: Plan, walks: Sequence[Walk]) -> None:
             told = {name: _spread(values) for name, values in columns.items()}
             table = pyarrow.table({name: list(values) for name, values in columns.items()})
             episode = f"chunk-000/episode_{number:06}"
-            parquet.write_table(table, root / "data" / f"{episode}.parquet")
+            data = io.BytesIO()
+            parquet.write_table(table, data)
+            write_whole(root / "data" / f"{episode}.parquet", data.getvalue())
             for view in cameras:
                 chunk, _, file = episode.partition("/")
                 video = root / "videos" / chunk / f"{_VIDEO}{view.name}" / f"{file}.mp4"
                 video.parent.mkdir(exist_ok=True)
+                taker = min(drone, takers(view, drones) - 1)
                 pictures = _Pictures(
-                    folder / picture_name("rgb", view.name, first + i, drone, drones, "png")
+                    folder / picture_name(view, first + i, taker, drones, "png")
                     for i in range(count)
                 )
                 write_film(video, pictures, plan.fps, quality=QUALITY)
@@ -83,15 +92,14 @@ def write_lerobot(folder: Path, plan: Plan, walks: Sequence[Walk]) -> None:
         write_whole(root / "meta" / f"{name}.jsonl", text.encode())
 
 
-def _columns(walk: Walk, drone: int, acts: bool) -> dict[str, np.ndarray]:
-    """State, time and action of a drone, a row for each frame."""
+def _columns(walk: Walk, drone: int) -> dict[str, np.ndarray]:
+    """State, action and time of a drone, a row for each frame."""
+    assert walk.actions is not None
     states = np.concatenate((walk.position[:, drone], walk.quaternion[:, drone]), axis=1)
-    columns = {"observation.state": states.astype(np.float32), "time": walk.times}
-    if not acts or walk.actions is None:
-        return columns
-    flown = ~np.isnan(walk.actions[:, drone]).any(axis=1)
-    columns["action"] = walk.actions[:, drone].astype(np.float32)
-    return {name: values[flown] for name, values in columns.items()}
+    actions = walk.actions[:, drone].astype(np.float32)
+    columns = {"observation.state": states.astype(np.float32), "action": actions}
+    flown = ~np.isnan(actions).any(axis=1)
+    return {name: values[flown] for name, values in {**columns, "time": walk.times}.items()}
 
 
 class _Pictures:
@@ -146,9 +154,8 @@ def _info(
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
         **{name: {"dtype": "int64", "shape": [1], "names": None} for name in _NUMBERS},
     }
-    if components:
-        names = list(components)
-        features["action"] = {"dtype": "float32", "shape": [len(names)], "names": names}
+    names = list(components)
+    features["action"] = {"dtype": "float32", "shape": [len(names)], "names": names}
     for view in cameras:
         features[f"{_VIDEO}{view.name}"] = {
             "dtype": "video", "shape": list(view.shape), "names": ["height", "width", "channel"],

@@ -5,7 +5,7 @@ random places come from its seed, flights from the evaluation episodes' seeds.
 """
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -17,6 +17,7 @@ from ..agents import CONTROLLERS
 from ..agents.checkpoints import load
 from ..agents.policies import Policy
 from ..envs.registry import env_spec
+from ..envs.registry import load as load_env
 from ..envs.spec import Discrete, Mark, component_names
 from ..envs.tasks.task import finite
 from ..models import parse_world
@@ -24,16 +25,17 @@ from ..models.cameras import View, cameras_of, chosen_views
 from ..models.errors import InputError, expect
 from ..models.frames import pose_in_mujoco_frame
 from ..models.vehicle import Vehicle
+from ..sim.rotations import multiplied
 from .trajectories import Trajectory, flown_trajectories, recorded_trajectories
 
-_KEYS: Final = ("vehicle", "world", "cameras", "seed", "fine", "fps", "poses")
+_KEYS: Final = ("vehicle", "world", "cameras", "seed", "fine", "fps", "least_area", "poses")
 _SOURCES: Final[Mapping[str, Mapping[str, Any]]] = {
     "random": {
         "count": None, "center": (0.0, 0.0, 5.0), "size": (10.0, 10.0, 6.0), "tilt": 0.3,
         "world": "",
     },
     "flight": {
-        "env": "rotorgram/Hover-v0", "agent": "geometric", "options": {}, "episodes": 1, "first": 0,
+        "env": None, "agent": "geometric", "options": {}, "episodes": 1, "first": 0,
         "every": 10, "drones": 1, "aside": 0.0, "tilt": 0.0, "world": "",
     },
     "journal": {
@@ -41,8 +43,12 @@ _SOURCES: Final[Mapping[str, Mapping[str, Any]]] = {
         "world": "",
     },
 }  # fmt: skip
-"""Keys of each source of poses, and their defaults; a `count` and a `file` have to be there."""
+"""Keys of each source of poses, and their defaults; a `count` and a `file` have to be there, and
+without an `env` it is that of the checkpoint, or Hover."""
+_CAMERAS: Final = ["front", "front_segmentation"]
 MOST_FRAMES: Final = 1_000_000
+_FURTHEST: Final = 1e4  # m
+_MOST_BYTES: Final = 1_000_000  # of a plan
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +86,13 @@ class Walk:
         """T."""
         return len(self.times)
 
+    def part(self, first: int, end: int) -> "Walk":
+        """The poses from `first` to before `end`."""
+        arrays: dict[str, Any] = {
+            k: x[first:end] for k, x in vars(self).items() if isinstance(x, np.ndarray)
+        }
+        return replace(self, **arrays)
+
     def state(self, row: int) -> dict[str, np.ndarray]:
         """One pose of all drones, as `Cameras.take` has it."""
         told = {"position": self.position[row], "quaternion": self.quaternion[row]}
@@ -107,18 +120,25 @@ class Plan:
     """With shadows and smooth edges."""
     fps: float = 10.0
     """Of the videos."""
+    least_area: int = 1
+    """Pixels that an object needs to be told of."""
 
     @classmethod
     def read(cls, path: Path) -> "Plan":
         """Read a TOML file. Raises `InputError`, or `OSError` where it cannot be read."""
+        size = path.stat().st_size
+        expect(size <= _MOST_BYTES, "plan", f"at most {_MOST_BYTES} bytes", f"{size}")
         try:
             text = path.read_text(encoding="utf-8")
             table = tomllib.loads(text)
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise InputError(f"plan: expected a TOML file, got {path.name}: {error}") from None
+        except RecursionError:
+            wanted = "a TOML file with tables as in docs/capture.md"
+            raise InputError(f"plan: expected {wanted}, got too many in each other") from None
         for key in table:
             expect(key in _KEYS, "plan", f"some of {', '.join(_KEYS)}", repr(key))
-        cameras, poses = table.pop("cameras", ["front"]), table.pop("poses", None)
+        cameras, poses = table.pop("cameras", _CAMERAS), table.pop("poses", None)
         right = isinstance(cameras, list) and all(isinstance(one, str) for one in cameras)
         expect(right and cameras, "plan: cameras", "a list of names", repr(cameras))
         right = isinstance(poses, list) and all(isinstance(one, dict) for one in poses)
@@ -131,12 +151,14 @@ class Plan:
         right = type(plan.seed) is int and 0 <= plan.seed < 1 << 63
         expect(right, "plan: seed", "a whole number from 0", repr(plan.seed))
         expect(type(plan.fine) is bool, "plan: fine", "true or false", repr(plan.fine))
+        right = type(plan.least_area) is int and plan.least_area >= 1
+        expect(right, "plan: least_area", "a number of pixels", repr(plan.least_area))
         right = finite(plan.fps) is not None and 0.1 <= plan.fps <= 1000
         expect(right, "plan: fps", "0.1 to 1000 pictures a second", repr(plan.fps))
         for view in plan.views():
-            size = f"{view.shape[1]}x{view.shape[0]}"
+            shape = f"{view.shape[1]}x{view.shape[0]}"
             right = view.kind != "rgb" or not (view.shape[0] % 2 or view.shape[1] % 2)
-            expect(right, f"plan: {view.name}", "even sizes, which its videos need", size)
+            expect(right, f"plan: {view.name}", "even sizes, which its videos need", shape)
         return plan
 
     def views(self) -> tuple[View, ...]:
@@ -152,10 +174,13 @@ class Plan:
                 walks = [_random(name, source, dice)]
             else:
                 flies = source["from"] == "flight"
-                flown = _flown(source, self.vehicle) if flies else _recorded(source)
+                flown = _flown(source, self.vehicle) if flies else _recorded(source, self.vehicle)
                 walks = _walks(name, flown, source["every"], source.get("drones", 1))
                 walks = [_moved(walk, source["aside"], source["tilt"], dice) for walk in walks]
             found += [replace(walk, world=source["world"] or self.world) for walk in walks]
+        kinds = dict.fromkeys(walk.components for walk in found if walk.actions is not None)
+        got = " and ".join(f"({', '.join(names)})" for names in kinds)
+        expect(len(kinds) < 2, "plan", "flights with the same actions", got)
         count = sum(map(len, found))
         expect(count <= MOST_FRAMES, "plan", f"at most {MOST_FRAMES} poses", f"{count}")
         return found
@@ -164,8 +189,9 @@ class Plan:
 def _source(table: dict[str, Any], number: int) -> dict[str, Any]:
     """A source of poses with all its keys. Raises `InputError`."""
     name, kind = f"plan: poses[{number}]", table.get("from")
-    expect(kind in _SOURCES, f"{name}.from", " or ".join(map(repr, _SOURCES)), repr(kind))
-    known = _SOURCES[str(kind)]
+    known = _SOURCES.get(kind) if isinstance(kind, str) else None
+    if known is None:
+        raise InputError(f"{name}.from: expected {_words(_SOURCES)}, got {kind!r:.80}")
     for key in table:
         expect(key in known or key == "from", name, f"some of {', '.join(known)}", repr(key))
     source = {**known, **table}
@@ -181,19 +207,29 @@ def _source(table: dict[str, Any], number: int) -> dict[str, Any]:
         if key in source:
             values = source[key]
             right = isinstance(values, list | tuple) and len(values) == 3
-            right = right and all(finite(one) is not None for one in values)
-            expect(right, f"{name}.{key}", "three numbers, m", repr(values))
-    for key, most, unit in (("tilt", np.pi, "rad"), ("aside", 1e4, "m")):
+            least = -_FURTHEST if key == "center" else 0.0
+            right = right and all(finite(x) is not None for x in values)
+            right = right and all(least <= x <= _FURTHEST for x in values)
+            wanted = f"three numbers, m, from {least:g} to {_FURTHEST:g}"
+            expect(right, f"{name}.{key}", wanted, repr(values))
+    for key, most, unit in (("tilt", np.pi, "rad"), ("aside", _FURTHEST, "m")):
         value = source.get(key, 0.0)
         right = finite(value) is not None and 0 <= value <= most
         expect(right, f"{name}.{key}", f"0 to {most:.6g} {unit}", repr(value))
-    if source["world"]:
+    if kind == "random":
+        low = source["center"][2] - source["size"][2] / 2
+        expect(low >= 0, name, "a box above the ground", f"one that begins at {low:g} m")
+    session = source.get("session")
+    right = session is None or (type(session) is int and session >= 1)
+    expect(right, f"{name}.session", "a whole number from 1", repr(session))
+    if source["world"] != "":
         parse_world(source["world"])
     texts = {"env": "the id of a task", "agent": "a controller or a checkpoint",
              "file": "a journal (.mcap)"}  # fmt: skip
     for key, expected in texts.items():
-        value = source.get(key, "")
-        expect(isinstance(value, str), f"{name}.{key}", expected, repr(value))
+        value = source.get(key) or ""
+        right = isinstance(value, str) and (value != "" or key != "file")
+        expect(right or key not in source, f"{name}.{key}", expected, repr(value))
     options = source.get("options", {})
     expect(isinstance(options, dict), f"{name}.options", "options by name", repr(options))
     return source
@@ -205,7 +241,7 @@ def _random(name: str, source: Mapping[str, Any], dice: np.random.Generator) -> 
     position = np.array(source["center"], float) + size * dice.uniform(-0.5, 0.5, (count, 3))
     half, zero = dice.uniform(-np.pi, np.pi, count) / 2, np.zeros(count)
     turned = np.stack((np.cos(half), zero, zero, np.sin(half)), axis=-1)
-    quaternion = _product(_tilts((count,), source["tilt"], dice), turned)
+    quaternion = multiplied(_tilts((count,), source["tilt"], dice), turned)
     place, turn = position[:, None], quaternion[:, None]
     return Walk(name=name, times=zero, position=place, quaternion=turn)
 
@@ -214,7 +250,7 @@ def _moved(walk: Walk, aside: float, tilt: float, dice: np.random.Generator) -> 
     """The cameras of a walk up to so far aside, m, or higher, and tilted up to an angle more."""
     shape = walk.position.shape
     moves = dice.uniform((-aside, -aside, 0.0), aside, shape)
-    quaternion = _product(_tilts(shape[:-1], tilt, dice), walk.quaternion)
+    quaternion = multiplied(_tilts(shape[:-1], tilt, dice), walk.quaternion)
     return replace(walk, position=walk.position + moves, quaternion=quaternion)
 
 
@@ -225,34 +261,39 @@ def _tilts(shape: tuple[int, ...], most: float, dice: np.random.Generator) -> np
     return np.stack(parts, axis=-1)
 
 
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton's product of quaternions, shape (..., 4)."""
-    w, v, x, u = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
-    real = w * x - (v * u).sum(axis=-1, keepdims=True)
-    return np.concatenate((real, w * u + x * v + np.cross(v, u)), axis=-1)
+def _words(names: Iterable[str]) -> str:
+    return " or ".join(map(repr, names))
 
 
 def _flown(source: Mapping[str, Any], vehicle: str | None) -> list[Trajectory]:
     agent, options, drones = source["agent"], source["options"], source["drones"]
-    checkpoint, controller = None, CONTROLLERS.get(agent)
-    if controller is None and agent != "random":
-        checkpoint = load(Path(agent))
-        options = {**checkpoint.spec.options, **options}
-    elif controller is not None:
+    env_id = load_env(source["env"] or "rotorgram/Hover-v0")  # the plan is the user's own
+    controller = CONTROLLERS.get(agent)
+    policy: Policy | None = None
+    if controller is not None:
         options = {**controller.options, **options}
-    spec = env_spec(source["env"], options, vehicle, drones)
-    policy: Policy | None = controller(spec) if controller else None
-    policy = checkpoint.policy() if checkpoint else policy
+        policy = controller(env_spec(env_id, options, vehicle, drones))
+    elif agent != "random":
+        checkpoint = load(Path(agent))
+        env_id, trained = env_id if source["env"] else checkpoint.env_id, checkpoint.spec
+        if env_id == checkpoint.env_id:
+            options = {**trained.options, **options}
+        spec = env_spec(env_id, options, vehicle, drones)
+        right = vehicle is not None or trained.vehicle_hash == spec.vehicle_hash
+        expect(right, "plan: vehicle", f"{trained.vehicle}, on which {agent} was trained", "none")
+        policy = checkpoint.policy(spec)
     episodes = range(source["first"], source["first"] + source["episodes"])
-    env_id = source["env"]
     return flown_trajectories(
         policy, env_id, options, episodes, vehicle=vehicle, of="final", drones=drones
     )
 
 
-def _recorded(source: Mapping[str, Any]) -> list[Trajectory]:
-    path = Path(source["file"])
-    return recorded_trajectories(path, session=source["session"], drone=source["drone"])
+def _recorded(source: Mapping[str, Any], vehicle: str | None) -> list[Trajectory]:
+    path, own = Path(source["file"]), Vehicle.load(vehicle).name
+    flown = recorded_trajectories(path, session=source["session"], drone=source["drone"])
+    name = flown[0].spec.vehicle
+    expect(name == own, "plan: vehicle", f"{name}, which flies in {path}", own)
+    return flown
 
 
 def _walks(name: str, flown: Sequence[Trajectory], every: int, drones: int) -> list[Walk]:

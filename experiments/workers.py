@@ -176,7 +176,8 @@ def _loky(config: WorkersConfig) -> Iterator[_Do]:
                 yield result
         except BaseException as error:
             # Their simulators end with the workers.
-            get_reusable_executor().shutdown(wait=False, kill_workers=True)
+            # With other arguments than those it has, loky would wait for them here.
+            get_reusable_executor(reuse=True).shutdown(wait=False, kill_workers=True)
             with warnings.catch_warnings(action="ignore"):  # that runs are cut short is wanted
                 results.close()
             if isinstance(error, TerminatedWorkerError):

@@ -36,6 +36,8 @@ OUTPUTS: Final = {
 _TEXTS: Final = PREFIX + "cameras."
 _CHECKED: Final = 16  # places along a side at which a lens is tried
 _SIDE: Final = 64  # Pixels of a side, where the file tells none
+MOST_LETTERS: Final = 64  # of a name
+FOVY: Final = (1e-3, 3.0)  # rad
 MOST_STEPS: Final = 1000  # from picture to picture
 _Vector = tuple[float, float, float]
 
@@ -165,8 +167,8 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
             view = View(camera=camera, kind=one)
             right = one != "flow" or not camera.optics.readout
             expect(right, "cameras", "flow of a camera that reads all rows at once", f"{word!r}")
-            expect(view.name not in views, "cameras", "each picture once", f"{view.name!r} twice")
-            views[view.name] = view
+            same = views.setdefault(view.name, view) == view
+            expect(same, "cameras", "each picture in one size", f"{view.name!r} in two")
     return tuple(views.values())
 
 
@@ -186,7 +188,8 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
     """Cameras of a vehicle's spec and of the model that it gave. Raises `InputError`.
 
     One that follows the craft but does not turn with it, as MuJoCo's mode `trackcom`, counts as
-    standing in the world.
+    standing in the world. Left out: those without a name of letters, digits and _, those that turn
+    to a target, and those without perspective.
     """
     texts = {text.name: text.data for text in spec.texts if text.name.startswith(_TEXTS)}
     found = []
@@ -195,16 +198,17 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_camlight(model, data)
-    fixed = mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+    modes, perspective = mujoco.mjtCamLight, mujoco.mjtProjection.mjPROJ_PERSPECTIVE
+    targets = modes.mjCAMLIGHT_TARGETBODY, modes.mjCAMLIGHT_TARGETBODYCOM
     for number in range(model.ncam):
         one = model.camera(number)
-        if not one.name:
+        usable = is_name(one.name) and model.cam_projection[number] == perspective
+        if not usable or model.cam_mode[number] in targets:
             continue
+        _check_numbers(f"camera {one.name}", model, number)
         width, height = (int(side) for side in model.cam_resolution[number])
         if (width, height) == (1, 1):  # MJCF's default
             width = height = _SIDE
-        flat = model.cam_projection[number] != mujoco.mjtProjection.mjPROJ_PERSPECTIVE.value
-        expect(not flat, f"camera {one.name}", "a perspective projection", "an orthographic one")
         for side in (width, height):
             expected = f"1 to {MOST_PIXELS} pixels a side"
             expect(1 <= side <= MOST_PIXELS, f"camera {one.name}", expected, f"{side}")
@@ -224,7 +228,7 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
                 fovy=math.radians(float(model.cam_fovy[number])),
                 kinds=tuple(kind for kind, bit in OUTPUTS.items() if output & bit) or ("rgb",),
                 every=steps_of(f"camera {one.name}", rate),
-                carried=bool(mine and model.cam_mode[number] == fixed),
+                carried=bool(mine and model.cam_mode[number] == modes.mjCAMLIGHT_FIXED),
                 position=_vector(data.cam_xpos[number]),
                 look=_vector(-axes[:, 2]),
                 up=_vector(axes[:, 1]),
@@ -234,6 +238,23 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
     for name in texts:
         raise InputError(f"{name}: expected a camera of that name and a key that it can have")
     return tuple(found)
+
+
+def is_name(name: object) -> bool:
+    """Whether a camera can be called so: also in an option with commas, and in a file's name."""
+    return isinstance(name, str) and name.isidentifier() and len(name) <= MOST_LETTERS
+
+
+def _check_numbers(name: str, model: mujoco.MjModel, number: int) -> None:
+    """Raise `InputError` unless a camera of a model can see something."""
+    low, high = (math.degrees(end) for end in FOVY)
+    fovy, focal = float(model.cam_fovy[number]), model.cam_intrinsic[number, :2].tolist()
+    if model.cam_sensorsize[number].any():
+        right = min(*focal, *model.cam_sensorsize[number]) > 0
+        expect(right, name, "a focal length above 0 with its sensorsize", f"{focal}")
+    expect(low <= fovy <= high, name, f"fovy from {low:.3g} to {high:.4g} degrees", f"{fovy:g}")
+    place = model.cam_pos[number].tolist()
+    expect(max(map(abs, place)) <= 1e4, name, "a position within 1e4 m", f"{place}")
 
 
 def _read(text: str) -> Any:
@@ -294,16 +315,27 @@ def add_cameras(spec: mujoco.MjSpec, body: mujoco.MjsBody, vehicle: "Vehicle", p
 
 def place_camera(spec: mujoco.MjSpec, body: mujoco.MjsBody, camera: Camera) -> None:
     """Add a camera to a body of a spec."""
-    right = np.cross(camera.look, camera.up)
     added = body.add_camera(name=camera.name, pos=camera.position)
     added.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
-    added.alt.xyaxes = (*right.tolist(), *np.cross(right, camera.look).tolist())
+    added.alt.xyaxes = axes_of(camera)
     added.fovy, added.resolution = math.degrees(camera.fovy), (camera.width, camera.height)
     added.output = sum(int(OUTPUTS[kind]) for kind in camera.kinds)
+    for name, data in texts_of(camera).items():
+        spec.add_text(name=name, data=data)
+
+
+def texts_of(camera: Camera) -> dict[str, str]:
+    """Names and data of the custom texts with which MJCF has a camera's rate and optics."""
     told = {one.name: np.ravel(getattr(camera.optics, one.name)) for one in fields(Optics)}
-    if camera.every > 1:
-        told["rate"] = np.array([1 / camera.every])
-    for key, values in told.items():
-        if values.any():
-            text = " ".join(map(repr, values.tolist()))
-            spec.add_text(name=f"{_TEXTS}{camera.name}.{key}", data=text)
+    told["rate"] = np.array([1 / camera.every if camera.every > 1 else 0.0])
+    return {
+        f"{_TEXTS}{camera.name}.{key}": " ".join(map(repr, values.tolist()))
+        for key, values in told.items()
+        if values.any()
+    }
+
+
+def axes_of(camera: Camera) -> tuple[float, ...]:
+    """MJCF's `xyaxes` of a camera: right, and up."""
+    right = np.cross(camera.look, camera.up)
+    return (*right.tolist(), *np.cross(right, camera.look).tolist())

@@ -34,13 +34,14 @@ class Lens(NamedTuple):
     """k1, k2, p1, p2, k3; empty: none."""
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Columns and rows of points of the world, shape (..., 3), m: shape (..., 2), pixels."""
+        """Columns and rows of points of the world, shape (..., 3), m: shape (..., 2), pixels; nan
+        of a point that is not ahead."""
         return self.pixels(points @ self.rotation.T + self.translation)
 
     def pixels(self, seen: np.ndarray) -> np.ndarray:
         """The same of points of the camera's frame."""
-        flat = distorted(seen[..., :2] / seen[..., 2:], self.distortion)
-        k = self.matrix
+        ahead = np.where(seen[..., 2:] > 0, seen[..., 2:], np.nan)
+        flat, k = distorted(seen[..., :2] / ahead, self.distortion), self.matrix
         pixels: np.ndarray = flat @ k[:2, :2].T + k[:2, 2]
         return pixels
 

@@ -15,7 +15,18 @@ from xml.etree import ElementTree
 
 import mujoco
 
-from .cameras import OUTPUTS, Camera, Optics, place_camera, steps_of
+from .cameras import (
+    FOVY,
+    MOST_LETTERS,
+    OUTPUTS,
+    Camera,
+    Optics,
+    axes_of,
+    is_name,
+    place_camera,
+    steps_of,
+    texts_of,
+)
 from .coefficients import PREFIX, Limits, checked, coefficient_fields
 from .errors import InputError, expect
 
@@ -54,7 +65,7 @@ ENTRIES: Final[Mapping[str, Field[Any]]] = {
     "cameras.position": _entry("m", -100.0, 100.0, 3),
     "cameras.look": _entry("1", -1e3, 1e3, 3),
     "cameras.up": _entry("1", -1e3, 1e3, 3),
-    "cameras.fovy": _entry("rad", 1e-3, 3.0),
+    "cameras.fovy": _entry("rad", *FOVY),
     "cameras.resolution": _entry("pixel", 1, 4096, 2),
     "cameras.rate": _entry("1", 1e-3, 1.0),
     **{f"cameras.{one.name}": one for one in fields(Optics)},
@@ -204,7 +215,7 @@ class VehicleFile:
             _complete(base, self)
         free = mujoco.mjtJoint.mjJNT_FREE
         crafts = [body for body in spec.bodies if any(j.type == free for j in body.joints)]
-        for camera in self.cameras if crafts else ():
+        for camera in self.cameras if crafts and base is not None else ():
             place_camera(spec, crafts[0] if camera.carried else spec.worldbody, camera)
         return spec
 
@@ -334,19 +345,26 @@ class _Reader:
     def _camera(self, table: Any, name: str) -> Camera:
         given = self._read(table, "cameras", name)
         own, kinds, stands = table.get("name"), table.get("kinds", ["rgb"]), table.get("stands")
-        right = isinstance(own, str) and own.isidentifier()
-        expect(right, f"{name}.name", "letters, digits and _", repr(own))
-        right = isinstance(kinds, list) and bool(kinds) and all(kind in OUTPUTS for kind in kinds)
+        expect(
+            is_name(own), f"{name}.name", f"up to {MOST_LETTERS} letters, digits and _", repr(own)
+        )
+        right = isinstance(kinds, list) and bool(kinds)
+        right = right and all(isinstance(kind, str) and kind in OUTPUTS for kind in kinds)
         expect(right, f"{name}.kinds", f"some of {', '.join(OUTPUTS)}", repr(kinds))
-        right = stands in (None, True, False)
+        right = stands is None or isinstance(stands, bool)
         expect(right, f"{name}.stands", "true, for one that no drone carries", repr(stands))
-        look, up = given.get("look", _AHEAD), given.get("up", _UP)
+        look = given.get("look", _AHEAD)
+        _check_axis(f"{name}.look", look)
+        upright = math.hypot(*look[:2]) > 1e-6 * math.hypot(*look)
+        up = given.get("up", _UP if upright else _AHEAD)
         across = math.hypot(*_crossed(look, up))
         right = across > 1e-6 * math.hypot(*look) * math.hypot(*up)
         expect(right, f"{name}.up", "another direction than look", f"{list(up)}")
         width, height = (round(side) for side in given.get("resolution", (64.0, 64.0)))
         right = (width, height) == given.get("resolution", (width, height))
         expect(right, f"{name}.resolution", "whole numbers", f"{given.get('resolution')}")
+        right = (width, height) != (1, 1)
+        expect(right, f"{name}.resolution", "more than one pixel", f"{width} by {height}")
         return Camera(
             name=str(own),
             width=width,
@@ -585,6 +603,25 @@ class _Mjcf:
         self._hull(clearance)
         self._looks()
         self._actuators()
+        for camera in file.cameras:
+            self._camera(self.body if camera.carried else world, camera)
+
+    def _camera(self, body: ElementTree.Element, camera: Camera) -> None:
+        ElementTree.SubElement(
+            body,
+            "camera",
+            name=camera.name,
+            pos=_text(*camera.position),
+            xyaxes=_text(*axes_of(camera)),
+            fovy=_text(math.degrees(camera.fovy)),
+            resolution=f"{camera.width} {camera.height}",
+            output=" ".join(camera.kinds),
+        )
+        for name, data in texts_of(camera).items():
+            custom = self.root.find("custom")
+            if custom is None:
+                custom = ElementTree.SubElement(self.root, "custom")
+            ElementTree.SubElement(custom, "text", name=name, data=data)
 
     def _sides(self) -> tuple[float, ...]:
         """Of the hub if the file does not tell: of the heaviest box, if there are any."""

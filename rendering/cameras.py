@@ -22,9 +22,10 @@ from ..models.lens import Lens
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
 from .gl import Offscreen
-from .seen import GOAL, PAYLOAD, drawn_model, objects_in
+from .seen import GOAL, PAYLOAD, drawn_model, objects_in, own_discs
 
-_ROOM: Final = 10_000  # geoms
+_ROOM: Final = 1000  # geoms beyond those of the model
+_HIDDEN: Final = 5  # a group of geoms that is not drawn
 _FINER: Final = 2  # pixels of a pinhole's picture for one of a lens that distorts
 _STEADY: Final = 0.5  # pixels by which what is seen may move while a strip of rows is read
 _FLIP: Final = np.array((1.0, -1.0, -1.0))  # from MuJoCo's camera frame to that of vision
@@ -54,6 +55,7 @@ class Cameras:
         payload: bool = False,
         fine: bool = False,
     ) -> None:
+        expect(views, "cameras", "one picture or more", "none")
         self.views, self._shape = tuple(views), shape
         self._names = drone_names(shape[1])
         self.model = drawn_model(vehicle, self._names, world, marks, payload=payload)
@@ -75,11 +77,10 @@ class Cameras:
         }
         self._before: list[np.ndarray | None] = [None] * shape[0]
         self.model.vis.quality.offsamples = 4 if fine else 0
-        self._scene = mujoco.MjvScene(self.model, _ROOM)
+        self._scene = mujoco.MjvScene(self.model, self.model.ngeom + _ROOM)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = fine
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._numbers = np.zeros(0, np.int32)
 
     def _camera_ids(self, view: View) -> list[int]:
         """The camera of each drone of a world; of one that stands there the same."""
@@ -172,16 +173,15 @@ class Cameras:
                 shot.rgb = colors if dice is None else _exposed(colors, eye.optics, dice)
             return shot.rgb
         if shot.depth is None:
-            shot.codes, depth = self._read(eye, shot, objects=True)
-            shot.depth = self._meters(depth)
+            shot.geoms, shot.depth = self._read(eye, shot, objects=True)
         if view.kind == "depth":
             return shot.depth[..., None]
         if view.kind == "segmentation":
-            numbers: np.ndarray = self._object[self._number(shot.codes)]
+            numbers: np.ndarray = self._object[shot.geoms]
             return numbers[..., None]
         if before is None:
             return np.zeros(view.shape, np.float32)
-        flow: np.ndarray = np.nan_to_num(self._flow(eye, shot.codes, shot.depth, before))
+        flow: np.ndarray = np.nan_to_num(self._flow(eye, shot.geoms, shot.depth, before))
         return flow
 
     def _read(self, eye: "_Eye", shot: "_Shot", *, objects: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -194,8 +194,8 @@ class Cameras:
             self._poses.restore(self.data, self._poses.ago(self.data, now, seconds))
             parts.append([picture[rows] for picture in self._render(eye, objects=objects)])
         self._poses.restore(self.data, now)
-        colors, depth = (np.concatenate(strips) for strips in zip(*parts, strict=True))
-        return colors, depth
+        first, second = (np.concatenate(strips) for strips in zip(*parts, strict=True))
+        return first, second
 
     def _strips(self, eye: "_Eye") -> list[tuple[float, slice]]:
         """How long before the state the rows of a picture are read, s, in strips that are so thin
@@ -204,21 +204,27 @@ class Cameras:
         height, readout = eye.size[0], eye.optics.readout
         if not (readout and self.data.qvel.any()):
             return [(0.0, slice(height))]
-        colors, depth = self._render(eye, objects=True)
+        geoms, depth = self._render(eye, objects=True)
         past = self._poses.ago(self.data, self._poses.now(self.data), readout)
-        most = np.abs(self._flow(eye, colors, self._meters(depth), past)).max()
+        most = np.abs(self._flow(eye, geoms, depth, past)).max()
         count = height if not most < _STEADY * height else max(int(np.ceil(most / _STEADY)), 1)
         ends = np.linspace(0, height, count + 1).round().astype(int).tolist()
         last = max(height - 1, 1)
         return [(readout * (1 - (a + b - 1) / 2 / last), slice(a, b)) for a, b in pairwise(ends)]
 
     def _render(self, eye: "_Eye", *, objects: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Colours, uint8 (H, W, 3), and OpenGL's depth, float32 (H, W), the first row on top."""
+        """Colours, uint8 (H, W, 3); or numbers of geoms from 1, 0 for none, int32 (H, W), and their
+        depth, float32 (H, W), m. The first row is on top.
+        """
         scene, view_of, every = self._scene, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value
         view_of.fixedcamid = eye.camera
         # The scene lays an endless floor around the camera that it had: without this the last one.
         mujoco.mjv_updateCamera(self.model, self.data, view_of, scene)
+        groups = self.model.geom_group[eye.discs]
+        if objects:
+            self.model.geom_group[eye.discs] = _HIDDEN
         mujoco.mjv_updateScene(self.model, self.data, self._option, None, view_of, every, scene)
+        self.model.geom_group[eye.discs] = groups
         for flag in mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR:
             scene.flags[flag.value] = objects
         colors = np.empty((*eye.drawn, 3), np.uint8)
@@ -227,23 +233,23 @@ class Cameras:
             eye.source.aim(scene)
         self._drawing.draw(scene, colors, depth if objects else None)
         colors, depth = colors[::-1], depth[::-1]
-        if eye.source is None:
-            return colors, depth
-        if objects:
-            return eye.source.nearest(colors), eye.source.nearest(depth)
-        return eye.source.blended(colors), depth
+        if not objects:
+            return colors if eye.source is None else eye.source.blended(colors), depth
+        if eye.source is not None:
+            colors, depth = eye.source.nearest(colors), eye.source.nearest(depth)
+        return self._number(eye, colors), self._meters(depth)
 
-    def _number(self, colors: np.ndarray) -> np.ndarray:
+    def _number(self, eye: "_Eye", colors: np.ndarray) -> np.ndarray:
         """Number of the geom of each pixel of the last picture, from 1; 0: none."""
         scene = self._scene
-        if len(self._numbers) != scene.ngeom + 1:  # the same geoms in each picture, in one order
+        if len(eye.numbers) != scene.ngeom + 1:  # the same geoms in each picture, in one order
             geom = mujoco.mjtObj.mjOBJ_GEOM.value
-            self._numbers = np.zeros(scene.ngeom + 1, np.int32)
+            eye.numbers = np.zeros(scene.ngeom + 1, np.int32)
             for one in scene.geoms[: scene.ngeom]:
                 if one.segid >= 0 and one.objtype == geom:
-                    self._numbers[one.segid + 1] = one.objid + 1
+                    eye.numbers[one.segid + 1] = one.objid + 1
         code = colors.astype(np.uint32)
-        numbers: np.ndarray = self._numbers[code[..., 0] | code[..., 1] << 8 | code[..., 2] << 16]
+        numbers: np.ndarray = eye.numbers[code[..., 0] | code[..., 1] << 8 | code[..., 2] << 16]
         return numbers
 
     def _meters(self, depth: np.ndarray) -> np.ndarray:
@@ -255,7 +261,7 @@ class Cameras:
         return told
 
     def _flow(
-        self, eye: "_Eye", codes: np.ndarray, depth: np.ndarray, before: np.ndarray
+        self, eye: "_Eye", geoms: np.ndarray, depth: np.ndarray, before: np.ndarray
     ) -> np.ndarray:
         """Pixels by which what a pixel sees has moved since the poses before, right and down.
 
@@ -267,7 +273,7 @@ class Cameras:
         self._poses.restore(self.data, before)
         past, old = self._poses.frames(self.data), eye.lens(self.data)
         self._poses.restore(self.data, state)
-        bodies = np.append(0, self.model.geom_bodyid)[self._number(codes)]
+        bodies = np.append(0, self.model.geom_bodyid)[geoms]
         flow = np.zeros((*eye.size, 2), np.float32)
         stands = np.array_equal(lens.rotation, old.rotation)
         stands &= np.array_equal(lens.translation, old.translation)
@@ -280,7 +286,6 @@ class Cameras:
             start += old.rotation @ old_place + old.translation
             which = bodies == body
             was = seen[which] @ (turn @ lens.rotation.T).T + start  # in the camera's frame of then
-            was[was[:, 2] <= 0] = np.nan
             flow[which] = eye.middles[which] - old.pixels(was)
         return flow
 
@@ -334,8 +339,7 @@ class _Shot:
 
     rgb: np.ndarray | None = None
     depth: np.ndarray | None = None
-    codes: np.ndarray = np.zeros((0, 0, 3), np.uint8)
-    """Colours that are numbers of geoms, uint8 (H, W, 3)."""
+    geoms: np.ndarray = np.zeros((0, 0), np.int32)
     strips: Sequence[tuple[float, slice]] = ()
 
 
@@ -347,6 +351,10 @@ class _Eye:
     ) -> None:
         self.camera, self.size, self.optics = number, size, camera.optics
         self._matrix = _matrix(model, number, size)
+        self.numbers = np.zeros(0, np.int32)
+        """Of the geoms from 1, by their colours in pictures of objects."""
+        self.discs = own_discs(model, number) if camera.carried else np.zeros(0, int)
+        """Geoms that it sees through where objects are concerned."""
         distorts = any(self.optics.distortion)
         self.source = _Source(self._still, size) if distorts else None
         self.drawn = self.source.size if self.source else size

@@ -24,6 +24,7 @@ PAYLOAD: Final = "payload"
 """Of the body of the payload, which all drones of a world share."""
 _NEAREST: Final = 0.05  # Where drawing begins, over the vehicle's radius
 _THINNEST: Final = 0.04  # Thickness of a disc, over the height at which the lowest craft rests
+_PLAIN: Final = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that has that of its material
 _UNNAMED: Final = "unnamed"
 _COLOR: Final = {"gate": (0.96, 0.42, 0.08, 1.0), "disc": (0.13, 0.78, 0.52, 1.0)}
 
@@ -63,6 +64,16 @@ def drawn_model(
     nearest = _NEAREST * min(craft.radius for craft in crafts)
     model.vis.map.znear, model.vis.map.zfar = nearest / extent, FARTHEST / extent
     return model
+
+
+def own_discs(model: mujoco.MjModel, camera: int) -> np.ndarray:
+    """Numbers of the geoms of a camera's craft that are seen through, as its rotors' discs are."""
+    plain = (model.geom_rgba == _PLAIN).all(axis=1)
+    materials = np.append(model.mat_rgba[:, 3], 1.0)[model.geom_matid]
+    alpha = np.where(plain, materials, model.geom_rgba[:, 3])
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[model.cam_bodyid[camera]]
+    discs: np.ndarray = np.flatnonzero(own & (alpha < 1))
+    return discs
 
 
 def _add(body: Any, name: str, kind: Any, size: Sequence[float], **more: Any) -> None:

@@ -12,6 +12,7 @@ from rotorgram.envs.spec import Mark
 from rotorgram.models import InputError
 from rotorgram.models.cameras import FARTHEST, Camera, cameras_of, chosen_views
 from rotorgram.models.errors import NoOpenGL
+from rotorgram.models.export import export_mjcf
 from rotorgram.models.fleet import load_vehicles
 from rotorgram.models.library import vehicle_names
 from rotorgram.models.vehicle import Vehicle
@@ -115,14 +116,40 @@ def test_cameras_of_an_mjcf_file(tmp_path: Path) -> None:
         Vehicle.load(file)
 
 
-def test_an_orthographic_camera_is_refused(tmp_path: Path) -> None:
+def test_a_camera_without_perspective_is_none_of_ours(tmp_path: Path) -> None:
     text = Vehicle.load().path.read_text("utf-8")
     flat = '<camera name="flat" projection="orthographic" fovy="6"/>'
     start = text.index("<camera ")
     file = tmp_path / "own.xml"
     file.write_text(text[:start] + flat + text[start:], "utf-8")
-    with pytest.raises(InputError, match="camera flat: expected a perspective projection, got an"):
+    assert [one.name for one in Vehicle.load(file).cameras] == ["chase", "portrait"]
+
+
+@pytest.mark.parametrize(
+    ("lens", "sentence"),
+    [
+        ('fovy="0"', "camera eye: expected fovy from 0.0573 to 171.9 degrees, got 0"),
+        ('fovy="179.99"', "camera eye: expected fovy from 0.0573 to 171.9 degrees"),
+        ('sensorsize=".01 .01"', "camera eye: expected a focal length above 0 with its sensorsize"),
+        ('pos="1e300 0 0"', "camera eye: expected a position within 1e4 m"),
+    ],
+)
+def test_wrong_cameras_of_an_mjcf_file(tmp_path: Path, lens: str, sentence: str) -> None:
+    text = Vehicle.load().path.read_text("utf-8")
+    start = text.index("<camera ")
+    file = tmp_path / "own.xml"
+    eye = f'<camera name="eye" resolution="40 30" {lens}/>'
+    file.write_text(text[:start] + eye + text[start:], "utf-8")
+    with pytest.raises(InputError, match=sentence):
         Vehicle.load(file)
+
+
+def test_what_is_exported_has_its_cameras(made: Any, tmp_path: Path) -> None:
+    craft = vehicle_with(tmp_path, BELLY)
+    export_mjcf(craft.path, tmp_path / "own.xml")
+    same = Vehicle.load(tmp_path / "own.xml")
+    assert same.cameras == craft.cameras
+    assert take(made("belly", same), **state((0.0, 0.0, 1.0)))["belly"].std() > 1
 
 
 def test_every_vehicle_has_two() -> None:
@@ -134,7 +161,7 @@ def test_every_vehicle_has_two() -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ('name = "belly"', r"cameras\[1\].name: expected letters, digits and _, got None"),
+        ('name = "belly"', r"cameras\[1\].name: expected up to 64 letters, digits and _"),
         ('kinds = ["depth", "rgb"]', r"kinds: expected some of rgb, depth, segmentation, got"),
         ("fovy = 1.0", r"cameras\[1\].fovy: expected a number from 0.001 to 3 rad, got 4"),
         ("rate = 0.5", r"cameras\[1\].rate: expected 1 over a whole number of control steps"),
@@ -177,8 +204,9 @@ def test_words_choose_views(tmp_path: Path) -> None:
     }.items():
         with pytest.raises(InputError, match=sentence):
             chosen_views([word], cameras)
-    with pytest.raises(InputError, match="expected each picture once, got 'front' twice"):
-        chosen_views(["front", "front_rgb"], cameras)
+    assert len(chosen_views(["front", "front_rgb", "belly", "belly_depth"], cameras)) == 3
+    with pytest.raises(InputError, match="expected each picture in one size, got 'front' in two"):
+        chosen_views(["front", "front_rgb@8x8"], cameras)
 
 
 # ---- pictures
@@ -394,6 +422,24 @@ def test_different_vehicles_in_one_world(made: Any, tmp_path: Path) -> None:
         expected = 0.25 * craft.rest_height
         assert picture == pytest.approx(expected, rel=1e-3)
     assert (seen["down_segmentation"] == cameras.objects.index("scene/floor")).all()
+
+
+def test_a_camera_sees_through_its_own_discs(made: Any, tmp_path: Path) -> None:
+    """And not through those of others: above each of two craft is an eye, and one stands."""
+    eye = (
+        '[[cameras]]\nname = "eye"\nposition = [0.0, 0.0, 0.2]\nlook = [0, 0, -1]\nfovy = 1.0\n'
+        '[[cameras]]\nname = "lamp"\nposition = [0.0, 0.0, 1.2]\nlook = [0, 0, -1]\nfovy = 1.0\n'
+        "stands = true\n"
+    )
+    craft = vehicle_with(tmp_path, eye)
+    words = "eye@128x128 eye_segmentation@128x128 lamp_segmentation@128x128 lamp@128x128"
+    cameras = made(words, craft, shape=(1, 2))
+    seen = take(cameras, **state((0.0, 0.0, 1.0), (5.0, 0.0, 1.0)))
+    own, lamp = ((seen[f"{name}_segmentation"][0, ..., 0] == 2) for name in ("eye", "lamp"))
+    assert cameras.objects[2] == "drone_0"
+    assert lamp.sum() > 1.5 * own.sum() > 100  # with and without discs, from one place
+    assert np.abs(seen["eye"][0].astype(int) - seen["lamp"][0]).max() <= 1  # colours have them
+    assert (seen["eye_segmentation"][1, ..., 0] == 3).sum() == own.sum()
 
 
 def test_cameras_after_their_end(made: Any) -> None:

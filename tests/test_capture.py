@@ -14,9 +14,11 @@ import pytest
 from rotorgram.experiments import capture as capturing
 from rotorgram.experiments.capture import capture, label_file, objects_in, read_labels
 from rotorgram.experiments.capture_formats import category
+from rotorgram.experiments.pairs import socket_pair
 from rotorgram.experiments.settings import WorkersConfig
 from rotorgram.experiments.viewpoints import Plan
 from rotorgram.models import InputError
+from test_cameras import BELLY, vehicle_with
 
 Image = pytest.importorskip("PIL.Image")
 ONE = WorkersConfig(jobs=1)
@@ -95,7 +97,7 @@ def test_a_flight_gives_every_so_many_steps(tmp_path: Path) -> None:
         (("tilt = 0.5", "tilt = 4"), r"poses\[1\].tilt: expected 0 to 3.14159 rad, got 4"),
         (("tilt = 0.5", "tip = 4"), r"poses\[1\]: expected some of count, center, size, tilt"),
         (('from = "random"', 'from = "air"'), r"poses\[1\].from: expected 'random' or 'flight'"),
-        (("[4.0, 4.0, 2.0]", "[4.0]"), r"poses\[1\].size: expected three numbers, m, got \[4.0\]"),
+        (("[4.0, 4.0, 2.0]", "[4.0]"), r"poses\[1\].size: expected three numbers, m, from 0 to 1"),
         (
             ('env = "rotorgram/Landing-v0"', "env = 3"),
             r"\[2\].env: expected the id of a task, got 3",
@@ -103,6 +105,16 @@ def test_a_flight_gives_every_so_many_steps(tmp_path: Path) -> None:
         (("every = 40", "agent = 5"), r"\[2\].agent: expected a controller or a checkpoint, got 5"),
         (("{ episode_length = 100 }", "1"), r"poses\[2\].options: expected options by name, got 1"),
         (("down@32x24", "down@33x24"), "plan: down: expected even sizes, .* got 33x24"),
+        (("count = 5", "count = 5\nworld = 3"), "world: expected"),
+        (("[0.0, 0.0, 2.0]", "[0.0, 0.0, 0.5]"), r"\[1\]: expected a box above the ground, got"),
+        (
+            ("[0.0, 0.0, 2.0]", "[1e308, 0.0, 2.0]"),
+            r"\[1\].center: expected three numbers, m, from",
+        ),
+        (("[4.0, 4.0, 2.0]", "[-4.0, 4.0, 2.0]"), r"\[1\].size: expected three numbers, m, from 0"),
+        (('from = "random"', 'from = ["random"]'), r"\[1\].from: expected 'random' or 'flight'"),
+        (("seed = 7", "seed = 7\nleast_area = 0"), "plan: least_area: expected a number of pixels"),
+        (("seed = 7", "seed = " + "[" * 5000), "plan: expected a TOML file"),
         (("down@32x24", "rear"), "cameras: expected some of front, down"),
         (("seed = 7", "seed ="), "plan: expected a TOML file, got plan.toml"),
     ],
@@ -150,7 +162,7 @@ def captured(opengl: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_file_is_there(captured: Path) -> None:
-    labels = read_labels(captured)
+    labels = read_labels(captured, 8)
     assert [one["frame"] for one in labels] == list(range(8))
     for frame in labels:
         kinds = [(one["camera"], one["kind"]) for one in frame["pictures"]]
@@ -168,7 +180,8 @@ def test_every_file_is_there(captured: Path) -> None:
 
 
 def test_depth_in_millimetres_is_depth_in_metres(captured: Path) -> None:
-    for frame in read_labels(captured):
+    seen: set[bool] = set()
+    for frame in read_labels(captured, 8):
         depth, coded = (captured / file for file in frame["pictures"][1]["files"])
         meters = np.load(depth)
         with Image.open(coded) as image:
@@ -176,6 +189,8 @@ def test_depth_in_millimetres_is_depth_in_metres(captured: Path) -> None:
         near = meters <= 65.535
         assert np.abs(millimetres[near] - 1000 * meters[near]).max(initial=0) <= 0.51
         assert not millimetres[~near].any()
+        seen |= {*near.ravel().tolist()}
+    assert seen == {True, False}
 
 
 def test_boxes_are_those_of_the_pictures(captured: Path) -> None:
@@ -202,13 +217,17 @@ def test_boxes_are_those_of_the_pictures(captured: Path) -> None:
 
 def test_poses_bring_points_to_their_pixels(captured: Path) -> None:
     """KITTI's [R | t] and P against the lens of the labels, and that against the pad."""
-    lines = (captured / "poses" / "down_drone_0.txt").read_text().splitlines()
+    lines = []
+    for sequence, count in ((0, 5), (1, 3)):
+        file = captured / "poses" / f"{sequence:03}_down_drone_0.txt"
+        lines += file.read_text().splitlines()
+        assert len(lines) == 5 * sequence + count
     poses = np.array([[float(x) for x in line.split()] for line in lines]).reshape(8, 3, 4)
     key, *numbers = (captured / "calib.txt").read_text().splitlines()[0].split()
-    assert key == "P_down:"
+    assert key == "P_down_drone_0:"
     projection = np.array(numbers, float).reshape(3, 4)
     seen = 0
-    for frame, pose in zip(read_labels(captured), poses, strict=True):
+    for frame, pose in zip(read_labels(captured, 8), poses, strict=True):
         picture = frame["pictures"][2]
         pads = [one for one in picture["objects"] if one["name"].startswith("task/disc")]
         for pad in pads:
@@ -224,28 +243,45 @@ def test_poses_bring_points_to_their_pixels(captured: Path) -> None:
     assert seen
 
 
-def test_the_layout_of_lerobot(captured: Path) -> None:
+def test_the_layout_of_lerobot(captured: Path, tmp_path: Path) -> None:
     parquet: Any = pytest.importorskip("pyarrow.parquet")
     root = captured / "lerobot"
     info = json.loads((root / "meta" / "info.json").read_text())
-    assert (info["total_episodes"], info["total_frames"], info["fps"]) == (2, 8, 10.0)
-    rows = [
-        parquet.read_table(
-            root / info["data_path"].format(episode_chunk=0, episode_index=episode)
-        ).to_pylist()
-        for episode in range(2)
-    ]
-    assert [len(one) for one in rows] == [5, 3]
-    assert set(rows[0][0]) | {"observation.images.down"} == set(info["features"])
-    assert [row["index"] for one in rows for row in one] == list(range(8))
-    labels = read_labels(captured)
-    assert rows[1][2]["observation.state"][:3] == pytest.approx(labels[7]["pose"]["position"][0])
-    assert rows[1][2]["time"] == 1.6
+    # The flight alone: 100 steps, of which 0, 40 and 80 are taken, each with its action.
+    assert (info["total_episodes"], info["total_frames"], info["fps"]) == (1, 3, 10.0)
+    rows = parquet.read_table(
+        root / info["data_path"].format(episode_chunk=0, episode_index=0)
+    ).to_pylist()
+    assert set(rows[0]) | {"observation.images.down"} == set(info["features"])
+    assert [row["index"] for row in rows] == list(range(3))
+    labels = read_labels(captured, 8)
+    assert rows[2]["observation.state"][:3] == pytest.approx(labels[7]["pose"]["position"][0])
+    assert rows[2]["time"] == labels[7]["time"] == 1.6
+    _, walk = plan_of(tmp_path).walks()
+    assert walk.actions is not None
+    assert info["features"]["action"]["names"] == list(walk.components)
+    for row, action in zip(rows, walk.actions[:, 0], strict=True):
+        np.testing.assert_array_equal(row["action"], action.astype(np.float32))
+    assert len({*map(tuple, (row["action"] for row in rows))}) > 1
     video = info["video_path"].format(
-        episode_chunk=0, video_key="observation.images.down", episode_index=1
+        episode_chunk=0, video_key="observation.images.down", episode_index=0
     )
     ffmpeg: Any = pytest.importorskip("imageio_ffmpeg")
     assert ffmpeg.count_frames_and_secs(str(root / video))[0] == 3
+    (told,) = (root / "meta" / "episodes_stats.jsonl").read_text().splitlines()
+    spread = json.loads(told)["stats"]
+    assert spread.keys() == info["features"].keys()
+    pictures = [
+        np.asarray(Image.open(captured / "rgb" / "down" / f"{i:06}.png")) / 255 for i in (5, 6, 7)
+    ]
+    own = spread["observation.images.down"]
+    assert np.shape(own["mean"]) == (3, 1, 1)
+    for name in ("mean", "std", "min", "max"):
+        expected = getattr(np, name)(pictures, axis=(0, 1, 2))
+        np.testing.assert_allclose(np.ravel(own[name]), expected, atol=1e-9)
+    places = np.array([row["observation.state"] for row in rows])
+    np.testing.assert_allclose(spread["observation.state"]["std"], places.std(axis=0), atol=1e-6)
+    assert spread["action"]["count"] == [3]
 
 
 def test_it_is_the_same_again_and_goes_on(captured: Path, tmp_path: Path) -> None:
@@ -256,34 +292,139 @@ def test_it_is_the_same_again_and_goes_on(captured: Path, tmp_path: Path) -> Non
     whole = contents(captured)
     whole.pop("plan.toml")
     assert {k: v for k, v in contents(folder).items() if k != "plan.toml"} == whole
-    kept = folder / "rgb" / "down" / "000001.png"
-    kept.write_bytes(whole["rgb/down/000000.png"])
+    kept, other = folder / "rgb" / "down" / "000001.png", bytearray(whole["rgb/down/000001.png"])
+    other[other.index(b"IEND") + 5] ^= 1  # of the same size, and a picture
+    kept.write_bytes(other)
     for number in (2, 7):
         label_file(folder, number).unlink()
     (folder / "rgb" / "down" / "000003.png").unlink()
+    cut = folder / "segmentation" / "down" / "000004.png"
+    cut.write_bytes(cut.read_bytes()[:-9])
     capture(plan_of(tmp_path), folder, ONE)
-    assert kept.read_bytes() == whole["rgb/down/000000.png"]
+    assert kept.read_bytes() == other
     kept.write_bytes(whole["rgb/down/000001.png"])
     told = contents(folder)
-    for name in ("labels/000003.json", "rgb/down/000003.png", "labels/000007.json", "coco.json"):
-        assert told[name] == whole[name]
-    assert told["flow/front/000007.npy"] == whole["flow/front/000007.npy"]
+    told.pop("plan.toml")
+    assert told == whole
 
 
-@pytest.mark.parametrize("text", ['{"frame"', "[]", '{"frame": 1}'])
-def test_labels_that_were_altered(captured: Path, tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize(
+    "text",
+    ['{"frame"', "[]", '{"frame": 1}', '{"pictures": 3}', '{"pictures": [{}]}', "[" * 9000,
+     '{"pictures": []}'],
+)  # fmt: skip
+def test_labels_that_were_altered_are_made_again(captured: Path, tmp_path: Path, text: str) -> None:
     folder = tmp_path / "altered"
     shutil.copytree(captured, folder)
     label_file(folder, 1).write_text(text)
-    with pytest.raises(InputError, match=r"000001.json: expected labels of a frame, got"):
-        capture(plan_of(tmp_path), folder, ONE)
-    label_file(folder, 1).unlink()
+    (folder / "labels" / "000099.json").write_text("of no frame")
     assert capture(plan_of(tmp_path), folder, ONE) == 8
+    assert label_file(folder, 1).read_bytes() == label_file(captured, 1).read_bytes()
+    assert (folder / "coco.json").read_bytes() == (captured / "coco.json").read_bytes()
 
 
 def test_a_folder_of_another_plan(captured: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected a folder of the same plan, got one of another"):
+    with pytest.raises(InputError, match="expected a folder of the same plan, got one of other"):
         capture(plan_of(tmp_path, PLAN.replace("seed = 7", "seed = 9")), captured, ONE)
+
+
+def test_a_folder_of_another_vehicle(captured: Path, tmp_path: Path) -> None:
+    """The same plan; the file that it names was changed since."""
+    own = vehicle_with(tmp_path, BELLY).path
+    text = PLAN.replace('"crazyflie2"', f'"{own}"').replace("down@32x24", "belly@32x24")
+    plan = plan_of(tmp_path, text.replace("down_", "belly_"))
+    folder = tmp_path / "out"
+    folder.mkdir()
+    assert capture(plan, folder, ONE) == 8
+    own.write_text(own.read_text("utf-8").replace("fovy = 1.0", "fovy = 1.1"), "utf-8")
+    with pytest.raises(InputError, match="expected a folder of the same vehicle, flights and MuJ"):
+        capture(plan, folder, ONE)
+
+
+def test_several_drones_and_a_camera_that_stands(opengl: None, tmp_path: Path) -> None:
+    own = vehicle_with(tmp_path, BELLY).path
+    text = f"""
+    vehicle = "{own}"
+    cameras = ["front@16x16", "front_segmentation@8x8", "tower@16x16", "tower_segmentation@16x16"]
+    least_area = 2
+    [[poses]]
+    from = "random"
+    count = 1
+    [[poses]]
+    from = "flight"
+    env = "rotorgram/Formation-v0"
+    drones = 2
+    every = 30
+    options = {{ episode_length = 60 }}
+    """
+    folder = tmp_path / "out"
+    folder.mkdir()
+    assert capture(plan_of(tmp_path, text), folder, ONE) == 4
+    names = {path.name for path in (folder / "rgb" / "tower").iterdir()}
+    assert names == {f"{i:06}.png" for i in range(4)}
+    names = {path.name for path in (folder / "rgb" / "front").iterdir()}
+    assert names == {"000000.png"} | {f"{i:06}_{k}.png" for i in (1, 2, 3) for k in (0, 1)}
+    told = json.loads((folder / "coco.json").read_text())
+    for image in told["images"]:
+        with Image.open(folder / image["file_name"]) as file:
+            assert file.size == (image["width"], image["height"])
+    assert {image["file_name"].split("/")[0] for image in told["images"]} == {"rgb", "segmentation"}
+    assert all(one["area"] >= 2 and one["iscrowd"] == 0 for one in told["annotations"])
+    kinds = [kind["name"] for kind in told["categories"]]
+    assert kinds == sorted(kinds)
+    assert {"drone", "scene/floor"} <= {*kinds}
+    lines = {path.name: len(path.read_text().splitlines()) for path in folder.glob("poses/*.txt")}
+    assert lines == {
+        "000_front_drone_0.txt": 1, "000_tower_drone_0.txt": 1, "001_front_drone_0.txt": 3,
+        "001_front_drone_1.txt": 3, "001_tower_drone_0.txt": 3,
+    }  # fmt: skip
+    episodes = (folder / "lerobot" / "meta" / "episodes.jsonl").read_text().splitlines()
+    assert [json.loads(line)["length"] for line in episodes] == [2, 2]  # not the end
+
+
+def test_a_journal_of_another_vehicle(tmp_path: Path) -> None:
+    journal = tmp_path / "flight.mcap"
+    with socket_pair("rotorgram/Hover-v0", record=journal) as env:
+        env.reset(seed=1)
+        for _ in range(4):
+            env.step(env.action_space.sample())
+    text = f"""
+    cameras = ["front@16x16"]
+    [[poses]]
+    from = "journal"
+    file = "{journal}"
+    every = 2
+    """
+    (walk,) = plan_of(tmp_path, text).walks()
+    assert len(walk) == 3
+    assert walk.actions is not None
+    assert np.isnan(walk.actions[:, 0]).all(axis=1).tolist() == [False, False, True]
+    with pytest.raises(InputError, match=r"plan: vehicle: expected .*, which flies in "):
+        plan_of(tmp_path, 'vehicle = "crazyflie2"\n' + text).walks()
+
+
+def test_a_task_of_a_module_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine.py").write_text(
+        "from rotorgram.envs import register\n"
+        "from rotorgram.envs.tasks.hover import Hover\n"
+        "class Mine(Hover):\n    pass\n"
+        'register("mine/Captured-v0", Mine)\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    text = """
+    [[poses]]
+    from = "flight"
+    env = "mine:mine/Captured-v0"
+    every = 50
+    options = { episode_length = 100 }
+    """
+    (walk,) = plan_of(tmp_path, text).walks()
+    assert walk.times.tolist() == [0.0, 1.0, 2.0]
+    assert walk.velocity is not None
+    assert walk.body_rates is not None
+    assert not walk.velocity[0].any()
+    assert walk.velocity[1:].any()
+    assert walk.body_rates[1:].any()
 
 
 def test_a_full_disk_loses_nothing(
@@ -306,9 +447,9 @@ def test_a_full_disk_loses_nothing(
     for file in (folder / "labels").glob("*.json"):
         for one in json.loads(file.read_text())["pictures"]:
             assert all((folder / name).is_file() for name in one["files"])
-    assert not list(folder.rglob("*.part"))
+    assert not list(folder.rglob("*.tmp"))
     assert capture(plan_of(tmp_path), folder, ONE) == 8
-    assert len(read_labels(folder)) == 8
+    assert len(read_labels(folder, 8)) == 8
 
 
 def test_flow_is_since_the_pose_before(captured: Path) -> None:
