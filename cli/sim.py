@@ -57,6 +57,10 @@ class Sim(BackendFlags):
 
     def run(self) -> int:
         """Simulate until the agent closes."""
+        if self.options.get("cameras"):  # an agent that was greeted would wait for pictures
+            from ..rendering.gl import offscreen_context
+
+            offscreen_context(16, 16).free()
         if "agents" in self.given:
             return self._run_shared()
         for name in ("when_lost", "patience"):

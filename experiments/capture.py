@@ -79,8 +79,6 @@ def capture(
             _keep(folder / name, content.encode())
         for left in folder.rglob(".*.tmp"):  # by a run that was killed
             left.unlink()
-        for name in ("rgb", "depth", "segmentation", LABELS):
-            (folder / name).mkdir(exist_ok=True)
         jobs = {
             f"frames {job.first} to {job.first + len(job.walk) - job.before - 1}": job
             for job in _jobs(plan, walks, views, folder, config.jobs or os.cpu_count() or 1)

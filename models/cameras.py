@@ -199,10 +199,10 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
     mujoco.mj_comPos(model, data)
     mujoco.mj_camlight(model, data)
     modes, perspective = mujoco.mjtCamLight, mujoco.mjtProjection.mjPROJ_PERSPECTIVE
-    targets = modes.mjCAMLIGHT_TARGETBODY, modes.mjCAMLIGHT_TARGETBODYCOM
+    targets = modes.mjCAMLIGHT_TARGETBODY.value, modes.mjCAMLIGHT_TARGETBODYCOM.value
     for number in range(model.ncam):
         one = model.camera(number)
-        usable = is_name(one.name) and model.cam_projection[number] == perspective
+        usable = is_name(one.name) and model.cam_projection[number] == perspective.value
         if not usable or model.cam_mode[number] in targets:
             continue
         _check_numbers(f"camera {one.name}", model, number)
@@ -228,7 +228,7 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
                 fovy=math.radians(float(model.cam_fovy[number])),
                 kinds=tuple(kind for kind, bit in OUTPUTS.items() if output & bit) or ("rgb",),
                 every=steps_of(f"camera {one.name}", rate),
-                carried=bool(mine and model.cam_mode[number] == modes.mjCAMLIGHT_FIXED),
+                carried=bool(mine and model.cam_mode[number] == modes.mjCAMLIGHT_FIXED.value),
                 position=_vector(data.cam_xpos[number]),
                 look=_vector(-axes[:, 2]),
                 up=_vector(axes[:, 1]),

@@ -65,6 +65,7 @@ def build_swarm(
     """
     spec = build_scene(vehicles[0], world, visual=visual)
     spec.delete(free_body(spec))
+    _drop_targets(spec)
     for path, name in zip(vehicles, names, strict=True):
         attach_craft(spec, path, f"{name}/")
     return spec
@@ -74,7 +75,16 @@ def attach_craft(spec: mujoco.MjSpec, vehicle: Path, prefix: str, place: Any = (
     """Add a file's craft, its names with a prefix; step and gravity are those of the scene."""
     own = read_spec(vehicle)  # as long as it has a name, its craft lives
     own.option.timestep, own.option.gravity = spec.option.timestep, spec.option.gravity
+    _drop_targets(own)
     spec.worldbody.add_frame(pos=place).attach_body(free_body(own), prefix, "")
+
+
+def _drop_targets(spec: mujoco.MjSpec) -> None:
+    """Delete the cameras that turn to a body, whose name becomes another in a swarm."""
+    modes = mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM
+    for camera in list(spec.cameras):
+        if camera.mode in modes:
+            spec.delete(camera)
 
 
 def free_body(spec: mujoco.MjSpec) -> mujoco.MjsBody:

@@ -116,13 +116,24 @@ def test_cameras_of_an_mjcf_file(tmp_path: Path) -> None:
         Vehicle.load(file)
 
 
-def test_a_camera_without_perspective_is_none_of_ours(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [
+        'name="flat" projection="orthographic" fovy="6"',
+        'name="turning" mode="targetbody" target="world"',
+        'name="../out"',
+        'name="a@b"',
+        "",
+    ],
+)
+def test_cameras_that_are_left_out(made: Any, tmp_path: Path, words: str) -> None:
     text = Vehicle.load().path.read_text("utf-8")
-    flat = '<camera name="flat" projection="orthographic" fovy="6"/>'
     start = text.index("<camera ")
     file = tmp_path / "own.xml"
-    file.write_text(text[:start] + flat + text[start:], "utf-8")
+    file.write_text(f"{text[:start]}<camera {words}/>{text[start:]}", "utf-8")
     assert [one.name for one in Vehicle.load(file).cameras] == ["chase", "portrait"]
+    seen = take(made("front", file, shape=(1, 2)), **state((0.0, 0.0, 3.0), (4.0, 0.0, 3.0)))
+    assert seen["front"].std() > 1
 
 
 @pytest.mark.parametrize(

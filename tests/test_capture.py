@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -458,6 +459,30 @@ def test_flow_is_since_the_pose_before(captured: Path) -> None:
     assert not flows[5].any()  # the first of the flight
     assert all(flow.any() for flow in (flows[1], flows[6], flows[7]))
     assert math.isfinite(float(np.abs(flows[7]).max()))
+
+
+def test_one_ctrl_c_ends_it(opengl: None, tmp_path: Path) -> None:
+    """With workers that have much left to do; what they made is kept, each file whole."""
+    plan = PLAN.replace("count = 5", "count = 3000").replace("tilt = 0.5", "tilt = 0.5\n")
+    (tmp_path / "plan.toml").write_text(plan, "utf-8")
+    line = [sys.executable, "-m", "rotorgram.cli", "capture", "plan.toml", "--out", "out"]
+    told: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(
+        [*line, "--jobs", "2"], cwd=tmp_path, start_new_session=True, **told
+    ) as process:
+        deadline = time.monotonic() + 90
+        while len(list((tmp_path / "out" / "labels").glob("*.json"))) < 5:
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert error.endswith("rotorgram: interrupted\n")
+    for file in (tmp_path / "out" / "labels").glob("*.json"):
+        for one in json.loads(file.read_text())["pictures"]:
+            sizes = {name: (tmp_path / "out" / name).stat().st_size for name in one["files"]}
+            assert sizes == one["files"]
 
 
 def test_a_run_that_is_killed_goes_on(captured: Path, tmp_path: Path) -> None:

@@ -165,6 +165,21 @@ def test_pictures_of_the_backend_rigid(opengl: None, tensors: bool) -> None:
             assert len(np.unique(pictures)) > 20
 
 
+def test_a_simulator_that_cannot_draw_says_so_before_it_greets() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as agent:
+        agent.bind(("127.0.0.1", 0))
+        line = ["sim", "--server", f"127.0.0.1:{agent.getsockname()[1]}", "--env", HOVER]
+        done = subprocess.run(
+            [sys.executable, "-m", "rotorgram.cli", *line, "--env.cameras", "front"],
+            env={**os.environ, "MUJOCO_GL": "disable"}, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == 2
+        assert "OpenGL: expected EGL" in done.stderr
+        agent.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            agent.recv(9)
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
