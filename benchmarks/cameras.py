@@ -3,10 +3,12 @@
     python benchmarks/cameras.py [--seconds 1] [--repeats 7] [--out FILE.json]
     python benchmarks/cameras.py --sheet FILE.png    pictures of every kind, to look at
     python benchmarks/cameras.py --worlds FILE.png   worlds of two seeds each
+    python benchmarks/cameras.py --optics FILE.png   what a camera does beyond a pinhole's
 
-Each case draws the plain world with a Crazyflie from its camera `front`. `mujoco.Renderer` draws
-the same model without shadows and smooth edges, and gives the same kind; it has no optical flow:
-there ours is beside its depth. Cases take turns within a repeat, medians are told.
+Unless told otherwise a case draws the plain world with a Crazyflie from its camera `front`.
+`mujoco.Renderer` draws the same model without shadows and smooth edges, and gives the same kind; it
+has no optical flow: there ours is beside its depth. Cases take turns within a repeat, medians are
+told.
 """
 
 import json
@@ -14,8 +16,10 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # which MuJoCo's renderer needs before it is imported
@@ -38,19 +42,43 @@ SIZES = ((64, 64), (128, 128), (320, 240))
 EPISODE = 100_000  # control steps: none ends while it is measured
 
 Step = Callable[[], object]
+Times = dict[str, float]
+WORLDS = ("plain", "airport", *SEEDED_WORLDS)
 
 
-def ours(kind: str, width: int, height: int) -> tuple[Step, Cameras]:
-    """A picture of a craft that moves a little from one to the next."""
-    vehicle = Vehicle.load(VEHICLE)
-    views = chosen_views([f"front_{kind}@{width}x{height}"], cameras_of(vehicle))
-    cameras, everybody = Cameras(vehicle, views), np.ones(1, bool)
+OPTICS = {
+    "pinhole": "",
+    "distortion": "distortion = [-0.25, 0.05, 0.001, -0.0005, 0.0]",
+    "noise": "exposure = 0.3\nnoise = [0.05, 0.02]",
+    "readout": "readout = 0.03",
+}
+
+
+def optical(folder: str) -> Vehicle:
+    """A Crazyflie with a camera for each of `OPTICS`, where its `front` is."""
+    text = Vehicle.load(VEHICLE).path.read_text("utf-8")
+    front = next(one for one in cameras_of(Vehicle.load(VEHICLE)) if one.name == "front")
+    for name, words in OPTICS.items():
+        place = [float(part) for part in front.position]
+        text += f'\n[[cameras]]\nname = "{name}"\nposition = {place}\n{words}\n'
+    file = Path(folder) / "optical.toml"
+    file.write_text(text, "utf-8")
+    return Vehicle.load(file)
+
+
+def ours(word: str, world: str = "plain", vehicle: Vehicle | None = None) -> tuple[Step, Cameras]:
+    """A picture of a craft that flies and yaws, a little further from one to the next."""
+    vehicle = vehicle or Vehicle.load(VEHICLE)
+    views = chosen_views([word], cameras_of(vehicle))
+    cameras, everybody = Cameras(vehicle, views, world=world), np.ones(1, bool)
     place, turn = np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0, 0.0]])
-    due = {views[0].name: everybody}
+    speeds = {"velocity": np.array([[3.0, 0.0, 0.0]]), "body_rates": np.array([[0.0, 0.0, 2.0]])}
+    due, dice = {views[0].name: everybody}, {0: np.random.default_rng(0)}
 
     def step() -> None:
         place[0, 0] += 1e-3
-        cameras.take(due, ~everybody, {"position": place, "quaternion": turn})
+        state = {"position": place, "quaternion": turn, **speeds}
+        cameras.take(due, ~everybody, state, dice.__getitem__)
 
     step()
     return step, cameras
@@ -81,7 +109,7 @@ def pictures(seconds: float, repeats: int) -> list[dict[str, Any]]:
     rows = []
     for width, height in SIZES:
         for kind in KINDS:
-            here, cameras = ours(kind, width, height)
+            here, cameras = ours(f"front_{kind}@{width}x{height}")
             cases = {"ours": here, "theirs": theirs(kind, width, height, cameras)}
             taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)))
             cameras.close()
@@ -96,6 +124,47 @@ def pictures(seconds: float, repeats: int) -> list[dict[str, Any]]:
                 }
             )
     return rows
+
+
+def milliseconds(cases: dict[str, tuple[Step, Cameras]], seconds: float, repeats: int) -> Times:
+    """Of a picture of each case, in turns."""
+    steps = {name: step for name, (step, _) in cases.items()}
+    taken = medians(in_turns(steps, repeats, lambda step: timed(step, seconds)))
+    for _, cameras in cases.values():
+        cameras.close()
+    return {name: round(1e3 * time, 2) for name, time in taken.items()}
+
+
+def surroundings(seconds: float, repeats: int) -> dict[str, Times]:
+    """Milliseconds of a picture of 64 x 64 in each world, by kind."""
+    return {
+        kind: milliseconds(
+            {world: ours(f"front_{kind}", world) for world in WORLDS}, seconds, repeats
+        )
+        for kind in ("rgb", "depth")
+    }
+
+
+def lenses(seconds: float, repeats: int) -> Times:
+    """Milliseconds of colours of 128 x 128 by what the camera does beyond a pinhole's."""
+    with TemporaryDirectory() as folder:
+        craft = optical(folder)
+        cases = {name: ours(f"{name}@128x128", "plain", craft) for name in OPTICS}
+    return milliseconds(cases, seconds, repeats)
+
+
+def threads(seconds: float, repeats: int) -> dict[str, float]:
+    """Pictures per second of 64 x 64 by two pairs of cameras: in one thread, and in two."""
+    each = [ours("front_rgb") for _ in range(2)]
+    with ThreadPoolExecutor(2) as pool:
+        cases: dict[str, Step] = {
+            "one thread": lambda: [step() for step, _ in each],
+            "two threads": lambda: [*pool.map(lambda one: one[0](), each)],
+        }
+        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)))
+    for _, cameras in each:
+        cameras.close()
+    return {name: round(2 / time, 1) for name, time in taken.items()}
 
 
 def steps(drones: int, seconds: float, repeats: int) -> dict[str, float]:
@@ -168,6 +237,26 @@ def sheet(path: Path) -> None:
     image.imsave(path, np.vstack(rows))
 
 
+def optics(path: Path) -> None:
+    """Gates by a pinhole, by a lens that distorts, with noise, and read row by row in a turn."""
+    from PIL import Image
+
+    with TemporaryDirectory() as folder:
+        vehicle = optical(folder)
+        views = chosen_views([f"{name}@320x240" for name in OPTICS], cameras_of(vehicle))
+        cameras, everybody = Cameras(vehicle, views, world="gates:2"), np.ones(1, bool)
+    state = {
+        "position": np.array([[0.0, 0.0, 5.0]]),
+        "quaternion": np.array([[1.0, 0.0, 0.0, 0.0]]),
+        "body_rates": np.array([[0.0, 0.0, 6.0]]),
+    }
+    dice = {0: np.random.default_rng(1)}
+    cameras.take(dict.fromkeys(OPTICS, everybody), everybody, state, dice.__getitem__)
+    row = np.hstack([cameras.pictures[name][0] for name in OPTICS])
+    Image.fromarray(row).quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+    cameras.close()
+
+
 def worlds(path: Path) -> None:
     """Two seeds of each world that is made from one: from behind the paper's craft, and ahead."""
     from PIL import Image
@@ -190,10 +279,13 @@ def worlds(path: Path) -> None:
 
 def main() -> None:
     """Measure, print and write."""
-    args = options(__doc__, seconds=1.0, repeats=7, out=Path, sheet=Path, worlds=Path).parse_args()
-    if args.sheet or args.worlds:
-        (sheet if args.sheet else worlds)(args.sheet or args.worlds)
-        return
+    drawings = {"sheet": sheet, "worlds": worlds, "optics": optics}
+    files = dict.fromkeys(drawings, Path)
+    args = options(__doc__, seconds=1.0, repeats=7, out=Path, **files).parse_args()
+    for name, draw in drawings.items():
+        if file := getattr(args, name):
+            draw(file)
+            return
     rows = pictures(args.seconds, args.repeats)
     print("| kind | pixels | pictures/s | of `mujoco.Renderer` | ratio |")
     print("|---|---|---:|---:|---:|")
@@ -207,8 +299,28 @@ def main() -> None:
     for name in taken["16"]:
         told = (f"{one[name]:.2f}" if name in one else "–" for one in taken.values())
         print(f"| {name} | " + " | ".join(told) + " |")
+    around = surroundings(args.seconds, args.repeats)
+    print("| ms of a picture of 64 × 64 | " + " | ".join(WORLDS) + " |")
+    print("|---|" + "---:|" * len(WORLDS))
+    for kind, told in around.items():
+        print(f"| {kind} | " + " | ".join(f"{told[world]:.1f}" for world in WORLDS) + " |")
+    beyond = lenses(args.seconds, args.repeats)
+    print("| ms of colours of 128 × 128 | " + " | ".join(beyond) + " |")
+    print("|---|" + "---:|" * len(beyond))
+    print("| | " + " | ".join(f"{time:.1f}" for time in beyond.values()) + " |")
+    side_by_side = threads(args.seconds, args.repeats)
+    print(f"pictures per second of two cameras: {side_by_side}")
     if args.out:
-        write(args.out, {"pictures": rows, "milliseconds of a step": taken})
+        write(
+            args.out,
+            {
+                "pictures": rows,
+                "milliseconds of a step": taken,
+                "milliseconds by world": around,
+                "milliseconds by optics": beyond,
+                "pictures per second of two cameras": side_by_side,
+            },
+        )
 
 
 if __name__ == "__main__":
