@@ -13,6 +13,7 @@ from typing import Any, Final
 import gymnasium as gym
 import numpy as np
 
+from ..models import scenes_of
 from ..models.errors import InputError, NotCopied, expect
 from ..models.fleet import Fleet, load_vehicles
 from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
@@ -40,7 +41,7 @@ from ..sim.sensors import Sensors, readings_of
 from . import registry
 from .autoreset import Seeds, checked_seeds, worlds_done
 from .delay import Delay
-from .sights import Sights, arrays_of, views_of
+from .sights import Sights, arrays_of, objects_of_all, views_of
 from .spec import ArraySpec, Discrete, EnvSpec, canonical_id
 from .tasks.task import Outcome, Task
 
@@ -160,8 +161,9 @@ def _pictures(task: Task, drones: int) -> tuple[ArraySpec, ...]:
         return arrays_of(views, ())
     from ..rendering.seen import objects_of
 
-    hung, world = bool(task.effects.get("payload")), task.options.world
-    return arrays_of(views, objects_of(task.vehicle, drones, world, task.marks, payload=hung))
+    hung, scenes = bool(task.effects.get("payload")), scenes_of(task.options.world)
+    objects = [objects_of(task.vehicle, drones, one, task.marks, payload=hung) for one in scenes]
+    return arrays_of(views, objects_of_all(objects))
 
 
 def _repeated(array: ArraySpec, count: int) -> ArraySpec:

@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from ..models import scenes_of
 from ..models.cameras import FARTHEST, View, cameras_of, chosen_views
 from ..models.errors import expect
 from ..models.fleet import members_of
 from ..sim import Array, WorldState, on_host
-from ..sim.random import CAMERAS, Streams
+from ..sim.random import CAMERAS, SCENES, Streams
 from .spec import ArraySpec
 from .tasks.task import Task
 
@@ -52,31 +53,45 @@ def arrays_of(views: Sequence[View], objects: Sequence[str]) -> tuple[ArraySpec,
     )
 
 
+def objects_of_all(scenes: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """Names of the objects of several scenes, each once, in the order in which they come."""
+    return tuple(dict.fromkeys(name for names in scenes for name in names))
+
+
 class Sights:
     """The cameras of a loop's drones."""
 
     def __init__(self, task: Task, shape: tuple[int, int]) -> None:
         from ..rendering.cameras import Cameras
 
-        self._task, self._rows, self._drones = task, shape[0] * shape[1], shape[1]
-        self._streams = Streams(shape[0], CAMERAS)
+        self._task, self._shape, self._rows = task, shape, shape[0] * shape[1]
+        self._noise, self._draws = Streams(shape[0], CAMERAS), Streams(shape[0], SCENES)
         self.views = views_of(task, shape[1])
-        self._cameras: Cameras = Cameras(
-            task.vehicle,
-            self.views,
-            shape,
-            world=task.options.world,
-            marks=task.marks,
-            payload=bool(task.effects.get("payload")),
-        )
+        self._scenes = [
+            Cameras(
+                task.vehicle, self.views, shape, world=scene, marks=task.marks,
+                payload=bool(task.effects.get("payload")),
+            )
+            for scene in scenes_of(task.options.world)
+        ]  # fmt: skip
+        self._scene = np.zeros(shape[0], int)  # of each world
         self._goes = any(mark.moves for mark in task.marks)
-        self.arrays = arrays_of(self.views, self._cameras.objects)
-        self.close = self._cameras.close
+        names = objects_of_all([scene.objects for scene in self._scenes])
+        self._objects = [np.array([names.index(x) for x in one.objects], np.int32)
+                         for one in self._scenes]  # fmt: skip
+        self.arrays = arrays_of(self.views, names)
+
+    def close(self) -> None:
+        """Free what draws. A second call does nothing."""
+        for scene in self._scenes:
+            scene.close()
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
-        """Seed the noise of the drones of a mask, bool, shape (N,); seeds (N,)."""
-        ids = np.flatnonzero(_rows(mask, self._rows)[:: self._drones]).tolist()
-        self._streams.seed(ids, [seeds[world * self._drones] for world in ids])
+        """Seed noise and scenes of the drones of a mask, bool, shape (N,); seeds (N,)."""
+        drones = self._shape[1]
+        ids = np.flatnonzero(_rows(mask, self._rows)[::drones]).tolist()
+        for streams in (self._noise, self._draws):
+            streams.seed(ids, [seeds[world * drones] for world in ids])
 
     def look(
         self, state: WorldState, steps: Array, flown: Array | None, begun: Array | None
@@ -101,10 +116,21 @@ class Sights:
         if self._goes:
             told["goal"] = self._task.goal(state)
         rows = {name: _rows(values, n) for name, values in told.items()}
-        self._cameras.take(due, fresh, rows, self._streams.of)
         pictures: dict[str, Array] = {
-            name: picture.copy() for name, picture in self._cameras.pictures.items()
+            view.name: np.empty((n, *view.shape), view.dtype) for view in self.views
         }
+        if len(self._scenes) > 1:
+            for world in np.flatnonzero(fresh.reshape(self._shape).any(axis=1)).tolist():
+                self._scene[world] = self._draws.of(world).integers(len(self._scenes))
+        for number, (scene, objects) in enumerate(zip(self._scenes, self._objects, strict=True)):
+            worlds = self._scene == number
+            if not worlds.any():
+                continue
+            scene.take(due, fresh, rows, self._noise.of, worlds)
+            mine = np.repeat(worlds, self._shape[1])
+            for view in self.views:
+                seen = scene.pictures[view.name][mine]
+                pictures[view.name][mine] = objects[seen] if view.kind == "segmentation" else seen
         xp = self._task.xp
         if xp is np:
             return pictures

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AIRPORT_XML", "BACKENDS", "MAX_DRONES", "MOST_DRAG", "QUAD_XML", "SCENE_XML", "SEEDED_WORLDS",
     "WORLDS", "Backend", "InputError", "MissingPackage", "Rotor", "Vehicle", "attach_airport",
-    "build_scene", "parse_world",
+    "build_scene", "parse_world", "scenes_of",
 ]  # fmt: skip
 
 QUAD_XML: Final = Path(__file__).parent / "quad.xml"
@@ -35,6 +35,8 @@ WORLDS: Final = ("plain", "airport", "forest", "warehouse", "gates")
 """Surroundings of the vehicle, which pictures show and physics does not know."""
 SEEDED_WORLDS: Final = WORLDS[2:]
 """Those that are made from a seed."""
+MOST_SCENES: Final = 64
+"""Most seeds of a world from which episodes get theirs."""
 MAX_DRONES: Final = 1024
 """Most drones of a world."""
 MOST_DRAG: Final = 100.0
@@ -51,6 +53,19 @@ def parse_world(text: str) -> tuple[str, int]:
     right = name in WORLDS and (not colon or (name in SEEDED_WORLDS and seed >= 0))
     expect(right, "world", expected, repr(text))
     return name, max(seed, 0)
+
+
+def scenes_of(text: str) -> tuple[str, ...]:
+    """The worlds of which an episode gets one: one by seed of NAME:FIRST-LAST, or the one named."""
+    name, _, numbers = text.partition(":") if isinstance(text, str) else (text, "", "")
+    first, dash, last = numbers.partition("-")
+    if not dash:
+        parse_world(text)
+        return (text,)
+    ends = [parse_world(f"{name}:{end}")[1] for end in (first, last)]
+    right = 0 <= ends[1] - ends[0] < MOST_SCENES
+    expect(right, "world", f"up to {MOST_SCENES} seeds, as 'forest:0-7'", repr(text))
+    return tuple(f"{name}:{seed}" for seed in range(ends[0], ends[1] + 1))
 
 
 def __getattr__(name: str) -> Any:

@@ -103,6 +103,7 @@ class Cameras:
         fresh: np.ndarray,
         state: Mapping[str, np.ndarray],
         dice: Callable[[int], np.random.Generator] | None = None,
+        of: np.ndarray | None = None,
     ) -> None:
         """Take pictures of the worlds as they are.
 
@@ -113,7 +114,7 @@ class Cameras:
         and `payload` (N, 3): MuJoCo's world frame, m. Rows that are read earlier show where craft
         were by their `velocity` (N, 3), m/s, and `body_rates` (N, 3), rad/s, if it has those.
         `flow` is since the last call. `dice` gives the generator of a world's noise; without it
-        there is none.
+        there is none. `of` has the worlds that are looked at, bool, shape (W,); None: all.
         """
         worlds, drones = self._shape
         of_world = {name: np.reshape(mask, (worlds, drones)) for name, mask in due.items()}
@@ -122,7 +123,7 @@ class Cameras:
         first = fresh.reshape(worlds, drones).max(axis=1)
         with self._drawing.current():
             for world in range(worlds):
-                if not (needed[world] or flows):
+                if not (needed[world] or flows) or not (of is None or of[world]):
                     continue
                 rows = slice(world * drones, (world + 1) * drones)
                 self._poses.set(self.data, {name: x[rows] for name, x in state.items()})

@@ -22,6 +22,8 @@ SENSORS: Final = 3
 """Child of the sensors; each of them has a child of it."""
 CAMERAS: Final = 4
 """Child of the noise of pictures."""
+SCENES: Final = 5
+"""Child that draws what surrounds an episode."""
 
 _ROWS: Final = 256  # Most rows of numbers that a stream gives at once
 _NUMBERS: Final = 1 << 23  # Most numbers that all streams of a `Noise` give at once: 64 MiB

@@ -165,6 +165,40 @@ def test_pictures_of_the_backend_rigid(opengl: None, tensors: bool) -> None:
             assert len(np.unique(pictures)) > 20
 
 
+def test_each_episode_has_a_world_of_its_own(opengl: None) -> None:
+    """One of those that are told, by the seed; the same alone, in a batch and over UDP."""
+    options: dict[str, Any] = {
+        "cameras": "front@32x24,front_segmentation@32x24", "world": "warehouse:0-2",
+        "action": "velocity", "episode_length": 2,
+    }  # fmt: skip
+    seeds, still = [3, 4, 5, 6], np.zeros((4, 4), np.float32)
+    with closing(LocalVectorEnv(HOVER, 4, autoreset_mode="Disabled", **options)) as env:
+        assert env.env_spec.observation == env_spec(HOVER, options).observation
+        names = env.env_spec.observation[2].categories
+        first = env.reset(seed=seeds)[0]
+        second = env.step(still)[0]
+        again = env.reset()[0]
+    found = []
+    for number in range(3):
+        alone = options | {"world": f"warehouse:{number}"}
+        with closing(LocalVectorEnv(HOVER, 4, autoreset_mode="Disabled", **alone)) as env:
+            own, stepped = env.reset(seed=seeds)[0], env.step(still)[0]
+            objects = np.array(env.env_spec.observation[2].categories)
+        same = (own["front"] == first["front"]).all(axis=(1, 2, 3))
+        for row in np.flatnonzero(same):
+            assert (second["front"][row] == stepped["front"][row]).all()
+            told = np.array(names)[first["front_segmentation"][row]]
+            assert (told == objects[own["front_segmentation"][row]]).all()
+        found.append(same)
+    assert np.sum(found, axis=0).tolist() == [1, 1, 1, 1]
+    assert len({*np.argmax(found, axis=0)}) > 1
+    assert (again["front"] != first["front"]).any(axis=(1, 2, 3)).all()  # other starts, at least
+    with socket_pair(HOVER, options) as env:
+        told = env.reset(seed=5)[0]
+        for name, picture in told.items():
+            assert (np.asarray(picture) == first[name][2]).all()
+
+
 def test_a_simulator_that_cannot_draw_says_so_before_it_greets() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as agent:
         agent.bind(("127.0.0.1", 0))
@@ -186,6 +220,11 @@ def test_a_simulator_that_cannot_draw_says_so_before_it_greets() -> None:
         ({"cameras": "rear"}, "cameras: expected some of chase, portrait, front, down, each with"),
         ({"cameras": 3}, "cameras: expected names, with commas between them, got 3"),
         ({"cameras": "front", "world": "moon"}, "world: expected 'plain' or 'airport'"),
+        ({"cameras": "front", "world": "plain:0-2"}, "world: expected 'plain' or 'airport'"),
+        ({"cameras": "front", "world": "forest:3-1"}, "world: expected up to 64 seeds, as"),
+        ({"cameras": "front", "world": "forest:0-64"}, "world: expected up to 64 seeds, as"),
+        ({"cameras": "front", "world": "forest:0-x"}, "world: expected 'plain' or 'airport'"),
+        ({"cameras": "front", "world": 3}, "world: expected 'plain' or 'airport'"),
     ],
 )
 def test_wrong_options(options: dict[str, Any], sentence: str) -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 import numpy as np
 
-from ...models import MOST_DRAG, parse_world
+from ...models import MOST_DRAG, scenes_of
 from ...models.errors import expect
 from ...sim import (
     LEVELS,
@@ -71,7 +71,7 @@ class TaskOptions:
     NAME@WIDTHxHEIGHT. See `models/cameras.py`."""
     world: str = "plain"
     """What the pictures show around the drones: plain, airport, forest, warehouse or gates; the
-    last three from a seed, as forest:3."""
+    last three from a seed, as forest:3, or from one of several for each episode, as forest:0-7."""
 
     actions: ClassVar[tuple[str, ...]] = LEVELS
     """Levels that the task can be flown at; one with a controller of its own may name fewer."""
@@ -91,7 +91,7 @@ class TaskOptions:
         object.__setattr__(self, "effects", effects.to_options())
         object.__setattr__(self, "sensors", checked_sensors(self.sensors))
         object.__setattr__(self, "cameras", _words(self.cameras))
-        parse_world(self.world)
+        scenes_of(self.world)
         self.check()
         acting = replace(effects, payload=1.0) if self.hangs else effects
         drawn = Randomization(self.randomize, acting)
