@@ -42,7 +42,7 @@ class Lens(NamedTuple):
         """The same of points of the camera's frame."""
         ahead = np.where(seen[..., 2:] > 0, seen[..., 2:], np.nan)
         flat, k = distorted(seen[..., :2] / ahead, self.distortion), self.matrix
-        pixels: np.ndarray = flat @ k[:2, :2].T + k[:2, 2]
+        pixels: np.ndarray = flat * np.diagonal(k)[:2] + k[:2, 2]
         return pixels
 
     def rays(self, height: int, width: int) -> np.ndarray:
