@@ -116,6 +116,7 @@ class Vehicle(Command):
         print(f"vehicle: {path} (rotorgram vehicle check {path} examines it)")
 
     def _show(self) -> None:
+        from ..models.cameras import cameras_of
         from ..models.vehicle import Vehicle as Craft
         from ..models.vehicle_file import read_vehicle_file
 
@@ -130,6 +131,10 @@ class Vehicle(Command):
         print("\nrotors: position, direction, torque besides that of the position per thrust")
         for rotor in craft.rotors:
             print(f"{rotor.name:17} {_rotor_words(rotor)}")
+        print("\ncameras: pictures, place")
+        for camera in cameras_of(craft):
+            size = f"{camera.width} × {camera.height}"
+            print(f"{camera.name:17} {', '.join(camera.kinds)} {size}, {camera.words}")
         if file:
             print(f"\nnumbers of {craft.path.name}")
             for line in _provenance(file):

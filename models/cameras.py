@@ -105,6 +105,19 @@ class Camera:
         lens = Lens(matrix, np.eye(3), np.zeros(3), self.optics.distortion)
         lens.rays(_CHECKED, _CHECKED)
 
+    @property
+    def words(self) -> str:
+        """Where it is, where it looks and how it sees."""
+        place, look, lens = (
+            " ".join(f"{one:.4g}" for one in numbers)
+            for numbers in (self.position, self.look, self.optics.distortion)
+        )
+        where = "the body" if self.carried else "the world"
+        angle = f"{math.degrees(self.fovy):.4g} degrees high"
+        words = f"at ({place}) m in {where}, looks along ({look}), {angle}"
+        words += f", distorts by ({lens})" if any(self.optics.distortion) else ""
+        return words + (f", every {self.every} steps" if self.every > 1 else "")
+
 
 @dataclass(frozen=True, kw_only=True)
 class View:
@@ -137,13 +150,7 @@ class View:
     @property
     def frame(self) -> str:
         """Where the camera is and looks, in words."""
-        camera = self.camera
-        where = "the body" if camera.carried else "the world"
-        place, look = (
-            " ".join(f"{one:.4g}" for one in vector) for vector in (camera.position, camera.look)
-        )
-        angle = math.degrees(camera.fovy)
-        return f"at ({place}) m in {where}, looks along ({look}), {angle:.4g} degrees high"
+        return self.camera.words
 
 
 def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View, ...]:
