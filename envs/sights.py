@@ -1,7 +1,10 @@
 """Pictures as observations: which drones take which one when, of the state that a step ended in."""
 
+import os
 from collections.abc import Sequence
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -14,7 +17,11 @@ from ..sim.random import CAMERAS, SCENES, Streams
 from .spec import ArraySpec
 from .tasks.task import Task
 
-_BOUNDS = {"rgb": (0.0, 255.0), "depth": (0.0, FARTHEST), "flow": (-np.inf, np.inf)}
+if TYPE_CHECKING:
+    from ..rendering.cameras import Cameras
+
+_MOST_THREADS: Final = 16
+_BOUNDS: Final = {"rgb": (0.0, 255.0), "depth": (0.0, FARTHEST), "flow": (-np.inf, np.inf)}
 
 
 def views_of(task: Task, drones: int) -> tuple[View, ...]:
@@ -58,8 +65,22 @@ def objects_of_all(scenes: Sequence[Sequence[str]]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for names in scenes for name in names))
 
 
+class _Painter(NamedTuple):
+    """What draws some worlds when they have one scene: it shares nothing with the others."""
+
+    cameras: "Cameras"
+    scene: int
+    objects: np.ndarray
+    """Numbers of its objects among those of all scenes."""
+    worlds: np.ndarray
+    """bool, shape (W,)."""
+
+
 class Sights:
-    """The cameras of a loop's drones."""
+    """The cameras of a loop's drones.
+
+    Threads draw its worlds, as many as there are cores; a world's pictures do not depend on them.
+    """
 
     def __init__(self, task: Task, shape: tuple[int, int]) -> None:
         from ..rendering.cameras import Cameras
@@ -67,24 +88,43 @@ class Sights:
         self._task, self._shape, self._rows = task, shape, shape[0] * shape[1]
         self._noise, self._draws = Streams(shape[0], CAMERAS), Streams(shape[0], SCENES)
         self.views = views_of(task, shape[1])
-        self._scenes = [
-            Cameras(
+        scenes = scenes_of(task.options.world)
+        self._count = len(scenes)
+        self._scene = np.zeros(shape[0], int)  # of each world
+        self._threads = min(os.cpu_count() or 1, shape[0], _MOST_THREADS)
+        parts = np.arange(shape[0]) % -(-self._threads // len(scenes))
+        drawn = [
+            (number, part, Cameras(
                 task.vehicle, self.views, shape, world=scene, marks=task.marks,
                 payload=bool(task.effects.get("payload")),
-            )
-            for scene in scenes_of(task.options.world)
+            ))
+            for number, scene in enumerate(scenes)
+            for part in range(parts.max() + 1)
         ]  # fmt: skip
-        self._scene = np.zeros(shape[0], int)  # of each world
+        names = objects_of_all([cameras.objects for _, _, cameras in drawn])
+        self._painters = [
+            _Painter(
+                cameras,
+                number,
+                np.array([names.index(one) for one in cameras.objects], np.int32),
+                parts == part,
+            )
+            for number, part, cameras in drawn
+        ]
         self._goes = any(mark.moves for mark in task.marks)
-        names = objects_of_all([scene.objects for scene in self._scenes])
-        self._objects = [np.array([names.index(x) for x in one.objects], np.int32)
-                         for one in self._scenes]  # fmt: skip
         self.arrays = arrays_of(self.views, names)
+
+    @cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        """Started with the first picture, so that a process may be forked before."""
+        return ThreadPoolExecutor(self._threads, "cameras")
 
     def close(self) -> None:
         """Free what draws. A second call does nothing."""
-        for scene in self._scenes:
-            scene.close()
+        if "_pool" in vars(self):
+            self._pool.shutdown()
+        for painter in self._painters:
+            painter.cameras.close()
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """Seed noise and scenes of the drones of a mask, bool, shape (N,); seeds (N,)."""
@@ -119,18 +159,26 @@ class Sights:
         pictures: dict[str, Array] = {
             view.name: np.empty((n, *view.shape), view.dtype) for view in self.views
         }
-        if len(self._scenes) > 1:
+        if self._count > 1:
             for world in np.flatnonzero(fresh.reshape(self._shape).any(axis=1)).tolist():
-                self._scene[world] = self._draws.of(world).integers(len(self._scenes))
-        for number, (scene, objects) in enumerate(zip(self._scenes, self._objects, strict=True)):
-            worlds = self._scene == number
-            if not worlds.any():
-                continue
-            scene.take(due, fresh, rows, self._noise.of, worlds)
+                self._scene[world] = self._draws.of(world).integers(self._count)
+
+        def paint(one: _Painter) -> None:
+            worlds = one.worlds & (self._scene == one.scene)
+            one.cameras.take(due, fresh, rows, self._noise.of, worlds)
             mine = np.repeat(worlds, self._shape[1])
             for view in self.views:
-                seen = scene.pictures[view.name][mine]
-                pictures[view.name][mine] = objects[seen] if view.kind == "segmentation" else seen
+                seen = one.cameras.pictures[view.name][mine]
+                told = one.objects[seen] if view.kind == "segmentation" else seen
+                pictures[view.name][mine] = told
+
+        at_work = [one for one in self._painters if (self._scene[one.worlds] == one.scene).any()]
+        for one in at_work:
+            one.cameras.open()
+        if len(at_work) > 1:
+            list(self._pool.map(paint, at_work))
+        else:
+            paint(at_work[0])
         xp = self._task.xp
         if xp is np:
             return pictures

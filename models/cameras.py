@@ -103,7 +103,10 @@ class Camera:
         middle = np.full(2, _CHECKED / 2)
         matrix = np.block([[np.diag(focal), middle[:, None]], [np.zeros((1, 2)), np.ones((1, 1))]])
         lens = Lens(matrix, np.eye(3), np.zeros(3), self.optics.distortion)
-        lens.rays(_CHECKED, _CHECKED)
+        try:
+            lens.rays(_CHECKED, _CHECKED)
+        except InputError as error:
+            raise InputError(f"camera {self.name}.{error}") from None
 
     @property
     def words(self) -> str:

@@ -97,6 +97,11 @@ class Cameras:
         height, width = (max(side) for side in zip(*sizes, strict=True))
         return Offscreen(self.model, width, height)
 
+    def open(self) -> None:
+        """Open OpenGL, as `take` does in its thread. A second call does nothing."""
+        with self._drawing.current():
+            pass
+
     def take(
         self,
         due: Mapping[str, np.ndarray],

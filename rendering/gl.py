@@ -54,11 +54,7 @@ def offscreen_context(width: int, height: int) -> Any:
     `MUJOCO_GL` decides if it is set (egl, osmesa, glfw). Otherwise it is EGL on Linux, or a hidden
     window where there is a display and no EGL; elsewhere the system's own.
     """
-    if _state["forked"]:
-        raise NoOpenGL(
-            "OpenGL: expected a process that was started anew, got one that was forked from one "
-            "that draws; multiprocessing's start method 'spawn' starts it anew"
-        )
+    _refuse_forked()
     _state["used"] = True
     reasons = []
     for name in _candidates():
@@ -75,6 +71,14 @@ def offscreen_context(width: int, height: int) -> Any:
         "OpenGL: expected EGL (on Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri), "
         f"got none ({'; '.join(reasons) or 'MUJOCO_GL switches it off'})"
     )
+
+
+def _refuse_forked() -> None:
+    if _state["forked"]:
+        raise NoOpenGL(
+            "OpenGL: expected a process that was started anew, got one that was forked from one "
+            "that draws; multiprocessing's start method 'spawn' starts it anew"
+        )
 
 
 class Offscreen:
@@ -102,6 +106,7 @@ class Offscreen:
         """Keep OpenGL with this thread for a block: `draw` in it is faster."""
         if self._gl is None:
             raise NoOpenGL("OpenGL: expected cameras that are open, got closed ones")
+        _refuse_forked()
         block: AbstractContextManager[Any] = self._gl.as_current()
         return block
 
