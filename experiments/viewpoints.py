@@ -7,6 +7,7 @@ random places come from its seed, flights from the evaluation episodes' seeds.
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import cycle, pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +21,7 @@ from ..envs.registry import env_spec
 from ..envs.registry import load as load_env
 from ..envs.spec import Discrete, Mark, component_names
 from ..envs.tasks.task import finite
-from ..models import parse_world
+from ..models import scenes_of
 from ..models.cameras import View, cameras_of, chosen_views
 from ..models.errors import InputError, expect
 from ..models.frames import pose_in_mujoco_frame
@@ -115,6 +116,7 @@ class Plan:
     """Sources of poses."""
     vehicle: str | None = None
     world: str = "plain"
+    """Its places and flights are in the worlds of `scenes_of` in turn."""
     seed: int = 0
     fine: bool = True
     """With shadows and smooth edges."""
@@ -147,7 +149,7 @@ class Plan:
             text=text, cameras=tuple(cameras),
             poses=tuple(_source(one, i) for i, one in enumerate(poses, 1)), **table,
         )  # fmt: skip
-        parse_world(plan.world)
+        scenes_of(plan.world)
         right = type(plan.seed) is int and 0 <= plan.seed < 1 << 63
         expect(right, "plan: seed", "a whole number from 0", repr(plan.seed))
         expect(type(plan.fine) is bool, "plan: fine", "true or false", repr(plan.fine))
@@ -170,14 +172,19 @@ class Plan:
         found: list[Walk] = []
         for number, source in enumerate(self.poses, 1):
             name, dice = f"{number} {source['from']}", np.random.default_rng([self.seed, number])
+            scenes = scenes_of(source["world"] or self.world)
             if source["from"] == "random":
-                walks = [_random(name, source, dice)]
+                places = _random(name, source, dice)
+                shares = min(len(scenes), len(places))
+                ends = np.linspace(0, len(places), shares + 1).astype(int).tolist()
+                walks = [places.part(first, end) for first, end in pairwise(ends)]
             else:
                 flies = source["from"] == "flight"
                 flown = _flown(source, self.vehicle) if flies else _recorded(source, self.vehicle)
                 walks = _walks(name, flown, source["every"], source.get("drones", 1))
                 walks = [_moved(walk, source["aside"], source["tilt"], dice) for walk in walks]
-            found += [replace(walk, world=source["world"] or self.world) for walk in walks]
+            in_turn = zip(walks, cycle(scenes), strict=False)
+            found += [replace(walk, world=world) for walk, world in in_turn]
         kinds = dict.fromkeys(walk.components for walk in found if walk.actions is not None)
         got = " and ".join(f"({', '.join(names)})" for names in kinds)
         expect(len(kinds) < 2, "plan", "flights with the same actions", got)
@@ -223,7 +230,7 @@ def _source(table: dict[str, Any], number: int) -> dict[str, Any]:
     right = session is None or (type(session) is int and session >= 1)
     expect(right, f"{name}.session", "a whole number from 1", repr(session))
     if source["world"] != "":
-        parse_world(source["world"])
+        scenes_of(source["world"])
     texts = {"env": "the id of a task", "agent": "a controller or a checkpoint",
              "file": "a journal (.mcap)"}  # fmt: skip
     for key, expected in texts.items():

@@ -62,10 +62,14 @@ def scenes_of(text: str) -> tuple[str, ...]:
     if not dash:
         parse_world(text)
         return (text,)
-    ends = [parse_world(f"{name}:{end}")[1] for end in (first, last)]
-    right = 0 <= ends[1] - ends[0] < MOST_SCENES
-    expect(right, "world", f"up to {MOST_SCENES} seeds, as 'forest:0-7'", repr(text))
-    return tuple(f"{name}:{seed}" for seed in range(ends[0], ends[1] + 1))
+    try:
+        low, high = (parse_world(f"{name}:{end}")[1] for end in (first, last))
+    except InputError:
+        low, high = 0, -1
+    names = ", ".join(map(repr, SEEDED_WORLDS))
+    expected = f"one of {names} with up to {MOST_SCENES} seeds, as 'forest:0-7'"
+    expect(0 <= high - low < MOST_SCENES, "world", expected, repr(text))
+    return tuple(f"{name}:{seed}" for seed in range(low, high + 1))
 
 
 def __getattr__(name: str) -> Any:

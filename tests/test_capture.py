@@ -79,6 +79,22 @@ def test_random_places_fill_the_box(tmp_path: Path) -> None:
     assert (other.position[0] != walk.position[0]).all()
 
 
+def test_places_and_flights_share_worlds(tmp_path: Path) -> None:
+    """Places as evenly as they can be, flights in turn."""
+    path, flight = tmp_path / "plan.toml", 'env = "rotorgram/Hover-v0"\nepisodes = 3\nevery = 500'
+    sources = f'[[poses]]\nfrom = "random"\ncount = 8\n[[poses]]\nfrom = "flight"\n{flight}'
+    path.write_text(f'world = "gates:1-3"\n{sources}')
+    walks = Plan.read(path).walks()
+    names = ["gates:1", "gates:2", "gates:3"]
+    assert [walk.world for walk in walks] == names * 2
+    assert [len(walk) for walk in walks[:3]] == [2, 3, 3]
+    path.write_text(sources)
+    alone = Plan.read(path).walks()[0]
+    np.testing.assert_array_equal(
+        np.concatenate([walk.position for walk in walks[:3]]), alone.position
+    )
+
+
 def test_a_flight_gives_every_so_many_steps(tmp_path: Path) -> None:
     _, walk = plan_of(tmp_path).walks()
     assert walk.times.tolist() == [0.0, 0.8, 1.6]

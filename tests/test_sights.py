@@ -220,10 +220,22 @@ def test_a_simulator_that_cannot_draw_says_so_before_it_greets() -> None:
         ({"cameras": "rear"}, "cameras: expected some of chase, portrait, front, down, each with"),
         ({"cameras": 3}, "cameras: expected names, with commas between them, got 3"),
         ({"cameras": "front", "world": "moon"}, "world: expected 'plain' or 'airport'"),
-        ({"cameras": "front", "world": "plain:0-2"}, "world: expected 'plain' or 'airport'"),
-        ({"cameras": "front", "world": "forest:3-1"}, "world: expected up to 64 seeds, as"),
-        ({"cameras": "front", "world": "forest:0-64"}, "world: expected up to 64 seeds, as"),
-        ({"cameras": "front", "world": "forest:0-x"}, "world: expected 'plain' or 'airport'"),
+        (
+            {"cameras": "front", "world": "plain:0-2"},
+            "world: expected one of .* up to 64 seeds, as",
+        ),
+        (
+            {"cameras": "front", "world": "forest:3-1"},
+            "world: expected one of .* up to 64 seeds, as",
+        ),
+        (
+            {"cameras": "front", "world": "forest:0-64"},
+            "world: expected one of .* up to 64 seeds, as",
+        ),
+        (
+            {"cameras": "front", "world": "forest:0-x"},
+            "world: expected one of .* up to 64 seeds, as",
+        ),
         ({"cameras": "front", "world": 3}, "world: expected 'plain' or 'airport'"),
     ],
 )
