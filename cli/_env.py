@@ -8,10 +8,10 @@ from typing import Any, Final
 from ..agents import CONTROLLERS, PID, Checkpoint, Geometric, Orca, Policy, load
 from ..envs.registry import env_spec, is_known, options_type
 from ..envs.spec import EnvSpec
-from ..experiments.pairs import socket_pair
-from ..experiments.trajectories import Trajectory
+from ..flights.trajectories import Trajectory
 from ..models import Backend
 from ..models.errors import expect
+from ..training.pairs import socket_pair
 from ..udp import RemoteEnv, RemoteVectorEnv
 from ._flags import AgentFlags, EnvFlags, check_count, parse_address
 

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tyro.conf import arg
 
-from ..experiments.folders import FolderBusy
-from ..experiments.settings import RunsConfig
+from ..training.folders import FolderBusy
+from ..training.settings import RunsConfig
 from ._flags import BackendFlags, Command, folder_to_write, go_on_with
 
 if TYPE_CHECKING:
-    from ..experiments.workers import OnProgress
+    from ..training.workers import OnProgress
 
 RESUMED: Final = ("jobs", "runner", "address", "resume", "env")
 """Flags that a resumed command may be given: they change no number. `--env` imports the module of a
@@ -72,9 +72,9 @@ def report_comparison(folder: Path, *, film: bool = True) -> None:
     """Write figures, film and report from the folder's files, and print the table."""
     from rich.console import Console
 
-    from ..experiments.report import VIDEO_FILE, table_of, terminal_table, write_report
-    from ..experiments.results import read_results
     from ..models.errors import InputError
+    from ..training.report import VIDEO_FILE, table_of, terminal_table, write_report
+    from ..training.results import read_results
     from ._progress import frame_bar
 
     results = read_results(folder)
@@ -83,7 +83,7 @@ def report_comparison(folder: Path, *, film: bool = True) -> None:
     # Only now: if the film fails, there is a report.
     if film and not (folder / VIDEO_FILE).exists():
         try:
-            from ..experiments.filming import film_comparison
+            from ..flights.filming import film_comparison
 
             with frame_bar(VIDEO_FILE) as on_frame:
                 if film_comparison(folder, folder / VIDEO_FILE, on_frame):
@@ -99,9 +99,9 @@ def report_sweep(folder: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from ..experiments.metrics import Headline
-    from ..experiments.results import read_spec
-    from ..experiments.sweep import SWEEP_FILE, read_sweep_config, write_sweep_table
+    from ..training.metrics import Headline
+    from ..training.results import read_spec
+    from ..training.sweep import SWEEP_FILE, read_sweep_config, write_sweep_table
 
     config = read_sweep_config(folder)
     headline = Headline.of(read_spec(folder))
@@ -127,7 +127,7 @@ def report_sweep(folder: Path) -> None:
 
 def report_board(folder: Path, page: Path | None = None) -> None:
     """Write the page of a board from the folder's files."""
-    from ..experiments.board import write_page
+    from ..training.board import write_page
 
     page = page or folder / "baselines.md"
     write_page(folder, page)

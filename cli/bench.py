@@ -13,7 +13,7 @@ from ..models.errors import require
 from ._flags import Command, folder_to_write
 
 if TYPE_CHECKING:
-    from ..experiments.bench import Layer
+    from ..training.bench import Layer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class Bench(Command):
         """Measure, print and draw."""
         from rich.console import Console
 
-        from ..experiments.bench import RATIOS, bench, parts_of
+        from ..training.bench import RATIOS, bench, parts_of
         from ._progress import bars
 
         require("matplotlib", "report", "drawing")  # before anything is measured

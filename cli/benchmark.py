@@ -6,8 +6,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from ..experiments.settings import WorkersConfig
 from ..models.errors import expect
+from ..training.settings import WorkersConfig
 from ._flags import refuse_settings
 from ._runs import RESUMED, FolderFlags, command_line, report_board, runs_folder
 
@@ -33,14 +33,14 @@ class Benchmark(FolderFlags, WorkersConfig):
 
     def run(self) -> int:
         """Train, evaluate, write the page."""
-        from ..experiments.benchmark import (
+        from ..training.benchmark import (
             BOARD,
             benchmark,
             missing_seeds,
             read_board,
             read_rows_file,
         )
-        from ..experiments.workers import RunsFailed
+        from ..training.workers import RunsFailed
 
         if self.resume:
             refuse_settings(self, self.resume, free=("page", *RESUMED))

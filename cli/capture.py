@@ -30,11 +30,11 @@ class Capture(Command):
 
     def run(self) -> int:
         """Take them; say where and how many."""
-        from ..experiments.capture import capture
-        from ..experiments.settings import WorkersConfig
-        from ..experiments.viewpoints import Plan
+        from ..flights.capture import capture
+        from ..flights.viewpoints import Plan
         from ..models.errors import expect
         from ..rendering.gl import offscreen_context
+        from ..training.settings import WorkersConfig
         from ._progress import bars
 
         expect(self.out.name, "out", "the name of a folder", repr(str(self.out)))

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 from ..agents import AlgorithmName
-from ..experiments.settings import CompareConfig, WorkersConfig
 from ..models.errors import expect, require
+from ..training.settings import CompareConfig, WorkersConfig
 from ._flags import refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_comparison, runs_folder
 
@@ -30,7 +30,7 @@ class Compare(RunsFlags):
         """Compare, report, print the table."""
         for module in ("matplotlib", "jinja2"):  # before hours of training
             require(module, "report", "a comparison's report")
-        from ..experiments.compare import PARTS, compare, read_compare_config
+        from ..training.compare import PARTS, compare, read_compare_config
 
         if self.resume:
             refuse_settings(self, self.resume, free=("film", *RESUMED))

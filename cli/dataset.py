@@ -31,7 +31,7 @@ class Dataset(Command):
 
     def run(self) -> int:
         """Write it; print what it holds."""
-        from ..experiments.datasets import RecordedEpisodes, env_of, write_minari, write_parquet
+        from ..flights.datasets import RecordedEpisodes, env_of, write_minari, write_parquet
         from ..models import MAX_DRONES
         from ..models.fleet import load_vehicles
         from ..udp.journal.reader import count_of

@@ -21,9 +21,9 @@ class Evaluate(AgentFlags, BackendFlags):
         """Fly and print the means."""
         import pandas as pd
 
-        from ..experiments.metrics import Headline
-        from ..experiments.results import evaluation_row
-        from ..experiments.trajectories import fly_episodes
+        from ..flights.trajectories import fly_episodes
+        from ..training.metrics import Headline
+        from ..training.results import evaluation_row
         from ._env import chosen_drones, chosen_env, load_checkpoint, policy_for, remote_env
 
         check_count("episodes", self.episodes)

@@ -38,9 +38,9 @@ class Identify(Command):
         from rich.console import Console
         from rich.table import Table
 
-        from ..experiments.flight_logs import read_log
-        from ..experiments.identified_vehicle import identified_toml
-        from ..experiments.identify import DEFAULT, SEGMENT, identify
+        from ..flights.flight_logs import read_log
+        from ..flights.identified_vehicle import identified_toml
+        from ..flights.identify import DEFAULT, SEGMENT, identify
         from ..models.errors import expect, require
         from ..models.files import write_new
         from ..models.vehicle import Vehicle

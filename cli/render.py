@@ -8,9 +8,9 @@ from typing import Final, Literal
 
 from tyro.conf import Positional
 
-from ..experiments.palette import DARK_COLORS, agent_color, agent_label
-from ..experiments.trajectories import Trajectory, flown_trajectories, recorded_trajectories
+from ..flights.trajectories import Trajectory, flown_trajectories, recorded_trajectories
 from ..models.errors import expect
+from ..training.palette import DARK_COLORS, agent_color, agent_label
 from ._flags import EnvFlags, check_count
 
 _ALIKE: Final = ("pid", "geometric", "orca", "random")  # their words tell no two of them apart
@@ -60,7 +60,7 @@ class Render(EnvFlags):
 
     def run(self) -> int:
         """Fly or read, draw, and say where."""
-        from ..experiments.filming import Film, Shot, film
+        from ..flights.filming import Film, Shot, film
         from ..rendering.film import check_film
         from ..rendering.gl import offscreen_context
         from ._progress import frame_bar

@@ -21,7 +21,7 @@ class Report(Command):
 
     def run(self) -> int:
         """Write figures and report from the files, and print the table."""
-        from ..experiments.results import content_of, read_config
+        from ..training.results import content_of, read_config
         from ._runs import report_board, report_comparison, report_sweep
 
         if "board" in content_of(self.folder):

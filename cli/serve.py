@@ -25,7 +25,7 @@ class Serve(AgentFlags):
 
     def run(self) -> int:
         """Fly episode after episode."""
-        from ..experiments.trajectories import fly_episodes
+        from ..flights.trajectories import fly_episodes
         from ..udp import LinkError
         from ._env import chosen_env, load_checkpoint, policy_for, remote_env, words_of
 

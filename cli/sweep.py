@@ -8,8 +8,8 @@ from typing import Annotated, Any
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ..agents import AlgorithmName
-from ..experiments.settings import SweepConfig, WorkersConfig
 from ..models.errors import expect
+from ..training.settings import SweepConfig, WorkersConfig
 from ._flags import parse_value, refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_sweep, runs_folder
 
@@ -36,8 +36,8 @@ class Sweep(RunsFlags):
 
     def run(self) -> int:
         """Sweep, and print the table."""
-        from ..experiments.sweep import sweep
-        from ..experiments.workers import RunsFailed
+        from ..training.sweep import sweep
+        from ..training.workers import RunsFailed
 
         if self.resume:
             config = self._resumed(self.resume)
@@ -55,7 +55,7 @@ class Sweep(RunsFlags):
         return 0
 
     def _resumed(self, folder: Path) -> SweepConfig:
-        from ..experiments.sweep import missing_runs, read_sweep_config, read_sweep_runs
+        from ..training.sweep import missing_runs, read_sweep_config, read_sweep_runs
 
         config = replace(read_sweep_config(folder), **self.settings(WorkersConfig))
         others = f"a sweep of {self.algorithm}, {folder} holds one of {config.algorithm}"

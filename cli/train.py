@@ -18,9 +18,9 @@ from tyro.conf import Positional, UseAppendAction, arg
 from ..agents import A2CConfig, AlgorithmName, Episode, load, preset, store
 from ..agents.checkpoints import Checkpoint, software_versions, write_whole
 from ..agents.presets import NETWORKS, PPOConfig, PresetName, VPGConfig, find_preset
-from ..experiments.folders import locked
-from ..experiments.settings import Run
 from ..models.errors import expect, require
+from ..training.folders import locked
+from ..training.settings import Run
 from ._flags import (
     AgentFlags,
     BackendFlags,
@@ -32,7 +32,7 @@ from ._flags import (
 )
 
 if TYPE_CHECKING:
-    from ..experiments.training import Training
+    from ..training.training import Training
 
 EPISODES: Final = "episodes.csv"
 _FREE: Final = ("resume", "listen", "num_simulators", "key_file", "insecure", "record",
@@ -86,7 +86,7 @@ class Train(AgentFlags, BackendFlags):
         return self._resume(self.resume) if self.resume else self._begin()
 
     def _begin(self) -> int:
-        from ..experiments.training import Training
+        from ..training.training import Training
 
         check_count("drones", self.drones)
         start, told = self._start()
@@ -129,7 +129,7 @@ class Train(AgentFlags, BackendFlags):
         return kept, {"start_from": {"file": str(file), "sha256": checksum}}
 
     def _resume(self, folder: Path) -> int:
-        from ..experiments.training import Training, is_finished
+        from ..training.training import Training, is_finished
         from ._env import CHECKPOINT
 
         with locked(folder):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from ..experiments.trajectories import Trajectory, flown_trajectories, recorded_trajectories
+from ..flights.trajectories import Trajectory, flown_trajectories, recorded_trajectories
 from ..models import parse_world
 from ..models.errors import expect
 from ._flags import EnvFlags, check_count
@@ -37,7 +37,7 @@ class View(EnvFlags):
 
     def run(self) -> int:
         """Fly and show, episode after episode."""
-        from ..experiments.filming import moments
+        from ..flights.filming import moments
         from ..rendering.live import LiveView, Pace, open_surface
         from ..rendering.stage import Stage
         from ._env import words_of

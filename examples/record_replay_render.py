@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 
 from rotorgram.agents import PID
-from rotorgram.experiments.filming import Film, Shot, film
-from rotorgram.experiments.pairs import socket_pair
-from rotorgram.experiments.trajectories import fly, recorded_trajectories
+from rotorgram.flights.filming import Film, Shot, film
+from rotorgram.flights.trajectories import fly, recorded_trajectories
+from rotorgram.training.pairs import socket_pair
 from rotorgram.udp.journal.replay import Verification
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 from rotorgram.agents import preset, store
-from rotorgram.experiments.metrics import steady_state
-from rotorgram.experiments.pairs import socket_pair
-from rotorgram.experiments.settings import Run
-from rotorgram.experiments.training import Training
-from rotorgram.experiments.trajectories import fly_episodes
+from rotorgram.flights.trajectories import fly_episodes
+from rotorgram.training.metrics import steady_state
+from rotorgram.training.pairs import socket_pair
+from rotorgram.training.settings import Run
+from rotorgram.training.training import Training
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--env-steps", type=int, default=100_000)

@@ -10,8 +10,8 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from rotorgram.envs.spec import ArraySpec, EnvSpec, Metric
-from rotorgram.experiments.metrics import Headline, overshoot, settling_time, steady_state
-from rotorgram.experiments.results import (
+from rotorgram.training.metrics import Headline, overshoot, settling_time, steady_state
+from rotorgram.training.results import (
     EPISODE_COLUMNS,
     EVALUATION_COLUMNS,
     RUN_COLUMNS,

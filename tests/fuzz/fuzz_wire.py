@@ -6,7 +6,7 @@
 
 Needs Atheris (`pip install atheris`: libFuzzer for Python; Linux and macOS). All options but
 `--json` are libFuzzer's. Its findings are written to `runs/fuzz`, where the corpus grows too.
-`targets.py` says what is tested; `tests/test_fuzz.py` gives it changed inputs without Atheris.
+`targets.py` says what is tested; `tests/udp/test_fuzz.py` gives it changed inputs without Atheris.
 NumPy raises here where it would only warn.
 """
 

@@ -4,7 +4,7 @@ A process that was asleep computes two to three times slower for a while: its co
 So a wait in a lock-step first looks again and again for as long as a step takes, and sleeps only
 then. Looking costs others the processor, so it ends where it does not pay: each wait in which
 nothing came, or in which another process had the core, lets more of the next waits sleep at once.
-`benchmarks/waiting.py` measures both ways, beside processes that want the same cores.
+`studies/waiting.py` measures both ways, beside processes that want the same cores.
 """
 
 import errno

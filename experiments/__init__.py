@@ -1,1 +1,0 @@
-"""Training runs, evaluation, and the comparison with its figures and report."""

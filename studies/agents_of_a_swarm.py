@@ -1,0 +1,258 @@
+"""Eight agent processes that fly one world together, killed and stopped; and a hundred drones.
+
+    python studies/agents_of_a_swarm.py [--kills 20] [--steps 1000] [--out FILE.json]
+
+Eight drones fly in one world, each by an agent process of its own (`RemoteEnv`), through relays
+that lose 30 % of the datagrams, double 10 % and reorder 10 %. At random moments an agent is killed
+(SIGKILL) and started again, or stopped (SIGSTOP) for 2 s, which is longer than the world waits.
+Agents 0, 3 and 6 hold when they are lost, 1, 4 and 7 land, 2 and 5 end.
+
+An action is computed from every bit of the observation before it. A second world, in process, gets
+the seeds, the absences and the actions that the simulator took: every bit of every State has to be
+the same, and every action the one that follows from it.
+
+Then one agent flies a hundred drones of one world through such a relay, beside the same env in
+process: again every bit has to be the same.
+"""
+
+import json
+import random
+import signal
+import sys
+import threading
+import time
+import zlib
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from measuring import RESULTS, free_ports, launch, options, write
+from rotorgram.envs import ArraySpec, LocalVectorEnv, Outcome, Task, TaskOptions, register
+from rotorgram.envs.loop import Loop
+from rotorgram.sim import Pose
+from rotorgram.udp import LinkConfig, RemoteVectorEnv, SharedSimulator, Simulator
+from rotorgram.udp.protocol.messages import Command, Message, State
+
+ENV_ID = "benchmark/Row-v0"
+FAULTS = {"drop": 0.3, "duplicate": 0.1, "reorder": 0.1}
+AGENTS, PATIENCE, STOPPED = 8, 1.0, 2.0  # drones and agents; s
+POLICIES = ("hold", "land", "end")
+ANY = ("127.0.0.1", 0)
+
+RELAYS = """
+import json, sys, threading
+from rotorgram.udp.transport.relay import FaultConfig, Relay
+servers, faults = json.loads(sys.argv[1])
+relays = [Relay(("127.0.0.1", 0), tuple(server), FaultConfig(**faults, seed=seed))
+          for seed, server in enumerate(servers)]
+for relay in relays:
+    threading.Thread(target=relay.run, daemon=True).start()
+print(json.dumps([relay.address for relay in relays]), flush=True)
+sys.stdin.read()
+print(json.dumps([relay.counters for relay in relays]), flush=True)
+"""
+
+AGENT = """
+import json, sys, zlib
+import numpy as np
+from rotorgram.udp import PeerClosed, RemoteEnv
+port, policy = json.loads(sys.argv[1])
+env = RemoteEnv(("127.0.0.1", port), connect_timeout=600, when_lost=policy)
+try:
+    while True:
+        observation, _ = env.reset()
+        over = False
+        while not over:
+            number = zlib.crc32(observation.tobytes()) % 2001 - 1000
+            observation, _, *ends, _ = env.step(np.array([number / 10_000], np.float32))
+            over = any(ends)
+except PeerClosed:
+    pass
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(TaskOptions):
+    """Of the task below."""
+
+    action: str = "offset"
+    episode_length: int = 200
+
+
+class Row(Task):
+    """Drones in a row, 5 m apart and 2 m high. One that rises by 5 cm is out."""
+
+    Options, drones = Options, 128
+
+    def setup(self) -> None:
+        self.observation = (ArraySpec(name="observation", shape=(3,)),)
+
+    def begin(self, mask: Any, draw: Any) -> Pose:
+        row = 5.0 * np.arange(self.shape[1]) + draw.uniform(-0.1, 0.1)
+        return Pose(position=np.stack((row, 0.0 * row, 2.0 + 0.0 * row), axis=-1))
+
+    def observe(self, state: Any) -> dict[str, Any]:
+        return {"observation": state.position}
+
+    def outcome(self, state: Any) -> Outcome:
+        risen = state.position[..., 2] - 2.0
+        return Outcome(reward={"risen": risen}, terminated=risen > 0.05, metrics={})
+
+
+register(ENV_ID, Row)
+
+
+def action_of(observation: np.ndarray) -> np.float32:
+    """As in an agent above."""
+    return np.float32((zlib.crc32(observation.tobytes()) % 2001 - 1000) / 10_000)
+
+
+class Twin:
+    """A world in process that repeats what the simulator does, and compares every bit."""
+
+    def __init__(self, simulator: SharedSimulator) -> None:
+        self.simulator, self.loop = simulator, Loop(ENV_ID, drones=AGENTS)
+        self.taken = 0  # absences that were repeated
+        self.absent = np.zeros(AGENTS, bool)
+        kinds = ("silent", "coming", "late", "waiting", "left")
+        self.counts = Counter({f"absent_{kind}": 0 for kind in kinds})
+        self.shown = np.zeros((AGENTS, 3), np.float32)
+
+    def __call__(self, cause: Message | None, state: State) -> None:
+        loop, simulator, everybody = self.loop, self.simulator, np.ones(AGENTS, bool)
+        nothing = np.zeros((AGENTS, 1), np.float32)
+        if cause is None:
+            seed = simulator.seed
+            loop.advance(nothing, everybody, None if seed is None else [seed] * AGENTS)
+            self.absent = ~everybody
+            self.taken = sum(one.episode < simulator.episodes for one in simulator.absences)
+        for absence in simulator.absences[self.taken :]:
+            self.absent = self.absent | (np.arange(AGENTS) == absence.agent)
+            policy = POLICIES[absence.agent % 3]
+            mask = np.arange(AGENTS) == absence.agent
+            if policy != "hold":
+                (loop.land if policy == "land" else loop.retire)(mask)
+            self.counts[f"absent_{absence.presence.value}"] += 1
+        self.taken = len(simulator.absences)
+        if isinstance(cause, Command):
+            flying = ~(self.absent | loop.out)
+            for drone in range(AGENTS):
+                right = action_of(self.shown[drone]) if flying[drone] else np.float32(0.0)
+                here = cause.actions[drone, 0]
+                self.counts["actions_that_differ"] += int(flying[drone] and here != right)
+                self.counts["drone_steps_by_commands"] += int(flying[drone])
+            loop.advance(cause.actions)
+            self.counts["control_steps"] += 1
+        here = (loop.observations["observation"], loop.rewards, loop.terminated, loop.truncated,
+                *loop.telemetry.values())  # fmt: skip
+        there = (state.observations[0], state.rewards, state.terminated, state.truncated,
+                 *state.telemetry)  # fmt: skip
+        same = all(a.tobytes() == b.tobytes() for a, b in zip(here, there, strict=True))
+        self.counts["states_that_differ"] += not same
+        self.shown = state.observations[0].copy()
+
+
+def fly_eight(kills: int, dice: random.Random) -> dict[str, Any]:
+    ports = free_ports(AGENTS)
+    settings = [[port, POLICIES[i % 3]] for i, port in enumerate(ports)]
+    agents = [launch(AGENT, each) for each in settings]
+    relays = launch(RELAYS, [[("127.0.0.1", port) for port in ports], FAULTS])
+    simulator = SharedSimulator(
+        ENV_ID, [tuple(a) for a in json.loads(relays.stdout.readline())], drones=AGENTS, bind=ANY,
+        patience=PATIENCE, config=LinkConfig(timeout=600),
+    )  # fmt: skip
+    simulator.observer = twin = Twin(simulator)
+    thread = threading.Thread(target=simulator.run)
+    thread.start()
+    done: Counter[str] = Counter()
+    try:
+        for number in range(kills):
+            while simulator.steps < 5 or not simulator.episodes:
+                assert thread.is_alive(), "the simulator failed"
+                time.sleep(0.01)
+            time.sleep(dice.uniform(0.0, 1.5))
+            victim, killed = dice.randrange(AGENTS), dice.random() < 0.6
+            if killed:
+                agents[victim].kill()
+                agents[victim].wait()
+                time.sleep(dice.choice((0.0, 2 * PATIENCE)))
+                agents[victim] = launch(AGENT, settings[victim])
+            else:
+                agents[victim].send_signal(signal.SIGSTOP)
+                time.sleep(STOPPED)
+                agents[victim].send_signal(signal.SIGCONT)
+            done["killed" if killed else "stopped"] += 1
+            print(f"{number + 1} of {kills}: agent {victim} {'killed' if killed else 'stopped'}, "
+                  f"episode {simulator.episodes}, {dict(twin.counts)}", flush=True)  # fmt: skip
+        wanted = simulator.episodes + 3  # all take part again
+        while simulator.episodes < wanted:
+            assert thread.is_alive(), "the simulator failed"
+            time.sleep(0.01)
+        present = [party.presence.value for party in simulator.parties]
+    finally:
+        simulator.stop()
+        thread.join(60)
+        simulator.close()
+        relays.stdin.close()
+        network: Counter[str] = Counter()
+        for counters in json.loads(relays.stdout.readline()):
+            network.update(counters)
+        time.sleep(1.0)
+        for agent in agents:
+            agent.kill()
+            agent.wait()
+    return {
+        "agents": AGENTS, "faults": FAULTS, "patience": PATIENCE, **done,
+        "episodes": simulator.episodes, **twin.counts,
+        "agents_lost_for_good": present.count("left"), "network": dict(network),
+    }  # fmt: skip
+
+
+def fly_hundred(steps: int) -> dict[str, Any]:
+    port = free_ports(1)[0]
+    relays = launch(RELAYS, [[("127.0.0.1", port)], FAULTS])
+    server = tuple(json.loads(relays.stdout.readline())[0])
+    simulator = Simulator(ENV_ID, server=server, bind=ANY, drones=100)
+    thread = threading.Thread(target=simulator.run)
+    thread.start()
+    remote, local = RemoteVectorEnv(("127.0.0.1", port)), LocalVectorEnv(ENV_ID, 100, drones=100)
+    here, there = local.reset(seed=0), remote.reset(seed=0)
+    dice, different, episodes = np.random.default_rng(0), 0, 0
+    for _ in range(steps):
+        actions = dice.uniform(-0.1, 0.1, (100, 1)).astype(np.float32)
+        here, there = local.step(actions), remote.step(actions)
+        told = (name for name in here[4] if not name.startswith(("_", "reward")))
+        pairs = [*zip(here[:4], there[:4], strict=True),
+                 *((here[4][name], there[4][name]) for name in told)]  # fmt: skip
+        different += any(a.tobytes() != b.tobytes() for a, b in pairs)
+        episodes += bool(local.done.any())
+    remote.close()
+    thread.join(30)
+    simulator.close()
+    relays.stdin.close()
+    return {
+        "drones": 100, "faults": FAULTS, "control_steps": steps, "drone_steps": 100 * steps,
+        "episodes": episodes, "steps_that_differ": different,
+        "bytes_of_a_state": simulator.link.layout.state_size,
+        "network": json.loads(relays.stdout.readline())[0],
+    }  # fmt: skip
+
+
+def main() -> None:
+    out = RESULTS / "reliability" / "swarm.json"
+    args = options(__doc__, kills=20, steps=1000, seed=0, out=out).parse_args()
+    result = {
+        "agent_processes": fly_eight(args.kills, random.Random(args.seed)),
+        "hundred_drones": fly_hundred(args.steps),
+    }
+    write(args.out, result)
+    print(json.dumps(result, indent=2))
+    eight, hundred = result["agent_processes"], result["hundred_drones"]
+    differ = eight["states_that_differ"] + eight["actions_that_differ"]
+    if differ or hundred["steps_that_differ"]:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,327 @@
+"""What a picture costs: by kind and size beside MuJoCo's own renderer, in an env, and over UDP.
+
+    python studies/cameras.py [--seconds 1] [--repeats 7] [--out FILE.json]
+    python studies/cameras.py --sheet FILE.png    pictures of every kind, to look at
+    python studies/cameras.py --worlds FILE.png   worlds of two seeds each
+    python studies/cameras.py --optics FILE.png   what a camera does beyond a pinhole's
+
+Unless told otherwise a case draws the plain world with a Crazyflie from its camera `front`.
+`mujoco.Renderer` draws the same model without shadows and smooth edges, and gives the same kind; it
+has no optical flow: there ours is beside its depth. Cases take turns within a repeat, medians are
+told.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+os.environ.setdefault("MUJOCO_GL", "egl")  # which MuJoCo's renderer needs before it is imported
+
+import mujoco
+import numpy as np
+from measuring import in_turns, medians, options, write
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.models import SEEDED_WORLDS
+from rotorgram.models.cameras import KINDS, cameras_of, chosen_views
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.rendering.cameras import Cameras
+from rotorgram.training.pairs import socket_pair
+from rotorgram.udp import RemoteVectorEnv
+from swarm import advanced, timed
+
+ENV = "rotorgram/Hover-v0"
+VEHICLE = "crazyflie2"
+SIZES = ((64, 64), (128, 128), (320, 240))
+EPISODE = 100_000  # control steps: none ends while it is measured
+
+Step = Callable[[], object]
+Times = dict[str, float]
+WORLDS = ("plain", "airport", *SEEDED_WORLDS)
+
+
+OPTICS = {
+    "pinhole": "",
+    "distortion": "distortion = [-0.25, 0.05, 0.001, -0.0005, 0.0]",
+    "noise": "exposure = 0.3\nnoise = [0.05, 0.02]",
+    "readout": "readout = 0.03",
+}
+
+
+def optical(folder: str) -> Vehicle:
+    """A Crazyflie with a camera for each of `OPTICS`, where its `front` is."""
+    text = Vehicle.load(VEHICLE).path.read_text("utf-8")
+    front = next(one for one in cameras_of(Vehicle.load(VEHICLE)) if one.name == "front")
+    for name, words in OPTICS.items():
+        place = [float(part) for part in front.position]
+        text += f'\n[[cameras]]\nname = "{name}"\nposition = {place}\n{words}\n'
+    file = Path(folder) / "optical.toml"
+    file.write_text(text, "utf-8")
+    return Vehicle.load(file)
+
+
+def ours(word: str, world: str = "plain", vehicle: Vehicle | None = None) -> tuple[Step, Cameras]:
+    """A picture of a craft that flies and yaws, a little further from one to the next."""
+    vehicle = vehicle or Vehicle.load(VEHICLE)
+    views = chosen_views([word], cameras_of(vehicle))
+    cameras, everybody = Cameras(vehicle, views, world=world), np.ones(1, bool)
+    place, turn = np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0, 0.0]])
+    speeds = {"velocity": np.array([[3.0, 0.0, 0.0]]), "body_rates": np.array([[0.0, 0.0, 2.0]])}
+    due, dice = {views[0].name: everybody}, {0: np.random.default_rng(0)}
+
+    def step() -> None:
+        place[0, 0] += 1e-3
+        state = {"position": place, "quaternion": turn, **speeds}
+        cameras.take(due, ~everybody, state, dice.__getitem__)
+
+    step()
+    return step, cameras
+
+
+def theirs(kind: str, width: int, height: int, cameras: Cameras) -> Step:
+    """The same by MuJoCo's renderer."""
+    renderer = mujoco.Renderer(cameras.model, height, width)
+    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+    if kind in ("depth", "flow"):
+        renderer.enable_depth_rendering()
+    if kind == "segmentation":
+        renderer.enable_segmentation_rendering()
+    data = cameras.data
+
+    def step() -> None:
+        data.qpos[0] += 1e-3
+        mujoco.mj_forward(cameras.model, data)
+        renderer.update_scene(data, "drone_0/front")
+        renderer.render()
+
+    step()
+    return step
+
+
+def pictures(seconds: float, repeats: int) -> list[dict[str, Any]]:
+    """Pictures per second by kind and size, ours and theirs."""
+    rows = []
+    for width, height in SIZES:
+        for kind in KINDS:
+            here, cameras = ours(f"front_{kind}@{width}x{height}")
+            cases = {"ours": here, "theirs": theirs(kind, width, height, cameras)}
+            taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)))
+            cameras.close()
+            rows.append(
+                {
+                    "kind": kind,
+                    "width": width,
+                    "height": height,
+                    "per_second": round(1 / taken["ours"], 1),
+                    "renderer_per_second": round(1 / taken["theirs"], 1),
+                    "ratio": round(taken["theirs"] / taken["ours"], 3),
+                }
+            )
+    return rows
+
+
+def milliseconds(cases: dict[str, tuple[Step, Cameras]], seconds: float, repeats: int) -> Times:
+    """Of a picture of each case, in turns."""
+    steps = {name: step for name, (step, _) in cases.items()}
+    taken = medians(in_turns(steps, repeats, lambda step: timed(step, seconds)))
+    for _, cameras in cases.values():
+        cameras.close()
+    return {name: round(1e3 * time, 2) for name, time in taken.items()}
+
+
+def surroundings(seconds: float, repeats: int) -> dict[str, Times]:
+    """Milliseconds of a picture of 64 x 64 in each world, by kind."""
+    return {
+        kind: milliseconds(
+            {world: ours(f"front_{kind}", world) for world in WORLDS}, seconds, repeats
+        )
+        for kind in ("rgb", "depth")
+    }
+
+
+def lenses(seconds: float, repeats: int) -> Times:
+    """Milliseconds of colours of 128 x 128 by what the camera does beyond a pinhole's."""
+    with TemporaryDirectory() as folder:
+        craft = optical(folder)
+        cases = {name: ours(f"{name}@128x128", "plain", craft) for name in OPTICS}
+    return milliseconds(cases, seconds, repeats)
+
+
+def threads(seconds: float, repeats: int) -> dict[str, float]:
+    """Pictures per second of 64 x 64 by two pairs of cameras: in one thread, and in two."""
+    each = [ours("front_rgb") for _ in range(2)]
+    with ThreadPoolExecutor(2) as pool:
+        cases: dict[str, Step] = {
+            "one thread": lambda: [step() for step, _ in each],
+            "two threads": lambda: [*pool.map(lambda one: one[0](), each)],
+        }
+        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)))
+    for _, cameras in each:
+        cameras.close()
+    return {name: round(2 / time, 1) for name, time in taken.items()}
+
+
+def steps(drones: int, seconds: float, repeats: int) -> dict[str, float]:
+    """Milliseconds of a step of so many drones: without pictures, with one each, and over UDP."""
+    blind: dict[str, Any] = {"episode_length": EPISODE, "action": "velocity"}
+    flown = {"blind": blind, "seeing": {**blind, "cameras": ["front"]}}
+    with ExitStack() as opened:
+        cases: dict[str, Step] = {}
+        for name, more in flown.items():
+            local = LocalVectorEnv(ENV, drones, vehicle=VEHICLE, **more)
+            opened.callback(local.close)
+            pair = socket_pair(ENV, more, num_envs=drones, vehicle=VEHICLE)
+            cases[name] = advanced(local, drones)
+            cases[f"{name} over UDP"] = advanced(opened.enter_context(pair), drones)
+        if drones > 1:
+            several = opened.enter_context(two_simulators(drones, flown["seeing"]))
+            cases["seeing over UDP, two simulators"] = advanced(several, drones)
+        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)))
+    return {name: round(time * 1e3, 3) for name, time in taken.items()}
+
+
+@contextmanager
+def two_simulators(drones: int, settings: dict[str, Any]) -> Iterator[RemoteVectorEnv]:
+    """A vector env of two processes, each of which draws half of the pictures."""
+    here = ("127.0.0.1", 0)
+    env = RemoteVectorEnv(
+        here, env_id=ENV, options=settings, num_simulators=2, num_envs=drones,
+        autoreset_mode="Disabled", connect=False,
+    )  # fmt: skip
+    told = {"server": env.address, "bind": here, "num_envs": drones // 2, "env": ENV}
+    words = json.dumps(told | {"vehicle": VEHICLE, "options": settings})
+    command = [sys.executable, "-P", "-m", "rotorgram.udp", words]
+    with ExitStack() as opened:
+        for _ in range(2):
+            opened.enter_context(subprocess.Popen(command))
+        opened.callback(env.close)
+        yield env
+
+
+def sheet(path: Path) -> None:
+    """A step of flights: a row for each, of every kind and of `down`."""
+    from matplotlib import colormaps, image
+
+    scenes: list[tuple[str, str | None, str, dict[str, Any], int]] = [
+        ("rotorgram/Landing-v0", "crazyflie2", "front", {"world": "airport"}, 1),
+        ("rotorgram/Racing-v0", "skydio_x2", "front", {}, 1),
+        ("rotorgram/Formation-v0", None, "chase", {}, 6),
+    ]
+    rows = []
+    for env_id, vehicle, eye, more, drones in scenes:
+        kinds = ("down", eye, *(f"{eye}_{kind}" for kind in KINDS[1:]))
+        words = [f"{name}@160x120" for name in kinds]
+        env = LocalVectorEnv(
+            env_id, drones, drones=drones, vehicle=vehicle, cameras=words, action="velocity", **more
+        )
+        env.reset(seed=1)
+        for _ in range(15):
+            env.step(np.tile(np.float32((0.3, 0.1, 0.0, 0.2)), (drones, 1)))
+        seen = {name: array[0] for name, array in env.observations.items()}
+        depth = np.log(seen[f"{eye}_depth"][..., 0])
+        flow = np.linalg.norm(seen[f"{eye}_flow"], axis=-1)
+        shades = (
+            colormaps["viridis_r"]((depth - depth.min()) / np.ptp(depth)),
+            colormaps["tab20"](seen[f"{eye}_segmentation"][..., 0] % 20),
+            colormaps["magma"](flow / max(flow.max(), 1e-9)),
+        )
+        told = [(255 * shade[..., :3]).astype(np.uint8) for shade in shades]
+        rows.append(np.hstack([seen["down"], seen[eye], *told]))
+        env.close()
+    image.imsave(path, np.vstack(rows))
+
+
+def optics(path: Path) -> None:
+    """Gates by a pinhole, by a lens that distorts, with noise, and read row by row in a turn."""
+    from PIL import Image
+
+    with TemporaryDirectory() as folder:
+        vehicle = optical(folder)
+        views = chosen_views([f"{name}@320x240" for name in OPTICS], cameras_of(vehicle))
+        cameras, everybody = Cameras(vehicle, views, world="gates:2"), np.ones(1, bool)
+    state = {
+        "position": np.array([[0.0, 0.0, 5.0]]),
+        "quaternion": np.array([[1.0, 0.0, 0.0, 0.0]]),
+        "body_rates": np.array([[0.0, 0.0, 6.0]]),
+    }
+    dice = {0: np.random.default_rng(1)}
+    cameras.take(dict.fromkeys(OPTICS, everybody), everybody, state, dice.__getitem__)
+    row = np.hstack([cameras.pictures[name][0] for name in OPTICS])
+    Image.fromarray(row).quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+    cameras.close()
+
+
+def worlds(path: Path) -> None:
+    """Two seeds of each world that is made from one: from behind the paper's craft, and ahead."""
+    from PIL import Image
+
+    vehicle, rows = Vehicle.load(), []
+    views = chosen_views(["chase@320x240", "front@320x240"], cameras_of(vehicle))
+    state = {"position": np.array([[0.0, 0.0, 5.0]]), "quaternion": np.array([[0.9, 0, 0, 0.436]])}
+    everybody = np.ones(1, bool)
+    for name in SEEDED_WORLDS:
+        row = []
+        for seed in range(2):
+            cameras = Cameras(vehicle, views, world=f"{name}:{seed}", fine=True)
+            cameras.take({view.name: everybody for view in views}, everybody, state)
+            row += [cameras.pictures[view.name][0] for view in views]
+            cameras.close()
+        rows.append(np.hstack(row))
+    pictures = Image.fromarray(np.vstack(rows)).quantize(128, dither=Image.Dither.NONE)
+    pictures.save(path, optimize=True)
+
+
+def main() -> None:
+    """Measure, print and write."""
+    drawings = {"sheet": sheet, "worlds": worlds, "optics": optics}
+    files = dict.fromkeys(drawings, Path)
+    args = options(__doc__, seconds=1.0, repeats=7, out=Path, **files).parse_args()
+    for name, draw in drawings.items():
+        if file := getattr(args, name):
+            draw(file)
+            return
+    rows = pictures(args.seconds, args.repeats)
+    print("| kind | pixels | pictures/s | of `mujoco.Renderer` | ratio |")
+    print("|---|---|---:|---:|---:|")
+    for row in rows:
+        size, names = f"{row['width']} × {row['height']}", ("per_second", "renderer_per_second")
+        told = " | ".join(f"{row[name]:,.0f}" for name in names)
+        print(f"| {row['kind']} | {size} | {told} | {row['ratio']:.2f} |")
+    taken = {str(drones): steps(drones, args.seconds, args.repeats) for drones in (1, 16)}
+    print("| ms of a step | " + " | ".join(f"{drones} drones" for drones in taken) + " |")
+    print("|---|" + "---:|" * len(taken))
+    for name in taken["16"]:
+        told = (f"{one[name]:.2f}" if name in one else "–" for one in taken.values())
+        print(f"| {name} | " + " | ".join(told) + " |")
+    around = surroundings(args.seconds, args.repeats)
+    print("| ms of a picture of 64 × 64 | " + " | ".join(WORLDS) + " |")
+    print("|---|" + "---:|" * len(WORLDS))
+    for kind, told in around.items():
+        print(f"| {kind} | " + " | ".join(f"{told[world]:.1f}" for world in WORLDS) + " |")
+    beyond = lenses(args.seconds, args.repeats)
+    print("| ms of colours of 128 × 128 | " + " | ".join(beyond) + " |")
+    print("|---|" + "---:|" * len(beyond))
+    print("| | " + " | ".join(f"{time:.1f}" for time in beyond.values()) + " |")
+    side_by_side = threads(args.seconds, args.repeats)
+    print(f"pictures per second of two cameras: {side_by_side}")
+    if args.out:
+        write(
+            args.out,
+            {
+                "pictures": rows,
+                "milliseconds of a step": taken,
+                "milliseconds by world": around,
+                "milliseconds by optics": beyond,
+                "pictures per second of two cameras": side_by_side,
+            },
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,333 @@
+"""Open-loop prediction error on recorded flights of a real drone, beside published rows.
+
+`python studies/real_flights.py FOLDER [--vehicle FILE] [--out docs/results/real_flights]`
+
+FOLDER has `train/*.csv` and `test/*.csv` of the IDSIA nano-drone benchmark (arXiv 2512.14450;
+`docs/real-flights.md` says how to get them). Every sample of a test flight, or every `--stride`-th,
+is a start: its measured state flies on in the simulator with the rotor speeds that were measured,
+and the error after 1, 10 and 50 steps of 10 ms is the Euclidean distance (attitude: the angle),
+mean over all starts. What is fitted is fitted on the training flights alone. With `--vehicle` that
+vehicle flies as its file has it, with drag of its body and nothing fitted.
+"""
+
+import csv
+import json
+import sys
+import tempfile
+import time
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from measuring import RESULTS, options
+from rotorgram.flights.flight_logs import read_log
+from rotorgram.flights.identified_vehicle import vehicle_toml
+from rotorgram.flights.identify import Group, fit, regressed
+from rotorgram.flights.prediction import Airframe, Flight, Floats, Windows, differences, predict
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.sim.effects import EffectOptions
+from rotorgram.sim.state import Pose
+from rotorgram.sim.world import make_world
+
+START: Final = Path(__file__).with_name("nanodrone.toml")
+HORIZONS: Final = (1, 10, 50)
+MEASURES: Final = ("position_m", "attitude_rad", "velocity_m_s", "rates_rad_s")
+PUBLISHED: Final = {
+    "naive": ((0.0143, 0.0071, 0.0329, 0.0796), (0.1430, 0.0692, 0.3182, 0.3596),
+              (0.6797, 0.3041, 1.4749, 0.8837)),
+    "physics": ((0.0013, 0.0011, 0.0080, 0.0796), (0.0126, 0.0205, 0.0570, 0.3596),
+                (0.1269, 0.2544, 0.5781, 0.8837)),
+    "MLP": ((0.0032, 0.0022, 0.0116, 0.1138), (0.0305, 0.0331, 0.0890, 0.5949),
+            (0.1712, 0.2268, 0.5720, 0.9005)),
+    "hybrid": ((0.0016, 0.0027, 0.0092, 0.0912), (0.0166, 0.0376, 0.0613, 0.4880),
+               (0.1119, 0.2306, 0.5556, 0.5979)),
+    "LSTM": ((0.0079, 0.0066, 0.0247, 0.1021), (0.0390, 0.0372, 0.1175, 0.4292),
+             (0.2572, 0.2325, 0.7407, 1.2407)),
+}  # fmt: skip
+"""Rows of the benchmark's table: position, attitude, velocity, rates at each horizon."""
+_WORLDS: Final = 2048
+_UP: Final = 100.0  # m: far from the ground, which no effect here feels
+_STRIDE: Final = 50  # samples between two starts of a fit: windows do not overlap
+
+K: Final = ("rotors.thrust_coefficient",)
+DRAG: Final = (("drag.linear.x", "drag.linear.y"), ("drag.linear.z",))
+ROTOR_DRAG: Final = (("rotors.drag",), ("rotors.inflow",))
+INERTIA: Final = (("body.inertia.x", "body.inertia.y"), ("body.inertia.z",))
+MOMENT: Final = (("drag.moment.x", "drag.moment.y"),)
+DAMPING: Final = (("drag.angular.x", "drag.angular.y"), ("drag.angular.z",))
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A model: which numbers are fitted, and whether rotors turn the craft."""
+
+    name: str
+    groups: tuple[Group, ...] = ()
+    turns: bool = True
+    regressed: bool = False
+    """Whether thrust and drag are those of a regression of accelerations, and not fitted too."""
+
+
+VARIANTS: Final = (
+    Variant("rates constant, published thrust coefficient", (), False),
+    Variant("+ thrust coefficient fitted", (K,), False),
+    Variant("+ drag of the body", (K, *DRAG), False),
+    Variant("or drag and inflow of the rotors instead", (K, *ROTOR_DRAG), False),
+    Variant("rotors turn the craft, published inertia", (K, *DRAG)),
+    Variant("+ inertia fitted", (K, *DRAG, *INERTIA)),
+    Variant("+ moment of the air", (K, *DRAG, *INERTIA, *MOMENT)),
+    Variant("+ damping of the rates", (K, *DRAG, *INERTIA, *MOMENT, *DAMPING)),
+    Variant("the same, thrust and drag by regression", (*INERTIA, *MOMENT, *DAMPING),
+            regressed=True),
+    Variant("the same with the published inertia", (K, *DRAG, *MOMENT, *DAMPING)),
+    Variant("the same with each axis apart",
+            (K, *((name,) for kind in ("drag.linear.", "body.inertia.", "drag.angular.")
+                  for name in (kind + "x", kind + "y", kind + "z")),
+             ("drag.moment.x",), ("drag.moment.y",))),
+)  # fmt: skip
+FORCES: Final = ("rotors.thrust_coefficient", *(f"drag.linear.{axis}" for axis in "xyz"))
+
+
+def main() -> int:
+    parser = options(__doc__, out=RESULTS / "real_flights", stride=1, vehicle=str)
+    parser.add_argument("folder", type=Path)
+    given = parser.parse_args()
+    base = Vehicle.load(START)
+    if given.vehicle:
+        return _measure(given, Vehicle.load(given.vehicle))
+    train, test = (_flights(given.folder / kind, base) for kind in ("train", "test"))
+    windows = Windows.cut(test, HORIZONS[-1], given.stride, HORIZONS)
+    print(f"{len(train)} training flights; {len(test)} test flights, {len(windows.index)} starts")
+    held = Airframe.of(base)
+    naive = dict.fromkeys(HORIZONS, windows.start)
+    rows = [_row("state held", naive, windows, test)]
+    _show(rows[-1], "ours")
+    cut = Windows.cut(train, HORIZONS[-1], _STRIDE, (10, 25, 50))
+    for variant in VARIANTS:
+        begun = time.monotonic()
+        airframe = _fitted(variant, held, cut, train)
+        text, vehicle = _vehicle(base, airframe, variant)
+        row = _row(variant.name, simulated(vehicle, windows), windows, test)
+        numpy = dict(predict(_flown(variant, airframe), windows))
+        ours = _row(variant.name, numpy, windows, test)
+        row["numpy"] = ours["errors"][HORIZONS[-1]]
+        row["unseen_kinds"] = _unseen(variant, held, train)
+        reference = rows[1] if len(rows) > 1 else row
+        ratios = np.divide(row["unseen_kinds"], reference["unseen_kinds"])
+        row["unseen_score"] = float(ratios[:3].mean())  # 1: as the published physics
+        names = [*(FORCES if variant.regressed else ()), *(n for g in variant.groups for n in g)]
+        row["numbers"] = {name: airframe.value(name) for name in names}
+        row["file"] = text
+        row["fit_s"] = round(time.monotonic() - begun, 1)
+        rows.append(row)
+        _show(row, "ours")
+    for name, errors in PUBLISHED.items():
+        theirs = dict(zip(HORIZONS, errors, strict=True))
+        _show({"name": name, "published_formula": theirs}, "theirs")
+    _write(given.out, rows, len(windows.index), given.stride)
+    return 0
+
+
+def _measure(given: Namespace, vehicle: Vehicle) -> int:
+    """Print and write the errors of a vehicle as its file has it."""
+    test = _flights(given.folder / "test", vehicle)
+    windows = Windows.cut(test, HORIZONS[-1], given.stride, HORIZONS)
+    row = _row(vehicle.name, simulated(vehicle, windows, rotors=False), windows, test)
+    result = {
+        "vehicle": vehicle.name,
+        "vehicle_hash": vehicle.hash,
+        "starts": len(windows.index),
+        "measures": MEASURES,
+        "errors": row["errors"],
+    }
+    text = json.dumps(result, indent=1, ensure_ascii=False)
+    given.out.mkdir(parents=True, exist_ok=True)
+    (given.out / f"{Path(given.vehicle).stem}.json").write_text(text + "\n", encoding="utf-8")
+    print(text)
+    return 0
+
+
+def simulated(
+    vehicle: Vehicle, windows: Windows, *, rotors: bool = True
+) -> dict[int, tuple[Floats, ...]]:
+    """Position, quaternion, velocity and body rates at each horizon, flown by the simulator."""
+    told = vehicle.coefficients
+    body = any(x is not None for x in (told.drag.linear, told.drag.angular, told.drag.moment))
+    rotor = any(x is not None for x in (told.rotors.drag, told.rotors.inflow))
+    effects = EffectOptions(body_drag=body, rotor_drag=rotor and rotors)
+    (coefficient,) = told.need("rotors.thrust_coefficient", "a flight from rotor speeds")
+    parts: dict[int, list[tuple[Floats, ...]]] = {h: [] for h in HORIZONS}
+    for first in range(0, len(windows.index), _WORLDS):
+        some = slice(first, first + _WORLDS)
+        position, quaternion, velocity, rates = (array[:, some].T for array in windows.start)
+        count = len(position)
+        world = make_world(vehicle, count, effects=effects, num_threads=1)
+        lift = np.array((0.0, 0.0, _UP))
+        thrust = [coefficient * windows.inputs(i)[:, some].T ** 2 for i in range(HORIZONS[-1])]
+        start = [position + lift, quaternion, velocity, rates, thrust[0]]
+        world.reset(np.ones((count, 1), bool), Pose(**dict(zip(
+            ("position", "quaternion", "velocity", "body_rates", "thrust"),
+            (array[:, None] for array in start), strict=True))))  # fmt: skip
+        substeps = vehicle.substeps(windows.period)
+        for step in range(HORIZONS[-1]):
+            world.step(thrust[step][:, None], substeps)
+            if step + 1 in HORIZONS:
+                s = world.state
+                parts[step + 1].append((
+                    (s.position[:, 0] - lift).T, s.quaternion[:, 0].T.copy(),
+                    s.velocity[:, 0].T.copy(), s.body_rates[:, 0].T.copy(),
+                ))  # fmt: skip
+        world.close()
+    return {
+        h: tuple(np.concatenate(arrays, axis=-1) for arrays in zip(*chunks, strict=True))
+        for h, chunks in parts.items()
+    }
+
+
+def _flights(folder: Path, vehicle: Vehicle) -> list[Flight]:
+    files = sorted(folder.glob("*.csv"))
+    if not files:
+        sys.exit(f"{folder}: expected CSV files of flights, got none")
+    return [read_log(file, vehicle).flight for file in files]
+
+
+def _fitted(
+    variant: Variant, held: Airframe, windows: Windows, flights: Sequence[Flight]
+) -> Airframe:
+    """The numbers of a variant; where rates are constant, forces are fitted with them constant."""
+    start = _flown(variant, regressed(held, flights, FORCES) if variant.regressed else held)
+    if not variant.groups:
+        return held
+    found = fit(start, windows, variant.groups)
+    return found if variant.turns else found.with_values(
+        {f"body.inertia.{axis}": held.value(f"body.inertia.{axis}") for axis in "xyz"}
+    )  # fmt: skip
+
+
+def _flown(variant: Variant, airframe: Airframe) -> Airframe:
+    """With an inertia that nothing turns, where the rates stay constant."""
+    if variant.turns:
+        return airframe
+    return airframe.with_values({f"body.inertia.{axis}": 1e3 for axis in "xyz"})
+
+
+def _vehicle(base: Vehicle, airframe: Airframe, variant: Variant) -> tuple[str, Vehicle]:
+    """The text of a vehicle file that says these numbers, and its vehicle."""
+    names = [*(FORCES if variant.regressed else ()), *(n for g in variant.groups for n in g)]
+    said = {name.rpartition(".")[0] if name.count(".") > 1 else name for name in names}
+    source = "studies/real_flights.py: fitted on the training flights of arXiv 2512.14450"
+    airframe = _flown(variant, airframe)
+    text = vehicle_toml(base, airframe, None, dict.fromkeys(said, (source, "")))
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "vehicle.toml")
+        file.write_text(text, encoding="utf-8")
+        return text, Vehicle.load(file)
+
+
+def _sizes(predicted: Sequence[Floats], truth: Sequence[Floats]) -> list[Floats]:
+    return [np.linalg.norm(error, axis=0) for error in differences(predicted, truth)]
+
+
+def _row(
+    name: str,
+    predicted: Mapping[int, Sequence[Floats]],
+    windows: Windows,
+    flights: Sequence[Flight],
+) -> dict:
+    """Mean errors: over all starts, by the formula of the published rows, and of each flight."""
+    row: dict = {"name": name, "errors": {}, "published_formula": {}, "flights": {}}
+    for h in HORIZONS:
+        sizes = _sizes(predicted[h], windows.truth[h])
+        row["errors"][h] = [float(size.mean()) for size in sizes]
+        row["published_formula"][h] = published_formula(predicted[h], windows, h)
+        for i, flight in enumerate(flights):
+            mine = [float(size[windows.flight == i].mean()) for size in sizes]
+            row["flights"].setdefault(flight.name, {})[h] = mine
+    return row
+
+
+def published_formula(predicted: Sequence[Floats], windows: Windows, h: int) -> list[float]:
+    """The means as the benchmark computes them (its utils/metrics_utils.py).
+
+    It joins the flights into one table with the measured state of the step after each start, and
+    takes the measured state h - 1 rows further for that at the horizon. For the last h - 1 starts
+    of a flight these rows are of the next flight.
+    """
+    rows = windows.truth[1]
+    count = rows[0].shape[-1] - h + 1
+    truth = [array[:, h - 1 :] for array in rows]
+    sizes = _sizes([array[:, :count] for array in predicted], truth)
+    return [float(size.mean()) for size in sizes]
+
+
+def _unseen(variant: Variant, held: Airframe, train: Sequence[Flight]) -> list[float]:
+    """Errors at the last horizon on each kind of training flights, fitted on the others; mean."""
+    kinds = sorted({flight.name.partition("_")[0] for flight in train})
+    errors = []
+    for kind in kinds:
+        rest = [one for one in train if not one.name.startswith(kind)]
+        left = [one for one in train if one.name.startswith(kind)]
+        windows = Windows.cut(rest, HORIZONS[-1], 2 * _STRIDE, (10, 25, 50))
+        airframe = _flown(variant, _fitted(variant, held, windows, rest))
+        cut = Windows.cut(left, HORIZONS[-1], _STRIDE // 2)
+        for horizon, predicted in predict(airframe, cut):
+            errors.append([float(s.mean()) for s in _sizes(predicted, cut.truth[horizon])])
+    return [float(x) for x in np.mean(errors, axis=0)]
+
+
+def _show(row: Mapping, whose: str) -> None:
+    text = "  ".join(
+        f"h={h}: " + " ".join(f"{x:.4f}" for x in row["published_formula"][h]) for h in HORIZONS
+    )
+    print(f"{whose:7}{row['name']:46}{text}", flush=True)
+
+
+def _write(out: Path, rows: Sequence[Mapping], starts: int, stride: int) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / "variants.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["model", "formula", "horizon", *MEASURES])
+        for row in rows:
+            for kind in ("errors", "published formula"):
+                for h, errors in row[kind.replace(" ", "_")].items():
+                    writer.writerow([row["name"], kind, h, *(f"{x:.5f}" for x in errors)])
+        for name, errors in PUBLISHED.items():
+            for h, one in zip(HORIZONS, errors, strict=True):
+                writer.writerow([f"published: {name}", "published formula", h, *one])
+    with (out / "flights.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["model", "flight", "horizon", *MEASURES])
+        for row in rows:
+            for name, told in row["flights"].items():
+                for h, errors in told.items():
+                    writer.writerow([row["name"], name, h, *(f"{x:.5f}" for x in errors)])
+    # Chosen by kinds of flights that the fit had not seen, among the training flights.
+    chosen = min(rows[1:], key=lambda row: row["unseen_score"])
+    position, attitude, velocity, _ = chosen["errors"][HORIZONS[-1]]
+    told = {"position": position, "velocity": velocity, "attitude": attitude}
+    source = "studies/real_flights.py: mean over the test flights of arXiv 2512.14450"
+    lines = [f'source = "{source}"', *(f"{name} = {value:.4g}" for name, value in told.items())]
+    text = "\n".join((chosen["file"].rstrip(), "", "[real_flights]", *lines, ""))
+    (out / "vehicle.toml").write_text(text, encoding="utf-8")
+    summary = {
+        "model": chosen["name"],
+        "starts": starts,
+        "stride": stride,
+        "horizon_s": 0.5,
+        "measures": MEASURES,
+        "ours": chosen["errors"][50],
+        "ours_by_the_published_formula": chosen["published_formula"][50],
+        "published": {name: errors[-1] for name, errors in PUBLISHED.items()},
+        "numbers": chosen["numbers"],
+        "unseen_kinds": {row["name"]: row["unseen_kinds"] for row in rows[1:]},
+        "unseen_score": {row["name"]: row["unseen_score"] for row in rows[1:]},
+        "ours_in_numpy": chosen["numpy"],
+    }
+    (out / "summary.json").write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

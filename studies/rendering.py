@@ -1,0 +1,131 @@
+"""How fast pictures are drawn without a window, and how long a film takes.
+
+    python studies/rendering.py [--rounds 5] [--frames 20] [--out FILE.json]
+
+Every size and quality is drawn in turns; the fastest round of each counts, since other work on the
+machine only slows it down. The craft flies: every picture differs from the one before.
+"""
+
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measuring import RESULTS, options, write
+from rotorgram.agents import PID
+from rotorgram.envs.registry import env_spec
+from rotorgram.flights.filming import Film, Shot, film, moments
+from rotorgram.flights.trajectories import Trajectory, flown_trajectories
+from rotorgram.models import Vehicle
+from rotorgram.rendering import Canvas, Moment, Stage
+from rotorgram.rendering.film import Overlay
+from rotorgram.rendering.gl import offscreen_context
+
+SIZES = ((640, 360), (1280, 720))
+ENV = "rotorgram/Elevation-v0"
+EPISODE = 1
+
+
+def rate(draw: Callable[[int], object], frames: int) -> float:
+    """Pictures per second."""
+    start = time.perf_counter()
+    for number in range(frames):
+        draw(number)
+    return frames / (time.perf_counter() - start)
+
+
+def pictures(flight: list[Moment], rounds: int, frames: int) -> tuple[dict[str, float], str]:
+    """Pictures per second by size and quality, and the name of the renderer."""
+    rates: dict[str, float] = {}
+    for _ in range(rounds):
+        for width, height in SIZES:
+            for fast in (False, True):
+                stage = Stage("airport")
+                with Canvas(stage, width, height, fast=fast) as canvas:
+                    renderer = driver()
+
+                    def draw(number: int, stage: Stage = stage, canvas: Canvas = canvas) -> None:
+                        stage.show(flight[number])
+                        canvas.draw("chase")
+
+                    draw(0)
+                    name = f"{width}x{height}{', fast' if fast else ''}"
+                    rates[name] = max(rates.get(name, 0.0), round(rate(draw, frames), 1))
+    return rates, renderer
+
+
+def driver() -> str:
+    """Name of OpenGL's renderer."""
+    context = offscreen_context(16, 16)
+    from OpenGL.GL import GL_RENDERER, glGetString  # after the context has chosen its platform
+
+    with context.as_current():
+        name = str(glGetString(GL_RENDERER).decode())
+    context.free()
+    return name
+
+
+def overlays(flight: list[Moment], rounds: int, frames: int) -> dict[str, float]:
+    """Milliseconds for panel and graph of a picture."""
+    times, values = {}, [moment.metrics[0].value for moment in flight]
+    for width, height in SIZES:
+        overlay = Overlay(
+            width,
+            height,
+            title="PID",
+            like=flight[0],
+            vehicle=Vehicle.load(),
+            period=0.02,
+            seconds=5.0,
+            scale=(-1.0, 1.0),
+        )
+        picture = np.zeros((height, width, 3), np.uint8)
+
+        def draw(number: int, overlay: Overlay = overlay, picture: Any = picture) -> None:
+            overlay.draw(picture, flight[number], values[: number + 1])
+
+        best = max(rate(draw, frames) for _ in range(rounds))
+        times[f"{width}x{height}"] = round(1000 / best, 2)
+    return times
+
+
+def whole_film(flown: Trajectory) -> dict[str, float]:
+    """Five seconds at 1280x720 as MP4, once."""
+    shot = Shot(name="PID", color="#B4BCC4", trajectories=[flown])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "film.mp4"
+        start, spent = time.perf_counter(), time.process_time()
+        frames = film(path, [shot], Film())
+        return {
+            "frames": frames,
+            "seconds": round(time.perf_counter() - start, 1),
+            "processor_seconds": round(time.process_time() - spent, 1),
+            "kilobytes": round(path.stat().st_size / 1000),
+        }
+
+
+def main() -> None:
+    out = RESULTS / "performance" / "rendering.json"
+    args = options(__doc__, rounds=5, frames=20, out=out).parse_args()
+    (flown,) = flown_trajectories(PID(env_spec(ENV)), ENV, {}, [EPISODE])
+    flight = moments(flown)
+    rates, renderer = pictures(flight, args.rounds, args.frames)
+    result = {
+        "rounds": args.rounds,
+        "frames": args.frames,
+        "pictures_per_second": rates,
+        "overlay_milliseconds": overlays(flight, args.rounds, args.frames),
+        "film": whole_film(flown),
+        "renderer": renderer,
+        "load": [round(load, 1) for load in os.getloadavg()],
+    }
+    write(args.out, result)
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""Accuracy and speed of the backend `rigid`.
+
+    python studies/rigid.py accuracy
+    python studies/rigid.py speed [--crazyflow PYTHON]
+    python studies/rigid.py sizes
+
+Accuracy: the largest distance to `mujoco` after 5 s of tumbling flight at random thrusts, of every
+vehicle of the library and of the tests. float64 and float32 begin 1000 m up for `mujoco`, where
+nothing is touched, and at the origin for `rigid`, which has no contact: so the figure of float32 is
+of a flight near the origin.
+
+Speed: control steps of 4,096 drones, per second and per second of a processor (which a busy machine
+disturbs less), in turn, medians: of the world alone for `mujoco`
+and `rigid`, arrays and tensors; the same for one env, `Loop.advance` of Hover. With PYTHON of an
+environment that has Crazyflow (pip install crazyflow): its own step benchmark at the same rates, in
+a process of its own.
+
+Sizes: the processor's time of `Loop.advance` of Hover with 64 to 4,096 drones.
+Writes docs/results/rigid/{accuracy,speed,sizes}.json.
+"""
+
+import json
+import statistics
+import subprocess
+import time
+from argparse import Namespace
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from measuring import RESULTS, in_turns, medians, options, write
+from rotorgram.envs import Loop
+from rotorgram.models import QUAD_XML, Vehicle
+from rotorgram.sim import Pose, make_world
+
+OUT = RESULTS / "rigid"
+HERE = Path(__file__).parent
+FILES = [*sorted(Path("tests/data").glob("*.xml")), *sorted(Path("tests/data").glob("*.toml"))]
+FILES += sorted(QUAD_XML.parent.glob("vehicles/*/vehicle.toml"))
+PERIOD, HOVER = 0.02, "rotorgram/Hover-v0"
+
+
+def accuracy() -> None:
+    rows = []
+    for file in FILES:
+        name = file.parent.name if file.stem == "vehicle" else file.stem
+        row: dict[str, Any] = {"vehicle": name}
+        for dtype in ("float64", "float32"):
+            row[dtype] = distances(file, dtype)
+        print(row, flush=True)
+        rows.append(row)
+    write(OUT / "accuracy.json", {"seconds": 5.0, "drones": 32, "rows": rows})
+
+
+def distances(file: Path, dtype: str, drones: int = 32) -> dict[str, float]:
+    vehicle, dice = Vehicle.load(file), np.random.default_rng(0)
+    ours = make_world(vehicle, drones, "rigid", device="cpu", dtype=dtype)
+    theirs = make_world(vehicle, drones, num_threads=1)
+    turned = dice.normal(size=(drones, 1, 4))
+    pose = {
+        "position": np.zeros((drones, 1, 3)),
+        "quaternion": turned / np.linalg.norm(turned, axis=-1, keepdims=True),
+        "velocity": dice.normal(size=(drones, 1, 3)),
+        "body_rates": dice.normal(size=(drones, 1, 3)),
+    }
+    every = torch.ones((drones, 1), dtype=torch.bool)
+    kind = getattr(torch, dtype)
+    ours.reset(every, Pose(**{name: torch.tensor(x, dtype=kind) for name, x in pose.items()}))
+    height = np.array((0.0, 0.0, 1000.0))
+    theirs.reset(every.numpy(), Pose(**pose | {"position": pose["position"] + height}))
+    for _ in range(round(5 / PERIOD)):
+        thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (drones, 1, vehicle.num_rotors))
+        ours.step(torch.tensor(thrust, dtype=kind), vehicle.substeps(PERIOD))
+        theirs.step(thrust, vehicle.substeps(PERIOD))
+    q, p = ours.state.quaternion.double().numpy(), theirs.state.quaternion
+    apart = np.minimum(np.linalg.norm(q - p, axis=-1), np.linalg.norm(q + p, axis=-1))
+    away = ours.state.position.double().numpy() + height - theirs.state.position
+    return {
+        "position_m": float(np.linalg.norm(away, axis=-1).max()),
+        "attitude_rad": float(4 * np.arcsin(apart / 2).max()),
+        "flown_m": float(np.linalg.norm(theirs.state.position - height, axis=-1).max()),
+        "rate_rad_s": float(abs(theirs.state.body_rates).max()),
+    }
+
+
+def rate(fly: Callable[[], None], drones: int, seconds: float) -> tuple[float, float]:
+    """Control steps of all drones per second, and per second of a processor."""
+    times, start, used = 0, time.perf_counter(), time.process_time()
+    while times < 3 or time.perf_counter() - start < seconds:
+        fly()
+        times += 1
+    flown = times * drones
+    return flown / (time.perf_counter() - start), flown / (time.process_time() - used)
+
+
+def world(backend: Any, drones: int, steps: int = 2, **settings: Any) -> Callable[[], None]:
+    """A control step of the world of the paper's vehicle, by default two physics steps."""
+    vehicle, dice = Vehicle.load(), np.random.default_rng(0)
+    made = make_world(vehicle, drones, backend, **settings)
+    thrust = vehicle.hover_thrust * dice.uniform(0.999, 1.001, (drones, 1, vehicle.num_rotors))
+    place = np.broadcast_to((0.0, 0.0, 2000.0), (drones, 1, 3))
+    every: Any = np.ones((drones, 1), bool)
+    if made.xp is np:
+        made.reset(every, Pose(position=place))
+        return lambda: made.step(thrust, steps)
+    put = torch.tensor(thrust, dtype=torch.float32)
+    made.reset(torch.tensor(every), Pose(position=torch.tensor(place.copy(), dtype=torch.float32)))
+    return lambda: made.step(put, steps)
+
+
+def env(backend: Any, drones: int, **settings: Any) -> Callable[[], None]:
+    """A step of Hover: controller, world, observation, reward, ends and resets."""
+    loop = Loop(HOVER, drones, backend=backend, **settings)
+    actions: Any = np.random.default_rng(0).uniform(-0.1, 0.1, (drones, 4)).astype(np.float32)
+    loop.advance(actions, np.ones(drones, bool), range(drones))
+    actions = actions if loop.world.xp is np else torch.tensor(actions)
+
+    def fly() -> None:
+        loop.advance(actions, loop.done if loop.done.any() else None)
+
+    return fly
+
+
+def sizes(args: Namespace) -> None:
+    """Processor microseconds of `Loop.advance` of Hover, by the number of drones."""
+    ways: dict[str, tuple[Any, dict[str, Any]]] = {
+        "mujoco": ("mujoco", {}),
+        "rigid, arrays": ("rigid", {"tensors": False}),
+        "rigid, arrays without a compiler": ("rigid", {"tensors": False, "compiled": False}),
+        "rigid, tensors": ("rigid", {"device": "cpu"}),
+    }
+    table = {}
+    for drones in (64, 128, 1024, 4096):
+        flights = {name: env(kind, drones, **given) for name, (kind, given) in ways.items()}
+        with torch.no_grad():
+            rates = in_turns(
+                flights, args.repeats, lambda fly, n=drones: rate(fly, n, args.seconds)[1]
+            )
+        row = {name: round(drones / median * 1e6) for name, median in medians(rates).items()}
+        print(drones, row, flush=True)
+        table[str(drones)] = row
+    write(OUT / "sizes.json", {"processor_microseconds": table, "repeats": args.repeats})
+
+
+def speed(args: Namespace) -> None:
+    ways: dict[str, Callable[[], None]] = {}
+    firsts = {}
+    for name, (make, backend, settings) in {
+        "world mujoco": (world, "mujoco", {}),
+        "world rigid": (world, "rigid", {"tensors": False}),
+        "world rigid, one physics step": (world, "rigid", {"tensors": False, "steps": 1}),
+        "world rigid tensors": (world, "rigid", {"device": "cpu"}),
+        "env mujoco": (env, "mujoco", {}),
+        "env rigid": (env, "rigid", {"tensors": False}),
+        "env rigid tensors": (env, "rigid", {"device": "cpu"}),
+    }.items():
+        start = time.perf_counter()
+        with torch.no_grad():
+            ways[name] = make(backend, args.drones, **settings)
+            ways[name]()
+        firsts[name] = round(time.perf_counter() - start, 2)
+    rates: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
+    told: dict[str, Any] = {}
+    for _ in range(args.repeats):
+        for name, fly in ways.items():
+            with torch.no_grad():
+                rates[name].append(rate(fly, args.drones, args.seconds))
+        if args.crazyflow:
+            words = [str(HERE / "rigid_crazyflow.py"), str(args.drones), str(args.seconds)]
+            said = subprocess.run([args.crazyflow, *words], capture_output=True, check=True).stdout
+            told = json.loads(said.splitlines()[-1])  # warnings come before
+            for kind, label in (("rate", "crazyflow"), ("own_rate", "crazyflow, one physics step")):
+                rates.setdefault(label, []).append(tuple(told[kind]))
+    clock, processor = (
+        {name: round(statistics.median(x[i] for x in values)) for name, values in rates.items()}
+        for i in (0, 1)
+    )
+    for name, median in clock.items():
+        print(f"{name:32} {median:14,} control steps/s, {processor[name]:14,} of a processor's")
+    write(OUT / "speed.json", {
+        "drones": args.drones, "repeats": args.repeats, "threads": torch.get_num_threads(),
+        "medians": clock, "medians_per_processor_second": processor,
+        "first_step_s": firsts, "crazyflow": told.get("versions"),
+    })  # fmt: skip
+
+
+def main() -> None:
+    parser = options(__doc__, drones=4096, repeats=5, seconds=1.0, crazyflow=str)
+    parser.add_argument("what", choices=("accuracy", "speed", "sizes"))
+    args = parser.parse_args()
+    {"accuracy": lambda _: accuracy(), "speed": speed, "sizes": sizes}[args.what](args)
+
+
+if __name__ == "__main__":
+    main()

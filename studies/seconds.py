@@ -1,0 +1,121 @@
+"""Wall time from process start to a policy that holds, by `rotorgram train`, over many seeds.
+
+    python studies/seconds.py [--seeds 20] [--first-seed 100] [--episodes 20]
+        [--out FILE.json] [--beside geometric] [-- ppo --env rotorgram/Hover-v0 …]
+
+After `--` are the words of `rotorgram train`; without any, PPO on the paper's task, with its tuned
+preset. The clock runs from before the process starts to after it has ended, with its checkpoint
+written. Processor seconds are of all its processes: on a busy machine compare these. Each policy
+then flies 20 `--episodes` on `mujoco`, of starts that no training has seen. A seed holds if the
+mean of the steady headline metric over the episodes is on the good side of `--within`, and none of
+them crashes; for a metric whose last value counts, as `landed`, the mean alone decides.
+"""
+
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measuring import RESULTS, options, write
+from rotorgram.agents import CONTROLLERS, load
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.flights.trajectories import fly_episodes
+from rotorgram.training.metrics import Headline, steady_state
+
+
+def train(words: list[str], seed: int, folder: Path) -> dict[str, float]:
+    """Wall time and processor time of a training, s."""
+    command = [sys.executable, "-m", "rotorgram.cli", "train", *words]
+    began, used = time.perf_counter(), processor_seconds()
+    subprocess.run([*command, "--seed", str(seed), "--out", str(folder)],
+                   check=True, stdout=subprocess.DEVNULL)  # fmt: skip
+    return {"seconds": round(time.perf_counter() - began, 2),
+            "processor_seconds": round(processor_seconds() - used, 2)}  # fmt: skip
+
+
+def processor_seconds() -> float:
+    """Of all processes that this one started and that have ended, and of theirs."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def evaluate(
+    agent: Any, env_id: str, within: float, vehicle: str | None, episodes: int
+) -> dict[str, Any]:
+    """Of a `Checkpoint`, or of a controller by its name: steady size of the headline metric and
+    return, means over episodes; crashes; the verdict.
+    """
+    options = CONTROLLERS[agent].options if isinstance(agent, str) else agent.options
+    env: Any = LocalVectorEnv(env_id, episodes, autoreset_mode="Disabled", vehicle=vehicle,
+                              **options)  # fmt: skip
+    spec = env.env_spec
+    policy = CONTROLLERS[agent](spec) if isinstance(agent, str) else agent.policy(spec)
+    flown = fly_episodes(env, policy, episodes, "final")
+    env.close()
+    headline = replace(Headline.of(spec), held=within)
+    sizes = [steady_state(headline.size(one.headline[1:]), final=headline.final) for one in flown]
+    crashes = 0 if headline.final else sum(bool(one.terminated) for one in flown)
+    return {
+        "steady": round(float(np.mean(sizes)), 5),
+        "worst": round(float(min(sizes) if headline.high else max(sizes)), 5),
+        "return": round(float(np.mean([one.rewards.sum() for one in flown])), 2),
+        "flight_seconds": round(float(np.mean([one.seconds for one in flown])), 2),
+        "crashes": crashes,
+        "holds": bool(headline.holds(np.mean(sizes))) and not crashes,
+    }
+
+
+def main() -> None:
+    parser = options(__doc__, seeds=20, first_seed=100, episodes=20, within=0.05, vehicle=str,
+                     out=RESULTS / "seconds.json")  # fmt: skip
+    parser.add_argument("--beside", choices=sorted(CONTROLLERS), nargs="+", default=[],
+                        help="controllers that fly the same starts")  # fmt: skip
+    parser.add_argument("words", nargs="*", default=["ppo"])
+    args = parser.parse_args()
+    words = args.words + (["--vehicle", args.vehicle] if args.vehicle else [])
+    rows: list[dict[str, Any]] = []
+    beside: dict[str, Any] = {}
+    for seed in range(args.first_seed, args.first_seed + args.seeds):
+        with tempfile.TemporaryDirectory() as folder:
+            row = {"seed": seed, **train(words, seed, Path(folder) / "run")}
+            kept = load(Path(folder) / "run" / "checkpoint.safetensors")
+        row["env_steps"] = kept.position.env_steps
+        row |= evaluate(kept, kept.env_id, args.within, args.vehicle, args.episodes)
+        row["load_average"] = round(os.getloadavg()[0], 1)
+        rows.append(row)
+        print(row, flush=True)
+        beside = beside or {
+            name: evaluate(name, kept.env_id, args.within, args.vehicle, args.episodes)
+            for name in args.beside
+        }
+        note(args.out, words, args.within, rows, beside)
+    print(f"{sum(row['holds'] for row in rows)} of {len(rows)} hold {args.within}")
+
+
+def note(
+    path: Path, words: list[str], within: float, rows: list[Any], beside: dict[str, Any]
+) -> None:
+    """After every seed, so that an interrupted measurement has those that were flown."""
+    result = {
+        "command": f"rotorgram train {' '.join(words)}",
+        "within": within,
+        "hold": sum(row["holds"] for row in rows),
+        "of": len(rows),
+        **{name: {"median": round(statistics.median(row[name] for row in rows), 2),
+                  "most": max(row[name] for row in rows)}
+           for name in ("seconds", "processor_seconds")},
+        "seeds": rows,
+        **({"beside": beside} if beside else {}),
+    }  # fmt: skip
+    write(path, result)
+
+
+if __name__ == "__main__":
+    main()

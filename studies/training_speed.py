@@ -1,0 +1,95 @@
+"""Env steps per second of training through the socket: our A2C and VPG beside SB3's A2C.
+
+    python studies/training_speed.py [--env-steps 20000] [--repeats 5] [--out FILE.json]
+    python studies/training_speed.py --agents a2c sb3-a2c --num-envs 64 --backend rigid
+        --steps-per-update 320 --env-steps 200000 --out docs/results/rigid/a2c.json
+
+Every training has a simulator process and a socket pair of its own, the same networks, the same
+hyperparameters (preset `tuned`) and the same number of env steps. The agents take turns, so that a
+machine that slows down slows all of them; medians are compared, of rates and of the ratios to SB3's
+in the same turn. Imports and the start of the simulator are not counted. 320 env steps of 64 drones
+are five of each for an update, as SB3's default has it.
+"""
+
+import os
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measuring import RESULTS, medians, options, write
+from rotorgram.agents import preset
+from rotorgram.training.pairs import socket_pair
+from rotorgram.training.settings import Run
+from rotorgram.training.training import Training
+
+
+def processor_seconds() -> float:
+    """Of this process and its simulator, by Linux."""
+    (task,) = Path("/proc/self/task").glob(str(os.getpid()))
+    used = time.process_time()
+    for child in (task / "children").read_text().split():
+        fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+        used += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return used
+
+
+def steps_per_second(
+    algorithm: str, changes: dict[str, int], seed: int, **settings: Any
+) -> tuple[float, float]:
+    """By the clock, and per second of a processor."""
+    config = preset(algorithm, "tuned", **changes)
+    run = Run(algorithm=algorithm, config=config, seed=seed, **settings)
+    with socket_pair(**run.training_env, num_envs=run.num_envs) as env:
+        training = Training(run, env)
+        before = processor_seconds()
+        training.train()
+        used = processor_seconds() - before
+        return training.log.env_steps / training.log.seconds, training.log.env_steps / used
+
+
+def main() -> None:
+    args = options(
+        __doc__, env_steps=20_000, agents=("a2c", "vpg", "sb3-a2c"), num_envs=1, backend="mujoco",
+        steps_per_update=int, repeats=5, out=RESULTS / "training_speed.json",
+    ).parse_args()  # fmt: skip
+    changes = {"steps_per_update": args.steps_per_update} if args.steps_per_update else {}
+    settings = {name: getattr(args, name) for name in ("env_steps", "num_envs", "backend")}
+    rates: dict[str, list[float]] = {agent: [] for agent in args.agents}
+    used: dict[str, list[float]] = {agent: [] for agent in args.agents}
+    for repeat in range(args.repeats):
+        for agent in args.agents:
+            rate, of_processor = steps_per_second(agent, changes, repeat, **settings)
+            rates[agent].append(round(rate, 1))
+            used[agent].append(round(of_processor, 1))
+            print(f"{agent:8} {rate:8,.0f} env steps/s, {of_processor:8,.0f} of a processor's",
+                  flush=True)  # fmt: skip
+    middle = medians(rates)
+    ratios, ratios_used = (
+        {
+            agent: round(statistics.median(np.divide(values, told["sb3-a2c"]).tolist()), 2)
+            for agent, values in told.items()
+        }
+        for told in (rates, used)
+    )
+    result = {
+        **settings,
+        "changes": changes,
+        "rates": rates,
+        "medians": middle,
+        "ratio_to_sb3": ratios,
+        "rates_per_processor_second": used,
+        "ratio_to_sb3_per_processor_second": ratios_used,
+        "load_average": round(os.getloadavg()[0], 1),
+    }
+    write(args.out, result)
+    for agent, median in middle.items():
+        print(
+            f"{agent:8} median {median:8,.0f} env steps/s, {ratios[agent]:.2f} x SB3's A2C, "
+            f"{ratios_used[agent]:.2f} x per second of a processor"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,656 @@
+"""Exported policies, run by other programs, give the numbers of the policy."""
+
+import json
+import re
+import subprocess
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from peers import ANY, Running
+from rotorgram.agents import load, store
+from rotorgram.agents.export import TARGETS, csharp, export, metadata, torchscript
+from rotorgram.agents.export import c as c_target
+from rotorgram.agents.export import onnx as onnx_target
+from rotorgram.agents.policies import NetworkPolicy, flat_size
+from rotorgram.cli import main
+from rotorgram.envs.registry import env_spec
+from rotorgram.envs.spec import ArraySpec, Discrete, EnvSpec
+from rotorgram.flights.trajectories import evaluation_seed
+from rotorgram.models.library import vehicle_names
+from rotorgram.udp import Simulator
+from rotorgram.udp.journal.reader import Recording
+from rotorgram.udp.protocol.messages import FLY, Command
+from scripted import spec_of
+from test_install import optional, run_without
+from test_peers import PEERS, ROOT, compiled, ended, running, tool, waiting
+
+ROWS = 10_000
+C_FLAGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-pedantic", "-Werror"]
+CPP_FLAGS = ["-x", "c++", "-std=c++11", *C_FLAGS[1:]]
+# An access out of bounds, or what C leaves undefined, ends the program with a text on stderr.
+CHECKED = ["-Wconversion", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+
+
+def policy_of(
+    spec: EnvSpec,
+    hidden: tuple[int, ...] = (16,),
+    activation: str = "relu",
+    *,
+    squash: bool = False,
+    normalise: bool = False,
+    seed: int = 0,
+) -> NetworkPolicy:
+    """A policy with random weights, whose outputs fill the range of actions."""
+    rng = np.random.default_rng(seed)
+    outputs = spec.action.n if isinstance(spec.action, Discrete) else spec.action.size
+    sizes = [flat_size(spec), *hidden, outputs]
+    weights = {}
+    for i, (inputs, units) in enumerate(pairwise(sizes)):
+        weights[f"layers.{i}.weight"] = rng.normal(size=(units, inputs)) / np.sqrt(inputs)
+        weights[f"layers.{i}.bias"] = 0.3 * rng.normal(size=units)
+    if not isinstance(spec.action, Discrete):
+        weights["log_std"] = np.zeros(outputs)
+    if normalise:
+        weights["observation.mean"] = rng.normal(size=sizes[0])
+        weights["observation.scale"] = np.exp(rng.normal(size=sizes[0]))
+    single = {name: array.astype(np.float32) for name, array in weights.items()}
+    policy = NetworkPolicy(single, spec, activation)
+    policy.squash = squash
+    return policy
+
+
+def told_of(spec: EnvSpec) -> dict[str, str]:
+    return metadata(spec, algorithm="a2c", seed=7, env_steps=4096)
+
+
+def observations_of(spec: EnvSpec, rows: int = ROWS) -> np.ndarray:
+    """Half of them around 0 and up to the bounds, half up to a hundred times as far."""
+    rng = np.random.default_rng(1)
+    bounds = [np.abs(np.stack(array.bounds())).max(0).ravel() for array in spec.observation]
+    far = np.minimum(np.concatenate(bounds), 10.0)
+    drawn = far * rng.uniform(-1, 1, (rows, far.size))
+    drawn[rows // 2 :] *= 10.0 ** rng.uniform(0, 2, (rows - rows // 2, 1))
+    return drawn.astype(np.float32)
+
+
+def by_policy(policy: NetworkPolicy, observations: np.ndarray) -> np.ndarray:
+    return np.array([np.atleast_1d(policy.act(row)).ravel() for row in observations], np.float64)
+
+
+# Each runs the file of a target on observations, in a folder.
+
+
+def by_onnxruntime(policy: NetworkPolicy, observations: np.ndarray, folder: Path) -> np.ndarray:
+    content = onnx_target.write(policy, told_of(policy.spec))
+    session = onnxruntime.InferenceSession(content)
+    (action,) = session.run(["action"], {"observation": observations})
+    return np.asarray(action).reshape(len(observations), -1)
+
+
+def by_torch(policy: NetworkPolicy, observations: np.ndarray, folder: Path) -> np.ndarray:
+    path = folder / "policy.pt"
+    path.write_bytes(torchscript.write(policy, told_of(policy.spec)))
+    action = load_torchscript(path)(torch.from_numpy(observations))
+    return np.asarray(action.numpy().reshape(len(observations), -1))
+
+
+def load_torchscript(path: Path, extra: dict[str, str] | None = None) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of all that is TorchScript
+        return torch.jit.load(path, _extra_files=extra)
+
+
+C_MAIN = """
+#include <stdio.h>
+#include "rotorgram_policy.h"
+
+int main(void)
+{
+    float observation[ROTORGRAM_OBSERVATIONS], action[ROTORGRAM_ACTIONS];
+    while (fread(observation, sizeof observation, 1, stdin) == 1) {
+        rotorgram_policy(observation, action);
+        fwrite(action, sizeof action, 1, stdout);
+    }
+    return 0;
+}
+"""
+CSHARP_MAIN = """
+using System;
+
+static class Program
+{
+    static void Main()
+    {
+        var policy = new Rotorgram.RotorgramPolicy();
+        var observation = new float[Rotorgram.RotorgramPolicy.Observations];
+        var action = new float[Rotorgram.RotorgramPolicy.Actions];
+        var bytes = new byte[4 * Math.Max(observation.Length, action.Length)];
+        var input = new System.IO.BufferedStream(Console.OpenStandardInput());
+        var output = new System.IO.BufferedStream(Console.OpenStandardOutput());
+        for (;;) {
+            for (int at = 0, n; at < 4 * observation.Length; at += n)
+                if ((n = input.Read(bytes, at, 4 * observation.Length - at)) == 0) {
+                    output.Flush();
+                    return;
+                }
+            Buffer.BlockCopy(bytes, 0, observation, 0, 4 * observation.Length);
+            policy.Act(observation, action);
+            Buffer.BlockCopy(action, 0, bytes, 0, 4 * action.Length);
+            output.Write(bytes, 0, 4 * action.Length);
+        }
+    }
+}
+"""
+
+
+def fed(observations: np.ndarray, *command: object) -> np.ndarray:
+    words = [str(word) for word in command]
+    done = subprocess.run(words, input=observations.tobytes(), capture_output=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, b"")
+    return np.frombuffer(done.stdout, np.float32).reshape(len(observations), -1)
+
+
+def by_gcc(
+    policy: NetworkPolicy, observations: np.ndarray, folder: Path, compiler: str = "gcc"
+) -> np.ndarray:
+    (folder / "rotorgram_policy.h").write_bytes(c_target.write(policy, told_of(policy.spec)))
+    (folder / "main.c").write_text(C_MAIN)
+    flags = [*C_FLAGS, *CHECKED] if compiler == "gcc" else CPP_FLAGS
+    compiled(tool(compiler), *flags, "-o", folder / "main", folder / "main.c")
+    return fed(observations, folder / "main")
+
+
+def by_gpp(policy: NetworkPolicy, observations: np.ndarray, folder: Path) -> np.ndarray:
+    return by_gcc(policy, observations, folder, "g++")
+
+
+def by_mono(policy: NetworkPolicy, observations: np.ndarray, folder: Path) -> np.ndarray:
+    sources = folder / "RotorgramPolicy.cs", folder / "Program.cs"
+    sources[0].write_bytes(csharp.write(policy, told_of(policy.spec)))
+    sources[1].write_text(CSHARP_MAIN)
+    compiled(tool("mcs"), "-warnaserror", f"-out:{folder / 'main.exe'}", *sources)
+    return fed(observations, tool("mono"), folder / "main.exe")
+
+
+CHOICE = spec_of(Discrete(n=5, components=("a", "b", "c", "d", "e")))
+HALF_BOUNDED = spec_of(
+    ArraySpec(name="a", shape=(3,), low=(0.0, -np.inf, -np.inf), high=(100.0, 0.5, np.inf))
+)
+CASES: dict[str, Callable[[], NetworkPolicy]] = {
+    "paper": lambda: policy_of(env_spec("rotorgram/Elevation-v0")),
+    "tanh": lambda: policy_of(env_spec("rotorgram/Hover-v0"), (64, 64), "tanh", normalise=True),
+    "squashed": lambda: policy_of(
+        env_spec("rotorgram/Hover-v0", {}, vehicle="crazyflie2"), (32, 32), squash=True
+    ),
+    "hexa": lambda: policy_of(env_spec("rotorgram/Hover-v0", {}, vehicle="heavy_hexa")),
+    "half bounded": lambda: policy_of(HALF_BOUNDED, (8,), normalise=True),
+    "choice": lambda: policy_of(CHOICE, (16, 8), "tanh", normalise=True),
+    "linear": lambda: policy_of(spec_of(), ()),
+}
+RUNNERS = {
+    "onnxruntime": by_onnxruntime, "torch": by_torch, "gcc": by_gcc, "g++": by_gpp, "mono": by_mono
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("runner", RUNNERS)
+def test_numbers_are_those_of_the_policy(case: str, runner: str, tmp_path: Path) -> None:
+    policy = CASES[case]()
+    observations = observations_of(policy.spec)
+    expected = by_policy(policy, observations)
+    actions = RUNNERS[runner](policy, observations, tmp_path)
+    assert actions.shape == expected.shape
+    # Far outside the bounds, an observation of 1000 is itself known to 6e-5 alone.
+    far = np.maximum(1.0, np.abs(observations).max(1, keepdims=True) / 10.0)
+    assert (np.abs(actions - expected) <= 1e-5 * (far + np.abs(expected))).all()
+    assert len(np.unique(expected, axis=0)) > (3 if case == "choice" else ROWS // 20)
+
+
+@pytest.mark.parametrize("vehicle", vehicle_names())
+def test_every_vehicle_has_its_actions(vehicle: str, tmp_path: Path) -> None:
+    spec = env_spec("rotorgram/Hover-v0", {"action": "rotors"}, vehicle=vehicle)
+    policy = policy_of(spec, (16,))
+    observations = observations_of(spec, 500)
+    expected = by_policy(policy, observations)
+    assert expected.shape == (500, 6 if vehicle == "heavy_hexa" else 4)
+    for run in (by_onnxruntime, by_gcc):
+        actions = run(policy, observations, tmp_path)
+        np.testing.assert_allclose(actions[:250], expected[:250], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("runner", RUNNERS)
+def test_tanh_is_exact_from_the_smallest_number_to_the_largest(runner: str, tmp_path: Path) -> None:
+    near, small = np.linspace(-12, 12, 20_001), np.geomspace(1e-30, 10, 10_001)
+    numbers = np.concatenate([near, small, -small, [0.0, 9.1, -9.1, 1e30, -1e30, np.inf, -np.inf]])
+    seen = numbers.astype(np.float32)[:, np.newaxis]
+    spec = spec_of(ArraySpec(name="a", shape=(1,)), [ArraySpec(name="o", shape=(1,))])
+    one, zero = np.ones((1, 1), np.float32), np.zeros(1, np.float32)
+    weights = {"layers.0.weight": one, "layers.0.bias": zero, "log_std": zero}
+    policy = NetworkPolicy(weights, spec)
+    policy.squash = True
+    actions = RUNNERS[runner](policy, seen, tmp_path)
+    expected = np.tanh(seen.astype(np.float64))
+    assert (np.abs(actions - expected) <= 5e-7 * np.abs(expected)).all()
+    assert np.abs(actions).max() == pytest.approx(1.0, abs=1.3e-7)
+
+
+@pytest.mark.parametrize("runner", RUNNERS)
+def test_weights_keep_every_bit(runner: str, tmp_path: Path) -> None:
+    """Of the smallest number, of the largest, and of some that no short decimal gives."""
+    numbers = [1e-45, 1.1754944e-38, 3.4028235e38, 1 / 3, -0.1, 16777217.0, 1e-5, 123456.79, 2.0]
+    bias, count = np.array(numbers, np.float32), len(numbers)
+    spec = spec_of(ArraySpec(name="a", shape=(count,)), [ArraySpec(name="o", shape=(1,))])
+    weights = {
+        "layers.0.weight": np.zeros((count, 1), np.float32),
+        "layers.0.bias": bias,
+        "log_std": np.zeros(count, np.float32),
+    }
+    actions = RUNNERS[runner](NetworkPolicy(weights, spec), np.ones((1, 1), np.float32), tmp_path)
+    assert actions.tolist() == [bias.tolist()]
+
+
+@pytest.mark.parametrize("runner", ["gcc", "mono"])
+def test_what_is_no_number_is_not_made_one(runner: str, tmp_path: Path) -> None:
+    for case in ("paper", "tanh", "squashed"):
+        policy = CASES[case]()
+        seen = np.full((1, flat_size(policy.spec)), np.nan, np.float32)
+        assert np.isnan(RUNNERS[runner](policy, seen, tmp_path)).all()
+
+
+def test_the_header_needs_nothing_but_a_compiler(tmp_path: Path) -> None:
+    header, program = tmp_path / "rotorgram_policy.h", tmp_path / "policy.c"
+    policy = policy_of(env_spec("rotorgram/Hover-v0"), (64, 64), "tanh", squash=True)
+    header.write_bytes(c_target.write(policy, told_of(policy.spec)))
+    assert "#include" not in header.read_text()
+    program.write_text(
+        '#include "rotorgram_policy.h"\n#include "rotorgram_policy.h"\n'  # twice: it is guarded
+        "void act(const float *o, float *a);\n"
+        "void act(const float *o, float *a) { rotorgram_policy(o, a); }\n"
+    )
+    strict = ["-Wconversion", "-Wdouble-promotion", "-Wshadow", "-ffreestanding"]
+    compiled(tool("gcc"), *C_FLAGS, *strict, "-c", "-o", tmp_path / "policy.o", program)
+    compiled(tool("nm"), "-u", tmp_path / "policy.o")  # names that a library would have to give
+    program.write_text('#include "rotorgram_policy.h"\nint main(void) { return 0; }\n')
+    compiled(tool("gcc"), *C_FLAGS, "-o", tmp_path / "unused", program)
+
+
+# From a checkpoint.
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a short training, whose 16 units are then those of a PD law that flies."""
+    folder = tmp_path_factory.mktemp("trained") / "run"
+    words = "train a2c --env-steps 512 --num-envs 8 --seed 3 --out"
+    assert main([*words.split(), str(folder)]) == 0
+    law = np.array([9.0, 6.0, -9.8], np.float32)
+    actor = {
+        "layers.0.weight": np.stack([law, -law, *np.zeros((14, 3), np.float32)]),
+        "layers.0.bias": np.zeros(16, np.float32),
+        "layers.1.weight": np.array([[1.0, -1.0, *[0.0] * 14]], np.float32),
+        "layers.1.bias": np.zeros(1, np.float32),
+        "log_std": np.zeros(1, np.float32),
+    }
+    path = folder / "checkpoint.safetensors"
+    store(replace(load(path), actor=actor), path)
+    return folder
+
+
+def exported(source: Path, target: str, folder: Path) -> Path:
+    """The file that the command writes, by its own name."""
+    path = folder / TARGETS[target]
+    assert main(["export", str(source), "--to", target, "--out", str(path)]) == 0
+    return path
+
+
+LISTS = "NAMES", "UNITS", "FRAMES"
+
+
+def constants_of_c(header: Path, *names: str) -> list[str]:
+    """Texts that a program finds in these macros, those of a list one after the other."""
+    program = header.with_name("constants.c")
+    lists = "".join(
+        f"tell(sizeof (const char *[]){name} / sizeof (char *), (const char *[]){name});"
+        if name.endswith(LISTS)
+        else f"tell(1, (const char *[]){{{name}}});"
+        for name in (f"ROTORGRAM_{name}" for name in names)
+    )
+    program.write_text(
+        '#include <stdio.h>\n#include "rotorgram_policy.h"\n'
+        "static void tell(size_t n, const char **texts) "
+        "{ while (n--) { fputs(*texts++, stdout); putchar(0); } }\n"
+        f"int main(void) {{ {lists} return 0; }}\n"
+    )
+    compiled(tool("gcc"), *C_FLAGS, "-o", program.with_suffix(""), program)
+    return said(program.with_suffix(""))
+
+
+def constants_of_csharp(source: Path, *names: str) -> list[str]:
+    program = source.with_name("Constants.cs")
+    tell = "".join(
+        f'foreach (var one in {value}) Console.Write(one + "\\0");'
+        for value in (
+            name if name.upper().endswith(LISTS) else f"new[] {{{name}}}" for name in names
+        )
+    )
+    program.write_text(
+        "using System; using static Rotorgram.RotorgramPolicy; static class Program {"
+        "static void Main() { Console.OutputEncoding = new System.Text.UTF8Encoding(false);"
+        f"{tell} }} }}"
+    )
+    out = program.with_suffix(".exe")
+    compiled(
+        tool("mcs"),
+        "-warnaserror",
+        f"-doc:{out}.xml",
+        "-nowarn:1591",
+        f"-out:{out}",
+        source,
+        program,
+    )
+    return said(tool("mono"), out)
+
+
+def said(*command: object) -> list[str]:
+    """Texts that a program prints, each with a 0 behind it."""
+    words = [str(word) for word in command]
+    done = subprocess.run(words, capture_output=True, timeout=60, check=True)
+    return done.stdout.decode().split("\0")[:-1]
+
+
+def test_every_file_tells_what_it_is(trained: Path, tmp_path: Path) -> None:
+    kept = load(trained / "checkpoint.safetensors")
+    files = {target: exported(trained, target, tmp_path) for target in TARGETS}
+    model = onnx.load(files["onnx"])
+    told = {entry.key: entry.value for entry in model.metadata_props}
+    assert [(one.domain, one.version) for one in model.opset_import] == [("", 13)]
+    assert told["format"] == "1"
+    assert (told["algorithm"], told["seed"], told["inputs"]) == ("a2c", "3", "3")
+    assert int(told["env_steps"]) == kept.position.env_steps >= 512
+    assert (told["env_id"], told["control_period"]) == ("rotorgram/Elevation-v0", "0.02")
+    assert (told["vehicle"], told["vehicle_hash"]) == (kept.spec.vehicle, kept.spec.vehicle_hash)
+    assert json.loads(told["options"]) == kept.options
+    (observation,), action = json.loads(told["observation"]), json.loads(told["action"])
+    assert observation["components"] == [
+        "elevation error",
+        "rate of the error",
+        "thrust over hover",
+    ]
+    assert (observation["unit"], observation["frame"]) == (["m", "m/s", "1"], "world, up")
+    assert (action["components"], action["low"], action["high"]) == (["collective"], -1.0, 1.0)
+    extra = {torchscript.FILE: ""}
+    load_torchscript(files["torchscript"], extra)
+    assert json.loads(extra[torchscript.FILE]) == told
+    expected = [
+        "a2c", "rotorgram/Elevation-v0", told["options"], kept.spec.vehicle, told["vehicle_hash"],
+        *observation["components"], "m", "m/s", "1", *["world, up"] * 3, "collective",
+    ]  # fmt: skip
+    names = ["ALGORITHM", "ENV_ID", "OPTIONS", "VEHICLE", "VEHICLE_HASH",
+             *(f"OBSERVATION_{what}S" for what in ("NAME", "UNIT", "FRAME")),
+             "ACTION_NAMES"]  # fmt: skip
+    assert constants_of_c(files["c"], *names) == expected
+    camel = ["".join(word.capitalize() for word in name.split("_")) for name in names]
+    assert constants_of_csharp(files["csharp"], *camel) == expected
+    header, source = files["c"].read_text(), files["csharp"].read_text()
+    assert "\n *   1: rate of the error: -11.2679 to 11.2679 m/s, world, up\n" in header
+    assert "\n    ///   1: rate of the error: -11.2679 to 11.2679 m/s, world, up\n" in source
+    for name, number in {"FORMAT": 1, "SEED": 3, "CONTROL_PERIOD": 0.02, "ACTIONS": 1}.items():
+        assert f"\n#define ROTORGRAM_{name} {number}\n" in header
+    for name, text in {"Format": "int", "Seed": "long", "ControlPeriod": "double"}.items():
+        assert re.search(rf"public const {text} {name} = [\d.]+;", source)
+
+
+def test_the_same_checkpoint_gives_the_same_bytes(trained: Path) -> None:
+    kept = load(trained / "checkpoint.safetensors")
+    for target in ("onnx", "c", "csharp"):
+        assert export(kept, target) == export(kept, target)
+
+
+def test_a_policy_that_was_trained_with_normalised_observations(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    words = "train ppo --env rotorgram/Hover-v0 --vehicle crazyflie2 --num-envs 8 --env-steps 1024"
+    settings = [
+        "hidden=[64,64]",
+        "activation=tanh",
+        "normalize_observations=true",
+        "steps_per_update=512",
+    ]
+    assert main([*words.split(), "--out", str(folder), "--set", *settings]) == 0
+    policy = load(folder / "checkpoint.safetensors").policy()
+    assert policy.mean is not None
+    observations = observations_of(policy.spec, 1000)[:500]
+    expected = by_policy(policy, observations)
+    session = onnxruntime.InferenceSession(exported(folder, "onnx", tmp_path))
+    (actions,) = session.run(["action"], {"observation": observations})
+    np.testing.assert_allclose(actions, expected, rtol=1e-5, atol=1e-5)
+    exported(folder, "c", tmp_path)
+    (tmp_path / "main.c").write_text(C_MAIN)
+    compiled(tool("gcc"), *C_FLAGS, "-o", tmp_path / "main", tmp_path / "main.c")
+    actions = fed(observations, tmp_path / "main")
+    np.testing.assert_allclose(actions, expected, rtol=1e-5, atol=1e-5)
+
+
+EVIL = [
+    "*/ int injected; /*",
+    "*/",
+    "/*",
+    "/",
+    "*",
+    "**//**/",
+    "\\",
+    "??/",
+    "?",
+    "??/*",
+    '"); #error "',
+    "</summary>&amp;<script>",
+    "{0}%s%n$(x)`x`",
+    "m/s² ° µ 漢字 🚁",
+    "\u202e abc \u2028 #error \u2029 \ufeff",
+]
+"""Legal in a spec: no control character, at most 200 characters."""
+
+
+def test_no_text_of_a_spec_becomes_code(trained: Path, tmp_path: Path) -> None:
+    count = len(EVIL)
+    kept = load(trained / "checkpoint.safetensors")
+    wicked = "".join(EVIL)
+    spec = replace(
+        kept.spec,
+        env_id=wicked,
+        vehicle=wicked[::-1],
+        options={"a\\": "*/\n#error\r\u0085\\\n??/\n", wicked: [wicked, "\0\x7f"]},
+        observation=(
+            ArraySpec(
+                name="*/",
+                shape=(count,),
+                unit=tuple(EVIL[::-1]),
+                frame=wicked,
+                components=tuple(EVIL),
+            ),
+        ),
+        action=ArraySpec(name="??/", shape=(2,), unit="*/", components=("\\", "/*")),
+    )
+    policy = policy_of(spec)
+    actor = {"log_std": np.zeros(2, np.float32)}
+    for i, (weight, bias) in enumerate(policy.layers):
+        actor |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
+    crafted = replace(kept, spec=spec, actor=actor)
+    files = {target: tmp_path / TARGETS[target] for target in TARGETS}
+    for target, path in files.items():
+        path.write_bytes(export(crafted, target))
+    options = json.dumps(dict(spec.options), ensure_ascii=False)
+    expected = [wicked, wicked[::-1], *EVIL, *EVIL[::-1], *[wicked] * count, "\\", "/*", "*/", "*/"]
+    expected.append(options)
+    names = ["ENV_ID", "VEHICLE", "OBSERVATION_NAMES", "OBSERVATION_UNITS", "OBSERVATION_FRAMES",
+             "ACTION_NAMES", "ACTION_UNITS", "OPTIONS"]  # fmt: skip
+    assert constants_of_c(files["c"], *names) == expected
+    camel = ["".join(word.capitalize() for word in name.split("_")) for name in names]
+    assert constants_of_csharp(files["csharp"], *camel) == expected
+    # Every line is one that the exporter began, and the header's comment ends where it should.
+    head, _, rest = files["c"].read_text().partition("\n */\n#ifndef")
+    assert all(line[:2] in ("/*", " *") for line in head.split("\n"))
+    assert head.count("*/") == 0
+    assert "/*" not in head[2:]
+    assert "??" not in head + rest
+    code = re.sub(r'"(\\.|[^"\\])*"', "", rest)
+    assert "injected" not in code
+    assert "#error" not in code
+    assert "\u202e" not in head + rest  # it would show the text in another order than it has
+    observations = observations_of(spec, 50)
+    flags = [*CPP_FLAGS, "-trigraphs"]
+    (tmp_path / "main.c").write_text(C_MAIN)
+    compiled(tool("g++"), *flags, "-o", tmp_path / "main", tmp_path / "main.c")
+    expected_actions = by_policy(policy, observations)
+    np.testing.assert_allclose(
+        fed(observations, tmp_path / "main"), expected_actions, rtol=1e-4, atol=1e-4
+    )
+    told = {entry.key: entry.value for entry in onnx.load(files["onnx"]).metadata_props}
+    assert json.loads(told["observation"])[0]["components"] == EVIL
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ["pid", "--to", "c"],
+            "policy: expected a checkpoint or the folder of a training, got pid",
+        ),
+        (["nowhere", "--to", "c"], "there is no file nowhere"),
+        (["RUN", "--to", "c", "--out", "."], "out: expected the name of a new file, got ."),
+        (["RUN", "--to", "c", "--out", "/dev/null/a.h"], "/dev/null/a.h: "),
+    ],
+)
+def test_wrong_input_is_one_sentence(
+    words: list[str], sentence: str, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", *(str(trained) if word == "RUN" else word for word in words)]) == 1
+    error = capsys.readouterr().err
+    assert sentence in error
+    assert error.count("\n") == 1
+
+
+def test_only_onnx_needs_onnx(trained: Path, tmp_path: Path) -> None:
+    def run(target: str) -> tuple[int, str]:
+        out = tmp_path / target
+        done = run_without(optional("export"), "export", trained, "--to", target, "--out", out)
+        return done.returncode, done.stderr
+
+    assert run("c") == (0, "")
+    status, error = run("onnx")
+    assert (status, error.count("\n")) == (1, 1)
+    assert "pip install 'rotorgram[export]'" in error
+    assert not (tmp_path / "onnx").exists()
+
+
+# The C peer flies the header over the wire.
+
+
+def flown_by_c(
+    header: Path, seeds: list[int], env: str, vehicle: str | None = None, **options: Any
+) -> list[np.ndarray]:
+    """Actions of each episode, shape (T, k), that a simulator got by text."""
+    program = header.with_name("agent")
+    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
+    policy = ['-DPOLICY="rotorgram_policy.h"', f"-I{header.parent}"]
+    compiled(tool("gcc"), *flags, *policy, "-o", program, PEERS / "agent.c", "-lm")
+    flights = []
+    for seed in seeds:
+        actions: list[np.ndarray] = []
+
+        def observe(message: Any, state: Any, actions: list[np.ndarray] = actions) -> None:
+            if isinstance(message, Command) and message.orders[0] == FLY:
+                actions.append(np.atleast_1d(message.actions[0]).astype(np.float64))
+
+        with running([str(program)], 0, 1, seed) as agent:
+            simulator = Simulator(env, server=waiting(agent), bind=ANY, codec="text",
+                                  vehicle=vehicle, **options)  # fmt: skip
+            simulator.observer = observe
+            flight = Running(simulator)
+            status, out, err = ended(agent)
+            assert (status, err) == (0, "")
+            assert f"episode 1: {len(actions)} steps" in out
+            flight.join()
+        flights.append(np.array(actions))
+    return flights
+
+
+def test_the_c_peer_flies_what_evaluate_flies(trained: Path, tmp_path: Path) -> None:
+    journal = tmp_path / "ours.mcap"
+    assert main(["evaluate", str(trained), "--episodes", "2", "--record", str(journal)]) == 0
+    sent = [item.message for item in Recording(journal) if isinstance(item.message, Command)]
+    ours = np.array([m.actions[0] for m in sent if m.orders[0] == FLY], np.float64)
+    header = exported(trained, "c", tmp_path)
+    seeds = [evaluation_seed(episode, "final") for episode in range(2)]
+    theirs = flown_by_c(header, seeds, "rotorgram/Elevation-v0")
+    assert [len(flight) for flight in theirs] == [250, 250]
+    assert np.ptp(ours) > 1.0
+    np.testing.assert_allclose(np.concatenate(theirs), ours, rtol=0, atol=1e-5)
+
+
+FLIGHTS: dict[str, tuple[str, str | None, dict[str, Any]]] = {
+    "four rotors": ("rotorgram/Hover-v0", "crazyflie2", {"episode_length": 60}),
+    "choices": ("rotorgram/Elevation-v0", None, {"action_type": "discrete", "episode_length": 60}),
+}
+
+
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_the_c_peer_flies_other_actions(name: str, tmp_path: Path) -> None:
+    env, vehicle, options = FLIGHTS[name]
+    policy = policy_of(env_spec(env, options, vehicle=vehicle), (16, 16), "tanh", normalise=True)
+    header = tmp_path / "rotorgram_policy.h"
+    header.write_bytes(c_target.write(policy, told_of(policy.spec)))
+    (theirs,) = flown_by_c(header, [7], env, vehicle, **options)
+    made: Any = gym.make(env, vehicle=vehicle, **options).unwrapped
+    observation, _ = made.reset(seed=7)
+    ours, done = [], False
+    while not done:
+        ours.append(np.atleast_1d(policy.act(observation)).astype(np.float64))
+        observation, _, terminated, truncated, _ = made.step(policy.act(observation))
+        done = terminated or truncated
+    made.close()
+    assert len(ours) > 5
+    np.testing.assert_allclose(theirs, np.array(ours), rtol=0, atol=1e-5)
+
+
+# The page.
+
+
+PAGE = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
+
+
+def block(language: str) -> str:
+    (code,) = re.findall(rf"^```{language}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    return str(code)
+
+
+def test_the_programs_of_the_page_run(trained: Path, tmp_path: Path) -> None:
+    header, source = exported(trained, "c", tmp_path), exported(trained, "csharp", tmp_path)
+    (tmp_path / "page.c").write_text(block("c"))
+    (tmp_path / "Page.cs").write_text(block("csharp"))
+    compiled(tool("gcc"), *C_FLAGS, f"-I{header.parent}", "-o", tmp_path / "c", tmp_path / "page.c")
+    out = tmp_path / "page.exe"
+    compiled(tool("mcs"), "-warnaserror", f"-out:{out}", source, tmp_path / "Page.cs")
+    for command in ([tmp_path / "c"], [tool("mono"), out]):
+        done = subprocess.run([str(word) for word in command], capture_output=True, text=True)
+        assert (done.returncode, done.stdout) == (0, "collective = 1\n")  # 9 * 0.5, clipped
+
+
+def test_the_page_shows_what_the_benchmark_wrote() -> None:
+    content = json.loads((ROOT / "docs" / "results" / "export.json").read_text())
+    for name, one in content["policies"].items():
+        times, sizes = one["microseconds"], one["bytes"]
+        row = " | ".join(f"{times[target]:.3g}" for target in ("NumPy", *TARGETS))
+        assert f"| {name}: µs a call | {row} |" in PAGE
+        row = " | ".join(f"{sizes[target]:,}" for target in TARGETS)
+        assert f"| bytes of the file | | {row} |" in PAGE
+        assert f"| bytes, compiled | | | {sizes['c, compiled']:,} | | |" in PAGE

@@ -1,0 +1,163 @@
+"""The agent `geometric` flies to goals at rest and moving, in calm and wind, over UDP too."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import rotorgram.envs  # noqa: F401
+from remotes import flying
+from rotorgram.agents import Geometric
+from rotorgram.agents.geometric import swing_gains
+from rotorgram.cli import main
+from rotorgram.envs import register
+from rotorgram.envs.tasks.hover import Hover
+from rotorgram.models import QUAD_XML
+from rotorgram.models.errors import InputError
+from rotorgram.sim import Array, WorldState, component, stack
+
+PAYLOAD = "rotorgram/PayloadHover-v0"
+HOVER, MOVING = "rotorgram/Hover-v0", "Moving-v0"
+DATA = Path(__file__).parents[1] / "data"
+MOCAP = {"noise": 0.001, "angle_noise": 0.002}
+FILES = {"quad": QUAD_XML, "tiny": DATA / "tiny.xml", "hexa": DATA / "hexa.xml"}
+FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/vehicle.toml"))}
+
+
+class Moving(Hover):
+    """A goal that turns on a circle of 1 m, at 1 m/s."""
+
+    def begin(self, mask: Any, draw: Any) -> Any:
+        self.time = 0.0
+        return super().begin(mask, draw)
+
+    def remember(self, state: WorldState, mask: Array) -> None:
+        self.time += 0.02
+
+    def goal(self, state: WorldState) -> Array:
+        zero = 0.0 * component(state.position, 0)
+        return stack((np.cos(self.time) + zero, np.sin(self.time), 5.0))
+
+
+if MOVING not in gym.registry:
+    register(MOVING, Moving)
+
+
+def errors_of(env: Any, seed: int = 0) -> list[tuple[float, float]]:
+    """Distance to the goal, m, and error of the heading, degrees, after each step."""
+    policy = Geometric(env.get_wrapper_attr("env_spec"))
+    observation, _ = env.reset(seed=seed)
+    errors, truncated = [], False
+    while not truncated:
+        observation, _, terminated, truncated, info = env.step(policy.act(observation))
+        errors.append((info["position_error"], info["heading_error"]))
+        assert not terminated
+    return errors
+
+
+@pytest.mark.parametrize("file", FILES.values(), ids=FILES)
+def test_every_vehicle_goes_to_the_goal_and_the_heading(file: Path) -> None:
+    errors = errors_of(gym.make(HOVER, action="position", vehicle=file, heading=90.0))
+    assert errors[0][0] > 0.3
+    assert max(distance for distance, _ in errors[200:]) < 0.02
+    assert abs(errors[-1][1]) < abs(errors[0][1]) / 4
+
+
+def test_a_goal_that_moves_is_followed() -> None:
+    """Without the goal's velocity and acceleration it would stay 1 / 0.88 m behind."""
+    errors = errors_of(gym.make(MOVING, action="position", episode_length=400))
+    assert max(distance for distance, _ in errors[300:]) < 0.15
+
+
+def test_wind_and_a_payload_are_held_against() -> None:
+    """3 m/s push 27 g sideways by 0.04 N; a payload of a tenth of the mass pulls it down."""
+    effects = {"body_drag": True, "wind": (3.0, 0.0, 0.0), "motor_lag": True}
+    env = gym.make(HOVER, action="position", vehicle="crazyflie2", effects=effects)
+    assert errors_of(env)[-1][0] < 0.02
+    effects = {"payload": 2.0, "cable": 0.5}
+    env = gym.make(HOVER, action="position", effects=effects, goal=(0, 0, 8), episode_length=500)
+    assert errors_of(env)[-1][0] < 0.05
+
+
+def test_gravity_is_the_vehicles(tmp_path: Path) -> None:
+    """On the moon twice the thrust of a hover lifts with 1.62 m/s²: nothing else pushes."""
+    file = tmp_path / "moon.toml"
+    text = (QUAD_XML.parent / "vehicles/crazyflie2/vehicle.toml").read_text(encoding="utf-8")
+    file.write_text(f"gravity = 1.62\n{text}", encoding="utf-8")
+    policy = Geometric(gym.make(HOVER, action="position", vehicle=file).unwrapped.env_spec)
+    for time in (0.0, 0.02):
+        below, nose, up = -1.62 * time**2 / 2, (1, 0, 0), (0, 0, 1)
+        seen = [0, 0, below, 0, 0, 1.62 * time, *nose, *up, 0, 0, 0, 1, 1, 1, 1]
+        assert policy.act(np.array(seen)) == pytest.approx([0, 0, below / 4, 0], abs=1e-6)
+
+
+def test_the_poles_of_a_swing() -> None:
+    """p = 5 /s, ω² = 9 /s², a ninth of the mass: the swing's ω² of 10 /s², half damped."""
+    plant = np.array(
+        [
+            [0, 1, 0, 0, 0, 0],
+            [0, 0, 1, 0, 1, 0],
+            [0, 0, 0, 1, 0, 0],
+            [0, 0, -10, 0, -1, 0],
+            [0, 0, 0, 0, 0, 1],
+            [0, 0, 0, 0, -50, -10],
+        ]
+    )
+    closed = plant - np.outer((0, 0, 0, 0, 0, 50), swing_gains(1.0, 9.0, 1 / 9))
+    half = [-1.25 + 0.9682458j, -5 + 5j, -1.5811388 + 2.7386128j]
+    expected = sorted([*half, *np.conj(half)], key=lambda pole: (pole.real, pole.imag))
+    poles = sorted(np.linalg.eigvals(closed), key=lambda pole: (round(pole.real, 6), pole.imag))
+    assert poles == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("vehicle", [None, "crazyflie2"])
+def test_a_payload_swings_no_more(vehicle: str | None) -> None:
+    """The payload alone would swing for minutes: MuJoCo's cable has hardly any damping."""
+    options = {} if vehicle is None else {"vehicle": vehicle}
+    env = gym.make(PAYLOAD, action="position", **options)
+    policy = Geometric(env.get_wrapper_attr("env_spec"))
+    observation, _ = env.reset(seed=100)
+    swings, errors, truncated = [], [], False
+    while not truncated:
+        observation, _, terminated, truncated, info = env.step(policy.act(observation))
+        swings.append(info["swing"])
+        errors.append(info["payload_error"])
+        assert not terminated
+    assert max(swings) > 5.0
+    assert max(swings[200:]) < 1.5
+    assert max(errors[200:]) < 0.1
+
+
+def test_an_estimate_is_flown_by() -> None:
+    """The accelerometer's bias moves the estimate itself by some 0.2 m."""
+    sensors = {"imu": True, "motion_capture": MOCAP, "estimate": True, "observe": "estimate"}
+    env = gym.make(HOVER, action="position", vehicle="crazyflie2", sensors=sensors)
+    assert max(distance for distance, _ in errors_of(env)[150:]) < 0.3
+
+
+def test_from_hello_alone_over_udp() -> None:
+    with flying(HOVER, action="position", vehicle="crazyflie2") as pair:
+        pair.remote.connect()
+        remote = errors_of(pair.remote)
+    assert remote == errors_of(gym.make(HOVER, action="position", vehicle="crazyflie2"))
+    assert remote[-1][0] < 0.01
+
+
+def test_it_says_what_it_needs() -> None:
+    spec = gym.make(HOVER).get_wrapper_attr("env_spec")
+    with pytest.raises(InputError, match=r"geometric: expected actions of the level position"):
+        Geometric(spec)
+    spec = gym.make(HOVER, action="position").get_wrapper_attr("env_spec")
+    nameless = replace(spec, observation=(replace(spec.observation[0], components=()),))
+    with pytest.raises(InputError, match=r"geometric: expected .*'goal - position x', got"):
+        Geometric(nameless)
+
+
+def test_evaluate_flies_it_at_its_level(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "geometric", "--env", HOVER, "--episodes", "1"]) == 0
+    assert "geometric on rotorgram/Hover-v0\nepisodes   1, 0 terminated" in capsys.readouterr().out
+    assert main(["evaluate", "geometric", "--episodes", "1"]) != 0
+    expected = "geometric: expected a task flown by position, got rotorgram/Elevation-v0"
+    assert expected in capsys.readouterr().err

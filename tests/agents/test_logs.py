@@ -1,0 +1,437 @@
+"""What a training logs: names and values of its curves, one curve over a resume, lines that fit."""
+
+import io
+import math
+import re
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+from rotorgram.agents import A2CConfig, VPGConfig, make_agent, preset
+from rotorgram.agents.a2c import A2C
+from rotorgram.agents.checkpoints import Checkpoint, load, store
+from rotorgram.agents.episodes import EpisodeLog
+from rotorgram.agents.networks import Weights
+from rotorgram.agents.sb3 import SB3VecEnv
+from rotorgram.agents.vpg import VPG
+from rotorgram.cli import main
+from rotorgram.cli._progress import Bars, Lines
+from rotorgram.cli._scalars import ScalarWriter
+from rotorgram.training.settings import Run
+from rotorgram.training.training import Training
+from stable_baselines3 import A2C as PlainA2C
+from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.vec_env import VecMonitor
+from tensorboard.backend.event_processing import plugin_event_accumulator
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_learning import Recorder, log_of, rollout, train_both
+
+DOCS = Path(__file__).parents[2] / "docs" / "algorithms"
+AGENTS = ["vpg", "a2c", "sb3-a2c"]
+ENTROPY_OF_ONE = 0.5 * math.log(2 * math.pi * math.e)  # nats, of a Gaussian with deviation 1
+
+Curves = dict[str, list[tuple[int, float]]]
+
+
+def elevation(**options: Any) -> Any:
+    return gym.make("rotorgram/Elevation-v0", **options).unwrapped
+
+
+def curves(folder: Path) -> Curves:
+    """Points by name, without those of the wire."""
+    board = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0})
+    board.Reload()
+    return {
+        name: [(point.step, point.value) for point in board.Scalars(name)]
+        for name in board.Tags()["scalars"]
+        if not name.startswith("wire/")
+    }
+
+
+def documented(page: str) -> set[str]:
+    return set(re.findall(r"^\| `((?:rollout|time|train)/\w+)`", (DOCS / page).read_text(), re.M))
+
+
+def train(algorithm: str, folder: Path, *settings: object) -> Curves:
+    arguments = ["train", algorithm, "--out", folder, *settings]
+    assert main([str(a) for a in arguments]) == 0
+    return curves(folder)
+
+
+def sized(algorithm: str, steps: int = 100) -> tuple[str, str]:
+    change = "episodes_per_update=4" if algorithm == "vpg" else f"steps_per_update={steps}"
+    return "--set", change
+
+
+# ---- names
+
+
+@pytest.mark.parametrize("drones", [1, 2])
+@pytest.mark.parametrize("algorithm", [*AGENTS, "ppo"])
+def test_the_names_are_those_of_the_pages(algorithm: str, drones: int, tmp_path: Path) -> None:
+    logged = train(
+        algorithm, tmp_path / "run", "--env-steps", 600, "--num-envs", drones, *sized(algorithm)
+    )
+    assert set(logged) == documented("README.md") | documented(f"{algorithm}.md")
+    critic = {"train/value_loss", "train/explained_variance"}
+    assert documented("a2c.md") == documented("sb3-a2c.md") == documented("vpg.md") | critic
+    steps = {tuple(step for step, _ in points) for points in logged.values()}
+    assert max(steps)[-1] >= 400
+    assert all(a < b for a, b in zip(max(steps), max(steps)[1:], strict=False))
+
+
+class Capture(KVWriter):
+    """Asks, whenever SB3 writes its log, what we would write."""
+
+    def __init__(self, training: Training) -> None:
+        self.training = training
+        self.rows: list[tuple[dict[str, Any], dict[str, float]]] = []
+
+    def write(self, key_values: dict[str, Any], key_excluded: Any, step: int = 0) -> None:
+        self.rows.append((dict(key_values), self.training.scalars()))
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def test_sb3_logs_the_same_under_the_same_names() -> None:
+    """A plain SB3 with its own Monitor and log, beside what we say of the same episodes."""
+    run = Run(
+        algorithm="sb3-a2c", config=preset("a2c", "tuned"), seed=0,
+        env_steps=2400,
+    )  # fmt: skip
+    training = Training(run, elevation(episode_length=12))
+    model = PlainA2C("MlpPolicy", VecMonitor(SB3VecEnv(training.log)), n_steps=40, device="cpu")
+    capture = Capture(training)
+    model.set_logger(Logger(folder=None, output_formats=[capture]))
+    training.log.start_clock()
+    model.learn(2400, log_interval=1)
+    assert len(training.log.episodes) > 190, "more than a window"
+    assert len(capture.rows) == 60
+    for theirs, ours in capture.rows[1:]:
+        for name in ("rollout/ep_rew_mean", "rollout/ep_len_mean", "time/total_timesteps"):
+            assert ours[name] == pytest.approx(theirs[name], abs=1e-4)
+    theirs, ours = capture.rows[-1]
+    assert documented("sb3-a2c.md") == {name for name in theirs if name.startswith("train/")}
+    own = {"rollout/ep_error_mean"}
+    assert documented("README.md") - own <= set(theirs)
+    assert ours["time/fps"] == pytest.approx(theirs["time/fps"], rel=0.5)
+
+
+@pytest.mark.parametrize("algorithm", AGENTS)
+def test_discrete_actions_have_no_deviation(algorithm: str) -> None:
+    env = elevation(action_type="discrete", episode_length=10)
+    size = {"episodes_per_update": 2} if algorithm == "vpg" else {"steps_per_update": 20}
+    run = Run(
+        algorithm=algorithm, config=preset(algorithm, "tuned", **size),
+        options={"action_type": "discrete"}, seed=0, env_steps=40,
+    )  # fmt: skip
+    training = Training(run, env)
+    assert not any(name.startswith("train/") for name in training.scalars()), "before an update"
+    training.train()
+    logged = training.scalars()
+    train_names = {name for name in logged if name.startswith("train/")}
+    assert train_names == documented(f"{algorithm}.md") - {"train/std"}
+    # The first policies are near to uniform over decrease, hold and increase.
+    assert logged["train/entropy_loss"] == pytest.approx(-math.log(3), abs=0.01)
+
+
+def test_what_is_not_defined_is_not_written() -> None:
+    """One step has no variance to explain."""
+    run = Run(algorithm="a2c", config=preset("a2c", "paper"), seed=0, env_steps=1)
+    training = Training(run, elevation())
+    training.train()
+    logged = training.scalars()
+    assert "train/explained_variance" not in logged
+    assert not any(name.startswith("rollout/") for name in logged), "no episode has ended"
+    assert (logged["train/n_updates"], logged["time/total_timesteps"]) == (1, 1)
+
+
+# ---- values
+
+
+@pytest.mark.parametrize("algorithm", AGENTS)
+def test_the_values_by_hand(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SB3_LOGDIR", str(tmp_path / "sb3"))
+    folder = tmp_path / "run"
+    settings = ("--env-steps", 800, "--env.episode-length", 5, *sized(algorithm))
+    logged = train(algorithm, folder, *settings)
+    assert not (tmp_path / "sb3").exists(), "SB3 is to write nothing"
+    table = pd.read_csv(folder / "episodes.csv")
+    assert len(table) > 150, "more than a window"
+    columns = {"rew": "total_reward", "len": "length", "error": "mean_size"}
+    for short, column in columns.items():
+        for step, value in logged[f"rollout/ep_{short}_mean"]:
+            ended = table[table.first_step + table.length <= step]
+            assert value == pytest.approx(ended[column][-100:].mean(), rel=1e-5)
+    assert logged["time/total_timesteps"] == [(s, s) for s, _ in logged["time/fps"]]
+    kept = load(folder / "checkpoint.safetensors")
+    deviation = float(np.exp(kept.actor["log_std"]).mean())
+    assert logged["train/std"][-1] == (800, pytest.approx(deviation, rel=1e-6))
+    # The rate falls from 0.01 to 0, and is that of the steps before the update.
+    size = 4 * 5 if algorithm == "vpg" else 100
+    for step, value in logged["train/learning_rate"]:
+        assert value == pytest.approx(0.01 * (1 - (step - size) / 800), rel=1e-5)
+    assert logged["train/n_updates"] == [(s, s / size) for s, _ in logged["train/n_updates"]]
+
+
+@pytest.mark.parametrize("algorithm", ["a2c", "sb3-a2c"])
+def test_the_entropy_is_that_of_the_deviation_before_the_update(
+    algorithm: str, tmp_path: Path
+) -> None:
+    logged = train(algorithm, tmp_path / "run", "--env-steps", 600, *sized(algorithm))
+    before = [math.exp(-0.5), *(value for _, value in logged["train/std"])]
+    assert len(before) == 7
+    for (_, loss), deviation in zip(logged["train/entropy_loss"], before, strict=False):
+        assert loss == pytest.approx(-(ENTROPY_OF_ONE + math.log(deviation)), rel=1e-5)
+
+
+TWO_STEPS = rollout(
+    observations=np.array([[1.0], [1.5]], np.float32),
+    actions=np.array([[0.3], [2.0]], np.float32),
+    rewards=np.array([1.0, 2.0]),
+    next_observations=np.array([[5.0], [5.0]], np.float32),
+    terminated=np.array([True, True]),
+    truncated=np.array([False, False]),
+    kept=np.array([True, True]),
+)
+LOG_P = [-0.045 - 0.9189385, -2.0 - 0.9189385]  # of the actions, of mean 0 and deviation 1
+
+
+def fill(weights: Weights, value: float) -> None:
+    for name, array in weights.arrays.items():
+        array[...] = value if name.endswith("weight") else 0.0
+
+
+def test_the_terms_of_a2c_by_hand() -> None:
+    """V is the observation, so A = (1 - 1, 2 - 1.5)."""
+    agent = A2C(log_of(), A2CConfig(hidden=1, log_std=0.0, ent_coef=0.1), 0)
+    fill(agent.weights.part("actor."), 0.0)
+    fill(agent.weights.part("critic."), 1.0)
+    agent.gradient(TWO_STEPS)
+    logged = agent.scalars()
+    assert logged["train/policy_loss"] == pytest.approx(-0.5 * LOG_P[1] / 2)
+    assert logged["train/value_loss"] == pytest.approx((0.0 + 0.25) / 2)
+    assert logged["train/entropy_loss"] == pytest.approx(-ENTROPY_OF_ONE)
+    assert logged["train/explained_variance"] == pytest.approx(1 - 0.0625 / 0.25)
+    assert (logged["train/std"], logged["train/n_updates"]) == (1.0, 0)
+
+
+def test_the_terms_of_vpg_by_hand() -> None:
+    agent = VPG(log_of(), VPGConfig(hidden=1, log_std=0.0), 0)
+    fill(agent.weights.part("actor."), 0.0)
+    agent.gradient(TWO_STEPS)
+    logged = agent.scalars()
+    assert logged["train/policy_loss"] == pytest.approx(-(1 * LOG_P[0] + 2 * LOG_P[1]) / 2)
+    assert logged["train/entropy_loss"] == pytest.approx(-ENTROPY_OF_ONE)
+
+
+def test_ours_logs_what_sb3_logs_of_the_same_updates() -> None:
+    config = A2CConfig(steps_per_update=64, gae_lambda=0.95, learning_rate=0.01, normalize=True)
+    recorder = Recorder(elevation(episode_length=40))
+    log = EpisodeLog(recorder, seed=0)
+    theirs: Any = make_agent("sb3-a2c", log, config, 0)
+    for here, there in train_both(theirs, A2C(log, config, seed=1), recorder, log, 320):
+        assert here.keys() == there.keys()
+        for name, value in there.items():
+            assert here[name] == pytest.approx(value, rel=2e-3, abs=2e-4), name
+    assert theirs.scalars()["train/n_updates"] == 5
+
+
+# ---- resuming
+
+
+# TensorBoard reads event files in the order of their names, and these tell whole seconds: a test
+# that is faster than a user waits one between two files of a folder.
+
+
+def exact(logged: Curves) -> Curves:
+    """Those that no clock is part of."""
+    return {name: points for name, points in logged.items() if name != "time/fps"}
+
+
+@pytest.mark.parametrize("algorithm", AGENTS)
+def test_the_curves_of_a_killed_training_go_on_as_if_it_had_not_been(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed where it hurts most: the curves are written, the checkpoint is the one before."""
+    folder, broken = tmp_path / "whole", tmp_path / "broken"
+
+    def copy_before(checkpoint: Checkpoint, path: Path) -> None:
+        if path.exists() and checkpoint.position.env_steps >= 800 and not broken.exists():
+            shutil.copytree(folder, broken)
+        store(checkpoint, path)
+
+    monkeypatch.setattr("rotorgram.cli.train.store", copy_before)
+    settings = ("--env-steps", 2400, *sized(algorithm), "--store-every", 0.05)
+    whole = train(algorithm, folder, *settings)
+    behind = load(broken / "checkpoint.safetensors").position.env_steps
+    left = curves(broken)["train/std"]
+    assert 0 < behind < left[-1][0] < 2400, "the copy has points beyond its checkpoint"
+    time.sleep(1.0)
+    assert main(["train", algorithm, "--resume", str(broken)]) == 0
+    assert exact(curves(broken)) == exact(whole)
+    assert len(list((broken / "tensorboard").iterdir())) == 2
+    assert len(whole["train/std"]) >= 4
+
+
+def test_lost_points_are_forgotten_and_none_is_double(tmp_path: Path) -> None:
+    for behind, value, end in ((0, 1.0, 800), (300, 2.0, 600)):
+        writer = ScalarWriter(tmp_path / "tensorboard", 800, behind=behind)
+        for step in range(behind + 100, end + 1, 100):
+            assert writer.due(step)
+            writer.write(step, {"a": value})
+        writer.close()
+        time.sleep(1.0)
+    expected = [(100, 1.0), (200, 1.0), (300, 1.0), (400, 2.0), (500, 2.0), (600, 2.0)]
+    assert curves(tmp_path)["a"] == expected
+    # The server reads in one of two ways; `--load_fast=false` is this.
+    slow = plugin_event_accumulator.EventAccumulator(str(tmp_path / "tensorboard"))
+    slow.Reload()
+    assert [point.step for point in slow.Tensors("a")] == [step for step, _ in expected]
+
+
+@pytest.mark.parametrize("size", [1, 128, 700])
+def test_points_are_few_and_near_the_same_steps_for_all(size: int, tmp_path: Path) -> None:
+    writer = ScalarWriter(tmp_path, 200_000)
+    steps = range(size, 200_001, size)
+    written = [step for step in steps if writer.due(step)]
+    assert written[0] == size, "the first update"
+    # Each thousand is written, as soon as an update is beyond it.
+    thousands = range(1000, steps[-1] + 1, 1000)
+    assert written[1:] == [math.ceil(t / size) * size for t in thousands]
+    writer.write(steps[-2], {})
+    assert writer.due(steps[-1], last=True)
+    writer.write(steps[-1], {})
+    assert not writer.due(steps[-1], last=True)
+    writer.close()
+
+
+def test_short_runs_have_a_point_each_hundred_steps(tmp_path: Path) -> None:
+    writer = ScalarWriter(tmp_path, 500)
+    written = [step for step in range(1, 501) if writer.due(step)]
+    writer.close()
+    assert written == [1, 100, 200, 300, 400, 500]
+
+
+# ---- lines
+
+
+class Clock:
+    """A clock that stands still unless it is moved."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def fly(show: Callable[[str, int, int, str], None], clock: Clock, name: str, seconds: int) -> None:
+    """5,120 env steps per second, told five times each."""
+    for tick in range(5 * seconds + 1):
+        show(name, 1024 * tick, 200_000, "return 224, |E| 0.02 m")
+        clock.now += 0.2
+    clock.now -= 0.2
+
+
+def drawn(bars: Bars, width: int) -> list[str]:
+    console = Console(width=width, file=io.StringIO(), force_terminal=True, color_system=None)
+    console.print(bars.progress.get_renderable())
+    return console.file.getvalue().splitlines()  # type: ignore[attr-defined,no-any-return]
+
+
+def test_a_bar_tells_everything_on_80_columns() -> None:
+    clock = Clock()
+    bars = Bars(Console(width=80, file=io.StringIO(), force_terminal=True), clock)
+    fly(bars, clock, "sb3-a2c seed 0", 20)
+    (line,) = drawn(bars, 80)
+    assert len(line) <= 80
+    assert re.fullmatch(
+        r"sb3-a2c seed 0 ━[━╸╺ ]{4,} 102\.4k/200k 5,120/s 0:20, 0:20 left "
+        r"return 224, \|E\| 0\.02 m",
+        line.rstrip(),
+    )
+
+
+@pytest.mark.parametrize("width", [30, 60, 79, 80, 100, 200])
+def test_no_bar_is_wider_than_its_terminal(width: int) -> None:
+    clock = Clock()
+    bars = Bars(Console(width=width, file=io.StringIO(), force_terminal=True), clock)
+    for step in range(3):
+        bars("sb3-a2c seed 12", 9_123_456 + step, 12_345_678, "return -1234, |E| 10.12 m")
+        bars("vpg seed 3", 40_000 * step, 200_000, "evaluating")
+        bars("a2c seed 4", 0, 200_000, "")
+        clock.now += 5000.0
+    lines = drawn(bars, width)
+    assert len(lines) == 3, "none is wrapped"
+    assert max(map(len, lines)) <= width
+    assert [line.split()[0][:2] for line in lines] == ["sb", "vp", "a2"]
+
+
+def test_bars_are_drawn_on_a_terminal_while_they_are_told() -> None:
+    """As `bars` does it: started, so that rich draws whenever it likes."""
+    clock, terminal = Clock(), io.StringIO()
+    bars = Bars(Console(width=80, file=terminal, force_terminal=True), clock)
+    with bars.progress:
+        fly(bars, clock, "vpg seed 3", 12)
+        bars.progress.refresh()
+        assert "61,440/200k 5,120/s 0:12, 0:28 left return 224" in terminal.getvalue()
+        bars("vpg seed 3", 200_000, 200_000, "done")
+    assert "vpg seed 3     done" in terminal.getvalue()
+
+
+def test_lines_come_every_ten_seconds_with_the_same_figures(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    clock = Clock()
+    fly(Lines(clock), clock, "a2c seed 0", 25)
+    assert capsys.readouterr().out.splitlines() == [
+        "a2c seed 0     0/200k  0:00  return 224, |E| 0.02 m",
+        "a2c seed 0     51,200/200k  5,120/s  0:10, 0:30 left  return 224, |E| 0.02 m",
+        "a2c seed 0     102.4k/200k  5,120/s  0:20, 0:20 left  return 224, |E| 0.02 m",
+    ]
+
+
+def test_what_was_flown_before_a_resume_is_no_rate(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    lines = Lines(clock)
+    lines("a2c seed 0", 150_000, 200_000, "")
+    clock.now += 10.0
+    lines("a2c seed 0", 160_000, 200_000, "")
+    assert capsys.readouterr().out.splitlines()[1] == (
+        "a2c seed 0     160k/200k  1,000/s  0:10, 0:40 left"
+    )
+
+
+def test_the_rate_is_that_of_the_last_seconds(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    lines = Lines(clock)
+    done = 0
+    for second in range(4000):
+        lines("a2c seed 0", done, 10_000_000, "")
+        done += 1000 if second < 3970 else 500
+        clock.now += 1.0
+    lines("a2c seed 0", done, 10_000_000, "")
+    *_, last = capsys.readouterr().out.splitlines()
+    assert "  500/s  1h06m, 3h20m left" in last
+
+
+def test_a_run_that_is_done_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    lines = Lines(clock)
+    lines("vpg seed 1", 0, 60, "simulate")
+    clock.now += 2.0
+    lines("vpg seed 1", 60, 60, "done")
+    assert capsys.readouterr().out.splitlines()[-1] == "vpg seed 1     60/60  30/s  0:02  done"
+    bars = Bars(Console(width=80, file=io.StringIO(), force_terminal=True), clock)
+    bars("vpg seed 1", 60, 60, "done")
+    assert drawn(bars, 80) == [], "it makes room"

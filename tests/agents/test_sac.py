@@ -1,0 +1,408 @@
+"""SAC: each gradient against torch, differences and numbers by hand; updates against SB3's."""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from rotorgram.agents import (
+    Checkpoint,
+    EpisodeLog,
+    SACConfig,
+    load,
+    make_agent,
+    preset,
+    resume_agent,
+    store,
+)
+from rotorgram.agents.networks import Weights, mlp_shapes
+from rotorgram.agents.rollouts import Rollout
+from rotorgram.agents.sac import SAC, ReplayBuffer, SquashedActor
+from rotorgram.agents.sb3_sac import SB3SAC
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.flights.trajectories import fly_episodes
+from rotorgram.models.errors import InputError
+from scripted import CALM, LOSSES, Scripted, log_of
+
+ENV = "rotorgram/Elevation-v0"
+N, K, BATCH = 3, 2, 64  # of scripted drones
+SMALL = {"hidden": (8, 7), "batch_size": 16, "learning_starts": 40, "buffer_size": 200}
+
+
+def normal(*shape: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
+
+
+def squashed(activation: str = "tanh") -> SquashedActor:
+    weights = Weights.zeros(mlp_shapes((N, 8, 7, 2 * K)))
+    weights.values[:] = 0.4 * normal(weights.values.size)
+    return SquashedActor(weights, activation)
+
+
+def agent_of(**changes: Any) -> SAC:
+    agent = make_agent("sac", log_of(Scripted(CALM)), SACConfig(**{**SMALL, **changes}), 0)
+    assert isinstance(agent, SAC)
+    return agent
+
+
+def batch_of(size: int = BATCH) -> tuple[np.ndarray, ...]:
+    """States, actions, next states, rewards, ends."""
+    ends = (np.arange(size) % 5 == 0).astype(np.float32)
+    return (normal(size, N, seed=1), np.tanh(normal(size, K, seed=2)), normal(size, N, seed=3),
+            normal(size, seed=4), ends)  # fmt: skip
+
+
+def test_log_probability_of_a_squashed_gaussian_by_hand() -> None:
+    """Mean 0.5, σ 1, noise 0.3: u = 0.8, log N = -0.963939, log(1 - tanh² 0.8) = -0.581507."""
+    actor = SquashedActor(Weights.zeros(mlp_shapes((1, 1, 2))), "relu")
+    actor.weights.arrays["layers.1.bias"][:] = 0.5, 0.0
+    actions, logs = actor.draw(np.ones((1, 1), np.float32), np.array([[0.3]], np.float32))
+    assert actions[0, 0] == pytest.approx(0.6640368, rel=1e-6)
+    assert logs[0] == pytest.approx(-0.382431, abs=1e-5)
+
+
+def torch_draw(actor: SquashedActor, states: np.ndarray, noise: np.ndarray) -> Any:
+    """Leaves, actions and log π by torch's own distributions."""
+    leaves = {k: torch.tensor(a, requires_grad=True) for k, a in actor.weights.arrays.items()}
+    hidden = torch.from_numpy(states)
+    for i in range(3):
+        hidden = hidden @ leaves[f"layers.{i}.weight"].T + leaves[f"layers.{i}.bias"]
+        hidden = torch.tanh(hidden) if i < 2 else hidden
+    mean, log_std = hidden[:, :K], hidden[:, K:].clamp(-20, 2)
+    base: Any = torch.distributions.Normal(mean, log_std.exp())
+    squash: Any = torch.distributions.TransformedDistribution(
+        base, [torch.distributions.TanhTransform(cache_size=1)]
+    )
+    u = mean + log_std.exp() * torch.from_numpy(noise)
+    actions = squash.transforms[0](u)  # its cache keeps u
+    return leaves, actions, squash.log_prob(actions).sum(1)
+
+
+def test_gradients_of_the_actor_are_those_of_torch() -> None:
+    actor, states, noise = squashed(), normal(BATCH, N, seed=5), normal(BATCH, K, seed=6)
+    leaves, actions, logs = torch_draw(actor, states, noise)
+    ours, our_logs = actor.draw(states, noise)
+    np.testing.assert_allclose(ours, actions.detach(), atol=1e-6)
+    # The authors add 1e-6 to 1 - tanh²; torch does not.
+    sure = (1 - ours**2).min(axis=1) > 1e-2
+    assert sure.sum() > 40
+    np.testing.assert_allclose(our_logs[sure], logs.detach()[sure], atol=5e-4)
+    slope = normal(BATCH, K, seed=7) * sure[:, np.newaxis]
+    weight = 0.3 / BATCH
+    actor.draw(states[sure], noise[sure])
+    actor.backward(slope[sure], weight)
+    (
+        (actions * torch.from_numpy(slope)).sum() + weight * logs[torch.from_numpy(sure)].sum()
+    ).backward()
+    for name, gradient in actor.weights.gradients.items():
+        np.testing.assert_allclose(gradient, leaves[name].grad, rtol=1e-3, atol=2e-5, err_msg=name)
+
+
+def test_gradients_of_the_actor_are_finite_differences() -> None:
+    actor, states, noise = squashed(), normal(BATCH, N, seed=5), 0.3 * normal(BATCH, K, seed=6)
+    actor.weights.values[:] *= 0.5  # where tanh is steep, float32 has digits enough
+    slope = normal(BATCH, K, seed=7) / BATCH
+
+    def loss() -> float:
+        actions, logs = actor.draw(states, noise)
+        return float((slope * actions).sum(dtype=float) + 0.3 * logs.mean(dtype=float))
+
+    loss()
+    actor.backward(slope, 0.3 / BATCH)
+    for i in range(0, actor.weights.values.size, 11):
+        found, before = [], actor.weights.values[i]
+        for step in (0.01, -0.01):
+            actor.weights.values[i] = before + step
+            found.append(loss())
+        actor.weights.values[i] = before
+        difference = (found[0] - found[1]) / 0.02
+        assert actor.weights.slopes[i] == pytest.approx(difference, rel=2e-2, abs=3e-4)
+
+
+def test_a_deviation_at_its_limit_has_no_gradient() -> None:
+    actor = SquashedActor(Weights.zeros(mlp_shapes((1, 1, 2))), "relu")
+    bias = actor.weights.arrays["layers.1.bias"]
+    for log_std, wanted in ((3.0, 2.0), (-25.0, -20.0)):
+        bias[:] = 0.0, log_std
+        actions, _ = actor.draw(np.ones((1, 1), np.float32), np.array([[0.1]], np.float32))
+        assert actions[0, 0] == pytest.approx(math.tanh(0.1 * math.exp(wanted)), rel=1e-5)
+        actor.backward(np.ones((1, 1), np.float32), 1.0)
+        assert actor.weights.gradients["layers.1.bias"][1] == 0
+
+
+def test_critics_and_temperature_by_hand() -> None:
+    """All weights 0 but the last biases: Q = b. Policy: mean 0, σ 1, so u is the noise.
+
+    With noise 0 log π = -2 · 0.9189385 = -1.837877. Biases 1 and 3, targets 2 and 5, alpha 0.5,
+    gamma 0.9, reward 4: wanted 4 + 0.9 · (2 + 0.5 · 1.837877) = 6.627045; after an end 4.
+    """
+    agent = agent_of(gamma=0.9, alpha=0.5, learning_rate=0.01, tau=0.1)
+    agent.weights.values[:-1] = agent.targets.values[:] = 0
+    for i, (own, target) in enumerate(((1.0, 2.0), (3.0, 5.0))):
+        agent.weights.arrays[f"critic.{i}.layers.2.bias"][:] = own
+        agent.targets.arrays[f"{i}.layers.2.bias"][:] = target
+    states, actions = np.zeros((2, N), np.float32), np.zeros((2, K), np.float32)
+    batch = states, actions, states, np.full(2, 4, np.float32), np.array([0, 1], np.float32)
+    agent.update(batch, actions, actions)
+    # Errors 1 - 6.627 and 1 - 4, mean -4.3135; 3 - 6.627 and 3 - 4, mean -2.3135: Adam's first
+    # step is the rate against the sign, and a tenth of it reaches the targets.
+    biases = [float(agent.weights.arrays[f"critic.{i}.layers.2.bias"][0]) for i in range(2)]
+    assert biases == pytest.approx([1.01, 3.01], abs=1e-6)
+    targets = [float(agent.targets.arrays[f"{i}.layers.2.bias"][0]) for i in range(2)]
+    assert targets == pytest.approx([2 + 0.1 * (1.01 - 2), 5 + 0.1 * (3.01 - 5)], abs=1e-6)
+    told = agent.scalars()
+    squares = (1 - 6.627045) ** 2 + 9 + (3 - 6.627045) ** 2 + 1
+    assert told["train/critic_loss"] == pytest.approx(squares / 4, rel=1e-5)
+    assert told["train/actor_loss"] == pytest.approx(0.5 * -1.837877 - 1.01, rel=1e-5)
+    # log alpha descends -log alpha · (log π + aim): aim -2, so alpha falls where π is too random.
+    loss = -math.log(0.5) * (-1.837877 - 2)
+    assert told["train/ent_coef_loss"] == pytest.approx(loss, rel=1e-5)
+    assert agent.weights.arrays["log_alpha"][0] == pytest.approx(math.log(0.5) - 0.01, abs=1e-6)
+
+
+def sb3_like(agent: SAC, config: SACConfig) -> SB3SAC:
+    """SB3's with the weights of ours."""
+    theirs = make_agent("sb3-sac", log_of(Scripted(CALM)), config, 0)
+    assert isinstance(theirs, SB3SAC)
+    weights = agent.weights.arrays
+    state: dict[str, np.ndarray] = {}
+    last = len(config.hidden)
+    for kind in ("weight", "bias"):
+        for i in range(last):
+            state[f"actor.latent_pi.{2 * i}.{kind}"] = weights[f"actor.layers.{i}.{kind}"]
+        both = weights[f"actor.layers.{last}.{kind}"]
+        state[f"actor.mu.{kind}"], state[f"actor.log_std.{kind}"] = both[:K], both[K:]
+        for net in range(2):
+            for i in range(last + 1):
+                own = weights[f"critic.{net}.layers.{i}.{kind}"]
+                target = agent.targets.arrays[f"{net}.layers.{i}.{kind}"]
+                state[f"critic.qf{net}.{2 * i}.{kind}"] = own
+                state[f"critic_target.qf{net}.{2 * i}.{kind}"] = target
+    tensors = {name: torch.from_numpy(array.copy()) for name, array in state.items()}
+    theirs.model.policy.load_state_dict(tensors)
+    return theirs
+
+
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+def test_updates_are_those_of_sb3(activation: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = SACConfig(**SMALL, activation=activation, learning_rate=0.003, alpha=0.3, tau=0.02)  # type: ignore[arg-type]
+    agent = agent_of(**{k: v for k, v in vars(config).items() if k not in SMALL})
+    theirs = sb3_like(agent, config)
+    noises: list[np.ndarray] = []
+    monkeypatch.setattr(
+        "torch.distributions.normal._standard_normal",
+        lambda *_, **__: torch.from_numpy(noises.pop(0)),
+    )
+    for step in range(12):
+        states, actions, next_states, rewards, ends = batch = tuple(
+            np.roll(part, step, axis=0) for part in batch_of()
+        )
+        noise, ahead = normal(BATCH, K, seed=50 + step), normal(BATCH, K, seed=90 + step)
+        noises += [noise, ahead]  # SB3 draws at the states first
+        columns = (states, actions, next_states, ends[:, None], rewards[:, None], None)
+        samples = _samples(*columns)
+        monkeypatch.setattr(theirs.model.replay_buffer, "sample", lambda *_, s=samples, **__: s)
+        theirs.model._current_progress_remaining = 1.0
+        theirs.model.on_update = lambda: True
+        theirs.model.train(1, BATCH)
+        agent.update(batch, noise, ahead)
+        if step in (0, 11):
+            close = {"rtol": 1e-3, "atol": 2e-5 if step == 0 else 4e-4}
+            for name, array in theirs.actor().items():
+                np.testing.assert_allclose(agent.actor()[name], array, **close, err_msg=name)
+            kept = theirs.state()
+            for net in range(2):
+                for place in range(len(config.hidden) + 1):
+                    for where, ours in (("critic", agent.weights.part("critic.")),
+                                        ("critic_target", agent.targets)):  # fmt: skip
+                        array = kept[f"policy.{where}.qf{net}.{2 * place}.weight"]
+                        mine = ours.arrays[f"{net}.layers.{place}.weight"]
+                        np.testing.assert_allclose(mine, array, **close, err_msg=where)
+            log_alpha = agent.weights.arrays["log_alpha"]
+            np.testing.assert_allclose(log_alpha, kept["log_alpha"], rtol=1e-4)
+            told, ours_told = theirs.scalars(), agent.scalars()
+            for name in ("actor_loss", "critic_loss", "ent_coef", "ent_coef_loss"):
+                got = ours_told[f"train/{name}"]
+                assert got == pytest.approx(told[f"train/{name}"], rel=2e-3, abs=1e-4), name
+
+
+def _samples(*columns: np.ndarray | None) -> Any:
+    from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+    return ReplayBufferSamples(*(None if c is None else torch.from_numpy(c) for c in columns))
+
+
+# ---- the buffer
+
+
+def rollout(values: list[float], **flags: list[bool]) -> Rollout:
+    """Steps of one drone, all numbers of a step alike."""
+    count = len(values)
+    column = np.array(values, np.float32)[:, None, None]
+    ends = {name: np.array(flags.get(name, [False] * count))[:, None]
+            for name in ("terminated", "truncated")}  # fmt: skip
+    kept = np.array(flags.get("kept", [True] * count))[:, None]
+    return Rollout(
+        observations=np.repeat(column, 2, axis=2), actions=column + 0.25,
+        rewards=column[..., 0] + 0.5, next_observations=np.repeat(column + 1, 2, axis=2),
+        kept=kept, **ends,
+    )  # fmt: skip
+
+
+def test_the_buffer_keeps_the_last_transitions() -> None:
+    buffer = ReplayBuffer(4, 2, 1)
+    buffer.add(rollout([1, 2, 3], terminated=[False, False, True]))
+    assert len(buffer) == 3
+    states, actions, next_states, rewards, ends = buffer.take(np.array([2, 0]))
+    assert states.tolist() == [[3, 3], [1, 1]]
+    assert actions.tolist() == [[3.25], [1.25]]
+    assert next_states.tolist() == [[4, 4], [2, 2]]
+    assert rewards.tolist() == [3.5, 1.5]
+    assert ends.tolist() == [1, 0]
+    # A truncation is no end; the row that is not kept is no transition.
+    buffer.add(rollout([4, 5, 6], truncated=[True, False, False], kept=[True, False, True]))
+    assert (len(buffer), buffer.added) == (4, 5)
+    states, *_, ends = buffer.take(np.arange(4))
+    assert states[:, 0].tolist() == [6, 2, 3, 4]
+    assert ends.tolist() == [0, 0, 1, 0]
+
+
+@pytest.mark.parametrize("script", [CALM, LOSSES], ids=["calm", "losses"])
+def test_every_drone_writes_what_it_flew(script: Any) -> None:
+    """In the order of flight; true last observations; nothing of a lost simulator's steps."""
+    env = Scripted(script)
+    agent: Any = make_agent("sac", log_of(env), SACConfig(**SMALL), 0)
+    agent.train(agent_log := log_of(env), 90, lambda: True)
+    assert agent_log.env_steps == sum(map(len, env.flown))
+    flown = {row.observation.tobytes(): row for rows in env.flown for row in rows}
+    kept = [row for row in flown.values() if not row.lost]
+    assert len(agent.buffer) == len(kept)
+    for state, action, after, reward, ends in zip(
+        *agent.buffer.take(np.arange(len(agent.buffer))), strict=True
+    ):
+        row = flown[state.tobytes()]
+        np.testing.assert_array_equal(action, row.action)
+        assert after.tobytes() == row.after.tobytes()
+        assert reward == np.float32(row.reward)
+        assert ends == row.terminated
+
+
+def test_the_beginning_is_uniform() -> None:
+    agent = agent_of(learning_starts=150)
+    agent.train(log_of(Scripted(CALM)), 400, lambda: agent.warming_up)
+    actions = agent.buffer.take(np.arange(len(agent.buffer)))[1]
+    assert agent.updates == 1
+    assert abs(actions[:150]).max() < 1
+    counts = np.histogram(actions[:150], bins=4, range=(-1, 1))[0]
+    assert counts.min() > 45  # of 300 numbers 75 on average, 7.5 off by chance
+
+
+# ---- trainings
+
+
+def elevation(drones: int, seed: int = 5) -> EpisodeLog:
+    options: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
+    return EpisodeLog(LocalVectorEnv(ENV, drones, autoreset_mode="Disabled", **options), seed)
+
+
+@pytest.mark.parametrize(("algorithm", "drones"), [("sac", 1), ("sac", 3), ("sb3-sac", 3)])
+def test_a_training_goes_on_to_the_same_bits(algorithm: str, drones: int, tmp_path: Path) -> None:
+    """The buffer is written over meanwhile."""
+    small = {**SMALL, "buffer_size": 100}
+    config = preset(algorithm, "tuned", **small, steps_per_update=6, gradient_steps=2)
+    total = 204
+    whole = elevation(drones)
+    unbroken: Any = make_agent(algorithm, whole, config, 5)
+    unbroken.train(whole, total, lambda: True)
+
+    log = elevation(drones)
+    agent: Any = make_agent(algorithm, log, config, 5)
+    agent.train(log, total, lambda: log.env_steps < 130)
+    assert 130 <= log.env_steps < 140
+    path = tmp_path / "checkpoint.safetensors"
+    store(
+        Checkpoint(algorithm=algorithm, config=vars(config), spec=log.spec, seed=5,
+                   env_steps=total, actor=agent.actor(), state=agent.state(),
+                   position=log.position()),
+        path,
+    )  # fmt: skip
+    kept = load(path)
+    again = elevation(drones)
+    resumed: Any = resume_agent(kept, again)
+    resumed.train(again, total, lambda: True)
+    assert again.env_steps == whole.env_steps >= total
+    expected, got = unbroken.state(), resumed.state()
+    assert expected.keys() == got.keys()
+    for name, array in expected.items():
+        assert got[name].tobytes() == array.tobytes(), name
+    seen = np.float32([[0.1, -0.2, 0.0]])
+    np.testing.assert_array_equal(load(path).policy().output(seen), agent.policy().output(seen))
+
+
+def test_a_checkpoint_of_another_buffer_is_refused() -> None:
+    agent = agent_of()
+    state = agent.state()
+    for name in ("buffer", "targets", "weights"):
+        with pytest.raises(ValueError, match=f"{name}: expected"):
+            agent.set_state(state | {name: np.zeros((1, 1), np.float32)})
+    with pytest.raises(KeyError):
+        agent.set_state({k: v for k, v in state.items() if k != "added"})
+
+
+def test_the_policy_is_the_mean_of_the_actor() -> None:
+    agent, seen = agent_of(), normal(5, N)
+    agent.weights.values[:] = normal(agent.weights.values.size)
+    actor = SquashedActor(agent.weights.part("actor."), "relu")
+    expected, _ = actor.draw(seen, np.zeros((5, K), np.float32))
+    np.testing.assert_allclose(agent.policy().output(seen), expected, atol=1e-6)
+    assert abs(expected).max() <= 1
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "sb3-sac"])
+def test_choices_are_refused(algorithm: str) -> None:
+    with pytest.raises(InputError, match="expected an env of continuous actions, got one of"):
+        make_agent(algorithm, log_of(Scripted(CALM, discrete=True)), SACConfig(), 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"tau": 0.0}, "tau: expected a number above 0, to 1, got 0.0"),
+        ({"gradient_steps": 0}, "gradient_steps: expected a whole number, 1 or more, got 0"),
+        ({"target_entropy": "auto"}, "target_entropy: expected a number, or null"),
+        ({"buffer_size": 50}, "buffer_size: expected learning_starts (1000) or more, got 50"),
+    ],
+)
+def test_wrong_settings_are_one_sentence(changes: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError) as caught:
+        SACConfig(**changes)
+    assert str(caught.value).startswith(sentence)
+
+
+def test_learns_to_hold_the_target() -> None:
+    """A third of the preset's length: the better of two seeds comes close."""
+    late = []
+    for seed in (0, 1):
+        log = EpisodeLog(LocalVectorEnv(ENV, 8, autoreset_mode="Disabled"), seed)
+        agent = make_agent("sac", log, preset("sac", "tuned"), seed)
+        agent.train(log, 10_000, lambda: True)
+        evaluation = LocalVectorEnv(ENV, 5, autoreset_mode="Disabled")
+        flown = fly_episodes(evaluation, agent.policy(), 5)
+        late.append(float(np.mean([np.abs(one.headline[-60:]).mean() for one in flown])))
+    assert min(late) < 0.1
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "sb3-sac"])
+def test_what_is_logged_is_on_the_page(algorithm: str) -> None:
+    page = Path(__file__).parents[2] / "docs" / "algorithms" / f"{algorithm}.md"
+    told = set(re.findall(r"^\| `(train/\w+)`", page.read_text(encoding="utf-8"), re.MULTILINE))
+    log = elevation(2)
+    agent = make_agent(algorithm, log, preset(algorithm, "tuned", **SMALL), 0)
+    assert agent.scalars() == {}
+    agent.train(log, 48, lambda: True)
+    assert set(agent.scalars()) == told
+    assert agent.scalars()["train/n_updates"] >= 1
+    assert agent.scalars()["train/ent_coef"] == pytest.approx(0.1, rel=0.05)

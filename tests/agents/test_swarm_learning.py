@@ -1,0 +1,190 @@
+"""Learning with several drones in a world: who counts, what the critic sees, and resuming."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from rotorgram.agents import EpisodeLog, ResumeError, make_agent, preset
+from rotorgram.agents.rollouts import Collector, Rollout
+from rotorgram.cli._flags import parse
+from rotorgram.cli.compare import Compare
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.training.settings import CompareConfig, Run
+from rotorgram.training.training import Training
+from swarms import RISE
+
+SMALL = {"steps_per_update": 48, "epochs": 2, "minibatches": 2}
+
+
+def log_of(worlds: int = 1, drones: int = 2, seed: int = 0, **options: Any) -> EpisodeLog:
+    env = LocalVectorEnv(RISE, worlds * drones, drones=drones, autoreset_mode="Disabled", **options)
+    return EpisodeLog(env, seed, keep_steps=True)
+
+
+class Climbers:
+    """A policy of which every second drone, from the first on, climbs; the others hover."""
+
+    def draw_noise(self, rng: np.random.Generator, steps: int) -> np.ndarray:
+        return np.zeros((steps, 1), np.float32)
+
+    def sample(self, observations: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        actions = np.zeros((len(observations), 1), np.float32)
+        actions[::2] = 1.0
+        return actions
+
+
+def flown(log: EpisodeLog, count: int) -> Rollout:
+    policy: Any = Climbers()
+    return Collector(log, np.random.default_rng(0)).steps(policy, count)
+
+
+def test_one_that_is_out_flies_no_env_step() -> None:
+    log = log_of()
+    rollout = flown(log, 60)  # thirty steps of two drones: an episode of the second
+    climb = log.episodes[0]
+    assert (climb.terminated, climb.episode) == (True, 0)
+    assert climb.length < 30
+    assert [(e.length, e.truncated, e.episode) for e in log.episodes[1:]] == [(30, True, 1)]
+    assert rollout.kept.sum(axis=0).tolist() == [climb.length, 30]
+    assert log.env_steps == climb.length + 30 == len(rollout)
+    assert (rollout.rewards[~rollout.kept] == 0).all()
+    assert np.bincount(log.steps()["episode"]).tolist() == [climb.length, 30]
+    # All were out: the world has begun anew, both drones with it.
+    assert log.position().numbers.tolist() == [2, 3]
+    assert log.position().lengths.tolist() == [0, 0]
+
+
+def test_a_world_begins_as_a_whole_and_spends_a_row_while_another_flies_on() -> None:
+    log = log_of(worlds=2, episode_length=10)
+    log.start()
+    first = np.array([True, True, False, False])
+    log.fly(np.zeros((4, 1), np.float32), None, first)  # the first world is a step behind
+    rollout = flown(log, 48)
+    ends = rollout.truncated
+    assert np.flatnonzero(ends[:, 2]).tolist() == np.flatnonzero(ends[:, 3]).tolist() == [8]
+    assert np.flatnonzero(ends[:, 0]).tolist() == [9]
+    assert not rollout.kept[9, 2:].any()  # the row after it begins the second world
+    assert not rollout.kept[10, :2].any()
+    assert rollout.kept.sum(axis=0).tolist() == [11] * 4
+
+
+def test_returns_of_a_drone_that_is_out_stop_at_its_end() -> None:
+    log = log_of()
+    agent: Any = make_agent("ippo", log, preset("ippo", "tuned", gamma=1.0, gae_lambda=1.0), 0)
+    for name, array in agent.weights.part("critic.").arrays.items():
+        array[...] = 0.0 if name != "layers.1.bias" else 5.0  # V(s) = 5
+    rollout = flown(log, 60)
+    estimates = agent.advantages(rollout)[0]
+    length = log.episodes[0].length
+    # Rewards of 1: those that are left, after a termination nothing, after the time limit 5.
+    assert estimates[:length, 0] == pytest.approx(np.arange(length, 0, -1) - 5.0)
+    assert estimates[:, 1] == pytest.approx(np.arange(30, 0, -1))
+
+
+def test_what_the_central_critic_sees_by_hand() -> None:
+    log = log_of(worlds=2, drones=3)
+    agent: Any = make_agent("mappo", log, preset("mappo", "tuned"), 0)
+    observations = np.arange(18, dtype=np.float32).reshape(1, 6, 3)
+    flying = np.array([[True, True, False, True, True, True]])
+    seen = agent.seen(observations, flying)
+    assert seen.shape == (1, 6, 9)
+    # Its own, the next one's, the one's after that; the third is out.
+    assert seen[0, 0].tolist() == [0, 1, 2, 3, 4, 5, 0, 0, 0]
+    assert seen[0, 1].tolist() == [3, 4, 5, 0, 0, 0, 0, 1, 2]
+    assert seen[0, 2].tolist() == [6, 7, 8, 0, 1, 2, 3, 4, 5]
+    assert seen[0, 3].tolist() == [9, 10, 11, 12, 13, 14, 15, 16, 17]
+    assert seen[0, 5].tolist() == [15, 16, 17, 9, 10, 11, 12, 13, 14]
+
+
+def test_of_a_single_drone_the_central_critic_is_ppos() -> None:
+    weights = []
+    for algorithm in ("ppo", "mappo"):
+        log = log_of(worlds=3, drones=1)
+        agent: Any = make_agent(algorithm, log, preset(algorithm, "tuned", **SMALL), 4)
+        agent.train(log, 200, lambda: True)
+        weights.append(agent.weights.values.tobytes())
+    assert weights[0] == weights[1]
+
+
+@pytest.mark.parametrize("algorithm", ["ippo", "mappo", "vpg", "sac"])
+def test_a_training_that_stops_anywhere_ends_with_the_same_bits(algorithm: str) -> None:
+    small: dict[str, Any] = {
+        "vpg": {"episodes_per_update": 3},
+        "sac": {"learning_starts": 60, "batch_size": 8, "hidden": (8,), "buffer_size": 500},
+    }.get(algorithm, SMALL)
+    settings: dict[str, Any] = {"algorithm": algorithm, "env_id": RISE, "seed": 1, "num_envs": 6,
+                                "options": {"episode_length": 90}}  # fmt: skip
+    run = Run(config=preset(algorithm, "tuned", **small), env_steps=1200, **settings)
+
+    def env() -> LocalVectorEnv:
+        return LocalVectorEnv(RISE, 6, drones=3, autoreset_mode="Disabled", episode_length=90)
+
+    whole = Training(run, env())
+    assert whole.train()
+    assert any(e.terminated for e in whole.log.episodes)
+    kept, stopped, outs = None, 0, 0
+    while True:
+        training = Training.resume(kept, env()) if kept else Training(run, env())
+        updates = iter([True, False])
+        ended = training.train(lambda updates=updates: next(updates, False))
+        kept, stopped = training.checkpoint(), stopped + 1
+        outs += int(training.log.out.any())
+        if ended:
+            break
+    assert stopped > (1 if algorithm == "vpg" else 4)
+    assert outs or algorithm == "vpg"  # VPG updates between worlds alone
+    ours, theirs = training.agent.state(), whole.agent.state()
+    assert all(ours[name].tobytes() == theirs[name].tobytes() for name in theirs)
+    lengths = [[e.length for e in one.log.episodes] for one in (training, whole)]
+    assert lengths[0] == lengths[1]
+
+
+def test_a_training_of_other_worlds_is_not_resumed() -> None:
+    def env(drones: int, **options: Any) -> LocalVectorEnv:
+        options = {"episode_length": 90, **options}
+        return LocalVectorEnv(RISE, 6, drones=drones, autoreset_mode="Disabled", **options)
+
+    run = Run(algorithm="mappo", config=preset("mappo", "tuned", **SMALL), env_id=RISE, seed=1,
+              env_steps=1200, num_envs=6, options={"episode_length": 90})  # fmt: skip
+    training = Training(run, env(3))
+    assert not training.train(lambda: False)
+    kept = training.checkpoint()
+    with pytest.raises(ResumeError) as told:
+        Training.resume(kept, env(2))
+    assert str(told.value) == (
+        "resume: expected an env with agents ('drone_0', 'drone_1', 'drone_2'), "
+        "got ('drone_0', 'drone_1')"
+    )
+    with pytest.raises(ResumeError) as told:
+        Training.resume(kept, env(3, episode_length=80))
+    assert str(told.value) == (
+        "resume: expected an env with options {'episode_length': 90}, got {'episode_length': 80}"
+    )
+
+
+def test_sb3_sees_zeros_of_one_that_is_out_until_its_world_ends() -> None:
+    log = log_of()
+    log.reset()
+    ends = []
+    for _ in range(30):
+        seen, rewards, terminated, truncated, info = log.step(np.array([[1.0], [0.0]]))
+        ends.append((terminated | truncated).tolist())
+    first = log.episodes[0].length
+    assert [row[0] for row in ends] == [step + 1 in (first, 30) for step in range(30)]
+    assert [row[1] for row in ends] == [step == 29 for step in range(30)]
+    assert (terminated[0], truncated[1]) == (True, True)
+    assert info["_final_obs"].tolist() == [True, True]
+    assert seen[:, 2] == pytest.approx(10.0)  # both have begun again
+
+    log.reset()
+    for _ in range(first + 1):
+        seen, rewards, *_ = log.step(np.array([[1.0], [0.0]]))
+    assert (seen[0].tolist(), rewards[0]) == ([0.0, 0.0, 0.0], 0.0)
+    assert seen[1, 2] == pytest.approx(10.0)
+
+
+def test_a_comparison_of_swarms_flies_one_world_unless_told() -> None:
+    words = ["--env", "rotorgram/Crossing-v0", "--drones", "4", "--agents", "ippo"]
+    for more, count in (([], 4), (["--num-envs", "8"], 8)):
+        command = parse(Compare, "rotorgram compare", [*words, *more])
+        assert CompareConfig(**command.settings(CompareConfig)).num_envs == count

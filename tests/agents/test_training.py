@@ -1,0 +1,191 @@
+"""Trainings: wrong ones are refused, progress, resuming, and the advice of `rotorgram train`."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from rotorgram.agents import (
+    CheckpointError,
+    ResumeError,
+    episode_seed,
+    load,
+    make_agent,
+    preset,
+    store,
+)
+from rotorgram.agents.episodes import EpisodeLog
+from rotorgram.cli import main
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.flights.trajectories import evaluation_seed, fly_episodes
+from rotorgram.models.errors import InputError
+from rotorgram.training.settings import Run
+from rotorgram.training.training import Training, is_finished
+
+ENV = "rotorgram/Elevation-v0"
+OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
+SMALL: dict[str, dict[str, int]] = {
+    "vpg": {"episodes_per_update": 4},
+    "a2c": {"steps_per_update": 70},
+    "ppo": {"steps_per_update": 72, "epochs": 2, "minibatches": 2},
+    "sb3-a2c": {"steps_per_update": 70},
+}
+
+
+def run_of(algorithm: str, drones: int = 4, **changes: Any) -> Run:
+    return Run(
+        algorithm=algorithm,
+        config=preset(algorithm, "tuned", **SMALL[algorithm]),
+        seed=4,
+        env_steps=1400,
+        num_envs=drones,
+        **{"options": OPTIONS, **changes},
+    )
+
+
+def env_of(run: Run, **changes: Any) -> Any:
+    options = {**run.options, **changes}
+    if run.num_envs == 1:
+        return gym.make(ENV, disable_env_checker=True, **options)
+    return LocalVectorEnv(ENV, run.num_envs, autoreset_mode="Disabled", **options)
+
+
+def test_wrong_runs_are_one_sentence() -> None:
+    run = run_of("a2c")
+    for changes, sentence in (
+        ({"seed": -1}, "seed: expected 0 or more, got -1"),
+        ({"num_envs": 0}, "num_envs: expected 1 or more, got 0"),
+        ({"env_steps": 71}, "env_steps: expected at least 72, got 71"),  # whole steps of 4 drones
+        ({"options": {"wind": 1}}, "wind"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            replace(run, **changes)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="env_steps: expected at least 120, got 119"):
+        replace(run_of("vpg"), env_steps=119)  # an episode of each
+    with pytest.raises(InputError, match="env: expected one of 4 drones, got 3"):
+        Training(run, env_of(replace(run, num_envs=3)))
+
+
+def test_training_and_evaluation_share_no_seed() -> None:
+    training = {episode_seed(run, episode) for run in range(10) for episode in range(300)}
+    sets = ("final", "curve", "tuning")
+    evaluation = [evaluation_seed(episode, of) for of in sets for episode in range(100)]  # type: ignore[arg-type]
+    assert training.isdisjoint(evaluation)
+
+
+def test_evaluation_flies_without_noise() -> None:
+    env = gym.make(ENV, disable_env_checker=True)
+    log = EpisodeLog(env, 0)
+    policy = make_agent("a2c", log, preset("a2c", "paper"), 0).policy()
+    first, second = (fly_episodes(env, policy, 2) for _ in range(2))
+    for one, other in zip(first, second, strict=True):
+        assert one.headline.tobytes() == other.headline.tobytes()
+
+
+def test_same_seed_same_numbers_and_other_seed_other_numbers() -> None:
+    def weights(seed: int) -> bytes:
+        run = replace(run_of("a2c", 1), seed=seed, env_steps=300)
+        training = Training(run, env_of(run))
+        training.train()
+        return training.agent.actor()["layers.1.weight"].tobytes()
+
+    assert weights(1) == weights(1)
+    assert weights(1) != weights(2)
+
+
+def test_progress_tells_of_every_drone() -> None:
+    """Of 120 drones that begin together the last 20 to end are those that flew longest."""
+    run = replace(run_of("vpg"), num_envs=120, env_steps=7200)
+    training = Training(run, env_of(run))
+    training.train()
+    assert len(training.log.episodes) >= 240
+    last = training.log.episodes[-120:]
+    lengths = [episode.length for episode in last]
+    assert np.mean(lengths[-20:]) > np.mean(lengths)
+    mean = np.mean([episode.total_reward for episode in last])
+    assert training.words().startswith(f"return {mean:.0f}, |E| 0.")
+    assert training.scalars()["rollout/ep_rew_mean"] == pytest.approx(mean)
+    assert training.scalars()["rollout/ep_len_mean"] == pytest.approx(np.mean(lengths))
+
+
+@pytest.mark.parametrize("drones", [1, 4])
+@pytest.mark.parametrize("algorithm", SMALL)
+def test_a_run_that_was_stopped_ends_as_if_it_had_not(
+    algorithm: str, drones: int, tmp_path: Path
+) -> None:
+    run, path = run_of(algorithm, drones), tmp_path / "checkpoint.safetensors"
+    unbroken = Training(run, env_of(run))
+    assert unbroken.train()
+    stopped = Training(run, env_of(run))
+    updates = iter(range(3))
+    assert not stopped.train(lambda: next(updates, None) != 2)
+    store(stopped.checkpoint(), path)
+    kept = load(path)
+    assert kept.num_envs == drones
+    assert not is_finished(kept)
+    torch.manual_seed(99)  # nothing may depend on what the process did before
+    resumed = Training.resume(kept, env_of(run))
+    assert resumed.log.env_steps == stopped.log.env_steps < 1400
+    assert resumed.train()
+    assert is_finished(resumed.checkpoint())
+    for name, expected in unbroken.agent.state().items():
+        assert resumed.agent.state()[name].tobytes() == expected.tobytes(), name
+    episodes = [[replace(e, seconds=0.0) for e in t.log.episodes] for t in (resumed, unbroken)]
+    assert episodes[0] == episodes[1]
+
+
+def test_what_cannot_be_resumed_is_refused() -> None:
+    run = run_of("a2c")
+    training = Training(run, env_of(run))
+    training.train(lambda: False)
+    kept = training.checkpoint()
+    with pytest.raises(ResumeError, match="resume: expected an env with options"):
+        Training.resume(kept, env_of(run, linear_drag=0.5))
+    with pytest.raises(
+        ResumeError,
+        match=r"resume: expected rotorgram quadcopter .*, got Crazyflie 2.* with --vehicle$",
+    ):
+        Training.resume(kept, env_of(run, vehicle="crazyflie2"))
+    with pytest.raises(CheckpointError, match="its parts do not fit together"):
+        Training.resume(replace(kept, config={**kept.config, "hidden": 8}), env_of(run))
+    with pytest.raises(CheckpointError, match="its parts do not fit together: seed: expected"):
+        Training.resume(replace(kept, seed=-1), env_of(run))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings", "note"),
+    [
+        ("a2c", ("--num-envs", 16), ""),
+        (
+            "sb3-a2c",
+            ("--num-envs", 18),
+            "note: an update has 15 steps of each of 18 drones, and sb3-a2c learns little from "
+            "fewer than 16: try --set steps_per_update=576, a higher learning_rate, and "
+            "--env-steps 57600 or more\n",
+        ),
+        # Rounds of 4 episodes of 5 steps: 30 updates, and one less.
+        ("vpg", ("--num-envs", 4, "--env-steps", 600), ""),
+        (
+            "vpg",
+            ("--num-envs", 4, "--env-steps", 599),
+            "note: 599 env steps of 4 drones may be as few as 29 updates, and vpg learns little "
+            "from fewer than 30: try --env-steps 600 or more, or fewer drones\n",
+        ),
+    ],
+)
+def test_train_says_where_the_drones_are_too_many(
+    algorithm: str,
+    settings: tuple[object, ...],
+    note: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    arguments = ["train", algorithm, "--env-steps", 600, "--env.episode-length", 5]
+    folder = tmp_path / "run"
+    assert main([str(a) for a in (*arguments, *settings, "--out", folder)]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith(note)
+    assert out.count("note: ") == bool(note)

@@ -1,0 +1,895 @@
+"""The command line as a user meets it: good input, wrong input, Ctrl-C, a missing peer."""
+
+import json
+import logging
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pandas as pd
+import pytest
+from rotorgram.agents import load
+from rotorgram.agents.checkpoints import store
+from rotorgram.cli import COMMANDS, main, train
+from rotorgram.cli._env import chosen_env
+from rotorgram.cli._flags import parse
+from rotorgram.cli._scalars import ScalarWriter
+from rotorgram.cli.serve import Serve
+from rotorgram.cli.sim import Sim
+from rotorgram.flights.trajectories import flown_trajectories
+from rotorgram.models import QUAD_XML, InputError
+from rotorgram.training.results import read_results, read_steps
+from rotorgram.udp import Simulator
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+SWARM = ("--env", "rotorgram/Formation-v0", "--drones", "2")
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    """Exit status, standard output and standard error of a command."""
+    try:
+        status = main([str(a) for a in arguments])
+    except SystemExit as end:
+        status = int(end.code or 0)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    """A command in a process of its own, in a terminal's process group of its own."""
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-m", "rotorgram.cli", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    started.append(process)
+    return process
+
+
+started: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(autouse=True)
+def _nothing_runs_on() -> Iterator[None]:
+    """After a test that failed, too."""
+    yield
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+    started.clear()
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+@pytest.mark.parametrize("command", [[], *[[c] for c in COMMANDS]], ids=" ".join)
+def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, *command, "--help")
+    assert status == 0
+    assert "usage: rotorgram" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["evaluate", "nowhere.safetensors"], "there is no file nowhere.safetensors"),
+        (["evaluate", "pid", "--episodes", "0"], "episodes: expected at least 1, got 0"),
+        (["evaluate", "pid", "--env.observation", "error"], "pid: expected observation='full'"),
+        (["evaluate", "pid", "--env", "rotorgram/Hover-v0"], "pid: expected the env rotorgram/El"),
+        (["train", "a2c", "--set", "gamma"], "set: expected NAME=VALUE, got 'gamma'"),
+        (["train", "a2c", "--set", "speed=1"], "hyperparameters: expected some of"),
+        (["train", "a2c", "--set", "gamma=[[["], "gamma: expected a number from 0 to 1, got '[[['"),
+        (["train", "a2c", "--set", "gamma=" + 9999 * "["], "gamma: expected a number from 0 to 1"),
+        (["train", "vpg", "--listen", "8001"], "address: expected HOST:PORT"),
+        (["train", "vpg", "--listen", "192.0.2.1:8001"], "is not a loopback address"),
+        (["train", "a2c", "--resume", "/dev/null"], "/dev/null: cannot be written: Not a dir"),
+        (["train", "a2c", "--out", "/proc/run"], "out: cannot make /proc/run: "),
+        (["train", "a2c", "--out", "/dev/null/run"], "out: cannot make /dev/null"),
+        (["train", "vpg", "--resume", "nowhere"], "nowhere: expected a folder, there is none"),
+        (["sim", "--server", "127.0.0.1:99999"], "address: expected HOST:PORT"),
+        (["sim", "--bind", "127.0.0.1:0", "--env.target", "1"], "target: expected"),
+        (["sim", "--env", "rotorgram/Nothing-v0"], "env: expected a registered id"),
+        (["sim", "--env", ":"], "env: expected MODULE:NAME with the name of a module, got ':'"),
+        (["sim", "--env", "..:x-v0"], "env: expected MODULE:NAME with the name of a module"),
+        (["sim", "--env", "os..x:x-v0"], "env: expected a module os..x here, got none"),
+        (["sim", "--env", "nowhere:Nothing-v0"], "env: expected a module nowhere here, got none"),
+        (["sim", "--vehicle", "nowhere.xml"], "vehicle: cannot read nowhere.xml"),
+        (["compare", "--num-envs", "0"], "num_envs: expected 1 or more, got 0"),
+        (["compare", "--first-seed", "-1"], "first_seed: expected 0 or more, got -1"),
+        (["compare", "--seeds", "0"], "seeds: expected at least 1, got 0"),
+        (["compare", "--agents", "vpg", "vpg"], "agents: expected each once"),
+        (["compare", "--out", "."], "expected a new folder"),
+        (["report", "nowhere"], "nowhere"),
+        (["sim", "--num-envs", "0", "--bind", "127.0.0.1:0"], "num_envs: expected 1 to 65536"),
+        (["sim", "--num-envs", "2", "--codec", "text"], "text codec: expected one drone, got 2"),
+        (["sim", "--key-file", "nowhere"], "key file: cannot read nowhere"),
+        (
+            ["sim", "--agents", "here:1", "--server", "here:2"],
+            "--server: expected none with --agents, got here:2",
+        ),
+        (
+            ["sim", "--agents", "here:1=drone_0", "here:2"],
+            "--agents: expected drones of each agent or of none, got here:1=drone_0 here:2",
+        ),
+        (["sim", "--agents"], "--agents: expected HOST:PORT of each agent, got none"),
+        (
+            ["sim", *SWARM, "--bind", "127.0.0.1:0", "--agents", "127.0.0.1:0"],
+            "agents: expected the port of each agent, 1 to 65535, got 0",
+        ),
+        (["sim", "--patience", "3"], "--patience: expected it with --agents, got 3.0"),
+        (["sim", "--when-lost", "land"], "--when-lost: expected it with --agents, got land"),
+        (["sim", "--drones", "0"], "drones: expected 1 or more, got 0"),
+        (["serve", "pid", "--drones", "0"], "drones: expected at least 1, got 0"),
+        (["train", "mappo", "--drones", "0"], "drones: expected at least 1, got 0"),
+        (["train", "a2c", "--key-file", "nowhere"], "key-file, insecure: expected them with"),
+        (["train", "a2c", "--store-every", "0"], "store-every: expected seconds > 0, got 0"),
+        (["serve", "pid", "--listen", "0.0.0.0:0"], "--key-file), or insecure=True (--insecure)"),
+        (["relay", "--drop", "2"], "drop: expected a probability from 0 to 1, got 2"),
+        (["relay", "--listen", "0.0.0.0:0"], "is not a loopback address"),
+        (["replay", "nowhere.mcap"], "nowhere.mcap"),
+    ],
+)
+def test_wrong_input_is_one_sentence(
+    arguments: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, _, err = run(capsys, *arguments)
+    assert status == 1
+    assert err.startswith("rotorgram: ")
+    assert sentence in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments", [["train", "dqn"], ["sim", "--speed", "2"], ["fly"], ["compare", "--seeds", "x"]]
+)
+def test_wrong_flags_name_what_was_expected(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = run(capsys, *arguments)
+    assert status == 2
+    assert "Traceback" not in out + err
+    assert arguments[-1] in out + err or arguments[-2] in out + err
+
+
+def test_no_command_and_an_unknown_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys)[0] == 2
+    status, _, err = run(capsys, "fly")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "expected a command of sim, train, " in err
+    status, out, _ = run(capsys, "--version")
+    assert status == 0
+    assert re.fullmatch(r"rotorgram \d+\.\d+\.\d+\n", out)
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NumPy raises ValueError for our bugs too."""
+
+    def broken(self: Sim) -> int:
+        raise ValueError("operands could not be broadcast together")
+
+    monkeypatch.setattr(Sim, "run", broken)
+    with pytest.raises(ValueError, match="broadcast"):
+        main(["sim"])
+
+
+def test_flags_that_are_set_to_their_default_are_set() -> None:
+    words = ["--env.target", "5", "--num-envs=1", "--no-realtime", "--env.action", "offset"]
+    command = parse(Sim, "rotorgram sim", words)
+    assert command.given == {"env.target", "num_envs", "realtime", "env.action"}
+    assert command.options == {"target": 5.0, "action": "offset"}
+    assert parse(Sim, "rotorgram sim", []).options == {}
+
+
+def test_options_are_those_of_the_task(capsys: pytest.CaptureFixture[str]) -> None:
+    _, out, _ = run(capsys, "sim", "--env", "rotorgram/Hover-v0", "--help")
+    assert "--env.start-tilt" in out
+    assert "--env.target" not in out
+    command = parse(Sim, "rotorgram sim", ["--env.target", "4", "6"])
+    assert command.options == {"target": [4.0, 6.0]}, "as JSON gives it"
+
+
+def test_requirements_of_a_task_that_is_not_known_here() -> None:
+    words = ["pid", "--env", "other/Race-v3", "--env.num-gates=3", "--env.wind", "[0.5, 1]"]
+    command = parse(Serve, "rotorgram serve", [*words, "--env.track", "long", "--episodes", "2"])
+    assert (command.env, command.episodes) == ("other/Race-v3", 2)
+    assert command.options == {"num_gates": 3, "wind": [0.5, 1], "track": "long"}
+
+
+TASK = """
+from rotorgram.envs import register
+from rotorgram.envs.tasks.elevation import Elevation
+
+
+class Low(Elevation):
+    pass
+
+
+register("Low-v0", Low)
+"""
+
+
+def test_a_task_of_the_working_directory(tmp_path: Path) -> None:
+    """It trains and flies; an agent that lacks its file serves it."""
+    (tmp_path / "low_task.py").write_text(TASK)
+    env = "--env low_task:Low-v0 --env.target 4"
+    done = shell(f"cd {tmp_path} && rotorgram train a2c {env} --env-steps 300 --out run")
+    assert done.returncode == 0, done.stderr
+    kept = load(tmp_path / "run" / "checkpoint.safetensors")
+    assert (kept.env_id, kept.options["target"]) == ("Low-v0", 4.0)
+    done = shell(f"rotorgram evaluate {tmp_path}/run --episodes 1")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "expected --env MODULE:Low-v0" in done.stderr
+    agent = start("serve", tmp_path / "run", "--listen", "127.0.0.1:0", "--episodes", 1)
+    assert agent.stdout is not None
+    server = agent.stdout.readline().split()[5]
+    done = shell(f"cd {tmp_path} && rotorgram sim {env} --bind 127.0.0.1:0 --server {server}")
+    assert done.returncode == 0, done.stderr
+    assert "episode 0: return" in agent.communicate(timeout=30)[0]
+
+
+@pytest.mark.parametrize("words", [["--help"], ["sim", "--help"], ["sim", "--speed", "2"]])
+def test_a_narrow_terminal(words: list[str]) -> None:
+    """In five columns tyro takes gigabytes."""
+    limited = "import resource as r, sys; r.setrlimit(r.RLIMIT_AS, (4 << 30, 4 << 30));"
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            limited + "from rotorgram.cli import main; sys.exit(main())",
+            *words,
+        ],
+        env={**os.environ, "COLUMNS": "5"},
+        capture_output=True,
+        text=True,
+        timeout=30,
+    )
+    assert done.returncode == (0 if "--help" in words else 2), done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def shell(command: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """A command line, with `rotorgram` for the command."""
+    words = f"{sys.executable} -P -m rotorgram.cli"
+    return subprocess.run(
+        ["bash", "-c", "set -o pipefail; " + command.replace("rotorgram", words)],
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+@pytest.mark.parametrize(
+    ("command", "status", "error"),
+    [
+        ("rotorgram --help >&-", 0, ""),
+        ("rotorgram sim --help >&- 2>&-", 0, ""),
+        ("rotorgram check-model > /dev/full", 1, "rotorgram: standard output: No space left"),
+        ("(sleep 1; rotorgram --help) | true", 141, ""),
+    ],
+)
+def test_standard_output_that_takes_nothing(command: str, status: int, error: str) -> None:
+    done = shell(command)
+    assert done.returncode == status, done.stderr
+    assert done.stderr.startswith(error)
+    assert done.stderr.count("\n") == bool(error)
+
+
+@pytest.mark.parametrize("out", ["> /dev/full", "| true"])
+def test_a_training_goes_on_without_standard_output(out: str, tmp_path: Path) -> None:
+    done = shell(f"rotorgram train a2c --env-steps 600 --out {tmp_path}/run {out}")
+    assert done.returncode == (1 if "full" in out else 141)
+    assert done.stderr.count("\n") == ("full" in out)
+    assert load(tmp_path / "run" / "checkpoint.safetensors").position.env_steps == 600
+
+
+def test_standard_output_in_ascii() -> None:
+    commands = ("rotorgram --help", "rotorgram render --help", "rotorgram check-model",
+                "rotorgram evaluate pid --episodes 1")  # fmt: skip
+    for command in commands:
+        done = shell(command, PYTHONIOENCODING="ascii")
+        assert (done.returncode, done.stderr) == (0, ""), command
+
+
+def test_an_opengl_that_does_not_exist() -> None:
+    """It is told to commands that draw; others go on."""
+    assert shell("rotorgram check-model", MUJOCO_GL="nonsense").returncode == 0
+    done = shell("rotorgram render random --out /nowhere/a.mp4", MUJOCO_GL="nonsense")
+    assert "Traceback" not in done.stderr
+    assert done.returncode in (1, 2)
+
+
+def test_a_folder_of_that_name_in_the_working_directory(tmp_path: Path) -> None:
+    """The simulators that a command starts import the package, not that folder."""
+    (tmp_path / "rotorgram").mkdir()
+    (tmp_path / "rotorgram" / "__init__.py").write_text("raise SystemExit('the wrong one')")
+    done = shell(f"cd {tmp_path} && rotorgram evaluate pid --episodes 1")
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_model_with_a_tiny_time_step(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = QUAD_XML.read_text(encoding="utf-8").replace('timestep="0.01"', 'timestep="1e-8"')
+    (tmp_path / "quad.xml").write_text(model)
+    status, out, _ = run(capsys, "check-model", tmp_path / "quad.xml")
+    assert status == 1
+    assert "expected a physics step of at least" in out
+
+
+@pytest.mark.parametrize(
+    ("command", "file"),
+    [
+        ("vehicle new v.toml", "v.toml"),
+        ("vehicle export crazyflie2 v.xml", "v.xml"),
+        ("evaluate pid --episodes 1 --record r.mcap", "r.mcap"),
+    ],
+)
+def test_a_file_that_cannot_be_written_is_named_and_leaves_its_name_free(
+    command: str, file: str, tmp_path: Path
+) -> None:
+    done = shell(f"cd {tmp_path} && ulimit -f 0 && rotorgram {command}")
+    assert (done.returncode, done.stderr) == (1, f"rotorgram: {file}: File too large\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_training_that_writes_nothing_leaves_the_name_of_its_folder_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(train, "write_whole", full)
+    status, _, err = run(capsys, "train", "a2c", "--out", tmp_path / "run")
+    assert (status, err) == (1, f"rotorgram: {tmp_path}/run/config.json: No space left on device\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_key_on_a_full_disk(capsys: pytest.CaptureFixture[str]) -> None:
+    status, _, err = run(capsys, "key", "/dev/full")
+    assert (status, err.count("\n")) == (1, 1)
+
+
+def test_curves_go_on_after_the_clock_went_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = ScalarWriter(tmp_path, 1000)
+    for step in range(100, 600, 100):
+        first.write(step, {"x": 1.0})
+    first.close()
+    monkeypatch.setattr(time, "time", lambda: 1e9)
+    resumed = ScalarWriter(tmp_path, 1000, behind=300)
+    for step in range(400, 800, 100):
+        resumed.write(step, {"x": 2.0})
+    resumed.close()
+    board = EventAccumulator(str(tmp_path))
+    board.Reload()
+    points = [(point.step, point.value) for point in board.Scalars("x")]
+    assert points == [(100, 1), (200, 1), (300, 1), (400, 2), (500, 2), (600, 2), (700, 2)]
+
+
+def test_port_in_use(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{sock.getsockname()[1]}"
+        for command in (["serve", "pid", "--listen", address], ["sim", "--bind", address]):
+            status, _, err = run(capsys, *command)
+            assert status == 1
+            assert f"cannot bind {address}: the port is in use" in err
+
+
+def test_unreachable_agent(capsys: pytest.CaptureFixture[str]) -> None:
+    server = f"127.0.0.1:{free_port()}"
+    status, _, err = run(
+        capsys, "sim", "--server", server, "--bind", "127.0.0.1:0", "--timeout", 0.5
+    )
+    assert status == 1
+    assert f"no answer from the agent at {server} for 0.5 s" in err
+
+
+def test_an_agent_that_is_late(capsys: pytest.CaptureFixture[str]) -> None:
+    """After a second the simulator tells, once, that nobody is there; it goes on asking."""
+    address = f"127.0.0.1:{free_port()}"
+    simulator = start("sim", "--server", address, "--bind", "127.0.0.1:0")
+    assert simulator.stderr is not None
+    began = time.monotonic()
+    sentence = simulator.stderr.readline()
+    assert time.monotonic() - began < 10
+    assert f"no answer from the agent at {address} for 1 s" in sentence
+    assert "; nothing listens on that port; asking for 120 s in all" in sentence
+    assert run(capsys, "serve", "pid", "--listen", address, "--episodes", 1)[0] == 0
+    out, err = simulator.communicate(timeout=30)
+    assert (simulator.returncode, err, "the agent closed" in out) == (0, "", True)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--vehicle", "nowhere.xml"], "vehicle: cannot read nowhere.xml: No such file"),
+        (["--env.control-period", "0.003"], "control_period: expected a positive multiple of the"),
+    ],
+)
+def test_an_error_of_our_own_simulator_is_told_once(
+    words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, _, err = run(capsys, "evaluate", "pid", "--episodes", 1, *words)
+    assert (status, err.startswith(f"rotorgram: {sentence}"), err.count("\n")) == (1, True, 1)
+
+
+def test_a_course_that_is_flown_to_its_end_is_no_crash(capsys: pytest.CaptureFixture[str]) -> None:
+    task = ("--env", "rotorgram/Waypoints-v0", "--env.points", 1, "--backend", "rigid")
+    status, out, _ = run(capsys, "evaluate", "geometric", "--episodes", 1, *task)
+    assert status == 0
+    assert "episodes   1, 1 terminated, 0 crashed\n" in out
+    assert "steady     points_left 0.0000\n" in out
+    assert re.search(r"^settling   to 0\.5: \d\.\d\d s \(1 of 1 episodes\)$", out, re.MULTILINE)
+
+
+def test_check_model(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "check-model")
+    assert status == 0
+    passed, checks = re.search(r"(\d+) of (\d+) checks passed", out).groups()  # type: ignore[union-attr]
+    assert passed == checks
+    assert run(capsys, "check-model", Path(__file__).parents[1] / "data" / "hexa.xml")[0] == 0
+
+
+def test_check_model_prints_json_and_exits_with_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = QUAD_XML.read_text(encoding="utf-8").replace('ctrlrange="0 100"', 'ctrlrange="0 50"')
+    (tmp_path / "weak.xml").write_text(text)
+    status, out, err = run(capsys, "check-model", tmp_path / "weak.xml", "--json")
+    report = json.loads(out)
+    failed = {check["name"]: check for check in report["checks"] if not check["passed"]}
+    assert (status, err, report["passed"]) == (1, "", False)
+    assert set(failed) == {"hover: thrust to weight", "hover: margin of the tightest rotor"}
+    assert failed["hover: thrust to weight"]["measured"] == pytest.approx(200 / 196)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (None, "vehicle: cannot read "),
+        ("nonsense", "vehicle: expected an MJCF file, got drone.xml: "),
+        ("<mujoco/>", "vehicle: expected one free body and no other joints, got 0 free of 0"),
+    ],
+)
+def test_check_model_of_what_is_no_vehicle(
+    text: str | None, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if text is not None:
+        (tmp_path / "drone.xml").write_text(text)
+    status, out, err = run(capsys, "check-model", tmp_path / "drone.xml")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"rotorgram: {sentence}")
+
+
+def test_worlds_of_the_simulator_that_comes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    here = f"127.0.0.1:{free_port()}"
+    swarm = ("sim", *SWARM, "--num-envs", 4, "--server", here, "--bind", "127.0.0.1:0")
+    flags = ("--env", "rotorgram/Formation-v0", "--listen", here)
+    simulator = start(*swarm)
+    status, _, err = run(capsys, "evaluate", "orca", *flags, "--drones", 4, "--episodes", 1)
+    assert (status, err) == (
+        1, "rotorgram: drones: expected a simulator of 4 in each world, got one of 2\n"
+    )  # fmt: skip
+    assert "the agent closed" in simulator.communicate(timeout=10)[0]
+    simulator = start(*swarm)
+    settings = ("--num-envs", 4, "--env-steps", 64, "--set", "steps_per_update=32", "hidden=8")
+    status, *_ = run(capsys, "train", "ippo", *flags, *settings, "--out", tmp_path / "run")
+    simulator.communicate(timeout=10)
+    assert status == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (config["num_envs"], config["drones"]) == (4, 2)
+
+
+def test_train_with_many_drones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, port = tmp_path / "run", free_port()
+    settings = ("--env-steps", 1200, "--num-envs", 4, "--set", "steps_per_update=100")
+    listen = ("--listen", f"127.0.0.1:{port}", "--num-simulators", 2)
+    sims = [
+        start("sim", "--server", f"127.0.0.1:{port}", "--bind", "127.0.0.1:0", "--num-envs", 2)
+        for _ in range(2)
+    ]
+    status, out, _ = run(capsys, "train", "a2c", "--out", folder, *settings, *listen)
+    assert status == 0
+    assert f"waiting for 2 simulators of 2 drones at 127.0.0.1:{port}" in out
+    assert re.search(r"trained 1,2\d\d of 1,200 env steps", out)
+    assert [sim.communicate(timeout=20)[0].splitlines()[-2] for sim in sims] == [
+        "the agent closed"
+    ] * 2
+    assert load(folder / "checkpoint.safetensors").num_envs == 4
+    status, out, _ = run(capsys, "train", "a2c", "--resume", folder)
+    assert (status, "already trained 1,2" in out, "wire" in out) == (0, True, False)
+    again = tmp_path / "again"  # with a simulator of its own: the same numbers
+    assert run(capsys, "train", "a2c", "--out", again, *settings)[0] == 0
+    weights = [load(f / "checkpoint.safetensors").actor for f in (folder, again)]
+    assert all(weights[0][name].tobytes() == weights[1][name].tobytes() for name in weights[0])
+    status, _, err = run(capsys, "train", "a2c", "--num-simulators", 2)
+    assert (status, "num-simulators: expected 1 without --listen" in err) == (1, True)
+    status, _, err = run(capsys, "train", "a2c", *settings[:2], "--num-envs", 0)
+    assert (status, "num_envs: expected 1 or more, got 0" in err) == (1, True)
+
+
+def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    settings = ("--env-steps", 1200, "--set", "steps_per_update=100", "--env.episode-length", 60)
+    status, out, _ = run(capsys, "train", "a2c", "--out", folder, *settings)
+    assert status == 0
+    assert "trained 1,200 of 1,200 env steps" in out
+    kept = load(folder / "checkpoint.safetensors")
+    assert (kept.algorithm, kept.config["steps_per_update"]) == ("a2c", 100)
+    assert kept.options["episode_length"] == 60
+    assert len(kept.spec.vehicle_hash) == 32
+    assert json.loads((folder / "config.json").read_text())["seed"] == 0
+    assert len(pd.read_csv(folder / "episodes.csv")) >= 20
+    status, out, _ = run(capsys, "evaluate", folder / "checkpoint.safetensors", "--episodes", 3)
+    assert status == 0
+    assert "episodes   3, " in out
+    assert run(capsys, "evaluate", folder, "--episodes", 1, "--env.linear-drag", 0.5)[0] == 0
+    for changes, sentence in (
+        (["vpg"], "resume: expected a training of vpg"),
+        (["a2c", "--seed", 0], "got others by --seed"),  # its own: set all the same
+        (["a2c", "--seed", 3, "--set", "gamma=0.5"], "got others by --seed, --set"),
+    ):
+        status, _, err = run(capsys, "train", *changes, "--resume", folder)
+        assert status == 1
+        assert sentence in err
+    status, _, err = run(capsys, "evaluate", folder, "--env.observation", "error")
+    assert status == 1
+    assert "policy: expected weights of shapes" in err
+    reference = chosen_env(parse(Serve, "serve", ["x"]), kept)
+    assert reference == ("rotorgram/Elevation-v0", kept.options)
+    words = ["x", "--env.episode-length", "1000", "--env.linear-drag=0"]  # the defaults
+    assert chosen_env(parse(Serve, "serve", words), kept)[1] == {
+        **kept.options, "episode_length": 1000, "linear_drag": 0.0
+    }  # fmt: skip
+    (folder / "episodes.csv").unlink()  # a result: the checkpoint has the episodes
+    assert run(capsys, "train", "a2c", "--resume", folder)[0] == 0
+
+
+def test_nothing_that_a_checkpoint_names_is_imported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fault 28: not in the processes of its simulators either."""
+    imported, folder = tmp_path / "imported", tmp_path / "run"
+    (tmp_path / "evil.py").write_text(f"open({str(imported)!r}, 'w')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    settings = ("--env-steps", 300, "--set", "steps_per_update=100", "--env.episode-length", 60)
+    assert run(capsys, "train", "a2c", "--out", folder, *settings)[0] == 0
+    kept = load(folder / "checkpoint.safetensors")
+    for name, known in (("evil:Evil-v0", False), ("evil:rotorgram/Elevation-v0", True)):
+        named = replace(kept, spec=replace(kept.spec, env_id=name), env_steps=600)
+        store(named, folder / "checkpoint.safetensors")
+        assert run(capsys, "evaluate", folder, "--episodes", 1)[0] == (not known)
+        assert run(capsys, "train", "a2c", "--resume", folder)[0] == 1
+    (trajectory,) = flown_trajectories(named.policy(), name, named.options, [0])  # as `render`
+    assert trajectory.spec.env_id == "rotorgram/Elevation-v0"
+    assert not imported.exists()
+
+
+def test_of_two_trainings_with_one_folder_one_is_refused(tmp_path: Path) -> None:
+    """And of two that resume it."""
+    settings = ("--env-steps", 3000, "--set", "steps_per_update=100", "--store-every", 0.1)
+    for words in (("--out", tmp_path / "run", *settings), ("--resume", tmp_path / "run")):
+        both = [start("train", "a2c", *words) for _ in range(2)]
+        ended = []
+        for process in both:
+            out, err = process.communicate(timeout=60)
+            ended.append((process.returncode, out, err))
+        (_, out, err), (status, _, refused) = sorted(ended, key=lambda one: one[0])
+        assert "3,000 env steps" in out, err
+        if words[0] == "--out" or status:  # of a finished one both may say that it is finished
+            assert (status, refused.count("\n")) == (1, 1)
+            assert "expected a " in refused
+        kept = load(tmp_path / "run" / "checkpoint.safetensors")
+        assert kept.position.env_steps == 3000
+        assert len(kept.position.episodes) == len(pd.read_csv(tmp_path / "run" / "episodes.csv"))
+
+
+def test_a_resumed_training_names_other_versions(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ("--env-steps", 300, "--set", "steps_per_update=100")
+    assert run(capsys, "train", "a2c", "--out", tmp_path / "run", *settings)[0] == 0
+    file = tmp_path / "run" / "checkpoint.safetensors"
+    kept = load(file)
+    versions = {**kept.versions, "mujoco": "3.0.0"}
+    store(replace(kept, versions=versions, env_steps=600), file)
+    status, out, _ = run(capsys, "train", "a2c", "--resume", tmp_path / "run")
+    assert status == 0
+    now = kept.versions["mujoco"]
+    assert f"note: mujoco was 3.0.0 and is {now}: the numbers may differ" in out
+    assert out.count("note: ") == 1
+
+
+def test_a_full_disk_is_named_with_its_file(tmp_path: Path) -> None:
+    """A limit of the size of files is as a disk that is full."""
+    words = "train a2c --env-steps 300 --set steps_per_update=100 --out"
+    done = shell(f"ulimit -f 1; rotorgram {words} {tmp_path}/run")
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert re.fullmatch(rf"rotorgram: {tmp_path}/run/\S+: File too large", line)
+
+
+def test_text_of_others_holds_no_terminal_escapes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(self: Sim) -> int:
+        logging.getLogger("rotorgram.udp").warning("said \x1b[2J")
+        raise InputError("refused: \x1b]0;title\x07")
+
+    monkeypatch.setattr(Sim, "run", fail)
+    status, _, err = run(capsys, "sim")
+    assert (status, err) == (
+        1,
+        "rotorgram: said \ufffd[2J\nrotorgram: refused: \ufffd]0;title\ufffd\n",
+    )
+
+
+def test_ctrl_c_stops_a_training_that_resumes_to_the_numbers_of_an_unbroken_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ("--env-steps", 12_000, "--set", "steps_per_update=100")
+    process = start("train", "a2c", "--out", tmp_path / "broken", *settings)
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("a2c seed 0"), "the first update is reported"
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert "stopped after" in out
+    assert f"go on with: rotorgram train a2c --resume {tmp_path / 'broken'}" in out
+    assert err == ""
+    stopped = load(tmp_path / "broken" / "checkpoint.safetensors").position.env_steps
+    assert 0 < stopped < 12_000
+    assert run(capsys, "train", "a2c", "--resume", tmp_path / "broken")[0] == 0
+    assert run(capsys, "train", "a2c", "--out", tmp_path / "whole", *settings)[0] == 0
+    broken, whole = (load(tmp_path / f / "checkpoint.safetensors") for f in ("broken", "whole"))
+    assert broken.state.keys() == whole.state.keys()
+    for name, array in whole.state.items():
+        assert array.tobytes() == broken.state[name].tobytes(), name
+    columns = ["episode", "first_step", "length", "total_reward"]
+    episodes = [pd.read_csv(tmp_path / f / "episodes.csv")[columns] for f in ("broken", "whole")]
+    pd.testing.assert_frame_equal(*episodes)
+
+
+def test_sim_and_serve_meet(tmp_path: Path) -> None:
+    agent = start("serve", "pid", "--listen", "127.0.0.1:0", "--episodes", 2)
+    assert agent.stdout is not None
+    address = agent.stdout.readline().split()[5]
+    simulator = start("sim", "--server", address, "--bind", "127.0.0.1:0", "--codec", "text")
+    out, err = agent.communicate(timeout=30)
+    assert (agent.returncode, err) == (0, "")
+    assert "episode 1: return" in out
+    out, err = simulator.communicate(timeout=10)
+    assert (simulator.returncode, err) == (0, "")
+    assert "the agent closed" in out
+
+
+class Terse(gym.Env[Any, Any]):
+    """Elevation without position and attitude in its telemetry."""
+
+    def __init__(self) -> None:
+        self.env: Any = gym.make("rotorgram/Elevation-v0", episode_length=50).unwrapped
+        some = [a for a in self.env.env_spec.telemetry if a.name in ("thrust", "metrics")]
+        self.env_spec = replace(self.env.env_spec, telemetry=tuple(some))
+        self.observation_space, self.action_space = (
+            self.env.observation_space,
+            self.env.action_space,
+        )
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return self.env.reset(seed=seed)
+
+    def step(self, action: Any) -> Any:
+        return self.env.step(action)
+
+
+def test_a_simulator_of_other_telemetry_is_served() -> None:  # fault 12
+    port = free_port()
+    agent = start("serve", "pid", "--listen", f"127.0.0.1:{port}", "--episodes", 1)
+    with Simulator(Terse(), server=("127.0.0.1", port), bind=("127.0.0.1", 0)) as simulator:
+        assert simulator.run() == "the agent closed"
+    out, err = agent.communicate(timeout=30)
+    assert (agent.returncode, err) == (0, "")
+    assert "episode 0: return" in out
+
+
+def test_serve_flies_as_many_drones_as_the_simulator_has(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:  # fault 12
+    """A checkpoint of one drone; each episode is bit for bit that of one drone alone."""
+    settings = ("--env-steps", 200, "--set", "steps_per_update=100", "--env.episode-length", 60)
+    assert run(capsys, "train", "a2c", "--out", tmp_path / "run", *settings)[0] == 0
+    told = []
+    for drones in (1, 3):
+        agent = start("serve", tmp_path / "run", "--listen", "127.0.0.1:0", "--episodes", 5)
+        assert agent.stdout is not None
+        server = agent.stdout.readline().split()[5]
+        status, out, _ = run(
+            capsys, "sim", "--server", server, "--bind", "127.0.0.1:0", "--num-envs", drones,
+            "--env.episode-length", 60,
+        )  # fmt: skip
+        assert (status, "the agent closed" in out) == (0, True)
+        out, err = agent.communicate(timeout=30)
+        assert (agent.returncode, err) == (0, "")
+        told.append(re.findall("episode .*", out))
+    assert len(told[0]) == 5
+    assert told[0] == told[1]
+
+
+def test_a_key_a_relay_and_a_journal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What a user does who flies over a bad network that others share."""
+    key, journal = tmp_path / "key", tmp_path / "flight.mcap"
+    assert run(capsys, "key", key)[0] == 0
+    assert key.stat().st_mode & 0o777 == 0o600
+    assert run(capsys, "key", key)[0] == 1, "a key is never replaced"
+    agent_port, relay_port = free_port(), free_port()
+    relay = start(
+        "relay", "--listen", f"127.0.0.1:{relay_port}", "--server", f"127.0.0.1:{agent_port}",
+        "--drop", 0.2, "--duplicate", 0.1, "--corrupt", 0.05,
+    )  # fmt: skip
+    agent = start(
+        "serve", "pid", "--listen", f"0.0.0.0:{agent_port}", "--episodes", 1, "--key-file", key,
+        "--record", journal,
+    )  # fmt: skip
+    simulator = start(
+        "sim", "--server", f"127.0.0.1:{relay_port}", "--bind", "127.0.0.1:0", "--key-file", key
+    )
+    out, _ = agent.communicate(timeout=60)
+    assert agent.returncode == 0
+    assert "episode 0: return" in out
+    assert re.search(r"wire: .*duplicate.*forged.*resent.*round trip p50 \d", out)
+    out, _ = simulator.communicate(timeout=10)
+    assert simulator.returncode == 0
+    assert re.search(r"wire: .*forged.*round trip p50 \d", out)
+    relay.send_signal(signal.SIGINT)
+    out, err = relay.communicate(timeout=10)
+    assert (relay.returncode, err) == (0, "")
+    assert re.search(r"\d+ dropped, \d+ duplicated", out)
+    status, out, _ = run(capsys, "replay", journal, "--verify")
+    assert status == 0, out
+    data = bytearray(journal.read_bytes())
+    journal.write_bytes(data[: len(data) // 2])
+    assert run(capsys, "replay", journal)[0] == 0
+
+
+@pytest.mark.quiet
+def test_ctrl_c_while_nobody_answers(tmp_path: Path) -> None:
+    """No update comes any more, for the simulator is stopped: it ends all the same."""
+    address = f"127.0.0.1:{free_port()}"
+    simulator = start("sim", "--server", address, "--bind", "127.0.0.1:0")
+    folder = tmp_path / "run"
+    agent = start("train", "a2c", "--out", folder, "--listen", address, "--env-steps", 10**7)
+    deadline = time.monotonic() + 60
+    while not (folder / "checkpoint.safetensors").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    simulator.send_signal(signal.SIGSTOP)
+    time.sleep(0.5)
+    began = time.monotonic()
+    agent.send_signal(signal.SIGINT)
+    out, _ = agent.communicate(timeout=20)
+    assert time.monotonic() - began < 5, "one second on a machine that has nothing else to do"
+    assert agent.returncode == 130
+    assert f"go on with: rotorgram train a2c --resume {folder}" in out
+    episodes = pd.read_csv(folder / "episodes.csv")
+    assert episodes.episode.tolist() == list(range(len(episodes)))
+    simulator.kill()
+    simulator.communicate()
+
+
+def test_tensorboard_has_the_training_and_the_wire(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ("--env-steps", 1200, "--env.episode-length", 60)
+    assert run(capsys, "train", "a2c", "--out", tmp_path / "run", *settings)[0] == 0
+    board = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    board.Reload()
+    names = board.Tags()["scalars"]
+    assert {"rollout/ep_rew_mean", "time/fps", "wire/received", "wire/round_trip_p99_ms"} <= {
+        *names
+    }
+    last = board.Scalars("rollout/ep_rew_mean")[-1]
+    episodes = pd.read_csv(tmp_path / "run" / "episodes.csv")
+    assert last.step == 1200
+    assert last.value == pytest.approx(episodes.total_reward[-100:].mean(), rel=1e-5)
+    assert board.Scalars("wire/received")[-1].value >= 1200
+
+
+def test_compare_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "out"
+    status, out, _ = run(
+        capsys, "compare", "--out", folder, "--seeds", 1, "--env-steps", 1100,
+        "--snapshots", 2, "--episodes", 2, "--env.episode-length", 50,
+    )  # fmt: skip
+    assert status == 0
+    assert f"report: {folder / 'report.html'}" in out.replace("\n", "")
+    results = read_results(folder)
+    assert sorted(set(results.runs.agent)) == ["a2c", "sb3-a2c", "vpg"]
+    assert sorted(set(results.evaluations.agent)) == ["a2c", "pid", "sb3-a2c", "vpg"]
+    steps = read_steps(folder, "elevation_error", "train", columns=("agent", "step"))
+    assert (steps.agent == "a2c").sum() == 1100
+    assert steps[steps.agent == "vpg"].step.tolist() == list(range(1, 1101))
+    names = {p.name for p in (folder / "checkpoints").iterdir()}
+    assert names == {f"{a}-seed0.safetensors" for a in ("vpg", "a2c", "sb3-a2c")}
+    page = (folder / "report.html").read_text()
+    assert page.count('<figure class="card chart"') == 6
+    assert len(list((folder / "figures").glob("*.png"))) == 4
+    assert (folder / "video.mp4").exists() == ("data:video/mp4;base64," in page)
+    assert (folder / "results.csv").exists()
+    assert results.spec.options["episode_length"] == 50
+    assert len(results.spec.vehicle_hash) == 32
+    # What is needed for the film alone is not needed for the report.
+    shutil.rmtree(folder / "checkpoints")
+    for name in ("video.mp4", "report.html"):
+        (folder / name).unlink(missing_ok=True)
+    assert run(capsys, "report", folder)[0] == 0
+    assert "data:video/mp4" not in (folder / "report.html").read_text()
+
+
+def test_an_interrupted_comparison_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "out"
+    process = start(
+        "compare", "--out", folder, "--agents", "vpg", "--seeds", 3, "--env-steps", 20_000,
+        "--snapshots", 1, "--episodes", 1, "--jobs", 2,
+    )  # fmt: skip
+    deadline = time.monotonic() + 100
+    while not list((folder / "parts").glob("vpg-seed*")):
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert f"go on with: rotorgram compare --resume {folder}" in out
+    assert err == "rotorgram: interrupted\n"
+    (part, *_) = (folder / "parts").glob("vpg-seed*")
+    first = (part / "evaluations.csv").read_text()
+    status, _, err = run(capsys, "compare", "--resume", folder, "--seeds", 4)
+    assert status == 1
+    assert "got others by --seeds" in err
+    assert run(capsys, "compare", "--resume", folder, "--jobs", 1, "--no-film")[0] == 0
+    assert read_results(folder).runs.seed.tolist() == [0, 1, 2]
+    assert first.splitlines()[1] in (folder / "evaluations.csv").read_text()
+    assert not (folder / "parts").exists()
+    status, _, err = run(capsys, "compare", "--resume", folder)
+    assert status == 1
+    assert "is finished" in err
+
+
+def test_a_killed_simulator_ends_a_training_with_a_sentence(tmp_path: Path) -> None:
+    process = start("train", "a2c", "--out", tmp_path / "run", "--env-steps", 10_000_000)
+    assert process.stdout is not None
+    process.stdout.readline()
+    children = subprocess.run(
+        ["pgrep", "-P", str(process.pid)], capture_output=True, text=True, check=True
+    )
+    (simulator,) = children.stdout.split()
+    os.kill(int(simulator), signal.SIGKILL)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert err.splitlines()[-1] == (
+        "rotorgram: the simulator ended with status -9: it said nothing"
+    )
+    assert f"go on with: rotorgram train a2c --resume {tmp_path / 'run'}" in out

@@ -1,0 +1,184 @@
+"""`rotorgram vehicle`: write, show, examine and export a vehicle's file."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+import mujoco
+import pytest
+from rotorgram.cli import main
+from rotorgram.cli import vehicle as command
+from rotorgram.models import Vehicle
+from rotorgram.models.vehicle_file import FRAMES
+
+DATA = Path(__file__).parents[1] / "data"
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
+    status = main(["vehicle", *map(str, words)])
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+@pytest.mark.parametrize("frame", [*FRAMES, "list"])
+def test_a_new_file_flies_as_it_is(
+    frame: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "mine.toml"
+    status, out, _ = run(capsys, "new", file, "--frame", frame)
+    assert (status, out) == (0, f"vehicle: {file} (rotorgram vehicle check {file} examines it)\n")
+    vehicle = Vehicle.load(file)
+    assert vehicle.num_rotors == {"hexa": 6, "octo": 8}.get(frame, 4)
+    assert vehicle.thrust_high.sum() == pytest.approx(30.0)
+    assert run(capsys, "check", file)[0] == 0
+
+
+def test_a_new_file_is_still_one_with_what_its_comments_offer(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "mine.toml"
+    run(capsys, "new", file, "--frame", "list")
+    text = file.read_text(encoding="utf-8")
+    offered = re.sub(r"^# (?=\[|\w+ = )", "", text, flags=re.MULTILINE)
+    file.write_text(offered, encoding="utf-8")
+    assert list(Vehicle.load(file).coefficients.numbers()) == [
+        "rotors.radius",
+        "rotors.time_constant",
+        "drag.linear",
+        "drag.quadratic",
+        "sensors.gyro_noise",
+    ]
+
+
+def test_the_frames_are_those_of_the_file() -> None:
+    hint = get_type_hints(command.Vehicle)["frame"]
+    assert get_args(hint) == (*FRAMES, "list")
+
+
+def test_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(
+        'name = "shown"\n[body]\ninertia = [0.02, 0.021, 0.035]\n[body.mass]\nvalue = 2\n'
+        'source = "scales"\nwhy = "with battery"\nothers = [{ value = 1.9, source = "maker" }]\n'
+        '[rotors]\nframe = "cross"\narm = 0.3\nthrust = [0, 10]\nreaction = 0.016\n'
+        '[[cameras]]\nname = "low"\nresolution = [160, 120]\nrate = 0.5\nlook = [0, 0, -1]\n'
+        'kinds = ["rgb", "depth"]\ndistortion = [-0.1, 0, 0, 0, 0]\nfovy = 1.0\n'
+    )
+    status, out, _ = run(capsys, "show", file)
+    assert status == 0
+    assert out.startswith(f"shown ({file})\n")
+    for line in (
+        "mass              2 kg",
+        "centre of mass    0, 0, 0 m",
+        "Ixx, Iyy, Izz     0.02, 0.021, 0.035 kg m²",
+        "hover thrust      4.905 N",  # 2 · 9.81 / 4
+        "hover throttle    49.05 %",
+        "thrust to weight  2.039",  # 40 / 19.62
+        "rotor2            0.212132, -0.212132, 0 m; 0, 0, 1; 0, 0, -0.016 N m/N; 0 to 10 N",
+        "low               rgb, depth 160 × 120, at (0 0 0) m in the body, looks along (0 0 -1), "
+        "57.3 degrees high, distorts by (-0.1 0 0 0 0), every 2 steps",
+        "body.mass = 2 kg\n    scales\n    why: with battery\n    also 1.9 kg: maker",
+        "rotors.arm = 0.3 m",
+    ):
+        assert f"\n{line}\n" in out
+    for what in (DATA / "tiny.xml", Vehicle.load().path):
+        status, out, _ = run(capsys, "show", what)
+        assert status == 0
+        assert "\nmass " in out
+
+
+def test_show_has_what_a_models_file_tells(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = (DATA / "racer.xml").read_text(encoding="utf-8")
+    (tmp_path / "racer.xml").write_text(model, encoding="utf-8")
+    file = tmp_path / "mine.toml"
+    file.write_text('[model]\nfile = "racer.xml"\n[rotors]\nradius = 0.25\n')
+    assert 'name="rotorgram/rotors.time_constant" data="0.05"' in model
+    status, out, _ = run(capsys, "show", file)
+    assert status == 0
+    numbers, others = out.split("\nnumbers of mine.toml\n")[1].split("coefficients of racer.xml\n")
+    assert numbers == "rotors.radius = 0.25 m\n\n"
+    assert "rotors.time_constant = 0.05\n" in others
+    assert "radius" not in others
+
+
+def test_export(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, out = tmp_path / "mine.toml", tmp_path / "mine.xml"
+    run(capsys, "new", file)
+    status, words, _ = run(capsys, "export", file, out)
+    assert (status, words) == (0, f"vehicle: {out} (every number with all its digits)\n")
+    model = mujoco.MjModel.from_xml_path(str(out))
+    assert model.body_mass[1] == 1.5
+    status, words, _ = run(capsys, "export", DATA / "hexa.xml", tmp_path / "hexa.xml")
+    assert status == 0
+    assert words.endswith("(numbers with the six digits that MuJoCo writes)\n")
+    again = Vehicle.load(tmp_path / "hexa.xml")
+    assert again.mass == pytest.approx(Vehicle.load(DATA / "hexa.xml").mass, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["new", "mine.xml"], "file: expected a name that ends in .toml, got mine.xml"),
+        (["new", "there.toml"], "file: expected the name of a new file, got there.toml"),
+        (["export", "there.toml"], "vehicle: expected two files, .*, got one"),
+        (["export", "there.toml", "x.txt"], "out: expected a name that ends in .xml, got x.txt"),
+        (
+            ["export", "paper", "there.xml"],
+            "out: expected the name of a new file, got there.xml, wh",
+        ),
+        (["show", "there.toml", "x.xml"], "vehicle: expected one file for show, got x.xml too"),
+        (["show", "there.toml", "--frame", "cross"], "frame: expected no --frame but with new"),
+        (["show", "nobodys"], "vehicle: expected a file, or one of .*paper.*, got 'nobodys'"),
+        (["check", "nowhere.toml"], "vehicle: cannot read nowhere.toml: No such file"),
+        (["check", "there.toml"], "vehicle: expected a table .body., or .model. .*, got neither"),
+    ],
+)
+def test_wrong_words_are_one_sentence(
+    words: list[str],
+    sentence: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("there.toml").touch()
+    Path("there.xml").touch()
+    status, out, err = run(capsys, *words)
+    assert (status, out) == (2 if words[0] == "check" else 1, "")
+    assert re.match(rf"rotorgram: {sentence}.*\n$", err)
+
+
+def test_an_action_that_there_is_not(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        run(capsys, "fly", "x.toml")
+    assert caught.value.code == 2
+
+
+def test_a_wrong_flag_loads_nothing_heavy() -> None:
+    words = ["vehicle", "show", "x.toml", "--wrong"]
+    program = (
+        "import sys; from rotorgram.cli import main\n"
+        f"try: main({words})\n"
+        "except SystemExit as error: assert error.code == 2\n"
+        "print({'mujoco', 'numpy', 'torch'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout == "set()\n"
+
+
+def test_every_command_takes_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, folder = tmp_path / "mine.toml", tmp_path / "run"
+    run(capsys, "new", file, "--frame", "hexa")
+    task = ["--env", "rotorgram/Hover-v0", "--vehicle", str(file)]
+    assert main(["train", "a2c", *task, "--env-steps", "256", "--out", str(folder)]) == 0
+    journal = str(tmp_path / "flight.mcap")
+    evaluate = ["evaluate", str(folder), "--episodes", "1", "--vehicle", str(file)]
+    assert main([*evaluate, "--record", journal]) == 0
+    assert main(["replay", journal, "--verify", "--vehicle", str(file)]) == 0
+    capsys.readouterr()
+    assert main(["replay", journal, "--verify"]) == 1  # the paper's has other rotors
+    assert re.search("the vehicle was .*: --vehicle names its file", capsys.readouterr().out)

@@ -1,0 +1,65 @@
+"""Every script of examples/ runs, with less to do than by default, and says what it should."""
+
+import json
+import re
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SHORT = {
+    "fly_pid.py": ([], r"return 2\d\d\.\d, elevation 6\.000 m of 6\.0 m"),
+    "ppo_loop.py": (["--updates", "2"], r"update 2: 4,096 steps, return -?\d+\.\d"),
+    "record_replay_render.py": ([], r"identical: \d+ States[^|]*film: flight\.mp4"),
+    "sb3_ppo.py": (["--env-steps", "2048"], r"return -?\d+\.\d ± \d+\.\d of at most 250"),
+    "train_headless.py": (["--env-steps", "3000"], r"steady-state \|E\|: \d\.\d+ m"),
+}
+
+
+def run(script: str, *arguments: str, cwd: Path) -> str:
+    command = [sys.executable, str(EXAMPLES / script), *arguments]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=110)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("script", SHORT)
+def test_it_runs(script: str, tmp_path: Path) -> None:
+    arguments, expected = SHORT[script]
+    assert re.search(expected, run(script, *arguments, cwd=tmp_path))
+
+
+def test_the_text_agent_flies_a_simulator(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        port = sock.getsockname()[1]
+    sim = [sys.executable, "-m", "rotorgram.cli", "sim", "--codec", "text", "--bind", "127.0.0.1:0"]
+    with subprocess.Popen([*sim, "--server", f"127.0.0.1:{port}"]) as simulator:
+        lines = run("text_agent.py", str(port), cwd=tmp_path).splitlines()
+        assert simulator.wait(20) == 0
+    assert [line.split(":")[0] for line in lines] == [f"episode {i}" for i in range(3)]
+    assert all(float(line.split()[-1]) > 150 for line in lines)
+
+
+def test_the_detector_learns_from_pictures(opengl: None, tmp_path: Path) -> None:
+    plan = (EXAMPLES / "pad.toml").read_text("utf-8").replace("episodes = 100", "episodes = 5")
+    plan = plan.replace('"down", "down_segm', '"down@32x32", "down_segm')
+    plan = plan.replace("every = 5", "every = 9")
+    (tmp_path / "pad.toml").write_text(plan.replace('tation"]', 'tation@32x32"]'), "utf-8")
+    command = [sys.executable, "-m", "rotorgram.cli", "capture", "pad.toml", "--out", "pad"]
+    subprocess.run([*command, "--jobs", "1"], cwd=tmp_path, check=True, timeout=110)
+    told = run("pad_detector.py", "pad", "--epochs", "2", "--out", "told.json", cwd=tmp_path)
+    assert json.loads(told) == json.loads((tmp_path / "told.json").read_text())
+    (one,) = json.loads(told)["seeds"]
+    assert 0.0 < one["median error"] < 32
+
+
+def test_every_script_is_run() -> None:
+    scripts = {path.name for path in EXAMPLES.glob("*.py")}
+    others = {"text_agent.py", "pad_detector.py", "landing.py"}  # its tests: test_own_task.py
+    assert scripts == {*SHORT, *others}
+    page = (EXAMPLES / "README.md").read_text()
+    assert all(f"({script})" in page for script in scripts)

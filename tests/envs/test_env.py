@@ -1,0 +1,532 @@
+"""Single envs: the contract of every task, the closed forms of the elevation task, its ends."""
+
+import copy
+import inspect
+import itertools
+import math
+import pickle
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rotorgram.envs import Loop, SingleEnv
+from rotorgram.envs.registry import env_spec
+from rotorgram.envs.tasks.elevation import Elevation
+from rotorgram.models.errors import InputError
+from rotorgram.sim import PhysicsError
+
+ID, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+HEXA = str(Path(__file__).parents[1] / "data" / "hexa.xml")
+COMBINATIONS: list[tuple[str, dict[str, Any]]] = [
+    (ID, {"action": mode, "action_type": kind, "observation": seen, **rest})
+    for mode, kind, seen, rest in itertools.product(
+        ("increment", "offset"),
+        ("continuous", "discrete"),
+        ("full", "error"),
+        ({}, {"target": (4.0, 8.0), "control_period": 0.05, "linear_drag": 2.0, "vehicle": HEXA}),
+    )
+]
+COMBINATIONS += [
+    (HOVER, {}),
+    (HOVER, {"goal": (30.0, -4.0, 8.0), "heading": 90.0, "control_period": 0.05, "vehicle": HEXA}),
+    (HOVER, {"start_tilt": 0.0, "start_band": 0.0, "start_heading": 180.0, "episode_length": 9}),
+]
+
+
+def _a(value: float) -> np.ndarray:
+    return np.array([value], np.float32)
+
+
+def _env(env_id: str = ID, **options: Any) -> SingleEnv:
+    env = gym.make(env_id, disable_env_checker=True, **options).unwrapped
+    assert isinstance(env, SingleEnv)
+    return env
+
+
+class Flight:
+    """A loop with one drone that begins where it is told; its state can be written."""
+
+    def __init__(self, start: float, target: float = 5.0, **options: Any) -> None:
+        self.loop = Loop(ID, options={"target": target, **options})
+        chosen = {"start": np.array([start]), "target": np.array([target])}
+        every = np.ones(1, bool)
+        self.loop.advance(np.zeros((1, 1), np.float32), every, [0], chosen=chosen)
+        self.state = self.loop.world.state
+
+    def step(self, action: float) -> None:
+        self.loop.advance(np.array([[action]], np.float32))
+
+    @property
+    def over(self) -> bool:
+        return bool(self.loop.done[0])
+
+    @property
+    def observation(self) -> np.ndarray:
+        return np.asarray(self.loop.observations["observation"][0])
+
+    @property
+    def height(self) -> float:
+        return float(self.loop.telemetry["position"][0, 1])
+
+    @property
+    def ends(self) -> tuple[bool, bool]:
+        return bool(self.loop.terminated[0]), bool(self.loop.truncated[0])
+
+    def fly_out(self, action: float) -> int:
+        """Steps until the episode is over."""
+        for n in itertools.count(1):
+            self.step(action)
+            if self.over:
+                return n
+        raise AssertionError
+
+
+# --- registration and contract ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("env_id", "options"), COMBINATIONS, ids=str)
+def test_contract(env_id: str, options: dict[str, Any]) -> None:
+    env = _env(env_id, **options)
+    check_env(env, skip_render_check=True)  # pictures: test_render_modes.py
+    observation, info = env.reset(seed=1)
+    spec = env.env_spec
+    telling = [name for array in spec.telemetry for name in array.components]
+    assert list(info)[: len(telling)] == telling
+    assert all(type(value) is float for value in info.values())
+    assert {metric.name for metric in spec.metrics} <= set(info)
+    assert env.control_period == spec.control_period
+    assert spec == env_spec(env_id, {k: v for k, v in options.items() if k != "vehicle"},
+                            options.get("vehicle"))  # fmt: skip
+    before = observation.copy()
+    env.step(env.action_space.sample())
+    assert observation.tobytes() == before.tobytes()  # nobody else's memory
+
+
+def test_stable_baselines_accepts_them() -> None:
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    for env_id in (ID, HOVER):
+        checker.check_env(_env(env_id))
+
+
+def test_module_prefix_needs_no_import_and_importing_loads_no_simulator() -> None:
+    code = (
+        "import gymnasium, sys\n"
+        "import rotorgram.envs\n"
+        "assert 'mujoco' not in sys.modules\n"
+        "assert 'torch' not in sys.modules\n"
+        "env = gymnasium.make('rotorgram.envs:rotorgram/Hover-v0', heading=7)\n"
+        "assert env.unwrapped.env_spec.options['heading'] == 7.0\n"
+        "assert env.unwrapped.env_spec.env_id == 'rotorgram/Hover-v0'\n"
+        "assert 'torch' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+
+
+def test_options_through_make() -> None:
+    env = _env(target=6, observation="error", linear_drag=2.0, episode_length=3)
+    env.reset(seed=1)
+    assert env.observation_space.shape == (1,)
+    assert env.env_spec.options["target"] == 6.0
+    assert [env.step(_a(0))[3] for _ in range(3)] == [False, False, True]
+    with pytest.raises(InputError, match=r"^options: expected some of .*target.*, got 'targt'$"):
+        gym.make(ID, targt=6)
+    with pytest.raises(InputError, match=r"^render_mode: expected None, .*, got 'ansi'$"):
+        SingleEnv(ID, render_mode="ansi")
+    with pytest.raises(InputError, match=r"^reset: expected no options, got {'target': 3}$"):
+        env.reset(options={"target": 3})
+    with pytest.raises(InputError, match=r"^vehicle: cannot read nowhere.xml: "):
+        gym.make(ID, vehicle="nowhere.xml")
+
+
+def test_frames_per_second_follow_the_control_period() -> None:
+    assert _env().metadata["render_fps"] == 50
+    assert _env(control_period=0.1).metadata["render_fps"] == 10
+
+
+@pytest.mark.parametrize("copies", [copy.copy, copy.deepcopy, pickle.dumps])
+@pytest.mark.parametrize("make", [_env, lambda: gym.make_vec(ID, num_envs=2), lambda: Loop(ID)])
+def test_a_running_env_is_not_copied(make: Any, copies: Any) -> None:
+    """A copy's arrays would no longer be those of its simulator."""
+    env = make()
+    with pytest.raises(TypeError, match="cannot be copied or pickled: make another one"):
+        copies(env)
+
+
+def _table(heading: str) -> list[list[str]]:
+    text = (inspect.getdoc(Elevation) or "").split(f"## {heading}")[1].split("\n## ")[0]
+    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in row] for row in rows]
+
+
+def test_docstring_tables_agree_with_the_spaces() -> None:
+    space: Any = _env().observation_space
+    header, *rows = _table("Observation")
+    assert header == ["index", "quantity", "unit", "bounds"]
+    assert [row[0] for row in rows] == [str(i) for i in range(space.shape[0])]
+    assert [row[2] for row in rows] == list(env_spec(ID).observation[0].unit)
+    for row, low, high in zip(rows, space.low.tolist(), space.high.tolist(), strict=True):
+        bounds = f"-{row[3][1:]} ... {row[3][1:]}" if row[3].startswith("±") else row[3]
+        told = [float(part) for part in bounds.split(" ... ")]
+        assert told == pytest.approx([low, high], abs=5e-4)
+    for row in _table("Action")[1:3]:
+        kind = _env(action_type=row[0].strip("`")).action_space
+        assert repr(kind).replace(".0", "") == row[1].strip("`")
+    for mode, formula in _table("Action")[4:6]:
+        flight = Flight(5.0, action=mode.strip("`"))
+        flight.step(1.0)
+        newtons = float(re.findall(r"(\d+) a", formula)[0])
+        assert flight.loop.telemetry["thrust"].tolist() == [[49.0 + newtons] * 4]
+
+
+# --- actions ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("mode", "newtons"), [("increment", 5.0), ("offset", 20.0)])
+def test_discrete_actions_fly_as_the_continuous_ones(mode: str, newtons: float) -> None:
+    for index, action in enumerate((-1.0, 0.0, 1.0)):
+        few, many = (_env(action=mode, action_type=k) for k in ("discrete", "continuous"))
+        few.reset(seed=3)
+        many.reset(seed=3)
+        one, other = few.step(np.int64(index)), many.step(_a(action))
+        assert one[0].tobytes() == other[0].tobytes()
+        assert one[1:] == other[1:]
+        assert one[4]["F1"] == one[4]["F4"] == 49.0 + newtons * action
+
+
+def test_thrust_is_clipped() -> None:
+    env = _env(thrust_scale=30.0, flight_band=4.0)
+    env.reset(seed=0)
+    thrusts = [env.step(_a(a))[4]["F3"] for a in (1, 1, 0, -1, -1, -1, -1)]
+    assert thrusts == [79, 100, 100, 70, 40, 10, 0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "action", "sentence"),
+    [
+        ("continuous", _a(math.nan), "expected finite numbers, got .nan."),
+        ("continuous", np.array([np.inf]), "expected finite numbers, got .inf."),
+        ("continuous", [1e300], "expected finite numbers, got .inf."),
+        ("continuous", 0.5, r"expected an array of shape \(1,\), got \(\)"),
+        ("continuous", [0.5, 0.5], r"expected an array of shape \(1,\), got \(2,\)"),
+        ("continuous", ["up"], r"expected an array .* of real numbers, got \['up'\]"),
+        ("continuous", [1j], r"expected an array .* of real numbers, got \[1j\]"),
+        ("continuous", [[1], [1, 2]], r"expected an array .* of real numbers, got"),
+        ("discrete", 3, "expected a whole number 0 to 2, got 3"),
+        ("discrete", -1, "expected a whole number 0 to 2, got -1"),
+        ("discrete", 1.0, "expected a whole number 0 to 2, got 1.0"),
+        ("discrete", "hold", "expected a whole number 0 to 2, got 'hold'"),
+    ],
+)
+def test_a_wrong_action_changes_nothing(kind: str, action: Any, sentence: str) -> None:
+    env, twin = (_env(action_type=kind) for _ in range(2))
+    for one in (env, twin):
+        one.reset(seed=5)
+    with pytest.raises(InputError, match=f"^actions?: {sentence}"):
+        env.step(action)
+    good = 2 if kind == "discrete" else _a(0.3)
+    assert env.step(good)[4] == twin.step(good)[4]
+
+
+def test_number_types_of_an_action_do_not_matter() -> None:
+    infos = []
+    for action in (_a(0.1), [0.1], (0.1,), np.array([0.1]), np.array([0.1], ">f8")):
+        env = _env()
+        env.reset(seed=0)
+        infos.append(env.step(action)[4])
+    assert all(info == infos[0] for info in infos)
+    assert infos[0]["F1"] == 49.0 + 5.0 * float(np.float32(0.1))
+
+
+# --- flight -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("period", [0.01, 0.02, 0.05])
+@pytest.mark.parametrize("mode", ["increment", "offset"])
+def test_flight_follows_the_formula_of_constant_acceleration(mode: str, period: float) -> None:
+    env = _env(action=mode, control_period=period, flight_band=50.0, target=60.0)
+    _, info = env.reset(seed=2)
+    height, speed, thrust = info["Y"], 0.0, 49.0
+    for n in range(60):
+        action = (1.0, -0.25, 0.5, -1.0)[n // 3 % 4]  # exact in float32
+        thrust = min(100.0, max(0.0, thrust + 5 * action if mode == "increment" else
+                                49 + 20 * action))  # fmt: skip
+        acceleration = 4 * thrust / 20 - 9.8
+        height += speed * period + acceleration * period**2 / 2
+        speed += acceleration * period
+        observation, *_, info = env.step(_a(action))
+        assert info["Y"] == pytest.approx(height, abs=1e-9)
+        assert info["elevation_error"] == pytest.approx(60 - height, abs=1e-9)
+        assert (info["X"], info["Z"]) == pytest.approx((0.0, 0.0), abs=1e-9)
+        assert (info["X_goal"], info["Y_goal"], info["Z_goal"]) == (0.0, 60.0, 0.0)
+        assert observation == pytest.approx([60 - height, -speed, thrust / 49 - 1], abs=1e-5)
+
+
+def test_flight_with_drag_follows_the_exponential() -> None:
+    drag = 2.0
+    flight = Flight(5.0, action="offset", linear_drag=drag, flight_band=20.0)
+    for n in range(1, 101):
+        flight.step(1.0)  # hover + 20 N each: 4 m/s2
+        fallen = (1 - math.exp(-drag * n * 0.02)) / drag
+        assert flight.height == pytest.approx(5.0 + 4 / drag * (n * 0.02 - fallen), abs=1e-8)
+
+
+def test_reward_and_observation_of_a_step_by_hand() -> None:
+    # Hover at 6 m: E = -1 m, reward (0.5 - 1) / (0.5 + 1).
+    flight = Flight(6.0)
+    flight.step(0.0)
+    loop = flight.loop
+    assert flight.observation == pytest.approx([-1.0, 0.0, 0.0], abs=1e-6)
+    assert loop.rewards.tolist() == pytest.approx([-1 / 3])
+    terms = {name: values.tolist() for name, values in loop.reward_terms.items()}
+    assert terms == {"elevation": loop.rewards.tolist(), "termination": [0.0]}
+    assert flight.ends == (False, False)
+    assert loop.telemetry["thrust"].tolist() == [[49.0] * 4]
+
+
+def test_telemetry_is_in_the_papers_frame() -> None:
+    flight, half = Flight(5.0), math.radians(20) / 2
+    flight.state.position[:] = 1.0, 2.0, 5.0
+    flight.state.quaternion[:] = math.cos(half), 0.0, 0.0, math.sin(half)  # to the left
+    flight.step(0.0)
+    told = flight.loop.telemetry
+    assert told["position"].ravel() == pytest.approx([-2.0, 5.0, 1.0], abs=1e-9)
+    assert told["attitude"].ravel() == pytest.approx([0.0, -20.0, 0.0], abs=1e-9)
+
+
+OPTIONS = st.fixed_dictionaries(
+    {
+        "action": st.sampled_from(["increment", "offset"]),
+        "observation": st.sampled_from(["full", "error"]),
+        "control_period": st.sampled_from([0.01, 0.02, 0.1, 1.0]),
+        "linear_drag": st.sampled_from([0.0, 0.0, 2.0, 100.0]),
+        "thrust_scale": st.sampled_from([None, 100.0]),
+        "flight_band": st.sampled_from([1.01, 3.0, 20.0]),
+        "target": st.sampled_from([2.0, 5.0, (2.0, 30.0)]),
+    }
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(OPTIONS, st.integers(0, 2**32), st.lists(st.tuples(st.floats(-1, 1), st.integers(1, 60))))
+def test_bounds_are_never_left(
+    options: dict[str, Any], seed: int, pieces: list[tuple[float, int]]
+) -> None:
+    env = _env(**options)
+    observation, _ = env.reset(seed=seed)
+    assert observation in env.observation_space
+    for action in itertools.chain.from_iterable([a] * n for a, n in pieces):
+        observation, reward, terminated, truncated, info = env.step(_a(action))
+        assert observation in env.observation_space
+        assert not (terminated and truncated)
+        assert reward == info["reward_elevation"] + info["reward_termination"]
+        if terminated or truncated:
+            return
+
+
+@pytest.mark.parametrize("period", [0.02, 0.5])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_fastest_crossing_stays_within_the_bounds(side: float, period: float) -> None:
+    """To one edge, back at full acceleration, and out at the other edge."""
+    fastest = 0.0
+    env = _env(action="offset", thrust_scale=51.0, target=10.0, episode_length=999,
+               start_band=0.0, control_period=period)  # fmt: skip
+    space: Any = env.observation_space
+    for turn in np.linspace(0.3, 2.99, 8).tolist():
+        env.reset(seed=0)
+        over, push = False, side * 0.5
+        while not over:
+            observation, _, over, *_ = env.step(_a(push))
+            assert observation in space
+            fastest = max(fastest, abs(observation[1]) / space.high[1])
+            if -side * observation[0] > turn:
+                push = -side
+    assert fastest > 0.4  # the bound is not idle
+
+
+# --- ends -------------------------------------------------------------------------------------
+
+
+def test_truncated_by_the_time_limit() -> None:
+    env = _env()
+    env.reset(seed=0)
+    for n in range(250):
+        _, reward, terminated, truncated, info = env.step(_a(0.0))
+        assert (terminated, truncated) == (False, n == 249)
+    assert info["reward_termination"] == 0.0
+    assert reward == info["reward_elevation"]
+    with pytest.raises(ResetNeeded, match=r"expected a call of reset\(\) for env 0 first"):
+        env.step(_a(0.0))
+
+
+@pytest.mark.parametrize("length", [250, 62])
+def test_terminated_by_the_band_and_never_truncated_too(length: int) -> None:
+    # From rest at the target in offset mode at full action: 4 m/s2, so 3 m after sqrt(1.5) s,
+    # which lies in step 62 of 0.02 s: 2 * 1.22^2 = 2.9768 and 2 * 1.24^2 = 3.0752.
+    flight = Flight(5.0, action="offset", episode_length=length)
+    assert flight.fly_out(1.0) == 62
+    assert flight.ends == (True, False)
+    assert flight.height == pytest.approx(8.0752, abs=1e-9)
+    assert flight.loop.rewards[0] == pytest.approx((0.5 - 3.0752) / (0.5 + 3.0752) - 20)
+    with pytest.raises(ResetNeeded):
+        flight.step(0.0)
+
+
+def test_terminated_by_the_floor() -> None:
+    flight = Flight(2.0, target=2.0, flight_band=50.0)
+    flight.fly_out(-1.0)
+    assert flight.ends == (True, False)
+    assert flight.height < 0.4 + 1e-3
+
+
+def test_a_bounce_within_a_long_control_period_is_a_crash() -> None:
+    flight = Flight(1.5, target=2.0, flight_band=50.0, control_period=1.0, thrust_scale=51.0)
+    flight.state.position[2], flight.state.velocity[2] = 0.5, -3.0  # floor, and up again
+    flight.step(1.0)
+    assert flight.height > 1.0
+    assert flight.ends == (True, False)
+
+
+@pytest.mark.parametrize(("degrees", "over"), [(59.0, False), (61.0, True), (180.0, True)])
+@pytest.mark.parametrize("axis", [1, 2])
+def test_terminated_by_tilt(degrees: float, over: bool, axis: int) -> None:
+    flight, half = Flight(5.0), math.radians(degrees) / 2
+    flight.state.quaternion[0] = math.cos(half)
+    flight.state.quaternion[axis] = math.sin(half)
+    flight.step(0.0)
+    assert flight.ends == (over, False)
+    assert flight.loop.reward_terms["termination"].tolist() == [-20.0 if over else 0.0]
+
+
+@pytest.mark.parametrize(("field", "warning"), [("position", "QPOS"), ("velocity", "QVEL")])
+def test_a_bad_state_raises_and_leaves_no_log(
+    field: str, warning: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    flight, twin = Flight(5.0), Flight(5.0)
+    getattr(flight.state, field)[2] = math.nan
+    with pytest.raises(PhysicsError, match=f"MuJoCo warned of mjWARN_BAD{warning} .*reset"):
+        flight.step(0.0)
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(ResetNeeded):
+        flight.step(0.0)
+    for one in (flight, twin):
+        one.loop.advance(_a(0.0), np.ones(1, bool), [4])
+        one.step(0.5)
+    assert flight.loop.row() == twin.loop.row()
+
+
+def test_a_log_file_that_the_user_named_stays_on(tmp_path: Path) -> None:
+    old, mine = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    mine.logto_file, mine.logfile = True, str(tmp_path / "mine.txt")
+    try:
+        mine.set()
+        flight = Flight(5.0)
+        assert mujoco.MjLogConfig.get().logto_file
+        flight.state.velocity[0] = math.nan
+        with pytest.raises(PhysicsError):
+            flight.step(0.0)
+        assert "QVEL" in (tmp_path / "mine.txt").read_text()
+    finally:
+        old.set()
+
+
+@pytest.mark.parametrize("env_id", [ID, HOVER])
+def test_a_step_before_a_reset(env_id: str) -> None:
+    env = _env(env_id)
+    with pytest.raises(ResetNeeded, match=r"step: expected a call of reset\(\) for env 0 first"):
+        env.step(env.action_space.sample())
+
+
+# --- seeds ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", [ID, HOVER])
+def test_seeds(env_id: str) -> None:
+    one, other = _env(env_id), _env(env_id)
+    starts = [one.reset(seed=seed)[0].tobytes() for seed in range(10)]
+    starts += [one.reset()[0].tobytes() for _ in range(5)]  # goes on with the stream
+    again = [other.reset(seed=seed)[0].tobytes() for seed in range(10)]
+    again += [other.reset()[0].tobytes() for _ in range(5)]
+    assert starts == again
+    assert len(set(starts)) == 15
+
+
+def test_targets_and_starts_are_uniform() -> None:
+    env = _env(target=(3.0, 7.0), start_band=0.5)
+    infos = [env.reset(seed=None if n else 0)[1] for n in range(2000)]
+    targets = np.array([info["Y_goal"] for info in infos])
+    offsets = np.array([info["Y"] for info in infos]) - targets
+    for values, low, high in ((targets, 3.0, 7.0), (offsets, -0.5, 0.5)):
+        share = np.sort((values - low) / (high - low))
+        # Kolmogorov-Smirnov: 1.95 / sqrt(n) is passed by chance once in a thousand times.
+        assert np.abs(share - np.linspace(0, 1, 2000)).max() < 1.95 / math.sqrt(2000)
+
+
+# --- what a policy on E alone can do ----------------------------------------------------------
+#
+# a = k E. Offset: E'' + d E' + 4 k E = 0. Increment: E''' + d E'' + 50 k E = 0.
+
+
+def _errors(gain: float, steps: int, **options: Any) -> np.ndarray:
+    """E after each step under a = gain * E, from 0.2 m below the target, m."""
+    flight = Flight(4.8, observation="error", episode_length=steps, **options)
+    errors = [0.2]
+    while not flight.over:
+        flight.step(gain * errors[-1])
+        errors.append(float(flight.observation[0]))
+    return np.array(errors[1:])
+
+
+@pytest.mark.parametrize("drag", [0.0, 2.0])
+@pytest.mark.parametrize("gain", [0.02, 0.3, -0.1])
+def test_increment_on_error_alone_diverges_even_with_drag(drag: float, gain: float) -> None:
+    roots = np.roots([1.0, drag, 0.0, 50 * gain])
+    assert roots.real.max() > 0.1
+    errors = _errors(gain, 5000, action="increment", linear_drag=drag)
+    assert len(errors) < 5000
+    assert abs(errors[-1]) > 3.0
+
+
+def test_offset_on_error_alone_oscillates_without_drag() -> None:
+    # w^2 = 4 k = 2; holding the thrust for a step feeds in energy: amplitude^2 grows by
+    # 1 + w^2 h^2 / 2 = 1.0004 in each step.
+    errors = _errors(0.5, 1000, action="offset")
+    assert len(errors) == 1000
+    peaks = np.abs(errors[1:-1])[np.diff(np.sign(np.diff(errors))) != 0]
+    periods = np.diff(np.flatnonzero(np.diff(np.sign(errors)) != 0)) * 2 * 0.02
+    assert periods == pytest.approx(2 * math.pi / math.sqrt(2), rel=0.02)
+    steps = math.pi / math.sqrt(2) / 0.02
+    assert peaks[1:] / peaks[:-1] == pytest.approx(1.0004 ** (steps / 2), rel=1e-3)
+    assert np.abs(errors[-250:]).max() > 0.2
+
+
+@pytest.mark.parametrize(("gain", "drag"), [(0.05, 0.5), (0.5, 2.0), (1.0, 0.5), (1.0, 2.0)])
+def test_offset_on_error_alone_converges_with_drag(gain: float, drag: float) -> None:
+    slowest = -np.roots([1.0, drag, 4 * gain]).real.max()
+    assert slowest > 0
+    errors = _errors(gain, round(10 / slowest / 0.02), action="offset", linear_drag=drag)
+    assert np.abs(errors[-10:]).max() < 2e-4  # ten time constants: 0.2 m * e^-10 = 9e-6 m
+
+
+def test_offset_with_the_wrong_sign_diverges() -> None:
+    assert abs(_errors(-0.5, 1000, action="offset", linear_drag=2.0)[-1]) > 3.0
+
+
+def test_increment_on_the_full_observation_can_converge() -> None:
+    # a = 0.4 E + 0.4 E' - f with f = F / 49 N - 1: with u = 9.8 f, E'' = -u and
+    # u' = 50 a = 20 E + 20 E' - 5.1 u, so s^3 + 5.1 s^2 + 20 s + 20: stable, since 5.1 * 20 > 20.
+    assert np.roots([1.0, 50 / 9.8, 20.0, 20.0]).real.max() < -1
+    flight = Flight(4.8)
+    for _ in range(250):
+        flight.step(float(flight.observation @ [0.4, 0.4, -1.0]))
+    assert abs(flight.observation[0]) < 2e-3

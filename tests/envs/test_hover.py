@@ -1,0 +1,165 @@
+"""The hover task against values worked out by hand: nothing assumes the first task."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from rotorgram.envs import Loop
+from rotorgram.envs.loop import make_task
+from rotorgram.envs.registry import env_spec
+from rotorgram.models.errors import InputError
+from rotorgram.models.vehicle import Vehicle
+
+from flights import about, state_of
+
+ID = "rotorgram/Hover-v0"
+HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
+
+
+def test_observation_by_hand() -> None:
+    """Turned left by 90 degrees where the nose shall point along y: all is seen from there."""
+    task = make_task(ID, {"goal": (1.0, 2.0, 6.0), "heading": 90.0})
+    state = state_of(
+        quaternion=about((0, 0, 1), 90.0), velocity=(3.0, 4.0, 5.0), body_rates=(0.1, 0.2, 0.3),
+        thrust=(49.0, 98.0, 0.0, 24.5),
+    )  # fmt: skip
+    seen = task.observe(state)["observation"]
+    expected = [2, -1, 1, 4, -3, 5, 1, 0, 0, 0, 0, 1, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
+    assert seen == pytest.approx(expected, abs=1e-12)
+    # Rolled left by 30 degrees: the thrust points to the right, -y.
+    tilted = make_task(ID, {}).observe(state_of(quaternion=about((1, 0, 0), 30.0)))["observation"]
+    assert tilted[6:12] == pytest.approx([1, 0, 0, 0, -0.5, math.sqrt(3) / 2], abs=1e-12)
+
+
+def test_observations_are_clipped_to_their_bounds() -> None:
+    task = make_task(ID, {})
+    far = state_of(position=(1e6, 0, 5), velocity=(0, -1e6, 0), body_rates=(0, 0, 1e6))
+    seen = task.observe(far)["observation"]
+    assert (seen[0], seen[4], seen[14]) == (-6.0, -100.0, 100.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "terms", "terminated"),
+    [
+        ({}, {"position": 1.0, "heading": 0.0, "rates": 0.0, "termination": 0.0}, False),
+        ({"position": (0.3, 0.4, 5.0)}, {"position": 0.0}, False),
+        ({"position": (0.0, 0.0, 6.5)}, {"position": -0.5}, False),
+        ({"quaternion": about((0, 0, 1), 90.0)}, {"heading": -0.1}, False),
+        ({"quaternion": about((0, 0, 1), -179.9)}, {"heading": -0.2 * 179.9 / 180}, False),
+        ({"body_rates": (3.0, 0.0, 4.0)}, {"rates": -0.1}, False),
+        ({"position": (3.01, 0.0, 5.0)}, {"termination": -20.0}, True),
+        ({"quaternion": about((0, 1, 0), 89.0)}, {"termination": 0.0}, False),
+        ({"quaternion": about((0, 1, 0), 91.0)}, {"termination": -20.0}, True),
+        ({"touching": True}, {"termination": -20.0}, True),
+    ],
+    ids=str,
+)
+def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:
+    outcome = make_task(ID, {}).outcome(state_of(**change))
+    for name, value in terms.items():
+        assert outcome.reward[name] == pytest.approx(value, abs=1e-12)
+    assert outcome.terminated == terminated
+
+
+def test_metrics_by_hand() -> None:
+    task = make_task(ID, {"goal": (0.0, 3.0, 9.0), "heading": 170.0})
+    metrics = task.outcome(state_of(quaternion=about((0, 0, 1), -170.0))).metrics
+    assert metrics["position_error"] == pytest.approx(5.0)
+    assert metrics["heading_error"] == pytest.approx(20.0)  # 190 to the left of it: past the back
+
+
+def test_thrust_below_zero_is_observed(tmp_path: Path) -> None:
+    """-20 N over 49 N: rotors that push down as well."""
+    text = Vehicle.load().path.read_text()
+    file = tmp_path / "reverse.xml"
+    file.write_text(text.replace('ctrlrange="0 100"', 'ctrlrange="-20 100"'))
+    seen = make_task(ID, {}, file).observe(state_of(thrust=(-20.0,) * 4))["observation"]
+    assert seen[15:] == pytest.approx([-20 / 49 - 1] * 4)
+
+
+@pytest.mark.parametrize("file", [None, HEXA], ids=["paper", "hexa"])
+def test_actions_are_thrusts_between_the_limits(file: Path | None) -> None:
+    vehicle = Vehicle.load(file)
+    loop = Loop(ID, vehicle=file)
+    every, n = np.ones(1, bool), vehicle.num_rotors
+    for action, expected in (
+        (0.0, vehicle.hover_thrust),
+        (1.0, vehicle.thrust_high),
+        (-1.0, vehicle.thrust_low),
+        (9.0, vehicle.thrust_high),
+        (-0.5, (vehicle.hover_thrust + vehicle.thrust_low) / 2),
+    ):
+        loop.advance(np.zeros((1, n), np.float32), every, [0])
+        loop.advance(np.full((1, n), action, np.float32))
+        np.testing.assert_allclose(loop.telemetry["thrust"][0], expected, rtol=1e-12)
+
+
+def test_a_single_rotor_turns_the_craft() -> None:
+    """Front left pushes: the nose and the left side rise, and it turns against that rotor."""
+    env = gym.make(ID, start_band=0.0, start_tilt=0.0, start_heading=0.0)
+    env.reset(seed=0)
+    info: dict[str, float] = {}
+    for _ in range(10):
+        *_, info = env.step(np.array([0.2, 0, 0, 0], np.float32))
+    assert info["phi"] < -0.1  # nose up
+    assert info["psi"] < -0.1  # left side up
+    assert info["heading_error"] > 0.01  # to the left, as its reaction is about +z
+
+
+def test_starts_fill_their_bands() -> None:
+    env: Any = gym.make_vec(ID, num_envs=2000, goal=(3.0, -2.0, 7.0), heading=50.0)
+    _, info = env.reset(seed=0)
+    # Paper's frame: X = -y, Y = z, Z = x.
+    for name, goal in (("X", 2.0), ("Y", 7.0), ("Z", 3.0)):
+        share = np.sort((info[name] - goal + 1) / 2)
+        assert abs(share - np.linspace(0, 1, 2000)).max() < 1.95 / math.sqrt(2000)
+        assert info[f"{name}_goal"].tolist() == [goal] * 2000
+    up = env.telemetry["attitude"]
+    tilt = np.degrees(np.arccos(np.cos(np.radians(up[:, 0])) * np.cos(np.radians(up[:, 2]))))
+    share = np.sort(tilt / 30.0)
+    assert abs(share - np.linspace(0, 1, 2000)).max() < 1.95 / math.sqrt(2000)
+    assert 30.0 - 0.1 < tilt.max() <= 30.0 + 1e-9
+    assert abs(info["heading_error"]).max() < 36.0  # 30, and what the tilt adds
+    assert abs(info["heading_error"].mean()) < 1.5
+
+
+def test_bounds_are_never_left_and_ends_are_never_both() -> None:
+    env: Any = gym.make_vec(ID, num_envs=32, episode_length=60, start_tilt=80.0, vehicle=HEXA)
+    env.reset(seed=0)
+    dice, ends = np.random.default_rng(0), np.zeros(2, int)
+    for _ in range(120):
+        actions = dice.choice([-1.0, 0.0, 1.0], env.action_space.shape).astype(np.float32)
+        observations, _, terminated, truncated, _ = env.step(actions)
+        assert observations in env.observation_space
+        assert not (terminated & truncated).any()
+        ends += terminated.sum(), truncated.sum()
+    assert ends[0] > 32
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"goal": 5.0}, "goal: expected three numbers"),
+        ({"goal": (0.0, 0.0)}, "goal: expected three numbers"),
+        ({"goal": (0.0, math.nan, 5.0)}, "goal: expected three numbers"),
+        ({"goal": (0.0, 0.0, 1.9)}, "goal: expected a height of at least 2 m above the ground"),
+        ({"heading": "north"}, "heading: expected a number from -360 to 360 degrees, got 'north'"),
+        ({"start_tilt": 81.0}, "start_tilt: expected a number from 0 to 80 degrees"),
+        ({"start_heading": -1.0}, "start_heading: expected a number from 0 to 180 degrees"),
+        ({"flight_band": 1.7}, "flight_band: expected more than .* = 1.732 m, got 1.7"),
+        ({"target": 5.0}, "options: expected some of episode_length, .*goal, .*, got 'target'"),
+    ],
+)
+def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=f"^{sentence}") as caught:
+        env_spec(ID, options)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_goal_read_from_json_is_a_tuple() -> None:
+    options = env_spec(ID, {"goal": [1, 2, 3]}).options
+    assert options["goal"] == [1.0, 2.0, 3.0]
+    assert make_task(ID, options).options.goal == (1.0, 2.0, 3.0)

@@ -1,0 +1,229 @@
+"""The landing task against values worked out by hand."""
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from pilot import Pilot, limited
+from rotorgram.envs.loop import make_task
+from rotorgram.envs.registry import env_spec
+from rotorgram.models import Vehicle
+from rotorgram.models.errors import InputError
+
+from flights import Shares, about, state_of
+
+ID = "rotorgram/Landing-v0"
+REST = 0.4  # height of the paper's craft on the ground, m
+MIDDLE = (0.5, 0.5, 0.5)  # of the start's band
+NOW = np.bool_(True)
+
+
+def begun(direction: float = 0.5, phase: float = 0.5, side: float = 1.0, **options: Any) -> Any:
+    """A task whose pad begins at these shares of its draws, at its largest speed."""
+    task = make_task(ID, options)
+    task.begin(NOW, Shares(MIDDLE, 1.0, direction, phase, side))
+    return task
+
+
+def moved(task: Any, steps: int, **state: Any) -> Any:
+    for _ in range(steps):
+        task.remember(state_of(**state), NOW)
+    return task
+
+
+def test_a_start_is_above_the_middle_of_the_path() -> None:
+    pose = make_task(ID, {}).begin(NOW, Shares((0.0, 0.5, 1.0), 0.5, 0.5, 0.5, 0.5))
+    assert pose.position == pytest.approx([-1.0, 0.0, REST + 5.0])
+    assert pose.velocity is None
+    assert pose.quaternion is None
+
+
+def test_a_pad_on_a_circle() -> None:
+    """At 1 m/s on a radius of 2 m it turns by 0.01 rad in a step of 0.02 s, to the left."""
+    task = begun()  # at φ = 0
+    assert task.goal(state_of()) == pytest.approx([2.0, 0.0, REST])
+    moved(task, 100)
+    assert task.goal(state_of()) == pytest.approx([2 * math.cos(1), 2 * math.sin(1), REST])
+    seen = task.observe(state_of(velocity=(9.0, 9.0, 9.0)))["observation"]
+    assert seen[19:] == pytest.approx([-math.sin(1), math.cos(1)])  # after 15 and 4 rotors
+    right = moved(begun(side=0.0), 100)
+    assert right.goal(state_of()) == pytest.approx([2 * math.cos(1), -2 * math.sin(1), REST])
+
+
+def test_a_pad_on_a_line() -> None:
+    """Along y (a quarter of the way round), from the middle (φ = 90°) backwards."""
+    task = begun(direction=0.75, phase=0.75, motion="line", pad_path=3.0, pad_speed=1.5)
+    assert task.goal(state_of()) == pytest.approx([0.0, 0.0, REST])
+    seen = task.observe(state_of())["observation"]
+    assert seen[19:] == pytest.approx([0.0, -1.5])  # its largest speed is in the middle
+    moved(task, 50)  # φ grows by 1.5 / 3 · 1 s
+    assert task.goal(state_of()) == pytest.approx([0.0, -3 * math.sin(0.5), REST])
+
+
+def test_observation_by_hand() -> None:
+    task = begun()
+    state = state_of(
+        position=(1.0, -1.0, 3.4), velocity=(1.0, 2.0, -3.0), body_rates=(0.1, 0.2, 0.3),
+        quaternion=about((1, 0, 0), 30.0), thrust=(49.0, 98.0, 0.0, 24.5),
+    )  # fmt: skip
+    seen = task.observe(state)["observation"]
+    half, root = 0.5, math.sqrt(3) / 2
+    expected = [1, 1, -3, 1, 2, -3, 1, 0, 0, 0, -half, root, 0.1, 0.2, 0.3, 0, 1, -1, -0.5, 0, 1]
+    assert seen == pytest.approx(expected, abs=1e-12)
+    (spec,) = task.observation
+    assert spec.shape == (21,)
+    assert spec.components[:3] == ("goal - position x", "goal - position y", "goal - position z")
+    assert spec.components[19:] == ("velocity of the pad x", "velocity of the pad y")
+    assert spec.bounds()[1][[0, 19]].tolist() == [20.0, 1.001]
+
+
+STILL = {"motion": "line", "pad_speed": 0.0}  # a pad that rests at (2, 0)
+
+
+@pytest.mark.parametrize(
+    ("before", "at", "landed"),
+    [
+        ({"velocity": (0.0, 0.0, -0.99)}, {}, True),
+        ({"velocity": (0.0, 0.0, -1.01)}, {}, False),
+        ({"velocity": (0.3, 0.39, -0.5)}, {}, True),
+        ({"velocity": (0.3, 0.41, -0.5)}, {}, False),
+        ({"velocity": (0.0, 0.0, 0.5)}, {}, True),  # its tail touches as it rises
+        ({"quaternion": about((1, 0, 0), 14.9)}, {}, True),
+        ({"quaternion": about((0, 1, 0), 15.1)}, {}, False),
+        ({}, {"position": (2.0, 0.49, REST)}, True),
+        ({}, {"position": (2.0, -0.51, REST)}, False),
+        # What contact does to speed and tilt does not count.
+        ({}, {"velocity": (3.0, 0.0, 2.0), "quaternion": about((1, 0, 0), 40.0)}, True),
+        ({"velocity": (0.0, 0.0, -3.0)}, {"velocity": (0.0, 0.0, 0.1)}, False),
+    ],
+)
+def test_what_is_a_landing(before: dict[str, Any], at: dict[str, Any], landed: bool) -> None:
+    task = begun(**STILL)
+    place = {"position": (2.0, 0.0, REST + 0.01), **before}
+    moved(task, 1, **place)
+    outcome = task.outcome(state_of(**place))
+    assert not outcome.terminated
+    assert outcome.metrics["landed"] == 0.0
+    state = {"position": (2.0, 0.0, REST), "touching": True, **at}
+    moved(task, 1, **state)
+    outcome = task.outcome(state_of(**state))
+    assert bool(outcome.terminated)
+    assert outcome.metrics["landed"] == landed
+    assert outcome.reward["landing"] == 20.0 * landed
+    assert outcome.reward["termination"] == -10.0 * (not landed)
+
+
+def test_drift_is_relative_to_the_pad() -> None:
+    """The pad is at (2, 0) and moves along +y at 1 m/s: who stands still drifts at 1 m/s."""
+    for speed, landed in ((1.0, True), (0.6, True), (0.4, False), (0.0, False)):
+        task = begun()
+        for state in (
+            state_of(position=(2.0, 0.0, REST + 0.01), velocity=(0.0, speed, -0.2)),
+            state_of(position=(2.0, 0.0, REST), velocity=(0.0, 0.0, 0.0), touching=True),
+        ):
+            task.remember(state, NOW)
+        outcome = task.outcome(state)
+        assert outcome.metrics["landed"] == landed
+        relative = math.hypot(1.0 - speed, 0.2)
+        assert outcome.metrics["relative_speed"] == pytest.approx(relative, abs=0.03)
+        assert outcome.metrics["pad_distance"] == pytest.approx(0.04, abs=1e-3)  # in two steps
+
+
+def test_progress_by_hand() -> None:
+    """From 5 m away at rest to 4.5 m away at 2 m/s: -(4.5 + 0.5 · 2) + 5; then 4 m at 1 m/s."""
+    task = begun(**STILL, start_height=4.0)  # start at (0, 0, 4.4), the pad at (2, 0, 0.4)
+    start = math.hypot(2.0, 4.0)
+    task.remember(state_of(position=(2.0, 4.5, REST), velocity=(2.0, 0.0, 0.0)), NOW)
+    state = state_of(position=(2.0, 4.0, REST), velocity=(0.0, 1.0, 0.0), body_rates=(3.0, 0, 4.0))
+    assert task.outcome(state).reward["progress"] == pytest.approx(start - 5.5)
+    task.remember(state, NOW)
+    reward = task.outcome(state).reward
+    assert reward["progress"] == pytest.approx(5.5 - 4.5)
+    assert reward["rates"] == pytest.approx(-0.1)
+    assert reward["time"] == -0.1
+    assert reward["termination"] == reward["landing"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "terminated"),
+    [
+        ({}, False),
+        ({"position": (2.0, 9.9, REST)}, False),
+        ({"position": (2.0, 10.1, REST)}, True),
+        ({"quaternion": about((0, 1, 0), 89.0)}, False),
+        ({"quaternion": about((0, 1, 0), 91.0)}, True),
+        ({"touching": True}, True),
+    ],
+    ids=str,
+)
+def test_ends(change: dict[str, Any], terminated: bool) -> None:
+    task = begun(**STILL)
+    outcome = task.outcome(state_of(**{"position": (2.0, 3.0, 3.0), **change}))
+    assert outcome.terminated == terminated
+    assert outcome.reward["termination"] == -10.0 * terminated
+    assert outcome.metrics["landed"] == 0.0
+
+
+def test_a_pilot_lands_and_a_stone_does_not() -> None:
+    """In a batch, on either path, with a 20 kg and a 27 g craft, also in wind."""
+    for vehicle, motion, effects in (
+        ("paper", "circle", {}),
+        ("crazyflie2", "line", {"body_drag": True, "rotor_drag": True, "wind": [1.2, -0.8, 0.0]}),
+    ):
+        craft, n = Vehicle.load(vehicle), 16
+        env: Any = gym.make_vec(
+            ID, num_envs=n, autoreset_mode="Disabled", vehicle=vehicle, motion=motion,
+            effects=effects,
+        )  # fmt: skip
+        env.reset(seed=0)
+        pilot, landed = Pilot(craft), np.zeros(n)
+        while not env.done.all():
+            flown = ~env.done
+            actions = pilot.act(env.observations, wanted(env.observations, craft.num_rotors))
+            env.advance(actions, None, None, env.done)
+            landed = np.where(flown, env.telemetry["metrics"][:, 0], landed)
+        assert landed.tolist() == [1.0] * n
+        env.reset(seed=0)
+        while not env.done.all():
+            env.advance(np.full((n, craft.num_rotors), -0.5, np.float32), None, None, env.done)
+        assert not env.telemetry["metrics"][:, 0].any()
+
+
+def wanted(seen: np.ndarray, rotors: int) -> np.ndarray:
+    """Follow the pad; come down to 1 m above it, and on it only when right above it."""
+    offset, pad = seen[:, :3].astype(float), seen[:, 15 + rotors :].astype(float)
+    speed = seen[:, 3:6] - np.pad(pad, ((0, 0), (0, 1)))
+    acceleration = 5 * offset - 4 * speed
+    above = np.hypot(*offset.T[:2]) < 0.8
+    climb = np.where(above, -0.8, np.clip(offset[:, 2] + 1, -1, 1))
+    acceleration[:, 2] = 3 * (climb - speed[:, 2])
+    return limited(acceleration, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"motion": "spiral"}, "motion: expected 'circle' or 'line', got 'spiral'"),
+        ({"pad_speed": (1.0, 0.5)}, "pad_speed: expected a speed of 0 to 20 m/s, or a pair"),
+        ({"pad_speed": -1.0}, "pad_speed: expected a speed of 0 to 20 m/s"),
+        ({"pad_path": 0.0}, "pad_path: expected a number from 0.01 to 1000 m, got 0"),
+        ({"pad_radius": "wide"}, "pad_radius: expected a number from 0.01 to 1000 m, got 'wide'"),
+        ({"sink": 0.0}, "sink: expected a number from 0.01 to 100 m/s"),
+        ({"drift": -1.0}, "drift: expected a number from 0.01 to 100 m/s"),
+        ({"tilt": 91.0}, "tilt: expected a number from 0.1 to 90 degrees"),
+        ({"start_height": 1.0}, "start_band: expected at most start_height - 0.5 m, got 1.0"),
+        ({"flight_band": 6.0}, "flight_band: expected more than the 6.054 m of the furthest start"),
+    ],
+)
+def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=f"^{sentence}") as caught:
+        env_spec(ID, options)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_speed_read_from_json_is_a_tuple() -> None:
+    options = env_spec(ID, {"pad_speed": [0.5, 2]}).options
+    assert options["pad_speed"] == [0.5, 2.0]
+    assert make_task(ID, options).options.pad_speed == (0.5, 2.0)

@@ -1,0 +1,352 @@
+"""The loop: masks of `advance`, streams of random numbers, and what a task may give."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from rotorgram.envs import ArraySpec, Loop, Metric, Outcome, Task, TaskOptions, register, registry
+from rotorgram.models.errors import InputError
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.sim import CollectiveThrust, Pose, make_world, stack
+
+ID, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
+
+
+def started(env_id: str = ID, num_envs: int = 2, **options: Any) -> tuple[Loop, np.ndarray]:
+    """A loop with running episodes, and actions for it."""
+    loop = Loop(env_id, num_envs, options=options)
+    actions = np.full((num_envs, len(loop.task.controller.low)), 0.4, np.float32)
+    loop.advance(actions, np.ones(num_envs, bool), range(num_envs))
+    return loop, actions
+
+
+def shown(loop: Loop, drone: int) -> bytes:
+    """All that is told of a drone."""
+    arrays = [*loop.observations.values(), *loop.telemetry.values()]
+    return b"".join(array[drone].tobytes() for array in arrays)
+
+
+@pytest.mark.parametrize("env_id", [ID, HOVER])
+def test_a_frozen_drone_is_as_before(env_id: str) -> None:
+    (held, actions), (free, _) = (started(env_id, episode_length=5) for _ in range(2))
+    first, second = np.array([True, False]), np.array([False, True])
+    for loop in (held, free):
+        loop.advance(actions)
+    before = shown(held, 0)
+    for wrong in (np.nan, 9.0):
+        given = actions.copy()
+        given[0] = wrong  # ignored
+        held.advance(given, second, frozen=first)
+        assert shown(held, 0) == before
+        assert (held.rewards[0], held.terminated[0], held.truncated[0]) == (0.0, False, False)
+    for _ in range(4):  # and its episode is as long as if it had not been frozen
+        held.advance(actions, second)
+        free.advance(actions, second)
+        assert shown(held, 0) == shown(free, 0)
+    assert held.truncated[0]
+    held.advance(actions, second, frozen=first)  # also when its episode is over
+    with pytest.raises(gym.error.ResetNeeded, match="env 0 first"):
+        held.advance(actions)
+
+
+def test_flags_of_those_that_do_not_fly() -> None:
+    loop, actions = started(episode_length=1)
+    loop.advance(actions)
+    assert loop.truncated.tolist() == loop.done.tolist() == [True, True]
+    loop.advance(actions, np.array([True, False]), None, np.array([False, True]))
+    assert loop.truncated.tolist() == [False, False]
+    assert loop.rewards.tolist() == [0.0, 0.0]
+    assert loop.done.tolist() == [False, True]
+    assert loop.steps.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_masks_and_seeds_of_another_shape_are_refused(num_envs: int) -> None:
+    loop, actions = started(num_envs=num_envs)
+    before, every = shown(loop, 0), np.ones(num_envs, bool)
+    for wrong in (np.ones(3, bool), np.ones(num_envs), np.bool_(True), [True] * num_envs):
+        for name in ("resets", "frozen"):
+            with pytest.raises(InputError, match=r"^resets, frozen: expected bool of shape"):
+                loop.advance(actions, **{name: wrong})  # type: ignore[arg-type]
+    for seeds in ([1, 2, 3], [-1] * num_envs):
+        with pytest.raises(InputError, match=rf"^seed: expected .* from 0 on, or {num_envs} of"):
+            loop.advance(actions, every, seeds)
+    assert shown(loop, 0) == before
+
+
+def test_wrong_seeds_are_refused_before_the_others_fly() -> None:
+    loop, actions = started()
+    with pytest.raises(InputError, match=r"^seed: expected .*, or 2 of them, got \[1\]"):
+        loop.advance(actions, np.array([True, False]), [1])
+    assert loop.steps.tolist() == [0, 0]
+
+
+def test_a_first_reset_that_is_refused_begins_nothing() -> None:
+    loop, still, some = Loop(ID, 2), np.zeros((2, 1), np.float32), np.array([True, False])
+    with pytest.raises(InputError, match=r"^start: expected at least"):
+        loop.advance(still, np.ones(2, bool), chosen={"start": np.full(2, 1e5)})
+    loop.advance(still, some, frozen=~some)
+    assert abs(loop.telemetry["position"][:, 1] - 5.0).max() <= 1.0
+
+
+def test_the_first_reset_may_be_of_some() -> None:
+    loop, every = Loop(ID, 3), np.ones(3, bool)
+    still, some = np.zeros((3, 1), np.float32), np.array([False, True, False])
+    loop.advance(still, some, [7, 7, 7], frozen=~some)
+    alone = Loop(ID)
+    alone.advance(still[:1], every[:1], [7])
+    assert shown(loop, 1) == shown(alone, 0)
+    with pytest.raises(gym.error.ResetNeeded, match="env 0 first"):
+        loop.advance(still)
+    loop.advance(still, ~some, [5, 6, 7])
+    loop.advance(still)
+    assert loop.steps.tolist() == [1, 2, 1]
+
+
+def test_seeds_of_a_wire() -> None:
+    """Unsigned numbers of 64 bits, those of drones that are not reset among them."""
+    loop, actions = started(num_envs=3)
+    before = shown(loop, 1)
+    seeds = np.array([2**64 - 1, 5, 2**64 - 1], np.uint64)
+    loop.advance(actions, np.array([True, False, True]), seeds, np.array([False, True, False]))
+    assert shown(loop, 0) == shown(loop, 2) != shown(loop, 1) == before
+
+
+def test_another_use_of_randomness_does_not_move_the_starts() -> None:
+    """A world's seed gives a child to each use; the starts are those of the first child."""
+    world, every = make_world(Vehicle.load(), 2), np.ones((2, 1), bool)
+    world.seed(every, [11, 12])
+    drawn = world.draw(every).uniform(0.0, 1.0, (3,))[:, 0]
+    for seed, numbers in zip((11, 12), drawn, strict=True):
+        child = np.random.SeedSequence(seed).spawn(5)[0]  # however many there are
+        assert numbers.tolist() == np.random.default_rng(child).uniform(0.0, 1.0, 3).tolist()
+
+
+def test_a_draw_that_is_switched_off_moves_no_other() -> None:
+    """Equal ends draw all the same: a start tilt of 0 leaves heading and offset as they were."""
+    (tilted, _), (level, _) = (started(HOVER, start_tilt=tilt) for tilt in (30.0, 0.0))
+    np.testing.assert_array_equal(tilted.telemetry["position"], level.telemetry["position"])
+    assert abs(level.telemetry["attitude"][:, [0, 2]]).max() < 1e-12
+    headings = level.telemetry["metrics"][:, 1]
+    np.testing.assert_allclose(tilted.telemetry["metrics"][:, 1], headings, atol=8.0)
+
+
+# --- a task that gives whatever a task may give ---------------------------------------------------
+
+
+class Careless(Task):
+    """Gives live arrays of the simulator, an integer picture, and an end that never comes."""
+
+    metrics = (Metric(name="climb", unit="m/s", goal="high"),)
+
+    def setup(self) -> None:
+        self.controller = CollectiveThrust(self.vehicle, 10.0, increment=False)
+        self.observation = (
+            ArraySpec(name="position", shape=(3,), dtype="float64", low=-1e3, high=1e3),
+            ArraySpec(name="picture", shape=(2, 2), dtype="uint8"),
+        )
+
+    def begin(self, mask: Any, draw: Any) -> Pose:
+        return Pose(position=stack((0.0, 0.0, draw.uniform(3.0, 4.0))))
+
+    def observe(self, state: Any) -> dict[str, Any]:
+        ones = stack((1.0, 2.0, 3.0, state.position[..., 2]))
+        return {"position": state.position, "picture": ones.reshape((*ones.shape[:-1], 2, 2))}
+
+    def outcome(self, state: Any) -> Outcome:
+        climb = state.velocity[..., 2]
+        return Outcome(reward={"climb": climb}, terminated=False, metrics={"climb": climb})
+
+
+class Counting(Careless):
+    """Counts the steps of an episode, in its memory."""
+
+    count: Any = 0.0
+
+    def begin(self, mask: Any, draw: Any) -> Pose:
+        self.count = self.xp.where(mask, 0.0, self.count)
+        return super().begin(mask, draw)
+
+    def remember(self, state: Any, mask: Any) -> None:
+        self.count = self.count + self.xp.where(mask, 1.0, 0.0)
+
+    def outcome(self, state: Any) -> Outcome:
+        climb = 0.0 * state.velocity[..., 2]
+        return Outcome(reward={"none": climb}, terminated=False, metrics={"climb": self.count})
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_a_tasks_memory_is_that_of_the_drones_that_flew(num_envs: int) -> None:
+    register("counting-v0", Counting)
+    try:
+        loop = Loop("counting-v0", num_envs)
+    finally:
+        gym.registry.pop("counting-v0")
+    actions, everyone = np.zeros((num_envs, 1), np.float32), np.ones(num_envs, bool)
+    first = np.arange(num_envs) == 0
+    loop.advance(actions, everyone, range(num_envs))
+    assert loop.metrics["climb"].tolist() == [0.0] * num_envs
+    loop.advance(actions)
+    loop.advance(actions, frozen=first)
+    loop.advance(actions)
+    assert loop.metrics["climb"].tolist() == np.where(first, 2.0, 3.0).tolist()
+    loop.advance(actions, first, range(num_envs))
+    assert loop.metrics["climb"].tolist() == np.where(first, 0.0, 4.0).tolist()
+
+
+def test_a_task_without_a_method_is_told_which() -> None:
+    register("unfinished-v0", type("Unfinished", (Task,), {"setup": Careless.setup}))
+    try:
+        with pytest.raises(InputError, match=r"a task with a method begin\(\), got Unfinished"):
+            Loop("unfinished-v0")
+    finally:
+        gym.registry.pop("unfinished-v0")
+
+
+@pytest.fixture
+def careless() -> Iterator[str]:
+    register("careless-v0", Careless)
+    yield "careless-v0"
+    gym.registry.pop("careless-v0")
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_what_a_step_gave_stays_as_it_was(careless: str, num_envs: int) -> None:
+    loop = Loop(careless, num_envs, options={"episode_length": 3})
+    actions = np.ones((num_envs, 1), np.float32)
+    loop.advance(actions, np.ones(num_envs, bool), range(num_envs))
+    loop.advance(actions)
+    given = [*loop.observations.values(), *loop.metrics.values(), *loop.reward_terms.values()]
+    given += [loop.rewards, loop.terminated, loop.truncated, *loop.telemetry.values()]
+    kept = [array.copy() for array in given]
+    loop.advance(actions)
+    loop.advance(actions)
+    assert loop.truncated.all()
+    for array, before in zip(given, kept, strict=True):
+        assert array.tobytes() == before.tobytes()
+    assert loop.observations["picture"].dtype == np.uint8
+    assert loop.observations["picture"].tolist() == [[[1, 2], [3, 3]]] * num_envs
+    assert loop.observations["position"].shape == (num_envs, 3)
+    # 40 N on 20 kg: 2 m/s² for 3 steps of 0.02 s
+    assert loop.metrics["climb"] == pytest.approx(0.12, abs=1e-9)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_a_task_may_give_constants_and_float32(num_envs: int) -> None:
+    class Plain(registry.task_type(ID)):  # type: ignore[misc]
+        def outcome(self, state: Any) -> Any:
+            outcome = super().outcome(state)
+            height = np.float32(1) * np.asarray(state.position[..., 2], np.float32)
+            outcome.reward = {"alive": 1.0, "height": height}
+            outcome.metrics = {"elevation_error": 0.25}
+            return outcome
+
+    register("Plain-v0", Plain)
+    loop, still = Loop("Plain-v0", num_envs), np.zeros((num_envs, 1), np.float32)
+    loop.advance(still, np.ones(num_envs, bool), chosen={"start": np.full(num_envs, 4.5)})
+    loop.advance(still)
+    assert loop.rewards.dtype == np.float64
+    assert loop.rewards.tolist() == [5.5] * num_envs
+    assert loop.reward_terms["alive"].tolist() == [1.0] * num_envs
+    assert loop.metrics["elevation_error"].tolist() == [0.25] * num_envs
+    assert loop.telemetry["metrics"].tolist() == [[0.25]] * num_envs
+
+
+def test_several_arrays_are_a_dict(careless: str) -> None:
+    env = gym.make(careless, disable_env_checker=True)
+    check_env(env.unwrapped, skip_render_check=True)
+    observation, info = env.reset(seed=0)
+    assert set(observation) == {"position", "picture"}
+    assert "X_goal" not in info
+    many = gym.make_vec(careless, num_envs=2)
+    seen, _ = many.reset(seed=0)
+    assert seen["position"][0].tobytes() == observation["position"].tobytes()
+
+
+def test_ids() -> None:
+    assert registry.is_known(ID)
+    assert registry.is_known(HOVER)
+    assert registry.is_known(f"rotorgram.envs:{ID}")
+    with pytest.raises(InputError, match=r"^env: expected a registered id .*, got 'CartPole-v1'"):
+        Loop("CartPole-v1")
+    with pytest.raises(InputError, match=r"^env id: expected one that is free, got 'CartPole-v1'"):
+        register("CartPole-v1", Careless)
+    for wrong in ("landing", "my landing-v0", 3):
+        with pytest.raises(InputError, match=r"^env id: expected name-v0"):
+            register(wrong, Careless)  # type: ignore[arg-type]
+
+
+def test_what_a_user_typed_is_imported_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "typed_here.py").write_text(
+        "from rotorgram.envs import Task, register\nregister('Typed-v0', Task)\n"
+    )
+    assert not registry.is_known("typed_here:Typed-v0")
+    with pytest.raises(InputError, match=r"^env: expected a registered id"):
+        registry.task_type("typed_here:Typed-v0")
+    assert registry.load("typed_here:Typed-v0") == "Typed-v0"
+    assert registry.task_type("Typed-v0") is Task
+    assert registry.load(ID) == ID
+    (tmp_path / "colorsys.py").write_text("raise AssertionError('not the installed one')\n")
+    with pytest.raises(InputError, match=r"^env: expected colorsys to register Typed-v1"):
+        registry.load("colorsys:Typed-v1")
+    with pytest.raises(InputError, match=r"^env: expected typed_here to register Other-v0"):
+        registry.load("typed_here:Other-v0")
+    with pytest.raises(InputError, match=r"^env: expected a module nowhere here, got none"):
+        registry.load("nowhere:Typed-v0")
+    gym.registry.pop("Typed-v0")
+
+
+def test_options_are_a_plain_dataclass() -> None:
+    assert registry.task_type(HOVER).Options.from_options({"heading": 3}).heading == 3.0  # type: ignore[attr-defined]
+    assert issubclass(registry.task_type(ID).Options, TaskOptions)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("wrong", ["observation", "reward"])
+def test_numbers_of_a_task_that_are_not_finite_go_no_further(num_envs: int, wrong: str) -> None:
+    class Broken(registry.task_type(ID)):  # type: ignore[misc]
+        def observe(self, state: Any) -> Any:
+            seen = super().observe(state)
+            return {"observation": seen["observation"] * (np.nan if wrong == "observation" else 1)}
+
+        def outcome(self, state: Any) -> Any:
+            outcome = super().outcome(state)
+            added = np.nan if wrong == "reward" else 0.0
+            outcome.reward = {name: x + added for name, x in outcome.reward.items()}
+            return outcome
+
+    register("Broken-v0", Broken)
+    loop = Loop("Broken-v0", num_envs)
+    everybody = np.ones(num_envs, bool)
+    with pytest.raises(InputError, match=rf"Broken-v0: expected finite numbers for {wrong}"):
+        loop.advance(np.zeros((num_envs, 1), np.float32), everybody)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize(
+    ("start", "got"),
+    [
+        (None, "<class 'NoneType'>"),
+        (np.zeros(3), "<class 'numpy.ndarray'>"),
+        (Pose(position=[0.0, 0.0, 3.0]), r"\(\)"),
+        (Pose(position=np.zeros(2)), r"\(2,\)"),
+    ],
+)
+def test_a_start_that_is_none(num_envs: int, start: Any, got: str) -> None:
+    class Lost(registry.task_type(ID)):  # type: ignore[misc]
+        def begin(self, mask: Any, draw: Any) -> Any:
+            return start
+
+    register("Lost-v0", Lost)
+    loop = Loop("Lost-v0", num_envs)
+    sentence = rf"^Lost-v0: expected begin\(\) to return a Pose with a position of .*, got {got}$"
+    with pytest.raises(InputError, match=sentence):
+        loop.advance(np.zeros((num_envs, 1), np.float32), np.ones(num_envs, bool))

@@ -1,0 +1,162 @@
+"""The payload task against values worked out by hand."""
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from pilot import Pilot, limited
+from rotorgram.envs import Loop
+from rotorgram.envs.loop import make_task
+from rotorgram.envs.registry import env_spec
+from rotorgram.models import Vehicle
+from rotorgram.models.errors import InputError
+
+from flights import Shares, about, state_of
+
+ID = "rotorgram/PayloadHover-v0"
+NOW = np.bool_(True)
+AT_GOAL = {"payload": (0.0, 0.0, 4.0), "payload_velocity": (0.0, 0.0, 0.0)}  # the craft at 5 m
+
+
+def test_a_start_by_hand() -> None:
+    """Tilted by 7.5° about y, moving along -x, at the thrust that carries 20 kg and 2 kg."""
+    pose = make_task(ID, {}).begin(NOW, Shares((1.0, 0.5, 0.0), 0.5, 0.75, 0.0, 0.5))
+    assert pose.position == pytest.approx([1.0, 0.0, 4.0])
+    assert pose.quaternion == pytest.approx(about((0, 1, 0), 7.5), abs=1e-12)
+    assert pose.velocity == pytest.approx([-1.0, 0.0, 0.0])
+    assert pose.thrust == pytest.approx([1.1 * 49.0] * 4)
+
+
+@pytest.mark.parametrize("vehicle", ["paper", "crazyflie2"])
+def test_the_task_hangs_the_payload_itself(vehicle: str) -> None:
+    """The world has it, the spec tells it, and what the effects say of it is replaced."""
+    options = {"payload_share": 0.2, "cable": 0.7, "effects": {"efficiency": (1.0, 1.0, 0.9, 1.0)}}
+    told = env_spec(ID, options, vehicle)
+    assert "payload" in [array.name for array in told.telemetry]
+    assert told.options["effects"] == {"efficiency": [1.0, 1.0, 0.9, 1.0]}
+    assert env_spec(ID, told.options, vehicle) == told
+    loop = Loop(ID, vehicle=vehicle, options=options)
+    loop.advance(np.zeros((1, 4), np.float32), np.ones(1, bool), [0])
+    state = loop.world.state
+    assert state.position - state.payload == pytest.approx([0.0, 0.0, 0.7])
+    assert state.payload_velocity.tolist() == state.velocity.tolist()
+    assert loop.observations["observation"][0, 19:] == pytest.approx([0, 0, -0.7, 0, 0, 0])
+
+
+def test_observation_by_hand() -> None:
+    task = make_task(ID, {"goal": (1.0, 2.0, 6.0)})
+    state = state_of(
+        position=(0.5, 2.0, 6.0), velocity=(1.0, 2.0, -3.0), body_rates=(0.1, 0.2, 0.3),
+        quaternion=about((1, 0, 0), 30.0), thrust=(49.0, 98.0, 0.0, 24.5),
+        payload=(0.1, 2.3, 5.2), payload_velocity=(1.5, 1.0, -3.0),
+    )  # fmt: skip
+    seen = task.observe(state)["observation"]
+    half, root = 0.5, math.sqrt(3) / 2
+    craft = [0.5, 0, 1, 1, 2, -3, 1, 0, 0, 0, -half, root, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
+    assert seen == pytest.approx([*craft, -0.4, 0.3, -0.8, 0.5, -1, 0], abs=1e-12)
+    assert task.goal(state).tolist() == [1.0, 2.0, 6.0]
+    (spec,) = task.observation
+    assert spec.components[:3] == ("goal - position x", "goal - position y", "goal - position z")
+    assert spec.components[19] == "payload - position x"
+    assert spec.components[24] == "payload velocity - velocity z"
+    assert spec.bounds()[1][[0, 19, 24]].tolist() == [6.0, 2.0, 100.0]
+
+
+@pytest.mark.parametrize(
+    ("change", "terms", "terminated"),
+    [
+        ({}, {"payload": 1.0, "swing": 0.0, "rates": 0.0, "termination": 0.0}, False),
+        ({"payload": (0.3, 0.4, 4.0)}, {"payload": 0.0}, False),
+        ({"payload": (0.0, 0.0, 2.5)}, {"payload": -0.5}, False),
+        ({"payload_velocity": (0.0, 3.0, 4.0)}, {"swing": -0.5}, False),
+        ({"velocity": (1.0, 0, 0), "payload_velocity": (1.0, 0, 0)}, {"swing": 0.0}, False),
+        ({"body_rates": (3.0, 0.0, 4.0)}, {"rates": -0.1}, False),
+        ({"payload": (2.99, 0.0, 4.0)}, {"termination": 0.0}, False),
+        ({"payload": (3.01, 0.0, 4.0)}, {"termination": -20.0}, True),
+        ({"quaternion": about((0, 1, 0), 89.0)}, {"termination": 0.0}, False),
+        ({"quaternion": about((0, 1, 0), 91.0)}, {"termination": -20.0}, True),
+        ({"touching": True}, {"termination": -20.0}, True),
+    ],
+    ids=str,
+)
+def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:
+    outcome = make_task(ID, {}).outcome(state_of(**{**AT_GOAL, **change}))
+    for name, value in terms.items():
+        assert outcome.reward[name] == pytest.approx(value, abs=1e-12)
+    assert outcome.terminated == terminated
+
+
+def test_metrics_by_hand() -> None:
+    """30° to the side on a cable of 1 m, under a craft at 5 m."""
+    payload = (0.5, 0.0, 5.0 - math.sqrt(3) / 2)
+    state = state_of(**{**AT_GOAL, "payload": payload})
+    metrics = make_task(ID, {}).outcome(state).metrics
+    assert metrics["payload_error"] == pytest.approx(math.hypot(0.5, 1 - math.sqrt(3) / 2))
+    assert metrics["swing"] == pytest.approx(30.0)
+
+
+def swinging_pilot(seen: np.ndarray, rotors: int) -> np.ndarray:
+    """Linear-quadratic gains for a point that carries a pendulum of 1 m and a tenth of its mass,
+    with a lag of 0.2 s; the last term is the acceleration that it has."""
+    offset, speed, axis = (seen[:, i : i + 3].astype(float) for i in (0, 3, 9))
+    hung, moving = (seen[:, 15 + rotors + i :][:, :3] for i in (0, 3))
+    wanted = 3.2 * offset - 4.0 * speed + 3.3 * hung + 2.1 * moving - 7.0 * axis
+    wanted[:, 2] = 4 * offset[:, 2] - 4 * speed[:, 2]
+    return limited(wanted, 5.0)
+
+
+@pytest.mark.parametrize("vehicle", ["paper", "crazyflie2", "heavy_hexa"])
+def test_a_pilot_damps_the_swing(vehicle: str) -> None:
+    """From all of 16 starts: below 5 cm and 1° for the last second."""
+    craft, n = Vehicle.load(vehicle), 16
+    env: Any = gym.make_vec(ID, num_envs=n, autoreset_mode="Disabled", vehicle=vehicle)
+    env.reset(seed=0)
+    pilot, errors = Pilot(craft, 100.0, 20.0), []
+    while not env.done.any():
+        seen = env.observations
+        wanted = 1.1 * swinging_pilot(seen, craft.num_rotors) + (0, 0, 0.1 * craft.gravity)
+        env.advance(pilot.act(seen, wanted))
+        errors.append(env.telemetry["metrics"].copy())
+    assert env.truncated.all()
+    assert np.max(errors[:100], axis=(0, 1)).min() > 0.5  # it does swing at first
+    assert (np.max(errors[200:], axis=(0, 1)) < (0.05, 1.0)).all()
+
+
+@pytest.mark.parametrize(("share", "factor"), [(0.1, 1.0), (0.05, 2.0), (0.2, 0.5)])
+def test_hovering_without_the_payload_drops_it(share: float, factor: float) -> None:
+    """Action 0 carries the craft alone: both sink with g · 0.1 / 1.1, in 2 s by 1.8 m. The mass of
+    a payload may be drawn as that of any."""
+    drawn = {"payload": f"uniform({factor}, {factor})"}
+    still = {"start_band": 0.0, "start_speed": 0.0, "start_tilt": 0.0}
+    env: Any = gym.make(ID, **still, payload_share=share, randomize=drawn)
+    env.reset(seed=0)
+    for _ in range(100):
+        _, _, terminated, _, info = env.step(np.zeros(4, np.float32))
+        assert not terminated
+    assert info["payload_error"] == pytest.approx(9.8 / 11 * 2.0, rel=0.01)
+    assert info["swing"] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"goal": (0.0, 0.0)}, "goal: expected three numbers"),
+        ({"goal": (0.0, 0.0, 1.5)}, "goal: expected a height of at least 1.678 m above the ground"),
+        (
+            {"effects": {"payload": 2.0}},
+            "effects: expected a payload that the options of the task describe, got payload",
+        ),
+        ({"randomize": {"gusts": "uniform(1, 2)"}}, "randomize: gusts: expected .*"),
+        ({"payload_share": 0.0}, "payload_share: expected a number from 0.001 to 10, got 0"),
+        ({"cable": "long"}, "cable: expected a number from 0.05 to 100 m, got 'long'"),
+        ({"start_speed": -1.0}, "start_speed: expected a number from 0 to 100 m/s"),
+        ({"start_tilt": 81.0}, "start_tilt: expected a number from 0 to 80 degrees"),
+        ({"flight_band": 1.7}, "flight_band: expected more than .* = 1.732 m, got 1.7"),
+    ],
+)
+def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=f"^{sentence}") as caught:
+        env_spec(ID, options)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,192 @@
+"""The racing task against values worked out by hand; a pilot flies every track."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from pilot import Pilot, limited
+from rotorgram.envs.loop import make_task
+from rotorgram.models import Vehicle
+from rotorgram.models.errors import InputError
+
+from flights import Shares, about, state_of
+
+ID = "rotorgram/Racing-v0"
+NOW = np.bool_(True)
+# Along x, then a turn to the left: a gate at x = 2, one at y = 3; start at the origin, 5 m high.
+TRACK = json.dumps({
+    "gates": [
+        {"position": [2, 0, 5], "heading": 0, "size": 1.0},
+        {"position": [2, 3, 5], "heading": 90, "size": 2.0},
+    ],
+    "start": {"position": [0, 0, 5], "heading": 90},
+})  # fmt: skip
+
+
+def begun(**options: Any) -> Any:
+    task = make_task(ID, {"track": TRACK, **options})
+    task.begin(NOW, Shares((0.5, 0.5, 0.5)))
+    return task
+
+
+def moved(task: Any, *position: float, **rest: Any) -> Any:
+    state = state_of(position=position, **rest)
+    task.remember(state, NOW)
+    return task.outcome(state)
+
+
+def test_a_start_by_hand() -> None:
+    task = make_task(ID, {"track": TRACK, "start_band": 2.0})
+    pose = task.begin(NOW, Shares((1.0, 0.0, 0.5)))
+    assert pose.position.tolist() == [2.0, -2.0, 5.0]
+    root = math.sqrt(0.5)
+    assert pose.quaternion == pytest.approx([root, 0.0, 0.0, root])
+
+
+def test_observation_by_hand() -> None:
+    task = begun()
+    state = state_of(position=(1.0, 0.5, 4.0), velocity=(1.0, 2.0, 3.0))
+    seen = task.observe(state)["observation"]
+    expected = [1, -0.5, 1, 1, 2, 3, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0]
+    assert seen == pytest.approx([*expected, 1, 0, 1, 2.5, 1, 0, 1, 0.5], abs=1e-12)
+    (spec,) = task.observation
+    assert spec.components[:3] == ("goal - position x", "goal - position y", "goal - position z")
+    assert spec.bounds()[1][0] == pytest.approx(math.hypot(2, 3) + 10.0)
+    assert task.goal(state).tolist() == [2.0, 0.0, 5.0]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "passes"),
+    [
+        ((1.9, 0.0, 5.0), (2.1, 0.0, 5.0), True),
+        ((1.9, 0.0, 5.0), (2.0, 0.0, 5.0), True),  # just on its plane
+        ((1.9, 0.0, 5.0), (1.99, 0.0, 5.0), False),
+        ((1.9, 0.49, 5.49), (2.1, 0.49, 5.49), True),
+        ((1.9, 0.51, 5.0), (2.1, 0.51, 5.0), False),
+        ((1.9, 0.0, 4.49), (2.1, 0.0, 4.49), False),
+        ((1.9, 0.6, 5.0), (2.1, 0.2, 5.0), True),  # in the middle of the step 0.4 aside
+        ((1.9, 0.8, 5.0), (2.1, 0.4, 5.0), False),  # 0.6 aside
+        ((2.1, 0.8, 5.0), (1.9, 0.0, 5.0), False),  # backwards
+    ],
+)
+def test_what_is_a_pass(before: Any, after: Any, passes: bool) -> None:
+    task = begun()
+    assert moved(task, *before).metrics["gates_left"] == 2
+    outcome = moved(task, *after)
+    assert outcome.metrics["gates_left"] == 2 - passes
+    assert outcome.reward["passing"] == passes
+
+
+def test_a_lap_by_hand() -> None:
+    task = begun(laps=2)
+    outcome = moved(task, 1.5, 0.0, 5.0, body_rates=(3.0, 0.0, 4.0))
+    assert {name: float(value) for name, value in outcome.reward.items()} == pytest.approx(
+        {"progress": 1.5, "passing": 0.0, "rates": -0.01, "termination": 0.0}
+    )
+    outcome = moved(task, 2.5, 0.0, 5.0)  # 0.5 m before the gate, 0.5 m behind it
+    assert outcome.reward["progress"] == pytest.approx(0.0, abs=1e-12)
+    outcome = moved(task, 2.0, 2.0, 5.0)
+    assert outcome.reward["progress"] == pytest.approx(math.hypot(0.5, 3.0) - 1.0)
+    outcome = moved(task, 2.0, 3.5, 5.0)
+    told = [outcome.metrics[name] for name in ("gates_left", "flight_time", "lap_time")]
+    assert told == pytest.approx([2, 0.08, 0.08])
+    assert not outcome.terminated
+    for place in ((1.0, 0.0, 5.0), (2.2, 0.0, 5.0), (2.0, 2.5, 5.0)):
+        assert not moved(task, *place).terminated
+    outcome = moved(task, 2.0, 3.1, 5.0)
+    told = [outcome.metrics[name] for name in ("gates_left", "flight_time", "lap_time")]
+    assert told == pytest.approx([0, 0.16, 0.08])
+    assert outcome.terminated
+    assert outcome.reward["termination"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("place", "rest", "ends"),
+    [
+        ((1.0, 4.9, 5.0), {}, False),  # aside of the line from start to gate
+        ((1.0, 5.1, 5.0), {}, True),
+        ((-4.9, 0.0, 5.0), {}, False),  # behind its beginning
+        ((-5.1, 0.0, 5.0), {}, True),
+        ((1.0, 0.0, 5.0), {"touching": True}, True),
+        ((1.0, 0.0, 5.0), {"quaternion": about((0, 1, 0), 91.0)}, True),
+    ],
+)
+def test_ends(place: Any, rest: dict[str, Any], ends: bool) -> None:
+    outcome = moved(begun(), *place, **rest)
+    assert bool(outcome.terminated) == ends
+    assert outcome.reward["termination"] == (-5.0 if ends else 0.0)
+
+
+def test_a_track_of_a_file_crosses_the_wire(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(
+        "gates = [{ position = [1, 2, 6], heading = -90, size = 3 }]\n"
+        "start = { position = [0, 0, 5], heading = 0 }\n"
+    )
+    task = make_task(ID, {"track": str(file)})
+    told = task.options.to_options()["track"]
+    file.unlink()
+    again = make_task(ID, {"track": told})
+    assert again.options.track == told
+    assert again.goal(state_of()).tolist() == [1.0, 2.0, 6.0]
+
+
+GATE = {"position": [2, 0, 5], "heading": 0, "size": 1}
+START = {"position": [0, 0, 5], "heading": 0}
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("loop", "track: expected a track of ours, a TOML file of gates, .* (dive, oval), got"),
+        ("../tracks/oval", "track: expected a track of ours"),
+        ({"gates": []}, "track: expected 1 to 64 gates, got 0"),
+        ({"gates": [GATE], "walls": []}, "track: expected gates and start, got ['walls']"),
+        ({"gates": [GATE]}, "track: start: expected position and heading, got None"),
+        ({"gates": [{**GATE, "size": 0}]}, "track: gate 1: expected a size from 0.01 to 10000 m"),
+        ({"gates": [{**GATE, "heading": "n"}]}, "track: gate 1: expected a heading from -360"),
+        ({"gates": [{**GATE, "position": [1]}]}, "track: gate 1: expected a position (x, y, z)"),
+        ({"gates": [GATE, 3]}, "track: gate 2: expected position and heading and size, got 3"),
+        ({"gates": [GATE], "start": {**START, "position": [0, 0, 1]}},
+         "track: expected a start at least 1.5 m above the ground, got 1"),
+    ],
+)  # fmt: skip
+def test_wrong_tracks(content: Any, sentence: str) -> None:
+    text = content if isinstance(content, str) else json.dumps(content)
+    with pytest.raises(InputError) as error:
+        make_task(ID, {"track": text})
+    first, _, last = sentence.partition(".*")
+    assert str(error.value).startswith(first.strip())
+    assert last.strip() in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("track", "name"), [("oval", None), ("dive", None), ("oval", "crazyflie2")]
+)
+def test_a_pilot_flies_it(track: str, name: str | None) -> None:
+    vehicle = Vehicle.load(name)
+    env = gym.make_vec(ID, 4, vehicle=name, autoreset_mode="Disabled", track=track, laps=1)
+    pilot, done = Pilot(vehicle), np.zeros(4, bool)
+    first = 15 + vehicle.num_rotors
+    seen, _ = env.reset(seed=3)
+    for _ in range(1499):
+        state = seen.astype(float)
+        way = np.column_stack((state[:, first : first + 2], np.zeros(4)))
+        away = state[:, :3]
+        before = np.sum(away * way, axis=1, keepdims=True)  # how far it is ahead
+        aside = away - before * way
+        # To a point before the gate, until the craft is on the line through its middle.
+        on_line = np.linalg.norm(aside, axis=1, keepdims=True) < 0.5
+        target = away + np.where(on_line & (before > -1.0), 1.0, -2.0) * way
+        wanted = limited(1.5 * target, 2.0) - state[:, 3:6]
+        env.advance(pilot.act(seen, 2.0 * wanted), None, None, done)  # type: ignore[attr-defined]
+        seen = env.observations  # type: ignore[attr-defined]
+        done = done | env.terminated  # type: ignore[attr-defined]
+    left, time, lap = env.telemetry["metrics"].T  # type: ignore[attr-defined]
+    assert left.tolist() == [0.0] * 4
+    assert (lap == time).all()
+    assert time.max() < 30.0

@@ -1,0 +1,282 @@
+"""The recovery task against values worked out by hand, and the moments of its starts."""
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from pilot import Pilot, limited
+from rotorgram.envs.loop import Loop, make_task
+from rotorgram.envs.registry import env_spec
+from rotorgram.envs.tasks.recovery import RecoveryOptions
+from rotorgram.models import Vehicle
+from rotorgram.models.errors import InputError
+from rotorgram.training.bounds import least_height_lost, recovery_bounds
+from scipy.special import fresnel
+
+from flights import Shares, about, state_of
+
+ID = "rotorgram/Recovery-v0"
+NOW = np.bool_(True)
+COUNT = 4000
+LARGE = 1.95 / math.sqrt(COUNT)  # distance of Kolmogorov and Smirnov that one in a thousand exceeds
+
+
+def begun(**options: Any) -> Any:
+    task = make_task(ID, options)
+    task.begin(NOW, Shares(*[0.5] * 7))
+    return task
+
+
+def test_a_start_by_hand() -> None:
+    """The quaternion of Shoemake for (1/4, a = 90°, b = 180°), thrown up and along y."""
+    task = make_task(ID, {"goal": (1.0, 2.0, 30.0)})
+    pose = task.begin(NOW, Shares(0.25, 0.75, 1.0, 1.0, 0.8, 0.75, (1.0, 0.5, 0.0)))
+    assert pose.position.tolist() == [1.0, 2.0, 30.0]
+    root = math.sqrt(0.75)
+    assert pose.quaternion == pytest.approx([-0.5, root, 0.0, 0.0], abs=1e-12)
+    assert pose.velocity == pytest.approx([0.0, 2.4, 1.8])  # 3 m/s at a sine of 0.6
+    assert pose.body_rates == pytest.approx([10.0, 0.0, -task.spin[2]])
+
+
+def test_a_slow_turner_spins_slower() -> None:
+    """What the largest torque stops in 0.5 s: of the paper's 100 N at arms of 1 m, 200 N·m."""
+    vehicle, task = Vehicle.load(), make_task(ID, {})
+    assert vehicle.turning((1.0, 0.0, 0.0)) == pytest.approx(200.0 / vehicle.inertia[0, 0])
+    yaw = 200.0 * abs(vehicle.rotors[0].reaction[2]) / vehicle.inertia[2, 2]
+    assert task.spin == pytest.approx([10.0, 10.0, 0.5 * yaw])
+    assert make_task(ID, {"spin": 0.1}).spin.tolist() == [0.1, 0.1, 0.1]
+    tiny = make_task(ID, {"spin": 100.0}, "crazyflie2")
+    assert tiny.spin[:2].tolist() == [100.0, 100.0]
+    assert 25.0 < tiny.spin[2] < 35.0
+
+
+@pytest.fixture(scope="module")
+def starts() -> Any:
+    loop = Loop(ID, COUNT, options={"spin": 5.0})
+    loop.advance(np.zeros((COUNT, 4), np.float32), np.ones(COUNT, bool), list(range(COUNT)))
+    state = loop.world.state
+    arrays = {
+        name: getattr(state, name)[:, 0].copy()
+        for name in ("position", "quaternion", "velocity", "body_rates")
+    }
+    loop.close()
+    return arrays
+
+
+def even(values: np.ndarray, low: float, high: float) -> bool:
+    """Whether values pass for uniform ones."""
+    share = np.sort((values - low) / (high - low))
+    return bool(abs(share - np.linspace(0, 1, COUNT)).max() < LARGE)
+
+
+def test_attitudes_are_uniform(starts: Any) -> None:
+    """Over rotations: the mean matrix is 0, each axis is uniform on the sphere, and the density of
+    the angle θ is (1 - cos θ) / π."""
+    w, x, y, z = starts["quaternion"].T
+    assert np.square(starts["quaternion"]).sum(axis=1) == pytest.approx(1.0)
+    # Fourth moments of a uniform unit quaternion: E[w²] = 1/4, E[w⁴] = 1/8, E[w² x²] = 1/24.
+    assert np.square((w, x, y, z)).mean(axis=1) == pytest.approx(0.25, abs=0.015)
+    assert (w**4).mean() == pytest.approx(1 / 8, abs=0.01)
+    assert (w * w * x * x).mean() == pytest.approx(1 / 24, abs=0.003)
+    pairs = [w * x, w * y, w * z, x * y, y * z, z * x]
+    assert np.mean(pairs, axis=1) == pytest.approx(0.0, abs=0.015)
+    body_x = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+    body_z = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    for cosines in (*body_x, *body_z):
+        assert even(cosines, -1.0, 1.0)
+    angle = 2 * np.arccos(np.minimum(abs(w), 1.0))
+    assert even((angle - np.sin(angle)) / math.pi, 0.0, 1.0)
+
+
+def test_throws_fill_their_ranges(starts: Any) -> None:
+    speed = np.linalg.norm(starts["velocity"], axis=1)
+    assert even(speed, 0.0, 3.0)
+    for axis in range(3):
+        assert even(starts["velocity"][:, axis] / speed, -1.0, 1.0)
+    limits = make_task(ID, {"spin": 5.0}).spin
+    for axis in range(3):
+        assert even(starts["body_rates"][:, axis], -limits[axis], limits[axis])
+    assert (starts["position"] == (0.0, 0.0, 20.0)).all()
+
+
+def test_observation_by_hand() -> None:
+    state = state_of(
+        position=(1.0, -2.0, 15.0), velocity=(1.0, 2.0, -3.0), body_rates=(0.1, 0.2, 0.3),
+        quaternion=about((0, 1, 0), 180.0), thrust=(49.0, 98.0, 0.0, 24.5),
+    )  # fmt: skip
+    seen = begun(frame="world").observe(state)["observation"]
+    expected = [-1, 2, 5, 1, 2, -3, -1, 0, 0, 0, 0, -1, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
+    assert seen == pytest.approx(expected, abs=1e-12)
+
+
+def test_observation_in_the_body_frame_by_hand() -> None:
+    """Turned left by 90° and then rolled by 90°, right side down: body x is world y, body y is
+    world z, and body z is world x."""
+    state = state_of(
+        position=(1.0, -2.0, 15.0), velocity=(1.0, 2.0, -3.0), body_rates=(0.1, 0.2, 0.3),
+        quaternion=(0.5, 0.5, 0.5, 0.5), thrust=(49.0, 98.0, 0.0, 24.5),
+    )  # fmt: skip
+    seen = begun().observe(state)["observation"]
+    expected = [2, 5, -1, 2, -3, 1, 0, 1, 0, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
+    assert seen == pytest.approx(expected, abs=1e-12)
+    (spec,) = make_task(ID, {}).observation
+    assert spec.components[5:8] == ("velocity z", "up x", "up y")
+    assert spec.frame == "body"
+
+
+@pytest.mark.parametrize(
+    ("action", "frame"),
+    [("rotors", "body"), ("rates", "body"), ("attitude", "world"), ("position", "world")],
+)
+def test_the_frame_is_by_default_that_of_the_action(action: str, frame: str) -> None:
+    options = env_spec(ID, {"action": action}).options
+    assert options["frame"] == frame
+    assert env_spec(ID, {"action": action, "frame": "world"}).options["frame"] == "world"
+    with pytest.raises(InputError, match=r"^frame: expected 'body' or 'world', got 'nose'"):
+        env_spec(ID, {"frame": "nose"})
+
+
+PLACE = {"position": (0.0, 0.0, 20.0)}
+
+
+@pytest.mark.parametrize(
+    ("change", "terms", "terminated"),
+    [
+        ({}, {"position": 1.0, "tilt": 0.0, "rates": 0.0, "termination": 0.0}, False),
+        ({"position": (0.6, 0.8, 20.0)}, {"position": 0.0}, False),
+        ({"position": (0.0, 0.0, 17.0)}, {"position": -0.5}, False),
+        ({"quaternion": about((1, 0, 0), 90.0)}, {"tilt": -0.25, "termination": 0.0}, False),
+        ({"quaternion": about((1, 0, 0), 180.0)}, {"tilt": -0.5, "termination": 0.0}, False),
+        ({"body_rates": (3.0, 0.0, 4.0)}, {"rates": -0.1}, False),
+        ({"position": (0.0, 0.0, 5.1)}, {"termination": 0.0}, False),
+        ({"position": (0.0, 0.0, 4.9)}, {"termination": -100.0}, True),
+        ({"touching": True}, {"termination": -100.0}, True),
+    ],
+    ids=str,
+)
+def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:
+    outcome = begun().outcome(state_of(**{**PLACE, **change}))
+    for name, value in terms.items():
+        assert outcome.reward[name] == pytest.approx(value, abs=1e-12)
+    assert outcome.terminated == terminated
+
+
+@pytest.mark.parametrize(
+    ("change", "recovered"),
+    [
+        ({}, True),
+        ({"position": (0.49, 0.0, 20.0)}, True),
+        ({"position": (0.0, 0.51, 20.0)}, False),
+        ({"velocity": (0.0, 0.0, 0.49)}, True),
+        ({"velocity": (0.3, 0.0, 0.41)}, False),
+        ({"quaternion": about((1, 0, 0), 14.9)}, True),
+        ({"quaternion": about((0, 1, 0), 15.1)}, False),
+        ({"quaternion": about((0, 0, 1), 120.0)}, True),  # any heading
+    ],
+    ids=str,
+)
+def test_what_is_recovered(change: dict[str, Any], recovered: bool) -> None:
+    outcome = begun().outcome(state_of(**{**PLACE, **change}))
+    assert outcome.metrics["recovered"] == recovered
+
+
+def test_time_and_height_lost_by_hand() -> None:
+    """Steps of 0.02 s: it is away, back, away again, and then back for good."""
+    task = begun()
+    heights = [19.0, 16.5, 18.0, 19.8, 19.3, 19.7, 20.1, 20.0]
+    told = []
+    for height in heights:
+        state = state_of(position=(0.0, 0.0, height))
+        task.remember(state, NOW)
+        metrics = task.outcome(state).metrics
+        told.append([metrics[name] for name in ("recovered", "recovery_time", "height_lost")])
+    expected = [
+        (0, 0.02, 1.0), (0, 0.04, 3.5), (0, 0.06, 3.5), (1, 0.06, 3.5),
+        (0, 0.10, 3.5), (1, 0.10, 3.5), (1, 0.10, 3.5), (1, 0.10, 3.5),
+    ]  # fmt: skip
+    np.testing.assert_allclose(told, expected, atol=1e-12)
+    task.begin(NOW, Shares(*[0.5] * 7))
+    metrics = task.outcome(state_of(**PLACE)).metrics
+    assert (metrics["recovery_time"], metrics["height_lost"]) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("vehicle", ["paper", "crazyflie2", "heavy_hexa"])
+def test_a_pilot_recovers_and_a_stone_does_not(vehicle: str) -> None:
+    """All of 32 throws, in 8 s, and it loses more height than the bound of each."""
+    craft, n = Vehicle.load(vehicle), 32
+    env: Any = gym.make_vec(
+        ID, num_envs=n, autoreset_mode="Disabled", vehicle=vehicle, frame="world"
+    )
+    env.reset(seed=0)
+    pilot, seen = Pilot(craft), env.observations.astype(float)
+    # What the throws lose at least, by their tilts, climbs and spins about x and y.
+    tilt, spin = np.arccos(np.clip(seen[:, 11], -1, 1)), np.hypot(seen[:, 12], seen[:, 13])
+    turn = 1.01 * math.hypot(*(craft.turning(axis) for axis in np.eye(3)[:2]))
+    lift = float(craft.thrust_high @ craft.allocation[0]) / craft.mass
+    least = least_height_lost(tilt, seen[:, 5], spin, turn, (0.0, lift), craft.gravity)
+    while not env.done.any():
+        offset, speed = env.observations[:, :3].astype(float), env.observations[:, 3:6]
+        wanted = limited(2 * offset - 2.5 * speed, pilot.most)
+        env.advance(pilot.act(env.observations, wanted))
+    assert env.truncated.all()
+    recovered, time, lost, error = env.telemetry["metrics"].T
+    assert recovered.all()
+    assert error.max() < 0.05
+    assert (time < 7.0).all()
+    assert (lost > least).all()
+    assert least.max() > 0.2
+    env.reset(seed=0)
+    while not env.done.all():
+        env.advance(np.full((n, craft.num_rotors), -1.0, np.float32), None, None, env.done)
+    assert env.telemetry["metrics"][:, 2].min() > 10.0
+
+
+def test_least_height_lost_by_hand() -> None:
+    """Upright and falling at 6 m/s, with 5 m/s² to brake: 36 / 10 m."""
+    one = np.ones(1)
+    lost = least_height_lost(0 * one, -6 * one, 0 * one, 40.0, (0.0, 14.8), 9.8)
+    assert lost == pytest.approx([3.6], rel=2e-3)
+    assert least_height_lost(0 * one, one, 0 * one, 40.0, (0.0, 14.8), 9.8).tolist() == [0.0]
+    # Upside down: it falls freely until its tilt is 90°, which takes sqrt(π / a); then the cosine
+    # of the tilt, -cos(a t² / 2), gives an integral of Fresnel; upright it is at sqrt(2π / a).
+    turn, lift, g = 40.0, 19.6, 9.8
+    scale = math.sqrt(math.pi / turn)
+    time = np.linspace(scale, math.sqrt(2) * scale, 20001)
+    gained = -lift * scale * (fresnel(time / scale)[1] - fresnel(1.0)[1])
+    speed = -g * time + gained
+    way = -g * scale**2 / 2 + np.sum((speed[1:] + speed[:-1]) / 2 * np.diff(time))
+    by_hand = -way + speed[-1] ** 2 / (2 * (lift - g))
+    lost = least_height_lost(math.pi * one, 0 * one, 0 * one, turn, (0.0, lift), g)
+    assert lost == pytest.approx([by_hand], rel=5e-3)
+
+
+def test_bounds_of_the_papers_vehicle() -> None:
+    """2 sqrt(θ / a) for the largest torque, over tilts whose cosines are uniform."""
+    bounds = recovery_bounds(RecoveryOptions(), Vehicle.load())
+    cosines = np.linspace(-1, 1, 20001)
+    largest = 200.0 / Vehicle.load().inertia[0, 0]  # two rotors of 100 N at arms of 1 m
+    assert bounds["turn_upright"] == pytest.approx(
+        np.mean(2 * np.sqrt(np.arccos(cosines) / largest)), rel=0.02
+    )
+    assert 0.02 < bounds["height_lost"] < 0.5  # most throws spin the craft upright
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"goal": 5.0}, "goal: expected three numbers"),
+        ({"goal": (0.0, 0.0, 0.9)}, "goal: expected a height of at least 1 m above the ground"),
+        ({"start_speed": -1.0}, "start_speed: expected a number from 0 to 100 m/s, got -1.0"),
+        ({"spin": math.inf}, "spin: expected a number from 0 to 100 rad/s, got inf"),
+        ({"near": 0.0}, "near: expected a number from 0.01 to 1000 m, got 0"),
+        ({"slow": "very"}, "slow: expected a number from 0.01 to 100 m/s, got 'very'"),
+        ({"upright": 91.0}, "upright: expected a number from 0.1 to 90 degrees"),
+        ({"flight_band": 0.5}, "flight_band: expected more than near = 0.5 m, got 0.5"),
+    ],
+)
+def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=f"^{sentence}") as caught:
+        env_spec(ID, options)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,283 @@
+"""Options and arithmetic of the elevation task against values worked out by hand."""
+
+import math
+import re
+from dataclasses import FrozenInstanceError, asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rotorgram.envs.loop import make_task
+from rotorgram.envs.registry import env_spec
+from rotorgram.envs.tasks.elevation import ElevationOptions
+from rotorgram.models.errors import InputError
+from rotorgram.sim import WorldState
+
+ID = "rotorgram/Elevation-v0"
+
+
+def state_of(n: int, **arrays: Any) -> WorldState:
+    """Level craft at rest at 5 m and at hover thrust, but for the arrays that are given."""
+    fields = {
+        "position": np.full((n, 1, 3), (0.0, 0.0, 5.0)),
+        "quaternion": np.full((n, 1, 4), (1.0, 0.0, 0.0, 0.0)),
+        "velocity": np.zeros((n, 1, 3)),
+        "body_rates": np.zeros((n, 1, 3)),
+        "thrust": np.full((n, 1, 4), 49.0),
+        "touching": np.zeros((n, 1), bool),
+    }
+    for name, values in arrays.items():
+        fields[name] = np.asarray(values, fields[name].dtype).reshape(fields[name].shape)
+    return WorldState(**fields, command=fields["thrust"])
+
+
+def task_of(n: int, target: float = 5.0, **options: Any) -> Any:
+    task: Any = make_task(ID, {"target": target, **options}, shape=(n, 1))
+    task.target = np.full((n, 1), target)
+    return task
+
+
+# --- options ----------------------------------------------------------------------------------
+
+
+def test_defaults() -> None:
+    assert asdict(ElevationOptions()) == {
+        "episode_length": 250,
+        "control_period": 0.02,
+        "history": 1,
+        "linear_drag": 0.0,
+        "effects": {},
+        "randomize": {},
+        "sensors": {},
+        "cameras": (),
+        "world": "plain",
+        "target": 5.0,
+        "start_band": 1.0,
+        "flight_band": 3.0,
+        "action": "increment",
+        "action_type": "continuous",
+        "observation": "full",
+        "thrust_scale": None,
+    }
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"target": "57"}, "target: expected an elevation in m, or a pair .*, got '57'"),
+        ({"target": True}, "target: expected an elevation in m, or a pair .*, got True"),
+        ({"target": None}, "target: expected an elevation in m, or a pair .*, got None"),
+        ({"target": math.nan}, "target: expected an elevation in m, or a pair .*, got nan"),
+        ({"target": 10**400}, "target: expected an elevation in m, or a pair .*, got 1000"),
+        ({"target": (6.0, 4.0)}, r"target: .* low <= high, got \(6.0, 4.0\)"),
+        ({"target": (4.0,)}, r"target: .* a pair \(low, high\) .*, got \(4.0,\)"),
+        ({"target": ()}, r"target: .* a pair \(low, high\) .*, got \(\)"),
+        ({"target": (4.0, 5.0, 6.0)}, r"target: .* a pair .*, got \(4.0, 5.0, 6.0\)"),
+        ({"target": (4.0, "x")}, r"target: .* a pair .*, got \(4.0, 'x'\)"),
+        ({"target": 1.9}, r"target: expected 2 m \(start_band = 1 m, and 1 m of room\) .*got 1.9"),
+        ({"target": 2e6}, r"target: expected 2 m .* to 1e\+06 m, got 2000000.0"),
+        ({"start_band": -0.1}, r"start_band: expected a number from 0 to 1e\+06 m, got -0.1"),
+        ({"start_band": False}, r"start_band: expected a number .*, got False"),
+        ({"flight_band": 1.0}, "flight_band: expected more than start_band = 1 m, got 1.0"),
+        ({"flight_band": math.inf}, "flight_band: expected a number from 0 .*, got inf"),
+        ({"flight_band": [3.0]}, r"flight_band: expected a number .*, got \[3.0\]"),
+        (
+            {"episode_length": 0},
+            "episode_length: expected a whole number .* from 1 to 2147483648, got 0",
+        ),
+        ({"episode_length": 2.5}, "episode_length: expected a whole number .*, got 2.5"),
+        ({"episode_length": True}, "episode_length: expected a whole number .*, got True"),
+        ({"episode_length": "250"}, "episode_length: expected a whole number .*, got '250'"),
+        ({"episode_length": math.inf}, "episode_length: expected a whole number .*, got inf"),
+        ({"control_period": 0.0}, "control_period: expected a number from 1e-06 to 1 s, got 0.0"),
+        ({"control_period": 0.005}, "control_period: expected a positive multiple .* 0.01 s, got"),
+        ({"control_period": 0.025}, "control_period: expected a positive multiple .*, got 0.025"),
+        ({"control_period": 1.01}, "control_period: expected a number .* to 1 s, got 1.01"),
+        ({"action": "delta"}, "action: expected 'increment' or 'offset', got 'delta'"),
+        ({"action_type": 3}, "action_type: expected 'continuous' or 'discrete', got 3"),
+        ({"observation": ["full"]}, r"observation: expected 'full' or 'error', got \['full'\]"),
+        ({"thrust_scale": 0}, "thrust_scale: expected a number .*, got 0"),
+        ({"thrust_scale": 101.0}, "thrust_scale: expected at most 100 N, .*, got 101.0"),
+        ({"thrust_scale": "5"}, "thrust_scale: expected a number .*, got '5'"),
+        ({"linear_drag": -1.0}, "linear_drag: expected a number from 0 to 100 /s, got -1.0"),
+        ({"linear_drag": 101.0}, "linear_drag: expected a number from 0 to 100 /s, got 101.0"),
+        ({"linear_drag": 1j}, "linear_drag: expected a number .*, got 1j"),
+        ({"drag": 1.0}, "options: expected some of episode_length, .*thrust_scale, got 'drag'"),
+    ],
+)
+def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=f"^{sentence}") as caught:
+        env_spec(ID, options)
+    assert "\n" not in str(caught.value)
+
+
+def test_numpy_numbers_become_python_numbers() -> None:
+    options = ElevationOptions(
+        target=np.array([4, 6])[0],
+        start_band=np.float32(0.5),  # type: ignore[arg-type]
+        episode_length=np.int64(10),  # type: ignore[arg-type]
+        linear_drag=np.float64(2.0),
+    )
+    assert options == ElevationOptions(target=4, start_band=0.5, episode_length=10, linear_drag=2)
+    kinds = {name: type(value) for name, value in asdict(options).items()}
+    assert kinds["target"] is kinds["start_band"] is kinds["linear_drag"] is float
+    assert kinds["episode_length"] is int
+
+
+def test_a_pair_read_from_json_is_a_tuple() -> None:
+    options = ElevationOptions.from_options({"target": [3, 6.5]})
+    assert options.target == options.target_range == (3.0, 6.5)
+    assert hash(options) == hash(ElevationOptions(target=(3.0, 6.5)))
+
+
+def test_extremes_are_allowed_and_options_do_not_change() -> None:
+    for options in (
+        {"target": 2.0},
+        {"start_band": 0.0, "target": 1.0},
+        {"control_period": 0.01},
+        {"control_period": 1},
+        {"episode_length": 250.0},
+        {"thrust_scale": 100},
+        {"target": 1e6},
+    ):
+        env_spec(ID, options)
+    with pytest.raises(FrozenInstanceError):
+        ElevationOptions().target = 3.0  # type: ignore[misc]
+
+
+# --- bounds -----------------------------------------------------------------------------------
+
+
+def test_bounds_by_hand() -> None:
+    # 2 * 10.2 * 6 = 122.4; half a period at 10.2 m/s2: 0.102, squared 0.010404.
+    # sqrt(122.410404) = 11.06392354; one period more: + 0.204.
+    low, high = env_spec(ID).observation[0].bounds()
+    np.testing.assert_allclose(high, [3.2253585, 11.267928, 100 / 49 - 1], rtol=1e-6)
+    np.testing.assert_allclose(low, [-3.2253585, -11.267928, -1.0], rtol=1e-6)
+
+
+def test_float32_bounds_lie_outside_the_float64_ones() -> None:
+    for band in np.linspace(1.1, 40.0, 50).tolist():
+        task = task_of(1, flight_band=band)
+        low, high = task.observation[0].bounds()
+        assert (high.astype(np.float32) == high).all()
+        assert (high > (task.error_bound, task.rate_bound, 51 / 49)).all()
+        assert low[2] < -1
+        assert (low[:2] == -high[:2]).all()
+
+
+# --- arithmetic -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "cases"),
+    [
+        (
+            {},
+            # (present thrust, action, next thrust)
+            [
+                (49.0, 0.0, 49.0),
+                (49.0, 1.0, 54.0),
+                (49.0, -0.5, 46.5),
+                (49.0, 7.0, 54.0),  # an action counts as 1 at most
+                (95.0, 1.0, 100.0),
+                (96.0, 1.0, 100.0),
+                (4.0, -1.0, 0.0),
+            ],
+        ),
+        (
+            {"action": "offset"},
+            # the present thrust does not count
+            [(90.0, 0.0, 49.0), (90.0, 1.0, 69.0), (0.0, -0.5, 39.0), (49.0, -9.0, 29.0)],
+        ),
+        (
+            {"action": "offset", "thrust_scale": 100.0},
+            [(49.0, 1.0, 100.0), (49.0, -0.5, 0.0), (49.0, 0.5, 99.0)],
+        ),
+        ({"action_type": "discrete"}, [(49.0, 0, 44.0), (49.0, 1, 49.0), (49.0, 2, 54.0)]),
+        ({"thrust_scale": 7.0}, [(49.0, 1.0, 56.0)]),
+    ],
+    ids=str,
+)
+def test_thrust(options: dict[str, Any], cases: list[tuple[float, float, float]]) -> None:
+    present, actions, expected = (np.array(column) for column in zip(*cases, strict=True))
+    state = state_of(len(cases), thrust=np.repeat(present, 4))
+    thrust = task_of(len(cases), **options).controller.thrust(
+        actions.astype(float).reshape(-1, 1, 1), state
+    )
+    assert np.broadcast_to(thrust, (len(cases), 1, 4)).tolist() == [[[f] * 4] for f in expected]
+
+
+@pytest.mark.parametrize(
+    ("error", "reward"),
+    [(0.0, 1.0), (0.5, 0.0), (-0.5, 0.0), (1.5, -0.5), (-1.5, -0.5), (0.125, 0.6), (2.0, -0.6)],
+)
+def test_reward(error: float, reward: float) -> None:
+    state = state_of(2, position=[[0, 0, 5.0 - error]] * 2, touching=[False, True])
+    outcome = task_of(2).outcome(state)
+    assert outcome.reward["elevation"].ravel() == pytest.approx(reward)
+    assert outcome.reward["termination"].ravel().tolist() == [0.0, -20.0]
+    assert outcome.metrics["elevation_error"].ravel() == pytest.approx(error)
+
+
+@given(st.floats(-100, 100), st.floats(-100, 100))
+def test_reward_falls_with_distance_and_is_bounded(a: float, b: float) -> None:
+    near, far = sorted((a, b), key=abs)
+    task = task_of(2, target=1000.0)
+    state = state_of(2, position=[[0, 0, 1000.0 - near], [0, 0, 1000.0 - far]])
+    first, second = task.outcome(state).reward["elevation"].ravel()
+    assert -1 < second <= first <= 1
+
+
+def test_ends_by_hand() -> None:
+    half = [math.radians(degrees) / 2 for degrees in (0, 0, 0, 59.9, 60.1, 180, 0)]
+    state = state_of(
+        7,
+        position=[[0, 0, z] for z in (2.0, 1.999, 8.1, 5, 5, 5, 5)],
+        quaternion=[[math.cos(h), 0.6 * math.sin(h), 0.8 * math.sin(h), 0] for h in half],
+        touching=[False] * 6 + [True],
+    )
+    ended = task_of(7).outcome(state).terminated.ravel().tolist()
+    assert ended == [False, True, True, False, True, True, True]
+
+
+def test_observation_by_hand() -> None:
+    state = state_of(1, position=[0, 0, 4.25], velocity=[1, 2, -0.5], thrust=[73.5] * 4)
+    assert task_of(1).observe(state)["observation"].tolist() == [[[0.75, 0.5, 0.5]]]
+    assert task_of(1, observation="error").observe(state)["observation"].tolist() == [[[0.75]]]
+
+
+# --- the page ---------------------------------------------------------------------------------
+
+
+def test_the_page_tells_the_metrics_of_both_tasks() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "task.md").read_text()
+    rows = [line for line in page.splitlines() if re.match(r"\| `\w+-v0` \| `\w+_error`", line)]
+    told = []
+    for env_id in (ID, "rotorgram/Hover-v0"):
+        for metric in env_spec(env_id).metrics:
+            bounds = [f"{x:g}" if x else "" for x in (metric.settled, metric.held)]
+            told.append((env_id.split("/")[1], metric.name, metric.unit, *bounds))
+    cells = [[cell.strip(" `") for cell in row.strip("| ").split("|")] for row in rows]
+    assert [
+        (task, metric.split("`")[0], unit, settled, held)
+        for task, metric, unit, settled, held in ([*row, ""][:5] for row in cells)
+    ] == told
+
+
+def test_the_page_and_the_class_tell_the_same_numbers() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "task.md").read_text()
+    options = ElevationOptions()
+    for sentence in (
+        f"| {options.target:g} m, or drawn from (low, high)",
+        f"uniform within {options.start_band:g} m of the target",
+        f"| {options.flight_band:g} m about the target",
+        f"| {options.control_period:g} s |",
+        f"| {options.episode_length} steps, 5 s |",
+        "(s − \\|E\\|) / (s + \\|E\\|), s = 0.5 m",
+        "5 N per unit and step; 20 N as an offset",
+    ):
+        assert sentence in page

@@ -1,0 +1,67 @@
+"""docs/tasks.md says what the tasks are and what their bounds compute."""
+
+import re
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+import rotorgram.envs  # noqa: F401
+from rotorgram.envs.registry import env_spec, task_type
+from rotorgram.envs.tasks.racing import RacingOptions
+from rotorgram.envs.tasks.recovery import RecoveryOptions
+from rotorgram.envs.tasks.tracking import Tracking, TrackingOptions
+from rotorgram.envs.tasks.waypoints import WaypointsOptions
+from rotorgram.models import Vehicle
+from rotorgram.training.bounds import (
+    landing_time,
+    payload_time,
+    racing_time,
+    recovery_bounds,
+    waypoints_time,
+)
+
+PAGE = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text(encoding="utf-8")
+ROWS = re.findall(r"^\| `([\w-]+)` \| .* \| `(\w+)` \| ([\dR+ ]+) \|", PAGE, re.MULTILINE)
+TASKS = sorted(name for name in gym.registry if name.startswith("rotorgram/"))
+
+
+def test_the_table_has_every_task() -> None:
+    assert sorted(f"rotorgram/{name}" for name, *_ in ROWS) == TASKS
+
+
+@pytest.mark.parametrize(("name", "headline", "size"), ROWS, ids=[row[0] for row in ROWS])
+@pytest.mark.parametrize("vehicle", [None, "heavy_hexa"])
+def test_headline_and_size(name: str, headline: str, size: str, vehicle: str | None) -> None:
+    drones = 2 if name == "Cable-v0" else 1
+    spec = env_spec(f"rotorgram/{name}", vehicle=vehicle, drones=drones)
+    assert spec.headline is not None
+    assert spec.headline.name == headline
+    number, *rotors = size.split(" + ")
+    count = int(number) + (Vehicle.load(vehicle).num_rotors if rotors == ["R"] else 0)
+    assert spec.observation[0].shape == (count,)
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_the_docstring_is_a_specification(env_id: str) -> None:
+    text = task_type(env_id).__doc__ or ""
+    for title in ("Observation", "Action", "Reward", "Start, termination, truncation"):
+        assert f"## {title}" in text
+    assert "Terminated" in text
+    assert "Truncated" in text
+
+
+def test_the_bounds_are_those_that_are_computed() -> None:
+    paper = Vehicle.load()
+    recovery = recovery_bounds(RecoveryOptions(), paper)
+    for number, unit in (
+        (waypoints_time(WaypointsOptions(), paper), "s"),
+        (Tracking(TrackingOptions(), paper).quickest, "s"),
+        (Tracking(TrackingOptions(trajectory="lemniscate"), paper).quickest, "s"),
+        (racing_time(RacingOptions(), paper), "s"),
+        (racing_time(RacingOptions(track="dive"), paper), "s"),
+        (landing_time(4.0, 1.0, paper), "s"),
+        (recovery["turn_upright"], "s"),
+        (recovery["height_lost"], "m"),
+        (payload_time(1.0, 0.1, paper), "s"),
+    ):
+        assert f" {number:.2f} {unit} " in PAGE.replace("\n", " ")

@@ -1,0 +1,230 @@
+"""The tracking task against values worked out by hand; a pilot flies every trajectory."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from pilot import Pilot, limited
+from rotorgram.envs.loop import make_task
+from rotorgram.envs.tasks.tracking import snap_basis
+from rotorgram.models import Vehicle
+from rotorgram.models.errors import InputError
+
+from flights import Shares, about, state_of
+
+ID = "rotorgram/Tracking-v0"
+NOW = np.bool_(True)
+HALF = (0.5, 0.5, 0.5)
+
+
+def begun(share: float = 0.0, **options: Any) -> Any:
+    task = make_task(ID, {"trajectory": "circle", "preview": 1, **options})
+    task.begin(NOW, Shares(share, HALF))
+    return task
+
+
+def test_a_circle_by_hand() -> None:
+    """2 m in 10 s: after a quarter it is at the top, as fast as 2 π 2 m / 10 s."""
+    task = make_task(ID, {"center": (1.0, 2.0, 6.0)})
+    pose = task.begin(NOW, Shares(0.25, (1.0, 0.5, 0.5)))
+    assert pose.position == pytest.approx([1.3, 4.0, 6.0], abs=1e-9)  # 0.3 m aside
+    assert pose.velocity == pytest.approx([-0.4 * math.pi, 0.0, 0.0], abs=1e-9)
+    for _ in range(125):  # another quarter
+        task.remember(state_of(), NOW)
+    assert task.goal(state_of()) == pytest.approx([-1.0, 2.0, 6.0])
+    for _ in range(375):  # and round
+        task.remember(state_of(), NOW)
+    assert task.goal(state_of()) == pytest.approx([1.0, 4.0, 6.0])
+
+
+def test_a_lemniscate_by_hand() -> None:
+    """At 45° of φ: (cos φ, sin φ cos φ) / (1 + sin² φ) = (√2 / 3, 1 / 3)."""
+    task = begun(0.125, trajectory="lemniscate", radius=3.0, period=20.0)
+    assert task.goal(state_of()) == pytest.approx([math.sqrt(2), 1.0, 5.0])
+    table, step = task._table, 0.02
+    assert task._rates[1:-1] == pytest.approx((table[2:] - table[:-2]) / (2 * step), abs=1e-4)
+
+
+def test_observation_by_hand() -> None:
+    task = begun(preview_time=5.0)  # half a round later
+    state = state_of(position=(1.0, 0.5, 4.0), velocity=(1.0, 2.0, 3.0))
+    seen = task.observe(state)["observation"]
+    expected = [1, -0.5, 1, 1, 2, 3, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0]
+    assert seen == pytest.approx([*expected, 0, 0.4 * math.pi, 0, -3, -0.5, 1], abs=1e-9)
+    (spec,) = task.observation
+    assert spec.components[:3] == ("goal - position x", "goal - position y", "goal - position z")
+    assert spec.components[-1] == "reference 5 s later - position z"
+
+
+def test_reward_and_metrics_by_hand() -> None:
+    outcome = begun().outcome(state_of(position=(2.0, 1.5, 5.0), body_rates=(3.0, 0.0, 4.0)))
+    assert outcome.reward["position"] == pytest.approx(-0.5)
+    assert outcome.reward["rates"] == pytest.approx(-0.1)
+    assert outcome.metrics["tracking_error"] == pytest.approx(1.5)
+    assert outcome.metrics["reference_speed"] == pytest.approx(0.4 * math.pi)
+    assert not outcome.terminated
+
+
+@pytest.mark.parametrize(
+    ("state", "ends"),
+    [
+        ({"position": (4.99, 0.0, 5.0)}, False),
+        ({"position": (5.01, 0.0, 5.0)}, True),
+        ({"touching": True}, True),
+        ({"quaternion": about((1, 0, 0), 89.0)}, False),
+        ({"quaternion": about((1, 0, 0), 91.0)}, True),
+    ],
+)
+def test_ends(state: dict[str, Any], ends: bool) -> None:
+    outcome = begun().outcome(state_of(**{"position": (2.0, 0.0, 5.0), **state}))
+    assert bool(outcome.terminated) == ends
+    assert outcome.reward["termination"] == (-20.0 if ends else 0.0)
+
+
+def test_minimum_snap_from_rest_to_rest() -> None:
+    """Between two points it is 35 τ⁴ - 84 τ⁵ + 70 τ⁶ - 20 τ⁷; half of the way at half the time."""
+    times = np.linspace(0.0, 1.0, 11)
+    share = 35 * times**4 - 84 * times**5 + 70 * times**6 - 20 * times**7
+    assert snap_basis(2, times) == pytest.approx(np.column_stack((1 - share, share)), abs=1e-9)
+    rate = 140 * times**3 - 420 * times**4 + 420 * times**5 - 140 * times**6
+    assert snap_basis(2, times, 1)[:, 1] == pytest.approx(rate, abs=1e-8)
+
+
+@pytest.mark.parametrize("points", [3, 5, 16])
+def test_minimum_snap_through_points(points: int) -> None:
+    knots = np.linspace(0.0, 1.0, points)
+    assert snap_basis(points, knots) == pytest.approx(np.eye(points), abs=1e-6)
+    ends = np.array([0.0, 1.0])
+    for order in (1, 2, 3):
+        assert np.abs(snap_basis(points, ends, order)).max() < 1e-4 * points**order
+    # Six derivatives are continuous, and points on a line of any place add up to 1.
+    inner, little = knots[1:-1], 1e-9
+    for order in range(7):
+        before, after = (snap_basis(points, inner + side, order) for side in (-little, little))
+        assert before == pytest.approx(after, abs=1e-4 * points ** (order + 1))
+    assert snap_basis(points, np.linspace(0, 1, 37)).sum(axis=1) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_nothing_snaps_less() -> None:
+    """The integral of the squared snap grows with any change that keeps points and ends."""
+    times = np.linspace(0.0, 1.0, 2001)
+    points = np.array([0.0, 1.0, -0.5])
+    snap = snap_basis(3, times, 4) @ points
+    # A bump that is 0 at 0, 1/2 and 1 with four derivatives at the ends: (τ (1 - τ))⁵ (τ - 1/2).
+    bump = np.polynomial.Polynomial([0, 1, -1]) ** 5 * np.polynomial.Polynomial([-0.5, 1])
+    change = bump.deriv(4)(times)
+    sizes = (np.trapezoid(values**2, times) for values in (snap, change))
+    assert abs(np.trapezoid(snap * change, times)) < 1e-4 * math.sqrt(math.prod(sizes))
+
+
+def test_a_snap_by_hand() -> None:
+    """Two points, 8 s: in the middle after 4 s; at its end it stays."""
+    task = make_task(ID, {"trajectory": "snap", "points": 2, "period": 8.0})
+    pose = task.begin(NOW, Shares(0.0, (0.0, 0.5, 0.5), (1.0, 1.0, 1.0), HALF))
+    assert pose.position == pytest.approx([-2.0, 0.0, 5.0])
+    assert pose.velocity == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
+    for steps, place in ((200, (0.0, 1.0, 5.5)), (200, (2.0, 2.0, 6.0)), (100, (2.0, 2.0, 6.0))):
+        for _ in range(steps):
+            task.remember(state_of(), NOW)
+        assert task.goal(state_of()) == pytest.approx(place, abs=1e-6)
+
+
+def test_a_file_without_a_column_is_told_its_name(tmp_path: Path) -> None:
+    file = tmp_path / "mine.csv"
+    file.write_text("0,0,0,5\n1,1,0,5\n")
+    with pytest.raises(InputError, match=r"with columns t, x, y, z, got .*: no column 't'$"):
+        make_task(ID, {"trajectory": str(file)})
+
+
+def test_a_file_crosses_the_wire(tmp_path: Path) -> None:
+    file = tmp_path / "mine.csv"
+    file.write_text("t,x,y,z\n1.0,0,0,5\n2.0,1,0,5\n4.0,1,2,6\n")
+    task = make_task(ID, {"trajectory": str(file)})
+    told = task.options.to_options()["trajectory"]
+    file.unlink()
+    task = make_task(ID, {"trajectory": told})
+    assert task.options.trajectory == told
+    pose = task.begin(NOW, Shares(0.0, HALF))
+    assert pose.position.tolist() == [0.0, 0.0, 5.0]
+    assert pose.velocity == pytest.approx([1.0, 0.0, 0.0])
+    for steps, place in ((25, (0.5, 0.0, 5.0)), (75, (1.0, 1.0, 5.5)), (200, (1.0, 2.0, 6.0))):
+        for _ in range(steps):
+            task.remember(state_of(), NOW)
+        assert task.goal(state_of()) == pytest.approx(place)
+
+
+def test_the_quickest_circle() -> None:
+    """400 N on 20 kg leave √(20² - 9.8²) m/s² aside; a circle of 2 m in T needs 2 (2 π / T)²."""
+    quickest = 2 * math.pi * math.sqrt(2.0 / math.sqrt(20.0**2 - 9.8**2))
+    assert make_task(ID, {}).quickest == pytest.approx(quickest, rel=1e-3)
+    make_task(ID, {"period": 1.01 * quickest})
+    with pytest.raises(InputError, match=r"period: expected at least 2\.12"):
+        make_task(ID, {"period": 0.96 * quickest})
+
+
+def test_a_snap_that_the_rotors_cannot_fly() -> None:
+    """From corner to corner: 4 m aside, twice, and 2 m up. 35 τ⁴ - 84 τ⁵ + … bends by 7.513.
+
+    With q = 7.513 / T² the thrust is 20 kg · √(2 (4 m q)² + (2 m q + 9.8 m/s²)²): 400 N at
+    q = 2.412 /s², T = 1.765 s.
+    """
+    make_task(ID, {"trajectory": "snap", "points": 2, "period": 1.78})
+    with pytest.raises(InputError, match=r"trajectory: expected 0 to 400 N of thrust, which the "):
+        make_task(ID, {"trajectory": "snap", "points": 2, "period": 1.75})
+
+
+def test_a_file_that_the_rotors_cannot_fly() -> None:
+    """At rest for 0.5 s, then up at 20 m/s: 20 kg · (40 + 9.8) m/s² = 996 N between."""
+    with pytest.raises(InputError) as error:
+        make_task(ID, {"trajectory": "[[0,0,0,5],[0.5,0,0,5],[1,0,0,15],[1.5,0,0,25]]"})
+    thrust = "trajectory: expected 0 to 400 N of thrust, which the vehicle has, got 996 at 0.5 s"
+    assert str(error.value) == thrust
+    # 9.8 m/s² along x, and 0.1 s later against it twice: the thrust turns by 90° in 0.1 s.
+    rows = [[0.1 * k, x, 0, 5] for k, x in enumerate((0.0, 0.0, 0.098, 0.098, 0.0))]
+    with pytest.raises(InputError) as error:
+        make_task(ID, {"trajectory": json.dumps(rows)})
+    rate = "trajectory: expected 0 to 11.07 rad/s of tilt rate, which the vehicle has, got 15.71 at"
+    assert str(error.value).startswith(rate)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"trajectory": "spiral"}, "trajectory: expected circle, lemniscate, snap, or a CSV file"),
+        ({"trajectory": "[[0,1,2]]"}, "trajectory: expected 2 to 20000 rows of t, x, y, z, got"),
+        ({"trajectory": "[[0,0,0,5],[0,1,0,5]]"}, "trajectory: expected times that rise"),
+        ({"trajectory": "[[0,0,0,5],[1,1e9,0,5]]"}, "trajectory: expected coordinates up to"),
+        ({"trajectory": '[["a"]]'}, "trajectory: expected circle, lemniscate, snap"),
+        ({"center": (0.0, 0.0, 1.2)}, "trajectory: expected a height of at least 1.3 m above"),
+        ({"points": 1}, "points: expected a whole number from 2 to 16, got 1"),
+        ({"preview": -1}, "preview: expected a whole number from 0 to 20, got -1"),
+        ({"period": 0.0}, "period: expected a number from 0.1 to 10000 s, got 0.0"),
+    ],
+)
+def test_wrong_options(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError) as error:
+        make_task(ID, options)
+    assert str(error.value).startswith(sentence)
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "name"),
+    [("circle", None), ("lemniscate", None), ("snap", None), ("lemniscate", "crazyflie2")],
+)
+def test_a_pilot_flies_it(trajectory: str, name: str | None) -> None:
+    vehicle = Vehicle.load(name)
+    env = gym.make_vec(ID, 4, vehicle=name, autoreset_mode="Disabled", trajectory=trajectory)
+    pilot, first = Pilot(vehicle), 15 + vehicle.num_rotors
+    seen, _ = env.reset(seed=3)
+    errors = []
+    for _ in range(599):
+        state = seen.astype(float)
+        wanted = limited(2.0 * state[:, :3], 2.0) + state[:, first : first + 3] - state[:, 3:6]
+        seen, *_ = env.step(pilot.act(seen, 3.0 * wanted))
+        errors.append(env.telemetry["metrics"][:, 0])  # type: ignore[attr-defined]
+        assert not env.terminated.any()  # type: ignore[attr-defined]
+    assert np.max(errors[-150:]) < 0.8  # without feed-forward of the acceleration

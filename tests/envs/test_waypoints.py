@@ -1,0 +1,141 @@
+"""The waypoints task against values worked out by hand; a pilot flies it."""
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from pilot import Pilot, limited
+from rotorgram.envs.loop import make_task
+from rotorgram.models import Vehicle
+from rotorgram.models.errors import InputError
+
+from flights import Shares, about, state_of
+
+ID = "rotorgram/Waypoints-v0"
+NOW = np.bool_(True)
+
+
+def begun(*places: tuple[float, float, float], **options: Any) -> Any:
+    """A task whose start and points lie at these shares of the box from one side to the other."""
+    task = make_task(ID, {"points": len(places) - 1, **options})
+    task.begin(NOW, Shares(*places))
+    return task
+
+
+def moved(task: Any, *position: float, **rest: Any) -> Any:
+    state = state_of(position=position, **rest)
+    task.remember(state, NOW)
+    return task.outcome(state)
+
+
+MIDDLE, EAST, ABOVE = (0.5, 0.5, 0.5), (1.0, 0.5, 0.5), (1.0, 0.5, 1.0)
+
+
+def test_starts_and_points_by_hand() -> None:
+    task = make_task(ID, {"points": 2, "center": (1.0, 2.0, 6.0), "box": (2.0, 4.0, 1.0)})
+    pose = task.begin(NOW, Shares((0.0, 0.5, 1.0), EAST, MIDDLE))
+    assert pose.position.tolist() == [-1.0, 2.0, 7.0]
+    assert pose.quaternion is None
+    assert task.goal(state_of()).tolist() == [3.0, 2.0, 6.0]
+
+
+def test_observation_by_hand() -> None:
+    task = begun(MIDDLE, EAST, ABOVE)  # at (0, 0, 5), to (3, 0, 5) and (3, 0, 6.5)
+    state = state_of(position=(1.0, -1.0, 4.0), velocity=(1.0, 2.0, 3.0))
+    seen = task.observe(state)["observation"]
+    expected = [2, 1, 1, 1, 2, 3, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 2, 1, 2.5]
+    assert seen == pytest.approx(expected)
+    (spec,) = task.observation
+    assert spec.components[:3] == ("goal - position x", "goal - position y", "goal - position z")
+    assert spec.components[-1] == "point after - position z"
+    assert spec.bounds()[1][0] == pytest.approx(2 * math.hypot(6.0, 6.0, 4.5))
+    moved(task, 3.0, 0.0, 5.0)  # the last point is also the one after it
+    seen = task.observe(state_of(position=(3.0, 0.0, 6.0)))["observation"]
+    assert seen[[0, 1, 2, -3, -2, -1]] == pytest.approx([0, 0, 0.5, 0, 0, 0.5])
+
+
+def test_progress_and_passing_by_hand() -> None:
+    task = begun(MIDDLE, EAST, ABOVE, radius=0.5)
+    outcome = moved(task, 1.0, 0.0, 5.0, body_rates=(3.0, 0.0, 4.0))
+    assert {name: float(value) for name, value in outcome.reward.items()} == pytest.approx(
+        {"progress": 1.0, "passing": 0.0, "rates": -0.01, "termination": 0.0}
+    )
+    assert moved(task, 0.5, 0.0, 5.0).reward["progress"] == pytest.approx(-0.5)
+    assert moved(task, 2.5, 0.0, 5.0).metrics["points_left"] == 2  # 0.5 m away is not nearer
+    outcome = moved(task, 2.6, 0.0, 5.0)
+    assert outcome.reward["progress"] == pytest.approx(0.1)
+    assert outcome.reward["passing"] == 1.0
+    assert outcome.metrics["points_left"] == 1
+    assert outcome.metrics["flight_time"] == pytest.approx(0.08)
+    assert not outcome.terminated
+    # The way to the next point counts from here: to (3, 0, 6.5) it was hypot(0.4, 1.5).
+    outcome = moved(task, 3.0, 0.0, 6.4)
+    assert outcome.reward["progress"] == pytest.approx(math.hypot(0.4, 1.5) - 0.1)
+    assert outcome.metrics["points_left"] == 0
+    assert outcome.terminated
+    assert outcome.reward["termination"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("place", "rest", "ends"),
+    [
+        ((5.99, 0.0, 5.0), {}, False),
+        ((6.01, 0.0, 5.0), {}, True),
+        ((0.0, -6.01, 5.0), {}, True),
+        ((0.0, 0.0, 9.49), {}, False),
+        ((0.0, 0.0, 9.51), {}, True),
+        ((0.0, 0.0, 5.0), {"touching": True}, True),
+        ((0.0, 0.0, 5.0), {"quaternion": about((1, 0, 0), 89.0)}, False),
+        ((0.0, 0.0, 5.0), {"quaternion": about((1, 0, 0), 91.0)}, True),
+    ],
+)
+def test_ends(place: tuple[float, float, float], rest: dict[str, Any], ends: bool) -> None:
+    task = begun(MIDDLE, (0.0, 0.0, 0.0), ABOVE)
+    outcome = moved(task, *place, **rest)
+    assert bool(outcome.terminated) == ends
+    assert outcome.reward["termination"] == (-5.0 if ends else 0.0)
+
+
+def test_points_of_others_stay() -> None:
+    """A batch in which one drone begins again."""
+    task = make_task(ID, {"points": 1}, shape=(2, 1))
+    both, first = np.ones((2, 1), bool), np.array([[True], [False]])
+    place = np.full((2, 1, 3), 0.5)
+    task.begin(both, Shares(place, place + 0.5))
+    task.begin(first, Shares(place, place))
+    goals = task.goal(state_of(position=np.zeros((2, 1, 3))))
+    assert goals.tolist() == [[[0.0, 0.0, 5.0]], [[3.0, 3.0, 6.5]]]
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"points": 0}, "points: expected a whole number from 1 to 64, got 0"),
+        ({"points": 1.5}, "points: expected a whole number from 1 to 64, got 1.5"),
+        ({"box": (1.0, -1.0, 1.0)}, "box: expected three numbers of 0 m or more, got"),
+        ({"center": (0.0, 0.0, 2.0)}, "center: expected a height of at least 2.5 m above"),
+        ({"radius": 0.0}, "radius: expected a number from 0.001 to 10000 m, got 0.0"),
+        ({"margin": "wide"}, "margin: expected a number from 0.1 to 10000 m, got 'wide'"),
+    ],
+)
+def test_wrong_options(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence.replace("(", r"\(")):
+        make_task(ID, options)
+
+
+@pytest.mark.parametrize("name", [None, "crazyflie2"])
+def test_a_pilot_flies_it(name: str | None) -> None:
+    vehicle = Vehicle.load(name)
+    env = gym.make_vec(ID, 8, vehicle=name, autoreset_mode="Disabled")
+    pilot, done = Pilot(vehicle), np.zeros(8, bool)
+    seen, _ = env.reset(seed=3)
+    for _ in range(749):
+        wanted = limited(2.0 * seen[:, :3].astype(float), 2.0) - seen[:, 3:6]
+        env.advance(pilot.act(seen, 2.0 * wanted), None, None, done)  # type: ignore[attr-defined]
+        seen = env.observations  # type: ignore[attr-defined]
+        done = done | env.terminated  # type: ignore[attr-defined]
+    left, time = env.telemetry["metrics"].T  # type: ignore[attr-defined]
+    assert left.tolist() == [0.0] * 8
+    assert time.max() < 15.0

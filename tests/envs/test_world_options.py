@@ -1,0 +1,214 @@
+"""Effects, drawn parameters and delays as options of every task: in process, in a batch, by UDP."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+import rotorgram.envs  # noqa: F401
+from rotorgram.cli import main
+from rotorgram.envs.delay import Delay
+from rotorgram.envs.registry import env_spec
+from rotorgram.models.errors import InputError
+from rotorgram.training.pairs import socket_pair
+
+RACER = Path(__file__).parents[1] / "data" / "racer.xml"
+ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+WORLD: dict[str, Any] = {
+    "effects": {"motor_lag": True, "body_drag": True, "wind": [0.5, 0.0, 0.0], "gusts": 2.0},
+    "randomize": {
+        "mass": "uniform(0.9, 1.1)",
+        "wind_y": "normal(0, 0.5)",
+        "action_delay": "choice(0, 1, 2)",
+        "observation_delay": 1,
+    },
+}
+
+
+def actions(steps: int, rotors: int = 4) -> np.ndarray:
+    return np.random.default_rng(5).uniform(-0.1, 0.1, (steps, rotors)).astype(np.float32)
+
+
+def flight(env: Any, seed: int, steps: int = 30) -> list[np.ndarray]:
+    """Observations of a reset and some steps."""
+    seen = [env.reset(seed=seed)[0]]
+    seen += [env.step(action)[0] for action in actions(steps)]
+    env.close()
+    return seen
+
+
+def test_a_delay_gives_what_was_pushed_so_many_steps_ago() -> None:
+    delay, everybody = Delay(2, np), np.ones((3, 1), bool)
+    delay.begin(everybody, np.full((3, 1), -1.0))
+    age = np.array([[0], [1], [2]])
+    given = []
+    for step in range(4):
+        delay.push(None, np.full((3, 1), float(step)))
+        given.append(delay.get(age)[:, 0].tolist())
+    assert given == [[0, -1, -1], [1, 0, -1], [2, 1, 0], [3, 2, 1]]
+    delay.push(np.array([[True], [False], [False]]), np.full((3, 1), 9.0))
+    assert delay.get(age)[:, 0].tolist() == [9, 2, 1]  # a frozen drone's past does not move
+
+
+@pytest.mark.parametrize("late", [1, 3])
+def test_a_late_action_acts_as_one_that_was_given_later(late: int) -> None:
+    given = actions(10)
+    plain = gym.make(HOVER, vehicle=str(RACER))
+    delayed = gym.make(HOVER, vehicle=str(RACER), randomize={"action_delay": late})
+    plain.reset(seed=2)
+    delayed.reset(seed=2)
+    waited = [np.zeros(4, np.float32)] * late + list(given)
+    for now, then in zip(given, waited, strict=False):
+        ours, theirs = delayed.step(now), plain.step(then)
+        assert (ours[0] == theirs[0]).all()
+        assert ours[1] == theirs[1]
+
+
+def test_a_late_action_is_held_where_it_is_one_of_choices() -> None:
+    options = {"action_type": "discrete", "randomize": {"action_delay": 2}}
+    env = gym.make(ELEVATION, **options)
+    env.reset(seed=0)
+    thrusts = [env.step(2)[4]["F1"] for _ in range(4)]
+    assert thrusts == [49.0, 49.0, 54.0, 59.0]
+
+
+def test_a_late_observation_is_that_of_an_earlier_step() -> None:
+    plain = flight(gym.make(HOVER, vehicle=str(RACER)), 2)
+    late = flight(gym.make(HOVER, vehicle=str(RACER), randomize={"observation_delay": 2}), 2)
+    for step, observation in enumerate(late):
+        assert (observation == plain[max(0, step - 2)]).all()
+
+
+def test_reward_and_end_are_never_late() -> None:
+    plain = gym.make(ELEVATION, episode_length=3)
+    late = gym.make(ELEVATION, episode_length=3, randomize={"observation_delay": 5})
+    plain.reset(seed=1)
+    late.reset(seed=1)
+    for _ in range(3):
+        assert plain.step(np.ones(1, np.float32))[1:4] == late.step(np.ones(1, np.float32))[1:4]
+
+
+@pytest.mark.parametrize("env_id", [ELEVATION, HOVER])
+def test_a_batch_equals_single_envs(env_id: str) -> None:
+    batch = gym.make_vec(env_id, num_envs=3, vehicle=str(RACER), **WORLD)
+    width = batch.single_action_space.shape[0]
+    given = actions(40, width)
+    seen, info = batch.reset(seed=7)
+    rows = [batch.step(np.tile(action, (3, 1)))[0] for action in given]
+    for index in range(3):
+        env = gym.make(env_id, vehicle=str(RACER), **WORLD)
+        alone, told = env.reset(seed=7 + index)
+        assert (alone == seen[index]).all()
+        assert told["drawn_mass"] == info["drawn_mass"][index]
+        for row, action in zip(rows, given, strict=True):
+            assert (env.step(action)[0] == row[index]).all()
+    batch.close()
+
+
+def test_over_udp_the_same_bits_and_what_was_drawn() -> None:
+    here = gym.make(HOVER, vehicle=str(RACER), **WORLD)
+    with socket_pair(HOVER, WORLD, vehicle=str(RACER)) as remote:
+        ours, theirs = here.reset(seed=4), remote.reset(seed=4)
+        assert (ours[0] == theirs[0]).all()
+        for name in ("drawn_mass", "drawn_wind_y", "drawn_action_delay"):
+            assert ours[1][name] == theirs[1][name]
+        for action in actions(20):
+            assert (here.step(action)[0] == remote.step(action)[0]).all()
+
+
+def test_options_that_are_on_move_no_other_draw() -> None:
+    plain = gym.make(HOVER, vehicle=str(RACER)).reset(seed=3)[1]
+    changed = gym.make(HOVER, vehicle=str(RACER), **WORLD).reset(seed=3)[1]
+    assert [plain[axis] for axis in "XYZ"] == [changed[axis] for axis in "XYZ"]
+
+
+def test_without_them_nothing_is_told_of_them() -> None:
+    spec = env_spec(HOVER)
+    assert "effects" not in spec.options
+    assert "randomize" not in spec.options
+    assert "drawn" not in [array.name for array in spec.telemetry]
+    told = env_spec(HOVER, WORLD, str(RACER))
+    assert told.options["effects"]["wind"] == [0.5, 0.0, 0.0]
+    assert told.options["randomize"]["observation_delay"] == 1
+    drawn = next(array for array in told.telemetry if array.name == "drawn")
+    assert drawn.components == (
+        "drawn_mass", "drawn_wind_y", "drawn_action_delay", "drawn_observation_delay"
+    )  # fmt: skip
+    assert drawn.unit == ("", "m/s", "steps", "steps")
+
+
+def test_observations_of_a_stronger_craft_stay_within_their_bounds() -> None:
+    env = gym.make(ELEVATION, randomize={"thrust": 3.0}, flight_band=50.0, start_band=0.0)
+    env.reset(seed=0)
+    space = env.observation_space
+    for _ in range(200):
+        observation, _, ended, _, info = env.step(np.ones(1, np.float32))
+        assert space.contains(observation)
+        if ended:
+            break
+    assert info["elevation_error"] < -40  # it was fast: three times the thrust
+
+
+def test_flags(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["evaluate", "pid", "--episodes", "1", "--vehicle", str(RACER)]
+    words += ["--env.episode-length", "20"]
+    flags = ["--effects", "motor-lag", "wind=0.5,0,0", "body_drag"]
+    assert main([*words, *flags, "--randomize", "mass=uniform(0.9,1.1)"]) == 0
+    assert "episodes   1, 0 terminated" in capsys.readouterr().out
+    for flag, sentence in (
+        (["--effects", "lag"], "effects: expected some of motor_lag, "),
+        (["--effects", "wind=3"], "effects: wind: expected 3 numbers"),
+        (["--effects", "motor-lag", "motor_lag"], "effects: expected each name once, got 'motor_l"),
+        (["--randomize", "mass=heavy"], "randomize: mass: expected uniform(low,high)"),
+        (["--sensors", "imu"], "sensors.imu: expected gyro_noise here, or "),
+        (["--sensors", 'gps={"rat":10}'], "sensors.gps: expected some of noise, "),
+    ):
+        assert main([*words, *flag]) != 0
+        assert sentence in capsys.readouterr().err
+
+
+def test_a_policy_needs_the_vehicle_that_has_its_effects(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = ["--vehicle", str(RACER), "--effects", "motor_lag", "--out", str(tmp_path / "run")]
+    assert main(["train", "a2c", "--env-steps", "256", *run]) == 0
+    assert main(["evaluate", str(tmp_path / "run"), "--episodes", "1"]) == 1
+    told = capsys.readouterr().err
+    assert re.search(r"expected racer \(model \w+\), on which the policy was trained, got", told)
+    assert "name one with --vehicle" in told
+    again = ["evaluate", str(tmp_path / "run"), "--episodes", "1", "--vehicle", str(RACER)]
+    assert main(again) == 0
+
+
+def test_files_of_a_comparison_tell_what_was_drawn(tmp_path: Path) -> None:
+    words = ["--agents", "vpg", "--seeds", "1", "--env-steps", "1500", "--episodes", "2"]
+    words += ["--jobs", "1", "--env.episode-length", "50", "--no-film"]
+    words += ["--randomize", "mass=uniform(0.9,1.1)", "--out", str(tmp_path / "c")]
+    assert main(["compare", *words]) == 0
+    for name in ("episodes.csv", "evaluations.csv"):
+        drawn = pd.read_csv(tmp_path / "c" / name)["drawn_mass"]
+        assert len(drawn) > 3
+        assert drawn.between(0.9, 1.1).all()
+        assert drawn.nunique() > 1
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"effects": {"motor": True}}, "effects: expected some of motor_lag, .*, got 'motor'"),
+        ({"effects": 3}, "effects: expected a mapping from names to values, got 3"),
+        ({"effects": {"wind": [1.0]}}, r"effects: wind: expected 3 numbers .* m/s, got \[1.0\]"),
+        ({"effects": {"motor_lag": True}, "vehicle": None}, "expected rotors.time_constant"),
+        ({"randomize": {"mas": "1"}}, "randomize: expected some of mass, .*, got 'mas'"),
+        ({"randomize": {"mass": "big"}}, r"randomize: mass: expected uniform.*, got 'big'"),
+        ({"randomize": {"action_delay": 101}}, "from 0 to 100 steps, got 101"),
+        ({"randomize": {"time_constant": "1"}}, "expected the effect motor_lag, got it switched"),
+    ],
+)
+def test_a_wrong_one_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence) as raised:
+        gym.make(HOVER, **{"vehicle": str(RACER), **options})
+    assert "\n" not in str(raised.value)

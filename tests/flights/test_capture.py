@@ -1,0 +1,521 @@
+"""Labelled pictures: plans, labels against the pictures, formats, and what an interrupt leaves."""
+
+import json
+import math
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rotorgram.flights import capture as capturing
+from rotorgram.flights.capture import capture, label_file, objects_in, read_labels
+from rotorgram.flights.capture_formats import category
+from rotorgram.flights.viewpoints import Plan
+from rotorgram.models import InputError
+from rotorgram.training.pairs import socket_pair
+from rotorgram.training.settings import WorkersConfig
+from test_cameras import BELLY, vehicle_with
+
+Image = pytest.importorskip("PIL.Image")
+ONE = WorkersConfig(jobs=1)
+PLAN = """
+vehicle = "crazyflie2"
+cameras = ["down@32x24", "down_depth@32x24", "down_segmentation@32x24", "front_flow@16x16"]
+seed = 7
+fine = false
+
+[[poses]]
+from = "random"
+count = 5
+center = [0.0, 0.0, 2.0]
+size = [4.0, 4.0, 2.0]
+tilt = 0.5
+
+[[poses]]
+from = "flight"
+env = "rotorgram/Landing-v0"
+every = 40
+options = { episode_length = 100 }
+"""
+
+
+def plan_of(folder: Path, text: str = PLAN) -> Plan:
+    file = folder / "plan.toml"
+    file.write_text(text, "utf-8")
+    return Plan.read(file)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files but the lock, and the films, which hold the time."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.suffix != ".mp4" and path.name != ".lock"
+    }
+
+
+# ---- plans
+
+
+def test_random_places_fill_the_box(tmp_path: Path) -> None:
+    walk, _ = plan_of(tmp_path, PLAN.replace("count = 5", "count = 400")).walks()
+    position, quaternion = walk.position[:, 0], walk.quaternion[:, 0]
+    assert position.min(axis=0) == pytest.approx([-2, -2, 1], abs=0.1)
+    assert position.max(axis=0) == pytest.approx([2, 2, 3], abs=0.1)
+    assert np.linalg.norm(quaternion, axis=1) == pytest.approx(1.0)
+    w, x, y, z = quaternion.T
+    tilts = np.arccos(1 - 2 * (x**2 + y**2))
+    assert 0.45 < tilts.max() <= 0.5
+    headings = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    assert np.ptp(headings) > 6
+    again, _ = plan_of(tmp_path, PLAN.replace("count = 5", "count = 400")).walks()
+    other, _ = plan_of(tmp_path, PLAN.replace("seed = 7", "seed = 8")).walks()
+    assert (again.position == walk.position).all()
+    assert (other.position[0] != walk.position[0]).all()
+
+
+def test_places_and_flights_share_worlds(tmp_path: Path) -> None:
+    """Places as evenly as they can be, flights in turn."""
+    path, flight = tmp_path / "plan.toml", 'env = "rotorgram/Hover-v0"\nepisodes = 3\nevery = 500'
+    sources = f'[[poses]]\nfrom = "random"\ncount = 8\n[[poses]]\nfrom = "flight"\n{flight}'
+    path.write_text(f'world = "gates:1-3"\n{sources}')
+    walks = Plan.read(path).walks()
+    names = ["gates:1", "gates:2", "gates:3"]
+    assert [walk.world for walk in walks] == names * 2
+    assert [len(walk) for walk in walks[:3]] == [2, 3, 3]
+    path.write_text(sources)
+    alone = Plan.read(path).walks()[0]
+    np.testing.assert_array_equal(
+        np.concatenate([walk.position for walk in walks[:3]]), alone.position
+    )
+
+
+def test_a_flight_gives_every_so_many_steps(tmp_path: Path) -> None:
+    _, walk = plan_of(tmp_path).walks()
+    assert walk.times.tolist() == [0.0, 0.8, 1.6]
+    assert walk.goal is not None
+    assert walk.goal.shape == walk.position.shape == (3, 1, 3)
+    assert [mark.shape for mark in walk.marks] == ["disc"]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (("seed = 7", "seed = -1"), "plan: seed: expected a whole number from 0, got -1"),
+        (("seed = 7", "sed = 7"), "plan: expected some of vehicle, world, .* got 'sed'"),
+        (("seed = 7", 'world = "moon"'), "world: expected 'plain' or 'airport' .* got 'moon'"),
+        (("count = 5", "count = 0"), r"plan: poses\[1\].count: expected 1 to 1000000, got 0"),
+        (("count = 5", ""), r"plan: poses\[1\].count: expected 1 to 1000000, got None"),
+        (("tilt = 0.5", "tilt = 4"), r"poses\[1\].tilt: expected 0 to 3.14159 rad, got 4"),
+        (("tilt = 0.5", "tip = 4"), r"poses\[1\]: expected some of count, center, size, tilt"),
+        (('from = "random"', 'from = "air"'), r"poses\[1\].from: expected 'random' or 'flight'"),
+        (("[4.0, 4.0, 2.0]", "[4.0]"), r"poses\[1\].size: expected three numbers, m, from 0 to 1"),
+        (
+            ('env = "rotorgram/Landing-v0"', "env = 3"),
+            r"\[2\].env: expected the id of a task, got 3",
+        ),
+        (("every = 40", "agent = 5"), r"\[2\].agent: expected a controller or a checkpoint, got 5"),
+        (("{ episode_length = 100 }", "1"), r"poses\[2\].options: expected options by name, got 1"),
+        (("down@32x24", "down@33x24"), "plan: down: expected even sizes, .* got 33x24"),
+        (("count = 5", "count = 5\nworld = 3"), "world: expected"),
+        (("[0.0, 0.0, 2.0]", "[0.0, 0.0, 0.5]"), r"\[1\]: expected a box above the ground, got"),
+        (
+            ("[0.0, 0.0, 2.0]", "[1e308, 0.0, 2.0]"),
+            r"\[1\].center: expected three numbers, m, from",
+        ),
+        (("[4.0, 4.0, 2.0]", "[-4.0, 4.0, 2.0]"), r"\[1\].size: expected three numbers, m, from 0"),
+        (('from = "random"', 'from = ["random"]'), r"\[1\].from: expected 'random' or 'flight'"),
+        (("seed = 7", "seed = 7\nleast_area = 0"), "plan: least_area: expected a number of pixels"),
+        (("seed = 7", "seed = " + "[" * 5000), "plan: expected a TOML file"),
+        (("down@32x24", "rear"), "cameras: expected some of front, down"),
+        (("seed = 7", "seed ="), "plan: expected a TOML file, got plan.toml"),
+    ],
+)
+def test_wrong_plans(tmp_path: Path, change: tuple[str, str], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        plan_of(tmp_path, PLAN.replace(*change))
+
+
+# ---- labels
+
+
+def test_boxes_and_runs_are_those_of_the_mask() -> None:
+    numbers = np.zeros((5, 6), np.int32)
+    numbers[1:4, 2:5] = 2
+    numbers[2, 3] = 1
+    one, two = objects_in(numbers, ["nothing", "inner", "outer"])
+    assert (one["name"], one["box"], one["area"]) == ("inner", [3, 2, 1, 1], 1)
+    assert (two["name"], two["box"], two["area"]) == ("outer", [2, 1, 3, 3], 8)
+    # Down the columns: 10 of the first two, the third's first; then 3; and so on.
+    assert two["runs"] == [11, 3, 2, 1, 1, 1, 2, 3, 6]
+    full = next(objects_in(np.ones((2, 2), np.int32), ["nothing", "all"]))
+    assert full["runs"] == [0, 4]
+
+
+def unrolled(runs: list[int], height: int, width: int) -> np.ndarray:
+    flat = np.repeat(np.arange(len(runs)) % 2, runs).astype(bool)
+    return flat.reshape(width, height).T
+
+
+def test_categories() -> None:
+    assert category("forest/tree_12") == "forest/tree"
+    assert category("task/disc_0 of drone_3") == "task/disc of drone"
+    assert category("drone_0") == "drone"
+
+
+# ---- data sets
+
+
+@pytest.fixture(scope="module")
+def captured(opengl: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("captured")
+    assert capture(plan_of(folder), folder, ONE) == 8
+    return folder
+
+
+def test_every_file_is_there(captured: Path) -> None:
+    labels = read_labels(captured, 8)
+    assert [one["frame"] for one in labels] == list(range(8))
+    for frame in labels:
+        kinds = [(one["camera"], one["kind"]) for one in frame["pictures"]]
+        assert kinds == [
+            ("down", "rgb"), ("down", "depth"), ("down", "segmentation"), ("front", "flow")
+        ]  # fmt: skip
+        for one in frame["pictures"]:
+            assert all((captured / file).is_file() for file in one["files"])
+    text = (captured / "README.md").read_text("utf-8")
+    assert "8 frames of Crazyflie 2.x" in text
+    assert "| 5 | 1 random, world `plain` |" in text
+    assert PLAN.strip() in text
+    with Image.open(captured / "contact.png") as sheet:
+        assert sheet.size == (4 * 160, 8 * 160)  # 32x24 is 160x120, the square flow 160x160
+
+
+def test_depth_in_millimetres_is_depth_in_metres(captured: Path) -> None:
+    seen: set[bool] = set()
+    for frame in read_labels(captured, 8):
+        depth, coded = (captured / file for file in frame["pictures"][1]["files"])
+        meters = np.load(depth)
+        with Image.open(coded) as image:
+            millimetres = np.asarray(image).astype(float)
+        near = meters <= 65.535
+        assert np.abs(millimetres[near] - 1000 * meters[near]).max(initial=0) <= 0.51
+        assert not millimetres[~near].any()
+        seen |= {*near.ravel().tolist()}
+    assert seen == {True, False}
+
+
+def test_boxes_are_those_of_the_pictures(captured: Path) -> None:
+    told = json.loads((captured / "coco.json").read_text())
+    names = {kind["id"]: kind["name"] for kind in told["categories"]}
+    assert {"scene/floor", "task/disc of drone"} <= {*names.values()}
+    masks = {}
+    for image in told["images"]:
+        number = Path(image["file_name"]).stem
+        with Image.open(captured / "segmentation" / "down" / f"{number}.png") as file:
+            masks[image["id"]] = np.asarray(file)
+    assert len(told["annotations"]) >= 8
+    for one in told["annotations"]:
+        mask = unrolled(one["segmentation"]["counts"], *one["segmentation"]["size"])
+        numbers = masks[one["image_id"]]
+        value = numbers[mask][0]
+        assert ((numbers == value) == mask).all()
+        rows, columns = np.nonzero(mask)
+        left, top, width, height = one["bbox"]
+        assert (columns.min(), rows.min()) == (left, top)
+        assert (columns.max() + 1, rows.max() + 1) == (left + width, top + height)
+        assert one["area"] == mask.sum()
+
+
+def test_poses_bring_points_to_their_pixels(captured: Path) -> None:
+    """KITTI's [R | t] and P against the lens of the labels, and that against the pad."""
+    lines = []
+    for sequence, count in ((0, 5), (1, 3)):
+        file = captured / "poses" / f"{sequence:03}_down_drone_0.txt"
+        lines += file.read_text().splitlines()
+        assert len(lines) == 5 * sequence + count
+    poses = np.array([[float(x) for x in line.split()] for line in lines]).reshape(8, 3, 4)
+    key, *numbers = (captured / "calib.txt").read_text().splitlines()[0].split()
+    assert key == "P_down_drone_0:"
+    projection = np.array(numbers, float).reshape(3, 4)
+    seen = 0
+    for frame, pose in zip(read_labels(captured, 8), poses, strict=True):
+        picture = frame["pictures"][2]
+        pads = [one for one in picture["objects"] if one["name"].startswith("task/disc")]
+        for pad in pads:
+            left, top, width, height = pad["box"]
+            if left == 0 or top == 0 or left + width == 32 or top + height == 24:
+                continue  # a part of it alone
+            point = np.add(frame["pose"]["goal"][0], (0.0, 0.0, 0.005))
+            there = pose[:, :3].T @ (point - pose[:, 3])
+            pixel = projection @ np.append(there, 1.0)
+            assert pixel[0] / pixel[2] == pytest.approx(left + width / 2, abs=1.0)
+            assert pixel[1] / pixel[2] == pytest.approx(top + height / 2, abs=1.0)
+            seen += 1
+    assert seen
+
+
+def test_the_layout_of_lerobot(captured: Path, tmp_path: Path) -> None:
+    parquet: Any = pytest.importorskip("pyarrow.parquet")
+    root = captured / "lerobot"
+    info = json.loads((root / "meta" / "info.json").read_text())
+    # The flight alone: 100 steps, of which 0, 40 and 80 are taken, each with its action.
+    assert (info["total_episodes"], info["total_frames"], info["fps"]) == (1, 3, 10.0)
+    rows = parquet.read_table(
+        root / info["data_path"].format(episode_chunk=0, episode_index=0)
+    ).to_pylist()
+    assert set(rows[0]) | {"observation.images.down"} == set(info["features"])
+    assert [row["index"] for row in rows] == list(range(3))
+    labels = read_labels(captured, 8)
+    assert rows[2]["observation.state"][:3] == pytest.approx(labels[7]["pose"]["position"][0])
+    assert rows[2]["time"] == labels[7]["time"] == 1.6
+    _, walk = plan_of(tmp_path).walks()
+    assert walk.actions is not None
+    assert info["features"]["action"]["names"] == list(walk.components)
+    for row, action in zip(rows, walk.actions[:, 0], strict=True):
+        np.testing.assert_array_equal(row["action"], action.astype(np.float32))
+    assert len({*map(tuple, (row["action"] for row in rows))}) > 1
+    video = info["video_path"].format(
+        episode_chunk=0, video_key="observation.images.down", episode_index=0
+    )
+    ffmpeg: Any = pytest.importorskip("imageio_ffmpeg")
+    assert ffmpeg.count_frames_and_secs(str(root / video))[0] == 3
+    (told,) = (root / "meta" / "episodes_stats.jsonl").read_text().splitlines()
+    spread = json.loads(told)["stats"]
+    assert spread.keys() == info["features"].keys()
+    pictures = [
+        np.asarray(Image.open(captured / "rgb" / "down" / f"{i:06}.png")) / 255 for i in (5, 6, 7)
+    ]
+    own = spread["observation.images.down"]
+    assert np.shape(own["mean"]) == (3, 1, 1)
+    for name in ("mean", "std", "min", "max"):
+        expected = getattr(np, name)(pictures, axis=(0, 1, 2))
+        np.testing.assert_allclose(np.ravel(own[name]), expected, atol=1e-9)
+    places = np.array([row["observation.state"] for row in rows])
+    np.testing.assert_allclose(spread["observation.state"]["std"], places.std(axis=0), atol=1e-6)
+    assert spread["action"]["count"] == [3]
+
+
+def test_it_is_the_same_again_and_goes_on(captured: Path, tmp_path: Path) -> None:
+    """Labels that are missing are made again; the rest stays; two workers give the same bits."""
+    folder = tmp_path / "again"
+    folder.mkdir()
+    capture(plan_of(tmp_path), folder, WorkersConfig(jobs=2))
+    whole = contents(captured)
+    whole.pop("plan.toml")
+    assert {k: v for k, v in contents(folder).items() if k != "plan.toml"} == whole
+    kept, other = folder / "rgb" / "down" / "000001.png", bytearray(whole["rgb/down/000001.png"])
+    other[other.index(b"IEND") + 5] ^= 1  # of the same size, and a picture
+    kept.write_bytes(other)
+    for number in (2, 7):
+        label_file(folder, number).unlink()
+    (folder / "rgb" / "down" / "000003.png").unlink()
+    cut = folder / "segmentation" / "down" / "000004.png"
+    cut.write_bytes(cut.read_bytes()[:-9])
+    capture(plan_of(tmp_path), folder, ONE)
+    assert kept.read_bytes() == other
+    kept.write_bytes(whole["rgb/down/000001.png"])
+    told = contents(folder)
+    told.pop("plan.toml")
+    assert told == whole
+
+
+@pytest.mark.parametrize(
+    "text",
+    ['{"frame"', "[]", '{"frame": 1}', '{"pictures": 3}', '{"pictures": [{}]}', "[" * 9000,
+     '{"pictures": []}'],
+)  # fmt: skip
+def test_labels_that_were_altered_are_made_again(captured: Path, tmp_path: Path, text: str) -> None:
+    folder = tmp_path / "altered"
+    shutil.copytree(captured, folder)
+    label_file(folder, 1).write_text(text)
+    (folder / "labels" / "000099.json").write_text("of no frame")
+    assert capture(plan_of(tmp_path), folder, ONE) == 8
+    assert label_file(folder, 1).read_bytes() == label_file(captured, 1).read_bytes()
+    assert (folder / "coco.json").read_bytes() == (captured / "coco.json").read_bytes()
+
+
+def test_a_folder_of_another_plan(captured: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected a folder of the same plan, got one of other"):
+        capture(plan_of(tmp_path, PLAN.replace("seed = 7", "seed = 9")), captured, ONE)
+
+
+def test_a_folder_of_another_vehicle(captured: Path, tmp_path: Path) -> None:
+    """The same plan; the file that it names was changed since."""
+    own = vehicle_with(tmp_path, BELLY).path
+    text = PLAN.replace('"crazyflie2"', f'"{own}"').replace("down@32x24", "belly@32x24")
+    plan = plan_of(tmp_path, text.replace("down_", "belly_"))
+    folder = tmp_path / "out"
+    folder.mkdir()
+    assert capture(plan, folder, ONE) == 8
+    own.write_text(own.read_text("utf-8").replace("fovy = 1.0", "fovy = 1.1"), "utf-8")
+    with pytest.raises(InputError, match="expected a folder of the same vehicle, flights and MuJ"):
+        capture(plan, folder, ONE)
+
+
+def test_several_drones_and_a_camera_that_stands(opengl: None, tmp_path: Path) -> None:
+    own = vehicle_with(tmp_path, BELLY).path
+    text = f"""
+    vehicle = "{own}"
+    cameras = ["front@16x16", "front_segmentation@8x8", "tower@16x16", "tower_segmentation@16x16"]
+    least_area = 2
+    [[poses]]
+    from = "random"
+    count = 1
+    [[poses]]
+    from = "flight"
+    env = "rotorgram/Formation-v0"
+    drones = 2
+    every = 30
+    options = {{ episode_length = 60 }}
+    """
+    folder = tmp_path / "out"
+    folder.mkdir()
+    assert capture(plan_of(tmp_path, text), folder, ONE) == 4
+    names = {path.name for path in (folder / "rgb" / "tower").iterdir()}
+    assert names == {f"{i:06}.png" for i in range(4)}
+    names = {path.name for path in (folder / "rgb" / "front").iterdir()}
+    assert names == {"000000.png"} | {f"{i:06}_{k}.png" for i in (1, 2, 3) for k in (0, 1)}
+    told = json.loads((folder / "coco.json").read_text())
+    for image in told["images"]:
+        with Image.open(folder / image["file_name"]) as file:
+            assert file.size == (image["width"], image["height"])
+    assert {image["file_name"].split("/")[0] for image in told["images"]} == {"rgb", "segmentation"}
+    assert all(one["area"] >= 2 and one["iscrowd"] == 0 for one in told["annotations"])
+    kinds = [kind["name"] for kind in told["categories"]]
+    assert kinds == sorted(kinds)
+    assert {"drone", "scene/floor"} <= {*kinds}
+    lines = {path.name: len(path.read_text().splitlines()) for path in folder.glob("poses/*.txt")}
+    assert lines == {
+        "000_front_drone_0.txt": 1, "000_tower_drone_0.txt": 1, "001_front_drone_0.txt": 3,
+        "001_front_drone_1.txt": 3, "001_tower_drone_0.txt": 3,
+    }  # fmt: skip
+    episodes = (folder / "lerobot" / "meta" / "episodes.jsonl").read_text().splitlines()
+    assert [json.loads(line)["length"] for line in episodes] == [2, 2]  # not the end
+
+
+def test_a_journal_of_another_vehicle(tmp_path: Path) -> None:
+    journal = tmp_path / "flight.mcap"
+    with socket_pair("rotorgram/Hover-v0", record=journal) as env:
+        env.reset(seed=1)
+        for _ in range(4):
+            env.step(env.action_space.sample())
+    text = f"""
+    cameras = ["front@16x16"]
+    [[poses]]
+    from = "journal"
+    file = "{journal}"
+    every = 2
+    """
+    (walk,) = plan_of(tmp_path, text).walks()
+    assert len(walk) == 3
+    assert walk.actions is not None
+    assert np.isnan(walk.actions[:, 0]).all(axis=1).tolist() == [False, False, True]
+    with pytest.raises(InputError, match=r"plan: vehicle: expected .*, which flies in "):
+        plan_of(tmp_path, 'vehicle = "crazyflie2"\n' + text).walks()
+
+
+def test_a_task_of_a_module_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine.py").write_text(
+        "from rotorgram.envs import register\n"
+        "from rotorgram.envs.tasks.hover import Hover\n"
+        "class Mine(Hover):\n    pass\n"
+        'register("mine/Captured-v0", Mine)\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    text = """
+    [[poses]]
+    from = "flight"
+    env = "mine:mine/Captured-v0"
+    every = 50
+    options = { episode_length = 100 }
+    """
+    (walk,) = plan_of(tmp_path, text).walks()
+    assert walk.times.tolist() == [0.0, 1.0, 2.0]
+    assert walk.velocity is not None
+    assert walk.body_rates is not None
+    assert not walk.velocity[0].any()
+    assert walk.velocity[1:].any()
+    assert walk.body_rates[1:].any()
+
+
+def test_a_full_disk_loses_nothing(
+    opengl: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, written = tmp_path / "full", []
+    folder.mkdir()
+    whole = capturing.write_whole
+
+    def full(path: Path, data: bytes) -> None:
+        if len(written) == 12:
+            raise OSError(28, "No space left on device", str(path))
+        written.append(path)
+        whole(path, data)
+
+    monkeypatch.setattr(capturing, "write_whole", full)
+    with pytest.raises(OSError, match="No space left on device"):
+        capture(plan_of(tmp_path), folder, ONE)
+    monkeypatch.undo()
+    for file in (folder / "labels").glob("*.json"):
+        for one in json.loads(file.read_text())["pictures"]:
+            assert all((folder / name).is_file() for name in one["files"])
+    assert not list(folder.rglob("*.tmp"))
+    assert capture(plan_of(tmp_path), folder, ONE) == 8
+    assert len(read_labels(folder, 8)) == 8
+
+
+def test_flow_is_since_the_pose_before(captured: Path) -> None:
+    flows = [np.load(captured / "flow" / "front" / f"{i:06}.npy") for i in range(8)]
+    assert not flows[0].any()
+    assert not flows[5].any()  # the first of the flight
+    assert all(flow.any() for flow in (flows[1], flows[6], flows[7]))
+    assert math.isfinite(float(np.abs(flows[7]).max()))
+
+
+def test_one_ctrl_c_ends_it(opengl: None, tmp_path: Path) -> None:
+    """With workers that have much left to do; what they made is kept, each file whole."""
+    plan = PLAN.replace("count = 5", "count = 3000").replace("tilt = 0.5", "tilt = 0.5\n")
+    (tmp_path / "plan.toml").write_text(plan, "utf-8")
+    line = [sys.executable, "-m", "rotorgram.cli", "capture", "plan.toml", "--out", "out"]
+    told: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(
+        [*line, "--jobs", "2"], cwd=tmp_path, start_new_session=True, **told
+    ) as process:
+        deadline = time.monotonic() + 90
+        while len(list((tmp_path / "out" / "labels").glob("*.json"))) < 5:
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert error.endswith("rotorgram: interrupted\n")
+    for file in (tmp_path / "out" / "labels").glob("*.json"):
+        for one in json.loads(file.read_text())["pictures"]:
+            sizes = {name: (tmp_path / "out" / name).stat().st_size for name in one["files"]}
+            assert sizes == one["files"]
+
+
+def test_a_run_that_is_killed_goes_on(captured: Path, tmp_path: Path) -> None:
+    """SIGKILL in the middle of it; the same line again makes the folder whole."""
+    (tmp_path / "plan.toml").write_text(PLAN, "utf-8")
+    line = [sys.executable, "-m", "rotorgram.cli", "capture", "plan.toml", "--out", "out"]
+    pipe = subprocess.DEVNULL
+    with subprocess.Popen([*line, "--jobs", "1"], cwd=tmp_path, stdout=pipe) as process:
+        deadline = time.monotonic() + 60
+        while not label_file(tmp_path / "out", 1).exists():
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        process.kill()
+    done = subprocess.run([*line, "--jobs", "1"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    assert done.returncode == 0
+    assert "out: 8 frames" in done.stdout
+    whole, told = contents(captured), contents(tmp_path / "out")
+    left = {name for name in told if name.endswith(".part")}
+    assert {name: told[name] for name in told.keys() - left} == whole

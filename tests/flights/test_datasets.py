@@ -1,0 +1,299 @@
+"""Data sets of journals: what is in them, what is left out, and that they fly again bit for bit."""
+
+import json
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from peers import ANY, Running, relaying
+from rotorgram.cli import main
+from rotorgram.envs.spec import EnvSpec
+from rotorgram.flights.datasets import (
+    RecordedEpisode,
+    RecordedEpisodes,
+    env_of,
+    write_minari,
+    write_parquet,
+)
+from rotorgram.models.errors import InputError
+from rotorgram.udp import LinkConfig, RemoteEnv, RemoteVectorEnv, Simulator
+from rotorgram.udp.transport.relay import FaultConfig
+
+pa = pytest.importorskip("pyarrow")
+pq = pytest.importorskip("pyarrow.parquet")
+LOSSY = FaultConfig(drop=0.1, duplicate=0.1, reorder=0.1, seed=3)
+ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+
+
+@contextmanager
+def recording(
+    path: Path, env_id: str = ELEVATION, drones: int = 1, faults: FaultConfig | None = None,
+    **options: Any,
+) -> Iterator[Any]:  # fmt: skip
+    """An agent's env over the wire; the simulator keeps the journal, or the agent of a fleet."""
+    times: dict[str, Any] = {"timeout": 5, "connect_timeout": 5, "connect": False}
+    remote: Any = (
+        RemoteEnv(ANY, record=path, **times)
+        if drones == 1
+        else RemoteVectorEnv(ANY, num_envs=drones, record=path, **times)
+    )
+    with relaying(remote.address, faults or FaultConfig()) as relay:
+        simulator = Simulator(
+            env_id, server=relay.address, bind=ANY, num_envs=drones, config=LinkConfig(timeout=5),
+            **options,
+        )  # fmt: skip
+        running = Running(simulator)
+        try:
+            yield remote
+        finally:
+            remote.close()
+            running.join()
+
+
+def fly_one(remote: RemoteEnv, seeds: list[int | None], most: int = 10**6) -> list[Any]:
+    """Episodes of one drone, at random: (observation, reward) of each step of each."""
+    remote.reset(seed=0)
+    remote.action_space.seed(1)
+    episodes = []
+    for seed in seeds:
+        observation, _ = remote.reset(seed=seed)
+        seen, done = [(observation, None)], False
+        while not done and len(seen) <= most:
+            observation, reward, terminated, truncated, _ = remote.step(
+                remote.action_space.sample()
+            )
+            seen.append((observation, reward))
+            done = terminated or truncated
+        episodes.append(seen)
+    return episodes
+
+
+def fly_fleet(remote: RemoteVectorEnv, steps: int) -> None:
+    """Drones at random; each reset has a seed of its own."""
+    remote.reset(seed=11)
+    remote.action_space.seed(1)
+    for step in range(steps):
+        seeds = [1000 * step + drone for drone in range(remote.num_envs)]
+        frozen = np.arange(remote.num_envs) == step % 7  # now and then one of them waits
+        remote.advance(remote.action_space.sample(), remote.done & ~frozen, seeds, frozen)
+
+
+def same(a: Any, b: Any) -> bool:
+    return bool(np.asarray(a).tobytes() == np.asarray(b).tobytes())
+
+
+def flown_again(env: gym.Env[Any, Any], seed: int, actions: Any) -> tuple[list[Any], list[Any]]:
+    """Observations and (reward, terminated, truncated) of these actions from this seed."""
+    observation, _ = env.reset(seed=seed)
+    observations, outcomes = [observation], []
+    for action in actions:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        observations.append(observation)
+        outcomes.append((reward, terminated, truncated))
+    return observations, outcomes
+
+
+@pytest.mark.parametrize("env_id", [ELEVATION, HOVER])
+@pytest.mark.parametrize("drones", [1, 3])
+def test_what_is_read_flies_again_to_the_same_bits(
+    env_id: str, drones: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "flight.mcap"
+    with recording(path, env_id, drones, LOSSY, episode_length=30) as remote:
+        if drones == 1:
+            fly_one(remote, [5, 6, 2**64 - 1])
+        else:
+            fly_fleet(remote, 120)
+    episodes = RecordedEpisodes([path])
+    table = tmp_path / "flight.parquet"
+    count, steps = write_parquet(episodes, table)
+    made = env_of(episodes.spec)
+    with gym.make(made, disable_env_checker=True) as env:
+        read = pq.read_table(table)
+        frame = {name: read[name].to_numpy() for name in read.column_names if name != "journal"}
+        assert read.num_rows == steps + count
+        assert count == 3 or (drones == 3 and count > 3)
+        for episode in range(count):
+            rows = frame["episode"] == episode
+            own = {name: values[rows] for name, values in frame.items()}
+            names = [name for name in own if name.startswith("observation")]
+            recorded = np.stack([own[name] for name in names], axis=1)
+            acted = np.stack([v for n, v in own.items() if n.startswith("action")], axis=1)
+            assert recorded.dtype == np.float32
+            assert own["step"].tolist() == list(range(len(recorded)))
+            observations, outcomes = flown_again(
+                env, int(read["seed"].filter(rows)[0].as_py()), acted[:-1]
+            )
+            assert same(np.stack(observations), recorded)
+            assert same([r for r, *_ in outcomes], own["reward"][:-1].astype(np.float64))
+            assert [e for _, e, _ in outcomes] == own["terminated"][:-1].tolist()
+            assert [t for *_, t in outcomes] == own["truncated"][:-1].tolist()
+
+
+def test_minari_reads_it_and_its_env_flies_it_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    minari = pytest.importorskip("minari")
+    pytest.importorskip("h5py")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    flights = {
+        "box": {"action_type": "continuous"},
+        "choice": {"action_type": "discrete"},
+        "dict": {"sensors": {"barometer": {"noise": 0.1}}},
+    }
+    for name, options in flights.items():
+        path = tmp_path / f"{name}.mcap"
+        with recording(path, faults=LOSSY, **options) as remote:
+            fly_one(remote, [5, 2**64 - 1, None])
+            spaces = remote.observation_space, remote.action_space
+        dataset_id = f"rotorgram/{name}-v0"
+        episodes = RecordedEpisodes([path])
+        assert write_minari(episodes, dataset_id)[0] == 3
+        data = minari.load_dataset(dataset_id)
+        assert (data.observation_space, data.action_space) == spaces
+        assert data.total_episodes == 3
+        seeds = [one.get("seed") for one in data.storage.get_episode_metadata(range(3))]
+        assert seeds == [5, 2**64 - 1, None]
+        assert json.loads(data.storage.metadata["rotorgram_env_spec"])["env_id"] == ELEVATION
+        with data.recover_environment(disable_env_checker=True) as env:
+            assert (env.observation_space, env.action_space) == spaces
+            for seed, episode in zip(seeds[:2], data, strict=False):
+                observations, outcomes = flown_again(env, seed, episode.actions)
+                recorded = episode.observations
+                if name == "dict":
+                    for key, values in recorded.items():
+                        assert same(np.stack([told[key] for told in observations]), values)
+                else:
+                    assert same(np.stack(observations), recorded)
+                assert same([r for r, *_ in outcomes], episode.rewards)
+                ends = [episode.terminations.tolist(), episode.truncations.tolist()]
+                assert [[e[1] for e in outcomes], [e[2] for e in outcomes]] == ends
+                assert len(episode.infos["Y"]) == len(episode.actions) + 1
+                assert episode.infos["elevation_error"].dtype == np.float64
+
+
+def test_episodes_that_are_not_whole_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    with recording(path, episode_length=5, start_band=0.0) as remote:
+        remote.reset(seed=0)
+        for seed, steps in (8, 5), (9, 3), (None, 5), (10, 2):
+            remote.reset(seed=seed)
+            for _ in range(steps):
+                remote.step([0.25])
+    episodes = RecordedEpisodes([path])
+    found: list[RecordedEpisode] = list(episodes)
+    # The reset with seed 0 has no step; those of 3 and 2 steps were given up.
+    assert [(one.seed, len(one)) for one in found] == [(8, 5), (None, 5)]
+    assert episodes.left_out == 2
+    assert [(one.terminated, one.truncated) for one in found] == [(False, True)] * 2
+    assert found[0].actions.tolist() == [[0.25]] * 5
+    assert found[0].observations["observation"].shape == (6, 3)
+    assert found[0].telemetry["position"].shape == (6, 3)
+
+
+def test_a_frozen_drone_makes_no_steps(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    with recording(path, drones=2, episode_length=4) as remote:
+        remote.reset(seed=20)
+        for step in range(6):  # drone 1 waits in steps 1 and 2, drone 0 after its end
+            frozen = np.array([step >= 4, step in (1, 2)])
+            remote.advance(np.full((2, 1), step / 8, np.float32), None, None, frozen)
+    first, second = RecordedEpisodes([path])
+    assert (first.drone, first.seed, first.actions.ravel().tolist()) == (
+        0, 20, [0.0, 0.125, 0.25, 0.375]
+    )  # fmt: skip
+    assert (second.drone, second.seed, second.actions.ravel().tolist()) == (
+        1, 21, [0.0, 0.375, 0.5, 0.625]
+    )  # fmt: skip
+
+
+def test_several_journals_are_one_data_set(tmp_path: Path) -> None:
+    paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    for seed, path in enumerate(paths):
+        with recording(path, episode_length=4) as remote:
+            fly_one(remote, [seed])
+    out = tmp_path / "both.parquet"
+    assert main(["dataset", *map(str, paths), "--to", "parquet", "--out", str(out)]) == 0
+    read = pq.read_table(out)
+    assert read["journal"].to_pylist() == ["a.mcap"] * 5 + ["b.mcap"] * 5
+    assert read["episode"].to_pylist() == [0] * 5 + [1] * 5
+    assert read["seed"].to_pylist() == [0] * 5 + [1] * 5
+    assert read["reward"].null_count == read["action.collective"].null_count == 2
+    spec = EnvSpec.from_json(pq.read_schema(out).metadata[b"env_spec"].decode())
+    assert spec.options["episode_length"] == 4
+    assert {f"telemetry.{name}" for name in spec.telemetry[-1].components} < {*read.column_names}
+
+
+def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good, other, short = (tmp_path / f"{name}.mcap" for name in ("good", "other", "short"))
+    with recording(good, episode_length=4) as remote:
+        fly_one(remote, [1])
+    with recording(other, episode_length=5) as remote:
+        fly_one(remote, [1])
+    with recording(short, episode_length=5) as remote:
+        fly_one(remote, [1], most=2)
+    (text := tmp_path / "notes.mcap").write_text("no journal at all")
+    (cut := tmp_path / "cut.mcap").write_bytes(good.read_bytes()[:100])  # before its first chunk
+    (there := tmp_path / "there.parquet").write_bytes(b"mine")
+    out = tmp_path / "new.parquet"
+
+    def told(*words: object) -> str:
+        assert main(["dataset", *map(str, words)]) == 1
+        sentence = capsys.readouterr().err
+        assert sentence.count("\n") == 1
+        assert not out.exists()
+        return sentence
+
+    def parquet(*paths: Path, out: Path = out) -> str:
+        return told(*paths, "--to", "parquet", "--out", out)
+
+    assert "at least one file, got none" in parquet()
+    assert "No such file" in parquet(tmp_path / "nowhere.mcap")
+    assert "expected an MCAP file" in parquet(text)
+    assert "expected a whole episode, got no step of a flight" in parquet(cut)
+    assert "expected journals of one env, all with the options" in parquet(good, other)
+    assert "expected each flight once" in parquet(good, good)
+    assert "expected a whole episode, got none of 1" in parquet(short)
+    assert f"expected the name of a new file, got {there}, which is there" in parquet(
+        good, out=there
+    )
+    assert there.read_bytes() == b"mine"
+    wrong = ("--to", "minari", "--out", "some/flight-v0", "--vehicle", "nobodys.toml")
+    assert "vehicle: cannot read nobodys.toml: No such file" in told(good, *wrong)
+    assert "a folder that is there" in parquet(good, out=tmp_path / "no" / "new.parquet")
+
+
+def test_a_write_that_fails_names_the_file_and_leaves_none(tmp_path: Path) -> None:
+    journal = tmp_path / "flight.mcap"
+    with recording(journal, episode_length=5) as remote:
+        fly_one(remote, [1])
+    out, limits = tmp_path / "flight.parquet", resource.getrlimit(resource.RLIMIT_FSIZE)
+    episodes = RecordedEpisodes([journal])
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))  # bytes, of any file
+    try:
+        with pytest.raises(OSError, match="too large") as error:
+            write_parquet(episodes, out)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert error.value.filename == str(out)
+    assert not out.exists()
+
+
+def test_minari_needs_an_id_that_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("minari")
+    pytest.importorskip("h5py")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
+    path = tmp_path / "flight.mcap"
+    with recording(path, episode_length=4) as remote:
+        fly_one(remote, [1])
+    for wrong in ("../flight-v0", "a/flight-v0", "flight", "rotorgram/flight-v"):
+        with pytest.raises(InputError, match="out: expected an id of Minari"):
+            write_minari(RecordedEpisodes([path]), wrong)
+    write_minari(RecordedEpisodes([path]), "flight-v0")
+    with pytest.raises(InputError, match="out: expected the id of a new data set"):
+        write_minari(RecordedEpisodes([path]), "flight-v0")

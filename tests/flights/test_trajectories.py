@@ -1,0 +1,174 @@
+"""Trajectories: in batches as one after the other, and from a journal as they were flown."""
+
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import rotorgram.envs  # noqa: F401  # makes the envs known
+from peers import ANY, Running
+from rotorgram.agents.pid import PID
+from rotorgram.envs.registry import env_spec
+from rotorgram.flights.trajectories import (
+    EpisodeSet,
+    Trajectory,
+    evaluation_seed,
+    flown_trajectories,
+    fly,
+    fly_episodes,
+    recorded_trajectories,
+)
+from rotorgram.training.metrics import Headline
+from rotorgram.training.pairs import socket_pair
+from rotorgram.training.results import evaluation_row
+from rotorgram.udp import RemoteVectorEnv, Simulator
+
+ELEVATION = "rotorgram/Elevation-v0"
+SHORT: dict[str, Any] = {"episode_length": 25}  # half a second
+SPEC = env_spec(ELEVATION, SHORT)
+
+
+def same(one: Trajectory, other: Trajectory) -> bool:
+    """Whether every bit of every number is the same."""
+    return (
+        (one.ending, one.episode, one.spec) == (other.ending, other.episode, other.spec)
+        and one.rewards.tobytes() == other.rewards.tobytes()
+        and set(one.telemetry) == set(other.telemetry)
+        and all(one.telemetry[k].tobytes() == other.telemetry[k].tobytes() for k in one.telemetry)
+    )
+
+
+class Clumsy:
+    """Full thrust in episodes that begin below the target: they end at different steps."""
+
+    def reset(self) -> None:
+        """Forget the start."""
+        self._up: bool | None = None
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        if self._up is None:
+            self._up = bool(observation[0] > 0)
+        return np.array([1.0 if self._up else 0.0], np.float32)
+
+
+@pytest.mark.parametrize("drones", [2, 5, 8])
+def test_a_batch_is_bit_for_bit_as_one_after_the_other(drones: int) -> None:
+    options = {"episode_length": 120}
+    with closing(gym.make(ELEVATION, **options).unwrapped) as env:
+        alone = fly_episodes(env, Clumsy(), 5)
+    made = gym.make_vec(ELEVATION, num_envs=drones, autoreset_mode="Disabled", **options)
+    with closing(made) as env:
+        together = fly_episodes(env, Clumsy(), 5)
+    assert len({len(one) for one in alone}) > 1  # some crash
+    assert {one.ending for one in alone} == {"terminated", "truncated"}
+    assert all(map(same, alone, together))
+
+
+def test_a_batch_over_udp_is_bit_for_bit_as_in_process() -> None:
+    flown = flown_trajectories(PID(SPEC), ELEVATION, SHORT, range(3))
+    with socket_pair(ELEVATION, SHORT, num_envs=2) as env:
+        assert all(map(same, flown, fly_episodes(env, PID(SPEC), 3)))
+
+
+def test_a_trajectory_is_what_the_env_tells() -> None:
+    with closing(gym.make(ELEVATION, **SHORT).unwrapped) as env:
+        flown = fly(env, PID(SPEC), 7, episode=3)
+        observation, info = env.reset(seed=7)
+        policy = PID(SPEC)
+        heights, errors, rewards = [info["Y"]], [info["elevation_error"]], []
+        for _ in range(25):
+            observation, reward, *_, info = env.step(policy.act(observation))
+            heights.append(info["Y"])
+            errors.append(info["elevation_error"])
+            rewards.append(reward)
+    assert (len(flown), flown.ending, flown.seconds, flown.episode) == (25, "truncated", 0.5, 3)
+    assert flown.telemetry["position"][:, 1].tolist() == heights
+    assert flown.headline.tolist() == errors
+    assert flown.rewards.tolist() == rewards
+    assert flown.mean_thrust[0] == pytest.approx(49.0)
+    assert [flown.step_at(s) for s in (-1.0, 0.0, 0.06, 0.07, 9.0)] == [0, 0, 3, 3, 25]
+    row = evaluation_row(flown, Headline.of(SPEC))
+    assert (row["episode"], row["length"], row["start"]) == (3, 25, errors[0])
+    # A quarter of 25 steps is 6.
+    assert row["steady"] == pytest.approx(np.mean(np.abs(errors[-6:])), rel=1e-12)
+    assert row["return"] == pytest.approx(sum(rewards), rel=1e-12)
+
+
+def test_sets_of_evaluation_episodes_share_no_seed() -> None:
+    sets: tuple[EpisodeSet, ...] = ("final", "curve", "tuning")
+    seeds = {evaluation_seed(episode, of) for of in sets for episode in range(100)}
+    assert len(seeds) == 300
+
+
+def test_a_recorded_trajectory_is_the_one_that_was_flown(tmp_path: Path) -> None:
+    journal = tmp_path / "pid.mcap"
+    with socket_pair(ELEVATION, SHORT, record=journal) as env:
+        for episode in range(2):
+            fly(env, PID(SPEC), evaluation_seed(episode))
+        env.reset(seed=3)  # given up at once: no episode
+        env.reset(seed=4)
+        env.step(np.zeros(1, np.float32))  # cut off
+    flown = flown_trajectories(PID(SPEC), ELEVATION, SHORT, [0, 1])
+    recorded = recorded_trajectories(journal, [0, 1, 2])
+    assert all(map(same, flown, recorded))
+    last = recorded[2]
+    assert (len(last), last.ending, last.episode) == (1, "cut off", 2)
+    with pytest.raises(ValueError, match=r"episode: expected 0 to 2 in .*, got 3"):
+        recorded_trajectories(journal, [3])
+
+
+def test_any_drone_of_any_session(tmp_path: Path) -> None:
+    journal = tmp_path / "two.mcap"
+    options: dict[str, Any] = {"timeout": 5, "connect_timeout": 5, "connect": False}
+    options |= {"num_envs": 2, "autoreset_mode": "Disabled"}
+    actions = np.full((2, 1), 0.25, np.float32)
+    with closing(RemoteVectorEnv(ANY, record=journal, **options)) as remote:
+        running = Running(Simulator(server=remote.address, bind=ANY, num_envs=2))
+        remote.reset(seed=[7, 8])
+        for _ in range(5):
+            remote.step(actions)
+        remote.reset(options={"reset_mask": np.array([False, True])})  # the first one is frozen
+        for _ in range(3):
+            remote.step(actions)
+    running.join()
+    with closing(gym.make(ELEVATION).unwrapped) as env:
+        for seed, drone, steps in ((7, 0, 8), (8, 1, 5)):
+            _, info = env.reset(seed=seed)
+            heights = [info["Y"]]
+            for _ in range(steps):
+                heights.append(env.step(actions[0])[4]["Y"])
+            (found,) = recorded_trajectories(journal, [0], drone=drone)
+            assert found.telemetry["position"][:, 1].tolist() == heights
+            assert found.ending == "cut off"
+    (second,) = recorded_trajectories(journal, [1], drone=1, session=1)
+    assert (len(second), second.episode) == (3, 1)
+    for choice, sentence in (
+        ({"drone": 2}, "drone: expected 0 to 1 in .*, got 2"),
+        ({"drone": -1}, "drone: expected 0 to 1"),
+        ({"session": 2}, "session: expected 1 to 1, got 2"),
+        ({"session": 0}, "session: expected 1 to 1, got 0"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            recorded_trajectories(journal, [0], **choice)
+
+
+def test_a_journal_without_a_step_is_one_sentence(tmp_path: Path) -> None:
+    journal = tmp_path / "nothing.mcap"
+    with socket_pair(ELEVATION, SHORT, record=journal) as env:
+        env.reset(seed=0)
+    with pytest.raises(ValueError, match="expected an episode with a step in it"):
+        recorded_trajectories(journal, [0])
+    (tmp_path / "text.mcap").write_text("no journal")
+    with pytest.raises(ValueError, match="expected an MCAP file"):
+        recorded_trajectories(tmp_path / "text.mcap", [0])
+    with pytest.raises(ValueError, match=r"nowhere\.mcap: expected a journal"):
+        recorded_trajectories(tmp_path / "nowhere.mcap", [0])
+
+
+def test_random_trajectories_are_the_same_for_the_same_episode() -> None:
+    first, second = flown_trajectories(None, ELEVATION, SHORT, [0, 1])
+    (again,) = flown_trajectories(None, ELEVATION, SHORT, [1])
+    assert same(again, second)
+    assert first.rewards.tolist() != second.rewards.tolist()

@@ -1,0 +1,383 @@
+"""The paper's MJCF says what the paper says; `Vehicle` derives the numbers of any other."""
+
+import copy
+import math
+import os
+import pickle
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import rotorgram.models
+from rotorgram.models import QUAD_XML, InputError, Vehicle, build_scene
+
+DATA = Path(__file__).parents[1] / "data"
+ROTORS = ("rotor1", "rotor2", "rotor3", "rotor4")
+REACTIONS = (0.05, -0.05, 0.05, -0.05)  # N·m per newton
+PLACES = [(1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (-1.0, -1.0, 0.0), (-1.0, 1.0, 0.0)]
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    return build_scene().compile()
+
+
+@pytest.fixture
+def hovering(model: mujoco.MjModel) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("hover").id)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+# --- the paper's vehicle --------------------------------------------------------------------------
+
+
+def test_options(model: mujoco.MjModel) -> None:
+    assert model.opt.timestep == 0.01
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    assert model.opt.gravity.tolist() == [0.0, 0.0, -9.8]
+    assert (model.opt.density, model.opt.viscosity) == (0.0, 0.0)  # no air, so no aerodynamics
+    assert model.opt.wind.tolist() == [0.0, 0.0, 0.0]
+    assert (model.opt.disableflags, model.opt.enableflags) == (0, 0)
+
+
+def test_one_free_body_and_four_thrusts(model: mujoco.MjModel) -> None:
+    assert (model.nq, model.nv, model.nu, model.na) == (7, 6, 4, 0)
+    assert model.actuator_ctrlrange.tolist() == [[0.0, 100.0]] * 4
+    for rotor, place, reaction in zip(ROTORS, PLACES, REACTIONS, strict=True):
+        assert tuple(model.site(rotor).pos) == place
+        assert model.actuator(rotor).gear.tolist() == [0.0, 0.0, 1.0, 0.0, 0.0, reaction]
+
+
+def test_nothing_is_added_silently(model: mujoco.MjModel) -> None:
+    for name in ("dof_damping", "dof_armature", "dof_frictionloss", "jnt_stiffness"):
+        assert not getattr(model, name).any(), name
+
+
+def test_yaw_constant_follows_from_a_measured_propeller(model: mujoco.MjModel) -> None:
+    # APC 10x4.7 at 6528 rpm, UIUC's static data: C_T 0.1274, C_P 0.0531; k = D C_P / (2 pi C_T)
+    diameter = 2 * model.geom("disc1").size[0]
+    assert diameter * 0.0531 / (2 * math.pi * 0.1274) == pytest.approx(0.05, rel=0.1)
+
+
+def test_every_mass_is_written_out() -> None:
+    geoms = mujoco.MjSpec.from_file(str(QUAD_XML)).geoms
+    assert not any(math.isnan(geom.mass) for geom in geoms)
+    assert all(geom.density == 0.0 for geom in geoms)
+    heavy = {geom.name: geom.mass for geom in geoms if geom.mass > 0}
+    parts = {f"arm{i}": 1.2 for i in range(1, 5)} | {f"motor{i}": 0.8 for i in range(1, 5)}
+    assert heavy == {"hub": 12.0} | parts
+    assert sum(heavy.values()) == pytest.approx(20.0, abs=1e-12)
+
+
+def test_front_is_marked_and_symmetric_otherwise(model: mujoco.MjModel) -> None:
+    mark = model.geom("front mark")
+    assert mark.pos[0] > 0.1
+    assert mark.pos[1] == 0.0
+    materials = [model.geom(f"disc{i}").matid[0] for i in range(1, 5)]
+    assert materials[0] == materials[1] != materials[2] == materials[3]
+    assert model.mat(materials[0]).name == "front disc"
+
+
+def test_only_few_geoms_collide(model: mujoco.MjModel) -> None:
+    colliding = {model.geom(i).name for i in range(model.ngeom) if model.geom_contype[i]}
+    motors = {f"motor{i}" for i in range(1, 5)}
+    assert colliding == {"scene/floor", "hub", "skid left", "skid right"} | motors
+
+
+def test_hover_keyframe_is_steady(hovering: mujoco.MjData) -> None:
+    assert hovering.qpos.tolist() == [0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0]
+    assert hovering.ctrl.tolist() == [49.0] * 4
+    assert np.abs(hovering.qacc).max() < 1e-12
+
+
+def test_sensors_at_hover(model: mujoco.MjModel, hovering: mujoco.MjData) -> None:
+    expected = {
+        "position": [0.0, 0.0, 5.0],
+        "orientation": [1.0, 0.0, 0.0, 0.0],
+        "velocity": [0.0, 0.0, 0.0],
+        "gyro": [0.0, 0.0, 0.0],
+        "accelerometer": [0.0, 0.0, 9.8],  # at rest it feels what holds it up
+    }
+    assert [model.sensor(i).name for i in range(model.nsensor)] == list(expected)
+    for name, value in expected.items():
+        assert hovering.sensor(name).data == pytest.approx(value, abs=1e-12), name
+
+
+def test_sensors_know_their_frames(model: mujoco.MjModel) -> None:
+    data = mujoco.MjData(model)
+    quarter = math.sqrt(0.5)  # nose to the left: body x is world y
+    data.qpos[:] = (1.0, 2.0, 3.0, quarter, 0.0, 0.0, quarter)
+    data.qvel[:] = (4.0, 5.0, 6.0, 0.1, 0.2, 0.3)
+    mujoco.mj_forward(model, data)
+    assert data.sensor("position").data == pytest.approx([1.0, 2.0, 3.0])
+    assert data.sensor("velocity").data == pytest.approx([4.0, 5.0, 6.0])  # world
+    assert data.sensor("gyro").data == pytest.approx([0.1, 0.2, 0.3])  # body
+    assert data.sensor("accelerometer").data == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)  # falling
+
+
+def test_offscreen_buffer_is_large_enough(model: mujoco.MjModel) -> None:
+    assert model.vis.global_.offwidth >= 1280
+    assert model.vis.global_.offheight >= 720
+
+
+OWN = {
+    "ground": '<geom name="own" type="plane" size="0 0 1"/>',
+    "sun": '<light name="own" pos="0 0 5"/>',
+    "sky": '<texture name="own" type="skybox" builtin="flat" width="8" height="8"/>',
+}
+
+
+@pytest.mark.parametrize("own", [[], ["ground"], ["ground", "sun"], ["ground", "sky"], [*OWN]])
+def test_a_file_keeps_its_ground_sun_and_sky_and_gets_those_it_lacks(
+    own: list[str], tmp_path: Path
+) -> None:
+    text = QUAD_XML.read_text(encoding="utf-8")
+    inside = "".join(OWN[name] for name in own if name != "sky")
+    text = text.replace("<worldbody>", f"<worldbody>{inside}", 1)
+    sky = f"<asset>{OWN['sky']}</asset>" if "sky" in own else ""
+    (tmp_path / "vehicle.xml").write_text(text.replace("<worldbody>", f"{sky}<worldbody>", 1))
+    model = build_scene(tmp_path / "vehicle.xml").compile()
+    suns = [model.light(i).name for i in range(model.nlight)]
+    skies = [model.tex(i).name for i in range(model.ntex)
+             if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX]  # fmt: skip
+    grounds = [model.geom(i).name for i in range(model.ngeom)
+               if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_PLANE]  # fmt: skip
+    assert suns == ["own" if "sun" in own else "scene/sun"]
+    assert skies == ["own" if "sky" in own else "scene/sky"]
+    assert grounds == ["own" if "ground" in own else "scene/floor"]
+
+
+def test_without_what_is_only_looked_at_the_physics_is_the_same() -> None:
+    models = [build_scene(visual=visual).compile() for visual in (True, False)]
+    assert models[0].ngeom > models[1].ngeom
+    dice, contacts = np.random.default_rng(0), 0
+    data = [mujoco.MjData(model) for model in models]
+    for one in data:
+        one.qpos[:] = [0, 0, 3, 0.99, 0.1, 0.05, 0.02]
+        one.qpos[3:] /= np.linalg.norm(one.qpos[3:])
+    for _ in range(300):
+        thrusts = dice.uniform(20, 70, 4)
+        for model, one in zip(models, data, strict=True):
+            one.ctrl[:] = thrusts
+            mujoco.mj_step(model, one, 2)
+        contacts += data[0].ncon
+        for name in ("qpos", "qvel", "qacc", "sensordata"):
+            assert getattr(data[0], name).tobytes() == getattr(data[1], name).tobytes()
+        assert data[0].ncon == data[1].ncon
+    assert contacts > 0  # it came down
+
+
+# --- what follows from a compiled model -----------------------------------------------------------
+
+
+def test_the_papers_vehicle() -> None:
+    vehicle = Vehicle.load()
+    assert vehicle is Vehicle.load(QUAD_XML)
+    assert (vehicle.mass, vehicle.gravity, vehicle.timestep) == (pytest.approx(20.0), 9.8, 0.01)
+    assert vehicle.center_of_mass == pytest.approx(0.0, abs=1e-15)
+    assert vehicle.rest_height == 0.4
+    assert [rotor.name for rotor in vehicle.rotors] == list(ROTORS)
+    assert [rotor.position for rotor in vehicle.rotors] == PLACES
+    assert {(rotor.axis, rotor.low, rotor.high) for rotor in vehicle.rotors} == {
+        ((0.0, 0.0, 1.0), 0.0, 100.0)
+    }
+    expected = [[1, 1, 1, 1], [1, -1, -1, 1], [-1, -1, 1, 1], REACTIONS]
+    np.testing.assert_allclose(vehicle.allocation, expected, atol=1e-15)
+    assert vehicle.hover_thrust == pytest.approx([49.0] * 4, abs=1e-12)
+    assert vehicle.max_acceleration == pytest.approx(10.2)
+    assert (vehicle.substeps(0.02), vehicle.substeps(0.01)) == (2, 1)
+    with pytest.raises(InputError, match=r"multiple of the physics step of 0\.01 s, got 0\.015"):
+        vehicle.substeps(0.015)
+
+
+def test_a_hexacopter_with_throttles_and_a_camera_in_front() -> None:
+    vehicle = Vehicle.load(DATA / "hexa.xml")
+    # 1.8 + 0.6 + 6 · 0.05 + 2 · 0.04 kg centred in x and y, and 0.25 kg of camera at (0.12, 0.01)
+    assert vehicle.mass == pytest.approx(3.03)
+    assert vehicle.center_of_mass[:2] == pytest.approx([0.25 * 0.12 / 3.03, 0.25 * 0.01 / 3.03])
+    assert vehicle.num_rotors == 6
+    assert {(rotor.low, rotor.high, rotor.newtons) for rotor in vehicle.rotors} == {(0, 12, 12)}
+    assert [rotor.reaction[2] * 12 for rotor in vehicle.rotors] == pytest.approx([0.19, -0.19] * 3)
+    front, rear = vehicle.hover_thrust[0], vehicle.hover_thrust[3]
+    assert front > 3.03 * 9.81 / 6 > rear
+    wanted = [3.03 * 9.81, 0.0, 0.0, 0.0]
+    np.testing.assert_allclose(vehicle.allocation @ vehicle.hover_thrust, wanted, atol=1e-12)
+    assert vehicle.rest_height == pytest.approx(0.17)
+
+
+def test_rotors_whose_sites_point_down() -> None:
+    vehicle = Vehicle.load(DATA / "small.xml")
+    assert all(rotor.axis == pytest.approx((0, 0, 1)) for rotor in vehicle.rotors)
+    np.testing.assert_allclose(
+        vehicle.allocation,
+        [[1] * 4, [0.18, -0.18, -0.18, 0.18], [-0.14, -0.14, 0.14, 0.14], [0.018, -0.018] * 2],
+        atol=1e-12,
+    )
+
+
+def test_tilted_rotors_share_the_weight_without_a_drift(tmp_path: Path) -> None:
+    gears = ("0.6 0 0.8 0 0 0", "-0.28 0 0.96 0 0 0")
+    motors = "".join(f'<motor class="quad" site="imu" gear="{gear}"/>' for gear in gears)
+    hover = Vehicle.load(_moved(tmp_path, "</actuator>", motors + "</actuator>")).hover_thrust
+    assert 0.6 * hover[4] == pytest.approx(0.28 * hover[5], rel=1e-9)
+    weight = hover[:4].sum() + 0.8 * hover[4] + 0.96 * hover[5]
+    assert weight == pytest.approx(20 * 9.8, rel=1e-9)
+
+
+def test_a_vehicle_is_never_copied_and_is_pickled_by_its_file() -> None:
+    vehicle = Vehicle.load(DATA / "hexa.xml", linear_drag=0.5)
+    assert copy.deepcopy(vehicle) is vehicle
+    assert pickle.loads(pickle.dumps(vehicle)).hash == vehicle.hash
+
+
+def test_linear_drag_brakes_translation_only() -> None:
+    damping = Vehicle.load(linear_drag=0.5).model.dof_damping
+    assert damping.tolist() == pytest.approx([10.0, 10.0, 10.0, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("drag", [-0.1, 101.0, math.nan, math.inf, "much"])
+def test_bad_drag_is_refused_in_words(drag: float) -> None:
+    with pytest.raises(InputError, match="linear_drag: expected a number from 0 to 100 /s, got"):
+        Vehicle.load(linear_drag=drag)
+
+
+def _moved(folder: Path, old: str = "", new: str = "", name: str = "quad.xml") -> Path:
+    """A copy of the paper's vehicle in `folder`, with `old` replaced by `new`."""
+    text = QUAD_XML.read_text()
+    assert old in text
+    text = re.sub("<keyframe>.*</keyframe>", "", text, flags=re.DOTALL)  # it knows the old numbers
+    (folder / name).write_text(text.replace(old, new))
+    return folder / name
+
+
+def test_hash_names_vehicle_and_drag_and_not_the_folder(tmp_path: Path) -> None:
+    name = Vehicle.load().hash
+    assert len(name) == 32
+    assert set(name) <= set("0123456789abcdef")
+    assert name == Vehicle.load(linear_drag=-0.0).hash
+    for comment in ("<!-- ", "<!-- else "):
+        (tmp_path / "other.xml").write_text(QUAD_XML.read_text().replace("<!-- ", comment))
+        assert Vehicle.load(tmp_path / "other.xml").hash == name
+    assert len({name, Vehicle.load(linear_drag=0.5).hash, Vehicle.load(linear_drag=0.25).hash}) == 3
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [('mass="12"', 'mass="12.5"'), ("0.05", "0.06"), ("RK4", "Euler")]
+)
+def test_hash_sees_every_number(tmp_path: Path, old: str, new: str) -> None:
+    assert Vehicle.load(_moved(tmp_path, old, new)).hash != Vehicle.load().hash
+
+
+def test_hash_sees_into_included_files(tmp_path: Path) -> None:
+    shutil.copy(DATA / "hexa.xml", tmp_path)
+    outer = tmp_path / "outer.xml"
+    outer.write_text('<mujoco model="hexacopter"><include file="hexa.xml"/></mujoco>')
+    assert Vehicle.load(outer).hash == Vehicle.load(DATA / "hexa.xml").hash
+
+
+def test_a_file_that_was_written_anew_is_loaded_anew(tmp_path: Path) -> None:
+    path = _moved(tmp_path)
+    before = Vehicle.load(path)
+    _moved(tmp_path, 'mass="12"', 'mass="13"')
+    os.utime(path, ns=(0, path.stat().st_mtime_ns + 1))
+    assert (before.mass, Vehicle.load(path).mass) == (pytest.approx(20), pytest.approx(21))
+
+
+# --- what is no vehicle ---------------------------------------------------------------------------
+
+FREE = '<freejoint name="free"/>'
+WALL = '<worldbody><geom type="plane" size="1 1 1"/><geom type="plane" size="1 1 1" zaxis="1 0 0"/>'
+SECOND = '<body pos="3 0 0"><freejoint/><geom size="0.1" mass="1"/></body></worldbody>'
+ROTOR1 = '<motor name="rotor1" class="quad" site="rotor1" gear="0 0 1 0 0  0.05"/>'
+PUSHER = '<actuator><motor name="push" class="quad" site="imu" gear="1 0 0 0 0 0"/>'
+SPHERES = '<replicate count="3000000" offset="0 0 1"><geom size="0.1"/></replicate>'
+NESTED = 2 * '<replicate count="300">' + '<geom size="0.1"/>' + 2 * "</replicate>"
+GRID = '<flexcomp name="f" type="grid" count="300 300 300" spacing="1 1 1" dim="3"/>'
+COLOURS = '<texture name="t" type="2d" builtin="flat" width="100000" height="100000"/></asset>'
+HEIGHTS = '<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (FREE, "", "expected one free body and no other joints, got 0 free of 0 joints"),
+        ("</worldbody>", SECOND, "expected one free body and no other joints, got 2 free of 2"),
+        (FREE, '<joint type="hinge"/>', "got 0 free of 1 joints"),
+        (ROTOR1, ROTOR1.replace('site="rotor1"', 'joint="free"'), "rotor1 to be an actuator at a"),
+        (
+            ROTOR1,
+            ROTOR1.replace("motor", "position").replace("gear", 'kp="2" gear'),
+            "rotor rotor1",
+        ),
+        (ROTOR1, ROTOR1.replace("gear", 'refsite="imu" gear'), "rotor1 to act without a reference"),
+        (
+            ROTOR1,
+            ROTOR1.replace("0 0 1 0", "0 0 0 0"),
+            "rotor1 to have a force .gear times gain., got 0 N",
+        ),
+        ('ctrllimited="true"', 'ctrllimited="false"', "rotor1 to have a thrust with limits"),
+        ('ctrlrange="0 100"', 'ctrlrange="0 40"', r"49 N, within its limits, got 0 to 40 N"),
+        ('gear="0 0 1', 'gear="0.2 0 1', "without a torque or a sideways force, got ones"),
+        ("<actuator>", PUSHER, "rotor push to carry a part of the weight of the level craft, got"),
+        ('gravity="0 0 -9.8"', 'gravity="0 1 -9.8"', "gravity along -z, got 20 kg and"),
+        ('gravity="0 0 -9.8"', 'gravity="0 0 0"', "gravity along -z, got 20 kg and"),
+        ("<worldbody>", WALL, "free above the ground, got one that touches something at .* m"),
+        ('timestep="0.01"', 'timestep="1e-8"', "physics step of at least .* s, got 1e-08"),
+        ('mass="', 'mass="0" user="', "expected an MJCF file, got quad.xml: .*mass"),
+        (
+            "</asset>",
+            HEIGHTS,
+            "field or texture of at most 4096 × 4096 points, got",
+        ),
+        ("</asset>", COLOURS, "texture of at most 4096 × 4096 points, got 100000 × 100000"),
+        ("</worldbody>", SPHERES + "</worldbody>", "expected at most 10000 elements, got 30000"),
+        ("</worldbody>", NESTED + "</worldbody>", "expected at most 10000 elements"),
+        ("<worldbody>", '<size memory="1"/><worldbody>', "expected an MJCF file, .* out of memory"),
+        ("</worldbody>", GRID + "</worldbody>", "expected at most 10000 elements, got 270000"),
+        ('timestep="0.01"', 'timestep="1e300"', "physics step of .* at most 1 s, got 1e"),
+        ('ctrlrange="0 100"', 'ctrlrange="0 inf"', "finite numbers, got others in actuator_c"),
+        (
+            'name="rotor1" pos="',
+            'name="rotor1" pos="nan 0 0" user="',
+            "finite numbers, got others in ",
+        ),
+        ("<mujoco", "<robot", "expected an MJCF file, got quad.xml: "),
+    ],
+)
+def test_what_is_no_vehicle_is_refused_in_one_sentence(
+    tmp_path: Path, old: str, new: str, said: str
+) -> None:
+    with pytest.raises(InputError, match=f"^vehicle: .*{said}") as refusal:
+        Vehicle.load(_moved(tmp_path, old, new))
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_file_that_is_not_there() -> None:
+    with pytest.raises(InputError, match=r"vehicle: cannot read nowhere\.xml: No such file"):
+        Vehicle.load("nowhere.xml")
+
+
+# --- imports --------------------------------------------------------------------------------------
+
+
+def test_paths_come_without_mujoco() -> None:
+    code = (
+        "import sys, rotorgram.models\n"
+        "assert rotorgram.models.SCENE_XML.is_file()\n"
+        "assert 'mujoco' not in sys.modules\n"
+        "rotorgram.models.Vehicle\n"
+        "assert 'mujoco' in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, env=dict(os.environ))
+
+
+def test_unknown_names_are_refused() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'Vehicel'"):
+        _ = rotorgram.models.Vehicel

@@ -1,0 +1,208 @@
+"""Vehicles from other MJCF files fly every task; tests/models/test_model.py has what is derived."""
+
+import math
+import re
+import struct
+from pathlib import Path
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from rotorgram.cli import main
+from rotorgram.envs import Loop
+from rotorgram.models.errors import InputError
+from rotorgram.models.vehicle import Vehicle
+
+ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+DATA = Path(__file__).parents[1] / "data"
+
+UNEQUAL = """<mujoco model="unequal">
+  <option timestep="0.005" integrator="RK4" gravity="0 0 -9.81"/>
+  <worldbody>
+    <body name="craft" pos="0 0 1">
+      <freejoint/>
+      <geom type="box" size="0.1 0.1 0.05" mass="2"/>
+      <geom type="sphere" size="0.02" pos="0.05 -0.02 -0.06" mass="0.3"/>
+      <site name="a" pos="0.3 0.2 0.02"/>
+      <site name="b" pos="0.25 -0.3 0"/>
+      <site name="c" pos="-0.2 -0.25 0"/>
+      <site name="d" pos="-0.35 0.2 0.01"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="a" site="a" gear="0 0 2 0 0 0.04" ctrllimited="true" ctrlrange="0 10"/>
+    <general name="b" site="b" gear="0 0 1 0 0 -0.02" gainprm="4" ctrllimited="true"
+      ctrlrange="0 5"/>
+    <motor name="c" site="c" gear="0 0 1 0 0 0.02" ctrllimited="true" ctrlrange="0 20"/>
+    <motor name="d" site="d" gear="0 0 0.5 0 0 -0.01" ctrllimited="true" ctrlrange="0 40"/>
+  </actuator>
+</mujoco>"""
+
+BODY = """<body name="craft" pos="0 0 1">
+  <freejoint/>
+  <geom type="mesh" mesh="wedge" mass="1"/>
+  <site name="a" pos="0.2 0 0"/>
+  <site name="b" pos="-0.1 0.17 0"/>
+  <site name="c" pos="-0.1 -0.17 0"/>
+</body>"""
+
+INCLUDING = """<mujoco model="included">
+  <option timestep="0.01" integrator="RK4"/>
+  <default><motor ctrllimited="true" ctrlrange="0 9"/></default>
+  <compiler meshdir="shapes"/>
+  <asset><mesh name="wedge" file="wedge.stl"/></asset>
+  <worldbody>
+    <geom name="meadow" type="plane" size="0 0 1" pos="0 0 0.5"/>
+    <include file="craft.xml"/>
+  </worldbody>
+  <actuator>
+    <motor site="a" gear="0 0 1 0 0 0"/>
+    <motor site="b" gear="0 0 1 0 0 0"/>
+    <motor site="c" gear="0 0 1 0 0 0"/>
+  </actuator>
+</mujoco>"""
+
+
+def tetrahedron(path: Path, size: float) -> None:
+    """A binary STL, m."""
+    corners = size * np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], np.float32)
+    faces = [(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)]
+    content = b"".join(
+        struct.pack("<12fH", 0, 0, 0, *corners[list(face)].ravel().tolist(), 0) for face in faces
+    )
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(bytes(80) + struct.pack("<I", len(faces)) + content)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Path]:
+    unequal, included = tmp_path / "unequal.xml", tmp_path / "included.xml"
+    unequal.write_text(UNEQUAL)
+    included.write_text(INCLUDING)
+    (tmp_path / "craft.xml").write_text(f"<mujoco>{BODY}</mujoco>")
+    tetrahedron(tmp_path / "shapes" / "wedge.stl", 0.05)
+    return {"unequal": unequal, "included": included, "hexa": DATA / "hexa.xml"}
+
+
+@pytest.mark.parametrize("name", ["unequal", "included", "hexa"])
+def test_action_zero_hovers_and_any_other_climbs(files: dict[str, Path], name: str) -> None:
+    """Every vehicle holds still, level and straight at action 0, whatever its rotors are."""
+    vehicle = Vehicle.load(files[name])
+    heights = {}
+    for action in (0.0, 0.2):
+        env = gym.make(ELEVATION, vehicle=files[name], start_band=0.0, action="offset")
+        _, info = env.reset(seed=0)
+        for _ in range(100):
+            *_, info = env.step(np.array([action], np.float32))
+        turned = abs(np.array([info["phi"], info["theta"], info["psi"]])).max()
+        assert turned < 1e-6
+        assert math.hypot(info["X"], info["Z"]) < 1e-6
+        heights[action] = info["Y"]
+        thrusts = [info[f"F{i + 1}"] for i in range(vehicle.num_rotors)]
+        # All rotors in proportion to hover: no torque, whatever the arms.
+        share = np.array(thrusts) / vehicle.hover_thrust
+        np.testing.assert_allclose(share, share[0], rtol=1e-9)
+    assert heights[0.0] == pytest.approx(5.0, abs=1e-6)
+    assert heights[0.2] > 5.0 + 0.1
+
+
+@pytest.mark.parametrize("name", ["unequal", "included", "hexa"])
+def test_acceleration_is_that_of_newton(files: dict[str, Path], name: str) -> None:
+    """Thrust in newtons reaches the body in newtons, whatever gear and gain."""
+    vehicle = Vehicle.load(files[name])
+    loop = Loop(ELEVATION, vehicle=files[name], options={"action": "offset"})
+    still = np.zeros((1, 1), np.float32)
+    loop.advance(still, np.ones(1, bool), [0])
+    start = loop.telemetry["position"][0, 1]
+    for _ in range(10):
+        loop.advance(still + 0.25)
+    force = float(loop.telemetry["thrust"].sum()) - vehicle.mass * vehicle.gravity
+    climbed = loop.telemetry["position"][0, 1] - start
+    assert climbed == pytest.approx(0.5 * force / vehicle.mass * 0.2**2, rel=1e-6)
+
+
+def test_unequal_arms_gears_gains_and_an_offset_mass(files: dict[str, Path]) -> None:
+    vehicle = Vehicle.load(files["unequal"])
+    assert vehicle.mass == pytest.approx(2.3)
+    assert vehicle.center_of_mass == pytest.approx(np.array([0.05, -0.02, -0.06]) * 0.3 / 2.3)
+    assert vehicle.thrust_high.tolist() == pytest.approx([20.0] * 4)
+    assert [rotor.newtons for rotor in vehicle.rotors] == [2.0, 4.0, 1.0, 0.5]
+    for rotor, reaction in zip(vehicle.rotors, (0.02, -0.02, 0.02, -0.02), strict=True):
+        assert rotor.reaction == pytest.approx((0.0, 0.0, reaction))
+    hover = vehicle.hover_thrust
+    assert hover.sum() == pytest.approx(2.3 * 9.81)
+    arms = np.array([rotor.position for rotor in vehicle.rotors]) - vehicle.center_of_mass
+    assert (arms[:, 0] * hover).sum() == pytest.approx(0.0, abs=1e-9)
+    assert (arms[:, 1] * hover).sum() == pytest.approx(0.0, abs=1e-9)
+    assert len(set(hover.round(3).tolist())) > 1
+
+
+def test_includes_meshes_and_a_ground_of_its_own(files: dict[str, Path], tmp_path: Path) -> None:
+    vehicle = Vehicle.load(files["included"])
+    planes = vehicle.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    assert planes.sum() == 1  # the file's, and none besides
+    assert vehicle.model.geom(int(planes.argmax())).name == "meadow"
+    # A mesh is placed at its centre: the lowest corner is 0.05 m below it, on ground at 0.5 m.
+    assert vehicle.rest_height == pytest.approx(0.55, abs=2e-3)
+    before = vehicle.hash
+    tetrahedron(tmp_path / "shapes" / "wedge.stl", 0.06)
+    files["included"].touch()
+    assert Vehicle.load(files["included"]).hash != before
+
+
+def test_each_vehicle_has_the_spec_of_its_rotors(files: dict[str, Path]) -> None:
+    env = gym.make(HOVER, vehicle=files["included"])
+    assert env.action_space.shape == (3,)
+    assert env.observation_space.shape == (18,)
+    spec = env.unwrapped.env_spec  # type: ignore[attr-defined]
+    assert spec.vehicle == "included"
+    assert spec.vehicle_hash == Vehicle.load(files["included"]).hash
+    assert spec.telemetry[2].components == ("F1", "F2", "F3")
+    assert spec.telemetry[2].high == 9.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("<freejoint/>", "", "expected one free body"),
+        ("<freejoint/>", '<joint type="hinge"/>', "expected one free body"),
+        ('gainprm="4"', 'gainprm="4" biastype="affine"', "thrust of rotor b to be gain times"),
+        ('ctrlrange="0 10"', 'ctrlrange="0 1"', "rotor a to carry its share of the weight"),
+        ('ctrllimited="true" ctrlrange="0 20"', 'ctrllimited="false"', "rotor c to have a thrust"),
+        ('gravity="0 0 -9.81"', 'gravity="0 0 0"', "expected a mass > 0 and gravity along -z"),
+        ('timestep="0.005"', 'timestep="1e-8"', "expected a physics step of at least 1e-05 s"),
+        ("</mujoco>", "</mujo>", "expected an MJCF file, got unequal.xml"),
+    ],
+)
+def test_what_cannot_fly_is_one_sentence(
+    files: dict[str, Path], old: str, new: str, sentence: str
+) -> None:
+    assert old in UNEQUAL
+    files["unequal"].write_text(UNEQUAL.replace(old, new))
+    with pytest.raises(InputError, match=f"^vehicle: .*{sentence}") as caught:
+        gym.make(ELEVATION, vehicle=files["unequal"])
+    assert "\n" not in str(caught.value)
+
+
+def test_a_period_that_does_not_fit_the_files_step(files: dict[str, Path]) -> None:
+    gym.make(ELEVATION, vehicle=files["unequal"], control_period=0.005)
+    with pytest.raises(InputError, match=r"^control_period: .* physics step of 0.01 s, got 0.005"):
+        gym.make(ELEVATION, vehicle=files["included"], control_period=0.005)
+
+
+def test_a_policy_flies_another_vehicle_only_if_the_user_names_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small, run = ("--vehicle", str(DATA / "small.xml")), str(tmp_path / "run")
+    task = ("--env", HOVER, "--num-envs", "4", "--env-steps", "256")
+    assert main(["train", "a2c", *task, *small, "--out", run]) == 0
+    assert main(["evaluate", run, "--episodes", "1", *small]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", run, "--episodes", "1"]) == 1
+    assert re.search(
+        r"vehicle: expected small .* on which the policy was trained, got rotorgram quadcopter",
+        capsys.readouterr().err,
+    )
+    paper = str(Vehicle.load().path)
+    assert main(["evaluate", run, "--episodes", "1", "--vehicle", paper]) == 0

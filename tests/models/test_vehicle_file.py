@@ -1,0 +1,701 @@
+"""TOML files of vehicles: what they compile to, what is refused, and what is told of each number.
+
+Expected values are written out: geometry, moments of inertia of boxes and cylinders, torques.
+"""
+
+import math
+import os
+import pickle
+import re
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+import rotorgram.envs  # noqa: F401  registers the envs
+from rotorgram.models import InputError, Vehicle, library
+from rotorgram.models.export import export_mjcf
+from rotorgram.models.vehicle_file import ENTRIES, FRAMES, read_vehicle_file
+from rotorgram.rendering.stage import Stage
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "vehicles.md").read_text(encoding="utf-8")
+
+BODY = """
+[body]
+mass = 1.5
+inertia = [0.02, 0.021, 0.035]
+"""
+CRAFT = f"""{BODY}
+[rotors]
+frame = "cross"
+arm = 0.3
+thrust = [0, 8]
+reaction = 0.016
+"""
+LISTED = """
+[rotors]
+thrust = [0, 8]
+reaction = 0.016
+[[rotors.list]]
+position = [0.2, 0.2, 0.0]
+turn = "cw"
+[[rotors.list]]
+position = [0.2, -0.2, 0.0]
+turn = "ccw"
+[[rotors.list]]
+position = [-0.2, -0.2, 0.0]
+turn = "cw"
+[[rotors.list]]
+position = [-0.2, 0.2, 0.0]
+turn = "ccw"
+"""
+PAPER = """
+name = "rotorgram quadcopter"
+gravity = 9.8
+[[body.parts]]
+shape = "box"
+mass = 12
+size = [0.44, 0.44, 0.14]
+{parts}
+[rotors]
+frame = "cross"
+arm = 1.4142135623730951
+thrust = [0, 100]
+reaction = 0.05
+""".format(
+    parts="".join(
+        f"""
+[[body.parts]]
+shape = "cylinder"
+mass = 1.2
+radius = 0.035
+length = 1.4142135623730951
+position = [{x / 2}, {y / 2}, 0]
+axis = [{x}, {y}, 0]
+[[body.parts]]
+shape = "cylinder"
+mass = 0.8
+radius = 0.09
+length = 0.12
+position = [{x}, {y}, 0]
+"""
+        for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))
+    )
+)
+
+
+def write(folder: Path, text: str, name: str = "craft.toml") -> Path:
+    (folder / name).write_text(text, encoding="utf-8")
+    return folder / name
+
+
+def load(folder: Path, text: str) -> Vehicle:
+    return Vehicle.load(write(folder, text))
+
+
+def flown(model: mujoco.MjModel, newtons: np.ndarray, steps: int = 200) -> np.ndarray:
+    """State after a flight from 100 m with thrusts that vary, from a turn."""
+    data = mujoco.MjData(model)
+    data.qpos[2] = 100.0
+    data.qvel[3:] = 0.3, -0.2, 0.1
+    for step in range(steps):
+        data.ctrl[:] = newtons * (1 + 0.2 * np.sin(0.1 * step + np.arange(model.nu)))
+        mujoco.mj_step(model, data)
+    return np.concatenate((data.qpos, data.qvel))
+
+
+# ---- rotors
+
+
+H = math.sqrt(0.5)
+C, S = math.cos(math.pi / 8), math.sin(math.pi / 8)
+Q = math.sqrt(0.75)
+PLACES = {
+    # of the rotors, by hand: clockwise seen from above
+    "plus": [(1, 0), (0, -1), (-1, 0), (0, 1)],
+    "cross": [(H, H), (H, -H), (-H, -H), (-H, H)],
+    "hexa": [(Q, 0.5), (Q, -0.5), (0, -1), (-Q, -0.5), (-Q, 0.5), (0, 1)],
+    "octo": [(C, S), (C, -S), (S, -C), (-S, -C), (-C, -S), (-C, S), (-S, C), (S, C)],
+}
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_frames(frame: str, tmp_path: Path) -> None:
+    vehicle = load(tmp_path, CRAFT.replace('"cross"', f'"{frame}"'))
+    places = 0.3 * np.array(PLACES[frame])
+    positions = np.array([rotor.position for rotor in vehicle.rotors])
+    np.testing.assert_allclose(positions, np.c_[places, 0 * places[:, 0]], atol=1e-15)
+    count = len(places)
+    np.testing.assert_allclose(vehicle.allocation[0], np.ones(count))
+    np.testing.assert_allclose(vehicle.allocation[1], places[:, 1], atol=1e-15)
+    np.testing.assert_allclose(vehicle.allocation[2], -places[:, 0], atol=1e-15)
+    np.testing.assert_allclose(vehicle.allocation[3], [0.016, -0.016] * (count // 2))
+    assert np.linalg.matrix_rank(vehicle.allocation) == 4
+    np.testing.assert_allclose(vehicle.hover_thrust, 1.5 * 9.81 / count)
+    assert [rotor.name for rotor in vehicle.rotors] == [f"rotor{i + 1}" for i in range(count)]
+
+
+def test_a_rotor_that_turns_clockwise_turns_the_craft_counterclockwise(tmp_path: Path) -> None:
+    vehicle = load(tmp_path, CRAFT)
+    data = mujoco.MjData(vehicle.model)
+    data.qpos[2] = 100.0
+    data.ctrl[:] = 5.0, 0.0, 5.0, 0.0  # the odd ones turn clockwise
+    mujoco.mj_step(vehicle.model, data)
+    assert data.qvel[5] == pytest.approx(0.01 * 10 * 0.016 / 0.035)  # about +z
+
+
+def test_a_list_of_tilted_rotors_above_the_origin(tmp_path: Path) -> None:
+    tilted = LISTED.replace("0.0]\n", "0.05]\naxis = [0, {}, 2]\n").replace("thrust", "{}thrust", 1)
+    text = BODY + tilted.format("", 0.5, -0.5, -0.5, 0.5)
+    vehicle = load(tmp_path, text)
+    up, side = 2 / math.hypot(2, 0.5), 0.5 / math.hypot(2, 0.5)
+    first = vehicle.rotors[0]
+    assert first.axis == pytest.approx((0.0, side, up))
+    assert first.reaction == pytest.approx((0.0, 0.016 * side, 0.016 * up))
+    # position × axis: (y az - z ay, z ax - x az, x ay - y ax)
+    torque = (0.2 * up - 0.05 * side, -0.2 * up, 0.2 * side)
+    torque = (torque[0], torque[1] + 0.016 * side, torque[2] + 0.016 * up)
+    assert vehicle.allocation[:, 0] == pytest.approx((up, *torque))
+
+
+def test_thrust_and_reaction_from_speeds_and_coefficients(tmp_path: Path) -> None:
+    told = "speed = [100, 1000]\nthrust_coefficient = 8e-6\ntorque_coefficient = 1.2e-7"
+    vehicle = load(tmp_path, CRAFT.replace("thrust = [0, 8]\nreaction = 0.016", told))
+    assert vehicle.thrust_low == pytest.approx([0.08] * 4)
+    assert vehicle.thrust_high == pytest.approx([8.0] * 4)
+    assert vehicle.allocation[3] == pytest.approx([0.015, -0.015, 0.015, -0.015])
+    assert vehicle.coefficients.rotors.thrust_coefficient == 8e-6
+
+
+# ---- bodies
+
+
+def test_mass_inertia_and_center_are_those_of_the_file(tmp_path: Path) -> None:
+    told = "inertia = [0.02, 0.021, 0.035, 0.001, -0.002, 0.0005]\n"
+    told += "center_of_mass = [0.01, -0.02, 0.03]"
+    vehicle = load(tmp_path, CRAFT.replace("inertia = [0.02, 0.021, 0.035]", told))
+    assert vehicle.mass == 1.5
+    np.testing.assert_allclose(vehicle.center_of_mass, (0.01, -0.02, 0.03), rtol=1e-14)
+    expected = [[0.02, 0.001, -0.002], [0.001, 0.021, 0.0005], [-0.002, 0.0005, 0.035]]
+    np.testing.assert_allclose(vehicle.inertia, expected, rtol=0, atol=1e-15)
+
+
+def test_inertia_of_parts(tmp_path: Path) -> None:
+    parts = """
+[[body.parts]]
+shape = "box"
+mass = 1.2
+size = [0.3, 0.2, 0.1]
+yaw = 1.5707963267948966
+[[body.parts]]
+shape = "cylinder"
+mass = 0.4
+radius = 0.02
+length = 0.3
+position = [0.0, 0.0, -0.2]
+axis = [0, 2, 0]
+"""
+    vehicle = load(tmp_path, CRAFT.replace(BODY, parts))
+    assert vehicle.mass == pytest.approx(1.6, rel=1e-15)
+    np.testing.assert_allclose(vehicle.center_of_mass, (0, 0, -0.05), atol=1e-15)
+    # The box has its 0.3 m along y: (m / 12) (b² + c²). The cylinder lies along y: m r² / 2 about
+    # it, m (3 r² + l²) / 12 across. Both are moved by Steiner, the box by 0.05 m along z, the
+    # cylinder by 0.15 m: m d² about x and y.
+    box = np.array((0.1 * (0.09 + 0.01), 0.1 * (0.04 + 0.01), 0.1 * (0.04 + 0.09)))
+    across, along = 0.4 * (3 * 0.0004 + 0.09) / 12, 0.4 * 0.0004 / 2
+    rod = np.array((across, along, across))
+    moved = (1.2 * 0.05**2 + 0.4 * 0.15**2) * np.array((1, 1, 0))
+    np.testing.assert_allclose(vehicle.inertia, np.diag(box + rod + moved), rtol=0, atol=1e-15)
+
+
+def test_the_hull_stands_where_the_file_says(tmp_path: Path) -> None:
+    told = "size = [0.2, 0.1, 0.06]\nground_clearance = 0.11"
+    vehicle = load(tmp_path, CRAFT.replace("mass = 1.5", f"mass = 1.5\n{told}"))
+    assert vehicle.rest_height == pytest.approx(0.11, abs=1e-8)
+    data = mujoco.MjData(vehicle.model)
+    data.qpos[2] = 0.15
+    mujoco.mj_step(vehicle.model, data, nstep=300)
+    assert data.qpos[2] == pytest.approx(0.11, abs=1e-3)  # soft contact lets it sink in
+    assert data.qpos[3] == pytest.approx(1.0, abs=1e-6)  # upright
+
+
+def test_the_papers_vehicle_as_toml_is_the_same_craft(tmp_path: Path) -> None:
+    toml, xml = load(tmp_path, PAPER), Vehicle.load()
+    assert toml.mass == pytest.approx(20.0, rel=1e-14)
+    assert (toml.gravity, toml.timestep, toml.rest_height) == (9.8, 0.01, pytest.approx(0.4))
+    np.testing.assert_allclose(toml.inertia, xml.inertia, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(toml.allocation, xml.allocation, rtol=0, atol=1e-14)
+    newtons = np.full(4, 49.0)
+    ours, theirs = flown(toml.model, newtons), flown(xml.model, newtons)
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12)
+
+
+# ---- coefficients and provenance
+
+
+def test_coefficients_reach_the_vehicle_with_all_digits(tmp_path: Path) -> None:
+    text = CRAFT + "time_constant = 0.0123456789012\ncurve = [0.1, 0.9]\n"
+    vehicle = load(
+        tmp_path, text + "[drag]\nlinear = [0.1, 0.2, 0.3]\n[sensors]\nrange_limit = 4\n"
+    )
+    assert vehicle.coefficients.numbers() == {
+        "rotors.time_constant": (0.0123456789012,),
+        "rotors.curve": (0.1, 0.9),
+        "drag.linear": (0.1, 0.2, 0.3),
+        "sensors.range_limit": (4.0,),
+    }
+
+
+def test_provenance(tmp_path: Path) -> None:
+    text = CRAFT.replace(
+        "mass = 1.5",
+        'source = "drawing"\nmass = { value = 1.5, source = "scales", why = "with battery", '
+        'others = [ { value = 1.4, source = "datasheet" } ] }',
+    )
+    numbers = {one.name: one for one in read_vehicle_file(write(tmp_path, text)).numbers}
+    mass, inertia, arm = (numbers[name] for name in ("body.mass", "body.inertia", "rotors.arm"))
+    assert (mass.value, mass.unit, mass.source, mass.why) == (1.5, "kg", "scales", "with battery")
+    assert mass.others == ((1.4, "datasheet"),)
+    assert (inertia.value, inertia.source) == ((0.02, 0.021, 0.035), "drawing")
+    assert (arm.value, arm.source, arm.others) == (0.3, "", ())
+    assert Vehicle.load(tmp_path / "craft.toml").mass == 1.5
+
+
+def test_the_hash_is_of_numbers_to_the_last_digit(tmp_path: Path) -> None:
+    def of(text: str, name: str = "craft.toml") -> str:
+        return Vehicle.load(write(tmp_path, text, name)).hash
+
+    plain = of(CRAFT)
+    assert of('name = "craft"\n# a comment\n' + CRAFT, "other.toml") == plain
+    told = '{ value = 1.50, source = "scales", others = [ { value = 1.4, source = "x" } ] }'
+    assert of(CRAFT.replace("mass = 1.5", f"mass = {told}"), "third.toml") != plain  # its name
+    named = 'name = "craft"\n' + CRAFT.replace("mass = 1.5", f"mass = {told}")
+    assert of(named, "fourth.toml") == plain
+    assert of('name = "craft"\n' + CRAFT.replace("1.5", "1.5000000001"), "fifth.toml") != plain
+
+
+def test_a_file_that_was_written_anew_is_read_anew(tmp_path: Path) -> None:
+    first = load(tmp_path, CRAFT)
+    assert Vehicle.load(first.path) is first
+    write(tmp_path, CRAFT.replace("1.5", "1.6"))
+    os.utime(first.path, ns=(1, 1))
+    assert Vehicle.load(first.path).mass == 1.6
+
+
+# ---- refusals
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("mass = 1.5", "mass = -1.5", r"body.mass: .* from 1e-06 to 1e\+06 kg, got -1.5"),
+        ("mass = 1.5", 'mass = "1.5"', "body.mass: expected a number .* kg, got '1.5'"),
+        ("mass = 1.5", "mass = true", "body.mass: expected a number .* kg, got True"),
+        ("mass = 1.5", "mass = nan", "body.mass: expected a number .* kg, got nan"),
+        ("mass = 1.5", "mass = [1, 2]", r"body.mass: expected a number .* kg, got \[1, 2\]"),
+        ("mass = 1.5", "", "body: expected mass and inertia, or parts, got no mass"),
+        ("mass = 1.5", "mas = 1.5", "body: expected some of .*mass, inertia.*, got 'mas'"),
+        ("mass = 1.5", "mass = { value = 0 }", "body.mass: expected a number .*, got 0"),
+        ("mass = 1.5", "mass = { source = 'x' }", "body.mass: expected a value, got none"),
+        ("mass = 1.5", "mass = { value = 1, src = 'x' }", "body.mass: expected some of value, sou"),
+        ("mass = 1.5", "mass = { value = 1, source = 3 }", "body.mass.source: expected a text, go"),
+        (
+            "mass = 1.5",
+            "mass = { value = 1, others = [ { value = -1, source = 'x' } ] }",
+            r"body.mass.others\[1\]: expected a number .* kg, got -1",
+        ),
+        ("[0.02, 0.021, 0.035]", "[0.02, 0.021]", "body.inertia: expected 3 numbers: Ixx.*, got 0"),
+        (
+            "[0.02, 0.021, 0.035]",
+            "[0.02, 0.021, 0.042]",
+            "body.inertia: expected .*none is larger than the sum.*, got 0.02, 0.021 and 0.042 kg",
+        ),
+        ("[0.02, 0.021, 0.035]", "[0.02, 0.021, -1]", "body.inertia: .* above 1e-15 kg m², got 0"),
+        ("[body]", "[bdoy]", "vehicle: expected some of .*body, rotors.*, got 'bdoy'"),
+        ("[body]", "[[body]]", r"body: expected a table, got \[\{'mass"),
+        (BODY, "", r"vehicle: expected a table \[body\], or \[model\] with a file, got neither"),
+        (BODY, "body.parts = []", r"body.parts: expected a list of tables, at least one, got \[\]"),
+        (
+            "mass = 1.5",
+            "mass = 1.5\nparts = [ { shape = 'box' } ]",
+            "body: expected parts, or mass and inertia, got mass, inertia too",
+        ),
+        ("mass = 1.5", "mass = 1.5\nground_clearance = 0.001", "body.ground_clearance: .* more th"),
+        ('frame = "cross"', 'frame = "tri"', "rotors.frame: expected 'plus' or .*, got 'tri'"),
+        ('frame = "cross"\n', "", "rotors: expected a frame or a list, got neither"),
+        ("arm = 0.3\n", "", "rotors: expected arm of the frame 'cross', got none"),
+        ("arm = 0.3", "arm = 300", "rotors.arm: expected a number from 0.001 to 100 m, got 300"),
+        ("[0, 8]", "[8, 0]", "rotors.thrust: expected a lower and a higher number, got 8, 0"),
+        ("[0, 8]", "[0, 8, 9]", "rotors.thrust: expected 2 numbers from .* N, got"),
+        ("thrust = [0, 8]\n", "", "rotors: expected thrust, or speed .*, got neither"),
+        ("thrust =", "speed =", "rotors: expected thrust_coefficient with speed, got none"),
+        ("arm", "speed = [0, 9]\narm", "rotors: expected thrust, or .*, got thrust and speed"),
+        ("reaction = 0.016\n", "", "rotors: expected reaction, or .*, got neither"),
+        ("[0, 8]", "[0, 3]", "vehicle: expected rotor rotor1 to carry its share of the weight"),
+        ("[rotors]", "timestep = 2\n[rotors]", "body: expected some of .*, got 'timestep'"),
+        (CRAFT, "timestep = 2\n" + CRAFT, "timestep: expected a number from 1e-05 to 1 s, got 2"),
+        (CRAFT, "name = 3\n" + CRAFT, "name: expected a text of 1 to 100 printable .*, got 3"),
+        (CRAFT, 'name = "a\\nb"\n' + CRAFT, r"name: expected a text of .*, got 'a\\nb'"),
+        (CRAFT, f'name = "{101 * "n"}"\n' + CRAFT, "name: expected a text of 1 to 100 "),
+        (CRAFT, f"{1000 * 'k'} = 1\n" + CRAFT, "vehicle: expected some of .*, got 'k{298}…$"),
+        (CRAFT, f"a = {5000 * '['}", "vehicle: expected a TOML .* too many in each other"),
+        (CRAFT, "#" * 1_000_001, "vehicle: expected a TOML file of at most 1000000 bytes, got"),
+        ("arm", "curve = []\narm", r"rotors.curve: .* numbers from -10 to 10, got \[\]$"),
+        (CRAFT, "mass 1.5", "vehicle: expected a TOML file, got craft.toml: "),
+        (
+            CRAFT,
+            CRAFT + "[drag]\nlinear = 0.1\n",
+            "drag.linear: expected 3 numbers from 0 to 10000 N s/m, got 0.1",
+        ),
+        (CRAFT, CRAFT + "[drag]\nlin = 1\n", "drag: expected some of linear, .*, got 'lin'"),
+        (CRAFT, CRAFT + "[model]\nfile = 'x.obj'", "model.file: expected a URDF .*got 'x.obj'"),
+        (CRAFT, CRAFT + "[model]\nfile = 'x.xml'", "model.file: expected a file that is there"),
+    ],
+)  # fmt: skip
+def test_a_wrong_file_is_one_sentence(old: str, new: str, sentence: str, tmp_path: Path) -> None:
+    assert old in CRAFT
+    with pytest.raises(InputError, match=f"^{sentence}") as caught:
+        load(tmp_path, CRAFT.replace(old, new, 1))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ('turn = "cw"', "", r"rotors.list\[1\].turn: expected 'cw' or 'ccw', got None"),
+        ('turn = "ccw"', 'turn = "left"', r"rotors.list\[2\].turn: expected .*, got 'left'"),
+        ("position = [0.2, 0.2, 0.0]", "", r"rotors.list\[1\]: expected a position, got none"),
+        ('turn = "cw"', 'turn = "cw"\naxis = [0, 0, 0]', r"rotors.list\[1\].axis: .*, got 0, 0, 0"),
+        ('turn = "cw"', 'turn = "cw"\nlink = "x"', r"rotors.list\[1\]: .* a position, got link"),
+        ('turn = "cw"', 'turn = "cw"\nname = "rotor2"', "rotors.list: .* name .*'rotor2' twice"),
+        ("reaction", "arm = 0.3\nreaction", "rotors: expected no arm with a list, got 0.3"),
+        ("reaction", 'frame = "plus"\nreaction', "rotors: expected a frame or a list, got both"),
+    ],
+)  # fmt: skip
+def test_a_wrong_list_is_one_sentence(old: str, new: str, sentence: str, tmp_path: Path) -> None:
+    assert old in LISTED
+    with pytest.raises(InputError, match=f"^{sentence}"):
+        load(tmp_path, BODY + LISTED.replace(old, new, 1))
+
+
+@pytest.mark.parametrize(
+    ("part", "sentence"),
+    [
+        ("mass = 1", r"body.parts\[1\].shape: expected 'box' or 'cylinder', got None"),
+        ("shape = 'box'\nmass = 1", r"body.parts\[1\]: expected size of a box, got none"),
+        ("shape = 'cylinder'\nmass = 1\nradius = 1", r"body.parts\[1\]: expected length of a cyl"),
+        ("shape = 'box'\nsize = [1, 1, 1]", r"body.parts\[1\]: expected mass of a box, got none"),
+        (
+            "shape = 'box'\nmass = 1\nsize = [1, 1, 1]\nradius = 2",
+            r"body.parts\[1\]: expected no radius for a box, got 2",
+        ),
+    ],
+)
+def test_a_wrong_part_is_one_sentence(part: str, sentence: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"^{sentence}"):
+        load(tmp_path, CRAFT.replace(BODY, f"[[body.parts]]\n{part}\n"))
+
+
+# ---- models of their own
+
+
+URDF = """<?xml version="1.0"?>
+<robot name="urdf quad">
+  <link name="base">
+    <inertial><origin xyz="0 0 0.01"/><mass value="0.8"/>
+      <inertia ixx="0.004" ixy="0" ixz="0" iyy="0.005" iyz="0" izz="0.008"/></inertial>
+    <visual><geometry><mesh filename="package://quad/body.dae"/></geometry></visual>
+    <collision><geometry><box size="0.2 0.2 0.1"/></geometry></collision>
+  </link>
+  {links}
+</robot>
+"""
+LINKS = "".join(
+    f"""
+  <link name="prop{i}"><inertial><mass value="0.05"/>
+    <inertia ixx="1e-5" ixy="0" ixz="0" iyy="1e-5" iyz="0" izz="2e-5"/></inertial></link>
+  <joint name="spin{i}" type="{kind}"><parent link="base"/><child link="prop{i}"/>
+    <origin xyz="{x} {y} 0.04"/><axis xyz="0 0 1"/></joint>
+"""
+    for i, x, y, kind in (
+        (1, 0.2, 0.2, "continuous"),
+        (2, 0.2, -0.2, "continuous"),
+        (3, -0.2, -0.2, "fixed"),
+        (4, -0.2, 0.2, "fixed"),
+    )
+)
+OF_URDF = """
+[model]
+file = "quad.urdf"
+[rotors]
+thrust = [0, 6]
+reaction = 0.02
+radius = 0.1
+[[rotors.list]]
+link = "prop1"
+turn = "cw"
+[[rotors.list]]
+link = "prop2"
+turn = "ccw"
+[[rotors.list]]
+link = "prop3"
+turn = "cw"
+[[rotors.list]]
+link = "base"
+position = [-0.2, 0.2, 0.04]
+turn = "ccw"
+"""
+
+
+def test_urdf(tmp_path: Path) -> None:
+    write(tmp_path, URDF.format(links=LINKS), "quad.urdf")
+    vehicle = load(tmp_path, OF_URDF)
+    assert vehicle.mass == pytest.approx(1.0, rel=1e-14)
+    np.testing.assert_allclose(vehicle.center_of_mass, (0, 0, 0.016), atol=1e-15)
+    # Ixx: 0.004 + 0.8 · 0.006² + 4 · (1e-5 + 0.05 (0.2² + 0.024²)); Izz: 0.008 + 4 (2e-5 + 0.004)
+    moments = np.diag(vehicle.inertia)
+    expected = (0.004 + 2.88e-5 + 0.00815520, 0.005 + 2.88e-5 + 0.00815520, 0.02408)
+    np.testing.assert_allclose(moments, expected, rtol=1e-12)
+    np.testing.assert_allclose(vehicle.allocation[1], (0.2, -0.2, -0.2, 0.2), rtol=1e-14)
+    np.testing.assert_allclose(vehicle.allocation[2], (-0.2, -0.2, 0.2, 0.2), rtol=1e-14)
+    np.testing.assert_allclose(vehicle.allocation[3], (0.02, -0.02, 0.02, -0.02), rtol=1e-14)
+    assert vehicle.rest_height == pytest.approx(0.05)
+    assert (vehicle.timestep, vehicle.gravity) == (0.01, 9.81)
+    assert vehicle.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    assert vehicle.coefficients.rotors.radius == 0.1
+    env = gym.make("rotorgram/Hover-v0", vehicle=vehicle.path)
+    env.reset(seed=0)
+    assert env.action_space.shape == (4,)
+
+
+@pytest.mark.parametrize("place", ["hull.stl", "meshes/hull.stl"])
+def test_meshes_of_a_package_are_found_above_a_urdf_file(place: str, tmp_path: Path) -> None:
+    (tmp_path / "urdf").mkdir()
+    mesh = f'<mesh filename="package://{tmp_path.name}/{place}"/>'
+    urdf = URDF.format(links=LINKS).replace('<box size="0.2 0.2 0.1"/>', mesh)
+    write(tmp_path / "urdf", urdf, "quad.urdf")
+    with pytest.raises(
+        InputError, match=r"^model.file: expected its meshes .*, got no file for pack"
+    ):
+        load(tmp_path / "urdf", OF_URDF)
+    tetrahedron(tmp_path / place, 0.07)
+    vehicle = load(tmp_path / "urdf", OF_URDF)
+    assert vehicle.rest_height == pytest.approx(0.07, abs=1e-4)
+    assert vehicle.mass == pytest.approx(1.0)
+
+
+def test_a_urdf_file_without_links(tmp_path: Path) -> None:
+    write(tmp_path, '<robot name="nothing"/>', "quad.urdf")
+    with pytest.raises(InputError, match=r"^model.file: expected a URDF file with links, got none"):
+        load(tmp_path, OF_URDF)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ('link = "prop1"', 'link = "prop9"', r"rotors.list\[1\]: .* a body .*prop1, .*'prop9'"),
+        ('link = "prop1"', "", r"rotors.list\[1\]: .* link, body and site .*, got none"),
+        ("[rotors]", BODY + "[rotors]", "body: expected none beside a model's file"),
+        ('link = "prop1"', 'link = "prop3"', "vehicle: .* one free body and no other joints"),
+    ],
+)  # fmt: skip
+def test_a_wrong_model_is_one_sentence(old: str, new: str, sentence: str, tmp_path: Path) -> None:
+    write(tmp_path, URDF.format(links=LINKS), "quad.urdf")
+    with pytest.raises(InputError, match=f"^{sentence}"):
+        load(tmp_path, OF_URDF.replace(old, new, 1))
+
+
+def test_a_urdf_file_needs_a_file_that_names_its_rotors(tmp_path: Path) -> None:
+    file = write(tmp_path, URDF.format(links=LINKS), "quad.urdf")
+    with pytest.raises(InputError, match=r"^vehicle: expected a TOML file that names the rotors"):
+        Vehicle.load(file)
+
+
+def test_mjcf_with_coefficients_from_toml(tmp_path: Path) -> None:
+    source = ROOT / "tests" / "data" / "tiny.xml"
+    (tmp_path / "tiny.xml").write_bytes(source.read_bytes())
+    more = '[model]\nfile = "tiny.xml"\n[rotors]\nradius = 0.023\n[sensors]\nrange_limit = 4\n'
+    vehicle, alone = load(tmp_path, more), Vehicle.load(source)
+    assert vehicle.coefficients.numbers() == {
+        "rotors.radius": (0.023,),
+        "sensors.range_limit": (4.0,),
+    }
+    assert (vehicle.mass, vehicle.timestep) == (alone.mass, 0.005)
+    newtons = alone.hover_thrust
+    assert (flown(vehicle.model, newtons) == flown(alone.model, newtons)).all()
+    with pytest.raises(InputError, match=r"^rotors.list: expected none for a model's file with ac"):
+        load(tmp_path, OF_URDF.replace("quad.urdf", "tiny.xml"))
+    with pytest.raises(
+        InputError, match=r"^rotors: expected no reaction for rotors of the model's"
+    ):
+        load(tmp_path, more.replace("radius", "reaction"))
+
+
+def test_rotors_at_sites_of_mjcf(tmp_path: Path) -> None:
+    text = (ROOT / "tests" / "data" / "tiny.xml").read_text()
+    write(tmp_path, re.sub("<actuator>.*</actuator>", "", text, flags=re.DOTALL), "bare.xml")
+    sites = OF_URDF.replace("quad.urdf", "bare.xml").replace("position = [-0.2, 0.2, 0.04]\n", "")
+    for number, link in enumerate(("prop1", "prop2", "prop3", "base"), 1):
+        sites = sites.replace(f'link = "{link}"', f'site = "s{number}"')
+    vehicle = load(tmp_path, sites)
+    assert vehicle.rotors[0].position == pytest.approx((0.0325, 0.0325, 0.0))
+    assert vehicle.allocation[3] == pytest.approx([0.02, -0.02, 0.02, -0.02])
+    moved = sites.replace('site = "s1"', 'site = "s1"\nposition = [0, 0, 1]')
+    with pytest.raises(InputError, match=r"^rotors.list\[1\]: expected no position besides a site"):
+        load(tmp_path, moved)
+
+
+# ---- export
+
+
+def test_exported_mjcf_flies_bit_for_bit_in_mujoco_alone(tmp_path: Path) -> None:
+    text = CRAFT.replace(
+        "[0.02, 0.021, 0.035]", "[0.0212345678901, 0.021, 0.035, 1e-4, 2e-4, 3e-5]"
+    )
+    vehicle = load(tmp_path, text.replace("0.3\n", "0.31234567890123\nradius = 0.0987654321\n"))
+    export_mjcf(vehicle.path, tmp_path / "out.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    assert (flown(model, vehicle.hover_thrust) == flown(vehicle.model, vehicle.hover_thrust)).all()
+    again = Vehicle.load(tmp_path / "out.xml")
+    assert again.coefficients == vehicle.coefficients
+    assert again.coefficients.rotors.radius == 0.0987654321
+    assert (again.allocation == vehicle.allocation).all()
+
+
+def tetrahedron(file: Path, size: float) -> None:
+    """Binary STL of a tetrahedron in a cube of twice the size, m."""
+    a, b, c, d = size * np.array(((-1, -1, -1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)))
+    faces = np.array(((a, b, c), (a, d, b), (a, c, d), (b, d, c)), "<f4").reshape(4, 9)
+    rows = [bytes(12) + face.tobytes() + bytes(2) for face in faces]
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(bytes(80) + b"\4\0\0\0" + b"".join(rows))
+
+
+def test_meshes_of_a_models_file(tmp_path: Path) -> None:
+    mesh = tmp_path / "shapes" / "hull.stl"
+    (tmp_path / "out").mkdir()
+    tetrahedron(mesh, 0.05)
+    tiny = (ROOT / "tests" / "data" / "tiny.xml").read_text()
+    text = tiny.replace("<option", '<compiler meshdir="shapes"/><option', 1).replace(
+        "<worldbody>", '<asset><mesh name="hull" file="hull.stl"/></asset><worldbody>'
+    )
+    hull = '<freejoint/><geom type="mesh" mesh="hull" mass="0.01" contype="1" conaffinity="1"/>'
+    write(tmp_path, text.replace("<freejoint/>", hull), "model.xml")
+    vehicle = load(tmp_path, '[model]\nfile = "model.xml"\n')
+    assert vehicle.rest_height == pytest.approx(0.05, abs=1e-4)
+    export_mjcf(vehicle.path, tmp_path / "out" / "craft.xml")
+    assert Vehicle.load(tmp_path / "out" / "craft.xml").rest_height == pytest.approx(
+        vehicle.rest_height, abs=1e-6
+    )
+    tetrahedron(mesh, 0.06)
+    os.utime(mesh, (1, 1))  # MuJoCo keeps meshes by the second
+    os.utime(tmp_path / "model.xml", (1, 1))
+    again = Vehicle.load(vehicle.path)
+    assert again.rest_height == pytest.approx(0.06, abs=1e-4)
+    assert again.hash != vehicle.hash
+
+
+def test_export_of_a_models_file_keeps_six_digits(tmp_path: Path) -> None:
+    write(tmp_path, URDF.format(links=LINKS), "quad.urdf")
+    vehicle, out = load(tmp_path, OF_URDF), tmp_path / "sub" / "out.xml"
+    out.parent.mkdir()
+    export_mjcf(vehicle.path, out)
+    again = Vehicle.load(out)
+    assert again.mass == pytest.approx(vehicle.mass, rel=1e-6)
+    np.testing.assert_allclose(again.allocation, vehicle.allocation, rtol=1e-5)
+    np.testing.assert_allclose(np.diag(again.inertia), np.diag(vehicle.inertia), rtol=1e-5)
+    with pytest.raises(InputError, match=r"^out: expected a name that ends in .xml, got"):
+        export_mjcf(vehicle.path, tmp_path / "out.txt")
+    with pytest.raises(InputError, match=r"^out: expected the name of a new file, got .*out.xml"):
+        export_mjcf(out, out)
+
+
+@pytest.mark.parametrize("given", [3, "", b"craft.toml", ["craft.toml"], "x" * 1001])
+def test_no_path_is_one_sentence(given: Any) -> None:
+    with pytest.raises(InputError, match=r"^vehicle: expected the path of a file, of 1 to 1000 "):
+        Vehicle.load(given)
+
+
+def test_what_is_no_file_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "folder.xml").mkdir()
+    (tmp_path / "loop.xml").symlink_to("loop.xml")
+    os.mkfifo(tmp_path / "pipe.xml")  # which a reader would wait for
+    for name in ("folder.xml", "loop.xml", "pipe.xml"):
+        with pytest.raises(
+            InputError, match=f"^vehicle: expected a file, got .*{name}, which is a"
+        ):
+            Vehicle.load(tmp_path / name)
+
+
+def test_a_mesh_without_a_path_is_refused(tmp_path: Path) -> None:
+    text = URDF.format(links=LINKS)
+    end = text.index("</link>")
+    mesh = '<collision><geometry><mesh filename="package://"/></geometry></collision>'
+    write(tmp_path, text[:end] + mesh + text[end:], "quad.urdf")
+    with pytest.raises(InputError, match=r"^model.file: expected its meshes .*no file for package"):
+        load(tmp_path, OF_URDF)
+
+
+# ---- everything that takes a vehicle
+
+
+def test_a_vehicle_goes_where_a_path_goes(tmp_path: Path) -> None:
+    vehicle = load(tmp_path, CRAFT)
+    assert pickle.loads(pickle.dumps(vehicle)) is vehicle
+    env = gym.make("rotorgram/Hover-v0", vehicle=str(vehicle.path))
+    env.reset(seed=0)
+    _, _, _, _, info = env.step(env.action_space.sample())
+    assert {"F1", "F2", "F3", "F4"} <= set(info)
+    many = gym.make_vec("rotorgram/Elevation-v0", num_envs=3, vehicle=vehicle.path)
+    many.reset(seed=0)
+    many.step(many.action_space.sample())
+    many.close()
+
+
+def test_it_is_drawn_with_an_orange_front(tmp_path: Path) -> None:
+    stage = Stage("plain", drones=2, vehicle=load(tmp_path, CRAFT).path)
+    geoms = [stage.model.geom(i) for i in range(stage.model.ngeom)]
+    front = {geom.name: bool(geom.pos[0] > 0) for geom in geoms if "disc" in geom.name}
+    orange = {
+        geom.name: stage.model.mat(int(geom.matid[0])).name.endswith("front disc")
+        for geom in geoms
+        if "disc" in geom.name
+    }
+    assert len(front) == 8
+    assert front == orange
+
+
+def test_bare_names_are_of_the_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine").mkdir()
+    write(tmp_path / "mine", CRAFT, "vehicle.toml")
+    monkeypatch.setattr(library, "LIBRARY", tmp_path)
+    assert library.vehicle_names() == ["mine"]
+    vehicle = Vehicle.load("mine")
+    assert (vehicle.name, vehicle.path) == ("mine", tmp_path / "mine" / "vehicle.toml")
+    with pytest.raises(InputError, match=r"^vehicle: expected a file, or one of mine, got 'yours'"):
+        Vehicle.load("yours")
+
+
+# ---- the page
+
+
+def test_the_page_has_every_field_with_its_limits() -> None:
+    rows = re.findall(r"^\| `([\w.]+)` \| ([^|]*) \| ([^|]*) \| ([^|]*) \|", PAGE, re.MULTILINE)
+    told = {name: (count, unit, limits) for name, count, unit, limits in rows}
+    assert list(told) == list(ENTRIES)
+    for name, entry in ENTRIES.items():
+        limits = entry.metadata["limits"]
+        count = {None: "1 or more"}.get(limits.count, str(limits.count))
+        count = "3 or 6" if name == "body.inertia" else count
+        assert told[name] == (count, limits.unit, f"{limits.low:g} to {limits.high:g}")
+
+
+@pytest.mark.parametrize("number", range(PAGE.count("```toml")))
+def test_the_files_of_the_page_fly(number: int, tmp_path: Path) -> None:
+    text = re.findall(r"^```toml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)[number]
+    vehicle = load(tmp_path, text)
+    assert vehicle.num_rotors >= 4
+    assert np.linalg.matrix_rank(vehicle.allocation) == 4

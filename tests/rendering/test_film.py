@@ -1,0 +1,358 @@
+"""Films: every frame at its time, whole or not at all, panes side by side."""
+
+import io
+import math
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from imageio_ffmpeg import (  # type: ignore[import-untyped]
+    count_frames_and_secs,
+)
+from pictures import HEIGHT, WIDTH, decoded, ffmpeg_facts, pixels, same
+from PIL import Image
+from rotorgram.envs.registry import env_spec
+from rotorgram.flights.filming import Film, Shot, film, grid
+from rotorgram.flights.trajectories import Trajectory
+from rotorgram.models import InputError, Vehicle
+from rotorgram.rendering import MetricValue
+from rotorgram.rendering.film import Overlay, check_film, poster, write_film
+
+FAST = Film(width=WIDTH, height=HEIGHT, world="plain", fast=True, overlay=False)
+
+
+def trajectory(*elevations: float, ending: Any = "truncated") -> Trajectory:
+    """A level craft at these elevations, one each 0.02 s, with its goal at 5 m."""
+    heights = np.array(elevations)
+    zeros, steps = np.zeros_like(heights), len(heights)
+    telemetry = {
+        "position": np.stack((zeros, heights, zeros), axis=1),
+        "attitude": np.zeros((steps, 3)),
+        "thrust": np.full((steps, 4), 49.0),
+        "goal": np.tile((0.0, 5.0, 0.0), (steps, 1)),
+        "metrics": (5.0 - heights)[:, np.newaxis],
+    }
+    return Trajectory(
+        spec=env_spec("rotorgram/Elevation-v0", {}),
+        telemetry=telemetry,
+        rewards=np.zeros(steps - 1),
+        actions=np.zeros((steps - 1, 1)),
+        ending=ending,
+    )
+
+
+def shot(*trajectories: Trajectory, name: str = "PID") -> Shot:
+    return Shot(name=name, color="#7CC8F2", trajectories=list(trajectories))
+
+
+def greys(count: int, width: int = 64, height: int = 48) -> Iterator[np.ndarray]:
+    """Frames that grow brighter by 4 each."""
+    for number in range(count):
+        yield np.full((height, width, 3), 20 + 4 * number, np.uint8)
+
+
+def test_mp4_has_every_frame_at_its_time(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "grey.mp4"
+    assert write_film(path, greys(30), 25.0) == 30
+    told = ffmpeg_facts(path)
+    for fact in ("Video: h264", "yuv420p", "64x48", "25 fps"):
+        assert fact in told
+    frames = decoded(path, 64, 48).mean(axis=(1, 2, 3))
+    np.testing.assert_allclose(frames, [20 + 4 * number for number in range(30)], atol=3)
+    count, seconds = count_frames_and_secs(str(path))
+    assert (count, seconds) == (30, pytest.approx(1.2, abs=0.01))
+    data = path.read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")  # plays before it is loaded whole
+
+
+def test_a_poster_is_a_picture_from_within_the_film(tmp_path: Path) -> None:
+    path = tmp_path / "grey.mp4"
+    write_film(path, greys(31), 25.0)  # from 20 to 140
+    for share, brightness in ((0.0, 20), (0.3, 56), (1.0, 140)):
+        with Image.open(io.BytesIO(poster(path, share))) as picture:
+            assert (picture.format, picture.size) == ("JPEG", (64, 48))
+            assert np.asarray(picture).mean() == pytest.approx(brightness, abs=8)
+    (tmp_path / "no.mp4").write_bytes(b"no film")
+    for name in ("no.mp4", "nowhere.mp4"):
+        with pytest.raises(OSError, match=f"{name}: expected a film"):
+            poster(tmp_path / name)
+
+
+def test_the_first_frame_of_a_film_shows_the_flight(opengl: None, tmp_path: Path) -> None:
+    path = tmp_path / "film.mp4"
+    film(path, [shot(trajectory(*[5.0] * 6))], FAST)
+    first, *_ = decoded(path, WIDTH, HEIGHT)
+    assert first.mean() > 100
+    assert first.std() > 20
+
+
+@pytest.mark.parametrize("package", ["PIL", "imageio_ffmpeg"])
+def test_a_missing_package_is_one_sentence(package: str, tmp_path: Path) -> None:
+    code = f"""
+        import sys
+        import numpy as np
+        sys.modules[{package!r}] = None
+        from pathlib import Path
+        from rotorgram.models import MissingPackage
+        try:
+            from rotorgram.rendering.film import write_film
+            write_film(Path("film.mp4"), [np.zeros((16, 16, 3), np.uint8)], 25.0)
+        except MissingPackage as error:
+            print(error)
+        """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        cwd=tmp_path, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert f"needs the package {package}: pip install 'rotorgram[render]'" in done.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_gif_repeats_with_every_frame(tmp_path: Path) -> None:
+    path = tmp_path / "grey.gif"
+    write_film(path, greys(7), 20.0)
+    with Image.open(path) as gif:
+        assert gif.info["loop"] == 0
+        assert (gif.size, gif.n_frames) == ((64, 48), 7)  # type: ignore[attr-defined]
+        for number in range(7):
+            gif.seek(number)
+            assert gif.info["duration"] == 50
+            assert np.asarray(gif.convert("RGB")).mean() == pytest.approx(20 + 4 * number, abs=1)
+
+
+def test_folder_and_picture_are_exact(tmp_path: Path) -> None:
+    write_film(tmp_path / "frames", greys(3), 25.0)
+    files = sorted((tmp_path / "frames").iterdir())
+    assert [file.name for file in files] == ["0001.png", "0002.png", "0003.png"]
+    for file, frame in zip(files, greys(3), strict=True):
+        np.testing.assert_array_equal(pixels(file), frame)
+    write_film(tmp_path / "last.png", greys(3), 25.0)
+    np.testing.assert_array_equal(pixels(tmp_path / "last.png"), list(greys(3))[-1])
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.gif", "film.png", "film"])
+def test_what_is_broken_off_leaves_nothing(name: str, tmp_path: Path) -> None:
+    def interrupted() -> Iterator[np.ndarray]:
+        yield from greys(3)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_film(tmp_path / name, interrupted(), 25.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "fps", "sentence"),
+    [
+        ("film.avi", greys(1), 25.0, "film: expected a name that ends in .mp4, .gif or .png"),
+        ("there", greys(1), 25.0, "there is there already"),
+        ("film.mp4", greys(1, 63), 25.0, "film: expected an even width and an even height"),
+        ("film.gif", greys(1), 30.0, "fps: expected 100 divided by a whole number"),
+        ("film.mp4", greys(1), 0.0, "fps: expected 0.01 to 1000"),
+        ("film.mp4", greys(1), math.nan, "fps: expected 0.01 to 1000"),
+        ("film.mp4", greys(0), 25.0, "film: expected at least one frame"),
+        ("film", iter([*greys(1), *greys(1, 32)]), 25.0, "film: expected frames of uint8"),
+        ("film", iter([np.zeros((48, 64))]), 25.0, "film: expected frames of uint8"),
+    ],
+)
+def test_what_is_no_film_is_one_sentence(
+    name: str, frames: Iterator[np.ndarray], fps: float, sentence: str, tmp_path: Path
+) -> None:
+    (tmp_path / "there").mkdir()
+    with pytest.raises(ValueError, match=sentence) as raised:
+        write_film(tmp_path / name, frames, fps)
+    assert isinstance(raised.value, InputError) == ("frames of uint8" not in sentence)
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+
+
+def test_a_picture_on_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", full)
+    with pytest.raises(OSError, match="No space left on device") as told:
+        write_film(tmp_path / "a.png", greys(1), 25.0)
+    assert told.value.filename == str(tmp_path / "a.png")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_encoder_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
+    with pytest.raises(OSError, match="ffmpeg: the film could not be written"):
+        write_film(tmp_path / "film.mp4", greys(3), 25.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_of_odd_size_may_be_anything_but_mp4(tmp_path: Path) -> None:
+    check_film(tmp_path / "film.gif", 63, 47, 25.0)
+    check_film(tmp_path / "film", 63, 47, 30.0)
+    write_film(tmp_path / "film.gif", greys(2, 63, 47), 25.0)
+    write_film(tmp_path / "film", greys(2, 63, 47), 30.0)
+    for path in (tmp_path / "film.gif", tmp_path / "film" / "0001.png"):
+        assert pixels(path).shape == (47, 63, 3)
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "expected"),
+    [
+        (1, (1280, 720), (1, 1)),
+        (2, (1280, 720), (2, 1)),
+        (3, (1280, 720), (3, 1)),
+        (4, (1280, 720), (2, 2)),
+        (4, (1280, 400), (4, 1)),
+        (4, (400, 1600), (1, 4)),
+        (6, (1280, 720), (3, 2)),
+    ],
+)
+def test_panes_are_about_as_high_as_wide(
+    count: int, size: tuple[int, int], expected: tuple[int, int]
+) -> None:
+    assert grid(count, *size) == expected
+
+
+def frames_of(folder: Path) -> list[np.ndarray]:
+    return [pixels(file) for file in sorted(folder.iterdir())]
+
+
+def filmed(folder: Path, *shots: Shot, **settings: Any) -> list[np.ndarray]:
+    """The frames of a film."""
+    out = folder / f"film{len(list(folder.iterdir()))}"
+    config = Film(**{**asdict(FAST), **settings})
+    assert film(out, shots, config) == len(list(out.iterdir()))
+    return frames_of(out)
+
+
+def test_a_frame_shows_the_step_of_its_time(opengl: None, tmp_path: Path) -> None:
+    flight = shot(trajectory(*(4.0 + step / 10 for step in range(11))))  # 0.2 s
+    assert [flight.trajectories[0].step_at(t) for t in (0, 0.019, 0.02, 0.06, 0.2, 9)] == [
+        0, 0, 1, 3, 10, 10,
+    ]  # fmt: skip
+    every = filmed(tmp_path, flight, fps=50.0)
+    assert len(every) == 11
+    for settings, steps in (
+        ({"fps": 25.0}, [0, 2, 4, 6, 8, 10]),
+        ({"fps": 25.0, "speed": 2.0}, [0, 4, 8]),
+        ({"fps": 50.0, "speed": 0.5}, [step // 2 for step in range(21)]),
+    ):
+        frames = filmed(tmp_path, flight, **settings)
+        assert len(frames) == len(steps)
+        for frame, step in zip(frames, steps, strict=True):
+            assert [same(frame, one) for one in every].index(True) == step
+
+
+def test_panes_are_the_single_pictures_side_by_side(opengl: None, tmp_path: Path) -> None:
+    one, other = trajectory(5.0, 5.1, 5.2), trajectory(4.0, 3.9, 3.8)
+    both = filmed(tmp_path, shot(one), shot(other), width=2 * WIDTH + 2)
+    for number, frame in enumerate(both):
+        assert frame.shape == (HEIGHT, 2 * WIDTH + 2, 3)
+        for flight, columns in ((one, slice(0, WIDTH)), (other, slice(WIDTH + 2, None))):
+            single, title = filmed(tmp_path, shot(flight))[number], slice(0, HEIGHT // 5)
+            assert same(frame[HEIGHT // 5 :, columns], single[HEIGHT // 5 :])
+            assert not same(frame[title, columns], single[title])  # of several the names are told
+        assert (frame[:, WIDTH : WIDTH + 2] == (13, 18, 26)).all()
+
+
+def alarms_in(picture: np.ndarray) -> int:
+    """Pixels of the colour in which is written how a flight ended."""
+    return int((np.abs(picture.astype(int) - (255, 107, 96)).max(axis=2) < 40).sum())
+
+
+def test_a_flight_that_ended_stays_on_its_last_picture(opengl: None, tmp_path: Path) -> None:
+    crash = trajectory(5.0, 4.0, 3.0, ending="terminated")  # 0.04 s
+    long = trajectory(*[5.0] * 11)  # 0.2 s
+    frames = filmed(tmp_path, shot(crash), shot(long), width=642, height=240, overlay=True)
+    panes = [frame[:, :320] for frame in frames]
+    assert len(frames) == 6
+    assert alarms_in(panes[0]) == 0
+    assert alarms_in(panes[1]) > 20
+    for pane in panes[2:]:
+        np.testing.assert_array_equal(pane, panes[1])
+    assert not np.array_equal(frames[4][:, 322:], frames[5][:, 322:])  # the other's time goes on
+    assert all(alarms_in(frame[:, 322:]) == 0 for frame in frames)
+
+
+def test_the_scale_holds_crashes_if_there_is_nothing_else(opengl: None, tmp_path: Path) -> None:
+    crash = trajectory(*(5.0 - 0.03 * step for step in range(101)), ending="terminated")  # E to 3 m
+    hovers = trajectory(*[5.0] * 101)
+    size = {"height": 240, "overlay": True, "fps": 0.5}
+    alone = filmed(tmp_path, shot(crash), width=320, **size)[-1]
+    beside = filmed(tmp_path, shot(crash), shot(hovers), width=642, **size)[-1][:, :320]
+    ((first, *_),), vehicle = shot(hovers).moments[0], Vehicle.load()
+    strip = Overlay(320, 240, title="PID", like=first, vehicle=vehicle, period=0.02, seconds=2.0,
+                    scale=(0.0, 3.0)).plot  # fmt: skip
+    columns = [
+        np.nonzero(np.abs(part[190:].astype(int) - (124, 200, 242)).max(axis=2) < 40)[1]
+        for part in (alone, beside)
+    ]
+    assert columns[0].max() == pytest.approx(strip.right, abs=4)  # to its end
+    assert columns[1].max() < strip.left + 20  # of 0.1 m it is out after 0.08 s
+
+
+def test_several_drones_tell_how_near_they_come() -> None:
+    first, second = trajectory(5.0, 5.0, 5.0, ending="terminated"), trajectory(8.0, 7.0, 6.0, 6.5)
+    both = Shot(name="ORCA", color="#7CC8F2", trajectories=[first, second], drones=2)
+    assert both.curve(0).tolist() == [3.0, 2.0, 1.0, 1.5]  # one that has ended stays there
+    distance, headline = both.panel(0, 1).metrics
+    assert distance == MetricValue("least distance", 2.0, "m")
+    assert (headline.name, headline.value) == ("elevation_error", 0.0)
+    assert both.panel(0, 3).metrics[0].value == 1.5
+    assert [both.note(0, step) for step in range(4)] == ["", "", *["1 of 2 ended"] * 2]
+    alone = shot(second)
+    assert alone.curve(0).tolist() == [-3.0, -2.0, -1.0, -1.5]
+    assert [metric.name for metric in alone.panel(0, 0).metrics] == ["elevation_error"]
+    assert [shot(first).note(0, step) for step in (1, 2)] == ["", "terminated"]
+
+
+def test_a_film_of_several_drones(opengl: None, tmp_path: Path) -> None:
+    spec = replace(trajectory(5.0, 5.0).spec, agents=("a", "b"))
+    pictures = []
+    for heights in ((8.0, 7.5, 7.0), (8.0, 7.5, 8.0)):
+        flights = trajectory(5.0, 5.0, 5.0), trajectory(*heights)
+        world = [replace(one, spec=spec) for one in flights]
+        both = Shot(name="ORCA", color="#7CC8F2", trajectories=world, drones=2)
+        pictures.append(filmed(tmp_path, both, overlay=True))
+    assert [len(frames) for frames in pictures] == [2, 2]
+    assert same(pictures[0][0], pictures[1][0])
+    assert not same(pictures[0][1], pictures[1][1])  # the second is where it is
+
+
+def test_episodes_follow_one_another_and_pictures_are_of_a_time(
+    opengl: None, tmp_path: Path
+) -> None:
+    flight = shot(trajectory(5.0, 5.1, 5.2), trajectory(4.0, 3.9, 3.8, 3.7, 3.6))
+    frames = filmed(tmp_path, flight)
+    assert len(frames) == 2 + 3
+    for settings, expected in (({}, frames[-1]), ({"at": 0.04}, frames[1])):
+        out = tmp_path / f"picture{len(settings)}.png"
+        assert film(out, [flight], Film(**{**asdict(FAST), **settings})) == 1
+        assert same(pixels(out), expected)
+
+
+def test_wrong_films_are_one_sentence(tmp_path: Path) -> None:
+    for settings, sentence in (
+        ({"speed": 0.0}, "speed: expected"),
+        ({"speed": math.inf}, "speed: expected"),
+        ({"at": -1.0}, "at: expected"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            Film(**settings)  # type: ignore[arg-type]
+    for shots in ([], [shot()], [shot(trajectory(5.0)), shot(trajectory(5.0), trajectory(5.0))]):
+        with pytest.raises(InputError, match="shots: expected one or more"):
+            film(tmp_path / "film.gif", shots, FAST)
+
+
+def test_a_film_without_end_is_refused(tmp_path: Path) -> None:
+    """A peer may name a control period of a quarter of an hour; the film would hold hours."""
+    flown = trajectory(*[5.0] * 50)
+    slow = replace(flown, spec=replace(flown.spec, control_period=1e3))
+    with pytest.raises(
+        InputError, match=r"film: expected at most 1,000,000 frames, got 1,22\d,\d+"
+    ):
+        film(tmp_path / "film.gif", [shot(slow)], FAST)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,265 @@
+"""What a camera does beyond a pinhole's sharp picture: lenses, noise, rows read one by one."""
+
+import math
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.spec import Mark
+from rotorgram.models import InputError
+from rotorgram.models.cameras import Optics, cameras_of, chosen_views
+from rotorgram.models.lens import Lens, distorted, undistorted
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.rendering.cameras import Cameras
+from rotorgram.training.pairs import socket_pair
+from test_cameras import made, state, take, vehicle_with
+
+__all__ = ["made"]  # a fixture
+
+HOVER = "rotorgram/Hover-v0"
+BARREL = (-0.28, 0.07, 0.001, -0.0005, 0.01)
+OPTICS = """
+[[cameras]]
+name = "wide"
+resolution = [96, 72]
+fovy = 1.3
+distortion = [-0.28, 0.07, 0.001, -0.0005, 0.01]
+kinds = ["rgb", "depth", "segmentation"]
+
+[[cameras]]
+name = "noisy"
+resolution = [24, 18]
+exposure = 0.5
+noise = [0.04, 0.02]
+
+[[cameras]]
+name = "rolling"
+resolution = [96, 72]
+readout = 0.03
+kinds = ["rgb", "depth", "segmentation"]
+
+[[cameras]]
+name = "sharp"
+resolution = [96, 72]
+"""
+
+
+# ---- lenses
+
+
+def test_a_lens_is_that_of_opencv() -> None:
+    """`cv2.projectPoints` of OpenCV 4.13 for the same numbers."""
+    matrix = np.array([[120.0, 0.0, 160.0], [0.0, 110.0, 118.0], [0.0, 0.0, 1.0]])
+    lens = Lens(matrix, np.eye(3), np.zeros(3), BARREL)
+    points = np.array([[0.1, -0.2, 1.0], [0.5, 0.4, 1.0], [-1.2, 0.9, 2.0], [0.3, 0.0, 0.5]])
+    expected = [
+        [171.825115, 96.3206225],
+        [213.8527726, 157.55517324],
+        [97.47541797, 161.02432202],
+        [225.36437632, 118.0396],
+    ]
+    np.testing.assert_allclose(lens.project(points), expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("lens", [BARREL, (0.4, -0.1, 0.0, 0.002, 0.0), (5.0, 0, 0, 0, 0)])
+def test_a_distortion_is_undone(lens: tuple[float, ...]) -> None:
+    flat = np.random.default_rng(0).uniform(-0.8, 0.8, (500, 2))
+    np.testing.assert_allclose(undistorted(distorted(flat, lens), lens), flat, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", [(-2.0, 0, 0, 0, 0), (0, 0, 3.0, 3.0, 0), (1e300, 0, 0, 0, 0)])
+def test_a_lens_that_folds_its_picture(lens: tuple[float, ...]) -> None:
+    corners = np.array([[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+    with pytest.raises(InputError, match=r"distortion: expected a lens that .* folds the picture"):
+        undistorted(corners, lens)
+
+
+def test_depth_and_flow_of_a_lens_that_distorts(made: Any, tmp_path: Path) -> None:
+    """The ground lies at height 0 by `points`; it flows as `project` tells of these points."""
+    craft = vehicle_with(tmp_path, OPTICS)
+    cameras = made("wide_depth wide_flow wide_segmentation", craft)
+    first, second = (state((x, 0.0, 1.0), quaternion=_pitched(0.5)) for x in (0.0, 0.1))
+    take(cameras, **first)
+    seen = take(cameras, fresh=False, **second)
+    ground = seen["wide_segmentation"][0, ..., 0] == cameras.objects.index("scene/floor")
+    near = ground & (seen["wide_depth"][0, ..., 0] < 20)
+    assert near.sum() > 2000
+    points = cameras.lens("wide_depth", second).points(seen["wide_depth"][0, ..., 0])
+    # Depth is that of the nearest of pixels half as wide: a quarter of a pixel aside at most.
+    assert np.median(np.abs(points[near][:, 2])) < 0.01
+    middles = np.argwhere(near)[:, ::-1] + 0.5
+    was = cameras.lens("wide_depth", first).project(points[near])
+    np.testing.assert_allclose(seen["wide_flow"][0][near], middles - was, atol=2e-3)
+
+
+def _pitched(angle: float) -> np.ndarray:
+    """Nose down."""
+    return np.array([math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0])
+
+
+# ---- noise
+
+
+def test_noise_is_as_wide_as_told(made: Any, tmp_path: Path) -> None:
+    """Over many pictures of the ground the mean is its colour, the spread that of √(a² v + b²)."""
+    craft = vehicle_with(tmp_path, OPTICS.replace("exposure = 0.5", ""))
+    cameras = made("noisy", craft, shape=(40, 1))
+    level = state(*[(0.0, 0.0, 50.0)] * 40, quaternion=_pitched(math.pi / 2))
+    plain = take(cameras, **level)["noisy"].astype(float)
+    dice = np.random.default_rng(1)
+    cameras.take({"noisy": np.ones(40, bool)}, np.ones(40, bool), level, lambda _: dice)
+    between = (plain > 50) & (plain < 200)  # far from black and white, where it is cut
+    assert between.mean() > 0.5
+    noise = (cameras.pictures["noisy"] / 255 - plain / 255)[between]
+    expected = np.sqrt(0.04**2 * plain / 255 + 0.02**2)[between]
+    assert (noise / expected).std() == pytest.approx(1.0, rel=0.02)
+    assert abs(noise.mean()) < 5e-4
+
+
+def test_exposure_is_one_for_each_picture(made: Any, tmp_path: Path) -> None:
+    craft = vehicle_with(tmp_path, OPTICS.replace("noise = [0.04, 0.02]", ""))
+    cameras = made("noisy", craft, shape=(60, 1))
+    level = state(*[(0.0, 0.0, 50.0)] * 60, quaternion=_pitched(math.pi / 2))
+    plain = take(cameras, **level)["noisy"].astype(float)
+    dice = np.random.default_rng(2)
+    cameras.take({"noisy": np.ones(60, bool)}, np.ones(60, bool), level, lambda _: dice)
+    stops = []
+    for picture, own in zip(cameras.pictures["noisy"].astype(float), plain, strict=True):
+        lit = picture < 255
+        share = (picture * own)[lit].sum() / (own**2)[lit].sum()
+        assert np.abs(picture - share * own)[lit].max() <= 1.0  # of 255: it is rounded twice
+        stops.append(np.log2(share))
+    assert np.std(stops) == pytest.approx(0.5, rel=0.3)
+    assert abs(np.mean(stops)) < 0.2
+
+
+def test_noise_is_that_of_the_seed(opengl: None, tmp_path: Path) -> None:
+    """The same in a batch and alone, over UDP and in process; another for another seed."""
+    vehicle = vehicle_with(tmp_path, OPTICS).path
+    options: dict[str, Any] = {"vehicle": vehicle, "cameras": "noisy", "action": "velocity"}
+    actions = np.zeros((2, 4), np.float32)
+    with (
+        closing(LocalVectorEnv(HOVER, 2, **options)) as both,
+        closing(LocalVectorEnv(HOVER, 1, **options)) as alone,
+        closing(LocalVectorEnv(HOVER, 1, **(options | {"cameras": "sharp@24x18"}))) as clean,
+    ):
+        first, single = both.reset(seed=[5, 6])[0], alone.reset(seed=[6])[0]
+        sharp = clean.reset(seed=[6])[0]
+        for _ in range(3):
+            assert (first["noisy"][1] == single["noisy"][0]).all()
+            assert (first["noisy"][0] != first["noisy"][1]).any()
+            assert (single["noisy"] != sharp["sharp"]).any()
+            assert (single["observation"] == sharp["observation"]).all()  # it flies the same
+            before = single["noisy"]
+            first, single = both.step(actions)[0], alone.step(actions[:1])[0]
+            sharp = clean.step(actions[:1])[0]
+            assert (single["noisy"] != before).any()
+
+
+# ---- rows one by one
+
+
+def test_rows_see_the_moment_at_which_they_are_read(made: Any, tmp_path: Path) -> None:
+    """Balls before a craft that yaws, climbs and flies on, each by the middle of its pixels."""
+    craft = vehicle_with(tmp_path, OPTICS)
+    places = [(4.0, y, 3.0 + z) for y in (-1.5, 0.0, 1.5) for z in (-2.0, -1.0, 0.0, 1.0, 2.0)]
+    balls = [Mark(shape="ball", size=0.15, position=place) for place in places]
+    cameras = made("rolling sharp", craft, marks=balls)
+    speeds = {"velocity": np.array([[3.0, 1.0, 2.0]]), "body_rates": np.array([[0.0, 0.0, 6.0]])}
+    told = state((0.0, 0.0, 3.0), **speeds)
+    seen = take(cameras, **told)
+    numbers = seen["rolling_segmentation"][0, ..., 0]
+    apart = []
+    for i, place in enumerate(places):
+        rows, columns = np.nonzero(numbers == cameras.objects.index(f"task/ball_{i}"))
+        if len(rows) < 4 or {0, 71} & {*rows} or {0, 95} & {*columns}:
+            continue
+        found = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+        ago = 0.03 * (1 - rows.mean() / 71)
+        turned = -6.0 * ago / 2
+        then = state(
+            np.array([0.0, 0.0, 3.0]) - ago * speeds["velocity"][0],
+            quaternion=(math.cos(turned), 0.0, 0.0, math.sin(turned)),
+        )
+        point = np.array([place])
+        assert np.abs(cameras.lens("rolling", then).project(point)[0] - found).max() < 0.5
+        apart.append(np.abs(cameras.lens("rolling", told).project(point)[0] - found).max())
+    assert len(apart) > 8
+    assert max(apart) > 4  # where a picture of one moment would have it
+    still = take(cameras, **state((0.0, 0.0, 3.0)))
+    assert (still["rolling"] == still["sharp"]).all()
+    assert (seen["rolling"] != seen["sharp"]).any()
+
+
+# ---- files, and the wire
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (("-0.28, 0.07", "-3.0, 0.0"), "distortion: expected a lens that sees each direction"),
+        (("0.0005, 0.01]", "0.0005]"), r"cameras\[1\].distortion: expected 5 numbers from"),
+        (("readout = 0.03", "readout = 3"), r"\[3\].readout: expected a number from 0 to 0.1 s"),
+        (("noise = [0.04, 0.02]", "noise = 0.1"), r"cameras\[2\].noise: expected 2 numbers from"),
+        (("exposure = 0.5", "exposure = -1"), r"exposure: expected a number from 0 to 10 stop"),
+    ],
+)
+def test_wrong_optics(tmp_path: Path, change: tuple[str, str], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        vehicle_with(tmp_path, OPTICS.replace(*change))
+
+
+def test_what_a_file_says_is_what_mjcf_says_of_it(tmp_path: Path) -> None:
+    """A vehicle's file that is written as MJCF keeps its optics, by custom texts."""
+    craft = vehicle_with(tmp_path, OPTICS)
+    told = {camera.name: camera.optics for camera in craft.cameras}
+    assert told["wide"] == Optics(distortion=BARREL)
+    assert told["noisy"] == Optics(exposure=0.5, noise=(0.04, 0.02))
+    assert told["rolling"] == Optics(readout=0.03)
+    text = Vehicle.load().path.read_text("utf-8")
+    start = text.index("<camera ")
+    texts = "".join(
+        f'<text name="rotorgram/cameras.eye.{key}" data="{data}"/>'
+        for key, data in (("distortion", "-0.28 0.07 0.001 -0.0005 0.01"), ("readout", "0.03"))
+    )
+    file = tmp_path / "own.xml"
+    eye = '<camera name="eye" pos="0.5 0 0"/>'
+    whole = text[:start] + eye + text[start:]
+    file.write_text(whole.replace("</mujoco>", f"<custom>{texts}</custom></mujoco>"), "utf-8")
+    named = {camera.name: camera.optics for camera in Vehicle.load(file).cameras}
+    assert named["eye"] == Optics(distortion=BARREL, readout=0.03)
+    wrong = texts.replace('"0.03"', '"soon"')
+    file.write_text(whole.replace("</mujoco>", f"<custom>{wrong}</custom></mujoco>"), "utf-8")
+    with pytest.raises(InputError, match=r"camera eye.readout: expected a number .* got 'soon'"):
+        Vehicle.load(file)
+
+
+def test_flow_wants_rows_of_one_moment(tmp_path: Path) -> None:
+    cameras = cameras_of(vehicle_with(tmp_path, OPTICS))
+    with pytest.raises(InputError, match="expected flow of a camera that reads all rows at once"):
+        chosen_views(["rolling_flow"], cameras)
+
+
+def test_a_lens_that_needs_too_much(tmp_path: Path) -> None:
+    text = OPTICS.replace("[-0.28, 0.07, 0.001, -0.0005, 0.01]", "[-0.05, 0.0, 0.0, 0.0, 0.0]")
+    craft = vehicle_with(tmp_path, text.replace("[96, 72]\nfovy = 1.3", "[4000, 3000]\nfovy = 1.5"))
+    with pytest.raises(InputError, match="distortion: expected a lens that needs at most 8192 pix"):
+        Cameras(craft, chosen_views(["wide"], cameras_of(craft)))
+
+
+def test_all_of_them_over_udp(opengl: None, tmp_path: Path) -> None:
+    vehicle = vehicle_with(tmp_path, OPTICS).path
+    options = {"cameras": "wide,noisy,rolling@24x18", "action": "velocity"}
+    with (
+        socket_pair(HOVER, options=options, vehicle=vehicle) as remote,
+        closing(LocalVectorEnv(HOVER, 1, vehicle=vehicle, **options)) as local,
+    ):
+        told, own = remote.reset(seed=4)[0], local.reset(seed=[4])[0]
+        for _ in range(3):
+            for name, picture in told.items():
+                assert (np.asarray(picture) == own[name][0]).all(), name
+            action = np.array([0.3, -0.2, 0.1, 0.5], np.float32)
+            told, own = remote.step(action)[0], local.step(action[None])[0]

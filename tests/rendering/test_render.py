@@ -1,0 +1,377 @@
+"""`rotorgram render`, what it does without OpenGL, and the film of a comparison."""
+
+import ctypes.util
+import json
+import logging
+import math
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pandas as pd
+import pytest
+import rotorgram.rendering.gl as gl
+from pictures import HEIGHT, WIDTH, decoded, pixels
+from PIL import Image
+from rotorgram.agents import PID
+from rotorgram.agents.checkpoints import load
+from rotorgram.cli import main
+from rotorgram.envs.registry import env_spec
+from rotorgram.flights import filming
+from rotorgram.flights.filming import Film, Shot, film, film_comparison
+from rotorgram.flights.trajectories import flown_trajectories, recorded_trajectories
+from rotorgram.models import InputError
+from rotorgram.rendering import NoOpenGL
+from rotorgram.training.results import (
+    CONFIG_KEYS,
+    EPISODE_COLUMNS,
+    EVALUATION_COLUMNS,
+    RUN_COLUMNS,
+    write_config,
+)
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    try:
+        status = main([str(a) for a in arguments])
+    except SystemExit as end:
+        status = int(end.code or 0)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+SMALL = ("--size", f"{WIDTH}x{HEIGHT}", "--world", "plain", "--fast")
+
+
+@pytest.fixture(scope="module")
+def training(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A training of 200 steps in a process of its own, which must not have touched what draws."""
+    folder = tmp_path_factory.mktemp("training") / "run"
+    code = """
+        import sys
+        from rotorgram.cli import main
+        import rotorgram.cli.compare, rotorgram.cli.sweep
+        status = main(["train", "a2c", "--env-steps", "200", "--out", sys.argv[1],
+                       "--set", "steps_per_update=50", "--env.episode-length", "25"])
+        drawing = {name for name in sys.modules
+                   if name.startswith(("rotorgram.rendering.", "OpenGL", "mujoco.egl"))}
+        drawing -= {"rotorgram.rendering.gl"}  # looks at MUJOCO_GL and imports nothing
+        assert not drawing, drawing
+        sys.exit(status)
+        """
+    command = [sys.executable, "-c", textwrap.dedent(code), str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_a_checkpoint_on_film_flies_as_it_does_over_the_wire(
+    training: Path, opengl: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    journal = tmp_path / "flight.mcap"
+    assert run(capsys, "evaluate", training, "--episodes", 2, "--record", journal)[0] == 0
+    trained = load(training / "checkpoint.safetensors")
+    assert trained.options["episode_length"] == 25
+    (flown,) = flown_trajectories(
+        trained.policy(), trained.env_id, trained.options, [1], of="final"
+    )
+    (recorded,) = recorded_trajectories(journal, [1])
+    for name, values in flown.telemetry.items():
+        assert values.tobytes() == recorded.telemetry[name].tobytes()
+    assert flown.rewards.tobytes() == recorded.rewards.tobytes()
+    out = tmp_path / "film.mp4"
+    what = (training, journal, "--out", out, "--size", "642x240", *SMALL[2:])
+    status, said, err = run(capsys, "render", *what, "--episode", 1, "--camera", "front")
+    assert (status, err) == (0, "")
+    assert f"film: {out} (13 pictures of 642x240)" in said  # 0.5 s, both ends
+    last = decoded(out, 642, 240)[-1].astype(int)
+    shots = [Shot(name="it", color="#7CC8F2", trajectories=[one]) for one in (flown, recorded)]
+    config = Film(width=642, height=240, camera="front", world="plain", fast=True, overlay=False)
+    film(tmp_path / "plain.png", shots, config)
+    bare = pixels(tmp_path / "plain.png").astype(int)
+    assert abs(bare[:, :320] - bare[:, 322:]).max() <= 3  # the same flight twice
+    assert abs(last - bare).mean() > 10
+
+
+def test_gif_pictures_and_names(
+    opengl: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "film.gif"
+    settings = ("--env.episode-length", 10, *SMALL)
+    command = ("render", "pid", "random", "--out", out, "--names", "ours", "theirs", *settings)
+    assert run(capsys, *command, "--episodes", 2)[0] == 0
+    with Image.open(out) as gif:
+        assert gif.n_frames <= 12  # type: ignore[attr-defined]
+        total = 0
+        for number in range(gif.n_frames):  # type: ignore[attr-defined]
+            gif.seek(number)
+            total += gif.info["duration"]
+    assert total == 12 * 40  # 0.2 s with both ends, twice
+    picture = tmp_path / "picture.png"
+    assert run(capsys, "render", "pid", "--out", picture, "--at", 0.1, *settings)[0] == 0
+    assert pixels(picture).shape == (HEIGHT, WIDTH, 3)
+
+
+def test_panes_of_the_same_have_names_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And show the episodes that `evaluate` flies."""
+    shown: list[Any] = []
+    monkeypatch.setattr(filming, "film", lambda out, shots, *_: shown.extend(shots) or 1)
+    monkeypatch.setattr(gl, "offscreen_context", lambda *_: SimpleNamespace(free=lambda: None))
+    what = ("pid", "pid", "random", "pid", "random")
+    settings = ("--env.episode-length", 10, "--episode", 1, "--out", tmp_path / "film.gif")
+    assert run(capsys, "render", *what, *settings)[0] == 0
+    names = [shot.name for shot in shown]
+    assert names == ["PID 1", "PID 2", "random 1", "PID 3", "random 2"]
+    evaluated = flown_trajectories(
+        PID(shown[0].trajectories[0].spec), "rotorgram/Elevation-v0", {"episode_length": 10}, [1],
+        of="final",
+    )  # fmt: skip
+    flown = (*evaluated, *shown[0].trajectories, *shown[3].trajectories)
+    assert len({one.telemetry["position"].tobytes() for one in flown}) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["pid", "--out", "film.avi"], "film: expected a name that ends in"),
+        (["pid", "--out", "."], "is there already"),
+        (["pid", "--out", "film.mp4", "--size", "641x360"], "film: expected an even width"),
+        (["pid", "--out", "film.mp4", "--size", "large"], "size: expected WIDTHxHEIGHT"),
+        (["pid", "--out", "film.mp4", "--size", "9x9"], "size: expected WIDTHxHEIGHT"),
+        (["pid", "--out", "film.mp4", "--speed", "0"], "speed: expected"),
+        (["pid", "--out", "film.mp4", "--episode", "-1"], "episode: expected 0 or more"),
+        (["pid", "--out", "film.mp4", "--episodes", "0"], "episodes: expected at least 1"),
+        (["pid", "--out", "film.mp4", "--names", "a", "b"], "names: expected one for each of 1"),
+        (["pid", "--out", "film.mp4", "--at", "-1"], "at: expected"),
+        (["--out", "film.mp4"], "what: expected a checkpoint, pid, geometric, random or a journal"),
+        (["nowhere", "--out", "film.mp4"], "policy: expected pid, geometric, orca, a checkpoint"),
+        (["nowhere.mcap", "--out", "film.mp4"], "nowhere.mcap"),
+        (["pid", "--out", "film.mp4", "--env.observation", "error"], "pid: expected"),
+    ],
+)
+def test_wrong_input_is_one_sentence(
+    arguments: list[str],
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, _, err = run(capsys, "render", *arguments)
+    assert status == 1
+    assert err.startswith("rotorgram: ")
+    assert sentence in err
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_leaves_no_half_film(opengl: None, tmp_path: Path) -> None:
+    out = tmp_path / "film.mp4"
+    words = ("render", "pid", "--out", out, "--speed", "0.001", *SMALL)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rotorgram.cli", *map(str, words)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    time.sleep(0.2)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (130, "rotorgram: interrupted\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---- where there is no OpenGL
+
+
+SENTENCE = "apt-get install libegl1 libgl1-mesa-dri"
+
+
+def test_without_opengl_it_is_one_sentence_and_status_2(tmp_path: Path) -> None:
+    command = ["render", "pid", "--out", str(tmp_path / "film.mp4"), *SMALL]
+    done = subprocess.run(
+        [sys.executable, "-m", "rotorgram.cli", *command],
+        env={**os.environ, "MUJOCO_GL": "disable"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("rotorgram: OpenGL: expected EGL")
+    assert SENTENCE in done.stderr
+    assert "MUJOCO_GL" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("setting", ["nonsense", "osmesa"])
+def test_a_wrong_mujoco_gl_is_one_sentence_of_what_draws(setting: str, tmp_path: Path) -> None:
+    if ctypes.util.find_library("OSMesa") and setting == "osmesa":
+        pytest.skip("OSMesa is installed")
+
+    clean = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}  # MuJoCo sets it
+
+    def done(*words: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "rotorgram.cli", *map(str, words)],
+            env=clean | {"MUJOCO_GL": setting}, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+
+    draws = done("render", "pid", "--out", tmp_path / "film.mp4", *SMALL)
+    assert draws.returncode == 2
+    expected = {
+        "nonsense": "rotorgram: MUJOCO_GL: expected egl, osmesa, glfw or disable, got 'nonsense'\n",
+        "osmesa": "osmesa: its library is not installed",
+    }
+    assert expected[setting] in draws.stderr
+    assert draws.stderr.count("\n") == 1
+    flies = done("evaluate", "pid", "--episodes", 1, "--env.episode-length", 5)
+    assert (flies.returncode, flies.stderr.count("Traceback")) == (0, 0)
+
+
+@pytest.fixture
+def no_egl(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine without libEGL and without a display."""
+
+    def import_module(name: str) -> Any:
+        raise AttributeError("'NoneType' object has no attribute 'eglQueryString'")  # as PyOpenGL
+
+    monkeypatch.setattr(gl, "import_module", import_module)
+    for variable in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(variable, raising=False)
+
+
+def test_without_libegl_it_says_what_to_install(
+    no_egl: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "film.gif"
+    status, _, err = run(capsys, "render", "pid", "--out", out, *SMALL)
+    assert (status, SENTENCE in err, err.count("\n")) == (2, True, 1)
+    assert "egl: its library is not installed" in err
+    assert list(tmp_path.iterdir()) == []
+    assert run(capsys, "evaluate", "pid", "--episodes", 1, "--env.episode-length", 5)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("variables", "tried"),
+    [
+        ({}, ["egl"]),
+        ({"DISPLAY": ":0"}, ["egl", "glfw"]),
+        ({"DISPLAY": ":0", "MUJOCO_GL": "egl"}, ["egl"]),
+        ({"MUJOCO_GL": "osmesa"}, ["osmesa"]),
+        ({"MUJOCO_GL": "on"}, ["glfw"]),
+        ({"MUJOCO_GL": "off"}, []),
+    ],
+)
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have their own")
+def test_which_opengl_is_tried(
+    variables: dict[str, str], tried: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def import_module(name: str) -> Any:
+        asked.append(name)
+        raise ImportError
+
+    monkeypatch.setattr(gl, "import_module", import_module)
+    for variable in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(variable, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(NoOpenGL):
+        gl.offscreen_context(16, 16)
+    assert asked == [f"mujoco.{name}" for name in tried]
+
+
+# ---- the film of a comparison
+
+
+@pytest.fixture
+def comparison(training: Path, tmp_path: Path) -> Path:
+    """A comparison's folder: the checkpoint of the middle seed alone."""
+    folder = tmp_path / "comparison"
+    folder.mkdir()
+    trained = load(training / "checkpoint.safetensors")
+    spec = env_spec(trained.env_id, trained.options)
+    content = dict.fromkeys(CONFIG_KEYS) | {"preset": "tuned", "seeds": [0, 1, 2], "agents": {}}
+    write_config(folder, "rotorgram compare", spec, None, content)
+    rows = [
+        dict.fromkeys(EVALUATION_COLUMNS, 0)
+        | {"agent": agent, "seed": seed, "env_steps": 200, "length": 25, "start": 0.5}
+        | {"steady": error, "settling_time": math.nan, "terminated": False}
+        for agent, seed, error in (("a2c", 0, 0.3), ("a2c", 1, 0.1), ("a2c", 2, 0.2),
+                                   ("pid", 0, 0.0))
+    ]  # fmt: skip
+    for name, columns, found in (("evaluations", EVALUATION_COLUMNS, rows),
+                                 ("episodes", EPISODE_COLUMNS, []),
+                                 ("runs", RUN_COLUMNS, [])):  # fmt: skip
+        table = pd.DataFrame(found, columns=list(columns))
+        named = table.rename(columns={"steady": spec.metrics[0].name,
+                                      "mean_size": spec.metrics[0].name})  # fmt: skip
+        named.to_csv(folder / f"{name}.csv", index=False)
+    (folder / "checkpoints").mkdir()
+    data = (training / "checkpoint.safetensors").read_bytes()
+    (folder / "checkpoints" / "a2c-seed2.safetensors").write_bytes(data)
+    return folder
+
+
+def test_the_film_of_a_comparison_shows_its_agents(comparison: Path, opengl: None) -> None:
+    out = comparison / "video.mp4"
+    out.write_text("an old one")
+    assert film_comparison(comparison, out, world="plain")
+    frames = decoded(out, 1280, 400)
+    assert len(frames) == 13
+    left, right = frames[0][:, :639].astype(int), frames[0][:, 641:].astype(int)
+    assert abs(left[100:300] - right[100:300]).mean() < 8  # they start alike
+    assert sorted(path.name for path in comparison.iterdir()) == [
+        "checkpoints", "config.json", "episodes.csv", "evaluations.csv", "runs.csv",
+        "video.mp4",
+    ]  # fmt: skip
+
+
+def test_a_comparison_without_opengl_has_no_film(
+    comparison: Path, no_egl: None, caplog: pytest.LogCaptureFixture
+) -> None:
+    out = comparison / "video.mp4"
+    with caplog.at_level(logging.INFO, logger="rotorgram"):
+        assert not film_comparison(comparison, out)
+    assert len(caplog.messages) == 1
+    assert SENTENCE in caplog.messages[0]
+    assert not out.exists()
+
+
+def test_what_is_no_comparison_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"got one without config\.json"):
+        film_comparison(tmp_path, tmp_path / "video.mp4")
+    (tmp_path / "config.json").write_text(json.dumps({}))
+    with pytest.raises(InputError, match=r"config\.json"):
+        film_comparison(tmp_path, tmp_path / "video.mp4")
+
+
+# ---- the page
+
+
+def test_the_page_tells_what_the_benchmark_wrote() -> None:
+    docs = Path(__file__).parents[2] / "docs"
+    page = (docs / "rendering.md").read_text()
+    told = json.loads((docs / "results" / "performance" / "rendering.json").read_text())
+    rates, overlay, filmed = (
+        told[name] for name in ("pictures_per_second", "overlay_milliseconds", "film")
+    )
+    for size in ("640x360", "1280x720"):
+        assert f"| {size} | {rates[size]} | {rates[f'{size}, fast']} | {overlay[size]} |" in page
+    assert f"took {filmed['seconds']} s, and are {filmed['kilobytes']} kB as MP4" in page
+    assert f"load {told['load'][0]:.0f}" in page
+    assert (docs / "images" / "cameras.jpg").stat().st_size < 200_000

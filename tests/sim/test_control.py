@@ -1,0 +1,431 @@
+"""Action levels: hand-computed thrusts, NumPy as torch, batch as single, and all vehicles fly."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from rotorgram.cli import main
+from rotorgram.envs.loop import Loop
+from rotorgram.models import QUAD_XML, InputError, Vehicle
+from rotorgram.models.library import vehicle_names
+from rotorgram.sim import (
+    LEVELS,
+    EffectOptions,
+    Gains,
+    Pose,
+    WorldState,
+    make_controller,
+    make_world,
+)
+
+DATA = Path(__file__).parents[1] / "data"
+DOCS = Path(__file__).parents[2] / "docs"
+HOVER = "rotorgram/Hover-v0"
+MOCAP = {"noise": 0.001, "angle_noise": 0.002}
+ESTIMATE = {"imu": True, "motion_capture": MOCAP, "estimate": True, "observe": "estimate"}
+CASCADE = ("rates", "attitude", "velocity", "position")
+FILES: dict[str, Any] = {"quad": QUAD_XML}
+FILES |= {path.stem: path for path in sorted(DATA.glob("*.xml"))} | {"lively": DATA / "lively.toml"}
+FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/vehicle.toml"))}
+
+
+def state_of(vehicle: Vehicle, **given: Any) -> WorldState:
+    """A single drone, level, at rest and at hover thrust where nothing else is given."""
+    thrust = vehicle.hover_thrust
+    usual = {"position": np.zeros(3), "quaternion": np.array((1.0, 0.0, 0.0, 0.0))}
+    usual |= {"velocity": np.zeros(3), "body_rates": np.zeros(3)}
+    usual |= {"command": thrust, "thrust": thrust, "touching": np.zeros((), bool)}
+    return WorldState(**(usual | given))
+
+
+def thrusts(level: str, action: Any, **given: Any) -> list[float]:
+    """Of the paper's craft."""
+    vehicle = Vehicle.load()
+    controller = make_controller(level, vehicle, vehicle.timestep)
+    found = controller.thrust(np.array(action, float), state_of(vehicle, **given))
+    return pytest.approx(found.tolist(), abs=2e-3)  # type: ignore[no-any-return]
+
+
+# --- gains and ranges -----------------------------------------------------------------------------
+
+
+def test_gains_of_the_papers_craft() -> None:
+    """20 kg, 196 N of at most 400 N; J = 5.0257 and 10.0016 kg m²; arms of 1 m; yaw 0.05 m.
+
+    A roll of 1 N m is 1 N up on one side and down on the other, of collective thrust; a yaw of it
+    20 N. So α = 196 / 5.0257 = 38.9993 rad/s² and 196 / 200.03 = 0.97984 rad/s², p = sqrt(α / 2).
+    """
+    gains = Gains.of(Vehicle.load(), 0.01)
+    assert (gains.lowest, gains.highest, gains.lead) == (0.0, pytest.approx(400.0), 1.0)
+    assert gains.attitude == pytest.approx(4.41584, abs=1e-4)
+    assert gains.rate == pytest.approx((8.83168, 8.83168, 1.39987), abs=1e-4)
+    assert gains.heading == pytest.approx(0.69994, abs=1e-4)
+    assert (gains.velocity, gains.position) == pytest.approx((2.20792, 0.88317), abs=1e-4)
+    assert gains.most_rate == pytest.approx((11.0689, 11.0689, 1.75449), abs=1e-4)
+    # 196 N of 196 + 0.75 · 204 N = 349 N; 9.8 m/s² · tan; and half of g.
+    assert math.degrees(gains.most_tilt) == pytest.approx(55.833, abs=1e-3)
+    assert gains.most_acceleration == pytest.approx((14.4382, 4.9), abs=1e-3)
+    assert gains.most_velocity == pytest.approx((5.37368, 3.13050), abs=1e-4)  # sqrt(2 m · a)
+    assert gains.most_offset == pytest.approx((6.08455, 4.0), abs=1e-3)  # 5.37368 / 0.88317
+
+
+def test_a_lag_slows_the_loops_and_is_led() -> None:
+    """72 ms are led to 24 ms; a step of 5 ms: L = 29 ms, p = 1 / (5 L) = 6.8966 rad/s.
+
+    The lead: (1 - exp(-5 / 24)) / (1 - exp(-5 / 72)) = 0.188056 / 0.067088.
+    """
+    vehicle = Vehicle.load("crazyflie2")
+    gains = Gains.of(vehicle, 0.005, 0.072)
+    assert gains.attitude == pytest.approx(6.8966, abs=1e-4)
+    assert gains.lead == pytest.approx(2.8032, abs=1e-3)
+    assert Gains.of(vehicle, 0.005).attitude > 15.0
+    state = state_of(vehicle, thrust=vehicle.hover_thrust - 0.001)
+    controller = make_controller("rates", vehicle, 0.005, lag=0.072)
+    found = controller.thrust(np.zeros(4), state)
+    assert found == pytest.approx(vehicle.hover_thrust - 0.001 + 0.0028032, abs=1e-6)
+
+
+def test_five_equal_poles() -> None:
+    """Rotors with the lag L = 1 / 5p, and the four loops: (s + p)⁵."""
+    vehicle, lag = Vehicle.load("crazyflie2"), 0.072
+    gains = Gains.of(vehicle, 0.005, lag)
+    rate, p = gains.rate[0], gains.attitude
+    ends = rate * np.array((1, p, p * gains.velocity, p * gains.velocity * gains.position))
+    roots = np.roots((lag / 3 + 0.005, 1.0, *ends))
+    assert np.abs(roots + p).max() < 0.01 * p
+
+
+# --- each level by hand ---------------------------------------------------------------------------
+
+
+def test_rates_by_hand() -> None:
+    assert thrusts("rates", (0, 0, 0, 0)) == [49.0, 49.0, 49.0, 49.0]
+    assert thrusts("rates", (1, 0, 0, 0)) == [100.0] * 4
+    assert thrusts("rates", (0.5, 0, 0, 0)) == [74.5] * 4  # 49 + 0.5 · 51
+    assert thrusts("rates", (-7, 0, 0, 0)) == [0.0] * 4  # beyond the bound is the bound
+    # 1.10689 rad/s · 8.83168 /s · 5.025725 kg m² = 49.1298 N m: 12.2825 N of each rotor.
+    assert thrusts("rates", (0, 0.1, 0, 0)) == [61.2825, 36.7175, 36.7175, 61.2825]
+    assert thrusts("rates", (0, 0, 0.1, 0)) == [36.7175, 36.7175, 61.2825, 61.2825]
+    # 0.175449 · 1.39987 · 10.00163 = 2.45646 N m; a rotor gives 0.05 N m/N, four share it.
+    assert thrusts("rates", (0, 0, 0, 0.1)) == [61.2823, 36.7177, 61.2823, 36.7177]
+
+
+def test_the_gyroscopic_torque_by_hand() -> None:
+    """At the rates that are wanted, (0, 2, 1) rad/s: 2 · 1 · (10.00163 - 5.025725) N m of roll."""
+    wanted = (0, 0, 2 / 11.06889, 1 / 1.754486)
+    spinning = thrusts("rates", wanted, body_rates=np.array((0.0, 2.0, 1.0)))
+    assert spinning == [51.48795, 46.51205, 46.51205, 51.48795]
+
+
+def test_attitude_by_hand() -> None:
+    # A roll of 0.0974452 rad: 2 sin of its half is 0.0974067; times 4.41584 /s, 8.83168 /s and
+    # 5.025725 kg m² it is 19.0918 N m.
+    assert thrusts("attitude", (0, 0.1, 0, 0)) == [53.77295, 44.22705, 44.22705, 53.77295]
+    assert thrusts("attitude", (0, 0, 0.1, 0)) == [44.22705, 44.22705, 53.77295, 53.77295]
+    # Rolled by 90°, to level: 2 sin 45° · 4.41584 · 8.83168 · 5.025725 = 277.185 N m to the right,
+    # more than 200: with the collective thrust in the middle, two rotors at full thrust.
+    half = math.sqrt(0.5)
+    assert thrusts("attitude", (0, 0, 0, 0), quaternion=np.array((half, half, 0.0, 0.0))) == [
+        0.0,
+        100.0,
+        100.0,
+        0.0,
+    ]
+    # Upside down the error is 2 rad, about x.
+    over = np.array((0.0, 1.0, 0.0, 0.0))
+    assert thrusts("attitude", (0, 0, 0, 0), quaternion=over) == [100.0, 0.0, 0.0, 100.0]
+
+
+def test_velocity_by_hand() -> None:
+    # 0.313050 m/s · 2.20792 /s = 0.691189 m/s²: 20 kg · 10.491189 m/s² over four.
+    assert thrusts("velocity", (0, 0, 0.1, 0)) == [52.45595] * 4
+    # 0.537368 m/s · 2.20792 /s = 1.186466 m/s² forward: a tilt of atan(1.186466 / 9.8) =
+    # 0.1204821 rad; 2 sin of its half is 0.1204092; · 4.41584 · 8.83168 · 5.025725 = 23.60013 N m.
+    assert thrusts("velocity", (0.1, 0, 0, 0)) == [43.09997, 43.09997, 54.90003, 54.90003]
+    # With the nose to the left, forward is left: the same torque about the same body axis.
+    left = np.array((math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
+    assert thrusts("velocity", (0.1, 0, 0, 0), quaternion=left) == [
+        43.09997,
+        43.09997,
+        54.90003,
+        54.90003,
+    ]
+
+
+def test_position_by_hand() -> None:
+    # 0.4 m · 0.883168 /s · 2.20792 /s = 0.779998 m/s².
+    assert thrusts("position", (0, 0, 0.1, 0)) == [52.89999] * 4
+    # 4 m: half of 4.9 m/s² stops from 3.1305 m/s, within 2 m; 3.1305 · 2.20792 is more than 4.9.
+    assert thrusts("position", (0, 0, 1, 0)) == [73.5] * 4
+    # 0.0314159 rad · 0.69994 /s · 1.39987 /s · 10.00163 kg m² = 0.307878 N m.
+    assert thrusts("position", (0, 0, 0, 0.01)) == [50.53939, 47.46061, 50.53939, 47.46061]
+
+
+def test_mixing_keeps_roll_and_pitch_before_collective_and_that_before_yaw() -> None:
+    vehicle = Vehicle.load()
+    controller: Any = make_controller("rates", vehicle, 0.01)
+
+    def mixed(collective: float, *torque: float) -> Any:
+        return pytest.approx(controller.mixed(collective, torque), abs=1e-6)
+
+    assert mixed(196.0, 100.0, 0.0, 0.0) == [74.0, 24.0, 24.0, 74.0]  # all fits
+    assert mixed(400.0, 100.0, 0.0, 0.0) == [100.0, 50.0, 50.0, 100.0]  # less collective thrust
+    assert mixed(0.0, 100.0, 0.0, 0.0) == [50.0, 0.0, 0.0, 50.0]  # more of it
+    assert mixed(196.0, 900.0, 0.0, 5.0) == [100.0, 0.0, 0.0, 100.0]  # no room: no yaw
+    assert mixed(196.0, 300.0, 300.0, 0.0) == [50.0, 0.0, 50.0, 100.0]  # both scaled alike
+    assert mixed(196.0, 0.0, 0.0, 1.0) == [54.0, 44.0, 54.0, 44.0]
+    assert mixed(196.0, 0.0, 0.0, 30.0) == [98.0, 0.0, 98.0, 0.0]  # yaw takes what is left
+    assert mixed(198.0, 100.0, 0.0, 30.0) == [99.0, 0.0, 49.0, 50.0]  # which is 98 / 20 N m
+
+
+# --- array code -----------------------------------------------------------------------------------
+
+
+def random_states(vehicle: Vehicle, n: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    dice = np.random.default_rng(7)
+    quaternion = dice.normal(size=(n, 1, 4))
+    span = vehicle.thrust_high - vehicle.thrust_low
+    given = {
+        "position": dice.normal(size=(n, 1, 3)),
+        "quaternion": quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True),
+        "velocity": dice.normal(size=(n, 1, 3)),
+        "body_rates": 3 * dice.normal(size=(n, 1, 3)),
+        "command": np.zeros((n, 1, vehicle.num_rotors)),
+        "thrust": vehicle.thrust_low + span * dice.uniform(size=(n, 1, vehicle.num_rotors)),
+        "touching": np.zeros((n, 1), bool),
+    }
+    return given, dice.uniform(-1.2, 1.2, (n, 1, 4))
+
+
+@pytest.mark.parametrize("level", CASCADE)
+@pytest.mark.parametrize("name", ["quad", "hexa", "crazyflie2"])
+def test_a_batch_has_the_bits_of_single_drones_and_torch_the_numbers(name: str, level: str) -> None:
+    torch = pytest.importorskip("torch")
+    vehicle = Vehicle.load(FILES[name])
+    lag = vehicle.coefficients.rotors.time_constant or 0.0
+    controller = make_controller(level, vehicle, vehicle.timestep, lag=lag)
+    given, actions = random_states(vehicle, 50)
+    batch = controller.thrust(actions, WorldState(**given))
+    assert batch.shape == (50, 1, vehicle.num_rotors)
+    assert (batch >= vehicle.thrust_low).all()
+    assert (batch <= vehicle.thrust_high).all()
+    for i in range(50):
+        one = WorldState(**{name: array[i, 0] for name, array in given.items()})
+        assert controller.thrust(actions[i, 0], one).tobytes() == batch[i, 0].tobytes()
+    tensors = {name: torch.from_numpy(array) for name, array in given.items()}
+    found = controller.thrust(torch.from_numpy(actions), WorldState(**tensors))
+    assert found.dtype == torch.float64
+    assert found.numpy() == pytest.approx(batch, abs=1e-6 * vehicle.thrust_high[0])
+    small = {name: array.float() for name, array in tensors.items()}
+    found = controller.thrust(torch.from_numpy(actions).float(), WorldState(**small))
+    assert found.dtype == torch.float32
+    assert bool(found.isfinite().all())
+
+
+@pytest.mark.parametrize("level", CASCADE)
+def test_gradients_flow_from_thrusts_to_actions_and_states(level: str) -> None:
+    """At hover too, where offsets and errors are 0, as a finite difference has them."""
+    torch = pytest.importorskip("torch")
+    vehicle = Vehicle.load()
+    controller = make_controller(level, vehicle, vehicle.timestep)
+    at_rest = state_of(vehicle)
+    tensors = {
+        name: torch.from_numpy(np.array(getattr(at_rest, name)))[None, None].clone()
+        for name in ("position", "quaternion", "velocity", "body_rates", "command", "thrust")
+    }
+    tensors["touching"] = torch.zeros((1, 1), dtype=torch.bool)
+    action = torch.zeros((1, 1, 4), dtype=torch.float64, requires_grad=True)
+    wanted = [tensors[name].requires_grad_() for name in ("quaternion", "body_rates")]
+    weights = torch.tensor((1.0, 2.0, 4.0, 8.0), dtype=torch.float64)
+    total = (controller.thrust(action, WorldState(**tensors)) * weights).sum()
+    slopes = torch.autograd.grad(total, (action, *wanted), allow_unused=True)
+    assert all(bool(slope.isfinite().all()) for slope in slopes if slope is not None)
+    for i in range(1, 4):
+        moved = [np.zeros(4), np.zeros(4)]
+        moved[0][i], moved[1][i] = 1e-6, -1e-6
+        up, down = (controller.thrust(one, at_rest) @ weights.numpy() for one in moved)
+        assert float(slopes[0][0, 0, i]) == pytest.approx((up - down) / 2e-6, rel=1e-3)
+        assert up != down
+
+
+# --- every vehicle flies --------------------------------------------------------------------------
+
+
+def lags(vehicle: Vehicle) -> list[float]:
+    """Without motor lag and, where the file has a time constant, with it."""
+    told = vehicle.coefficients.rotors
+    times = [time for time in (told.time_constant, told.time_constant_down) if time]
+    return [0.0, max(times)] if times else [0.0]
+
+
+def flown(vehicle: Vehicle, level: str, lag: float, quaternion: Any, time: float) -> list[Any]:
+    """Distance, tilt cosine and heading after each physics step of a flight to (0, 0, 50) m."""
+    world = make_world(vehicle, 1, effects=EffectOptions(motor_lag=lag > 0))
+    controller: Any = make_controller(level, vehicle, vehicle.timestep, lag=lag)
+    goal = np.array((0.0, 0.0, 50.0))
+    start = np.array((0.8, -0.6, 0.5)) if level == "position" else np.zeros(3)
+    world.reset(np.True_, Pose(position=goal + start, quaternion=np.array(quaternion)))
+    seen, state = [], world.state
+    for _ in range(round(time / vehicle.timestep)):
+        w, x, y, z = state.quaternion
+        heading = math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+        action = np.zeros(4)
+        if level == "position":
+            offset, c, s = goal - state.position, math.cos(heading), math.sin(heading)
+            turned = c * offset[0] + s * offset[1], c * offset[1] - s * offset[0], offset[2]
+            action = np.array((*turned, -heading)) / [size for size, _ in controller.ranges()]
+        world.step(controller.thrust(action, state), 1)
+        seen.append((np.linalg.norm(goal - state.position), state.tilt_cosine, heading))
+    return seen
+
+
+def check_flights(vehicle: Vehicle) -> None:
+    for lag in lags(vehicle):
+        tilted = (math.cos(0.2618), 0.6 * math.sin(0.2618), 0.8 * math.sin(0.2618), 0.0)  # by 30°
+        seen = np.array(flown(vehicle, "position", lag, tilted, 4.0))
+        assert seen[:, 0].max() < 1.5
+        settled = seen[round(3.0 / vehicle.timestep) :]
+        assert settled[:, 0].max() < 0.05
+        assert abs(settled[-1, 2]) < math.radians(10)
+        over = np.array(flown(vehicle, "attitude", lag, (0.0, 1.0, 0.0, 0.0), 2.0))
+        assert over[-1, 1] > math.cos(math.radians(3))
+
+
+@pytest.mark.parametrize("file", FILES.values(), ids=FILES)
+def test_every_vehicle_holds_a_position_and_turns_upright_without_tuning(file: Path) -> None:
+    check_flights(Vehicle.load(file))
+
+
+@pytest.mark.parametrize("frame", ["plus", "hexa", "octo"])
+def test_a_new_vehicle_flies_without_tuning(frame: str, tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    assert main(["vehicle", "new", str(file), "--frame", frame]) == 0
+    check_flights(Vehicle.load(file))
+
+
+# --- in an env ------------------------------------------------------------------------------------
+
+
+def env_of(level: str, **options: Any) -> Any:
+    return gym.make(HOVER, action=level, **options).unwrapped
+
+
+def test_the_spec_tells_names_units_and_frames() -> None:
+    action = env_of("position").env_spec.action
+    assert action.components == ("offset x", "offset y", "offset z", "offset of the heading")
+    assert action.unit == ("6.084548 m", "6.084548 m", "4 m", "3.141593 rad")
+    expected = "world turned by the heading, approached at 0.8831687 /s, gravity 9.8 m/s²"
+    assert action.frame == expected
+    action = env_of("rates").env_spec.action
+    assert action.unit[:2] == ("1", "11.06888 rad/s")
+    assert (action.low, action.high, action.shape) == (-1.0, 1.0, (4,))
+    assert env_of("rotors").env_spec.action.unit == ""
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_batch_of_every_level_flies_as_single_envs(level: str) -> None:
+    batch = gym.make_vec(HOVER, num_envs=3, autoreset_mode="Disabled", action=level)
+    singles = [env_of(level) for _ in range(3)]
+    first, _ = batch.reset(seed=4)
+    for i, env in enumerate(singles):
+        assert env.reset(seed=4 + i)[0].tobytes() == first[i].tobytes()
+    dice = np.random.default_rng(0)
+    for _ in range(8):
+        actions = dice.uniform(-0.3, 0.3, batch.action_space.shape).astype(np.float32)
+        seen, *_ = batch.step(actions)
+        for i, env in enumerate(singles):
+            assert env.step(actions[i])[0].tobytes() == seen[i].tobytes()
+
+
+@pytest.mark.parametrize(("estimate", "calls"), [(False, 4), (True, 1)], ids=["exact", "estimate"])
+def test_loops_run_in_every_physics_step_unless_they_see_an_estimate(
+    estimate: bool, calls: int
+) -> None:
+    sensors = ESTIMATE if estimate else {}
+    loop = Loop(HOVER, options={"action": "attitude", "sensors": sensors}, vehicle="crazyflie2")
+    controller, looked = loop.task.controller, []
+    thrust = controller.thrust
+    controller.thrust = lambda action, state: looked.append(1) or thrust(action, state)
+    loop.advance(np.zeros(4), np.ones(1, bool))
+    loop.advance(np.zeros(4))
+    assert len(looked) == calls  # of a control period of 0.02 s in steps of 0.005 s
+
+
+def test_a_touch_in_an_earlier_physics_step_counts() -> None:
+    vehicle = Vehicle.load()
+    world = make_world(vehicle, 1)
+    world.reset(np.True_, Pose(position=np.array((0.0, 0.0, vehicle.rest_height - 1e-3))))
+    full = np.full(4, 100.0)
+    world.step(full, 1)
+    assert world.state.touching
+    for _ in range(30):
+        world.step(full, 1, again=True)
+    assert world.state.touching
+    world.step(full, 1)
+    assert not world.state.touching
+
+
+def test_delayed_actions_and_wrong_levels() -> None:
+    env = env_of("velocity", randomize={"action_delay": "3"})
+    env.reset(seed=0)
+    climb = np.array((0, 0, 1, 0), np.float32)
+    late = [env.step(climb)[4]["F1"] for _ in range(5)]
+    assert late[3] > late[2] + 10.0  # three steps of the neutral action, then the climb
+    with pytest.raises(InputError, match=r"action: expected .*'position'.* got 'torque'"):
+        env_of("torque")
+    with pytest.raises(InputError, match="action: expected 'increment' or 'offset', got 'rates'"):
+        gym.make("rotorgram/Elevation-v0", action="rates")
+
+
+def test_a_craft_that_cannot_yaw_is_refused(tmp_path: Path) -> None:
+    text = QUAD_XML.read_text(encoding="utf-8")
+    file = tmp_path / "still.xml"
+    file.write_text(text.replace('0.05"', '0"').replace('-0"', '0"'), encoding="utf-8")
+    vehicle = Vehicle.load(file)
+    with pytest.raises(InputError, match=r"vehicle: expected .* yaw it.* got .* of rank 3"):
+        make_controller("rates", vehicle, 0.01)
+
+
+# --- the page -------------------------------------------------------------------------------------
+
+
+def test_the_page_tells_what_the_benchmark_wrote_and_the_code_gives() -> None:
+    page = (DOCS / "control.md").read_text(encoding="utf-8")
+    told = json.loads((DOCS / "results/control/control.json").read_text(encoding="utf-8"))
+    assert sorted(told["gains"]) == sorted(
+        name for name, file in FILES.items() if "vehicles" in str(file)
+    )
+    for name, given in told["gains"].items():
+        gains = Gains.of(Vehicle.load(name), given["timestep"], given["lag"])
+        for field in given.keys() - {"timestep", "lag"}:
+            assert getattr(gains, field) == pytest.approx(given[field], abs=1e-4)
+        tilt, (level, up) = math.degrees(gains.most_tilt), gains.most_offset
+        assert f"| {tilt:.0f} | {given['most_velocity'][0]:.2f}, " in page
+        assert f"{given['most_velocity'][1]:.2f} | {level:.2f}, {up:.2f} |" in page
+        assert f"| {gains.velocity:.2f} | {given['position']:.3f} | {given['lead']:.2f} |" in page
+    for name, steps in told["responses"].items():
+        cells = [
+            f"{one['rise_s']:.2f} s, {100 * one['overshoot']:.0f} %, {one['settled_s']:.2f} s"
+            for one in steps.values()
+        ]
+        row = f"| `{name}` | {' | '.join(cells)} | {100 * told['circle_m'][name]:.0f} cm |"
+        assert row in page
+    for level in LEVELS:
+        costs = [f"{told['cost'][n]['ratio_to_rotors'][level]:.2f}" for n in ("1", "1024")]
+        assert f"| `{level}` | {' | '.join(costs)} |" in page
+
+
+def test_the_page_tells_how_near_a_shared_payload_is_held() -> None:
+    page = (DOCS / "algorithms" / "geometric.md").read_text()
+    told = json.loads((DOCS / "results" / "control" / "cable.json").read_text())
+    for name in vehicle_names():
+        cells = [
+            f"{100 * row['error_m']:.2f} cm"
+            + (f", {row['terminated']} ended" if row["terminated"] else "")
+            for row in told[name].values()
+        ]
+        assert f"| `{name}` | {' | '.join(cells)} |" in page

@@ -1,0 +1,155 @@
+"""The jets below drones: their formula, their momentum, and what they do to the drones in them."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rotorgram.models import InputError, Vehicle
+from rotorgram.models.library import vehicle_names
+from rotorgram.sim import EffectOptions, Pose, World, make_world
+from rotorgram.sim.effects.downwash import Downwash
+
+ROOT = Path(__file__).parents[2]
+BIRD = "hummingbird"
+# Of its file, typed here again: four rotors at 0.17 m, their radius, and its drag along z.
+LENGTH, RADIUS, DRAG = 0.34, 0.1, 0.01
+MASS = Vehicle.load(BIRD).mass
+WEIGHT = MASS * Vehicle.load(BIRD).gravity
+SPEED = math.sqrt(WEIGHT / (2 * 1.225 * 4 * math.pi * RADIUS**2))  # at the rotors, in hover
+
+
+def jet(below: float, beside: float = 0.0, thrust: float = WEIGHT) -> float:
+    """Of the bird, at distances in its lengths."""
+    numbers = (np.array([x]) for x in (thrust, below * LENGTH, beside * LENGTH))
+    return float(Downwash(Vehicle.load(BIRD)).velocity(*numbers)[0])
+
+
+def test_the_profile_by_hand() -> None:
+    assert jet(5.0) == pytest.approx(SPEED * 10.11 / 10.817, rel=1e-6)
+    half = 0.07668 * 10.817  # radius at which the velocity has halved
+    assert jet(5.0, half) == pytest.approx(jet(5.0) / 2, rel=1e-6)
+    assert jet(5.0, 2 * half) == pytest.approx(jet(5.0) / (1 + 4 * (math.sqrt(2) - 1)) ** 2)
+    assert jet(5.0, thrust=4 * WEIGHT) == pytest.approx(2 * jet(5.0))
+    assert jet(100.0) / jet(50.0) == pytest.approx(55.817 / 105.817)
+    # Nearer than 2.5 lengths the speed falls to 0 at the height of the rotors, and above it is 0.
+    assert [jet(x) / jet(2.5) for x in (1.25, 0.0, -1.0)] == pytest.approx([0.5, 0.0, 0.0])
+    assert jet(5.0, thrust=-1.0) == 0.0
+
+
+@pytest.mark.parametrize("name", sorted(set(vehicle_names()) - {"paper"}))
+def test_the_momentum_of_a_jet_is_the_thrust_but_for_a_third(name: str) -> None:
+    """ρ ∫ V² dA = ρ U² l² π B² S² / (3 (√2 - 1)) at every depth, by integration. Of an ideal rotor
+    it is the thrust; the paper fits no momentum, so that this tells whether numbers are misread.
+    """
+    vehicle = Vehicle.load(name)
+    if vehicle.coefficients.rotors.radius is None:
+        pytest.skip("no rotors.radius")
+    downwash, weight = Downwash(vehicle), vehicle.mass * vehicle.gravity
+    for depth in (3.0, 30.0):
+        radius = np.linspace(0.0, 60 * depth / 3 * downwash.length, 300_001)
+        far = np.full_like(radius, depth * downwash.length)
+        speed = downwash.velocity(np.full_like(radius, weight), far, radius)
+        rings = speed**2 * radius
+        integral = float(((rings[1:] + rings[:-1]) / 2 * np.diff(radius)).sum())
+        momentum = 1.225 * 2 * math.pi * integral
+        area = vehicle.num_rotors * math.pi * vehicle.coefficients.rotors.radius**2
+        shape = math.pi * (10.11 * 0.07668) ** 2 / (3 * (math.sqrt(2) - 1))
+        expected = weight / (2 * area) * downwash.length**2 * shape
+        assert momentum == pytest.approx(expected, rel=1e-3)
+        assert 2 / 3 < momentum / weight < 1.0
+
+
+def birds(positions: Any, quaternion: Any = (1.0, 0.0, 0.0, 0.0), **effects: Any) -> World:
+    """One world of birds at rest at these positions, at hover thrust."""
+    options = EffectOptions(**effects)
+    count = len(positions)
+    world = make_world(Vehicle.load(BIRD), 1, drones=count, effects=options)
+    every = np.ones(world.shape, bool)[()]
+    turned = np.broadcast_to(quaternion, (1, count, 4))
+    place = np.array(positions, float).reshape(*world.shape, 3)
+    world.reset(every, Pose(position=place, quaternion=turned.reshape(*world.shape, 4)))
+    return world
+
+
+def hover(world: World, steps: int = 1) -> np.ndarray:
+    """Velocities after physics steps at hover thrust, shape (A, 3)."""
+    thrust = np.broadcast_to(world.vehicle.hover_thrust, world.state.thrust.shape)
+    world.step(thrust, steps)
+    return np.array(world.state.velocity).reshape(-1, 3)
+
+
+def test_the_lower_drone_is_pushed_down_by_its_drag_and_the_upper_is_not() -> None:
+    world = birds([(0, 0, 20.0), (0, 0, 20.0 - 5 * LENGTH)], body_drag=True, downwash=True)
+    velocity = hover(world)
+    wind = jet(5.0)
+    expected = -DRAG * wind * wind / MASS * world.vehicle.timestep
+    assert velocity[1] == pytest.approx([0.0, 0.0, expected], rel=1e-3, abs=1e-12)
+    assert velocity[0] == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
+    assert hover(world, 200)[1, 2] < -0.2  # m/s, after 2 s
+    assert abs(hover(world)[0, 2]) < 1e-9
+
+
+def test_rotors_in_the_jet_lose_thrust_by_their_inflow() -> None:
+    world = birds([(0, 0, 20.0), (0, 0, 20.0 - 5 * LENGTH)], rotor_drag=True, downwash=True)
+    rotors = world.vehicle.coefficients.rotors
+    speeds = np.sqrt(world.vehicle.hover_thrust / rotors.thrust_coefficient)
+    lost = rotors.inflow * speeds.sum() * jet(5.0)
+    assert hover(world)[1, 2] == pytest.approx(-lost / MASS * world.vehicle.timestep, rel=1e-3)
+
+
+def test_a_tilted_craft_blows_along_its_own_axis() -> None:
+    """By 30° about y: its jet goes down and to -x, and misses the one straight below."""
+    tilt = math.radians(30)
+    quaternion = (math.cos(tilt / 2), 0.0, math.sin(tilt / 2), 0.0)
+    away = 8 * LENGTH
+    there = (-away * math.sin(tilt), 0.0, 20.0 - away * math.cos(tilt))
+    world = birds([(0, 0, 20.0), there, (0, 0, 20.0 - away)], quaternion)
+    air = np.stack(Downwash(world.vehicle).air(world.state), axis=-1)[0]
+    assert air[0] == pytest.approx([0.0, 0.0, 0.0], abs=1e-3)
+    own, side = jet(8.0), jet(8.0 * math.cos(tilt), 8.0 * math.sin(tilt))
+    assert np.linalg.norm(air[1]) == pytest.approx(own, rel=0.02)  # the third one's edge besides
+    assert air[1] / np.linalg.norm(air[1]) == pytest.approx([-0.5, 0.0, -math.sqrt(0.75)], abs=1e-6)
+    assert np.linalg.norm(air[2]) == pytest.approx(side, rel=0.02)
+    assert side < 0.1 * own
+
+
+def test_jets_of_several_add_up() -> None:
+    world = birds([(0, 0, 20.0), (0, 0, 20.0 - 4 * LENGTH), (0, 0, 20.0 - 9 * LENGTH)])
+    air = np.stack(Downwash(world.vehicle).air(world.state), axis=-1)[0]
+    assert air[2] == pytest.approx([0.0, 0.0, -(jet(9.0) + jet(5.0))], rel=1e-6)
+
+
+@pytest.mark.parametrize("places", [[(0, 0, 20.0)], [(0, 0, 20.0), (2.0, 0, 20.0)]])
+def test_alone_and_side_by_side_it_changes_no_bit(places: Any) -> None:
+    flown = []
+    for on in (True, False):
+        world = birds(places, body_drag=True, wind=(1.0, 0.5, 0.0), downwash=on)
+        flown.append(hover(world, 5).tobytes())
+    assert flown[0] == flown[1]
+
+
+def test_a_batch_of_swarms_is_that_many_swarms() -> None:
+    dice = np.random.default_rng(0)
+    places = dice.uniform(-0.5, 0.5, (3, 4, 3)) + (0.0, 0.0, 1.0) * np.arange(5, 9)[:, None]
+    options = EffectOptions(body_drag=True, downwash=True, motor_lag=True)
+    batch = make_world(Vehicle.load(BIRD), 3, drones=4, effects=options)
+    batch.reset(np.ones((3, 4), bool), Pose(position=places))
+    alone = [birds(row, body_drag=True, downwash=True, motor_lag=True) for row in places]
+    thrust = np.broadcast_to(batch.vehicle.hover_thrust, (3, 4, 4)) * 0.9
+    for _ in range(20):
+        batch.step(thrust, 2)
+        for world, row in zip(alone, thrust, strict=True):
+            world.step(row[None], 2)
+    singles = np.concatenate([world.state.position for world in alone])
+    assert singles.tobytes() == np.ascontiguousarray(batch.state.position).tobytes()
+
+
+def test_what_lacks_is_one_sentence() -> None:
+    with pytest.raises(InputError, match="effects: expected body_drag or rotor_drag, on which"):
+        birds([(0, 0, 9), (0, 0, 5)], downwash=True)
+    with pytest.raises(InputError, match=r"rotors\.radius in .*, which downwash needs"):
+        Downwash(Vehicle.load())
+    with pytest.raises(InputError, match="effects: downwash: expected true or false, got 1"):
+        EffectOptions(downwash=1)  # type: ignore[arg-type]

@@ -1,0 +1,506 @@
+"""The backend rigid: MuJoCo's flights without contact, the tasks on it, gradients through it."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from remotes import flying
+from rotorgram.envs import LocalVectorEnv, Loop
+from rotorgram.envs.tasks.flight import length
+from rotorgram.models import QUAD_XML, Vehicle
+from rotorgram.models.errors import InputError
+from rotorgram.sim import PhysicsError, Pose, World, make_world, square_root
+from rotorgram.sim.backends import kernel
+from rotorgram.training.settings import CompareConfig
+
+torch = pytest.importorskip("torch")
+torch_api: Any = pytest.importorskip("array_api_compat.torch")
+
+ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+DATA = Path(__file__).parents[1] / "data"
+FILES = {path.stem: path for path in sorted((*DATA.glob("*.xml"), *DATA.glob("*.toml")))}
+FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/vehicle.toml"))}
+RACER, HEXA = DATA / "racer.xml", DATA / "hexa.xml"
+N = 4
+EVERY = np.ones((N, 1), bool)
+
+
+def rigid(vehicle: Vehicle, num_worlds: int = N, dtype: str = "float64", **rest: Any) -> Any:
+    return make_world(vehicle, num_worlds, "rigid", device="cpu", dtype=dtype, **rest)
+
+
+def arrays(vehicle: Vehicle, num_worlds: int = N, dtype: str = "float64", **rest: Any) -> Any:
+    return make_world(vehicle, num_worlds, "rigid", tensors=False, dtype=dtype, **rest)
+
+
+def tumbling(dice: np.random.Generator, count: int = N) -> dict[str, np.ndarray]:
+    """Starts high up, at any attitude."""
+    turned = dice.normal(size=(count, 1, 4))
+    return {
+        "position": dice.uniform(1000.0, 1001.0, (count, 1, 3)),
+        "quaternion": turned / np.linalg.norm(turned, axis=-1, keepdims=True),
+        "velocity": dice.normal(size=(count, 1, 3)),
+        "body_rates": dice.normal(size=(count, 1, 3)),
+    }
+
+
+def begin(world: World, **pose: np.ndarray) -> None:
+    put = {name: torch.tensor(values, dtype=world.dtype) for name, values in pose.items()}  # type: ignore[attr-defined]
+    world.reset(torch.ones(world.shape, dtype=torch.bool), Pose(**put))
+
+
+def angle(ours: Any, theirs: np.ndarray) -> float:
+    """Largest angle between attitudes, rad."""
+    q, p = np.asarray(ours, np.float64), theirs
+    apart = np.minimum(abs(q - p).max(axis=-1), abs(q + p).max(axis=-1))
+    return 4 * float(apart.max())
+
+
+# --- the motion -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "drag"), [*((name, 0.0) for name in FILES), ("paper", 0.3), ("hexa", 0.3)]
+)
+def test_flies_as_mujoco_for_five_seconds(name: str, drag: float) -> None:
+    """1e-6 m and 1e-6 rad, from any attitude, tumbling, at random thrusts; measured: 1e-9."""
+    vehicle, dice = Vehicle.load(FILES[name], linear_drag=drag), np.random.default_rng(0)
+    pose = tumbling(dice)
+    ours, theirs = arrays(vehicle), make_world(vehicle, N, num_threads=1)
+    substeps = vehicle.substeps(0.02)
+    for world in (ours, theirs):
+        world.reset(EVERY, Pose(**pose))
+    for _ in range(250):
+        thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (N, 1, vehicle.num_rotors))
+        for world in (ours, theirs):
+            world.step(thrust, substeps)
+    assert not theirs.state.touching.any()
+    assert abs(theirs.state.velocity).max() > 3
+    assert abs(ours.state.position - theirs.state.position).max() < 1e-6
+    assert angle(ours.state.quaternion, theirs.state.quaternion) < 1e-6
+    assert abs(ours.acceleration() - theirs.acceleration()).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_arrays_and_tensors_fly_the_same(name: str) -> None:
+    """A C function, if there is a compiler, NumPy and torch: but for rounding."""
+    vehicle, dice = Vehicle.load(FILES[name]), np.random.default_rng(0)
+    pose = tumbling(dice)
+    worlds = [arrays(vehicle, compiled=choice) for choice in (None, False)]
+    for world in worlds:
+        world.reset(EVERY, Pose(**pose))
+    worlds.append(rigid(vehicle))
+    begin(worlds[2], **pose)
+    for _ in range(5):
+        thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (N, 1, vehicle.num_rotors))
+        for world, values in zip(worlds, (thrust, thrust, torch.tensor(thrust)), strict=True):
+            world.step(values, 2)
+    for name in ("position", "quaternion", "velocity", "body_rates"):
+        seen = [np.asarray(getattr(world.state, name)) for world in worlds]
+        np.testing.assert_allclose(seen[0], seen[1], rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(seen[0], seen[2], rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_compiled_a_fast_spin_is_exact(dtype: str) -> None:
+    """Three and a half turns in a control step of two physics steps: half a turn about z."""
+    world = arrays(Vehicle.load(), 1, dtype)
+    rates = np.array([[[0.0, 0.0, 7 * np.pi / 0.02]]])
+    world.reset(EVERY[:1], Pose(position=np.full((1, 1, 3), 5.0), body_rates=rates))
+    world.step(np.zeros((1, 1, 4)), 2)
+    near = 1e-5 if dtype == "float32" else 1e-12
+    w, x, y, z = world.state.quaternion[0, 0].tolist()
+    assert [w, x, y, abs(z)] == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=near)
+
+
+def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
+    vehicle, dice = Vehicle.load(FILES["hexa"]), np.random.default_rng(0)
+    many = 19  # no multiple of what a processor computes at once
+    pose = tumbling(dice, many)
+    thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (many, 1, 6))
+    batch = arrays(vehicle, many, "float32")
+    batch.reset(np.ones((many, 1), bool), Pose(**pose))
+    batch.step(thrust, 2)
+    for i in (0, 18):
+        alone = arrays(vehicle, 1, "float32")
+        alone.reset(EVERY[:1], Pose(**{name: x[i : i + 1] for name, x in pose.items()}))
+        alone.step(thrust[i : i + 1], 2)
+        for name in ("position", "quaternion", "velocity", "body_rates"):
+            one, all_ = getattr(alone.state, name), getattr(batch.state, name)
+            assert one[0].tobytes() == all_[i].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("script", "reason"),
+    [
+        (b"#!/bin/sh\nexec sleep 30", "timed out after 0.2 seconds"),
+        (b"#!/bin/sh\nfor f; do case $f in *.so) echo > $f;; esac; done", "file too short"),
+        (b"#!/no/interpreter", "No such file"),
+        (b"#!/bin/sh\nprintf '\\377 no' >&2; exit 1", "\ufffd no"),
+    ],
+)
+def test_a_compiler_that_misbehaves_is_told_in_one_sentence(
+    script: bytes, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tool = tmp_path / "cc"
+    tool.write_bytes(script)
+    tool.chmod(0o755)
+    monkeypatch.setenv("CC", str(tool))
+    monkeypatch.setattr(kernel, "COMPILE_SECONDS", 0.2 if b"sleep" in script else 60.0)
+    with pytest.raises(InputError, match=rf"^compiled: expected [^\n]*{reason}"):
+        arrays(Vehicle.load(linear_drag=0.124))
+
+
+def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None:
+    vehicle = Vehicle.load(linear_drag=0.123)
+    monkeypatch.setenv("CC", str(shutil.which("false")))
+    with pytest.raises(InputError, match=r"^compiled: expected .*false to compile the equations"):
+        arrays(vehicle)
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    with pytest.raises(InputError, match=r"^compiled: expected false where no C compiler is found"):
+        arrays(vehicle, compiled=True)
+    world = arrays(vehicle)
+    world.reset(EVERY, Pose(position=np.full((N, 1, 3), 9.0), velocity=np.full((N, 1, 3), 1.0)))
+    world.step(np.zeros((N, 1, 4)), 1)
+    # v' = -0.123 v - (0, 0, g) over 0.01 s, solved.
+    left = np.exp(-0.123 * 0.01)
+    expected = (left, left, left - 9.8 / 0.123 * (1 - left))
+    np.testing.assert_allclose(world.state.velocity[0, 0], expected, rtol=1e-9)
+
+
+def test_a_seed_gives_arrays_the_draws_of_mujoco() -> None:
+    ours, theirs = (Loop(HOVER, N, backend=name, **rest) for name, rest in
+                    (("rigid", {"tensors": False}), ("mujoco", {})))  # fmt: skip
+    for loop in (ours, theirs):
+        loop.advance(np.zeros((N, 4), np.float32), EVERY[:, 0], range(N))
+    np.testing.assert_allclose(ours.world.state.position, theirs.world.state.position, rtol=1e-6)
+
+
+def test_sizes_have_a_derivative_where_they_are_0() -> None:
+    """Of |v| it is v / |v|, of a root 1 / (2 root), and 0 at 0: not NaN."""
+    vectors = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]], requires_grad=True)
+    length(torch_api, vectors).sum().backward()
+    assert vectors.grad.tolist() == [[0.0, 0.0, 0.0], pytest.approx([0.6, 0.8, 0.0])]
+    squares = torch.tensor([-1.0, 0.0, 4.0], requires_grad=True)
+    roots = square_root(squares, torch_api)
+    assert roots.tolist() == [0.0, 0.0, 2.0]
+    roots.sum().backward()
+    assert squares.grad.tolist() == [0.0, 0.0, 0.25]
+
+
+def test_a_free_fall_is_exact() -> None:
+    vehicle = Vehicle.load(linear_drag=0.0)
+    world = rigid(vehicle, 1, "float32")
+    begin(world, position=np.full((1, 1, 3), 10.0), velocity=np.array([[[1.0, 2.0, 3.0]]]))
+    world.step(torch.zeros(1, 1, 4), 100)  # 1 s
+    expected = torch.tensor((11.0, 12.0, 13.0 - 9.8 / 2))
+    torch.testing.assert_close(world.state.position[0, 0], expected, atol=1e-4, rtol=0)
+    expected = torch.tensor((1.0, 2.0, 3.0 - 9.8))
+    torch.testing.assert_close(world.state.velocity[0, 0], expected, atol=1e-5, rtol=0)
+
+
+def test_a_spin_about_a_principal_axis_keeps_its_rate() -> None:
+    """Half a turn about z in 1 s, and the unit quaternion stays one."""
+    world = rigid(Vehicle.load(), 1)
+    begin(world, position=np.full((1, 1, 3), 50.0), body_rates=np.array([[[0.0, 0.0, np.pi]]]))
+    world.step(torch.full((1, 1, 4), 49.0, dtype=torch.float64), 100)
+    turned = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
+    torch.testing.assert_close(world.state.quaternion[0, 0], turned, atol=1e-12, rtol=0)
+    assert float(world.state.position[0, 0, 2]) == pytest.approx(50.0, abs=1e-12)
+
+
+@pytest.mark.quiet
+@pytest.mark.timeout(300)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of torch's own modules
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch needs a compiler")
+def test_compiled_it_flies_the_same() -> None:
+    vehicle, dice = Vehicle.load(), np.random.default_rng(0)
+    worlds = [rigid(vehicle, N, "float32", compiled=choice) for choice in (False, True)]
+    pose = {"position": np.full((N, 1, 3), 5.0), "body_rates": dice.normal(size=(N, 1, 3))}
+    thrust = torch.tensor(dice.uniform(40.0, 60.0, (N, 1, 4)), dtype=torch.float32)
+    for world in worlds:
+        begin(world, **pose)
+        for _ in range(10):
+            world.step(thrust, 2)
+    for name in ("position", "quaternion", "velocity", "body_rates"):
+        one, other = (getattr(world.state, name) for world in worlds)
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
+
+
+EFFECTS = {
+    "motor_lag": True, "thrust_curve": True, "battery": True, "body_drag": True,
+    "rotor_drag": True, "ground_effect": True, "wind": (4.0, -3.0, 1.0), "gusts": 5.0,
+    "efficiency": (0.9, 1.0, 1.0, 1.0),
+}  # fmt: skip
+DRAWN = {
+    "mass": "uniform(0.8, 1.2)", "inertia": "uniform(0.8, 1.2)", "center_x": "uniform(-0.01, 0.01)",
+    "center_z": "uniform(-0.01, 0.01)", "reaction": "uniform(0.5, 1.5)",
+    "thrust_1": "uniform(0.9, 1.1)",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("file", "effects"),
+    [(RACER, EFFECTS), (HEXA, {}), (DATA / "small.xml", {})],
+    ids=["racer, all effects", "welded bodies", "in a fluid"],
+)
+def test_effects_and_drawn_parameters(file: Path, effects: dict[str, Any]) -> None:
+    """With float64 a seed draws what it draws on mujoco, gusts among it."""
+    options = {"effects": effects, "randomize": DRAWN, "linear_drag": 0.2, "flight_band": 10.0}
+    options["goal"] = (0, 0, 60)
+    ours = Loop(HOVER, N, vehicle=file, backend="rigid", device="cpu", dtype="float64",
+                options=options)  # fmt: skip
+    theirs = Loop(HOVER, N, vehicle=file, options=options)
+    still = np.zeros((N, ours.vehicle.num_rotors), np.float32)
+    for loop in (ours, theirs):
+        loop.advance(still, EVERY[:, 0], range(7, 7 + N))
+    for name, values in theirs.world.parameters.items():
+        assert ours.world.parameters[name].numpy().tolist() == values.tolist()
+    dice = np.random.default_rng(1)
+    frozen = np.array([False, True, False, False])
+    for step in range(20):
+        actions = dice.uniform(-0.1, 0.1, still.shape).astype(np.float32)
+        for loop in (ours, theirs):
+            loop.advance(actions, frozen=frozen if step == 3 else None)
+        for name in ("position", "velocity", "body_rates", "quaternion", "thrust"):
+            one, other = (getattr(loop.world.state, name) for loop in (ours, theirs))
+            np.testing.assert_allclose(one.numpy(), other, atol=1e-9, rtol=0)
+
+
+def test_acceleration_and_below() -> None:
+    world = rigid(Vehicle.load(), 3)
+    half = np.sqrt(0.5)
+    turned = np.array([[[1.0, 0, 0, 0]], [[half, half, 0, 0]], [[np.cos(0.5), 0, np.sin(0.5), 0]]])
+    begin(world, position=np.full((3, 1, 3), 2.0), quaternion=turned)
+    # At hover thrust: level it stays, on its side it falls and is pushed along -y.
+    expected = torch.tensor([[0.0, 0.0, 0.0], [0.0, -9.8, -9.8]], dtype=torch.float64)
+    torch.testing.assert_close(world.acceleration()[:2, 0], expected, atol=1e-12, rtol=0)
+    assert world.below()[:, 0].tolist() == pytest.approx([2.0, np.inf, 2.0 / np.cos(1.0)])
+
+
+@pytest.mark.parametrize("file", FILES.values(), ids=FILES)
+def test_touches_the_ground_where_mujoco_does(file: Path) -> None:
+    """Attitudes at random, just above and below the contact."""
+    vehicle, dice, count = Vehicle.load(file), np.random.default_rng(3), 24
+    turned = dice.normal(size=(count, 1, 4))
+    turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
+    turned[0] = (1.0, 0.0, 0.0, 0.0)
+    ours, theirs = rigid(vehicle, count), make_world(vehicle, count, num_threads=1)
+    low, high = np.zeros(count), np.full(count, float(vehicle.model.stat.extent) * 2)
+    for _ in range(40):
+        middle = (low + high) / 2
+        place = np.stack((0 * middle, 0 * middle, middle), axis=-1)[:, None]
+        theirs.reset(np.ones((count, 1), bool), Pose(position=place, quaternion=turned))
+        touching = theirs.state.touching[:, 0]
+        low, high = np.where(touching, middle, low), np.where(touching, high, middle)
+    small = 1e-4 * vehicle.rest_height
+    for offset in (small, -small):
+        place = np.stack((0 * high, 0 * high, high + offset), axis=-1)[:, None]
+        begin(ours, position=place, quaternion=turned)
+        theirs.reset(np.ones((count, 1), bool), Pose(position=place, quaternion=turned))
+        assert ours.state.touching.tolist() == theirs.state.touching.tolist()
+        assert bool(ours.state.touching[0]) == (offset < 0)
+
+
+# --- the tasks ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("env_id", "size"), [(ELEVATION, 1.0), (HOVER, 0.3)])
+@pytest.mark.parametrize("file", [None, HEXA, "crazyflie_brushless"])
+def test_whole_episodes_agree_with_mujoco(env_id: str, size: float, file: Any) -> None:
+    """From the same seeds: observations within a float32's rounding, rewards 1e-9, ends alike."""
+    theirs = LocalVectorEnv(env_id, N, vehicle=file, autoreset_mode="Disabled")
+    ours = LocalVectorEnv(
+        env_id, N, vehicle=file, autoreset_mode="Disabled", backend="rigid", dtype="float64",
+        device="cpu",
+    )  # fmt: skip
+    first, expected = ours.reset(seed=5)[0], theirs.reset(seed=5)[0]
+    np.testing.assert_array_equal(first, expected)
+    dice, shape = np.random.default_rng(2), theirs.action_space.shape
+    alive = np.ones(N, bool)
+    for _ in range(250):
+        actions = dice.uniform(-size, size, shape).astype(np.float32)
+        for env in (ours, theirs):
+            env.advance(actions, None, None, ~alive)
+        np.testing.assert_array_equal(ours.terminated, theirs.terminated)
+        np.testing.assert_array_equal(ours.truncated, theirs.truncated)
+        np.testing.assert_allclose(ours.observations, theirs.observations, atol=1e-6, rtol=1e-6)
+        np.testing.assert_allclose(ours.rewards, theirs.rewards, atol=1e-9, rtol=0)
+        alive = ~theirs.done
+        if not alive.any():
+            break
+    assert theirs.terminated.any() or theirs.truncated.any()
+
+
+def test_a_vector_env_gives_numpy_and_tensors_on_request() -> None:
+    """In float64 both draw the same numbers, and compute the same but for rounding."""
+    shared: Any = {"backend": "rigid", "device": "cpu", "dtype": "float64", "episode_length": 2}
+    host, ours = (gym.make_vec(HOVER, num_envs=N, tensors=x, **shared) for x in (False, True))
+    observation, info = host.reset(seed=0)
+    assert (type(observation), observation.dtype) == (np.ndarray, np.float32)
+    assert info["position_error"].shape == (N,)
+    assert {type(value) for value in info.values()} == {np.ndarray}
+    np.testing.assert_allclose(ours.reset(seed=0)[0], observation, atol=1e-6)
+    for _ in range(3):
+        actions = np.full((N, 4), 0.1, np.float32)
+        told, other = ours.step(torch.from_numpy(actions)), host.step(actions)
+        for one, another in zip(told[:4], other[:4], strict=True):
+            np.testing.assert_allclose(one, another, atol=1e-6)
+            assert (type(one), type(another)) == (torch.Tensor, np.ndarray)
+    with pytest.raises(InputError, match="tensors: expected False with the backend mujoco"):
+        LocalVectorEnv(HOVER, 2, tensors=True)
+    with pytest.raises(InputError, match="gradients: expected False with mujoco, got True"):
+        LocalVectorEnv(HOVER, 2, gradients=True)
+
+
+def test_seeds_repeat_starts_in_float32() -> None:
+    env = LocalVectorEnv(HOVER, 50, backend="rigid", device="cpu")
+    first, again, other = (env.reset(seed=seed)[0] for seed in (3, 3, 4))
+    assert first.tobytes() == again.tobytes()
+    assert first.tobytes() != other.tobytes()
+    assert len({row.tobytes() for row in first}) == 50
+
+
+def test_over_udp_it_flies_as_in_process() -> None:
+    with flying(HOVER, backend="rigid") as pair:
+        pair.remote.connect()
+        local = LocalVectorEnv(HOVER, 1, backend="rigid", autoreset_mode="Disabled")
+        seen = pair.remote.reset(seed=4)[0], local.reset(seed=[4])[0]
+        assert seen[0].tobytes() == seen[1].tobytes()
+        for _ in range(5):
+            actions = np.full((1, 4), 0.1, np.float32)
+            here, there = pair.remote.step(actions[0]), local.step(actions)
+            assert here[0].tobytes() == there[0].tobytes()
+            assert here[1] == there[1][0]
+
+
+def test_runs_train_on_it_and_are_evaluated_on_mujoco() -> None:
+    config = CompareConfig(backend="rigid", seeds=1, agents=("a2c",))
+    (run,) = config.runs()
+    assert run.training_env["backend"] == "rigid"
+    assert "backend" not in config.env
+    assert config.content("a2c")["backend"] == "rigid"
+    with pytest.raises(InputError, match="backend: expected mujoco or rigid or warp, got 'unity'"):
+        CompareConfig(backend="unity")  # type: ignore[arg-type]
+
+
+# --- gradients ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("effects", [{}, {"motor_lag": True, "body_drag": True}])
+def test_gradients_through_a_rollout_are_those_of_differences(effects: dict[str, Any]) -> None:
+    """Of the reward of eight steps of Hover to the actions of the first and the last."""
+    loop = Loop(HOVER, 2, vehicle=RACER, backend="rigid", device="cpu", dtype="float64",
+                options={"effects": effects})  # fmt: skip
+    task, world = loop.task, loop.world
+    every = torch.ones(2, dtype=torch.bool)
+
+    def total(actions: Any) -> Any:
+        world.detach()  # type: ignore[attr-defined]
+        loop.advance(np.zeros((2, 4)), every, [0, 1])
+        reward = 0.0
+        for action in actions:
+            world.step(task.controller.thrust(action[:, None], world.state), 4)
+            outcome = task.outcome(world.state)
+            reward = reward + sum(term for term in outcome.reward.values()).sum()
+        return reward
+
+    dice = torch.Generator().manual_seed(0)
+    actions = 0.4 * torch.rand(8, 2, 4, generator=dice, dtype=torch.float64) - 0.2
+    actions.requires_grad_(True)
+    total(actions).backward()
+    assert actions.grad is not None
+    for place in ((0, 0, 0), (0, 1, 2), (7, 0, 3)):
+        ends = []
+        for sign in (1, -1):
+            moved = actions.detach().clone()
+            moved[place] += sign * 1e-5
+            ends.append(float(total(moved)))
+        slope = (ends[0] - ends[1]) / 2e-5
+        assert float(actions.grad[place]) == pytest.approx(slope, rel=1e-5, abs=1e-8)
+        assert slope != 0
+    assert not world.state.position.requires_grad  # the last flight had none
+
+
+@pytest.mark.parametrize("env_id", ["rotorgram/Landing-v0", "rotorgram/Waypoints-v0"])
+@pytest.mark.parametrize("effects", [{}, {"motor_lag": True, "battery": True, "rotor_drag": True}])
+def test_gradients_are_numbers_where_nothing_turns_and_no_rotor_pushes(
+    env_id: str, effects: dict[str, Any]
+) -> None:
+    """A root has no slope at 0. Level, all rotors at their least: rates and thrusts are 0."""
+    loop = Loop(env_id, 2, vehicle=RACER, backend="rigid", device="cpu",
+                options={"effects": effects})  # fmt: skip
+    loop.advance(np.zeros((2, 4)), np.ones(2, bool), [0, 1])
+    actions = torch.full((2, 4), -1.0, requires_grad=True)
+    reward = 0.0
+    for _ in range(2):
+        loop.advance(actions)
+        reward = reward + loop.rewards.sum()
+    (slope,) = torch.autograd.grad(reward, actions)
+    assert bool(torch.isfinite(slope).all())
+    # Without effects thrust is in proportion to the action; with a lag it begins as a root.
+    assert bool((slope != 0).all()) == (not effects)
+
+
+def test_actions_keep_their_graph_through_the_loop_until_it_is_detached() -> None:
+    loop = Loop(HOVER, 2, backend="rigid", device="cpu")
+    loop.advance(np.zeros((2, 4)), np.ones(2, bool), [0, 1])
+    actions = torch.full((2, 4), 0.1, requires_grad=True)
+    loop.advance(actions)
+    loop.advance(actions)
+    (slope,) = torch.autograd.grad(loop.rewards.sum(), actions, retain_graph=True)
+    assert bool(torch.isfinite(slope).all())
+    assert float(slope.abs().sum()) > 0
+    loop.world.detach()  # type: ignore[attr-defined]
+    assert not loop.world.state.velocity.requires_grad
+    loop.advance(np.zeros((2, 4)))
+    assert not loop.rewards.requires_grad
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ({"effects": {"payload": 0.1}}, "effects: payload: expected none with the backend rigid"),
+        ({"dtype": "float16"}, "dtype: expected float32 or float64, got 'float16'"),
+        ({"device": "gpu"}, "device: expected 'cpu', or a CUDA device that torch finds, got 'gpu'"),
+        ({"compiled": 1}, "compiled: expected true or false, got 1"),
+        ({"num_threads": 2}, "num_threads: expected device or dtype or compiled or tensors"),
+    ],
+)
+def test_wrong_arguments(arguments: dict[str, Any], expected: str) -> None:
+    with pytest.raises(InputError, match=f"^{expected}"):
+        LocalVectorEnv(HOVER, **{"num_envs": 2, "backend": "rigid", **arguments})
+
+
+@pytest.mark.parametrize("change", ['integrator="Euler"', 'integrator="RK4" wind="3 0 0"'])
+def test_what_mujoco_moves_in_another_way_is_refused(change: str, tmp_path: Path) -> None:
+    text = (DATA / "racer.xml").read_text().replace('integrator="RK4"', change)
+    (tmp_path / "other.xml").write_text(text)
+    vehicle = Vehicle.load(tmp_path / "other.xml")
+    if "wind" in change:  # wind without a fluid does nothing
+        rigid(vehicle)
+        return
+    with pytest.raises(InputError, match=r"vehicle: expected RK4, .* others in racer"):
+        rigid(vehicle)
+
+
+def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
+    loop = Loop(ELEVATION, 2, backend="rigid", device="cpu")
+    every, still = np.ones(2, bool), np.zeros((2, 1))
+    loop.advance(still, every, [0, 1])
+    begin(
+        loop.world, position=np.full((2, 1, 3), 9.0), velocity=np.array([[[0.0] * 3], [[1e30] * 3]])
+    )
+    with pytest.raises(PhysicsError, match=r"bad states in envs \[1\]: reset the env"):
+        loop.advance(still)
+    with pytest.raises(gym.error.ResetNeeded):
+        loop.advance(still)
+    loop.advance(still, every, [0, 1])
+    loop.advance(still)
+    assert abs(loop.observations["observation"][:, 1:]).max() < 1e-6

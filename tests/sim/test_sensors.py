@@ -1,0 +1,746 @@
+"""Sensors and the onboard estimate against closed forms, and as a part of every env."""
+
+import csv
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from remotes import flying
+from rotorgram.agents import PID
+from rotorgram.envs import Loop
+from rotorgram.envs.registry import env_spec
+from rotorgram.models.errors import InputError
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.sim import EffectOptions, Pose, World, checked_sensors, make_world
+from rotorgram.sim.sensors import Estimator, Sensors, isa_height, isa_pressure
+
+ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+PERIOD = 0.02
+LEVEL, LEFT = (1.0, 0.0, 0.0, 0.0), (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+IMU = {"gyro_noise": 0.0, "accelerometer_noise": 0.0}
+GPS = {"noise": 0.0, "vertical_noise": 0.0, "velocity_noise": 0.0}
+NOISY = {
+    "imu": {
+        "gyro_noise": 1e-3, "gyro_walk": 1e-4, "gyro_bias": 0.01, "gyro_scale": 0.01,
+        "accelerometer_noise": 0.01, "accelerometer_walk": 1e-3, "accelerometer_bias": 0.1,
+        "accelerometer_scale": 0.01,
+    },
+    "magnetometer": {"noise": 0.3},
+    "barometer": {"noise": 1.0, "walk": 0.1, "rate": 25, "altitude": 400.0},
+    "rangefinder": {"noise": 0.02, "limit": 6.0},
+    "gps": {
+        "noise": 1.0, "vertical_noise": 2.0, "velocity_noise": 0.1, "rate": 10, "delay": 0.1,
+        "dropout": 0.2,
+    },
+    "motion_capture": {"noise": 1e-3, "angle_noise": 1e-2, "delay": 0.02, "dropout": 0.1},
+    "estimate": True,
+}  # fmt: skip
+
+
+def about_x(degrees: float) -> tuple[float, ...]:
+    half = math.radians(degrees) / 2
+    return (math.cos(half), math.sin(half), 0.0, 0.0)
+
+
+def sensing(
+    sensors: Mapping[str, Any], worlds: int = 1, file: Path | None = None, **pose: Any
+) -> tuple[World, Sensors, Any]:
+    """A world that has just begun at a pose, its sensors, and the mask of all its drones."""
+    world = make_world(Vehicle.load(file), worlds, num_threads=1)
+    every: Any = np.ones(world.shape, bool)[()]
+    start = {"position": (0.0, 0.0, 5.0), **pose}
+    shaped = {k: np.broadcast_to(v, (*world.shape, len(v))).copy() for k, v in start.items()}
+    made = Sensors(checked_sensors(sensors), world, PERIOD)
+    world.seed(every, [100 + i for i in range(worlds)])
+    world.reset(every, Pose(**shaped))
+    made.begin(every)
+    return world, made, every
+
+
+def first(name: str, settings: Mapping[str, Any], **rest: Any) -> list[float]:
+    """First reading of a sensor of a single drone."""
+    return sensing({name: settings}, **rest)[1].readings[name].tolist()
+
+
+# --- what each measures ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("pose", "expected"),
+    [
+        ({}, (0, 0, 0, 0, 0, 9.8)),  # hovers: the thrust carries the weight
+        ({"thrust": [0.0] * 4}, (0, 0, 0, 0, 0, 0)),  # falls
+        ({"thrust": [98.0] * 4}, (0, 0, 0, 0, 0, 19.6)),
+        # Tilted, it still feels its thrust alone: an accelerometer does not tell the tilt.
+        ({"quaternion": about_x(50.0)}, (0, 0, 0, 0, 0, 9.8)),
+        ({"body_rates": (0.1, -0.2, 3.0)}, (0.1, -0.2, 3.0, 0, 0, 9.8)),
+        ({"position": (0.0, 0.0, 0.4), "thrust": [0.0] * 4}, (0, 0, 0, 0, 0, 9.8)),  # stands
+    ],
+)
+def test_imu(pose: Mapping[str, Any], expected: tuple[float, ...]) -> None:
+    world, sensors, every = sensing({"imu": IMU}, **pose)
+    stands = "position" in pose
+    if stands:
+        for _ in range(100):  # until it has come to rest
+            world.step(np.zeros(4), 2)
+        sensors.sample(every)
+    reading = sensors.readings["imu"].tolist()
+    assert reading == pytest.approx(expected, abs=1e-3 if stands else 1e-9)
+
+
+def test_imu_at_the_end_of_a_step() -> None:
+    """A tumbling craft: the force is that of the last thrusts, in the body's axes of the end."""
+    world, sensors, every = sensing({"imu": IMU}, body_rates=(1.0, 2.0, 0.5))
+    world.step(np.array((60.0, 50.0, 40.0, 30.0)), 2)
+    sensors.sample(every)
+    reading = sensors.readings["imu"]
+    assert reading[3:].tolist() == pytest.approx((0.0, 0.0, 180.0 / 20.0), abs=1e-9)
+    np.testing.assert_array_equal(reading[:3], world.state.body_rates)
+
+
+def test_imu_off_the_center_of_mass(tmp_path: Path) -> None:
+    """The hub, 12 of 20 kg, 5 cm ahead: the center 3 cm ahead. Turning at 2 rad/s, the origin is
+    drawn towards it by ω² r = 0.12 m/s²."""
+    text = Vehicle.load().path.read_text()
+    file = tmp_path / "ahead.xml"
+    file.write_text(text.replace('size="0.22 0.22 0.07"', 'size="0.22 0.22 0.07" pos="0.05 0 0"'))
+    reading = first("imu", IMU, file=file, body_rates=(0.0, 0.0, 2.0))
+    assert reading == pytest.approx((0, 0, 2.0, 0.12, 0, 9.8), abs=1e-9)
+
+
+def test_imu_feels_the_air(tmp_path: Path) -> None:
+    """Drag of 2 N s/m in a wind of 5 m/s from behind: 10 N on 20 kg, as long as it stands still."""
+    drag = '<custom><numeric name="rotorgram/drag.linear" data="2 2 2"/></custom>'
+    file = tmp_path / "draggy.xml"
+    text = Vehicle.load().path.read_text()
+    file.write_text(text.replace("<worldbody>", f"{drag}<worldbody>"))
+    vehicle, every = Vehicle.load(file), np.True_
+    world = make_world(vehicle, 1, effects=EffectOptions(body_drag=True, wind=(5.0, 0.0, 0.0)))
+    sensors = Sensors(checked_sensors({"imu": IMU}), world, PERIOD)
+    world.reset(every, Pose(position=np.array((0.0, 0.0, 5.0))))
+    sensors.begin(every)
+    world.step(vehicle.hover_thrust, 1)
+    sensors.sample(every)
+    assert sensors.readings["imu"][3:].tolist() == pytest.approx((0.5, 0.0, 9.8), abs=1e-3)
+
+
+def test_imu_within_its_range() -> None:
+    settings = IMU | {"gyro_range": 2.0, "accelerometer_range": 5.0}
+    assert first("imu", settings, body_rates=(3.0, -3.0, 0.0)) == [2.0, -2.0, 0.0, 0.0, 0.0, 5.0]
+    observed = env_spec(HOVER, {"sensors": {"imu": settings}}).observation[1]
+    assert observed.high == (2.0, 2.0, 2.0, 5.0, 5.0, 5.0)
+
+
+def test_imu_bias_and_scale() -> None:
+    """Drawn for each axis of each drone when an episode begins, and kept."""
+    settings = IMU | {"gyro_bias": 0.1, "accelerometer_scale": 0.02}
+    _, sensors, every = sensing({"imu": settings}, 3000)
+    bias, scale = np.split(sensors.readings["imu"].reshape(-1, 6), 2, axis=1)
+    off = scale[:, 2] / 9.8 - 1
+    assert bias.std() == pytest.approx(0.1, abs=4 * 0.1 / math.sqrt(2 * 9000))
+    assert off.std() == pytest.approx(0.02, abs=4 * 0.02 / math.sqrt(2 * 3000))
+    assert abs(bias.mean()) < 4 * 0.1 / math.sqrt(9000)
+    sensors.sample(every)
+    np.testing.assert_allclose(sensors.readings["imu"][:, 0, :3], bias, atol=1e-15)
+    some = np.arange(3000)[:, None] < 10
+    sensors.begin(some)
+    drawn = sensors.readings["imu"][:, 0, :3]
+    np.testing.assert_array_equal(drawn[10:], bias[10:])
+    assert (drawn[:10] != bias[:10]).all()
+
+
+@pytest.mark.parametrize(
+    ("height", "pressure"),
+    [
+        (-1000.0, 113_929.0),
+        (0.0, 101_325.0),
+        (1000.0, 89_874.6),
+        (5000.0, 54_019.9),
+        (11e3, 22_632),
+    ],
+)
+def test_the_standard_atmosphere(height: float, pressure: float) -> None:
+    """ISO 2533:1975, at geopotential heights."""
+    assert isa_pressure(height) == pytest.approx(pressure, rel=5e-6)
+    assert isa_height(isa_pressure(height)) == pytest.approx(height, abs=1e-8)
+
+
+def test_barometer() -> None:
+    assert first("barometer", {"noise": 0.0, "altitude": 430.0}) == pytest.approx([435.0])
+    # At sea level a pascal is 1 / (1.225 kg/m³ · 9.80665 m/s²) = 83.24 mm.
+    _, sensors, _ = sensing({"barometer": {"noise": 2.0}}, 4000, position=(0.0, 0.0, 0.4))
+    off = sensors.readings["barometer"].ravel() - 0.4
+    assert off.std() == pytest.approx(2 * 0.08324, abs=4 * 0.1665 / math.sqrt(8000))
+
+
+def test_barometer_walks() -> None:
+    """K √t after a time t: 0.5 Pa/s/√Hz for 4 s are 1 Pa."""
+    _, sensors, every = sensing({"barometer": {"noise": 0.0, "walk": 0.5}}, 2000)
+    assert sensors.readings["barometer"].ravel().tolist() == pytest.approx([5.0] * 2000)
+    for _ in range(200):
+        sensors.sample(every)
+    pressure = isa_pressure(sensors.readings["barometer"].ravel()) - isa_pressure(5.0)
+    # The bias of a reading is that before its own step of the walk.
+    expected = 0.5 * math.sqrt(200 * PERIOD)
+    assert pressure.std() == pytest.approx(expected, abs=4 * expected / math.sqrt(4000))
+
+
+def test_magnetometer() -> None:
+    """Level with the nose east, it has the field of the world; with the nose north, turned."""
+    assert first("magnetometer", {"noise": 0.0}) == pytest.approx((1.287, 21.532, -43.231))
+    turned = first("magnetometer", {"noise": 0.0}, quaternion=LEFT)
+    assert turned == pytest.approx((21.532, -1.287, -43.231))
+    assert first("magnetometer", {"noise": 0.0, "field": [0, 30, 0]}) == pytest.approx((0, 30, 0))
+    _, sensors, _ = sensing({"magnetometer": {"noise": 0.3, "field": [0, 0, 0]}}, 2000)
+    noise = sensors.readings["magnetometer"]
+    assert noise.std() == pytest.approx(0.3, abs=4 * 0.3 / math.sqrt(12_000))
+
+
+@pytest.mark.parametrize(
+    ("attitude", "expected"),
+    [(LEVEL, 3.0), (about_x(60.0), 6.0), (about_x(75.0), 8.0), (about_x(180.0), 8.0)],
+)
+def test_rangefinder(attitude: tuple[float, ...], expected: float) -> None:
+    """Height over the cosine of the tilt, and no further than 8 m."""
+    settings = {"noise": 0.0, "limit": 8.0}
+    pose = {"position": (1.0, 2.0, 3.0), "quaternion": attitude}
+    assert first("rangefinder", settings, **pose) == pytest.approx([expected], abs=1e-9)
+
+
+def test_rangefinder_sees_what_stands_in_a_vehicles_file(tmp_path: Path) -> None:
+    text = Vehicle.load().path.read_text()
+    table = '<geom type="box" size="0.1 0.1 0.5" pos="7 0 0.5"/>'
+    file = tmp_path / "table.xml"
+    file.write_text(text.replace("<worldbody>", f"<worldbody>{table}"))
+    settings = {"noise": 0.0, "limit": 8.0}
+    for x, expected in ((0.0, 3.0), (7.0, 2.0)):
+        reading = first("rangefinder", settings, file=file, position=(x, 0.0, 3.0))
+        assert reading == pytest.approx([expected], abs=1e-9)
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "warp"])
+def test_rangefinder_looks_past_what_is_fixed_to_the_craft(backend: Any, tmp_path: Path) -> None:
+    if backend == "warp":
+        pytest.importorskip("mujoco_warp")
+    text = Vehicle.load().path.read_text()
+    leg = '<body pos="0 0 -0.3"><geom type="box" size="0.1 0.1 0.1" mass="0"/></body>'
+    file = tmp_path / "leg.xml"
+    file.write_text(text.replace("<freejoint", f"{leg}<freejoint", 1))
+    world = make_world(Vehicle.load(file), 2, backend)
+    position = world.xp.zeros((2, 1, 3), dtype=world.xp.float32)
+    position[..., 2] = 3.0
+    world.reset(world.xp.ones((2, 1), dtype=bool), Pose(position=position))
+    np.testing.assert_allclose(world.below(), 3.0, rtol=1e-6)
+
+
+def test_gps_and_motion_capture() -> None:
+    pose = {"position": (1.0, -2.0, 3.0), "velocity": (4.0, 5.0, -6.0), "quaternion": LEFT}
+    assert first("gps", GPS, **pose) == [1.0, -2.0, 3.0, 4.0, 5.0, -6.0]
+    exact = {"noise": 0.0, "angle_noise": 0.0}
+    assert first("motion_capture", exact, **pose) == pytest.approx([1.0, -2.0, 3.0, *LEFT])
+    noisy = {"noise": 2.0, "vertical_noise": 3.0, "velocity_noise": 0.5}
+    _, sensors, _ = sensing({"gps": noisy}, 4000, **pose)
+    deviation = sensors.readings["gps"].reshape(-1, 6).std(axis=0)
+    np.testing.assert_allclose(deviation, (2, 2, 3, 0.5, 0.5, 0.5), rtol=4 / math.sqrt(8000))
+    turned = {"noise": 0.0, "angle_noise": 0.02}
+    _, sensors, _ = sensing({"motion_capture": turned}, 4000, **pose)
+    quaternion = sensors.readings["motion_capture"][:, 0, 3:]
+    np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1.0, atol=1e-12)
+    # The mean square of a rotation about three axes of σ is 3 σ².
+    angle = 2 * np.arccos(np.clip(np.abs(quaternion @ LEFT), 0, 1))
+    assert math.sqrt((angle**2).mean() / 3) == pytest.approx(0.02, rel=4 / math.sqrt(24_000))
+
+
+# --- the gyroscope's noise ------------------------------------------------------------------------
+
+
+def allan_deviation(rates: np.ndarray, m: int) -> float:
+    """Overlapping Allan deviation over m samples, of the series (n, series) together.
+
+    IEEE Std 952-1997, annex C.1: half the mean square of what two averages side by side differ.
+    """
+    angle = np.concatenate((np.zeros((1, rates.shape[1])), rates.cumsum(axis=0)))
+    second = angle[2 * m :] - 2 * angle[m:-m] + angle[: -2 * m]
+    return math.sqrt(0.5 * np.mean((second / m) ** 2))
+
+
+def freedom(n: int, m: int) -> float:
+    """Least degrees of freedom of that estimator: white and random walk frequency noise, whichever
+    has fewer (NIST SP 1065, table 5)."""
+    white = (1.5 * (n - 1) / m - 2 * (n - 2) / n) * 4 * m**2 / (4 * m**2 + 5)
+    walk = (n - 2) / m * ((n - 1) ** 2 - 3 * m * (n - 1) + 4 * m**2) / (n - 3) ** 2
+    return min(white, walk)
+
+
+@pytest.mark.parametrize("rate", [50.0, 25.0])
+def test_allan_deviation_of_the_gyroscope(rate: float) -> None:
+    """N / √τ at short, K √(τ / 3) at long times: the numbers that the datasheet gives."""
+    density, walk, samples, worlds = 1e-3, 3e-3, 6000, 16
+    settings = IMU | {"gyro_noise": density, "gyro_walk": walk, "rate": rate}
+    _, sensors, every = sensing({"imu": settings}, worlds)
+    interval, series = 1 / rate, []
+    for _ in range(samples):
+        for _ in range(round(interval / PERIOD)):
+            sensors.sample(every)
+        series.append(sensors.readings["imu"][:, 0, :3].ravel())
+    rates = np.array(series)
+    found = {}
+    for m in (1, 2, 4, 16, 64, 256, 1024):
+        time = m * interval
+        expected = math.sqrt(density**2 / time + walk**2 * time / 3)
+        found[m] = allan_deviation(rates, m)
+        # Of a χ² with f degrees of freedom, the relative error of the square root: √(1 / 2f).
+        error = math.sqrt(0.5 / (freedom(samples, m) * rates.shape[1]))
+        assert found[m] == pytest.approx(expected, rel=4 * error), m
+    assert found[1] == pytest.approx(density / math.sqrt(interval), rel=0.02)
+    assert found[1024] == pytest.approx(walk * math.sqrt(1024 * interval / 3), rel=0.2)
+
+
+# --- rate, delay and dropout ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("worlds", [1, 2])
+def test_a_delay_is_exact_and_a_rate_holds(worlds: int) -> None:
+    """Read every 5th step and told 3 steps later; the first reading until then."""
+    settings = GPS | {"rate": 10.0, "delay": 0.06}
+    world, sensors, every = sensing({"gps": settings}, worlds, velocity=(1.0, 2.0, 3.0))
+    flown, told = [world.state.position.copy()], [sensors.readings["gps"][..., :3]]
+    for _ in range(20):
+        world.step(np.full((*world.shape, 4), 60.0), 2)
+        sensors.sample(every)
+        flown.append(world.state.position.copy())
+        told.append(sensors.readings["gps"][..., :3])
+    of_step = [0, 0, 0, 0, 0, 0, 0, 0, 5, 5, 5, 5, 5, 10, 10, 10, 10, 10, 15, 15, 15]
+    for step, sampled in enumerate(of_step):
+        np.testing.assert_array_equal(told[step], flown[sampled])
+
+
+def test_dropouts() -> None:
+    """A lost reading leaves the one before: 30 % of 100,000."""
+    settings = {"noise": 1.0, "vertical_noise": 1.0, "velocity_noise": 1.0, "dropout": 0.3}
+    _, sensors, every = sensing({"gps": settings}, 2000)
+    lost, before = 0, sensors.readings["gps"]
+    for _ in range(50):
+        sensors.sample(every)
+        now = sensors.readings["gps"]
+        same = (now == before).all(axis=-1)
+        assert (same == (now == before).any(axis=-1)).all()
+        lost, before = lost + int(same.sum()), now
+    assert lost / 1e5 == pytest.approx(0.3, abs=4 * math.sqrt(0.3 * 0.7 / 1e5))
+
+
+# --- options --------------------------------------------------------------------------------------
+
+
+def test_a_vehicles_numbers_and_the_settings_that_replace_them(tmp_path: Path) -> None:
+    numbers = {"gyro_noise": 0.0, "accelerometer_noise": 0.0, "gyro_range": 2.0}
+    told = "".join(
+        f'<numeric name="rotorgram/sensors.{name}" data="{value}"/>'
+        for name, value in numbers.items()
+    )
+    file = tmp_path / "sensing.xml"
+    text = Vehicle.load().path.read_text()
+    file.write_text(text.replace("<worldbody>", f"<custom>{told}</custom><worldbody>"))
+    fast = {"body_rates": (5.0, 0.0, 0.0)}
+    assert sensing({"imu": True}, file=file, **fast)[1].readings["imu"][0] == 2.0
+    assert first("imu", {"gyro_range": 4.0}, file=file, **fast)[0] == 4.0
+
+
+def test_options_are_plain_values_in_one_order() -> None:
+    given = {"gps": {**GPS, "delay": 1}, "barometer": False, "imu": True, "observe": "added"}
+    sensors = checked_sensors(given)
+    assert list(sensors.items()) == [("imu", {}), ("gps", {**GPS, "delay": 1.0})]
+    assert checked_sensors(sensors) == sensors
+    assert env_spec(ELEVATION, {"sensors": {"imu": False}}) == env_spec(ELEVATION)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "sentence"),
+    [
+        ([], r"sensors: expected settings by sensor, got \[\]"),
+        ({"radar": True}, "sensors: expected some of imu, .*estimate, observe, got 'radar'"),
+        ({"imu": 3}, "sensors.imu: expected true, or settings by name, got 3"),
+        ({"imu": {"noise": 1}}, "sensors.imu: expected some of gyro_noise, .*, got 'noise'"),
+        (
+            {"barometer": {"noise": -1}},
+            "sensors.barometer.noise: expected a number from 0 to 10000 Pa, got -1",
+        ),
+        (
+            {"magnetometer": {"noise": 0, "field": [1, 2]}},
+            "sensors.magnetometer.field: expected 3 numbers from -100 to 100 µT",
+        ),
+        (
+            {"barometer": True},
+            "sensors.barometer: expected noise here, or sensors.barometer_noise in the vehicle's "
+            "file, got none",
+        ),
+        (
+            {"gps": GPS | {"rate": 30}},
+            "sensors.gps.rate: expected the control rate of 50 Hz over a whole number, got 30 Hz",
+        ),
+        ({"gps": GPS | {"rate": 100}}, "sensors.gps.rate: expected the control rate of 50 Hz"),
+        (
+            {"gps": GPS | {"delay": 0.03}},
+            "sensors.gps.delay: expected a whole number of control periods of 0.02 s, at most "
+            "1000, got 0.03 s",
+        ),
+        (
+            {"gps": GPS | {"delay": 11}},
+            "sensors.gps.delay: expected a number from 0 to 10 s, got 11",
+        ),
+        ({"imu": 0}, "sensors.imu: expected true, or settings by name, got 0"),
+        ({"estimate": True}, "sensors: expected imu, which estimate needs, got none"),
+        ({"observe": "estimate"}, "sensors: expected estimate, which is to be observed, got none"),
+        ({"observe": "all"}, "sensors.observe: expected 'added' or 'estimate', got 'all'"),
+    ],
+)
+def test_a_wrong_option_gives_one_sentence(sensors: Any, sentence: str) -> None:
+    with pytest.raises(InputError, match=f"^{sentence}") as caught:
+        env_spec(HOVER, {"sensors": sensors})
+    assert "\n" not in str(caught.value)
+
+
+# --- as a part of an env --------------------------------------------------------------------------
+
+
+def bits(observation: Any, drone: Any = ...) -> bytes:
+    """An observation's bytes, of one drone of a batch or of a single env."""
+    arrays = observation.values() if isinstance(observation, dict) else [observation]
+    return b"".join(np.ascontiguousarray(array[drone]).tobytes() for array in arrays)
+
+
+def actions_of(num_envs: int, steps: int) -> np.ndarray:
+    dice = np.random.default_rng(3)
+    return dice.uniform(-0.3, 0.3, (steps, num_envs, 4)).astype(np.float32)
+
+
+@pytest.mark.parametrize("observe", ["added", "estimate"])
+def test_a_batch_is_so_many_single_envs(observe: str) -> None:
+    """With an episode's end on the way, and a second one from the streams as they are."""
+    options: dict[str, Any] = {"sensors": {**NOISY, "observe": observe}, "episode_length": 30}
+    many = gym.make_vec(HOVER, num_envs=3, autoreset_mode="NextStep", **options)
+    singles = [gym.make(HOVER, disable_env_checker=True, **options) for _ in range(3)]
+    seen, _ = many.reset(seed=7)
+    alone = [env.reset(seed=7 + i)[0] for i, env in enumerate(singles)]
+    ended = [False] * 3
+    for actions in actions_of(3, 75):
+        assert [bits(seen, i) for i in range(3)] == [bits(one) for one in alone]
+        seen, _, terminated, truncated, _ = many.step(actions)
+        for i, env in enumerate(singles):
+            if ended[i]:
+                alone[i], ended[i] = env.reset()[0], False
+            else:
+                alone[i], _, *ends, _ = env.step(actions[i])
+                ended[i] = any(ends)
+        assert (terminated | truncated).tolist() == ended
+    many.close()
+
+
+def test_a_frozen_drone_stays_as_it_is() -> None:
+    held, free = (Loop(HOVER, 2, options={"sensors": NOISY}) for _ in range(2))
+    every, mask, actions = np.ones(2, bool), np.array([True, False]), actions_of(2, 12)
+    for loop in (held, free):
+        loop.advance(actions[0], every, [1, 2])
+        loop.advance(actions[0])
+    before = bits(held.observations, 0)
+    for action in actions[1:4]:
+        held.advance(action, frozen=mask)
+        free.advance(action)
+        assert bits(held.observations, 0) == before
+        assert bits(held.observations, 1) == bits(free.observations, 1)
+    after = Loop(HOVER, 2, options={"sensors": NOISY})
+    after.advance(actions[0], every, [1, 2])
+    after.advance(actions[0])
+    for action in actions[4:]:
+        held.advance(action)
+        after.advance(action)
+        assert bits(held.observations, 0) == bits(after.observations, 0)
+
+
+@pytest.mark.parametrize("worlds", [1, 3])
+def test_sensors_move_nothing_else(worlds: int) -> None:
+    """Physics with contact, starts, and the readings of the other sensors keep their bits."""
+    two = {name: NOISY[name] for name in ("imu", "gps")}
+    none, some, all_of_them = (
+        Loop(HOVER, worlds, options={"sensors": sensors, "flight_band": 100.0})
+        for sensors in ({}, two, NOISY)
+    )
+    every, down = np.ones(worlds, bool), np.full((worlds, 4), -0.5, np.float32)
+    for seeds in (range(worlds), None):  # two episodes
+        for loop in (none, some, all_of_them):
+            loop.advance(down, every, seeds)
+        while not none.terminated.any():  # by contact with the floor
+            for loop in (none, some, all_of_them):
+                loop.advance(down)
+            exact = none.observations["observation"].tobytes()
+            assert some.observations["observation"].tobytes() == exact
+            assert all_of_them.observations["observation"].tobytes() == exact
+            for name in two:
+                ours, theirs = (loop.observations[name] for loop in (some, all_of_them))
+                assert ours.tobytes() == theirs.tobytes()
+
+
+def test_contacts_are_the_same_with_an_imu() -> None:
+    """What reads the acceleration leaves the solver's warm start as it was."""
+    states = []
+    for sensors in ({}, {"imu": IMU}):
+        world, made, every = sensing(sensors, 2, position=(0.0, 0.0, 0.45), body_rates=(1, 0.5, 0))
+        for _ in range(100):
+            world.step(np.full((2, 1, 4), 20.0), 2)
+            made.sample(every)
+        assert world.state.touching.all()
+        states.append(world.state.position.tobytes() + world.state.velocity.tobytes())
+    assert states[0] == states[1]
+
+
+def test_over_the_wire_as_in_process() -> None:
+    options = {"sensors": NOISY, "episode_length": 20}
+    local = gym.make(HOVER, disable_env_checker=True, **options)
+    dice = np.random.default_rng(0)
+    with flying(HOVER, **options) as pair:
+        assert bits(pair.remote.reset(seed=3)[0]) == bits(local.reset(seed=3)[0])
+        assert pair.remote.observation_space == local.observation_space
+        for _ in range(20):
+            action = dice.uniform(-0.2, 0.2, 4).astype(np.float32)
+            here, there = pair.remote.step(action), local.step(action)
+            assert bits(here[0]) == bits(there[0])
+            assert here[1:4] == there[1:4]
+
+
+@pytest.mark.parametrize("env_id", [ELEVATION, HOVER])
+@pytest.mark.parametrize("observe", ["added", "estimate"])
+def test_gymnasium_takes_it(env_id: str, observe: str) -> None:
+    env = gym.make(env_id, sensors={**NOISY, "observe": observe}, disable_env_checker=True)
+    check_env(env.unwrapped, skip_render_check=True)
+    is_dict = isinstance(env.observation_space, gym.spaces.Dict)
+    assert is_dict == (observe == "added")
+    if is_dict:
+        sensors = [name for name in NOISY if name != "observe"]
+        assert set(env.observation_space) == {"observation", *sensors}  # type: ignore[call-overload]
+
+
+def test_sb3_takes_it() -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    env = gym.make(HOVER, sensors=NOISY)
+    model = sb3.A2C("MultiInputPolicy", env, n_steps=8, device="cpu", seed=0).learn(16)
+    assert env.action_space.contains(model.predict(env.reset(seed=0)[0])[0])
+
+
+def test_an_estimate_stays_within_the_bounds_of_a_task() -> None:
+    """A barometer that is 40 m off: the task sees the end of its bounds."""
+    sensors = {"imu": IMU, "barometer": {"noise": 400.0, "altitude": 500.0}, "estimate": True}
+    env = gym.make(ELEVATION, sensors={**sensors, "observe": "estimate"})
+    seen, _ = env.reset(seed=1)
+    ends = 0
+    for _ in range(60):
+        seen, *_, info = env.step(np.zeros(1, np.float32))
+        assert env.observation_space.contains(seen)
+        ends += abs(seen[0]) > 3.2
+        assert abs(info["elevation_error"]) < 2.0
+    assert ends > 10
+
+
+# --- the estimate ---------------------------------------------------------------------------------
+
+HALF_LIFE = PERIOD / math.log(2)  # a time constant with which a step takes half of an error
+
+
+def estimator(**state: Any) -> Estimator:
+    times = dict.fromkeys(("attitude_time", "height_time", "position_time"), HALF_LIFE)
+    made = Estimator(times, np, PERIOD, 10.0, 100.0, (0.0, 20.0, -40.0))
+    start = {"position": (0, 0, 0), "velocity": (0, 0, 0), "quaternion": LEVEL, **state}
+    exact: Any = SimpleNamespace(**{k: np.array(v, float) for k, v in start.items()})
+    made.begin(np.True_, exact, np.zeros(6))
+    return made
+
+
+def channel(*value: float, fresh: bool = True) -> Any:
+    return SimpleNamespace(value=np.array(value), fresh=fresh, interval=PERIOD)
+
+
+def angles_of(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation vector of a quaternion."""
+    size = np.linalg.norm(quaternion[1:])
+    return 2 * math.atan2(size, quaternion[0]) * quaternion[1:] / max(size, 1e-30)
+
+
+STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 10.0)
+
+
+def test_a_step_of_position_by_hand() -> None:
+    """a = 10.5 - 10 m/s² up for 0.02 s, then half of the rest for each measurement."""
+    made = estimator(position=(1, 2, 3), velocity=(0.5, 0, 0))
+    made.update(np.True_, {"imu": channel(0, 0, 0, 0, 0, 10.5)})
+    assert made.position.tolist() == pytest.approx((1.01, 2.0, 3.0001), abs=1e-12)
+    assert made.velocity.tolist() == pytest.approx((0.5, 0.0, 0.01), abs=1e-12)
+    made = estimator(position=(1, 2, 3))
+    made.update(np.True_, {"imu": channel(*STILL), "barometer": channel(104.0)})
+    # Both poles at 1/2: g = 1 - 1/4, h = (1 - 1/2)² / 0.02 s; it is 1 m higher.
+    assert made.position.tolist() == pytest.approx((1.0, 2.0, 3.75))
+    assert made.velocity.tolist() == pytest.approx((0.0, 0.0, 12.5))
+    made = estimator(position=(1, 2, 3))
+    made.update(np.True_, {"imu": channel(*STILL), "gps": channel(2, 2, 5, 0, 1, 0)})
+    assert made.position.tolist() == pytest.approx((1.5, 2.0, 4.0))
+    assert made.velocity.tolist() == pytest.approx((0.0, 0.5, 0.0))
+    made = estimator(position=(1, 2, 3))
+    capture = channel(3, 2, 3, *LEVEL)
+    made.update(np.True_, {"imu": channel(*STILL), "motion_capture": capture})
+    assert made.position.tolist() == pytest.approx((2.5, 2.0, 3.0))
+    assert made.velocity.tolist() == pytest.approx((25.0, 0.0, 0.0))
+
+
+def test_a_step_of_attitude_by_hand() -> None:
+    made = estimator()
+    made.update(np.True_, {"imu": channel(0.5, 0, 0, 0, 0, 0)})  # falls: nothing pulls
+    assert angles_of(made.quaternion) == pytest.approx((0.01, 0, 0))
+    tilted = about_x(math.degrees(0.2))
+    made = estimator(quaternion=tilted)
+    made.update(np.True_, {"imu": channel(*STILL)})
+    assert angles_of(made.quaternion) == pytest.approx((0.2 - 0.5 * math.sin(0.2), 0, 0))
+    # Nose north where it is believed to be east: field along -y... seen as along body x.
+    made = estimator()
+    made.update(np.True_, {"imu": channel(*STILL), "magnetometer": channel(20, 0, -40)})
+    assert angles_of(made.quaternion) == pytest.approx((0, 0, math.pi / 4))
+    turned = (math.cos(0.15), 0, 0, math.sin(0.15))
+    for sign in (1, -1):  # the same attitude
+        made = estimator()
+        capture = channel(0, 0, 0, *(sign * x for x in turned))
+        made.update(np.True_, {"imu": channel(*STILL), "motion_capture": capture})
+        assert angles_of(made.quaternion) == pytest.approx((0, 0, math.sin(0.15)))
+
+
+def test_a_reading_counts_once() -> None:
+    made = estimator(position=(1, 2, 3))
+    stale = {
+        "barometer": channel(140.0, fresh=False), "gps": channel(9, 9, 9, 9, 9, 9, fresh=False),
+        "motion_capture": channel(9, 9, 9, *LEFT, fresh=False),
+        "magnetometer": channel(20, 0, -40, fresh=False),
+    }  # fmt: skip
+    made.update(np.True_, {"imu": channel(*STILL), **stale})
+    assert made.position.tolist() == pytest.approx((1, 2, 3))
+    assert made.velocity.tolist() == pytest.approx((0, 0, 0))
+    assert made.quaternion.tolist() == pytest.approx(LEVEL)
+
+
+def test_a_gyroscopes_bias_tilts_the_estimate_by_so_much() -> None:
+    """What the bias adds in a step is what the accelerometer takes away: b T = sin(tilt) / 2."""
+    made, bias = estimator(), 0.5
+    for _ in range(100):
+        made.update(np.True_, {"imu": channel(bias, 0, 0, 0, 0, 10)})
+    assert math.sin(angles_of(made.quaternion)[0]) == pytest.approx(2 * bias * PERIOD)
+
+
+def test_errors_of_a_long_hover_are_those_of_the_biases() -> None:
+    """With a time constant of τ steps: tilt by b τ and a / g, height by a τ²."""
+    gyro, force, drones = 0.01, 0.1, 400
+    biases = IMU | {"gyro_bias": gyro, "accelerometer_bias": force}
+    sensors = {"imu": biases, "barometer": {"noise": 0.0}, "estimate": True}
+    _, made, every = sensing(sensors, drones)
+    for _ in range(600):  # 12 s: a filter of 1 s has settled
+        made.sample(every)
+    estimate = made.readings["estimate"][:, 0]
+    turned = 2 * estimate[:, 7:10]  # small angles, about x, y, z
+    pole = math.exp(-PERIOD)
+    tilt = math.hypot(gyro * PERIOD / (1 - pole), force / 9.8)
+    # A step's rise of a T² is made up by h times what the barometer tells before the pull.
+    height = force * (pole * PERIOD / (1 - pole)) ** 2
+    error = 4 / math.sqrt(2 * drones)
+    assert turned[:, :2].std() == pytest.approx(tilt, rel=error / math.sqrt(2) + 0.01)
+    assert (estimate[:, 2] - 5.0).std() == pytest.approx(height, rel=error + 0.01)
+    assert turned[:, 2].std() == pytest.approx(12 * gyro, rel=error + 0.01)
+    assert estimate[:, :2].std() > 10 * height  # nothing measures it
+
+
+def test_an_exact_estimate_of_a_steady_climb() -> None:
+    """Constant thrust, level: the integral is exact, and nothing pulls it away."""
+    sensors = {"imu": IMU, "barometer": {"noise": 0.0}, "magnetometer": {"noise": 0.0}}
+    world, made, every = sensing({**sensors, "estimate": True}, velocity=(1.0, -2.0, 0.0))
+    for _ in range(100):
+        world.step(np.full(4, 55.0), 2)
+        made.sample(every)
+    estimate = made.readings["estimate"]
+    assert estimate[:3].tolist() == pytest.approx(world.state.position.tolist(), abs=1e-9)
+    assert estimate[3:6].tolist() == pytest.approx(world.state.velocity.tolist(), abs=1e-9)
+    assert estimate[6:10].tolist() == pytest.approx(LEVEL, abs=1e-12)
+    # 55 N · 4 / 20 kg - 9.8 = 1.2 m/s² for 2 s
+    assert estimate[2] == pytest.approx(5.0 + 0.5 * 1.2 * 4)
+
+
+def test_a_controller_flies_on_the_estimate() -> None:
+    """PID on barometer and accelerometer: what it sees is off, and it holds the elevation."""
+    imu = {"gyro_noise": 2e-4, "accelerometer_noise": 2e-3, "accelerometer_bias": 0.05}
+    sensors = {"imu": imu, "barometer": {"noise": 0.4}, "estimate": True, "observe": "estimate"}
+    env = gym.make(ELEVATION, sensors=sensors, disable_env_checker=True)
+    pilot = PID(env.unwrapped.env_spec)  # type: ignore[attr-defined]
+    pilot.reset()
+    seen, _ = env.reset(seed=5)
+    errors, differences = [], []
+    for _ in range(250):
+        seen, _, terminated, _, info = env.step(pilot.act(seen))
+        assert not terminated
+        errors.append(abs(info["elevation_error"]))
+        differences.append(abs(info["elevation_error"] - seen[0]))
+    assert 1e-3 < max(differences) < 0.5
+    assert max(errors[-100:]) < 0.5
+
+
+# --- on the backend warp --------------------------------------------------------------------------
+
+
+def test_on_the_backend_warp() -> None:
+    torch = pytest.importorskip("torch")
+    wp = pytest.importorskip("warp")
+    pytest.importorskip("mujoco_warp")
+    wp.config.log_level = 30
+    exact = {
+        "imu": IMU, "magnetometer": {"noise": 0.0}, "barometer": {"noise": 0.0},
+        "rangefinder": {"noise": 0.0, "limit": 50.0}, "gps": {**GPS, "rate": 25, "delay": 0.04},
+        "motion_capture": {"noise": 0.0, "angle_noise": 0.0}, "estimate": True,
+    }  # fmt: skip
+    options = {"sensors": exact, "start_tilt": 0.0, "start_heading": 0.0, "start_band": 0.0}
+    ours, theirs = (
+        Loop(HOVER, 3, backend=name, options=options, **settings)
+        for name, settings in (("warp", {"device": "cpu"}), ("mujoco", {}))
+    )
+    every = np.ones(3, bool)
+    for step, action in enumerate(actions_of(3, 15)):
+        for loop in (ours, theirs):
+            loop.advance(action, every if step == 0 else None, [1, 2, 3] if step == 0 else None)
+        for name, values in theirs.observations.items():
+            mine = ours.observations[name]
+            assert isinstance(mine, torch.Tensor)
+            np.testing.assert_allclose(mine, values, atol=3e-3, rtol=1e-5, err_msg=name)
+    first, again, other = ([], [], [])  # type: ignore[var-annotated]
+    noisy = Loop(HOVER, 3, backend="warp", options={"sensors": NOISY}, device="cpu")
+    for seen, seed in ((first, 1), (again, 1), (other, 2)):
+        for step, action in enumerate(actions_of(3, 8)):
+            noisy.advance(action, every if step == 0 else None, [seed] * 3)
+            seen.append(noisy.observations["gps"].numpy().copy())
+    np.testing.assert_array_equal(first, again)
+    assert (np.array(first) != np.array(other)).any()
+
+
+# --- the page -------------------------------------------------------------------------------------
+
+
+def test_the_page_tells_what_the_benchmark_wrote() -> None:
+    docs = Path(__file__).parents[2] / "docs"
+    page, results = (docs / "sensors.md").read_text(), docs / "results" / "sensors"
+    one, many = json.loads((results / "cost.json").read_text()).values()
+    for name, time in one.items():
+        assert f"| {name} | {time:.0f} | {many[name]:,.0f} |" in page
+    with (results / "allan.csv").open(newline="") as file:
+        _, *rows = csv.reader(file)
+    told = 0
+    for row in rows:
+        time, found, expected, ratio = map(float, row)
+        told += f"| {time:g} | {found:.3e} | {expected:.3e} |" in page
+        assert abs(ratio - 1) < 0.05
+    assert told == page.split("| τ, s")[1].split("\n\n")[0].count("\n") - 1

@@ -1,0 +1,70 @@
+"""`rotorgram bench`: every layer is measured, and ratios are those of the same round."""
+
+import json
+from pathlib import Path
+
+import pytest
+from rotorgram.cli import main
+from rotorgram.training.bench import (
+    PARTS,
+    RATIOS,
+    Layer,
+    Ratio,
+    bench,
+    parts_of,
+)
+
+
+def layer(name: str, *rates: float) -> Layer:
+    return Layer(name=name, about="", drones=1, rates=rates)
+
+
+def test_ratios_are_medians_over_rounds() -> None:
+    # The machine was half as fast in the second round: both layers were.
+    layers = [layer("a", 30.0, 10.0, 50.0), layer("b", 10.0, 5.0, 10.0)]
+    ratio = Ratio(name="a ÷ b", of=lambda rates: rates["a"] / rates["b"], target=2.5)
+    assert ratio.value(layers) == 3.0
+    assert layers[0].rate == 30.0
+    assert (ratio.target_text, ratio.reached(3.0), ratio.reached(2.0)) == ("≥ 2.5", True, False)
+
+
+def test_a_step_is_compared_with_its_physics_and_an_echo() -> None:
+    # 100 µs of a step, 20 µs of physics and 30 µs of echo.
+    rates = {"UDP, 1": 10_000.0, "mj_step": 50_000.0, "UDP echo": 1e6 / 30}
+    assert RATIOS[0].of(rates) == pytest.approx(2.0)
+    assert (RATIOS[0].target_text, RATIOS[0].reached(2.0)) == ("≤ 1.7", False)
+
+
+def test_the_parts_of_a_step_and_what_is_left() -> None:
+    layers = [layer(name, 1e5) for name in PARTS] + [layer("UDP, 1", 1e4)]
+    parts = dict(parts_of(layers))
+    assert list(parts) == [*PARTS, "links", "step"]
+    # Seven parts of 10 µs; the step of 100 µs flies without a policy, which decides in 10 µs.
+    assert parts["step"] == pytest.approx(110e-6)
+    assert parts["links"] == pytest.approx(40e-6)
+
+
+def test_every_layer_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "bench"
+    assert main(["bench", "--rounds", "1", "--seconds", "0.01", "--out", str(folder)]) == 0
+    written = json.loads((folder / "bench.json").read_text())
+    layers = [Layer(**{**one, "rates": tuple(one["rates"])}) for one in written["layers"]]
+    assert set(PARTS) <= {one.name for one in layers}
+    assert written["medians"] == {one.name: one.rate for one in layers}
+    for ratio in RATIOS:
+        told = written["ratios"][ratio.name]
+        assert told["target"] == ratio.target_text
+        assert told["value"] == pytest.approx(ratio.value(layers), abs=0.001)
+    assert all(one.rate > 0 and len(one.rates) == 1 for one in layers)
+    assert (folder / "bench.png").read_bytes()[:4] == b"\x89PNG"
+    said = capsys.readouterr().out
+    assert all(one.name in said for one in layers)
+
+
+def test_wrong_times(tmp_path: Path) -> None:
+    for rounds, seconds, sentence in (
+        (0, 1.0, "rounds: expected at least 1, got 0"),
+        (1, 0.0, "seconds: expected more than 0 and at most 60, got 0"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            bench(rounds, seconds, tmp_path, lambda *_: None)

@@ -1,0 +1,307 @@
+"""Verdicts on the paper's claims, for training curves of which the answer is known."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+from comparisons import GATES, HEADLINE, spec_of
+from rotorgram.training.claims import (
+    Verdict,
+    convergence_step,
+    fluctuation,
+    judge_claims,
+    judge_no_worse,
+    long_run_return,
+)
+from rotorgram.training.metrics import Headline
+from rotorgram.training.results import EPISODE_COLUMNS, EVALUATION_COLUMNS
+
+LENGTH = 10
+COUNT = 100
+
+
+def run(returns: np.ndarray, agent: str = "a2c", seed: int = 0) -> pd.DataFrame:
+    """The training episodes of a run, of 10 steps each."""
+    number = np.arange(len(returns))
+    frame = pd.DataFrame({"episode": number, "first_step": number * LENGTH, "return": returns})
+    frame = frame.assign(agent=agent, seed=seed, length=LENGTH, mean_size=0.0)
+    frame = frame.assign(last_step=frame["first_step"] + LENGTH)
+    return frame.assign(terminated=False, truncated=True, seconds=0.0)[list(EPISODE_COLUMNS)]
+
+
+def step_at(episode: int, top: float = 1.0) -> np.ndarray:
+    return np.where(np.arange(COUNT) < episode, 0.0, top)
+
+
+def training(make: Callable[[str, int], np.ndarray], seeds: int = 50) -> pd.DataFrame:
+    return pd.concat(
+        run(make(agent, seed), agent, seed) for agent in ("a2c", "vpg") for seed in range(seeds)
+    )
+
+
+def evaluated(**errors: list[float]) -> pd.DataFrame:
+    rows = [
+        dict.fromkeys(EVALUATION_COLUMNS, 0)
+        | {"agent": agent, "seed": seed, "env_steps": 1000, "steady": error}
+        | {"settling_time": math.nan, "terminated": False}
+        for agent, values in errors.items()
+        for seed, error in enumerate(values)
+    ]
+    return pd.DataFrame(rows, columns=list(EVALUATION_COLUMNS))
+
+
+HELD = evaluated(a2c=[0.01] * 50, vpg=[0.02] * 50)
+
+
+def outcomes(episodes: pd.DataFrame, evaluations: pd.DataFrame = HELD) -> list[str]:
+    return [verdict.verdict for verdict in judge_claims(episodes, evaluations, "paper", HEADLINE)]
+
+
+def test_convergence_step_of_a_step_curve():
+    # The step comes at env step 500; the mean over 100 steps is within 10 % of the new level
+    # when 9 of its 10 episodes lie behind the step.
+    assert convergence_step(run(step_at(50))) == 590.0
+    assert convergence_step(run(step_at(50, top=3.0) - 100.0)) == 590.0
+    assert math.isnan(convergence_step(run(step_at(5)[:9])))
+
+
+def test_what_does_not_rise_does_not_converge():
+    assert math.isnan(convergence_step(run(np.full(COUNT, 7.0))))
+    assert math.isnan(convergence_step(run(step_at(50, top=-3.0))))  # it unlearns
+    # Blocks of ten episodes at 0 and 1 in turn. The level ends where the last block lies, and its
+    # standard deviation in the last quarter is 0.28 or, with a last block of 1.0, 0.29: the rise
+    # is 2.9 of them, or 3.4.
+    swinging = np.repeat(np.resize([0.0, 1.0], 10), 10)
+    assert math.isnan(convergence_step(run(np.where(np.arange(COUNT) < 90, swinging, 0.8))))
+    assert convergence_step(run(swinging)) == 990.0
+
+
+def test_flat_noise_does_not_converge_and_a_rise_in_the_same_noise_does():
+    noise = [np.random.default_rng(seed).normal(size=COUNT) for seed in range(100)]
+    flat = [convergence_step(run(values)) for values in noise]
+    assert np.isnan(flat).sum() >= 85
+    rising = [convergence_step(run(step_at(30, top=10.0) + values)) for values in noise]
+    assert np.isfinite(rising).all()
+    # Without noise it would be 390; with it, the level's last excursion from the band counts.
+    assert 370.0 <= np.median(rising) <= 450.0
+
+
+def test_convergence_step_where_windows_are_empty():
+    # Ten episodes, the windows of a tenth hold one each; the return rises at the last.
+    assert convergence_step(run(step_at(9)[:10])) == 100.0
+    # Nothing ended before env step 60 of 105: the curve begins there.
+    # It leaves the first episode, of return 0, behind when that window ends beyond 70.5.
+    late = run(step_at(1)[:10]).assign(last_step=range(60, 110, 5))
+    assert convergence_step(late) == pytest.approx(71.4)
+
+
+def test_long_run_return_is_the_mean_of_the_last_quarter():
+    returns = np.concatenate([np.full(75, -100.0), np.arange(25.0)])
+    assert long_run_return(run(returns)) == 12.0
+    assert math.isnan(long_run_return(run(np.ones(9))))
+
+
+def test_fluctuation_ignores_trends_and_sees_alternation():
+    assert fluctuation(run(np.full(COUNT, 3.0))) == 0.0
+    # A ramp equals its centred mean but for the last five episodes, whose window is cut: they lie
+    # 2.5, 2, 1.5, 1 and 0.5 above it, in a quarter of 25 episodes.
+    ends = np.array([0.0] * 20 + [0.5, 1.0, 1.5, 2.0, 2.5])
+    assert fluctuation(run(np.arange(float(COUNT)))) == pytest.approx(ends.std(ddof=1))
+    alternating = np.resize([1.0, -1.0], COUNT)
+    # Eleven alternating values have the mean -1/11 of the middle one, so it lies 12/11 off; the
+    # last five windows are cut and differ a little.
+    assert fluctuation(run(alternating)) == pytest.approx(12 / 11, rel=0.05)
+    assert fluctuation(run(5 * alternating)) == pytest.approx(
+        5 * fluctuation(run(alternating)), rel=1e-12
+    )
+    assert math.isnan(fluctuation(run(np.ones(9))))
+
+
+def paper_like(agent: str, seed: int) -> np.ndarray:
+    noise = np.resize([1.0, -1.0], COUNT)
+    if agent == "a2c":
+        return step_at(50 + seed % 5, top=10.0) + 0.1 * noise
+    return step_at(20 + seed % 5, top=8.0) + 0.5 * noise
+
+
+def swapped(agent: str, seed: int) -> np.ndarray:
+    return paper_like("vpg" if agent == "a2c" else "a2c", seed)
+
+
+def test_data_as_in_the_paper_bear_its_claims_out():
+    assert outcomes(training(paper_like)) == ["borne out"] * 4
+
+
+def test_data_with_the_agents_swapped_do_not():
+    assert outcomes(training(swapped)) == ["not borne out"] * 3 + ["borne out"]
+
+
+def test_alike_agents_leave_claims_undecided():
+    def alike(agent: str, seed: int) -> np.ndarray:
+        noise = np.random.default_rng([seed, agent == "vpg"]).normal(size=COUNT)
+        return step_at(40 + seed, top=10.0) + noise
+
+    assert outcomes(training(alike))[:3] == ["undecided"] * 3
+
+
+@pytest.mark.parametrize("seeds", [1, 5, 29])
+def test_few_seeds_decide_nothing(seeds):
+    errors = evaluated(a2c=[0.01] * seeds, vpg=[0.01] * seeds)
+    verdicts = judge_claims(training(paper_like, seeds), errors, "paper", HEADLINE)
+    assert [verdict.verdict for verdict in verdicts] == ["undecided"] * 4
+    for verdict in verdicts[:3]:
+        assert "fewer than 30 seeds with a value decide nothing" in verdict.evidence
+    assert "Fewer than 30 seeds decide nothing" in verdicts[3].definition
+
+
+def test_runs_that_did_not_converge_are_counted_and_left_out():
+    def one_flat(agent: str, seed: int) -> np.ndarray:
+        flat = agent == "a2c" and seed == 0
+        return np.zeros(COUNT) if flat else paper_like(agent, seed)
+
+    verdict = judge_claims(training(one_flat, seeds=31), HELD, "paper", HEADLINE)[0]
+    assert verdict.verdict == "borne out"
+    assert "(30 of 31 seeds, 1 did not converge), VPG" in verdict.evidence
+    assert "(31 seeds);" in verdict.evidence
+    verdict = judge_claims(training(one_flat, seeds=30), HELD, "paper", HEADLINE)[0]
+    assert verdict.verdict == "undecided"
+    flat = training(lambda agent, seed: np.zeros(COUNT))
+    verdict = judge_claims(flat, HELD, "paper", HEADLINE)[0]
+    assert "A2C no value (0 of 50 seeds, 50 did not converge), VPG no value" in verdict.evidence
+
+
+def test_an_agent_that_was_not_trained_is_not_tested():
+    episodes = training(paper_like)
+    only = episodes[episodes["agent"] == "a2c"]
+    verdicts = judge_claims(only, evaluated(a2c=[0.01] * 30), "paper", HEADLINE)
+    assert [verdict.verdict for verdict in verdicts] == ["not tested"] * 4
+    assert verdicts[0].evidence == "VPG was not trained."
+    assert outcomes(episodes.iloc[:0], evaluated(pid=[0.0])) == ["not tested"] * 4
+
+
+def test_one_agent_that_fails_refutes_both_even_if_the_other_was_not_trained():
+    episodes = training(paper_like)
+    only = episodes[episodes["agent"] == "a2c"]
+    verdict = judge_claims(only, evaluated(a2c=[0.5] * 30), "paper", HEADLINE)[3]
+    assert verdict.verdict == "not borne out"
+    assert "VPG not trained" in verdict.evidence
+    # What is merely open leaves the claim about both untested.
+    assert outcomes(only, evaluated(a2c=[0.01] * 4))[3] == "not tested"
+
+
+@pytest.mark.parametrize(
+    ("vpg", "expected"),
+    [
+        ([0.02, 0.03, 0.04, 0.05, 0.06] * 10, "borne out"),
+        # 48 of 48 show a share of 0.00625^(1/48) = 89.97 %, 49 of 49 one of 90.2 %.
+        ([0.02] * 48, "undecided"),
+        ([0.02] * 49, "borne out"),
+        ([0.2, 0.3, 0.4, 0.5, 0.6] * 10, "not borne out"),
+        ([0.02] * 25 + [0.4] * 25, "not borne out"),  # the interval ends at 68 %
+        ([0.02] * 50 + [math.nan], "undecided"),  # a seed without a value does not hold
+        ([0.02] * 48 + [0.9] * 2, "undecided"),  # and the mean hides them
+    ],
+)
+def test_holding_the_target(vpg, expected):
+    errors = evaluated(a2c=[0.01] * 50, vpg=vpg)
+    verdict = judge_claims(training(paper_like), errors, "paper", HEADLINE)[3]
+    assert verdict.verdict == expected
+    assert "A2C 0.01 m, holds in 50 of 50 seeds, 98.75 % interval of the share 90." in (
+        verdict.evidence
+    )
+
+
+def test_an_undecided_share_tells_how_many_seeds_decide_it():
+    errors = evaluated(a2c=[0.01] * 30, vpg=[0.02] * 28 + [0.9] * 2)
+    verdict = judge_claims(training(paper_like, 30), errors, "paper", HEADLINE)[3]
+    assert verdict.verdict == "undecided"
+    assert "49 seeds would decide it if the share is 100.0%" in verdict.evidence
+    number = re.search(r"holds in 28 of 30 seeds.* (\S+) seeds would decide", verdict.evidence)
+    # By the normal approximation, with shares p = 28 / 30 and q = 0.9:
+    # ((2.498 sqrt(q (1 - q)) + 0.842 sqrt(p (1 - p))) / (p - q))² = 827.
+    assert number
+    assert float(number[1].replace(",", "")) == pytest.approx(827, rel=0.2)
+
+
+def test_an_undecided_difference_tells_how_many_seeds_decide_it():
+    def noisy(agent: str, seed: int) -> np.ndarray:
+        # Long-run returns of a standard deviation of 1, A2C's higher by 0.25 on average.
+        level = np.random.default_rng([seed, agent == "vpg"]).normal()
+        return step_at(10, top=10 + level + 0.25 * (agent == "a2c"))
+
+    verdict = judge_claims(training(noisy), HELD, "paper", HEADLINE)[1]
+    assert verdict.verdict == "undecided"
+    numbers = re.search(
+        r"difference (\S+), 98.75 % interval (\S+) to (\S+); to decide it with a probability of "
+        r"80% takes (\S+) seeds of each if this is the difference, and at least (\S+) if",
+        verdict.evidence,
+    )
+    assert numbers
+    found, low, high, wanted, fewest = (float(text.replace(",", "")) for text in numbers.groups())
+    # (2.498 + 0.842)² · 2 · v / d², where the interval tells v: 2 · 2.498 sqrt(2 v / 50) wide.
+    variance = ((high - low) / (2 * 2.498)) ** 2 * 50 / 2
+    for number, difference in ((wanted, found), (fewest, max(-low, high))):
+        assert number == pytest.approx(3.34**2 * 2 * variance / difference**2, rel=0.15)
+
+
+def test_a_crash_in_the_evaluation_is_not_holding():
+    errors = HELD.assign(terminated=[True, *[False] * 99])
+    verdict = judge_claims(training(paper_like), errors, "paper", HEADLINE)[3]
+    assert verdict.verdict == "undecided"
+    assert "holds in 49 of 50 seeds" in verdict.evidence
+    assert "1 of 50 episodes crashed" in verdict.evidence
+
+
+def test_runs_that_are_too_short_are_named():
+    episodes = training(paper_like, seeds=31)
+    short = (episodes["agent"] == "vpg") & (episodes["seed"] == 3) & (episodes["episode"] >= 5)
+    convergence, verdict = judge_claims(episodes[~short], HELD, "paper", HEADLINE)[:2]
+    assert verdict.verdict == "borne out"
+    # 8, and 25 alternating halves that begin and end with -0.5.
+    assert "A2C 10 (31 seeds), VPG 7.98 (30 of 31 seeds)" in verdict.evidence
+    # Too short to tell is not the same as not converging.
+    assert "did not converge" not in convergence.evidence
+
+
+def test_verdicts_are_frozen_and_state_their_source_and_preset():
+    verdicts = judge_claims(training(paper_like), HELD, "tuned", HEADLINE)
+    for verdict in verdicts:
+        assert verdict.preset == "tuned"
+        assert "ection 3" in verdict.source
+        assert verdict.definition
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        verdicts[0].verdict = "undecided"  # type: ignore[misc]
+    assert isinstance(verdicts[0], Verdict)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "expected"),
+    [
+        ([0.03] * 30, [0.02] * 30, "borne out"),  # worse by 0.01 m, and the margin is 0.02 m
+        ([0.05] * 30, [0.02] * 30, "not borne out"),
+        # Alike on average, but the interval reaches beyond the margin: overlap shows nothing.
+        ([0.0, 0.3] * 15, [0.0, 0.3] * 15, "undecided"),
+        ([0.01] * 29, [0.02] * 29, "undecided"),
+        ([0.01] * 28 + [3.0] * 2, [0.02] * 30, "undecided"),  # two seeds hold no more
+    ],
+)
+def test_no_worse_is_shown_by_a_margin(ours, theirs, expected):
+    evaluations = evaluated(a2c=ours, **{"sb3-a2c": theirs})
+    verdict = judge_no_worse(evaluations, ["a2c", "sb3-a2c"], "tuned", HEADLINE)
+    assert verdict.verdict == expected
+    assert "margin of 0.02 m" in verdict.definition
+
+
+def test_no_worse_of_what_is_to_be_high_and_of_what_was_not_trained():
+    high = Headline.of(spec_of(GATES))  # held from 3 gates on: the margin is 0.6 of a gate
+    evaluations = evaluated(a2c=[4.5] * 30, **{"sb3-a2c": [5.0] * 30})
+    both = ["a2c", "sb3-a2c"]
+    assert judge_no_worse(evaluations, both, "tuned", high).verdict == "borne out"
+    worse = evaluated(a2c=[4.0] * 30, **{"sb3-a2c": [5.0] * 30})
+    assert judge_no_worse(worse, both, "tuned", high).verdict == "not borne out"
+    verdict = judge_no_worse(evaluations, ["a2c"], "tuned", high)
+    assert (verdict.verdict, verdict.evidence) == ("not tested", "sb3-a2c was not trained.")

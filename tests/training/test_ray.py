@@ -1,0 +1,215 @@
+"""Comparison and sweep on a Ray cluster: two nodes of one core each, on this machine."""
+
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from rotorgram.agents.checkpoints import load, software_versions
+from rotorgram.flights.capture import capture
+from rotorgram.flights.viewpoints import Plan
+from rotorgram.training import workers as module
+from rotorgram.training.compare import compare
+from rotorgram.training.folders import new_folder
+from rotorgram.training.results import read_results, read_steps
+from rotorgram.training.settings import CompareConfig, SweepConfig, WorkersConfig
+from rotorgram.training.sweep import read_sweep_runs, sweep
+from rotorgram.training.workers import RunsFailed, open_workers
+
+# Ray listens beyond this machine. It reads these when it is imported.
+os.environ |= {
+    "RAY_AUTH_MODE": "token",
+    "RAY_AUTH_TOKEN": secrets.token_hex(32),
+    "RAY_USAGE_STATS_ENABLED": "0",
+}
+ray = pytest.importorskip("ray", reason="needs Ray: pip install 'rotorgram[ray]'")
+
+CONFIG = CompareConfig(
+    agents=("a2c",), seeds=1, env_steps=600, snapshots=1, curve_episodes=1, episodes=1,
+    options={"episode_length": 50},
+)  # fmt: skip
+PLAN = """
+cameras = ["front@32x24", "front_depth@32x24"]
+[[poses]]
+from = "random"
+count = 20
+"""
+TIMES = ["seconds", "steps_per_second"]
+
+
+def nothing(*_: object) -> None:
+    """No progress is shown."""
+
+
+CLUSTER = """
+import sys
+from ray.cluster_utils import Cluster
+
+cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+cluster.add_node(num_cpus=1)
+print("at", cluster.address, flush=True)
+sys.stdin.read()
+cluster.shutdown()
+"""
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    # In a process of its own: it leaves pipes and processes open, which are errors in ours.
+    command = [sys.executable, "-c", CLUSTER]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+        assert process.stdout is not None
+        words = next(line for line in process.stdout if line.startswith("at "))
+        yield words.split()[1]
+
+
+def test_the_numbers_are_those_of_this_machine(tmp_path: Path, address: str) -> None:
+    shown = []
+    on_ray, here = (new_folder(tmp_path / name, "compare") for name in ("ray", "here"))
+    config = replace(CONFIG, runner="ray", address=address)
+    compare(config, on_ray, "", lambda name, done, total, words: shown.append((name, words)))
+    compare(CONFIG, here, "", nothing)
+    assert {("a2c seed 0", "done"), ("pid", "done")} <= {*shown}
+    a, b = read_results(on_ray), read_results(here)
+    assert len(a.episodes) > 5
+    for table in ("episodes", "evaluations", "runs"):
+        left, right = (
+            getattr(results, table).drop(columns=TIMES, errors="ignore") for results in (a, b)
+        )
+        pd.testing.assert_frame_equal(left, right, check_exact=True)
+    for phase in ("train", "evaluation"):
+        pd.testing.assert_frame_equal(
+            read_steps(on_ray, "elevation_error", phase),
+            read_steps(here, "elevation_error", phase),
+            check_exact=True,
+        )
+    name = "checkpoints/a2c-seed0.safetensors"
+    actor, other = load(on_ray / name).actor, load(here / name).actor
+    assert {k: v.tobytes() for k, v in actor.items()} == {k: v.tobytes() for k, v in other.items()}
+
+
+def test_a_sweep_gives_the_rows_of_this_machine(tmp_path: Path, address: str) -> None:
+    config = SweepConfig(
+        algorithm="a2c", grid={"gamma": (0.9, 0.99)}, seeds=1, env_steps=300, episodes=1,
+        options={"episode_length": 50},
+    )  # fmt: skip
+    tables = []
+    for where in (config, replace(config, runner="ray", address=address)):
+        folder = new_folder(tmp_path / where.runner, "sweep")
+        sweep(where, folder, "", nothing)
+        rows = read_sweep_runs(folder, config).sort_values("point").reset_index(drop=True)
+        tables.append(rows.drop(columns=TIMES))
+    assert tables[0]["point"].tolist() == [0, 1]
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
+
+
+def test_every_node_flies(address: str) -> None:
+    def node(job: int, _: object) -> tuple[int, str]:
+        time.sleep(0.5)
+        return job, ray.get_runtime_context().get_node_id()
+
+    config = WorkersConfig(runner="ray", address=address)
+    with open_workers(config, nothing) as workers:
+        results = list(workers.fly(node, {f"job {n}": n for n in range(4)}))
+    assert sorted((result.name, result.value[0]) for result in results) == [
+        ("job 0", 0), ("job 1", 1), ("job 2", 2), ("job 3", 3),
+    ]  # fmt: skip
+    assert len({result.value[1] for result in results}) == 2
+
+
+def test_pictures_are_taken_on_a_cluster(opengl: None, tmp_path: Path, address: str) -> None:
+    (tmp_path / "plan.toml").write_text(PLAN, "utf-8")
+    plan, found = Plan.read(tmp_path / "plan.toml"), []
+    for name, config in {
+        "here": WorkersConfig(jobs=1),
+        "there": WorkersConfig(runner="ray", address=address),
+    }.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        assert capture(plan, folder, config) == 20
+        found.append({p.relative_to(folder): p.read_bytes() for p in folder.rglob("*.[jpn]*")})
+    assert len(found[0]) > 40
+    assert found[0] == found[1]
+
+
+def test_a_worker_with_other_software_is_refused(
+    tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = software_versions()
+    monkeypatch.setattr(module, "software_versions", lambda: {**here, "numpy": "0.1"})
+    config = replace(CONFIG, runner="ray", address=address)
+    sentence = f"numpy: expected version 0.1 .*, got {here['numpy']} on {socket.gethostname()}"
+    with pytest.raises(RunsFailed, match=f"2 of 2 runs failed: .*{sentence}"):
+        compare(config, tmp_path, "", nothing)
+
+
+def test_ctrl_c_ends_workers_and_simulators(tmp_path: Path, address: str) -> None:
+    folder = tmp_path / "out"
+    where = ["--runner", "ray", "--address", address]
+    settings = ["--agents", "a2c", "--seeds", "2", "--env-steps", "1000000", "--out", str(folder)]
+    before = set(_simulators())  # of workers that other tests have used
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rotorgram.cli", "compare", *settings, *where],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + 60
+        while len(simulators := set(_simulators()) - before) < 2:
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=20)
+    finally:
+        process.kill()
+    assert process.returncode == 130, err
+    assert err == "rotorgram: interrupted\n"
+    assert f"go on with: rotorgram compare --resume {folder} {' '.join(where)}" in out
+    deadline = time.monotonic() + 10
+    while any(Path(f"/proc/{simulator}").exists() for simulator in simulators):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def _simulators() -> list[int]:
+    """Simulators that descend from this process, whose children the nodes are."""
+    listing = subprocess.run(
+        ["ps", "-ewwo", "pid,ppid,args"], capture_output=True, text=True, check=True
+    )
+    rows = [line.split(None, 2) for line in listing.stdout.splitlines()[1:]]
+    parents = {int(pid): int(parent) for pid, parent, _ in rows}
+
+    def is_ours(pid: int) -> bool:
+        return pid == os.getpid() or (pid in parents and is_ours(parents[pid]))
+
+    return [int(p) for p, _, words in rows if "until-stdin-closes" in words and is_ours(int(p))]
+
+
+def test_no_such_cluster(tmp_path: Path) -> None:
+    with socket.socket() as sock:  # bound, but nobody listens
+        sock.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{sock.getsockname()[1]}"
+        sentence = f"address: expected a Ray cluster at {address}, got: Connection refused"
+        with pytest.raises(ValueError, match=sentence):
+            compare(replace(CONFIG, runner="ray", address=address), tmp_path, "", nothing)
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ImportError, match=r"pip install 'rotorgram\[ray\]'"):
+        compare(replace(CONFIG, runner="ray"), tmp_path, "", nothing)
+
+
+def test_an_address_is_of_a_cluster() -> None:
+    with pytest.raises(ValueError, match="address: expected it with runner ray"):
+        replace(CONFIG, address="auto")

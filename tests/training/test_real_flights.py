@@ -1,0 +1,109 @@
+"""The benchmark against recorded flights: its formulas, and the page that shows its figures."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rotorgram.flights.prediction import Flight, Windows
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.models.vehicle_file import read_vehicle_file
+
+pytest.importorskip("scipy")
+pytest.importorskip("pandas")
+
+import real_flights
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "docs" / "results" / "real_flights"
+
+
+def flight(count: int, velocity: float, start: float = 0.0) -> Flight:
+    """Along x at a constant velocity, level, with rotors at rest."""
+    still = np.zeros((count, 3))
+    time = 0.01 * np.arange(count)
+    position = still.copy()
+    position[:, 0] = start + velocity * time
+    return Flight(
+        name=f"flight{velocity:g}",
+        period=0.01,
+        position=position,
+        quaternion=np.tile((1.0, 0.0, 0.0, 0.0), (count, 1)),
+        velocity=np.tile((velocity, 0.0, 0.0), (count, 1)),
+        body_rates=still,
+        speeds=np.zeros((count, 4)),
+    )
+
+
+def test_the_published_formula_compares_the_end_of_a_flight_with_the_next() -> None:
+    """Two flights of 12 samples, horizon 10: two starts each, in a table of four rows."""
+    windows = Windows.cut([flight(12, 1.0), flight(12, 2.0, 50.0)], 10, 1, (1, 10))
+    held = windows.start
+    position, _, velocity, _ = real_flights.published_formula(held, windows, 1)
+    assert position == pytest.approx((0.01 + 0.01 + 0.02 + 0.02) / 4)
+    assert velocity == pytest.approx(0.0)
+    # Horizon 3: rows 2 and 3 of the table are of the second flight, at 50.02 and 50.04 m; the
+    # predictions are those of the first one, at 0 and 0.01 m.
+    position, _, velocity, _ = real_flights.published_formula(held, windows, 3)
+    assert position == pytest.approx((50.02 + 50.03) / 2)
+    assert velocity == pytest.approx(1.0)
+
+
+def test_the_simulator_falls_from_each_start() -> None:
+    vehicle = Vehicle.load(ROOT / "studies" / "nanodrone.toml")
+    windows = Windows.cut([flight(60, 1.5)], 50, 5, (1, 10, 50))
+    flown = real_flights.simulated(vehicle, windows)
+    position, quaternion, velocity, rates = flown[50]
+    assert position.shape == (3, 2)
+    np.testing.assert_allclose(position[0], windows.start[0][0] + 1.5 * 0.5, atol=1e-9)
+    np.testing.assert_allclose(position[2], -0.5 * 9.81 * 0.25, atol=1e-9)
+    np.testing.assert_allclose(velocity[2], -9.81 * 0.5, atol=1e-9)
+    np.testing.assert_allclose(quaternion[0], 1.0)
+    np.testing.assert_allclose(rates, 0.0, atol=1e-12)
+
+
+def test_the_page_has_the_figures_of_the_benchmark() -> None:
+    page = (ROOT / "docs" / "real-flights.md").read_text(encoding="utf-8").replace("**", "")
+    summary = json.loads((RESULTS / "summary.json").read_text())
+    chosen = summary["model"]
+    assert summary["unseen_score"][chosen] == min(summary["unseen_score"].values())
+    with (RESULTS / "variants.csv").open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["formula"] == "published formula"]
+    measures = ("position_m", "velocity_m_s", "attitude_rad", "rates_rad_s")
+    count = 0
+    for row in rows:
+        if row["horizon"] != "50":
+            continue
+        numbers = [f"{float(row[name]):.3f}" for name in measures]
+        name = row["model"]
+        score = summary["unseen_score"].get(name)
+        if score is not None:
+            assert f"| {name} | {' | '.join(numbers[:3])} | {score:.2f} |" in page
+        if name == chosen or name.startswith("published"):
+            shown = "ours" if name == chosen else name
+            assert f"| {shown} | {' | '.join(numbers)} |" in page
+        count += 1
+    assert count == 17
+    position, attitude, velocity, _ = summary["ours"]
+    assert f"{position:.3f} m, {velocity:.3f} m/s and {attitude:.3f} rad" in page
+
+
+def test_ours_is_ahead_of_the_published_rows_at_half_a_second() -> None:
+    summary = json.loads((RESULTS / "summary.json").read_text())
+    assert summary["starts"] == 19347
+    ours, published = summary["ours_by_the_published_formula"], summary["published"]
+    for name in ("physics", "hybrid"):
+        assert all(a < b for a, b in zip(ours, published[name], strict=True))
+    np.testing.assert_allclose(summary["ours"], summary["ours_in_numpy"], rtol=1e-3)
+
+
+def test_the_library_says_what_was_measured_of_its_file() -> None:
+    told = json.loads((RESULTS / "crazyflie_brushless.json").read_text(encoding="utf-8"))
+    vehicle = Vehicle.load("crazyflie_brushless")
+    assert told["vehicle_hash"] == vehicle.hash
+    position, attitude, velocity, _ = told["errors"]["50"]
+    file = read_vehicle_file(vehicle.path)
+    for name, value in (("position", position), ("velocity", velocity), ("attitude", attitude)):
+        assert file.value(f"real_flights.{name}") == pytest.approx(value, rel=5e-3)
+    assert file.real_flights == "0.596 m, 3.7 m/s, 1.84 rad"

@@ -1,0 +1,148 @@
+"""Statistics over seeds against values computed by hand, and against `rliable`."""
+
+import math
+
+import numpy as np
+import pytest
+from rotorgram.training.statistics import (
+    bootstrap_difference,
+    bootstrap_interval,
+    improvement_interval,
+    iqm,
+    performance_profile,
+    probability_of_improvement,
+    seeds_to_decide,
+    seeds_to_decide_share,
+    share_interval,
+    trimmed_mean,
+)
+
+# Scores of seven runs on two tasks of two agents, and what rliable 1.2.0 (with arch 7.2.0) gives
+# for them: `aggregate_iqm`, `get_interval_estimates` with 50,000 resamples (5,000 of pairs),
+# `create_performance_profile`, `probability_of_improvement`.
+FIRST = [[0.9, 0.7, 0.8, 0.3, 0.6, 0.85, 0.65], [0.2, 0.4, 0.1, 0.5, 0.6, 0.35, 0.45]]
+SECOND = [[0.5, 0.55, 0.8, 0.2, 0.4, 0.45, 0.6], [0.3, 0.4, 0.2, 0.15, 0.25, 0.05, 0.7]]
+THRESHOLDS = [0.0, 0.2, 0.45, 0.6, 0.8]
+
+
+def test_interquartile_means_and_stratified_intervals_are_those_of_rliable():
+    assert iqm(*FIRST) == pytest.approx(0.53125, abs=1e-12)
+    assert iqm(*SECOND) == pytest.approx(0.38125, abs=1e-12)
+    assert bootstrap_interval(*FIRST) == pytest.approx((0.4125, 0.63125), abs=0.015)
+    assert bootstrap_interval(*SECOND) == pytest.approx((0.275, 0.5125), abs=0.015)
+
+
+def test_performance_profiles_are_those_of_rliable():
+    expected = [1.0, 0.85714286, 0.57142857, 0.35714286, 0.14285714]
+    assert performance_profile(FIRST, THRESHOLDS) == pytest.approx(expected, abs=1e-8)
+
+
+def test_the_probability_of_improvement_is_that_of_rliable():
+    assert probability_of_improvement(FIRST, SECOND) == pytest.approx(0.7244897959, abs=1e-9)
+    assert improvement_interval(FIRST, SECOND) == pytest.approx((0.5255, 0.9082), abs=0.02)
+
+
+def test_strata_are_resampled_by_themselves():
+    # Every run of a task has the task's score: no resample changes anything.
+    assert bootstrap_interval([1.0] * 4, [3.0] * 4) == (2.0, 2.0)
+    assert all(math.isnan(end) for end in bootstrap_interval([1.0, 2.0], [3.0]))
+
+
+def test_a_profile_counts_what_is_above_a_threshold():
+    # One of two runs is above 1, and both of the other task; a missing run does not count.
+    assert performance_profile([[1.0, 2.0], [3.0, 3.0, math.nan]], [1.0]).tolist() == [0.75]
+
+
+def test_ties_improve_by_halves():
+    # Pairs: 1 < 2, 1 = 1, 3 > 2, 3 > 1: two and a half of four. The second task is all ties.
+    assert probability_of_improvement([[1.0, 3.0]], [[2.0, 1.0]]) == 0.625
+    assert probability_of_improvement([[1.0, 3.0], [5.0]], [[2.0, 1.0], [5.0]]) == 0.5625
+
+
+def test_a_level_of_its_own_widens_an_interval():
+    values = np.random.default_rng(3).normal(10.0, 1.0, size=40)
+    (low, high), (lowest, highest) = (bootstrap_interval(values, level=x) for x in (0.95, 0.9875))
+    assert lowest < low < high < highest
+
+
+def test_seeds_that_decide_a_difference():
+    # Normal samples of standard deviation 1 around 0 and 0.5, forty of each. The interquartile
+    # mean of a normal sample has about 1.19 times the variance of its mean, so the textbook's
+    # number is (1.960 + 0.842)² · 2 · 1.19 / 0.5² = 74.7 of each.
+    dice = np.random.default_rng(0)
+    found = []
+    for _ in range(40):
+        first, second = dice.normal(0.0, 1.0, 40), dice.normal(0.0, 1.0, 40)
+        second += iqm(first) - iqm(second) - 0.5  # the very difference
+        number, fewest = seeds_to_decide(first, second)
+        assert 1 <= fewest < number
+        found.append(number)
+    assert np.median(found) == pytest.approx(74.7, rel=0.1)
+    assert seeds_to_decide([1.0, 2.0] * 5, [1.0, 2.0] * 5)[0] == math.inf
+    # Four times the seeds of one agent tell the same variance of its seeds, and the same number.
+    first, second = dice.normal(0.0, 1.0, 40), dice.normal(0.5, 1.0, 40)
+    many = np.tile(second, 4)
+    assert seeds_to_decide(first, many)[0] == pytest.approx(
+        seeds_to_decide(first, second)[0], rel=0.1
+    )
+    assert all(math.isnan(number) for number in seeds_to_decide([1.0], [2.0, 3.0]))
+
+
+def test_exact_intervals_of_shares():
+    # Of n out of n the lower end is the tail's n-th root, and of none the mirror image.
+    assert share_interval(50, 50) == (pytest.approx(0.025 ** (1 / 50)), 1.0)
+    assert share_interval(0, 50) == (0.0, pytest.approx(1 - 0.025 ** (1 / 50)))
+    # Clopper and Pearson's interval of 10 out of 20, as tables have it.
+    assert share_interval(10, 20) == pytest.approx((0.2720, 0.7280), abs=5e-5)
+
+
+def test_seeds_that_decide_a_share():
+    # All hold: 0.9^n < 0.00625 from n = 49 on, 0.9^n < 0.025 from 36 on.
+    assert seeds_to_decide_share(1.0, 0.9, 0.9875) == 49
+    assert seeds_to_decide_share(1.0, 0.9) == 36
+    assert seeds_to_decide_share(0.0, 0.9) == 2  # both fail: 0.1² < 0.025
+    assert seeds_to_decide_share(0.9, 0.9) == math.inf
+    # A share between: the number decides with 80 % or more, by a count of flips of a coin.
+    count = int(seeds_to_decide_share(0.8, 0.9))
+    coins = np.random.default_rng(1).binomial(count, 0.8, 4000)
+    intervals = {coin: share_interval(coin, count) for coin in np.unique(coins).tolist()}
+    decided = [not intervals[coin][0] <= 0.9 <= intervals[coin][1] for coin in coins.tolist()]
+    assert 0.78 < np.mean(decided) < 0.86
+
+
+def test_iqm_cuts_a_quarter_from_each_end():
+    assert iqm([1.0, 2.0, 3.0, 100.0]) == 2.5
+    assert iqm([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 700.0]) == 3.5
+    assert iqm([1.0, 2.0, 6.0]) == 3.0  # nothing to cut below four
+    assert iqm([math.nan, 4.0]) == 4.0
+    assert math.isnan(iqm([]))
+
+
+def test_bootstrap_interval():
+    assert bootstrap_interval([3.0] * 5) == (3.0, 3.0)
+    assert all(math.isnan(end) for end in bootstrap_interval([3.0]))
+    assert all(math.isnan(end) for end in bootstrap_interval([3.0, math.nan]))
+    # Of two values, a quarter of the resamples holds one alone: the 95 % interval spans both.
+    assert bootstrap_interval([1.0, 2.0]) == (1.0, 2.0)
+    values = np.random.default_rng(3).normal(10.0, 1.0, size=40)
+    low, high = bootstrap_interval(values)
+    assert low < iqm(values) < high
+    # The standard error of the mean of 40 would be 0.16, and the interval 0.62 wide.
+    assert 0.4 < high - low < 1.2
+    assert bootstrap_interval(values) == (low, high)
+
+
+def test_bootstrap_difference():
+    assert bootstrap_difference([5.0] * 3, [2.0] * 4) == (3.0, 3.0, 3.0)
+    difference, low, high = bootstrap_difference([1.0, 2.0], [0.0, 4.0])
+    assert (difference, low, high) == (-0.5, -3.0, 2.0)
+    difference, low, high = bootstrap_difference([1.0], [0.0, 4.0])
+    assert difference == -1.0
+    assert math.isnan(low)
+    assert math.isnan(high)
+
+
+def test_the_trimmed_mean_leaves_a_quarter_out_at_each_end():
+    assert trimmed_mean(np.array([1.0, 2.0, 6.0])) == 3.0
+    assert trimmed_mean(np.array([100.0, 2.0, 4.0, -100.0])) == 3.0
+    assert trimmed_mean(np.array([[0.0, 8.0], [2.0, 4.0]]), axis=0).tolist() == [1.0, 6.0]

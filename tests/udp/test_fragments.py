@@ -1,0 +1,234 @@
+"""Messages larger than a datagram: only what is missing is sent again."""
+
+import random
+import re
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from links import Pair, agent, hello, layout, lossy, send_command, simulator, state
+from rotorgram.models.errors import InputError
+from rotorgram.udp.protocol import binary
+from rotorgram.udp.protocol.client import largest_datagram
+from rotorgram.udp.protocol.errors import DecodeError
+from rotorgram.udp.protocol.fragments import (
+    FAR,
+    NEAR,
+    Assembler,
+    Transfer,
+    Window,
+    asks,
+    is_fragment,
+)
+from rotorgram.udp.protocol.messages import MAX_SPEC, Missing, Refuse
+from rotorgram.udp.transport.relay import FaultConfig, Faults
+
+QUAD = ((3,), (3,), (4,), (3,), (1,))
+"""Telemetry of `Elevation-v0`."""
+
+
+def message(size: int) -> bytes:
+    of = layout(1, size)
+    return binary.encode(state(3, of=of, value=1.0), of)
+
+
+def test_what_fits_is_not_cut() -> None:
+    transfer = Transfer(message(10), FAR, Window())
+    assert transfer.start() == [message(10)] == transfer.probe()
+
+
+@settings(max_examples=60)
+@given(
+    st.integers(1, 4000), st.integers(256, 1500), st.integers(0, 2**32), st.sampled_from([0, 0.4])
+)
+def test_any_message_comes_through(size: int, largest: int, seed: int, loss: float) -> None:
+    data = message(size)
+    dice = random.Random(seed)
+    transfer, assembler = Transfer(data, largest, Window()), Assembler(len(data))
+    out = transfer.start()
+    for _ in range(100):
+        assert all(len(datagram) <= largest for datagram in out)
+        arriving = [d for d in out for _ in range(2) if dice.random() >= loss]
+        dice.shuffle(arriving)
+        for datagram in arriving:
+            if not is_fragment(datagram):
+                assert datagram == data
+                return
+            binary.check(datagram)
+            if (whole := assembler.take(datagram)) is not None:
+                assert whole == data
+                return
+        missing = assembler.missing() if any(map(asks, arriving)) else None
+        out = transfer.resend(missing) if missing else transfer.probe()
+    pytest.fail("never whole")
+
+
+def test_messages_of_too_many_fragments_are_not_begun() -> None:
+    of = layout(1, 1_000_000)
+    sentence = r"max_datagram: expected at least 277 for messages of 40000\d\d bytes, got 256"
+    with pytest.raises(InputError, match=sentence):
+        simulator(of=of, largest=256)
+    server = agent(of=of, max_datagram=256)
+    server.receive(binary.encode(hello()), ("127.0.0.1", 1), 0.0)
+    ((refuse, _),) = server.take_outgoing()
+    assert isinstance(binary.decode(refuse), Refuse)
+    assert re.search(sentence, server.statistics.last_error)
+    simulator(of=of, largest=277)
+    with pytest.raises(InputError, match="at least 289 for messages of 41943"):
+        simulator(said=hello(spec=" " * MAX_SPEC), largest=256)
+
+
+def test_only_what_is_missing_is_sent_again() -> None:
+    data = message(5000)
+    transfer, assembler = Transfer(data, FAR, Window()), Assembler(len(data))
+    first = transfer.start()
+    assert len(first) == transfer.count == 18
+    for number, datagram in enumerate(first):
+        if number not in (3, 7, 11):
+            assert assembler.take(datagram) is None
+    missing = assembler.missing()
+    assert missing is not None
+    assert missing.numbers() == [3, 7, 11]
+    decoded = binary.decode(binary.encode(missing))
+    assert decoded == missing
+    again = transfer.resend(missing)
+    assert [asks(datagram) for datagram in again] == [False, False, True]
+    assert [assembler.take(datagram) for datagram in again] == [None, None, data]
+
+
+def test_other_cuts_of_a_message_begin_it_anew() -> None:  # fault 18
+    data = message(5000)
+    assembler = Assembler(len(data))
+    for datagram in Transfer(data, FAR, Window()).start()[:9]:
+        assert assembler.take(datagram) is None
+    *others, last = Transfer(data, FAR // 2, Window()).start()
+    assert [assembler.take(datagram) for datagram in others] == [None] * len(others)
+    assert assembler.take(last) == data
+
+
+def test_a_large_message_goes_in_bursts_that_grow_and_shrink() -> None:
+    window = Window()
+    transfer = Transfer(bytes(24) + bytes(1 << 22), FAR, window)
+    burst = transfer.start()
+    assert sum(map(len, burst)) <= 210_000
+    assert [asks(d) for d in burst].index(True) == len(burst) - 1
+    all_missing = Missing(session=0, sequence=0, kind=1, count=transfer.count, first=len(burst),
+                          bitmap=b"\xff")  # fmt: skip
+    assert len(transfer.resend(all_missing)) > len(burst)
+    before = window.size
+    window.report(100, 50)
+    assert window.size == before // 2
+    window.report(100, 5)
+    assert window.size == before // 2
+
+
+@pytest.mark.parametrize(
+    ("number", "count", "flag"), [(3, 3, 0), (0, 0, 0), (0, 16_385, 0), (0, 2, 2)]
+)
+def test_numbers_that_make_no_sense(number: int, count: int, flag: int) -> None:
+    body = b"".join(n.to_bytes(2, "little") for n in (number, count)) + bytes((flag, 0, 0, 0))
+    with pytest.raises(DecodeError, match="fragment"):
+        Assembler(1000).take(binary.frame(132, 1, 1, body + b"x"))
+
+
+def test_more_than_can_come_is_not_kept() -> None:
+    data = message(1000)
+    assembler = Assembler(600)
+    first, second, *_ = Transfer(data, 600, Window()).start()
+    assert assembler.take(first) is None
+    with pytest.raises(DecodeError, match="at most 600 bytes"):
+        assembler.take(second)
+
+
+def test_fragments_of_another_message_inside() -> None:
+    inner = binary.frame(132, 1, 1, bytes(8))
+    pieces = [inner[:20], inner[20:]]
+    assembler = Assembler(100)
+    bodies = [bytes((i, 0, 2, 0, 0, 0, 0, 0)) + piece for i, piece in enumerate(pieces)]
+    assert assembler.take(binary.frame(132, 1, 1, bodies[0])) is None
+    with pytest.raises(DecodeError, match="header of its fragments"):
+        assembler.take(binary.frame(132, 1, 1, bodies[1]))
+
+
+def test_a_missing_bitmap_has_the_size_of_its_numbers() -> None:
+    for first, bitmap in ((20, b"\1"), (0, b""), (0, bytes(4)), (16, b"\x10")):
+        with pytest.raises(InputError, match=r"bitmap|below"):
+            Missing(session=1, sequence=1, kind=4, count=20, first=first, bitmap=bitmap)
+        body = struct.pack("<BxHH", 4, 20, first) + bitmap
+        with pytest.raises(DecodeError, match=r"bitmap|below"):
+            binary.decode(binary.frame(binary.MISSING, 1, 1, body))
+
+
+# ---- fault 15: datagrams beyond one machine
+
+
+@pytest.mark.parametrize("sealed", [False, True])
+@pytest.mark.parametrize(
+    ("drones", "loss", "least"),
+    [(1024, 0.01, 200), (1024, 0.05, 100), (64, 0.05, 150), (64, 0.3, 30), (1, 0.3, 60)],
+)
+def test_steps_a_second_where_datagrams_are_lost(
+    drones: int, loss: float, least: float, sealed: bool
+) -> None:
+    """1 ms each way, datagrams of 1,200 bytes; the physics and the agent take no time."""
+    of = layout(drones, 3, QUAD)
+    client = simulator(of=of, sealed=sealed, largest=FAR)
+    server = agent(of=of, sealed=sealed, max_datagram=FAR)
+    pair = Pair(client, server, lossy(loss))
+    pair.run(200)
+    assert pair.steps == [float(i + 1) for i in range(200)]
+    assert pair.seen[:200] == [float(i) for i in range(200)]
+    assert 200 / pair.now >= least
+    fragments = -(-of.state_size // 1168) + -(-of.orders.end // 1168)
+    assert pair.sent / 200 <= fragments * (1 + 4 * loss) + 3
+
+
+@pytest.mark.parametrize("drones", [1, 64])
+def test_steps_a_second_through_the_network_of_the_soak(drones: int) -> None:
+    """As studies/soak.py, were everything but the network to take no time."""
+    of = layout(drones, 3, QUAD)
+    config = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.2, corrupt=0.05, truncate=0.02)
+    pair = Pair(simulator(of=of, largest=NEAR), agent(of=of), Faults(config).fate)
+    pair.run(300)
+    assert pair.steps == [float(i + 1) for i in range(300)]
+    assert 300 / pair.now >= 80
+
+
+def test_small_fragments_to_other_machines() -> None:
+    assert largest_datagram(("127.0.0.1", 1)) == NEAR == 65_483
+    assert largest_datagram(("10.0.0.1", 1)) == FAR == 1_200
+    of = layout(1024)
+    for host in ("127.0.0.1", "10.0.0.1"):
+        server = agent(of=of)
+        for said in (hello(), state(1, of=of)):
+            server.receive(binary.encode(said, of), (host, 1), 0.0)
+        server.take_outgoing()
+        send_command(server, 0, 0.0, 0.0)
+        sizes = [len(datagram) for datagram, _ in server.take_outgoing()]
+        assert max(sizes) == sum(sizes) if host == "127.0.0.1" else max(sizes) <= FAR
+
+
+def test_large_fragments_on_loopback() -> None:
+    of = layout(1024, 3, QUAD)
+    pair = Pair(simulator(of=of, largest=NEAR), agent(of=of), lossy(0))
+    pair.run(20)
+    assert pair.sent / 20 < 5
+
+
+def test_a_long_hello_is_cut_too() -> None:  # fault 3
+    bounds = np.arange(65_535).tolist()
+    spec = '{"low":' + str(bounds) + "}"
+    through = lossy(0.1)
+
+    def fate(datagram: bytes) -> list[tuple[float, bytes]]:
+        assert len(datagram) <= FAR
+        return through(datagram)
+
+    pair = Pair(simulator(said=hello(spec=spec), largest=FAR), agent(max_datagram=FAR), fate)
+    pair.run(3)
+    session = pair.server.slots[0]
+    assert session is not None
+    assert session.hello is not None
+    assert session.hello.spec == spec

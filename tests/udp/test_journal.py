@@ -1,0 +1,1077 @@
+"""The journal: what is in it, that it can be repeated, and that no end of a program spoils it."""
+
+import gc
+import io
+import json
+import logging
+import os
+import re
+import signal
+import struct
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from mcap import records
+from mcap.exceptions import EndOfFile, McapError
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+from peers import ANY, ENV_ID, Running
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rotorgram.cli.replay import Replay
+from rotorgram.envs.loop import Loop
+from rotorgram.envs.spec import EnvSpec
+from rotorgram.models.errors import InputError
+from rotorgram.udp import (
+    LinkConfig,
+    PeerClosed,
+    PeerSilent,
+    Refused,
+    RemoteEnv,
+    RemoteVectorEnv,
+    Simulator,
+)
+from rotorgram.udp.journal import Journal, Recording, Summary
+from rotorgram.udp.journal import writer as journal_module
+from rotorgram.udp.journal.reader import MAX_CHUNK
+from rotorgram.udp.journal.replay import Verification
+from rotorgram.udp.journal.writer import McapFile
+from rotorgram.udp.layouts import layout_of
+from rotorgram.udp.protocol import binary
+from rotorgram.udp.protocol.auth import write_key
+from rotorgram.udp.protocol.layout import Layout
+from rotorgram.udp.protocol.messages import Close, Command, Hello, Message, State, Welcome
+from rotorgram.udp.protocol.statistics import Statistics
+from rotorgram.udp.transport.relay import FaultConfig, Relay
+
+PAGE = Path(__file__).parents[2] / "docs" / "journal.md"
+QUICK = LinkConfig(timeout=5)
+TIMES: dict[str, Any] = {"timeout": 5, "connect_timeout": 5}
+
+
+def fly(remote: Any, steps: int, seed: int | None = 7) -> SimpleNamespace:
+    """Fly at random; steps, episodes and returns as the agent sees them."""
+    remote.reset(seed=seed)
+    remote.action_space.seed(steps)
+    drones = getattr(remote, "num_envs", 1)
+    flown, episodes, total, running = 0, 0, 0.0, np.zeros(drones)
+    ended = np.zeros(drones, bool)
+    for _ in range(steps):
+        _, reward, terminated, truncated, _ = remote.step(remote.action_space.sample())
+        running = np.where(ended, 0.0, running + reward)
+        flown += int((~ended).sum())
+        ended = np.atleast_1d(terminated) | np.atleast_1d(truncated)
+        episodes += int(ended.sum())
+        total += float(running[ended].sum())
+        if drones == 1 and ended[0]:
+            remote.reset()
+            running, ended = np.zeros(1), np.zeros(1, bool)
+    return SimpleNamespace(steps=flown, episodes=episodes, returns=total)
+
+
+@contextmanager
+def pair(
+    folder: Path, codec: Any = "binary", drones: int = 1, key: bool = False, **options: Any
+) -> Iterator[SimpleNamespace]:
+    """An agent and a simulator in a thread that both keep a journal."""
+    files = {side: folder / f"{side}.mcap" for side in ("agent", "simulator")}
+    key_file = folder / "key" if key else None
+    if key_file:
+        write_key(key_file)
+    known = options if codec == "text" else None
+    env_id = ENV_ID if codec == "text" else None
+    common: dict[str, Any] = {
+        "env_id": env_id, "options": known, "connect": False, "key_file": key_file, **TIMES
+    }  # fmt: skip
+    remote: Any
+    if drones == 1:
+        remote = RemoteEnv(ANY, record=files["agent"], **common)
+    else:
+        remote = RemoteVectorEnv(ANY, num_envs=drones, record=files["agent"], **common)
+    simulator = Simulator(
+        server=remote.address, bind=ANY, num_envs=drones, codec=codec, config=QUICK,
+        key_file=key_file, record=files["simulator"], **options,
+    )  # fmt: skip
+    running = Running(simulator)
+    try:
+        yield SimpleNamespace(remote=remote, **files)
+    finally:
+        remote.close()
+        running.join()
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """The files of a flight of 3 drones, 600 steps, and what it came to."""
+    with pair(tmp_path_factory.mktemp("flight"), drones=3) as both:
+        seen = fly(both.remote, 600)
+    return SimpleNamespace(agent=both.agent, simulator=both.simulator, seen=seen)
+
+
+def datagrams(path: Path, *kinds: type) -> list[bytes]:
+    """Those of States and Commands, or of the messages asked for, in order."""
+    wanted = kinds or (State, Command)
+    return [item.datagram for item in Recording(path) if isinstance(item.message, wanted)]
+
+
+def rewrite(source: Path, target: Path, change: Callable[[Message], Message]) -> None:
+    """Write a journal again, by other means, with changed messages."""
+    with source.open("rb") as old, target.open("wb") as new:
+        reader, writer = make_reader(old), Writer(new)
+        writer.start()
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        channels: dict[int, int] = {}
+        layout: Layout | None = None
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            assert schema is not None
+            if channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number
+                )
+            data = message.data
+            if channel.topic.endswith("events"):
+                words = json.loads(data)
+                message_ = binary.decode(bytes.fromhex(words["datagram"]))
+                if isinstance(message_, Hello):
+                    layout = layout_of(EnvSpec.from_json(message_.spec), message_.worlds)
+                changed = change(message_)
+                data = json.dumps(words | {"datagram": binary.encode(changed).hex()}).encode()
+            elif channel.message_encoding == "ros1":
+                data = binary.encode(change(binary.decode(data, layout)), layout)
+            writer.add_message(channels[channel.id], message.log_time, data, message.publish_time)
+        writer.finish()
+
+
+def flip(array: np.ndarray, *index: int) -> np.ndarray:
+    """A copy with the last bit of one number flipped."""
+    copy = array.copy()
+    kind = {1: np.uint8, 4: np.uint32, 8: np.uint64}[copy.itemsize]
+    copy.view(kind)[index] ^= 1
+    return copy
+
+
+def flipped(arrays: tuple[np.ndarray, ...], which: int, *index: int) -> tuple[np.ndarray, ...]:
+    """Arrays with the last bit of one number of one of them flipped."""
+    return tuple(flip(a, *index) if i == which else a for i, a in enumerate(arrays))
+
+
+# ---- repeating
+
+
+@pytest.mark.parametrize(
+    ("arrangement", "options"),
+    [
+        ({}, {}),
+        ({"codec": "text"}, {"target": (4.0, 6.0), "episode_length": 40}),
+        ({"drones": 3, "key": True}, {"action_type": "discrete", "observation": "error"}),
+    ],
+)
+def test_both_sides_can_be_repeated_bit_for_bit(
+    arrangement: dict[str, Any], options: dict[str, Any], tmp_path: Path
+) -> None:
+    with pair(tmp_path, **arrangement, **options) as both:
+        seen = fly(both.remote, 500)
+    assert seen.episodes > 1
+    for side in ("agent", "simulator"):
+        path = getattr(both, side)
+        summary, verdict = Summary(path), Verification(path)
+        assert (summary.about["side"], summary.complete, summary.ending) == (side, True, "complete")
+        assert (summary.steps, summary.episodes) == (seen.steps, seen.episodes)
+        (session,) = summary.sessions
+        assert session.returns == pytest.approx(seen.returns, rel=1e-12)
+        assert session.session.num_envs == arrangement.get("drones", 1)
+        assert session.session.codec == arrangement.get("codec", "binary")
+        assert session.ending.startswith("closed: the ")
+        assert 0 < session.last - session.first < 60e9
+        (compared,) = verdict.sessions
+        blind = int(side == "agent" and session.session.codec == "text")
+        assert (compared.same, compared.unchecked) == (session.states - blind, blind)
+        assert compared.notes == verdict.notes == []
+        assert verdict.identical
+        assert str(verdict).endswith(f"identical: {compared.same} States in 1 session")
+    assert datagrams(both.agent, State)[1][40:] == datagrams(both.simulator, State)[1][40:]
+
+
+WORLD: dict[str, Any] = {
+    "effects": {
+        "motor_lag": True, "body_drag": True, "wind": (2.0, 1.0, 0.0), "gusts": 3.0,
+        "payload": 0.004, "cable": 0.3,
+    },
+    "randomize": {
+        "mass": "uniform(0.8, 1.2)", "center_x": "normal(0, 0.001)", "thrust": "normal(1, 0.1)",
+        "wind_x": "normal(0, 1)", "action_delay": "uniform(0, 3)",
+        "observation_delay": "uniform(0, 2)",
+    },
+    "sensors": {
+        "imu": True, "estimate": True,
+        "motion_capture": {
+            "noise": 0.001, "angle_noise": 0.01, "rate": 25, "delay": 0.1, "dropout": 0.2
+        },
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("drones", [1, 3])
+def test_what_acts_is_drawn_and_is_measured_is_repeated(drones: int, tmp_path: Path) -> None:
+    options = {**WORLD, "vehicle": "crazyflie2", "env": "rotorgram/Hover-v0", "episode_length": 40}
+    with pair(tmp_path, drones=drones, **options) as both:
+        assert fly(both.remote, 150, seed=None).episodes > 1
+        if drones > 1:
+            both.remote.reset(seed=5, options={"reset_mask": np.array([True, False, True])})
+            both.remote.step(both.remote.action_space.sample())
+    for side in ("agent", "simulator"):
+        assert Verification(getattr(both, side), vehicle="crazyflie2").identical
+
+
+def test_a_flight_on_rigid_is_repeated_on_rigid(tmp_path: Path) -> None:
+    with pair(tmp_path, drones=3, env="rotorgram/Hover-v0", backend="rigid") as both:
+        assert fly(both.remote, 100).episodes > 1
+    for side in ("agent", "simulator"):
+        path = getattr(both, side)
+        assert Verification(path, backend="rigid").identical
+        assert not Verification(path).identical  # mujoco computes in float64
+
+
+def test_both_sides_write_the_same_datagrams(flight: SimpleNamespace) -> None:
+    everything = State, Command, Hello, Welcome
+    ours, theirs = datagrams(flight.agent, *everything), datagrams(flight.simulator, *everything)
+    assert ours == theirs
+    assert len(ours) == 2 * 602 + 1  # Hello, Welcome, State 1 and its reset; the last has no answer
+
+
+def test_nothing_that_a_journal_names_is_imported(
+    flight: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "evil.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for env_id in ("evil:Evil-v0", "CartPole-v1", "rotorgram/No-v0"):
+        path = tmp_path / "named.mcap"
+        rewrite(flight.simulator, path, changed_spec(env_id=env_id))
+        (session,) = Verification(path).sessions
+        assert session.problem.startswith(
+            f"State 1 cannot be repeated: expected a registered env id, got {env_id!r}"
+        )
+        assert Summary(path).sessions[0].session.spec.env_id == env_id
+    path = tmp_path / "named.mcap"  # a module before an id that is registered changes nothing
+    name = f"evil:{ENV_ID}"
+    rewrite(flight.simulator, path, changed_spec(env_id=name))
+    assert Verification(path).identical
+
+
+def changed_spec(**values: Any) -> Callable[[Message], Message]:
+    """Changes fields of the spec of every Hello."""
+
+    def changed(message: Message) -> Message:
+        if not isinstance(message, Hello):
+            return message
+        return replace(message, spec=json.dumps(json.loads(message.spec) | values))
+
+    return changed
+
+
+def test_a_flight_of_another_env_is_recorded_and_not_repeated(tmp_path: Path) -> None:
+    path = tmp_path / "pole.mcap"
+    remote = RemoteEnv(ANY, env_id="CartPole-v1", connect=False, **TIMES)
+    simulator = Simulator("CartPole-v1", server=remote.address, bind=ANY, config=QUICK,
+                          record=path, sutton_barto_reward=True)  # fmt: skip
+    running = Running(simulator)
+    with remote:
+        fly(remote, 60)
+    running.join()
+    assert Summary(path).steps == 60
+    assert not Verification(path).identical
+    assert Recording(path).attachments == {}
+
+
+def test_a_flight_that_never_began(tmp_path: Path) -> None:
+    path = tmp_path / "alone.mcap"
+    config = LinkConfig(timeout=0.1)
+    with Simulator(server=("127.0.0.1", 9), bind=ANY, record=path, config=config) as simulator:
+        with pytest.raises(PeerSilent):
+            simulator.run()
+        (session,) = Summary(path).sessions  # finished by the end of `run`
+    assert (session.ending, session.steps) == ("not closed", 0)
+    assert str(Verification(path)).endswith("nothing to compare")
+    assert not Verification(path).identical
+
+
+def test_a_refused_simulator(tmp_path: Path) -> None:
+    path = tmp_path / "refused.mcap"
+    with RemoteEnv(ANY, env_id=ENV_ID, connect=False, timeout=5, connect_timeout=1) as remote:
+        simulator = Simulator("CartPole-v1", server=remote.address, bind=ANY, record=path)
+        running = Running(simulator)
+        with pytest.raises(PeerSilent):
+            remote.connect()
+        assert isinstance(running.join(), Refused)
+    (session,) = Summary(path).sessions
+    assert session.ending.startswith("refused: ")
+    assert ENV_ID in session.ending
+
+
+CHANGES = {
+    "reward": lambda s: replace(s, rewards=flip(s.rewards, 2)),
+    "telemetry theta": lambda s: replace(s, telemetry=flipped(s.telemetry, 1, 2, 1)),
+    "telemetry elevation_error": lambda s: replace(s, telemetry=flipped(s.telemetry, 4, 2, 0)),
+    "observation rate of the error": (
+        lambda s: replace(s, observations=flipped(s.observations, 0, 2, 1))
+    ),
+    "terminated": lambda s: replace(s, terminated=flip(s.terminated, 2)),
+    "truncated": lambda s: replace(s, truncated=flip(s.truncated, 2)),
+}
+
+
+@pytest.mark.parametrize("field", CHANGES)
+def test_one_flipped_bit_is_found(field: str, flight: SimpleNamespace, tmp_path: Path) -> None:
+    path = tmp_path / "flipped.mcap"
+
+    def change(message: Message) -> Message:
+        chosen = isinstance(message, State) and message.sequence == 123
+        return CHANGES[field](message) if chosen else message
+
+    rewrite(flight.simulator, path, lambda message: message)
+    assert Verification(path).identical
+    rewrite(flight.simulator, path, change)
+    verdict = Verification(path)
+    assert not verdict.identical
+    (session,) = verdict.sessions
+    found = session.difference
+    assert found is not None
+    assert (found.sequence, found.drone, found.field) == (123, 2, field)
+    assert (session.differing, session.same) == (1, 601)
+    assert found.recorded != found.replayed
+    if field == "reward":
+        was, now = (float.fromhex(text.split()[0]) for text in (found.recorded, found.replayed))
+        assert abs(was - now) == pytest.approx(np.spacing(now), rel=0.5)
+        assert f"State 123, drone 2, reward: recorded {found.recorded}" in str(verdict)
+
+
+def test_other_options_and_another_model_are_noticed(
+    flight: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def other(**values: Any) -> Path:
+        path = tmp_path / "other.mcap"
+        rewrite(flight.simulator, path, changed_spec(**values))
+        return path
+
+    options = dict(next(iter(Recording(flight.simulator))).session.spec.options)
+    verdict = Verification(other(options=options | {"linear_drag": 0.5}))
+    found = verdict.sessions[0].difference
+    assert found is not None
+    assert found.sequence == 3  # the resets are at rest; drag slows what moves
+    assert re.match("the vehicle was [0-9a-f]{32}, and is", verdict.sessions[0].notes[0])
+    verdict = Verification(other(vehicle_hash="1" * 32))
+    assert verdict.identical
+    assert verdict.sessions[0].notes[0].startswith(f"the vehicle was {'1' * 32}, and is ")
+    verdict = Verification(other(options=options | {"observation": "error"}))
+    assert "State 1 cannot be repeated: expected an env of the observation " in (
+        verdict.sessions[0].problem
+    )
+    assert str(verdict).endswith("not identical")
+    verdict = Verification(other(options=options | {"gravity": 1}))
+    assert "State 1 cannot be repeated: " in verdict.sessions[0].problem
+    monkeypatch.setattr("rotorgram.udp.journal.replay.software", lambda: {"mujoco": "9.9"})
+    assert re.match(
+        "recorded with mujoco [0-9.]+, repeated with 9.9", Verification(flight.simulator).notes[0]
+    )
+    assert Verification(flight.agent).notes == []  # those of the agent have no part in the numbers
+
+
+def test_a_missing_command_is_noticed(flight: SimpleNamespace, tmp_path: Path) -> None:
+    path = tmp_path / "gap.mcap"
+
+    def change(message: Message) -> Message:
+        if isinstance(message, Command) and message.sequence == 50:
+            return replace(message, sequence=51)
+        return message
+
+    rewrite(flight.agent, path, change)
+    (session,) = Verification(path).sessions
+    assert session.same == 50
+    assert session.problem == "State 51 cannot be repeated: expected Command 50 before it, got 51"
+
+
+# ---- sessions
+
+
+def test_simulators_that_come_and_go(tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    remote = RemoteEnv(ANY, connect=False, record=path, **TIMES)
+    own = []
+    for number in range(3):
+        own.append(tmp_path / f"{number}.mcap")
+        simulator = Simulator(server=remote.address, bind=ANY, config=QUICK, record=own[-1])
+        running = Running(simulator)
+        fly(remote, 30, seed=number)
+        simulator.link.close("enough", time.monotonic())
+        with pytest.raises(PeerClosed):
+            fly(remote, 1)
+        running.join()
+    remote.close()
+    summary = Summary(path)
+    assert [s.steps for s in summary.sessions] == [30, 30, 30]
+    assert len({s.session.hello.session for s in summary.sessions}) == 3
+    assert all(s.ending.startswith("closed") for s in summary.sessions)
+    assert Verification(path).identical
+    assert all(Verification(file).identical for file in own)
+
+
+def test_text_simulators_one_after_another_are_sessions_of_their_own(tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    with RemoteEnv(
+        ANY, env_id=ENV_ID, connect=False, record=path, timeout=1, connect_timeout=2
+    ) as remote:
+        for seed in (1, 2):
+            simulator = Simulator(server=remote.address, bind=ANY, codec="text", config=QUICK)
+            running = Running(simulator)
+            fly(remote, 20, seed=seed)
+            simulator._socket.close()  # gone without a word
+            running.join()
+            if seed == 1:
+                with pytest.raises(PeerSilent):
+                    remote.reset()
+    summary = Summary(path)
+    assert len(summary.sessions) == 2
+    assert [s.session.codec for s in summary.sessions] == ["text", "text"]
+    assert Verification(path).identical
+
+
+def test_a_binary_session_may_have_the_number_0(tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    with RemoteEnv(ANY, env_id=ENV_ID, connect=False, record=path, **TIMES) as remote:
+        simulator = Simulator(server=remote.address, bind=ANY, config=QUICK)
+        simulator.link.hello = replace(simulator.link.hello, session=0)
+        running = Running(simulator)
+        fly(remote, 20)
+    assert running.join() == "the agent closed"
+    (session,) = Summary(path).sessions
+    assert (session.session.codec, session.steps) == ("binary", 20)
+    assert Verification(path).identical
+
+
+def test_several_simulators_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=4, connect=False, record=path, **TIMES)
+    running = [
+        Running(Simulator(server=remote.address, bind=ANY, num_envs=2, config=QUICK))
+        for _ in range(2)
+    ]
+    seen = fly(remote, 300)
+    remote.close()
+    for one in running:
+        one.join()
+    summary = Summary(path)
+    assert [s.session.slot for s in summary.sessions] == [0, 1]
+    assert (summary.steps, summary.episodes) == (seen.steps, seen.episodes)
+    assert Verification(path).identical
+    with path.open("rb") as file:
+        topics = {c.topic for c in make_reader(file).get_summary().channels.values()}
+    assert topics == {
+        "/statistics",
+        *(f"/slot{p}/{name}" for p in (0, 1) for name in ("state", "command", "events")),
+    }
+
+
+def test_an_agent_that_was_started_anew(tmp_path: Path) -> None:
+    path = tmp_path / "simulator.mcap"
+    killed = launch(RECORD, 0, tmp_path / "killed.mcap", 20, "wait")
+    assert killed.stdout is not None
+    address = "127.0.0.1", int(killed.stdout.readline())
+    running = Running(Simulator(server=address, bind=ANY, config=QUICK, record=path))
+    while not killed.stdout.readline().startswith("flown"):
+        pass
+    killed.kill()
+    killed.communicate()
+    with RemoteEnv(address, connect=False, **TIMES) as second:
+        fly(second, 20)
+    running.join()
+    summary = Summary(path)
+    assert [s.ending for s in summary.sessions] == [
+        "the agent does not know this session",
+        "closed: the agent closed",
+    ]
+    assert [s.steps for s in summary.sessions] == [20, 20]
+    assert Verification(path).identical
+
+
+def test_loss_and_repetition_do_not_enter(tmp_path: Path) -> None:
+    ours, theirs = tmp_path / "agent.mcap", tmp_path / "simulator.mcap"
+    faults = FaultConfig(drop=0.1, duplicate=0.1, reorder=0.1, corrupt=0.05, seed=3)
+    remote = RemoteEnv(ANY, connect=False, record=ours, **TIMES)
+    with Relay(ANY, remote.address, faults) as relay:
+        thread = threading.Thread(target=relay.run)
+        thread.start()
+        running = Running(Simulator(server=relay.address, bind=ANY, config=QUICK, record=theirs))
+        fly(remote, 200)
+        remote.close()
+        running.join()
+        relay.stop()
+        thread.join()
+    assert relay.counters["dropped"] > 10
+    assert datagrams(ours)[:-1] == datagrams(theirs)[: len(datagrams(ours)) - 1]
+    numbers = [binary.peek(datagram)[::2] for datagram in datagrams(theirs)]
+    assert numbers[:-1] == [(kind, n) for n in range(1, len(numbers) // 2 + 1) for kind in (4, 5)]
+    assert Verification(ours).identical
+    assert Verification(theirs).identical
+
+
+# ---- the file
+
+
+def test_it_is_valid_mcap_with_checksums_and_summary(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_module, "_CHUNK", 5000)
+    with pair(tmp_path) as both:
+        fly(both.remote, 300)
+    for path in (both.agent, both.simulator):
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            summary = reader.get_summary()
+            messages = [(c.topic, m) for _, c, m in reader.iter_messages()]
+            some = [c.topic for _, c, _ in reader.iter_messages(topics=["/slot0/command"])]
+            assert reader.get_header().library == "rotorgram 0.1.0"
+        assert summary is not None
+        counts = summary.statistics
+        assert counts.message_count == len(messages)
+        assert counts.chunk_count == len(summary.chunk_indexes) > 10
+        assert len(some) == sum(topic == "/slot0/command" for topic, _ in messages) > 300
+        assert counts.message_start_time == min(m.log_time for _, m in messages)
+        assert counts.message_end_time == max(m.log_time for _, m in messages)
+        times = [m.log_time for topic, m in messages]
+        assert abs(times[-1] - time.time_ns()) < 60e9
+        states = [m for topic, m in messages if topic == "/slot0/state"]
+        assert [m.sequence for m in states] == list(range(1, len(states) + 1))
+        assert crc_of_the_summary(path)
+        indexed = set()
+        for index in summary.chunk_indexes:
+            indexed |= set(index.message_index_offsets)
+            assert index.message_index_length > 0
+        assert indexed == set(summary.channels)
+
+
+def crc_of_the_summary(path: Path) -> bool:
+    """The mcap package writes that sum but does not check it."""
+    import zlib
+
+    data = path.read_bytes()
+    opcode, size, start, offsets, crc = struct.unpack("<BQQQI", data[-37:-8])
+    assert (opcode, size) == (2, 20)
+    assert 0 < start < len(data)
+    assert offsets == 0  # readers take the whole summary
+    return crc == zlib.crc32(data[start:-12])
+
+
+def test_message_indexes_point_at_the_messages(flight: SimpleNamespace) -> None:
+    from mcap.records import Chunk, MessageIndex
+    from mcap.stream_reader import StreamReader, get_chunk_data_stream
+
+    checked = 0
+    with flight.agent.open("rb") as file:
+        raw = b""
+        for record in StreamReader(file, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                stream, size = get_chunk_data_stream(record, validate_crc=True)
+                raw = stream.read(size)
+            elif isinstance(record, MessageIndex):
+                for when, offset in record.records:
+                    opcode, _, channel, _, log_time = struct.unpack_from("<BQHIQ", raw, offset)
+                    assert (opcode, channel, log_time) == (5, record.channel_id, when)
+                    checked += 1
+    assert checked == sum(1 for _ in Recording(flight.agent)) + 1  # and the statistics
+
+
+def test_states_and_commands_are_ros_messages(flight: SimpleNamespace) -> None:
+    with flight.simulator.open("rb") as file:
+        messages = list(make_reader(file).iter_messages())
+    stores: dict[int, Any] = {}
+    decoded = (
+        i.message for i in Recording(flight.simulator) if isinstance(i.message, State | Command)
+    )
+    seen = 0
+    for schema, channel, message in messages:
+        assert schema is not None
+        if channel.message_encoding != "ros1":
+            json.loads(message.data)
+            continue
+        assert schema.encoding == "ros1msg"
+        if schema.id not in stores:
+            stores[schema.id] = get_typestore(Stores.EMPTY)
+            name = schema.name.replace("/", "/msg/")
+            types = get_types_from_msg(schema.data.decode(), name)
+            stores[schema.id].register(types)
+        name = schema.name.replace("/", "/msg/")
+        ros, true = stores[schema.id].deserialize_ros1(message.data, name), next(decoded)
+        assert (bytes(ros.magic), ros.version) == (binary.MAGIC, binary.VERSION)
+        assert (ros.session, ros.sequence) == (true.session, true.sequence)
+        if isinstance(true, State):
+            assert (ros.time, ros.nonce) == (true.time, true.nonce)
+            assert ros.rewards.tolist() == true.rewards.tolist()
+            assert ros.observation_observation.tolist() == true.observations[0].ravel().tolist()
+            assert ros.telemetry_position.tolist() == true.telemetry[0].ravel().tolist()
+            assert ros.telemetry_metrics.tolist() == true.telemetry[4].ravel().tolist()
+            assert list(ros.terminated) == true.terminated.tolist()
+            assert list(ros.truncated) == true.truncated.tolist()
+        else:
+            assert isinstance(true, Command)
+            assert ros.seed_count == (0 if true.seeds is None else 3)
+            assert true.seeds is None or ros.seeds.tolist() == true.seeds.tolist()
+            assert ros.actions.tolist() == true.actions.ravel().tolist()
+            assert ros.orders.tolist() == true.orders.tolist()
+        assert stores[schema.id].serialize_ros1(ros, name) == message.data
+        seen += 1
+    assert seen == 2 * 602 - 1
+
+
+def test_what_else_is_in_it(flight: SimpleNamespace) -> None:
+    ours, theirs = Recording(flight.agent), Recording(flight.simulator)
+    assert ours.attachments == {}
+    hello = next(iter(theirs)).session.hello
+    assert list(theirs.attachments) == ["model.xml"]
+    assert b"<mujoco" in theirs.attachments["model.xml"]
+    assert ours.about["side"] == "agent"
+    assert theirs.about["version of mujoco"][0].isdigit()
+    with flight.agent.open("rb") as file:
+        reader = make_reader(file)
+        sessions = [m.metadata for m in reader.iter_metadata() if m.name == "session"]
+        counts = [json.loads(m.data) for _, _, m in reader.iter_messages(topics="/statistics")]
+    assert [s["drones"] for s in sessions] == ["3"]
+    assert sessions[0]["session"] == f"{hello.session:016x}"
+    assert sessions[0]["spec"] == hello.spec
+    assert [c["sessions"] for c in counts] == [1]
+    assert counts[0]["sent"] >= 602
+
+
+def test_statistics_every_ten_seconds_and_a_clock_that_is_set_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [10**18]
+    monkeypatch.setattr(time, "time_ns", lambda: now[0])
+    path = tmp_path / "j.mcap"
+    sizes = []
+    journal = Journal(path, Statistics(), side="agent")
+    close = Close(session=1, sequence=1, reason="x" * 500)
+    hello = Hello(session=1, spec=Loop(ENV_ID, options={}).spec.to_json())
+    journal.tap(0, hello, binary.encode(hello))
+    for _ in range(50):
+        now[0] += 5 * 10**8
+        journal.tap(0, close, binary.encode(close))
+        journal.write()
+        sizes.append(path.stat().st_size)
+    now[0] -= 3600 * 10**9
+    journal.tap(0, close, binary.encode(close))
+    journal.write()
+    assert path.stat().st_size > sizes[-1]  # written at once
+    journal.close()
+    journal.close()
+    journal.tap(0, close, binary.encode(close))
+    assert sum(b > a for a, b in pairwise(sizes)) in (24, 25)
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        assert len(list(reader.iter_messages(topics="/statistics"))) == 4
+        assert len(list(reader.iter_messages(topics="/slot0/events"))) == 52
+
+
+def test_a_file_that_is_there_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "old.mcap"
+    path.write_bytes(b"precious")
+    sentence = "record: expected a file that does not exist yet, got "
+    with pytest.raises(FileExistsError, match=sentence):
+        Simulator(bind=ANY, record=path)
+    with pytest.raises(FileExistsError, match=sentence):
+        RemoteEnv(ANY, connect=False, record=path)
+    assert path.read_bytes() == b"precious"
+    with pytest.raises(FileNotFoundError):
+        RemoteEnv(ANY, connect=False, record=tmp_path / "no" / "where.mcap")
+    gc.collect()
+
+
+def test_what_is_no_journal(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(b"not at all an mcap file")
+    with pytest.raises(ValueError, match="expected an MCAP file, got another"):
+        Summary(path)
+    buffer = io.BytesIO()
+    writer = Writer(buffer)
+    writer.start()
+    writer.finish()
+    path.write_bytes(buffer.getvalue())
+    with pytest.raises(ValueError, match="expected a journal of format 2, got 'another MCAP file'"):
+        Verification(path)
+    with pytest.raises(FileNotFoundError):
+        Verification(tmp_path / "none")
+
+
+# ---- hostile files
+
+
+def test_a_chunk_that_grows_is_not_read(flight: SimpleNamespace, tmp_path: Path) -> None:
+    """A short chunk can decompress to any number of bytes, and these to any number of records."""
+    head = flight.simulator.read_bytes()
+    begin = head.index(b"\x06", head.index(b"model.xml"))  # opcode of the first chunk
+    while struct.unpack_from("<BQ", head, begin)[1] > len(head):
+        begin = head.index(b"\x06", begin + 1)
+    message = struct.pack("<BQHIQQ", 5, 22, 999, 0, 0, 0)  # without data, of no channel
+    unknown = struct.pack("<BQ", 0x7F, 0)
+    for content, size in (
+        (bytes(4 * MAX_CHUNK), 4 * MAX_CHUNK),
+        (bytes(4 * MAX_CHUNK), MAX_CHUNK),
+        (bytes(4 * MAX_CHUNK), 100),
+        (message * (MAX_CHUNK // len(message)), None),
+        (unknown * (MAX_CHUNK // len(unknown)), None),
+    ):
+        compressed = zstandard.ZstdCompressor(level=19).compress(content)
+        assert len(compressed) < 20_000
+        size, crc = (len(content), zlib.crc32(content)) if size is None else (size, 0)
+        body = struct.pack("<QQQII", 0, 0, size, crc, 4) + b"zstd"
+        body += struct.pack("<Q", len(compressed)) + compressed
+        path = tmp_path / "bomb.mcap"
+        path.write_bytes(head[:begin] + struct.pack("<BQ", 6, len(body)) + body)
+        program = (
+            "import resource, sys, time; from rotorgram.udp.journal import Summary; "
+            "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; "
+            "began = time.process_time(); "
+            "print(Summary(sys.argv[1]).ending); print(time.process_time() - began); "
+            "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
+        )
+        out, errors = launch(program, path).communicate(timeout=60)
+        ending, seconds, kilobytes = out.splitlines()
+        assert (errors, ending.startswith("cut off")) == ("", True)
+        assert float(seconds) < 1.0
+        assert int(kilobytes) < 3 * MAX_CHUNK / 1024
+
+
+def test_an_event_that_is_nested_too_deep(tmp_path: Path) -> None:
+    path = tmp_path / "deep.mcap"
+    with path.open("wb") as new:
+        writer = Writer(new)
+        writer.start()
+        writer.add_metadata("rotorgram", {"format": "2"})
+        schema = writer.register_schema("rotorgram.Event", "jsonschema", b"{}")
+        channel = writer.register_channel("/slot0/events", "json", schema)
+        writer.add_message(channel, 0, b"[" * 200_000, 0)
+        writer.finish()
+    with pytest.raises(InputError, match=r"deep\.mcap: a message that cannot be read: maximum"):
+        Summary(path)
+
+
+def test_terminal_escapes_are_not_printed(flight: SimpleNamespace, tmp_path: Path) -> None:
+    path = tmp_path / "escape.mcap"
+    with flight.simulator.open("rb") as old, path.open("wb") as new:
+        reader, writer = make_reader(old), Writer(new)
+        writer.start()
+        for metadata in reader.iter_metadata():
+            changed = {
+                name: "\x1b[2J\x9b31m\u202e" if name in ("side", "version of numpy") else text
+                for name, text in metadata.metadata.items()
+            }
+            writer.add_metadata(metadata.name, changed)
+        writer.finish()
+    out = str(Summary(path)) + str(Verification(path))
+    assert "[2J" in out
+    assert all(character.isprintable() or character == "\n" for character in out)
+
+
+# ---- ends that nobody wished for
+
+
+def test_a_file_that_was_cut_is_read_up_to_the_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_module, "_CHUNK", 10_000)
+    with pair(tmp_path) as both:
+        fly(both.remote, 500)
+    for path in (both.agent, both.simulator):
+        whole, data = datagrams(path, object), path.read_bytes()
+        cut = tmp_path / "cut.mcap"
+        sizes = []
+        for tenth in range(10):
+            for size in (len(data) * tenth // 10, len(data) * tenth // 10 + 3):
+                cut.write_bytes(data[:size])
+                part = datagrams(cut, object)
+                assert part == whole[: len(part)]
+                summary, verdict = Summary(cut), Verification(cut)
+                assert not summary.complete
+                assert summary.ending.startswith("cut off")
+                assert all(session.identical for session in verdict.sessions)
+                assert verdict.identical == bool(part)
+                sizes.append(len(part))
+        assert sizes == sorted(sizes)
+        assert sizes[-1] > 0.8 * len(whole)
+        cut.write_bytes(data[:-1])  # no message is missing, and yet it is not complete
+        assert datagrams(cut, object) == whole
+        assert not Summary(cut).complete
+
+
+def test_a_damaged_file_is_read_up_to_the_damage(flight: SimpleNamespace, tmp_path: Path) -> None:
+    data = bytearray(flight.simulator.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(data)
+    summary = Summary(path)
+    assert not summary.complete
+    assert summary.ending.startswith("damaged (")
+    assert all(session.identical for session in Verification(path).sessions)
+    assert Replay(file=path, verify=True).run() == 1, "a script must not take it for verified"
+
+
+RECORD = """
+    import sys, time, numpy as np
+    from rotorgram.udp import RemoteEnv
+    remote = RemoteEnv(("127.0.0.1", int(sys.argv[1])), record=sys.argv[2], connect=False)
+    print(remote.address[1], flush=True)
+    remote.reset(seed=1)
+    for step in range(int(sys.argv[3])):
+        if any(remote.step(np.zeros(1, np.float32))[2:4]):
+            remote.reset()
+        if step % 50 == 0:
+            print("step", time.time_ns(), flush=True)
+    print("flown", flush=True)
+    if sys.argv[4:]:
+        time.sleep(60)
+"""
+
+
+def launch(code: str, *arguments: object) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_sigkill_costs_at_most_a_second(tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    process = launch(RECORD, 0, path, 10**9)
+    assert process.stdout is not None
+    port = int(process.stdout.readline())
+    simulator = Simulator(
+        server=("127.0.0.1", port), bind=ANY, config=LinkConfig(timeout=1), record=None
+    )
+    running = Running(simulator)
+    start = time.monotonic()
+    last = ""
+    while time.monotonic() - start < 2.5:
+        last = process.stdout.readline()
+    process.kill()
+    process.communicate()
+    assert isinstance(running.join(), PeerSilent)
+    items = list(Recording(path))
+    lost = int(last.split()[1]) - items[-1].time
+    assert lost < 1.1e9
+    assert len(items) > 1000
+    verdict = Verification(path)
+    assert verdict.identical
+    assert not verdict.complete
+    assert "note: the file is cut off" in str(verdict)
+
+
+@pytest.mark.parametrize("goodbye", ["", "import os; os.kill(os.getpid(), 2)", "1 / 0"])
+def test_the_end_of_the_program_finishes_the_file(goodbye: str, tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"
+    process = launch(textwrap.dedent(RECORD) + goodbye + "\n", 0, path, 100)
+    assert process.stdout is not None
+    port = int(process.stdout.readline())
+    running = Running(Simulator(server=("127.0.0.1", port), bind=ANY, config=QUICK))
+    _, errors = process.communicate(timeout=30)
+    assert bool(errors) == bool(goodbye)
+    assert running.join() == "the agent closed"
+    summary = Summary(path)
+    assert (summary.complete, summary.steps) == (True, 100)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no forks there")
+@pytest.mark.parametrize("goodbye", ["sys.exit()", "del remote; os._exit(0)"])
+def test_a_forked_child_leaves_its_parents_file_alone(goodbye: str, tmp_path: Path) -> None:
+    path = tmp_path / "agent.mcap"  # fault 34
+    fork = f"""
+import os
+if not os.fork():
+    {goodbye}
+os.wait()
+for _ in range(50):
+    remote.step(np.zeros(1, np.float32))
+"""
+    process = launch(textwrap.dedent(RECORD) + fork, 0, path, 100)
+    assert process.stdout is not None
+    server = "127.0.0.1", int(process.stdout.readline())
+    running = Running(Simulator(server=server, bind=ANY, config=QUICK))
+    _, errors = process.communicate(timeout=30)
+    assert errors == ""
+    assert running.join() == "the agent closed"
+    summary = Summary(path)
+    assert (summary.complete, summary.steps) == (True, 150)
+    assert Verification(path).identical
+
+
+def test_garbage_finishes_the_file(tmp_path: Path) -> None:
+    ours, theirs = tmp_path / "agent.mcap", tmp_path / "simulator.mcap"
+    remote = RemoteEnv(ANY, connect=False, record=ours, **TIMES)
+    running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK, record=theirs))
+    fly(remote, 10)
+    del remote
+    gc.collect()
+    assert running.join() == "the agent closed"
+    assert Summary(ours).complete
+    assert Summary(theirs).complete
+    journal = Journal(tmp_path / "j", Statistics(), side="x")
+    del journal
+    assert Recording(tmp_path / "j").complete
+
+
+def test_a_full_device_ends_the_record_and_not_the_flight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(journal_module, "_CHUNK", 10_000)
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with caplog.at_level(logging.WARNING, "rotorgram.udp"), pair(tmp_path) as both:
+        both.remote.reset(seed=1)
+        fly(both.remote, 100)
+        room = 8192 + max(p.stat().st_size for p in (both.agent, both.simulator))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
+        try:
+            seen = fly(both.remote, 400)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert seen.steps == 400
+    warnings = [record.getMessage() for record in caplog.records]
+    assert len(warnings) == 2  # one for each file
+    for warning in warnings:
+        assert re.fullmatch(
+            r"record: writing .*\.mcap failed \(File too large\): the flight goes on, its journal "
+            "ends here",
+            warning,
+        )
+    for path in (both.agent, both.simulator):
+        assert path.stat().st_size <= room
+        assert not Summary(path).complete
+        assert Summary(path).steps > 100
+        assert Verification(path).identical
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
+def test_a_device_that_is_full_from_the_beginning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "full.mcap"
+    opened = Path.open
+
+    def full(self: Path, *arguments: Any, **words: Any) -> Any:
+        file = opened(self, *arguments, **words)
+        if self != path:
+            return file
+        file.close()
+        return open("/dev/full", "wb")
+
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(OSError, match="No space left on device"):
+        RemoteEnv(ANY, connect=False, record=path)
+    assert not path.exists()
+
+
+def test_an_interrupted_write_costs_its_chunk_alone(tmp_path: Path) -> None:
+    path = tmp_path / "i.mcap"
+    file = McapFile(path, "test")
+    channel = file.channel("/t", "json", "s", "{}")
+    for number in range(100):
+        file.pending.append((channel, number, number, b"%d" % number))
+        if number == 59:
+            file.flush()
+    file.pending.append((channel, 100, 100, None))  # type: ignore[arg-type]
+    with pytest.raises(TypeError):  # in the midst of a chunk, as Ctrl-C may come
+        file.flush()
+    with pytest.raises(OSError, match="a write was interrupted"):
+        file.finish()
+    file.abandon()
+    assert path.stat().st_size == file.size
+    seen = []
+    with path.open("rb") as stream, suppress(EndOfFile, McapError):
+        for record in StreamReader(stream, record_size_limit=1 << 20).records:
+            if isinstance(record, records.Message):
+                seen.append(record.data)
+    assert seen == [b"%d" % number for number in range(60)]
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no interval timer here")
+def test_interrupts_at_any_moment(
+    tmp_path: Path,
+    flight: SimpleNamespace,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(journal_module, "_CHUNK", 10_000)
+    items = list(Recording(flight.agent))
+    hello, state = items[0], next(i for i in items if isinstance(i.message, State)).message
+    journal = Journal(tmp_path / "j", Statistics(), side="agent")
+    journal.tap(0, hello.message, hello.datagram)
+    armed, returned, interrupts = False, [], 0
+
+    def interrupt(*_: Any) -> None:
+        if armed:
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, 1e-3, 1e-3)
+    try:
+        for number in range(1, 20_001):
+            message = replace(state, sequence=number)
+            datagram = binary.encode(message, hello.session.layout)
+            try:
+                armed = True
+                journal.tap(0, message, datagram)
+                armed = False
+                returned.append(number)
+            except KeyboardInterrupt:
+                armed = False
+                interrupts += 1
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    journal.close()
+    recorded = Recording(tmp_path / "j")
+    written = [item.message.sequence for item in recorded if isinstance(item.message, State)]
+    assert interrupts > 0
+    assert written == sorted(set(written))
+    # One that comes in the midst of a write ends the journal: what was written before is there.
+    assert {n for n in returned if n <= max(written, default=0)} <= set(written)
+
+
+def test_what_a_message_costs(tmp_path: Path, flight: SimpleNamespace) -> None:
+    items = list(Recording(flight.agent))
+    journal = Journal(tmp_path / "j", Statistics(), side="agent")
+    start = time.process_time()
+    for _ in range(10):
+        for item in items:
+            journal.tap(0, item.message, item.datagram)
+            journal.write()
+    each = (time.process_time() - start) / (10 * len(items))
+    journal.close()
+    print(f"{1e6 * each:.2f} µs for each message of 3 drones")
+    assert each < 100e-6
+
+
+# ---- the page
+
+
+def test_the_snippet_of_the_page(
+    flight: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
+    assert len(code.splitlines()) <= 12
+    exec(code.replace("flight.mcap", str(flight.simulator)), {})
+    lines = capsys.readouterr().out.splitlines()
+    states = [i.message for i in Recording(flight.simulator) if isinstance(i.message, State)]
+    assert len(lines) == len(states)
+    assert float(lines[-1].split()[-1]) == states[-1].telemetry[0][0, 1]

@@ -1,0 +1,574 @@
+"""One world flown by several agents over UDP: the bits of the world in process, whoever is lost."""
+
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from peers import ANY, Running, launch, relaying
+from rotorgram.envs.loop import Loop
+from rotorgram.models import QUAD_XML, InputError
+from rotorgram.udp import (
+    LinkConfig,
+    PeerClosed,
+    PeerSilent,
+    Refused,
+    RemoteEnv,
+    RemoteVectorEnv,
+    SharedSimulator,
+    Simulator,
+)
+from rotorgram.udp.journal.replay import Verification
+from rotorgram.udp.protocol.auth import write_key
+from rotorgram.udp.remote_parallel import RemoteParallelEnv
+from rotorgram.udp.transport.relay import FaultConfig
+from rotorgram.udp.transport.shared import Presence
+from swarms import RISE
+
+LOSSY = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.1, seed=3)
+LONG = 150  # control steps of an episode in which somebody is lost
+Step = tuple[bytes, float, bool, bool]
+VICTIM = """
+    import sys, time
+    import numpy as np
+    from rotorgram.udp import RemoteEnv
+
+    port, policy = int(sys.argv[1]), sys.argv[2]
+    env = RemoteEnv(("127.0.0.1", port), connect_timeout=60, when_lost=policy)
+    for episode in range(3):
+        env.reset(seed=episode)
+        print("begun", flush=True)
+        truncated, steps = False, 0
+        while not truncated:
+            time.sleep(0.01)
+            _, reward, _, truncated, _ = env.step(np.zeros(1, np.float32))
+            steps += 1
+            print("cut" if truncated and not reward else steps, flush=True)
+"""
+
+
+def free_ports(count: int) -> list[tuple[str, int]]:
+    with ExitStack() as stack:
+        socks = [
+            stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            for _ in range(count)
+        ]
+        for sock in socks:
+            sock.bind(ANY)
+        return [sock.getsockname() for sock in socks]
+
+
+@contextmanager
+def shared(
+    agents: list[tuple[str, int]], drones: int, faults: FaultConfig | None = None, **rest: Any
+) -> Iterator[Running]:
+    """A simulator of these agents in a thread, which ends with the last of them."""
+    with ExitStack() as stack:
+        if faults:
+            agents = [stack.enter_context(relaying(a, faults)).address for a in agents]
+        rest = {"patience": 20.0, "config": LinkConfig(timeout=60), **rest}
+        running = Running(SharedSimulator(RISE, agents, drones=drones, bind=ANY, **rest))
+        try:
+            yield running
+        finally:
+            running.simulator.stop()
+            running.join()
+
+
+def in_threads(flights: list[Callable[[], None]]) -> None:
+    errors: list[BaseException] = []
+
+    def guarded(flight: Callable[[], None]) -> None:
+        try:
+            flight()
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=guarded, args=(flight,)) for flight in flights]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert not errors, errors
+    assert not any(thread.is_alive() for thread in threads)
+
+
+def action_of(drone: int, episode: int, step: int) -> np.ndarray:
+    """The higher its number, the faster it climbs, and the sooner it is out."""
+    dice = np.random.default_rng((drone, episode, step))
+    return (0.3 + 0.1 * drone) * dice.uniform(0.9, 1.0, 1).astype(np.float32)
+
+
+def calm(drone: int, episode: int, step: int) -> np.ndarray:
+    return np.random.default_rng((drone, episode, step)).uniform(-0.1, 0.1, 1).astype(np.float32)
+
+
+def fly_one(
+    address: tuple[str, int], drone: int, episodes: int, seen: dict[int, list[list[Step]]],
+    act: Callable[[int, int, int], np.ndarray] = action_of, **settings: Any,
+) -> None:  # fmt: skip
+    env = RemoteEnv(address, connect_timeout=60, **settings)
+    for episode in range(episodes):
+        observation, _ = env.reset(seed=100 * drone + episode)
+        flight: list[Step] = [(observation.tobytes(), 0.0, False, False)]
+        while not (flight[-1][2] or flight[-1][3]):
+            observation, *told, _ = env.step(act(drone, episode, len(flight) - 1))
+            flight.append((observation.tobytes(), *told))
+        seen.setdefault(drone, []).append(flight)
+    env.close()
+
+
+def fly_several(
+    address: tuple[str, int], names: list[str], episodes: int, seen: dict[int, list[list[Step]]]
+) -> None:
+    env = RemoteParallelEnv(address, connect_timeout=60)
+    assert env.possible_agents == names
+    for episode in range(episodes):
+        first = int(names[0][-1])
+        observations, _ = env.reset(seed=100 * first + episode)
+        flights = {n: [(observations[n].tobytes(), 0.0, False, False)] for n in names}
+        step = 0
+        while env.agents:
+            actions = {name: action_of(int(name[-1]), episode, step) for name in env.agents}
+            observations, rewards, ends, cuts, _ = env.step(actions)
+            for n in observations:
+                told = observations[n].tobytes(), rewards[n], ends[n], cuts[n]
+                flights[n].append(told)
+            step += 1
+        for name in names:
+            seen.setdefault(int(name[-1]), []).append(flights[name])
+    env.close()
+
+
+def in_process(
+    drones: int, episodes: int, act: Callable[[int, int, int], np.ndarray] = action_of,
+    lost: tuple[int, int, str] | None = None, first: int = 0, **options: Any,
+) -> dict[int, list[list[Step]]]:  # fmt: skip
+    """The same in one process; `lost`: a drone, a step of the first episode, and its policy."""
+    loop = Loop(RISE, drones=drones, options=options)
+    seen: dict[int, list[list[Step]]] = {drone: [] for drone in range(drones)}
+    for episode in range(episodes):
+        nothing = np.zeros((drones, 1), np.float32)
+        loop.advance(nothing, np.ones(drones, bool), [first + episode] * drones)
+        rows = loop.observations["observation"]
+        flights = [[(rows[i].tobytes(), 0.0, False, False)] for i in range(drones)]
+        step = 0
+        while not loop.done.all():
+            flown, actions = ~loop.out, nothing.copy()
+            for i in range(drones):
+                actions[i] = act(i, episode, step)
+            if lost and episode == 0 and step >= lost[1]:
+                victim = np.arange(drones) == lost[0]
+                actions[victim] = 0.0
+                if step == lost[1] and lost[2] != "hold":
+                    (loop.land if lost[2] == "land" else loop.retire)(victim)
+            loop.advance(actions)
+            rows, step = loop.observations["observation"], step + 1
+            for i in np.flatnonzero(flown):
+                told = loop.rewards[i].item(), loop.terminated[i].item(), loop.truncated[i].item()
+                flights[i].append((rows[i].tobytes(), *told))
+        for i in range(drones):
+            seen[i].append(flights[i])
+    loop.close()
+    return seen
+
+
+@pytest.mark.parametrize("faults", [None, LOSSY], ids=["clean", "30 % loss"])
+def test_an_agent_for_each_drone_is_the_world_in_process(faults: FaultConfig | None) -> None:
+    agents, seen = free_ports(8), {}
+    with shared(agents, 8, faults, episode_length=60) as running:
+        in_threads([lambda a=a, i=i: fly_one(a, i, 2, seen) for i, a in enumerate(agents)])
+        assert running.join() == "the agent closed"
+        assert running.simulator.episodes == 2
+    expected = in_process(8, 2, episode_length=60)
+    assert len({len(flights[0]) for flights in expected.values()}) > 6  # one after the other
+    assert seen == expected
+
+
+def test_two_agents_of_four_drones_each_are_the_world_in_process() -> None:
+    agents, seen = free_ports(2), {}
+    names = [f"drone_{i}" for i in range(8)]
+    with shared(agents, 8, LOSSY, episode_length=60):
+        in_threads([
+            lambda: fly_several(agents[0], names[:4], 2, seen),
+            lambda: fly_several(agents[1], names[4:], 2, seen),
+        ])  # fmt: skip
+    assert seen == in_process(8, 2, episode_length=60)
+
+
+def heard(process: subprocess.Popen[str], word: str) -> None:
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.strip() == word:
+            return
+    raise AssertionError(f"never said {word}: {process.stderr.read()}")
+
+
+@pytest.mark.parametrize("policy", ["hold", "land", "end"])
+def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> None:
+    agents, seen = free_ports(3), {}
+    others = [threading.Thread(target=fly_one, args=(agents[i], i, 3, seen, calm)) for i in (0, 2)]
+    victim = launch(VICTIM, agents[1][1], policy)
+    with shared(agents, 3, episode_length=LONG, patience=1.0) as running:
+        for thread in others:
+            thread.start()
+        heard(victim, "20")
+        victim.send_signal(signal.SIGKILL)
+        again = launch(VICTIM, agents[1][1], policy)
+        heard(again, "20")  # of a later episode
+        for thread in others:
+            thread.join(60)
+    for process in (victim, again):
+        process.kill()
+        process.communicate()
+    loss, *later = running.simulator.absences
+    assert (loss.agent, loss.episode) == (1, 1)
+    assert 20 <= loss.step < LONG - 1
+    assert loss.presence in (Presence.SILENT, Presence.COMING)
+    expected = in_process(3, 3, calm, (1, loss.step, policy), episode_length=LONG)
+    assert [seen[i][0] for i in (0, 2)] == [expected[i][0] for i in (0, 2)]
+    assert all(loss.agent != 1 or loss.presence is not Presence.LEFT for loss in later)
+
+
+def test_an_agent_that_comes_back_to_land_where_the_vehicle_cannot_ends_nobodys_flight(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    model, agents, seen = tmp_path / "no_yaw.xml", free_ports(2), {}
+    text = QUAD_XML.read_text(encoding="utf-8")
+    for rotor, reaction in (("2", "0.05"), ("3", "-0.05")):  # a yaw is always a roll, too
+        at = rf'(site="rotor{rotor}" gear="0 0 1 0 0) +[-.0-9]+'
+        text = re.sub(at, rf"\1 {reaction}", text)
+    model.write_text(text)
+    other = threading.Thread(target=fly_one, args=(agents[0], 0, 3, seen, calm))
+    victim = launch(VICTIM, agents[1][1], "hold")
+    with shared(agents, 2, episode_length=LONG, patience=4.0, vehicle=model):
+        other.start()
+        heard(victim, "20")
+        victim.kill()
+        again = launch(VICTIM, agents[1][1], "land")
+        heard(again, "20")  # of a later episode
+        again.kill()
+        other.join(60)
+    for process in (victim, again):
+        process.communicate()
+    assert [len(flight) for flight in seen[0]] == [LONG + 1] * 3
+    assert (
+        f"the agent at 127.0.0.1:{agents[1][1]} cannot have land (vehicle: expected a vehicle "
+        "whose rotors roll, pitch and yaw it, for this action, got rotorgram "
+        "quadcopter, an allocation of rank 3): hold"
+    ) in caplog.messages
+
+
+def test_one_that_is_started_anew_before_the_others_come_flies_the_first_episode() -> None:
+    agents, seen = free_ports(2), {}
+    with shared(agents, 2, episode_length=60) as running:
+        first = launch(VICTIM, agents[0][1], "end")
+        while running.simulator.parties[0].presence is not Presence.READY:
+            assert running.thread.is_alive()
+        first.kill()
+        again = launch(VICTIM, agents[0][1], "end")
+        fly_one(agents[1], 1, 1, seen, calm)
+        heard(again, "60")
+        again.kill()
+    for process in (first, again):
+        process.communicate()
+    assert [absence.episode for absence in running.simulator.absences] == [2] * len(
+        running.simulator.absences
+    )
+    expected = in_process(
+        2, 1, lambda i, *at: calm(i, *at) if i else np.zeros(1, np.float32), episode_length=60
+    )
+    assert seen[1] == expected[1]
+
+
+def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:
+    agents, seen = free_ports(2), {}
+    other = threading.Thread(target=fly_one, args=(agents[0], 0, 3, seen, calm))
+    victim = launch(VICTIM, agents[1][1], "hold")
+    with shared(agents, 2, episode_length=LONG, patience=0.5) as running:
+        other.start()
+        heard(victim, "20")
+        victim.send_signal(signal.SIGSTOP)
+        while not running.simulator.absences:
+            assert running.thread.is_alive()
+        victim.send_signal(signal.SIGCONT)
+        heard(victim, "cut")
+        heard(victim, "begun")
+        heard(victim, "20")  # of a later episode
+        other.join(60)
+        victim.kill()
+        victim.communicate()
+    loss = running.simulator.absences[0]
+    assert (loss.agent, loss.episode, loss.presence) == (1, 1, Presence.SILENT)
+    expected = in_process(2, 3, calm, (1, loss.step, "hold"), episode_length=LONG)
+    assert seen[0][0] == expected[0][0]
+
+
+def test_with_a_key_they_are_the_world_in_process(tmp_path: Path) -> None:
+    agents, seen, key = free_ports(2), {}, tmp_path / "key"
+    write_key(key)
+    with shared(agents, 2, LOSSY, key_file=key):
+        in_threads([
+            lambda a=a, i=i: fly_one(a, i, 1, seen, key_file=key) for i, a in enumerate(agents)
+        ])  # fmt: skip
+    assert seen == in_process(2, 1)
+
+
+def test_one_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
+    agents, seen, starts = free_ports(2), {}, []
+
+    def impatient() -> None:
+        env = RemoteEnv(agents[0], connect_timeout=60)
+        starts.append(env.reset(seed=0)[0].tobytes())
+        for step in range(5):
+            env.step(calm(0, 0, step))
+        starts.append(env.reset(seed=1)[0].tobytes())
+        env.step(calm(0, 1, 0))
+        env.close()
+
+    with shared(agents, 2, episode_length=LONG) as running:
+        in_threads([impatient, lambda: fly_one(agents[1], 1, 2, seen, calm)])
+        running.join()
+        waits, closes = running.simulator.absences
+        assert waits == (0, 1, 5, Presence.WAITING)
+        assert closes == (0, 2, 1, Presence.LEFT)
+    expected = in_process(2, 2, calm, (0, 5, "hold"), episode_length=LONG)
+    assert seen[1][0] == expected[1][0]
+    assert starts == [expected[0][0][0][0], expected[0][1][0][0]]
+    assert seen[1][1][0] == expected[1][1][0]
+
+
+def test_one_that_resets_a_start_gets_it_again() -> None:
+    agents, starts = free_ports(2), []
+    done = threading.Event()
+
+    def twice() -> None:
+        env = RemoteEnv(agents[0], connect_timeout=60)
+        for seed in (1, 2):
+            observation, info = env.reset(seed=seed)
+            starts.append((observation.tobytes(), info))
+        env.step(calm(0, 0, 0))
+        done.wait(60)
+        env.close()
+
+    def once() -> None:
+        env = RemoteEnv(agents[1], connect_timeout=60)
+        env.reset(seed=3)
+        env.step(calm(1, 0, 0))
+        done.set()
+        env.close()
+
+    with shared(agents, 2) as running:
+        in_threads([twice, once])
+        running.join()
+        assert (running.simulator.seed, running.simulator.episodes) == (1, 1)
+    assert starts[0] == starts[1]
+
+
+def test_orders_that_the_world_cannot_follow_end_the_session_of_that_agent_alone() -> None:
+    agents, seen = free_ports(2), {}
+
+    def wrong() -> None:
+        env = RemoteVectorEnv(agents[0], connect_timeout=60)
+        env.reset(seed=0)
+        with pytest.raises(PeerClosed, match="orders: expected the same for all 2 drones"):
+            env.advance(np.zeros((2, 1), np.float32), None, None, np.array([True, False]))
+        env.close()
+
+    with shared({agents[0]: ["drone_0", "drone_1"], agents[1]: ["drone_2"]}, 3):
+        in_threads([wrong, lambda: fly_one(agents[1], 2, 1, seen)])
+    nothing = np.zeros(1, np.float32)
+    others = in_process(3, 1, lambda i, *at: action_of(i, *at) if i == 2 else nothing)
+    assert seen == {2: others[2]}
+
+
+def test_a_late_agent_is_told_the_end_of_the_drones_that_were_in_flight() -> None:
+    agents, seen, ends = free_ports(2), {}, []
+    done = threading.Event()
+
+    def late() -> None:
+        env = RemoteVectorEnv(agents[0], connect_timeout=60, autoreset_mode="Disabled")
+        env.reset(seed=0)
+        while not env.out.any():
+            observations, *_, info = env.step(np.array([[1.0], [0.0]], np.float32))
+            last = observations.tobytes(), info["risen"].tolist()
+        assert env.terminated.tolist() == [True, False]
+        done.wait(60)
+        observations, rewards, *flags, info = env.step(np.zeros((2, 1), np.float32))
+        # Its own last moment: the world may be in another episode.
+        assert (observations.tobytes(), info["risen"].tolist()) == last
+        ends.append((rewards.tolist(), *(flag.tolist() for flag in flags)))
+        env.close()
+
+    def other() -> None:
+        fly_one(agents[1], 2, 1, seen, calm)
+        done.set()
+
+    shares = {agents[0]: ["drone_0", "drone_1"], agents[1]: ["drone_2"]}
+    with shared(shares, 3, episode_length=LONG, patience=0.5):
+        in_threads([late, other])
+    assert ends == [([0.0, 0.0], [False, False], [False, True])]
+    assert len(seen[2][0]) == LONG + 1
+
+
+def test_the_command_flies_the_world_of_several_agents() -> None:
+    agents, seen = free_ports(2), {}
+    where = [f"127.0.0.1:{port}" for _, port in agents]
+    command = [sys.executable, "-m", "rotorgram.cli", "sim", "--env", "swarms:swarm/Rise-v0",
+               "--drones", "2", "--bind", "127.0.0.1:0", "--agents", *where]  # fmt: skip
+    pipe, here = subprocess.PIPE, Path(__file__).parents[1]
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, cwd=here) as simulator:
+        in_threads([lambda a=a, i=i: fly_one(a, i, 1, seen) for i, a in enumerate(agents)])
+        out, err = simulator.communicate(timeout=30)
+    assert (simulator.returncode, err) == (0, "")
+    first, closed, *wires = out.splitlines()
+    assert first.startswith("simulating at 127.0.0.1:")
+    assert first.endswith(" for 2 agents (Ctrl-C ends)")
+    assert closed == "the agent closed"
+    assert [wire.split(": ")[0] for wire in wires] == [f"wire to {one}" for one in where]
+    assert seen == in_process(2, 1)
+
+
+def test_a_journal_of_a_part_of_a_world_cannot_be_simulated_and_says_so_briefly(
+    tmp_path: Path,
+) -> None:
+    agents, journal = free_ports(2), tmp_path / "part.mcap"
+
+    def begin(address: tuple[str, int], **settings: Any) -> None:
+        with closing(RemoteVectorEnv(address, connect_timeout=60, **settings)) as env:
+            env.reset(seed=0)
+
+    formation = SharedSimulator("rotorgram/Formation-v0", agents, drones=4, bind=ANY)
+    running = Running(formation)
+    in_threads([lambda: begin(agents[0], record=journal), lambda: begin(agents[1])])
+    assert running.join() == "the agent closed"
+    verdict = Verification(journal)
+    assert not verdict.identical
+    told = str(verdict).splitlines()
+    assert told[1].startswith("  State 1 cannot be repeated: expected an env of the observation (")
+    assert len(told[1]) < 500
+
+
+def test_an_agent_of_each_own_names() -> None:
+    agents, seen = free_ports(2), {}
+    shares = {agents[0]: ["drone_2", "drone_0"], agents[1]: ["drone_1"]}
+    with shared(shares, 3):
+        in_threads([
+            lambda: fly_several(agents[0], ["drone_2", "drone_0"], 1, seen),
+            lambda: fly_one(agents[1], 1, 1, seen),
+        ])  # fmt: skip
+    assert seen == in_process(3, 1, first=201)  # the seed of drone_0
+
+
+def test_an_agent_that_does_not_come_is_named() -> None:
+    there, nowhere = free_ports(2)
+    with shared([there, nowhere], 2, config=LinkConfig(timeout=1.0)) as running:
+        env = RemoteEnv(there, connect=False, connect_timeout=2)
+        with pytest.raises(PeerSilent, match="no simulator came"):
+            env.reset()
+        result = running.join()
+        env.close()
+    assert isinstance(result, PeerSilent)
+    expected = f"no answer from the agent at 127.0.0.1:{nowhere[1]} for 1 s, and the world begins"
+    assert str(result).startswith(expected)
+
+
+def test_who_is_waited_for_is_told_soon(caplog: pytest.LogCaptureFixture) -> None:
+    there, late = free_ports(2)
+    with shared([there, late], 2), closing(RemoteEnv(there, connect=False)) as env:
+        first = threading.Thread(target=env.reset)
+        first.start()
+        while not caplog.messages:
+            assert first.is_alive()
+        with closing(RemoteEnv(late)) as other:
+            other.reset()
+        first.join(60)
+    where = f"127.0.0.1:{late[1]}"
+    assert (
+        caplog.messages[0] == f"no answer from the agent at {where} for 1 s; asking for 60 s in all"
+    )
+
+
+def test_an_agent_that_refuses_is_named() -> None:
+    agents = free_ports(2)
+    with shared(agents, 2) as running:
+        env = RemoteEnv(agents[0], connect=False, env_id="rotorgram/Hover-v0", connect_timeout=2)
+        with pytest.raises(PeerSilent, match="no simulator came"):
+            env.reset()
+        result = running.join()
+        env.close()
+    assert isinstance(result, Refused)
+    assert f"the agent at 127.0.0.1:{agents[0][1]} refused: expected a simulator of" in str(result)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"agents": [("127.0.0.1", i) for i in (1, 2)]},
+         "agents: expected a divisor of 3 drones, got 2 agents"),
+        ({"agents": []}, "agents: expected a divisor of 3 drones, got 0 agents"),
+        ({"agents": [("127.0.0.1", 1)] * 3}, "agents: expected a different address of each"),
+        ({"agents": {("127.0.0.1", 1): ["drone_0", "drone_1"]}},
+         "agents: expected each of drone_0, drone_1, drone_2 once, got drone_0, drone_1"),
+        ({"when_lost": "panic"}, "when_lost: expected one of hold, land, end, got 'panic'"),
+        ({"patience": 0}, "patience: expected seconds > 0, got 0"),
+        ({"env": "rotorgram/Hover-v0"}, "drones: expected 1 with rotorgram/Hover-v0"),
+    ],
+)  # fmt: skip
+def test_wrong_arguments_are_told(changes: dict[str, Any], sentence: str) -> None:
+    given = {"env": RISE, "agents": [("127.0.0.1", 1)], "drones": 3, "bind": ANY, **changes}
+    with pytest.raises(InputError) as told:
+        SharedSimulator(given.pop("env"), given.pop("agents"), **given)
+    assert str(told.value).startswith(sentence)
+
+
+def test_this_side_is_no_agent() -> None:
+    (here,) = free_ports(1)
+    with pytest.raises(InputError, match="agents: expected addresses of agents, got that of this"):
+        SharedSimulator(RISE, [here], drones=1, bind=here)
+    with pytest.raises(InputError, match="server: expected the address of the agent, got that of"):
+        Simulator(server=here, bind=here)
+
+
+def test_a_policy_that_does_not_exist_is_told() -> None:
+    with pytest.raises(InputError, match="when_lost: expected one of hold, land, end, got 'fall'"):
+        RemoteEnv(ANY, connect=False, when_lost="fall")
+
+
+def test_a_landing_drone_comes_down_at_its_speed_and_is_then_out() -> None:
+    loop = Loop(RISE, drones=2, options={"episode_length": 2000})
+    nothing = np.zeros((2, 1), np.float32)
+    loop.advance(nothing, np.ones(2, bool), [1, 1])
+    start = loop.world.state.position.copy()
+    loop.task.outcome = lambda state, told=loop.task.outcome: flying_on(told(state))
+    loop.land(np.array([False, True]))
+    speeds = []
+    while not loop.out[1]:
+        loop.advance(nothing)
+        speeds.append(loop.world.state.velocity[0, 1, 2])
+        assert len(speeds) < 1500
+    assert min(speeds) == pytest.approx(-0.7, abs=0.01)
+    assert loop.world.state.position[0, 1, :2] == pytest.approx(start[0, 1, :2], abs=0.01)
+    assert loop.world.state.position[0, 1, 2] < 1.0
+    assert loop.out.tolist() == [False, True]
+    assert loop.world.state.position[0, 0] == pytest.approx(start[0, 0], abs=1e-9)
+    for _ in range(3):
+        loop.advance(nothing)
+    assert loop.telemetry["thrust"][1].tolist() == [0.0] * 4
+    loop.advance(nothing, np.ones(2, bool), [1, 1])
+    loop.advance(nothing)
+    assert loop.world.state.position[0] == pytest.approx(start[0], abs=1e-9)
+
+
+def flying_on(outcome: Any) -> Any:
+    """Without an end."""
+    object.__setattr__(outcome, "terminated", outcome.terminated & False)
+    return outcome

@@ -1,0 +1,1 @@
+"""Many trainings: runs, comparisons, sweeps, benchmarks, their tables, figures and reports."""
