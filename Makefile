@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PACKAGES := models sim envs udp agents rendering flights training cli
 
-.PHONY: install demo test lint types docs clean
+.PHONY: install demo test test-other-processor test-wheel lint types docs clean
 
 # What trains, draws, reports and records; Ray, Warp and the tools of `make test` are left out.
 install: .venv/.train,record,render,report
@@ -17,6 +17,17 @@ demo: .venv/.train,render,report
 test: lint types docs
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not quiet" -n auto --dist loadfile
 	$(BIN)/python -m pytest -m quiet
+
+# The tests whose numbers depend on the processor, with the instructions of an older one (AVX2, without
+# AVX-512) and in the plainest locale.
+test-other-processor: .venv/.dev
+	OPENBLAS_CORETYPE=Haswell ATEN_CPU_CAPABILITY=avx2 LC_ALL=C OMP_NUM_THREADS=1 \
+	  $(BIN)/python -m pytest -m "not quiet" -n auto --dist loadfile tests/agents tests/sim
+
+# The wheel, installed without extras into an empty environment, flies from a folder outside of the
+# checkout.
+test-wheel: .venv/.dev
+	PYTHON=$(PYTHON) .ci/wheel
 
 lint: .venv/.dev
 	$(BIN)/ruff check

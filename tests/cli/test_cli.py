@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import re
+import shlex
 import shutil
 import signal
 import socket
@@ -265,10 +266,10 @@ def test_a_narrow_terminal(words: list[str]) -> None:
 
 
 def shell(command: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    """A command line, with `rotorgram` for the command."""
-    words = f"{sys.executable} -P -m rotorgram.cli"
+    """Run a line of bash, in which `rotorgram` is the command of this installation."""
+    function = f'rotorgram() {{ {shlex.quote(sys.executable)} -P -m rotorgram.cli "$@"; }}'
     return subprocess.run(
-        ["bash", "-c", "set -o pipefail; " + command.replace("rotorgram", words)],
+        ["bash", "-c", f"set -o pipefail; {function}; {command}"],
         env={**os.environ, **variables},
         capture_output=True,
         text=True,
