@@ -259,7 +259,7 @@ VPG_SETTINGS = [
 ]
 
 
-# SB3 learns from lost steps too; with one drone tests/agents/test_learning.py holds it against ours.
+# SB3 learns from lost steps too; tests/agents/test_learning.py compares it with ours for one drone.
 CASES = [
     *(("a2c", changes, script)
       for changes in A2C_SETTINGS for script in (CALM, CALM[:1], LOSSES, LOSSES[:1])),
