@@ -14,9 +14,9 @@ from typing import Annotated, Any, Final, TypeVar, Union, cast, get_args, get_or
 import tyro
 from tyro.conf import Fixed, Suppress, arg
 
+from ..flights.folders import LOCK, new_folder
 from ..models import Backend
 from ..models.errors import InputError, expect
-from ..training.folders import LOCK, new_folder
 
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
 _WORLD_FLAGS: Final = ("effects", "randomize", "sensors")

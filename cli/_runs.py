@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tyro.conf import arg
 
-from ..training.folders import FolderBusy
+from ..flights.folders import FolderBusy
 from ..training.settings import RunsConfig
 from ._flags import BackendFlags, Command, folder_to_write, go_on_with
 
@@ -83,7 +83,7 @@ def report_comparison(folder: Path, *, film: bool = True) -> None:
     # Only now: if the film fails, there is a report.
     if film and not (folder / VIDEO_FILE).exists():
         try:
-            from ..flights.filming import film_comparison
+            from ..training.films import film_comparison
 
             with frame_bar(VIDEO_FILE) as on_frame:
                 if film_comparison(folder, folder / VIDEO_FILE, on_frame):

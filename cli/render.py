@@ -8,9 +8,9 @@ from typing import Final, Literal
 
 from tyro.conf import Positional
 
+from ..flights.palette import DARK_COLORS, agent_color, agent_label
 from ..flights.trajectories import Trajectory, flown_trajectories, recorded_trajectories
 from ..models.errors import expect
-from ..training.palette import DARK_COLORS, agent_color, agent_label
 from ._flags import EnvFlags, check_count
 
 _ALIKE: Final = ("pid", "geometric", "orca", "random")  # their words tell no two of them apart

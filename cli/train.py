@@ -18,8 +18,8 @@ from tyro.conf import Positional, UseAppendAction, arg
 from ..agents import A2CConfig, AlgorithmName, Episode, load, preset, store
 from ..agents.checkpoints import Checkpoint, software_versions, write_whole
 from ..agents.presets import NETWORKS, PPOConfig, PresetName, VPGConfig, find_preset
+from ..flights.folders import locked
 from ..models.errors import expect, require
-from ..training.folders import locked
 from ..training.settings import Run
 from ._flags import (
     AgentFlags,

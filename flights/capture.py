@@ -23,9 +23,9 @@ from ..models.cameras import View
 from ..models.errors import expect
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
-from ..training.folders import locked
 from ..training.settings import WorkersConfig
 from ..training.workers import OnProgress, Tell, open_workers
+from .folders import locked
 from .viewpoints import Plan, Walk
 
 LABELS: Final = "labels"

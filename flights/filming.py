@@ -1,30 +1,22 @@
 """Films of trajectories: a frame shows the control step of its time; several side by side."""
 
-import logging
 import math
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-from ..agents import CONTROLLERS
-from ..agents.checkpoints import load
-from ..agents.policies import Policy
 from ..envs.rendering import moment
 from ..models import parse_world
 from ..models.errors import InputError, expect
-from ..rendering import Camera, Canvas, MetricValue, Moment, NoOpenGL, Stage
+from ..rendering import Camera, Canvas, MetricValue, Moment, Stage
 from ..rendering.film import QUALITY, Overlay, check_film, graph_scale, write_film
-from ..training.palette import agent_color
-from ..training.swarms import least
-from .trajectories import Trajectory, flown_trajectories
-
-if TYPE_CHECKING:
-    from ..training.results import Results
+from .distances import least
+from .trajectories import Trajectory
 
 OnFrame = Callable[[int, int], object]
 """Called with frames drawn, and frames in all."""
@@ -258,58 +250,3 @@ def _scale(shots: Sequence[Shot]) -> tuple[float, float]:
     ends = [1 if crash and not all(crashed) else None for crash in crashed]
     shown = [one.headline[:end] for one, end in zip(flown, ends, strict=True)]
     return graph_scale(np.concatenate(shown).tolist())
-
-
-# ---- the film of a comparison
-
-
-def film_comparison(
-    folder: Path, out: Path, on_frame: OnFrame = lambda *_: None, *, world: str = "airport"
-) -> bool:
-    """Film a comparison: each agent and the controller, the same episode side by side.
-
-    `metrics.shown_runs` says which seeds and which episode.
-
-    The folder is one that `rotorgram compare` wrote; a film that exists is replaced. Returns
-    whether there is a film: without OpenGL there is none, and a line in the log says why.
-
-    Raises:
-        InputError: The folder is not a comparison's.
-        OSError: The film cannot be written.
-    """
-    from ..training.results import read_results
-
-    results = read_results(folder)
-    vehicle = results.config["vehicle"]
-    # Small enough for a page that holds the film in itself.
-    camera: Camera = "top" if len(results.spec.agents) > 1 else "front"  # no craft hides another
-    config = Film(height=400, camera=camera, fast=True, quality=27, world=world, vehicle=vehicle)
-    fresh = out.with_name(f".fresh-{out.name}")
-    fresh.unlink(missing_ok=True)
-    try:
-        film(fresh, _comparison_shots(folder, results), config, on_frame)
-    except NoOpenGL as error:
-        logging.getLogger(__name__).info("no film of the agents: %s", error)
-        return False
-    fresh.replace(out)
-    return True
-
-
-def _comparison_shots(folder: Path, results: "Results") -> list[Shot]:
-    from ..training.metrics import run_label, shown_runs
-
-    spec, vehicle = results.spec, results.config["vehicle"]
-    seeds, episode = shown_runs(results.evaluations, results.headline)
-    shots, drones = [], len(spec.agents)
-    for agent, seed in seeds.items():
-        name = run_label(results.evaluations, agent, seed)
-        file = folder / "checkpoints" / f"{agent}-seed{seed}.safetensors"
-        controller = CONTROLLERS.get(agent)
-        policy: Policy = controller(spec) if controller else load(file).policy()
-        flown = flown_trajectories(
-            policy, spec.env_id, spec.options, [episode],
-            vehicle=vehicle, of="final", drones=drones,
-        )  # fmt: skip
-        color = agent_color(agent, dark=True)
-        shots.append(Shot(name=name, color=color, trajectories=flown, drones=drones))
-    return shots

@@ -30,8 +30,8 @@ import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401  # makes the envs known
 from measuring import RESULTS, medians, options, write
+from rotorgram.flights.folders import new_folder
 from rotorgram.training.compare import compare
-from rotorgram.training.folders import new_folder
 from rotorgram.training.settings import CompareConfig
 from rotorgram.udp import RemoteVectorEnv
 

@@ -29,11 +29,11 @@ from ..agents.checkpoints import Checkpoint, store
 from ..envs import LocalVectorEnv
 from ..envs.registry import env_spec
 from ..envs.spec import EnvSpec
+from ..flights.folders import locked
 from ..models.errors import InputError, expect
 from . import results
 from .bounds import known_bounds
 from .evaluations import Stage, evaluate_stages, stages_of
-from .folders import locked
 from .metrics import Headline, final_per_run, first_lasting_snapshot
 from .pairs import shared_pair
 from .results import CONFIG_FILE, ResultsError

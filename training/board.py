@@ -18,9 +18,9 @@ import numpy as np
 import pandas as pd
 
 from ..agents.checkpoints import write_whole
+from ..flights.palette import agent_label
 from .benchmark import SEEDS_FILE, Board, checkpoint_file, read_board
 from .metrics import Headline
-from .palette import agent_label
 from .results import CONFIG_FILE
 from .settings import BoardRow
 from .statistics import (

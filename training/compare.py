@@ -11,12 +11,12 @@ from ..agents import CONTROLLERS
 from ..agents.checkpoints import Checkpoint, store
 from ..envs.registry import env_spec
 from ..envs.spec import EnvSpec
+from ..flights.folders import locked
 from ..models.errors import InputError
 from ..models.fleet import load_vehicles
 from . import results, swarms
 from .bounds import known_bounds
 from .evaluations import Stage, evaluate_stages, stages_of
-from .folders import locked
 from .metrics import Headline
 from .pairs import shared_pair
 from .results import CONFIG_FILE, ResultsError

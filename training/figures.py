@@ -22,13 +22,14 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import EngFormatter
 
+from ..flights.distances import nearest
+from ..flights.palette import agent_color, agent_label, sort_agents
 from ..rendering.stage import DRONE_COLORS, MOST_NAMES
 from . import metrics
 from .metrics import Curve, Headline, Spread
-from .palette import agent_color, agent_label, sort_agents
 from .results import Results, read_steps
 from .statistics import Floats, iqm
-from .swarms import World, distance_curves, nearest, worlds
+from .swarms import World, distance_curves, worlds
 
 AVERAGING_SHARE: Final = 0.05
 """Share of training over which the average reward is a running mean."""

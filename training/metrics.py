@@ -20,8 +20,8 @@ import numpy.typing as npt
 import pandas as pd
 
 from ..envs.spec import EnvSpec, Metric
+from ..flights.palette import agent_label, sort_agents
 from ..models.errors import InputError
-from .palette import agent_label, sort_agents
 from .statistics import Floats, Values, bootstrap_interval, iqm, trimmed_mean
 
 _MEASURES: Final = ("steady", "settling_time", "overshoot", "return")

@@ -25,12 +25,12 @@ from rich.table import Table
 from rich.text import Text
 
 from ..envs.spec import canonical_id
+from ..flights.palette import agent_color, agent_label, sort_agents
 from ..models.errors import MissingPackage
 from ..rendering.film import poster
 from .claims import MIN_SEEDS, OURS, Outcome, Verdict, judge_claims, judge_no_worse
 from .figures import AVERAGING_SHARE, SWARM_FIGURE, Curves, draw_figures, make_curves
 from .metrics import Headline, Spread, results_table
-from .palette import agent_color, agent_label, sort_agents
 from .results import Results, read_results
 from .swarms import least_distances
 

@@ -18,9 +18,9 @@ import pandas as pd
 
 from ..agents.checkpoints import write_whole
 from ..envs.registry import env_spec
+from ..flights.folders import locked
 from . import results
 from .evaluations import evaluate_stages, stages_of
-from .folders import locked
 from .metrics import Headline, final_per_run
 from .pairs import shared_pair
 from .results import CONFIG_FILE, ResultsError

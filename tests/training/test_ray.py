@@ -15,10 +15,10 @@ import pandas as pd
 import pytest
 from rotorgram.agents.checkpoints import load, software_versions
 from rotorgram.flights.capture import capture
+from rotorgram.flights.folders import new_folder
 from rotorgram.flights.viewpoints import Plan
 from rotorgram.training import workers as module
 from rotorgram.training.compare import compare
-from rotorgram.training.folders import new_folder
 from rotorgram.training.results import read_results, read_steps
 from rotorgram.training.settings import CompareConfig, SweepConfig, WorkersConfig
 from rotorgram.training.sweep import read_sweep_runs, sweep

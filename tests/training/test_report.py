@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 from comparisons import GATES, HEADLINE, spec_of, synthetic_folder
 from rich.console import Console
+from rotorgram.flights.palette import agent_color, agent_label, sort_agents
 from rotorgram.training.figures import FIGURE_FILES, draw_figures, make_curves
 from rotorgram.training.metrics import Headline
-from rotorgram.training.palette import agent_color, agent_label, sort_agents
 from rotorgram.training.report import (
     VIDEO_FILE,
     headings,

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from comparisons import HEADLINE, synthetic_folder
+from rotorgram.flights.palette import agent_color
 from rotorgram.rendering.film import poster, write_film
 from rotorgram.training.figures import (
     FIGURE_FILES,
@@ -26,7 +27,6 @@ from rotorgram.training.figures import (
     value_fan,
 )
 from rotorgram.training.metrics import Spread
-from rotorgram.training.palette import agent_color
 from rotorgram.training.report import (
     MAX_POINTS,
     VIDEO_FILE,

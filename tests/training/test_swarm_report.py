@@ -10,9 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 from comparisons import HEADLINE, PERIOD, spec_of, synthetic_folder
 from rotorgram.cli import main
-from rotorgram.flights import filming
+from rotorgram.flights.distances import least, nearest
 from rotorgram.flights.filming import Film, Shot
 from rotorgram.flights.trajectories import Trajectory
+from rotorgram.training import films
 from rotorgram.training.compare import read_compare_config
 from rotorgram.training.figures import SWARM_FIGURE, pick_trajectories
 from rotorgram.training.metrics import shown_runs
@@ -22,9 +23,7 @@ from rotorgram.training.swarms import (
     GOAL,
     POSITION,
     distance_curves,
-    least,
     least_distances,
-    nearest,
     rows_of,
     worlds,
 )
@@ -222,6 +221,6 @@ def test_a_comparison_of_several_drones(tmp_path: Path, monkeypatch: pytest.Monk
         filmed.append(config.camera)
         return 1
 
-    monkeypatch.setattr(filming, "film", film)
-    assert filming.film_comparison(folder, tmp_path / "film.mp4")
+    monkeypatch.setattr(films, "film", film)
+    assert films.film_comparison(folder, tmp_path / "film.mp4")
     assert filmed == [("IPPO", 2, 2), ("ORCA", 2, 2), "top"]

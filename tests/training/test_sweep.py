@@ -18,10 +18,10 @@ from comparisons import GATES, HEADLINE, spec_of
 from rotorgram.agents import preset
 from rotorgram.cli import main
 from rotorgram.cli.sweep import parse_grid
-from rotorgram.flights import filming
+from rotorgram.flights.folders import locked
 from rotorgram.flights.trajectories import evaluation_seed
+from rotorgram.training import films
 from rotorgram.training.compare import compare, read_compare_config
-from rotorgram.training.folders import locked
 from rotorgram.training.metrics import Headline
 from rotorgram.training.results import CONFIG_KEYS, ResultsError
 from rotorgram.training.settings import CompareConfig, Run, SweepConfig, WorkersConfig
@@ -137,8 +137,8 @@ def test_a_comparison_of_swarms_goes_on_and_is_filmed_with_all_drones(
         filmed.extend(shots)
         fresh.touch()
 
-    monkeypatch.setattr(filming, "film", film)
-    assert filming.film_comparison(tmp_path, tmp_path / "film.mp4")
+    monkeypatch.setattr(films, "film", film)
+    assert films.film_comparison(tmp_path, tmp_path / "film.mp4")
     assert len(filmed) == 2  # ORCA flies beside
     for shot in filmed:
         assert [len(drones) for drones in shot.episodes] == [2]

@@ -7,13 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from rotorgram.training import folders
-from rotorgram.training.folders import locked, new_folder
+from rotorgram.flights import folders
+from rotorgram.flights.folders import locked, new_folder
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from rotorgram.training.folders import locked
+from rotorgram.flights.folders import locked
 with locked(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
