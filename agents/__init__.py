@@ -19,7 +19,6 @@ from .presets import (
     PRESETS,
     A2CConfig,
     AlgorithmName,
-    APGConfig,
     Config,
     PPOConfig,
     SACConfig,
@@ -41,7 +40,7 @@ CONTROLLERS: Final[dict[str, type[PID] | type[Geometric] | type[Orca]]] = {
 """Agents that need no training, made of an env's spec."""
 
 __all__ = [
-    "CONTROLLERS", "PID", "PRESETS", "A2CConfig", "APGConfig", "AlgorithmName", "Checkpoint",
+    "CONTROLLERS", "PID", "PRESETS", "A2CConfig", "AlgorithmName", "Checkpoint",
     "CheckpointError", "Episode", "EpisodeLog", "Geometric", "NetworkPolicy", "Orca", "PPOConfig",
     "Policy", "ResumeError", "SACConfig", "VPGConfig", "episode_seed", "load", "make_agent",
     "preset", "resume_agent", "start_agent", "store",
@@ -60,10 +59,6 @@ def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> "A
             from .vpg import VPG
 
             return VPG(log, config, seed)
-        case "apg", APGConfig():
-            from .apg import APG
-
-            return APG(log, config, seed)
         case "ppo" | "ippo", PPOConfig():
             from .ppo import PPO
 
@@ -94,7 +89,7 @@ def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> "A
     )
 
 
-_ALIKE: Final = {"vpg", "a2c", "ppo", "ippo", "mappo", "apg"}
+_ALIKE: Final = {"vpg", "a2c", "ppo", "ippo", "mappo"}
 """Algorithms whose policies are the same network."""
 
 
@@ -103,8 +98,8 @@ def start_agent(
 ) -> "Agent":
     """A new agent that begins with the networks of a checkpoint; all else of it is fresh.
 
-    The checkpoint is of the same algorithm; `vpg`, `a2c`, `ppo`, `ippo`, `mappo` and `apg` take
-    each other's policy too, and `a2c`, `ppo` and `ippo` each other's critic. Its task, vehicle and
+    The checkpoint is of the same algorithm; `vpg`, `a2c`, `ppo`, `ippo` and `mappo` take each
+    other's policy too, and `a2c`, `ppo` and `ippo` each other's critic. Its task, vehicle and
     effects may be others, its observation and action may not.
 
     Raises:

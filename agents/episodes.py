@@ -163,15 +163,13 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def advance(
         self, sent: Any, begins: np.ndarray | None = None, frozen: np.ndarray | None = None
     ) -> None:
-        """The same with actions of the env, shape (N, k), or (N,) if discrete; or with a tensor, to
-        an env that takes those.
-        """
+        """The same with actions of the env, shape (N, k), or (N,) if discrete."""
         env, seeds, idle = self.env, None, self._idle(frozen)
         if begins is not None:
             self._number(begins)
             seeds, idle = self._seeds, begins if idle is None else begins | idle
         env.advance(sent, begins, seeds, frozen)
-        self._flown.append(sent.detach().numpy() if hasattr(sent, "detach") else sent)
+        self._flown.append(sent)
         self._keep_step(idle)
         self.env_steps += self.num_envs - (0 if idle is None else int(np.count_nonzero(idle)))
         ended = env.terminated | env.truncated

@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 from ..models.errors import expect
 
 AlgorithmName = Literal[
-    "vpg", "a2c", "ppo", "ippo", "mappo", "sac", "apg", "sb3-a2c", "sb3-ppo", "sb3-sac"
+    "vpg", "a2c", "ppo", "ippo", "mappo", "sac", "sb3-a2c", "sb3-ppo", "sb3-sac"
 ]
 PresetName = Literal["paper", "tuned"]
 
@@ -26,14 +26,14 @@ def _is_count(value: Any) -> bool:
 
 
 _RULES: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
-    ("episodes_per_update steps_per_update epochs minibatches horizon gradient_steps batch_size"
+    ("episodes_per_update steps_per_update epochs minibatches gradient_steps batch_size"
      " buffer_size learning_starts", "a whole number, 1 or more", _is_count),
     ("hidden", "whole numbers, 1 or more, one a layer",
      lambda value: len(value) > 0 and all(map(_is_count, value))),
     ("activation", "'relu' or 'tanh'", lambda value: value in ("relu", "tanh")),
     ("gamma gae_lambda", "a number from 0 to 1", lambda value: _is_number(value, 0, 1)),
     ("clip max_grad_norm", "a number above 0", lambda value: _is_number(value, 5e-324)),
-    ("vf_coef ent_coef crash_cost", "a number, 0 or more", lambda value: _is_number(value, 0)),
+    ("vf_coef ent_coef", "a number, 0 or more", lambda value: _is_number(value, 0)),
     ("anneal normalize normalize_observations", "true or false", lambda value: type(value) is bool),
     ("tau", "a number above 0, to 1", lambda value: _is_number(value, 5e-324, 1)),
     ("target_entropy", "a number, or null",
@@ -185,46 +185,9 @@ class SACConfig(_Config):
         return -(-self.steps_per_update // drones) * drones
 
 
-@dataclass(frozen=True, kw_only=True)
-class APGConfig(_Config):
-    """Analytic policy gradient, on the backend `rigid`. Defaults are ours."""
-
-    hidden: tuple[int, ...] = (64, 64)
-    """Units of each hidden layer."""
-    activation: Literal["relu", "tanh"] = "tanh"
-    """Of the hidden units."""
-    learning_rate: float = 0.005
-    """Of Adam."""
-    anneal: bool = True
-    """Lower the learning rate linearly to zero over the run."""
-    normalize_observations: bool = True
-    """Shift and scale each observation by its mean and deviation until now."""
-    horizon: int = 64
-    """Steps of each drone that an update looks through."""
-    tail: int = 20
-    """Last steps of these, and before a truncation, whose actions move no weight: their
-    consequences are not seen."""
-    minibatches: int = 6
-    """Parts of the other steps, each for one step of Adam."""
-    crash_cost: float = 20.0
-    """Reward that an episode's termination counts as less, smoothed over states that are near."""
-    max_grad_norm: float = 1.0
-    """The gradient, as one vector, is scaled down to this length."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        right = type(self.tail) is int and 0 <= self.tail < self.horizon
-        expected = f"a whole number from 0, below horizon ({self.horizon})"
-        expect(right, "tail", expected, f"{self.tail!r}")
-
-    def rollout_size(self, drones: int) -> int:
-        """Env steps between updates: `horizon` of each drone."""
-        return self.horizon * drones
-
-
 NETWORKS: Final = ("hidden", "activation", "normalize_observations")
 """Hyperparameters that all have, which say what networks there are."""
-Config = VPGConfig | A2CConfig | PPOConfig | SACConfig | APGConfig
+Config = VPGConfig | A2CConfig | PPOConfig | SACConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,13 +227,10 @@ _SACS: Final = {
         env_steps=30_000,
     )
 }  # fmt: skip
-_APGS: Final = {
-    "tuned": Preset(config=APGConfig(), num_envs=512, env_steps=1_200_000, backend="rigid")
-}
 # The references get the very same settings: only the implementation differs.
 PRESETS: Final[dict[str, dict[str, Preset]]] = {
     "vpg": _VPG, "a2c": _A2C, "ppo": _PPOS, "ippo": _PPOS, "mappo": _PPOS, "sac": _SACS,
-    "apg": _APGS, "sb3-a2c": _A2C, "sb3-ppo": _PPOS, "sb3-sac": _SACS,
+    "sb3-a2c": _A2C, "sb3-ppo": _PPOS, "sb3-sac": _SACS,
 }  # fmt: skip
 """By algorithm and name: of the paper's task, and of all others that `_OF_TASKS` does not have."""
 _HOVER: Final = PPOConfig(

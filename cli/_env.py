@@ -162,21 +162,6 @@ def remote_env(
 
 
 @contextmanager
-def local_env(
-    command: AgentFlags, env_id: str, options: dict[str, Any], num_envs: int, backend: str
-) -> Iterator[Any]:
-    """A vector env in this process, without autoreset. Raises `InputError` for others' flags."""
-    given = [name for name in ("listen", "key_file", "insecure", "record") if name in command.given]
-    expect(not given, ", ".join(given), "no flags of the wire: derivatives do not cross it", "them")
-    from ..envs.vector import LocalVectorEnv
-
-    settings: Any = {"vehicle": command.vehicle, "backend": backend, **options}
-    settings["gradients"] = backend == "rigid"
-    with closing(LocalVectorEnv(env_id, num_envs, autoreset_mode="Disabled", **settings)) as env:
-        yield env
-
-
-@contextmanager
 def _waiting(
     command: AgentFlags, listen: str, num_envs: int | None, num_simulators: int, **settings: Any
 ) -> Iterator[RemoteEnv | RemoteVectorEnv]:

@@ -23,7 +23,6 @@ class Sweep(RunsFlags):
     """
 
     algorithm: Positional[AlgorithmName]
-    """One that learns over the wire: any but apg."""
     grid: UseAppendAction[
         Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE,... ...")]
     ] = ()

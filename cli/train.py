@@ -52,7 +52,7 @@ class Train(AgentFlags, BackendFlags):
     """
 
     algorithm: Positional[AlgorithmName]
-    """vpg, a2c, ppo, ippo, mappo, sac, apg, sb3-a2c, sb3-ppo or sb3-sac."""
+    """vpg, a2c, ppo, ippo, mappo, sac, sb3-a2c, sb3-ppo or sb3-sac."""
     preset: PresetName = "tuned"
     """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
     set: UseAppendAction[Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE …")]] = ()
@@ -79,7 +79,7 @@ class Train(AgentFlags, BackendFlags):
     def run(self) -> int:
         """Train by these settings, or by those of the folder to resume."""
         require("tensorboard", "train", "training")
-        if self.algorithm.startswith("sb3-") or self.algorithm == "apg":
+        if self.algorithm.startswith("sb3-"):
             require("torch", "train", self.algorithm)
         right = 0 < self.store_every < math.inf
         expect(right, "store-every", "seconds > 0", str(self.store_every))
@@ -151,12 +151,9 @@ class Train(AgentFlags, BackendFlags):
                 return self._train(Training.resume(kept, env), folder)
 
     def _env(self, env_id: str, options: dict[str, Any], **settings: Any) -> Any:
-        """The env of the training, over the wire; of apg in this process."""
-        from ._env import local_env, remote_env
+        """The env of the training, over the wire."""
+        from ._env import remote_env
 
-        if self.algorithm == "apg":
-            expect(settings["drones"] == 1, "drones", "1 with apg", f"{settings['drones']}")
-            return local_env(self, env_id, options, settings["num_envs"], settings["backend"])
         return remote_env(self, env_id, options, num_simulators=self.num_simulators, **settings)
 
     def _train(self, training: "Training", folder: Path) -> int:

@@ -5,7 +5,7 @@ from typing import Final
 
 _LABELS: Final = {
     "vpg": "VPG", "a2c": "A2C", "ppo": "PPO", "ippo": "IPPO", "mappo": "MAPPO", "sac": "SAC",
-    "apg": "APG", "sb3-a2c": "SB3 A2C", "sb3-ppo": "SB3 PPO", "sb3-sac": "SB3 SAC", "pid": "PID",
+    "sb3-a2c": "SB3 A2C", "sb3-ppo": "SB3 PPO", "sb3-sac": "SB3 SAC", "pid": "PID",
     "geometric": "Geometric", "orca": "ORCA",
 }  # fmt: skip
 # Okabe and Ito's palette: told apart by readers with colour-blindness. The second of a pair is the

@@ -15,7 +15,6 @@ import json
 import re
 import tomllib
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, closing
 from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
@@ -26,7 +25,6 @@ import pandas as pd
 
 from ..agents import CONTROLLERS
 from ..agents.checkpoints import Checkpoint, store
-from ..envs import LocalVectorEnv
 from ..envs.registry import env_spec
 from ..envs.spec import EnvSpec
 from ..flights.folders import locked
@@ -107,22 +105,13 @@ def checkpoint_file(folder: Path, row: BoardRow) -> Path:
     return folder / CHECKPOINTS / f"{name}.safetensors"
 
 
-def _training_env(row: BoardRow) -> AbstractContextManager[Any]:
-    """Over the wire; of apg in this process, for derivatives do not cross the wire."""
-    if row.agent != "apg":
-        return shared_pair(**row.training_env, num_envs=row.num_envs)
-    settings: Any = {"vehicle": row.vehicle, "backend": row.backend, "gradients": True}
-    return closing(LocalVectorEnv(row.env_id, row.num_envs, autoreset_mode="Disabled", **settings,
-                                  **row.options))  # fmt: skip
-
-
 def _fly(config: BenchmarkConfig, job: Job, tell: Tell) -> _Done:
     """Train and evaluate (in a worker process)."""
     row, seed = job
     times: dict[str, Any] = {"env_steps": 0, "seconds": 0.0, "steps_per_second": np.nan}
     stages, checkpoint = [Stage(CONTROLLERS[row.agent])] if row.controller else [], None
     if not row.controller:
-        with _training_env(row) as env:
+        with shared_pair(**row.training_env, num_envs=row.num_envs) as env:
             training, times = train_run(row.run(seed), env, tell, config.snapshots)
         stages, checkpoint = stages_of(training.taken), training.checkpoint()
     rows, flown = evaluate_stages(row, stages, config.episodes, config.curve_episodes)

@@ -14,7 +14,6 @@ from ..agents import CONTROLLERS
 from ..agents.presets import (
     PRESETS,
     A2CConfig,
-    APGConfig,
     Config,
     PresetName,
     SACConfig,
@@ -88,7 +87,7 @@ class Run(EnvConfig):
         whole = self.num_envs % self.drones == 0
         expect(whole, "num_envs", f"a multiple of drones = {self.drones}", str(self.num_envs))
         least = 1
-        if isinstance(self.config, A2CConfig | SACConfig | APGConfig):
+        if isinstance(self.config, A2CConfig | SACConfig):
             least = self.config.rollout_size(self.num_envs)
         elif self.num_envs > 1:  # a whole episode of each
             least = self.num_envs * int(self.options.get("episode_length", 1))
@@ -171,7 +170,6 @@ class _ManyRuns(RunsConfig, EnvConfig):
         return kept | {"seeds": len(seeds), "first_seed": seeds[0]}
 
     def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:
-        expect(algorithm != "apg", "agent", "one that learns over the wire", algorithm)
         shared = {"env_steps": self.env_steps, "num_envs": self.num_envs, **self.training_env}
         config = preset(algorithm, self.preset, self.env_id, **changes)
         return Run(algorithm=algorithm, config=config, seed=seed, **shared)
@@ -328,7 +326,6 @@ class SweepConfig(_ManyRuns):
     """Settings of a sweep and its workers. Its seeds are not those of a comparison."""
 
     algorithm: str
-    """Any but `apg`, which does not learn over the wire."""
     grid: Mapping[str, tuple[Any, ...]]
     """Values of hyperparameters, by name: every combination is a point."""
     seeds: int = 3

@@ -114,7 +114,7 @@ def test_what_does_not_fit_is_one_sentence() -> None:
     for changes, sentence in (
         ({"algorithm": "sac"}, "start-from: expected a training of sac, got ppo"),
         ({"start": kept.policy_alone()}, "start-from: expected the checkpoint of a training, got"),
-        ({"start": trained("sac")}, "start-from: expected a training of a2c, apg, ippo, mappo,"),
+        ({"start": trained("sac")}, "start-from: expected a training of a2c, ippo, mappo,"),
         ({"hidden": (8,)}, r"hidden: expected \(16,\) of the training to start from, got \(8,\)"),
         (
             {"options": {**SHORT, "observation": "error"}},

@@ -241,7 +241,6 @@ def test_a_share_of_one_scores_one() -> None:
         ('[[row]]\nagent = "lqg"', "agent: expected one of pid, "),
         ('[[row]]\nagent = "a2c"\n[[row]]\nagent = "a2c"', "row: expected each row once, got a2c"),
         ('[[row]]\nagent = "a2c"\nenv_id = "x/Y-v0"', "env_id: expected a registered id"),
-        ('[[row]]\nagent = "apg"\nenv_steps = 9', "env_steps: expected at least"),
         ('[[row]]\nagent = "a2c"\ncolour = 1', "row 1: expected some of env_id, options, vehicle"),
         ("[[row]]\nnum_envs = 8", "row 1: expected an agent, got none"),
         ('[[row]]\nagent = "a2c"\nenv_steps = "a"', "env_steps: expected a whole number, got 'a'"),
@@ -313,19 +312,6 @@ def test_the_committed_policies_fly_the_committed_numbers() -> None:
         # Another processor may round otherwise.
         wanted = first["steady"], first["return"]
         assert found == pytest.approx(wanted, rel=0.02, abs=1e-3), row.name
-
-
-def test_a_row_of_apg_trains_in_process_on_rigid(tmp_path: Path) -> None:
-    options = {"episode_length": 40}
-    row = BoardRow(agent="apg", env_steps=128, num_envs=2, options=options)
-    assert row.backend == "rigid"
-    config = BenchmarkConfig(rows=(row,), seeds=1, snapshots=1, curve_episodes=1, episodes=2,
-                             jobs=1)  # fmt: skip
-    benchmark(config, tmp_path, "rotorgram benchmark", nothing)
-    board = read_board(tmp_path)
-    (first,) = board.seeds.to_dict("records")
-    assert (first["env_steps"], first["episodes"]) == (128, 2)
-    assert measured(board, tmp_path, row) == pytest.approx((first["steady"], first["return"]))
 
 
 def test_a_controller_brings_its_options() -> None:
