@@ -51,7 +51,7 @@ COMMANDS: Final = {
 """Class of each command, in the module of the command's name."""
 
 EXTRAS: Final = {
-    "train": ("torch", "stable_baselines3", "tensorboard", "safetensors", "joblib", "pandas",
+    "train": ("torch", "stable_baselines3", "tensorboard", "safetensors", "pandas",
               "pyarrow", "scipy"),
     "record": ("mcap",),
     "render": ("PIL", "imageio_ffmpeg"),

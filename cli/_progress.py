@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, Task, TextColumn
 from rich.table import Column
 from rich.text import Text
 
-from ..training.workers import OnProgress
+from ..flights.executors import OnProgress
 
 _LINE_EVERY: Final = 10.0  # s
 _RATE_OVER: Final = 10.0  # s: the rate is that of so long a time up to now

@@ -33,6 +33,7 @@ class Benchmark(FolderFlags, WorkersConfig):
 
     def run(self) -> int:
         """Train, evaluate, write the page."""
+        from ..flights.executors import RunsFailed
         from ..training.benchmark import (
             BOARD,
             benchmark,
@@ -40,7 +41,6 @@ class Benchmark(FolderFlags, WorkersConfig):
             read_board,
             read_rows_file,
         )
-        from ..training.workers import RunsFailed
 
         if self.resume:
             refuse_settings(self, self.resume, free=("page", *RESUMED))

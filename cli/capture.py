@@ -23,18 +23,18 @@ class Capture(Command):
     """Folder to write to: a new one, or one of the same plan to go on with."""
     jobs: int | None = None
     """Workers. Default: one for each core of this machine, or of the cluster."""
-    runner: Literal["loky", "ray"] = "loky"
-    """loky: processes of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
+    runner: Literal["processes", "ray"] = "processes"
+    """processes: of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
     address: str | None = None
     """The cluster's: ray://HOST:PORT of its client server, or HOST:PORT on one of its machines."""
 
     def run(self) -> int:
         """Take them; say where and how many."""
         from ..flights.capture import capture
+        from ..flights.executors import WorkersConfig
         from ..flights.viewpoints import Plan
         from ..models.errors import expect
         from ..rendering.gl import offscreen_context
-        from ..training.settings import WorkersConfig
         from ._progress import bars
 
         expect(self.out.name, "out", "the name of a folder", repr(str(self.out)))

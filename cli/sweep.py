@@ -35,8 +35,8 @@ class Sweep(RunsFlags):
 
     def run(self) -> int:
         """Sweep, and print the table."""
+        from ..flights.executors import RunsFailed
         from ..training.sweep import sweep
-        from ..training.workers import RunsFailed
 
         if self.resume:
             config = self._resumed(self.resume)

@@ -23,8 +23,7 @@ from ..models.cameras import View
 from ..models.errors import expect
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
-from ..training.settings import WorkersConfig
-from ..training.workers import OnProgress, Tell, open_workers
+from .executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
 from .folders import locked
 from .viewpoints import Plan, Walk
 
@@ -84,8 +83,9 @@ def capture(
             for job in _jobs(plan, walks, views, folder, config.jobs or os.cpu_count() or 1)
         }
         if jobs:
-            with open_workers(config, on_progress) as workers:
-                workers.fly_all(_take, jobs, lambda _, frames: _write(folder, frames))
+            with open_executor(config, len(jobs), on_progress) as executor:
+                keep = lambda _, frames: _write(folder, frames)  # noqa: E731
+                run_jobs(executor, _take, jobs, keep, on_progress)
         write_formats(plan, walks, folder)
     return sum(map(len, walks))
 

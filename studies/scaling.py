@@ -10,7 +10,7 @@
 
       M * 1024 / (t_physics + M * t_agent + round trip of the network)
 
-* **runs**: one comparison of four trainings, by one worker, by two processes (loky) and by two
+* **runs**: one comparison of four trainings, by one worker, by two processes and by two
   workers of a Ray cluster (two nodes on this machine, started before the clock). Left out where
   there is no Ray.
 """
@@ -133,7 +133,7 @@ def measure_runs(env_steps, rounds):
     config = CompareConfig(
         agents=("a2c",), seeds=4, env_steps=env_steps, snapshots=1, curve_episodes=1, episodes=1,
     )  # fmt: skip
-    ways = {"one worker": replace(config, jobs=1), "two, loky": replace(config, jobs=2)}
+    ways = {"one worker": replace(config, jobs=1), "two processes": replace(config, jobs=2)}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         if find_spec("ray"):

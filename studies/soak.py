@@ -14,13 +14,13 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401
-from joblib import Parallel, delayed
 from measuring import RESULTS, launch, options, write
 from rotorgram.udp import RemoteVectorEnv
 from rotorgram.udp.protocol.auth import write_key
@@ -114,7 +114,8 @@ def main() -> None:
     many = args.steps // 20
     each = -(-(args.steps - many) // (args.jobs - 1))
     kinds = [(each, 1, job == args.jobs - 2) for job in range(args.jobs - 1)] + [(many, 64, False)]
-    jobs = Parallel(n_jobs=args.jobs)(delayed(soak)(job, *kind) for job, kind in enumerate(kinds))
+    with ProcessPoolExecutor(args.jobs) as executor:
+        jobs = list(executor.map(soak, range(len(kinds)), *zip(*kinds, strict=True)))
     network: Counter[str] = Counter()
     for job in jobs:
         network.update(job["network"])

@@ -27,6 +27,7 @@ from ..agents import CONTROLLERS
 from ..agents.checkpoints import Checkpoint, store
 from ..envs.registry import env_spec
 from ..envs.spec import EnvSpec
+from ..flights.executors import OnProgress, Tell, open_executor, run_jobs
 from ..flights.folders import locked
 from ..models.errors import InputError, expect
 from . import results
@@ -38,7 +39,6 @@ from .results import CONFIG_FILE, ResultsError
 from .rows import adding_rows, read_rows
 from .settings import BenchmarkConfig, BoardRow
 from .training import train_run
-from .workers import OnProgress, Tell, open_workers
 
 SEEDS_FILE: Final = "seeds.csv"
 CHECKPOINTS: Final = "checkpoints"
@@ -78,7 +78,8 @@ def benchmark(config: BenchmarkConfig, folder: Path, command: str, on_progress: 
 
     Arguments and errors are those of `compare.compare`.
     """
-    with open_workers(config, on_progress) as workers, locked(folder):
+    runs = len(config.runs())
+    with open_executor(config, runs, on_progress) as executor, locked(folder):
         if not (folder / CONFIG_FILE).exists():  # a resumed board keeps its settings
             results.write_settings(folder, command, _content(config))
         done = read_seeds(folder, config)
@@ -90,7 +91,8 @@ def benchmark(config: BenchmarkConfig, folder: Path, command: str, on_progress: 
                 store(given.checkpoint.policy_alone(), checkpoint_file(folder, row))
             add(given.row)
 
-        workers.fly_all(partial(_fly, config), missing_seeds(config, done), keep)
+        fly, jobs = partial(_fly, config), missing_seeds(config, done)
+        run_jobs(executor, fly, jobs, keep, on_progress)
 
 
 def missing_seeds(config: BenchmarkConfig, rows: pd.DataFrame) -> dict[str, Job]:

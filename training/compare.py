@@ -11,6 +11,7 @@ from ..agents import CONTROLLERS
 from ..agents.checkpoints import Checkpoint, store
 from ..envs.registry import env_spec
 from ..envs.spec import EnvSpec
+from ..flights.executors import OnProgress, Tell, open_executor, run_jobs
 from ..flights.folders import locked
 from ..models.errors import InputError
 from ..models.fleet import load_vehicles
@@ -22,7 +23,6 @@ from .pairs import shared_pair
 from .results import CONFIG_FILE, ResultsError
 from .settings import CompareConfig, Run
 from .training import train_run
-from .workers import OnProgress, Tell, open_workers
 
 PARTS: Final = "parts"
 """Folder with the parts of an unfinished comparison, one for each run."""
@@ -48,7 +48,8 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
     spec = env_spec(**config.env)
     metric = Headline.of(spec).name
     parts = folder / PARTS
-    with open_workers(config, on_progress) as workers, locked(folder):
+    runs: list[Run | str] = [*config.runs(), *filter(partial(_flies, spec), _CONTROLLERS)]
+    with open_executor(config, len(runs), on_progress) as executor, locked(folder):
         parts.mkdir(exist_ok=True)
         if not (folder / CONFIG_FILE).exists():  # a resumed comparison keeps its settings
             content = config.content(*config.agents)
@@ -59,13 +60,13 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
             results.write_config(folder, command, spec, config.vehicle, content)
         for unfinished in parts.glob(".*"):
             shutil.rmtree(unfinished)
-        runs: list[Run | str] = [*config.runs(), *filter(partial(_flies, spec), _CONTROLLERS)]
         jobs = {
             run if isinstance(run, str) else f"{run.algorithm} seed {run.seed}": run
             for run in runs
             if not (parts / _part(run)).exists()
         }
-        workers.fly_all(partial(_fly, config), jobs, partial(_keep, folder, metric), config)
+        fly, keep = partial(_fly, config), partial(_keep, folder, metric)
+        run_jobs(executor, fly, jobs, keep, on_progress, task=config.own_task)
         results.join_parts(parts, folder, metric)
 
 

@@ -20,6 +20,7 @@ stands in `config.json`. In data frames its name says what it is: `steady`
 """
 
 import json
+import os
 import platform
 import shutil
 from collections.abc import Iterable, Mapping
@@ -38,7 +39,7 @@ from ..agents.checkpoints import software_versions, write_whole
 from ..agents.episodes import Episode
 from ..envs.spec import EnvSpec, SpecError
 from ..flights.trajectories import Trajectory
-from ..models.errors import InputError, require
+from ..models.errors import InputError
 from .metrics import Headline, overshoot, settling_time, steady_state
 from .swarms import GOAL, POSITION
 
@@ -158,7 +159,7 @@ def write_settings(folder: Path, command: str, content: Mapping[str, Any]) -> No
 
 def machine() -> dict[str, Any]:
     """Machine and software on which times depend."""
-    cores = require("joblib", "train", "counting cores").cpu_count()
+    cores = os.cpu_count()
     return {"platform": platform.platform(), "processor": platform.machine(), "cores": cores}
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from hashlib import blake2b
 from itertools import product
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from ..agents import CONTROLLERS
 from ..agents.presets import (
@@ -21,6 +21,7 @@ from ..agents.presets import (
     preset,
 )  # fmt: skip
 from ..envs.registry import env_spec, is_known, options_type, task_type
+from ..flights.executors import WorkersConfig
 from ..models import BACKENDS, Backend
 from ..models.errors import InputError, expect
 
@@ -67,6 +68,11 @@ class EnvConfig:
         name = task_type(self.env_id).__module__ if is_known(self.env_id) else "__main__"
         return None if name.startswith("rotorgram.") or name == "__main__" else name
 
+    @property
+    def own_task(self) -> str | None:
+        """`module:id` of a user's task; None for ours."""
+        return f"{self.module}:{self.env_id}" if self.module else None
+
 
 @dataclass(frozen=True, kw_only=True)
 class Run(EnvConfig):
@@ -92,24 +98,6 @@ class Run(EnvConfig):
         elif self.num_envs > 1:  # a whole episode of each
             least = self.num_envs * int(self.options.get("episode_length", 1))
         expect(self.env_steps >= least, "env_steps", f"at least {least}", str(self.env_steps))
-
-
-@dataclass(frozen=True, kw_only=True)
-class WorkersConfig:
-    """Kind and number of workers."""
-
-    jobs: int | None = None
-    """Runs at a time. Default: one for each core of this machine, or of the cluster."""
-    runner: Literal["loky", "ray"] = "loky"
-    """loky: processes of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
-    address: str | None = None
-    """The cluster's: `ray://HOST:PORT` of its client server from anywhere, `HOST:PORT` or None on
-    one of its machines."""
-
-    def __post_init__(self) -> None:
-        expect(self.jobs is None or self.jobs >= 1, "jobs", "at least 1", str(self.jobs))
-        right = self.address is None or self.runner == "ray"
-        expect(right, "address", "it with runner ray", f"it with {self.runner}")
 
 
 @dataclass(frozen=True, kw_only=True)

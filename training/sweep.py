@@ -18,6 +18,7 @@ import pandas as pd
 
 from ..agents.checkpoints import write_whole
 from ..envs.registry import env_spec
+from ..flights.executors import OnProgress, Tell, open_executor, run_jobs
 from ..flights.folders import locked
 from . import results
 from .evaluations import evaluate_stages, stages_of
@@ -27,7 +28,6 @@ from .results import CONFIG_FILE, ResultsError
 from .rows import adding_rows, read_rows
 from .settings import Run, SweepConfig
 from .training import train_run
-from .workers import OnProgress, Tell, open_workers
 
 SWEEP_FILE: Final = "sweep.csv"
 
@@ -58,7 +58,8 @@ def sweep(config: SweepConfig, folder: Path, command: str, on_progress: OnProgre
     Arguments and errors are those of `compare.compare`.
     """
     spec = env_spec(**config.env)
-    with open_workers(config, on_progress) as workers, locked(folder):
+    runs = len(config.runs())
+    with open_executor(config, runs, on_progress) as executor, locked(folder):
         if not (folder / CONFIG_FILE).exists():  # a resumed sweep keeps its settings
             content = config.content(config.algorithm)
             content["sweep"] = {"grid": dict(config.grid), "episodes": config.episodes}
@@ -66,7 +67,8 @@ def sweep(config: SweepConfig, folder: Path, command: str, on_progress: OnProgre
         done = read_sweep_runs(folder, config)
         add = adding_rows(folder / results.RUNS_FILE, done, partial(_with_settings, config))
         keep = lambda _, row: add(row)  # noqa: E731
-        workers.fly_all(partial(_fly, config), missing_runs(config, done), keep, config)
+        fly, jobs = partial(_fly, config), missing_runs(config, done)
+        run_jobs(executor, fly, jobs, keep, on_progress, task=config.own_task)
 
 
 def missing_runs(config: SweepConfig, rows: pd.DataFrame) -> dict[str, Job]:

@@ -11,9 +11,9 @@ import numpy as np
 from .. import agents
 from ..agents import Checkpoint, CheckpointError
 from ..envs.autoreset import AdvancingVectorEnv
+from ..flights.executors import Tell
 from ..models.errors import InputError, expect
 from .settings import Run
-from .workers import Tell
 
 AnyEnv = gym.Env[Any, Any] | AdvancingVectorEnv
 

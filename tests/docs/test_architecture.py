@@ -75,8 +75,6 @@ def test_who_imports_whom(package: str) -> None:
     listed = set(table("package | imports from |")[package])
     assert packages(imported(package)) - {package} == listed
     earlier = set(PACKAGES[: PACKAGES.index(package)])
-    if package == "flights":  # its workers and colours still lie in training
-        earlier.add("training")
     assert listed <= earlier
 
 

@@ -15,10 +15,10 @@ import pytest
 from rotorgram.flights import capture as capturing
 from rotorgram.flights.capture import capture, label_file, objects_in, read_labels
 from rotorgram.flights.capture_formats import category
+from rotorgram.flights.executors import WorkersConfig
 from rotorgram.flights.viewpoints import Plan
 from rotorgram.models import InputError
 from rotorgram.training.pairs import socket_pair
-from rotorgram.training.settings import WorkersConfig
 from test_cameras import BELLY, vehicle_with
 
 Image = pytest.importorskip("PIL.Image")

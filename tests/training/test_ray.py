@@ -14,15 +14,15 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from rotorgram.agents.checkpoints import load, software_versions
+from rotorgram.flights import ray_cluster as module
 from rotorgram.flights.capture import capture
+from rotorgram.flights.executors import RunsFailed, open_executor, run_jobs
 from rotorgram.flights.folders import new_folder
 from rotorgram.flights.viewpoints import Plan
-from rotorgram.training import workers as module
 from rotorgram.training.compare import compare
 from rotorgram.training.results import read_results, read_steps
 from rotorgram.training.settings import CompareConfig, SweepConfig, WorkersConfig
 from rotorgram.training.sweep import read_sweep_runs, sweep
-from rotorgram.training.workers import RunsFailed, open_workers
 
 # Ray listens beyond this machine. It reads these when it is imported.
 os.environ |= {
@@ -118,12 +118,12 @@ def test_every_node_flies(address: str) -> None:
         return job, ray.get_runtime_context().get_node_id()
 
     config = WorkersConfig(runner="ray", address=address)
-    with open_workers(config, nothing) as workers:
-        results = list(workers.fly(node, {f"job {n}": n for n in range(4)}))
-    assert sorted((result.name, result.value[0]) for result in results) == [
-        ("job 0", 0), ("job 1", 1), ("job 2", 2), ("job 3", 3),
-    ]  # fmt: skip
-    assert len({result.value[1] for result in results}) == 2
+    found: list[tuple[int, str]] = []
+    with open_executor(config, 4) as executor:
+        jobs = {f"job {n}": n for n in range(4)}
+        run_jobs(executor, node, jobs, lambda _, value: found.append(value), nothing)
+    assert sorted(job for job, _ in found) == [0, 1, 2, 3]
+    assert len({where for _, where in found}) == 2
 
 
 def test_pictures_are_taken_on_a_cluster(opengl: None, tmp_path: Path, address: str) -> None:

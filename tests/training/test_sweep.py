@@ -18,13 +18,14 @@ from comparisons import GATES, HEADLINE, spec_of
 from rotorgram.agents import preset
 from rotorgram.cli import main
 from rotorgram.cli.sweep import parse_grid
+from rotorgram.flights.executors import RunsFailed
 from rotorgram.flights.folders import locked
 from rotorgram.flights.trajectories import evaluation_seed
 from rotorgram.training import films
 from rotorgram.training.compare import compare, read_compare_config
 from rotorgram.training.metrics import Headline
 from rotorgram.training.results import CONFIG_KEYS, ResultsError
-from rotorgram.training.settings import CompareConfig, Run, SweepConfig, WorkersConfig
+from rotorgram.training.settings import CompareConfig, Run, SweepConfig
 from rotorgram.training.sweep import (
     RUN_COLUMNS,
     missing_runs,
@@ -35,7 +36,6 @@ from rotorgram.training.sweep import (
     write_sweep_table,
 )
 from rotorgram.training.training import Training
-from rotorgram.training.workers import RunsFailed, open_workers
 
 OPTIONS: dict[str, Any] = {"episode_length": 40, "flight_band": 1.2}
 CONFIG = SweepConfig(
@@ -186,11 +186,6 @@ def test_a_run_that_fails_is_named_and_the_others_are_kept(
     assert err.endswith(f"{folder}: expected a folder that no other process writes to\n")
 
 
-def _dies(job: int, _: object) -> int:
-    os.kill(os.getpid(), signal.SIGKILL)
-    return job
-
-
 SWEEP = """
 import sys
 from pathlib import Path
@@ -246,12 +241,6 @@ def test_a_folder_is_swept_by_one_process(work: Any, tmp_path: Path) -> None:
     with locked(tmp_path), busy:
         work(config, tmp_path, "", nothing)
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]
-
-
-def test_a_worker_that_is_killed_is_one_sentence() -> None:
-    sentence = pytest.raises(RunsFailed, match=r"^a worker was killed, .* before is kept$")
-    with open_workers(WorkersConfig(jobs=2), nothing) as workers, sentence:
-        list(workers.fly(_dies, {"one": 1, "two": 2}))
 
 
 def test_points_are_all_combinations_and_every_one_flies_before_the_next_seed() -> None:

@@ -1,0 +1,243 @@
+"""Many jobs at a time: in processes of this machine, or on a Ray cluster.
+
+An executor has the interface of `concurrent.futures`. A job is anything that can be pickled, and so
+is the function that does it. Workers may share no folder with the main process, so the result of a
+job comes back as a value. A job that fails comes back as a sentence, and the others go on.
+
+A worker of this machine ends with the process that started it, however that process ends.
+"""
+
+import os
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.queues import SimpleQueue
+from threading import Thread
+from typing import Any, Final, Literal, NamedTuple, TypeVar
+
+from ..envs.registry import load
+from ..models.errors import InputError
+
+OnProgress = Callable[[str, int, int, str], None]
+"""Called with a job's name, the amounts done and in total, and a status text."""
+Tell = Callable[[int, int, str], None]
+"""The same for one job, without its name."""
+_Job = TypeVar("_Job")
+_Value = TypeVar("_Value")
+_Progress = SimpleQueue[tuple[str, int, int, str] | None]
+
+_CHILD_ENVIRONMENT: Final = {
+    "PYTHONSAFEPATH": "1",  # no file of the working directory takes the place of a package
+    "OMP_NUM_THREADS": "1",  # a second thread makes small tensors slower
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkersConfig:
+    """Kind and number of workers."""
+
+    jobs: int | None = None
+    """Jobs at a time. Default: one for each core of this machine, or of the cluster."""
+    runner: Literal["processes", "ray"] = "processes"
+    """processes: of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
+    address: str | None = None
+    """Address of the Ray cluster: `ray://HOST:PORT` of its client server from anywhere, `HOST:PORT`
+    or None on one of its machines."""
+
+    def __post_init__(self) -> None:
+        if self.jobs is not None and self.jobs < 1:
+            raise InputError(f"jobs: expected at least 1, got {self.jobs}")
+        if self.address is not None and self.runner != "ray":
+            raise InputError(f"address: expected it with runner ray, got it with {self.runner}")
+
+
+class RunsFailed(RuntimeError):
+    """Some jobs failed; the message names each with its reason. The others are kept."""
+
+
+class Result(NamedTuple):
+    """The end of a job: its name, why it failed (empty if it did not), its value."""
+
+    name: str
+    failure: str
+    value: Any
+
+
+# ---- in the main process
+
+
+def run_jobs(
+    executor: Executor,
+    function: Callable[[_Job, Tell], _Value],
+    jobs: Mapping[str, _Job],
+    keep: Callable[[_Job, _Value], None],
+    on_progress: OnProgress,
+    *,
+    task: str | None = None,
+) -> None:
+    """Do all jobs, given by name, and hand each with its result to `keep` as soon as it is there.
+
+    Args:
+        executor: Made by `open_executor`.
+        function: Called in a worker with a job and a function that reports its progress.
+        task: `module:id` of the user's task, which a worker imports first.
+
+    Raises:
+        RunsFailed: At the end, if jobs failed; at once, if a worker was killed.
+    """
+    failures: list[str] = []
+    on_progress("all runs", 0, len(jobs), "")
+    for number, result in enumerate(_results(executor, function, jobs, task), 1):
+        if result.failure:
+            failures.append(result.failure)
+            on_progress(result.name, 0, 1, "failed")
+        else:
+            keep(jobs[result.name], result.value)
+            on_progress(result.name, 1, 1, "done")
+        on_progress("all runs", number, len(jobs), "")
+    if failures:
+        raise RunsFailed(f"{len(failures)} of {len(jobs)} runs failed: {'; '.join(failures)}")
+
+
+def _results(
+    executor: Executor,
+    function: Callable[[_Job, Tell], _Value],
+    jobs: Mapping[str, _Job],
+    task: str | None,
+) -> Iterator[Result]:
+    """Results in the order in which they come; at most `executor.workers` jobs are submitted."""
+    waiting = iter(jobs.items())
+    workers: int = getattr(executor, "workers", 1)
+    submitted: set[Future[Result]] = set()
+    while True:
+        for name, job in islice(waiting, workers - len(submitted)):
+            submitted.add(executor.submit(_do, function, name, job, task))
+        if not submitted:
+            return
+        done, submitted = wait(submitted, return_when=FIRST_COMPLETED)
+        for future in done:
+            yield _result(future)
+
+
+def _result(future: Future[Result]) -> Result:
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        raise RunsFailed(
+            "a worker was killed, perhaps for want of memory (try fewer --jobs); "
+            "what was done before is kept"
+        ) from None
+
+
+@contextmanager
+def open_executor(
+    config: WorkersConfig, jobs: int, on_progress: OnProgress = lambda *_: None
+) -> Iterator[Executor]:
+    """An executor for so many jobs, to the end of the block; jobs that still run then are ended.
+
+    Progress is reported for jobs of this machine. One job at a time runs in this process. Raises
+    `InputError` if there is no such Ray cluster.
+    """
+    if config.runner == "ray":
+        from .ray_cluster import RayExecutor
+
+        executor: Executor = RayExecutor(config.address, config.jobs)
+    elif min(config.jobs or os.cpu_count() or 1, jobs) <= 1:
+        executor = _ThisProcess(on_progress)
+    else:
+        executor = _Processes(min(config.jobs or os.cpu_count() or 1, jobs), on_progress)
+    try:
+        yield executor
+    finally:
+        executor.shutdown(wait=False, cancel_futures=True)
+
+
+class _ThisProcess(Executor):
+    """Does a job when it is submitted."""
+
+    workers = 1
+
+    def __init__(self, on_progress: OnProgress) -> None:
+        _worker.report = on_progress
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **_: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(function(*args))
+        return future
+
+
+class _Processes(ProcessPoolExecutor):
+    """Spawned processes that end when this process ends or the executor is shut down."""
+
+    def __init__(self, workers: int, on_progress: OnProgress) -> None:
+        self.workers = workers
+        context = get_context("spawn")
+        # Nothing is sent through this pipe: its end says that the main process is gone.
+        ends, self._alive = context.Pipe(duplex=False)
+        self._progress: _Progress = context.SimpleQueue()
+        self._before = {name: os.environ.get(name) for name in _CHILD_ENVIRONMENT}
+        os.environ.update(_CHILD_ENVIRONMENT)
+        arguments = (ends, self._progress)
+        super().__init__(workers, context, initializer=_begin_worker, initargs=arguments)
+        Thread(target=_pass_on, args=(self._progress, on_progress), daemon=True).start()
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        self._alive.close()  # workers end, and with them their simulators
+        self._progress.put(None)
+        super().shutdown(wait=wait, cancel_futures=cancel_futures)
+        for name, value in self._before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _pass_on(progress: _Progress, on_progress: OnProgress) -> None:
+    while (item := progress.get()) is not None:
+        on_progress(*item)
+
+
+# ---- in a worker
+
+
+class _Worker:
+    """State of this process, if it is a worker."""
+
+    report: OnProgress = staticmethod(lambda *_: None)
+
+
+_worker = _Worker()
+
+
+def _begin_worker(ends: Connection, progress: _Progress) -> None:
+    """Before the first job: from here on this process ends with the main process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's affair
+    Thread(target=_end_with, args=(ends,), daemon=True).start()
+
+    def report(*item: Any) -> None:
+        progress.put(item)  # type: ignore[arg-type]
+
+    _worker.report = report
+
+
+def _end_with(ends: Connection) -> None:
+    ends.poll(None)  # until the other end is closed, which it may be already
+    os._exit(1)
+
+
+def _do(function: Callable[[_Job, Tell], _Value], name: str, job: _Job, task: str | None) -> Result:
+    """Do a job (in a worker)."""
+    report = _worker.report
+    try:
+        if task:
+            load(task)
+        value = function(job, lambda done, total, words: report(name, done, total, words))
+        return Result(name, "", value)
+    except Exception as error:
+        return Result(name, f"{name}: {type(error).__name__}: {error}", None)

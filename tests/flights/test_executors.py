@@ -1,0 +1,129 @@
+"""Executors: results, failures, and workers that end with the main process."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rotorgram.flights.executors import (
+    OnProgress,
+    RunsFailed,
+    Tell,
+    WorkersConfig,
+    open_executor,
+    run_jobs,
+)
+
+
+def half(job: int, tell: Tell) -> float:
+    if job % 2:
+        raise ValueError(f"{job} is odd")
+    tell(job, 10, "halved")
+    return job / 2
+
+
+def name_of_queue(job: int, tell: Tell) -> str:
+    import queue
+
+    return str(queue.__file__)
+
+
+def is_killed(job: int, tell: Tell) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def do(config: WorkersConfig, function: Any, jobs: dict[str, int], shown: list[Any]) -> list[Any]:
+    results: list[Any] = []
+    on_progress: OnProgress = lambda *item: shown.append(item)  # noqa: E731
+    with open_executor(config, len(jobs), on_progress) as executor:
+        keep = lambda job, value: results.append((job, value))  # noqa: E731
+        run_jobs(executor, function, jobs, keep, on_progress)
+        deadline = time.monotonic() + 5
+        while ("four", 4, 10, "halved") not in shown and time.monotonic() < deadline:
+            time.sleep(0.01)
+    return sorted(results)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_results_come_with_their_jobs_and_progress_is_reported(jobs: int) -> None:
+    shown: list[Any] = []
+    given = {"two": 2, "four": 4, "eight": 8}
+    assert do(WorkersConfig(jobs=jobs), half, given, shown) == [(2, 1.0), (4, 2.0), (8, 4.0)]
+    assert ("four", 4, 10, "halved") in shown
+    assert {("two", 1, 1, "done"), ("all runs", 0, 3, ""), ("all runs", 3, 3, "")} <= set(shown)
+
+
+def test_a_job_that_fails_is_a_sentence_and_the_others_are_kept() -> None:
+    kept: list[int] = []
+    keep = lambda job, value: kept.append(job)  # noqa: E731
+    sentence = pytest.raises(RunsFailed, match=r"^1 of 3 runs failed: c: ValueError: 3 is odd$")
+    with open_executor(WorkersConfig(jobs=1), 3) as executor, sentence:
+        run_jobs(executor, half, {"a": 2, "c": 3, "b": 4}, keep, lambda *_: None)
+    assert kept == [2, 4]
+
+
+def test_a_worker_that_is_killed_is_one_sentence() -> None:
+    sentence = pytest.raises(RunsFailed, match=r"^a worker was killed, .* before is kept$")
+    with open_executor(WorkersConfig(jobs=2), 2) as executor, sentence:
+        keep = lambda *_: None  # noqa: E731
+        run_jobs(executor, is_killed, {"one": 1, "two": 2}, keep, lambda *_: None)
+
+
+def test_no_file_of_the_working_directory_is_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fault 51
+    (tmp_path / "queue.py").write_text("raise SystemExit('foreign code')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    found: list[str] = []
+    with open_executor(WorkersConfig(jobs=2), 2) as executor:
+        keep = lambda job, value: found.append(value)  # noqa: E731
+        run_jobs(executor, name_of_queue, {"one": 1, "two": 2}, keep, lambda *_: None)
+    assert len(found) == 2
+    assert not any(str(tmp_path) in file for file in found)
+    assert "PYTHONSAFEPATH" not in os.environ
+
+
+PARENT = """
+import os, signal, sys, threading, time
+sys.path.insert(0, sys.argv[1])
+from test_executors import sleeps
+from rotorgram.flights.executors import WorkersConfig, open_executor, run_jobs
+print("ready", flush=True)
+with open_executor(WorkersConfig(jobs=2), 2) as executor:
+    threading.Timer(float(sys.argv[2]), os.kill, (os.getpid(), signal.SIGKILL)).start()
+    run_jobs(executor, sleeps, {"one": 1, "two": 2}, print, lambda *_: None)
+"""
+
+
+def sleeps(job: int, tell: Tell) -> None:
+    time.sleep(600)
+
+
+@pytest.mark.parametrize("after", [0.05, 0.4, 6.0])
+def test_no_worker_outlives_a_main_process_that_is_killed(after: float) -> None:
+    """Before, while and after the workers start."""  # fault 52
+    words = [sys.executable, "-c", PARENT, str(Path(__file__).parent), str(after)]
+    mark = {"ROTORGRAM_TEST_MARK": f"{os.getpid()}-{after}"}
+    with subprocess.Popen(words, env={**os.environ, **mark}) as process:
+        process.wait(60)
+    deadline = time.monotonic() + 30
+    while left := _with_environment("=".join(*mark.items())):
+        assert time.monotonic() < deadline, left
+        time.sleep(0.1)
+
+
+def _with_environment(word: str) -> list[str]:
+    """Processes with a word in their environment."""
+    found = []
+    for file in Path("/proc").glob("[0-9]*/environ"):
+        try:
+            if word.encode() in file.read_bytes():
+                found.append(file.parent.name)
+        except OSError:
+            continue
+    return found
