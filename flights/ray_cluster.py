@@ -44,7 +44,8 @@ class RayExecutor(Executor):
         self._submitted[future] = reference
 
         def finish(done: Future[Any]) -> None:
-            del self._submitted[future]
+            if self._submitted.pop(future, None) is None:  # cancelled
+                return
             error = done.exception()
             if error is None:
                 future.set_result(done.result())
@@ -56,7 +57,9 @@ class RayExecutor(Executor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Cancel what still runs, whose simulators end with it, and leave the cluster."""
-        for reference in list(self._submitted.values()):
+        running = list(self._submitted.values())
+        self._submitted.clear()
+        for reference in running:
             self._ray.cancel(reference, force=True)
         self._ray.shutdown()
 
