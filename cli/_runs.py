@@ -16,7 +16,7 @@ from ..training.settings import RunsConfig
 from ._flags import BackendFlags, Command, folder_to_write, go_on_with
 
 if TYPE_CHECKING:
-    from ..training.workers import OnProgress
+    from ..flights.executors import OnProgress
 
 RESUMED: Final = ("jobs", "runner", "address", "resume", "env")
 """Flags that a resumed command may be given: they change no number. `--env` imports the module of a

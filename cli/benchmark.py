@@ -6,8 +6,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from ..flights.executors import WorkersConfig
 from ..models.errors import expect
-from ..training.settings import WorkersConfig
 from ._flags import refuse_settings
 from ._runs import RESUMED, FolderFlags, command_line, report_board, runs_folder
 

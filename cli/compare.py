@@ -3,8 +3,9 @@
 from dataclasses import dataclass, replace
 
 from ..agents import AlgorithmName
+from ..flights.executors import WorkersConfig
 from ..models.errors import expect, require
-from ..training.settings import CompareConfig, WorkersConfig
+from ..training.settings import CompareConfig
 from ._flags import refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_comparison, runs_folder
 

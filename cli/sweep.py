@@ -8,8 +8,9 @@ from typing import Annotated, Any
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ..agents import AlgorithmName
+from ..flights.executors import WorkersConfig
 from ..models.errors import expect
-from ..training.settings import SweepConfig, WorkersConfig
+from ..training.settings import SweepConfig
 from ._flags import parse_value, refuse_settings
 from ._runs import RESUMED, RunsFlags, command_line, report_sweep, runs_folder
 

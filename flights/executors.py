@@ -221,7 +221,7 @@ def _begin_worker(ends: Connection, progress: _Progress) -> None:
     Thread(target=_end_with, args=(ends,), daemon=True).start()
 
     def report(*item: Any) -> None:
-        progress.put(item)  # type: ignore[arg-type]
+        progress.put(item)
 
     _worker.report = report
 
