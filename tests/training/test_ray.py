@@ -16,12 +16,12 @@ import pytest
 from rotorgram.agents.checkpoints import load, software_versions
 from rotorgram.flights import ray_cluster as module
 from rotorgram.flights.capture import capture
-from rotorgram.flights.executors import RunsFailed, open_executor, run_jobs
+from rotorgram.flights.executors import RunsFailed, WorkersConfig, open_executor, run_jobs
 from rotorgram.flights.folders import new_folder
 from rotorgram.flights.viewpoints import Plan
 from rotorgram.training.compare import compare
 from rotorgram.training.results import read_results, read_steps
-from rotorgram.training.settings import CompareConfig, SweepConfig, WorkersConfig
+from rotorgram.training.settings import CompareConfig, SweepConfig
 from rotorgram.training.sweep import read_sweep_runs, sweep
 
 # Ray listens beyond this machine. It reads these when it is imported.
