@@ -12,18 +12,19 @@ Neither loads MuJoCo before an env is made.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
+from ..models.fields import Limits
 from .registry import register
 from .spec import ArraySpec, Discrete, EnvSpec, Mark, Metric
 
 if TYPE_CHECKING:
     from .loop import Loop
     from .single import SingleEnv
-    from .tasks.task import Outcome, Task, TaskOptions, check_choice, check_number
+    from .tasks.task import Outcome, Task, TaskOptions
     from .vector import LocalVectorEnv
 
 __all__ = [
-    "ArraySpec", "Discrete", "EnvSpec", "LocalVectorEnv", "Loop", "Mark", "Metric", "Outcome",
-    "SingleEnv", "Task", "TaskOptions", "check_choice", "check_number", "register",
+    "ArraySpec", "Discrete", "EnvSpec", "Limits", "LocalVectorEnv", "Loop", "Mark", "Metric",
+    "Outcome", "SingleEnv", "Task", "TaskOptions", "register",
 ]  # fmt: skip
 
 _HOMES: Final = {"Loop": "loop", "LocalVectorEnv": "vector", "SingleEnv": "single"}

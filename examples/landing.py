@@ -4,8 +4,9 @@ rotorgram train a2c --env landing:Landing-v0
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from rotorgram.envs import ArraySpec, Metric, Outcome, Task, TaskOptions, check_number, register
+from rotorgram.envs import ArraySpec, Limits, Metric, Outcome, Task, TaskOptions, register
 from rotorgram.sim import Pose, clip, stack
 
 
@@ -15,11 +16,8 @@ class LandingOptions(TaskOptions):
 
     action: str = "offset"
     episode_length: int = 400
-    start: float = 4.0
+    start: Annotated[float, Limits(2.0, 50.0, "m")] = 4.0
     """Mean height at which an episode begins, m above the ground; drawn from ± 1 m of it."""
-
-    def check(self):
-        check_number(self, "start", 2.0, 50.0, "m")
 
 
 class Landing(Task):

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..models.coefficients import coefficient_fields
+from ..models.coefficients import COEFFICIENTS
 from ..models.vehicle import Vehicle
 from ..models.vehicle_file import read_vehicle_file
 from .identify import LAG, Estimate, Identified
@@ -75,11 +75,9 @@ def vehicle_toml(
     else:
         rotors["rotors.thrust"] = [vehicle.thrust_low.min(), vehicle.thrust_high.max()]
     rotors["rotors.reaction"] = airframe.reaction
-    numbers: dict[str, Any] = {
-        name: value[0] if len(value) == 1 and one.metadata["limits"].count == 1 else list(value)
-        for name, one in coefficient_fields()
-        if (value := vehicle.coefficients.numbers().get(name)) is not None
-    }
+    numbers: dict[str, Any] = {}
+    for name, value in vehicle.coefficients.numbers().items():
+        numbers[name] = value[0] if COEFFICIENTS[name].count == 1 else list(value)
     numbers["rotors.thrust_coefficient"] = airframe.thrust_coefficient
     moved: dict[str, Any] = {
         "rotors.drag": airframe.drag, "rotors.inflow": airframe.inflow,

@@ -20,10 +20,10 @@ from ..agents.policies import Policy
 from ..envs.registry import env_spec
 from ..envs.registry import load as load_env
 from ..envs.spec import Discrete, Mark, component_names
-from ..envs.tasks.task import finite
 from ..models import scenes_of
 from ..models.cameras import View, cameras_of, chosen_views
 from ..models.errors import InputError, expect
+from ..models.fields import Limits, check
 from ..models.frames import pose_in_mujoco_frame
 from ..models.vehicle import Vehicle
 from ..sim.rotations import multiplied
@@ -155,8 +155,7 @@ class Plan:
         expect(type(plan.fine) is bool, "plan: fine", "true or false", repr(plan.fine))
         right = type(plan.least_area) is int and plan.least_area >= 1
         expect(right, "plan: least_area", "a number of pixels", repr(plan.least_area))
-        right = finite(plan.fps) is not None and 0.1 <= plan.fps <= 1000
-        expect(right, "plan: fps", "0.1 to 1000 pictures a second", repr(plan.fps))
+        check("plan: fps", Limits(0.1, 1000, "pictures a second"), plan.fps)
         for view in plan.views():
             shape = f"{view.shape[1]}x{view.shape[0]}"
             right = view.kind != "rgb" or not (view.shape[0] % 2 or view.shape[1] % 2)
@@ -212,17 +211,10 @@ def _source(table: dict[str, Any], number: int) -> dict[str, Any]:
         expect(right, f"{name}.{key}", "a whole number from 0", repr(source.get(key)))
     for key in ("center", "size"):
         if key in source:
-            values = source[key]
-            right = isinstance(values, list | tuple) and len(values) == 3
             least = -_FURTHEST if key == "center" else 0.0
-            right = right and all(finite(x) is not None for x in values)
-            right = right and all(least <= x <= _FURTHEST for x in values)
-            wanted = f"three numbers, m, from {least:g} to {_FURTHEST:g}"
-            expect(right, f"{name}.{key}", wanted, repr(values))
+            check(f"{name}.{key}", Limits(least, _FURTHEST, "m", count=3), source[key])
     for key, most, unit in (("tilt", np.pi, "rad"), ("aside", _FURTHEST, "m")):
-        value = source.get(key, 0.0)
-        right = finite(value) is not None and 0 <= value <= most
-        expect(right, f"{name}.{key}", f"0 to {most:.6g} {unit}", repr(value))
+        check(f"{name}.{key}", Limits(0, most, unit), source.get(key, 0.0))
     if kind == "random":
         low = source["center"][2] - source["size"][2] / 2
         expect(low >= 0, name, "a box above the ground", f"one that begins at {low:g} m")

@@ -6,15 +6,16 @@ file has a table `[[cameras]]` for each. A file without a `front` or a `down` ge
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 
 import mujoco
 import numpy as np
 
-from .coefficients import PREFIX, Limits, checked
+from .coefficients import PREFIX
 from .errors import InputError, expect
+from .fields import Limits, read_table
 from .lens import Lens
 
 if TYPE_CHECKING:
@@ -42,33 +43,19 @@ MOST_STEPS: Final = 1000  # from picture to picture
 _Vector = tuple[float, float, float]
 
 
-def _number(default: Any, *limits: Any) -> Any:
-    return field(default=default, metadata={"limits": Limits(*limits)})
-
-
 @dataclass(frozen=True, kw_only=True)
 class Optics:
     """What a camera does beyond a pinhole's sharp picture; by default nothing."""
 
-    distortion: tuple[float, ...] = _number((), "1", -1e6, 1e6, 5)
+    distortion: Annotated[tuple[float, ...], Limits(-1e6, 1e6, "1", count=5)] = (0.0,) * 5
     """k1, k2, p1, p2, k3 of its lens: see `lens.distorted`."""
-    exposure: float = _number(0.0, "stop", 0.0, 10.0)
+    exposure: Annotated[float, Limits(0.0, 10.0, "stop")] = 0.0
     """Standard deviation of the exposure of a picture: e in light times 2^e, in colours."""
-    noise: tuple[float, ...] = _number((0.0, 0.0), "1", 0.0, 1.0, 2)
+    noise: Annotated[tuple[float, ...], Limits(0.0, 1.0, "1", count=2)] = (0.0, 0.0)
     """a and b in: standard deviation of a colour v, 0 to 1, is √(a² v + b²): the noise of photons
     and that of reading them, as of EMVA's standard 1288."""
-    readout: float = _number(0.0, "s", 0.0, 0.1)
+    readout: Annotated[float, Limits(0.0, 0.1, "s")] = 0.0
     """From the first row to the last, which is read at the moment of the state."""
-
-    @classmethod
-    def read(cls, camera: str, given: Mapping[str, Any]) -> "Optics":
-        """Those of a camera's table. Raises `InputError`."""
-        told: dict[str, Any] = {
-            one.name: checked(f"{camera}.{one.name}", one, given[one.name])
-            for one in fields(cls)
-            if one.name in given
-        }
-        return cls(**told)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,6 +215,7 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
             if f"{_TEXTS}{one.name}.{key}" in texts
         }
         rate = told.pop("rate", "1")
+        optics = {key: _read(text) for key, text in told.items()}
         output, axes = int(model.cam_output[number]), data.cam_xmat[number].reshape(3, 3)
         mine = model.body_rootid[model.cam_bodyid[number]] == model.jnt_bodyid[0]
         found.append(
@@ -242,7 +230,7 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
                 position=_vector(data.cam_xpos[number]),
                 look=_vector(-axes[:, 2]),
                 up=_vector(axes[:, 1]),
-                optics=Optics.read(f"camera {one.name}", {k: _read(v) for k, v in told.items()}),
+                optics=read_table(Optics, optics, f"camera {one.name}"),
             )
         )
     for name in texts:

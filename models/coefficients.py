@@ -5,53 +5,37 @@ and a vehicle's TOML file as NAME in the table GROUP. None: the file does not sa
 it cannot be switched on. SI units; body axes x forward, y left, z up.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import Field, dataclass, field, fields
-from typing import Any, Final
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Final
 
-import numpy as np
-
-from .errors import InputError, expect
+from .errors import InputError
+from .fields import Limits, check, check_names, limits_of
 
 PREFIX: Final = "rotorgram/"
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What a coefficient may be: so many finite numbers from low to high, in a unit."""
-
-    unit: str
-    low: float
-    high: float
-    count: int | None = 1
-    """How many numbers; None: one or more."""
-
-
-def _number(unit: str, low: float, high: float, count: int | None = 1) -> Any:
-    return field(default=None, metadata={"limits": Limits(unit, low, high, count)})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rotors:
     """Rotors, all alike."""
 
-    radius: float | None = _number("m", 1e-3, 10.0)
+    radius: Annotated[float | None, Limits(1e-3, 10.0, "m")] = None
     """Of the disc."""
-    thrust_coefficient: float | None = _number("N s²/rad²", 1e-12, 1.0)
+    thrust_coefficient: Annotated[float | None, Limits(1e-12, 1.0, "N s²/rad²")] = None
     """k in: thrust = k · speed²."""
-    time_constant: float | None = _number("s", 1e-4, 10.0)
+    time_constant: Annotated[float | None, Limits(1e-4, 10.0, "s")] = None
     """Of the speed's first-order answer to its command."""
-    time_constant_down: float | None = _number("s", 1e-4, 10.0)
+    time_constant_down: Annotated[float | None, Limits(1e-4, 10.0, "s")] = None
     """The same where the speed falls. None: as `time_constant`."""
-    curve: tuple[float, ...] | None = _number("1", -10.0, 10.0, None)
+    curve: Annotated[tuple[float, ...] | None, Limits(-10.0, 10.0, "1", count=None)] = None
     """c₀, c₁, c₂... in: thrust / largest thrust = c₀ + c₁ u + c₂ u² ... at throttle u, 0 to 1."""
-    drag: float | None = _number("N s²/(rad m)", 0.0, 1.0)
+    drag: Annotated[float | None, Limits(0.0, 1.0, "N s²/(rad m)")] = None
     """k in: drag = -k · speed · velocity of the air past the rotor, in its plane."""
-    inflow: float | None = _number("N s²/(rad m)", 0.0, 1.0)
+    inflow: Annotated[float | None, Limits(0.0, 1.0, "N s²/(rad m)")] = None
     """k in: loss of thrust = k · speed · velocity of the rotor along its axis."""
-    lift: float | None = _number("N s²/m²", 0.0, 10.0)
+    lift: Annotated[float | None, Limits(0.0, 10.0, "N s²/m²")] = None
     """k in: gain of thrust = k · squared velocity of the air past the rotor, in its plane."""
-    power: float | None = _number("W/N^1.5", 1e-3, 1e4)
+    power: Annotated[float | None, Limits(1e-3, 1e4, "W/N^1.5")] = None
     """k in: electrical power = k · thrust^1.5."""
 
 
@@ -59,13 +43,13 @@ class Rotors:
 class Drag:
     """Drag of the body, at its center of mass, along its axes."""
 
-    linear: tuple[float, ...] | None = _number("N s/m", 0.0, 1e4, 3)
+    linear: Annotated[tuple[float, ...] | None, Limits(0.0, 1e4, "N s/m", count=3)] = None
     """c in: force = -c · velocity of the air past it."""
-    quadratic: tuple[float, ...] | None = _number("N s²/m²", 0.0, 1e4, 3)
+    quadratic: Annotated[tuple[float, ...] | None, Limits(0.0, 1e4, "N s²/m²", count=3)] = None
     """c in: force = -c · speed · velocity, both of the air past it."""
-    angular: tuple[float, ...] | None = _number("N m s", 0.0, 1e4, 3)
+    angular: Annotated[tuple[float, ...] | None, Limits(0.0, 1e4, "N m s", count=3)] = None
     """c in: torque = -c · body rates."""
-    moment: tuple[float, ...] | None = _number("N s", -1e4, 1e4, 2)
+    moment: Annotated[tuple[float, ...] | None, Limits(-1e4, 1e4, "N s", count=2)] = None
     """c in: torque = (c₁ v_y, -c₂ v_x, 0), v the velocity through the air: rotors that flap, and
     drag above the center of mass."""
 
@@ -74,12 +58,12 @@ class Drag:
 class Battery:
     """A battery: an open-circuit voltage that falls with the charge, behind a resistance."""
 
-    full: float | None = _number("V", 0.1, 1e4)
+    full: Annotated[float | None, Limits(0.1, 1e4, "V")] = None
     """Open-circuit voltage when it is full. The vehicle's largest thrust is given at this one."""
-    empty: float | None = _number("V", 0.1, 1e4)
+    empty: Annotated[float | None, Limits(0.1, 1e4, "V")] = None
     """Open-circuit voltage when it is empty; in between it falls in proportion to the charge."""
-    capacity: float | None = _number("A h", 1e-3, 1e4)
-    resistance: float | None = _number("Ohm", 0.0, 100.0)
+    capacity: Annotated[float | None, Limits(1e-3, 1e4, "A h")] = None
+    resistance: Annotated[float | None, Limits(0.0, 100.0, "Ohm")] = None
     """Of the battery and the wires."""
 
 
@@ -87,37 +71,37 @@ class Battery:
 class Sensors:
     """Datasheet numbers of sensors. Densities: standard deviation per square root of hertz."""
 
-    gyro_noise: float | None = _number("rad/s/√Hz", 0.0, 1.0)
+    gyro_noise: Annotated[float | None, Limits(0.0, 1.0, "rad/s/√Hz")] = None
     """White noise density of the gyroscope: the angle random walk."""
-    gyro_walk: float | None = _number("rad/s²/√Hz", 0.0, 1.0)
+    gyro_walk: Annotated[float | None, Limits(0.0, 1.0, "rad/s²/√Hz")] = None
     """Density of its bias's random walk: the rate random walk."""
-    gyro_bias: float | None = _number("rad/s", 0.0, 10.0)
+    gyro_bias: Annotated[float | None, Limits(0.0, 10.0, "rad/s")] = None
     """Standard deviation of its bias when it is switched on."""
-    gyro_scale: float | None = _number("1", 0.0, 0.5)
+    gyro_scale: Annotated[float | None, Limits(0.0, 0.5, "1")] = None
     """Standard deviation of its error of scale."""
-    accelerometer_noise: float | None = _number("m/s²/√Hz", 0.0, 10.0)
-    accelerometer_walk: float | None = _number("m/s³/√Hz", 0.0, 10.0)
-    accelerometer_bias: float | None = _number("m/s²", 0.0, 10.0)
-    accelerometer_scale: float | None = _number("1", 0.0, 0.5)
-    magnetometer_noise: float | None = _number("µT", 0.0, 1e3)
+    accelerometer_noise: Annotated[float | None, Limits(0.0, 10.0, "m/s²/√Hz")] = None
+    accelerometer_walk: Annotated[float | None, Limits(0.0, 10.0, "m/s³/√Hz")] = None
+    accelerometer_bias: Annotated[float | None, Limits(0.0, 10.0, "m/s²")] = None
+    accelerometer_scale: Annotated[float | None, Limits(0.0, 0.5, "1")] = None
+    magnetometer_noise: Annotated[float | None, Limits(0.0, 1e3, "µT")] = None
     """Standard deviation of a reading."""
-    barometer_noise: float | None = _number("Pa", 0.0, 1e4)
+    barometer_noise: Annotated[float | None, Limits(0.0, 1e4, "Pa")] = None
     """Standard deviation of a reading."""
-    barometer_walk: float | None = _number("Pa/s/√Hz", 0.0, 1e3)
-    range_noise: float | None = _number("m", 0.0, 10.0)
-    range_limit: float | None = _number("m", 0.01, 1e4)
+    barometer_walk: Annotated[float | None, Limits(0.0, 1e3, "Pa/s/√Hz")] = None
+    range_noise: Annotated[float | None, Limits(0.0, 10.0, "m")] = None
+    range_limit: Annotated[float | None, Limits(0.01, 1e4, "m")] = None
     """Longest distance that the rangefinder sees."""
-    gyro_range: float | None = _number("rad/s", 0.1, 1e3)
+    gyro_range: Annotated[float | None, Limits(0.1, 1e3, "rad/s")] = None
     """Largest rate that the gyroscope reads, along each axis."""
-    accelerometer_range: float | None = _number("m/s²", 1.0, 1e4)
-    gps_noise: float | None = _number("m", 0.0, 1e3)
+    accelerometer_range: Annotated[float | None, Limits(1.0, 1e4, "m/s²")] = None
+    gps_noise: Annotated[float | None, Limits(0.0, 1e3, "m")] = None
     """Standard deviation of a horizontal coordinate."""
-    gps_vertical_noise: float | None = _number("m", 0.0, 1e3)
-    gps_velocity_noise: float | None = _number("m/s", 0.0, 100.0)
+    gps_vertical_noise: Annotated[float | None, Limits(0.0, 1e3, "m")] = None
+    gps_velocity_noise: Annotated[float | None, Limits(0.0, 100.0, "m/s")] = None
     """Standard deviation along each axis."""
-    mocap_noise: float | None = _number("m", 0.0, 10.0)
+    mocap_noise: Annotated[float | None, Limits(0.0, 10.0, "m")] = None
     """Standard deviation of a coordinate that motion capture measures."""
-    mocap_angle_noise: float | None = _number("rad", 0.0, 1.0)
+    mocap_angle_noise: Annotated[float | None, Limits(0.0, 1.0, "rad")] = None
     """Standard deviation of the attitude that it measures, about each axis."""
 
 
@@ -137,57 +121,48 @@ class Coefficients:
         """
         values = []
         for name in names.split():
-            group, _, key = name.partition(".")
-            value = getattr(getattr(self, group), key)
-            given = f"{name} in the vehicle's file, which {what} needs"
-            expect(value is not None, "vehicle", given, "none")
+            value = self._value(name)
+            if value is None:
+                raise InputError(
+                    f"vehicle: expected {name} in the vehicle's file, which {what} needs, got none"
+                )
             values.append(value)
         return tuple(values)
 
+    def _value(self, name: str) -> Any:
+        group, _, key = name.partition(".")
+        return getattr(getattr(self, group), key)
+
     @classmethod
     def read(cls, numbers: Mapping[str, Any]) -> "Coefficients":
-        """From arrays of numbers by "group.name". Raises `InputError` for any that is wrong."""
-        known, given = dict(coefficient_fields()), dict[str, dict[str, Any]]()
-        for name, values in numbers.items():
+        """From numbers and lists of numbers by "group.name". Raises `InputError`."""
+        groups: dict[str, dict[str, Any]] = {one.name: {} for one in fields(cls)}
+        for name, value in numbers.items():
             group, _, key = name.partition(".")
-            near = [word for word in known if word.startswith(group + ".")] or list(known)
-            expect(name in known, "vehicle", f"some of {', '.join(near)}", repr(name))
-            given.setdefault(group, {})[key] = checked(name, known[name], values)
-        kinds: dict[str, Callable[..., Any]] = {f.name: type(f.default) for f in fields(cls)}
-        return cls(**{group: kinds[group](**values) for group, values in given.items()})
+            alike = [word for word in COEFFICIENTS if word.startswith(group + ".")]
+            check_names([name], alike or COEFFICIENTS, "vehicle")
+            groups[group][key] = check(name, COEFFICIENTS[name], value)
+        return cls(
+            rotors=Rotors(**groups["rotors"]),
+            drag=Drag(**groups["drag"]),
+            battery=Battery(**groups["battery"]),
+            sensors=Sensors(**groups["sensors"]),
+        )
 
     def numbers(self) -> dict[str, tuple[float, ...]]:
-        """The reverse of `read`: what the file says, by "group.name"."""
-        told = {}
-        for name, _ in coefficient_fields():
-            group, _, key = name.partition(".")
-            value = getattr(getattr(self, group), key)
+        """The reverse of `read`: the coefficients of the file, by "group.name"."""
+        found = {}
+        for name in COEFFICIENTS:
+            value = self._value(name)
             if value is not None:
-                told[name] = value if isinstance(value, tuple) else (value,)
-        return told
+                found[name] = value if isinstance(value, tuple) else (value,)
+        return found
 
 
-def coefficient_fields() -> list[tuple[str, Field[Any]]]:
-    """Every coefficient as "group.name" with its field; `metadata["limits"]` has its `Limits`."""
-    groups: dict[str, Any] = {group.name: group.default for group in fields(Coefficients)}
-    return [(f"{name}.{one.name}", one) for name, group in groups.items() for one in fields(group)]
-
-
-def checked(name: str, one: Field[Any], values: Any) -> float | tuple[float, ...]:
-    """A coefficient's value within its limits, as a float or a tuple. Raises `InputError`."""
-    limits: Limits = one.metadata["limits"]
-    many = limits.count or "one or more"
-    numbers = "a number" if limits.count == 1 else f"{many} numbers"
-    unit = "" if limits.unit == "1" else f" {limits.unit}"
-    expected = f"{numbers} from {limits.low:g} to {limits.high:g}{unit}"
-    try:
-        array = np.asarray(values)
-        right = array.dtype.kind in "iuf" and array.ndim <= 1
-        flat = tuple(np.ravel(array).astype(float).tolist()) if right else ()
-    except (TypeError, ValueError, OverflowError):
-        flat = ()
-    right = len(flat) == limits.count or (limits.count is None and len(flat) > 0)
-    right = right and all(limits.low <= value <= limits.high for value in flat)
-    if not right:
-        raise InputError(f"{name}: expected {expected}, got {values!r:.80}")
-    return flat[0] if limits.count == 1 else flat
+COEFFICIENTS: Final[Mapping[str, Limits]] = {
+    **limits_of(Rotors, "rotors."),
+    **limits_of(Drag, "drag."),
+    **limits_of(Battery, "battery."),
+    **limits_of(Sensors, "sensors."),
+}
+"""The limits of every coefficient, by "group.name"."""

@@ -377,7 +377,11 @@ def read_coefficients(model: mujoco.MjModel) -> Coefficients:
     """Those among the custom numerics of a model. Raises `InputError` for a wrong one."""
     numerics = [model.numeric(index) for index in range(model.nnumeric)]
     ours = [one for one in numerics if one.name.startswith(PREFIX)]
-    return Coefficients.read({one.name.removeprefix(PREFIX): one.data for one in ours})
+    numbers = {}
+    for one in ours:
+        values = one.data.tolist()
+        numbers[one.name.removeprefix(PREFIX)] = values[0] if len(values) == 1 else values
+    return Coefficients.read(numbers)
 
 
 def rotor_name(model: mujoco.MjModel, index: int) -> str:

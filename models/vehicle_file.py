@@ -8,7 +8,7 @@ import math
 import os
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree
@@ -27,53 +27,49 @@ from .cameras import (
     steps_of,
     texts_of,
 )
-from .coefficients import PREFIX, Limits, checked, coefficient_fields
+from .coefficients import COEFFICIENTS, PREFIX
 from .errors import InputError, expect
+from .fields import Limits, check, limits_of, rules_of
 
 _Vector = tuple[float, float, float]
 
 
-def _entry(unit: str, low: float, high: float, count: int | None = 1) -> Field[Any]:
-    one: Field[Any] = field(metadata={"limits": Limits(unit, low, high, count)})
-    return one
-
-
-ENTRIES: Final[Mapping[str, Field[Any]]] = {
-    "timestep": _entry("s", 1e-5, 1.0),
-    "gravity": _entry("m/s²", 1e-3, 1e3),
-    "body.mass": _entry("kg", 1e-6, 1e6),
-    "body.inertia": _entry("kg m²", -1e9, 1e9, None),
-    "body.center_of_mass": _entry("m", -100.0, 100.0, 3),
-    "body.size": _entry("m", 1e-4, 100.0, 3),
-    "body.ground_clearance": _entry("m", 1e-4, 100.0),
-    "body.parts.mass": _entry("kg", 1e-6, 1e6),
-    "body.parts.position": _entry("m", -100.0, 100.0, 3),
-    "body.parts.size": _entry("m", 1e-5, 100.0, 3),
-    "body.parts.yaw": _entry("rad", -2 * math.pi, 2 * math.pi),
-    "body.parts.radius": _entry("m", 1e-5, 100.0),
-    "body.parts.length": _entry("m", 1e-5, 100.0),
-    "body.parts.axis": _entry("1", -1e3, 1e3, 3),
-    "rotors.arm": _entry("m", 1e-3, 100.0),
-    "rotors.height": _entry("m", -100.0, 100.0),
-    "rotors.thrust": _entry("N", -1e6, 1e6, 2),
-    "rotors.speed": _entry("rad/s", 0.0, 1e6, 2),
-    "rotors.reaction": _entry("N m/N", 0.0, 10.0),
-    "rotors.torque_coefficient": _entry("N m s²/rad²", 0.0, 1.0),
-    "rotors.list.position": _entry("m", -100.0, 100.0, 3),
-    "rotors.list.axis": _entry("1", -1e3, 1e3, 3),
-    **dict(coefficient_fields()),
-    "cameras.position": _entry("m", -100.0, 100.0, 3),
-    "cameras.look": _entry("1", -1e3, 1e3, 3),
-    "cameras.up": _entry("1", -1e3, 1e3, 3),
-    "cameras.fovy": _entry("rad", *FOVY),
-    "cameras.resolution": _entry("pixel", 1, 4096, 2),
-    "cameras.rate": _entry("1", 1e-3, 1.0),
-    **{f"cameras.{one.name}": one for one in fields(Optics)},
-    "real_flights.position": _entry("m", 0.0, 1e4),
-    "real_flights.velocity": _entry("m/s", 0.0, 1e4),
-    "real_flights.attitude": _entry("rad", 0.0, 3.15),
+ENTRIES: Final[Mapping[str, Limits]] = {
+    "timestep": Limits(1e-5, 1.0, "s"),
+    "gravity": Limits(1e-3, 1e3, "m/s²"),
+    "body.mass": Limits(1e-6, 1e6, "kg"),
+    "body.inertia": Limits(-1e9, 1e9, "kg m²", count=None),
+    "body.center_of_mass": Limits(-100.0, 100.0, "m", count=3),
+    "body.size": Limits(1e-4, 100.0, "m", count=3),
+    "body.ground_clearance": Limits(1e-4, 100.0, "m"),
+    "body.parts.mass": Limits(1e-6, 1e6, "kg"),
+    "body.parts.position": Limits(-100.0, 100.0, "m", count=3),
+    "body.parts.size": Limits(1e-5, 100.0, "m", count=3),
+    "body.parts.yaw": Limits(-2 * math.pi, 2 * math.pi, "rad"),
+    "body.parts.radius": Limits(1e-5, 100.0, "m"),
+    "body.parts.length": Limits(1e-5, 100.0, "m"),
+    "body.parts.axis": Limits(-1e3, 1e3, "1", count=3),
+    "rotors.arm": Limits(1e-3, 100.0, "m"),
+    "rotors.height": Limits(-100.0, 100.0, "m"),
+    "rotors.thrust": Limits(-1e6, 1e6, "N", count=2),
+    "rotors.speed": Limits(0.0, 1e6, "rad/s", count=2),
+    "rotors.reaction": Limits(0.0, 10.0, "N m/N"),
+    "rotors.torque_coefficient": Limits(0.0, 1.0, "N m s²/rad²"),
+    "rotors.list.position": Limits(-100.0, 100.0, "m", count=3),
+    "rotors.list.axis": Limits(-1e3, 1e3, "1", count=3),
+    **COEFFICIENTS,
+    "cameras.position": Limits(-100.0, 100.0, "m", count=3),
+    "cameras.look": Limits(-1e3, 1e3, "1", count=3),
+    "cameras.up": Limits(-1e3, 1e3, "1", count=3),
+    "cameras.fovy": Limits(*FOVY, "rad"),
+    "cameras.resolution": Limits(1, 4096, "pixel", count=2),
+    "cameras.rate": Limits(1e-3, 1.0, "1"),
+    **limits_of(Optics, "cameras."),
+    "real_flights.position": Limits(0.0, 1e4, "m"),
+    "real_flights.velocity": Limits(0.0, 1e4, "m/s"),
+    "real_flights.attitude": Limits(0.0, 3.15, "rad"),
 }
-"""Every number of a file by its dotted name; `metadata["limits"]` has its `Limits`."""
+"""Every number of a file by its dotted name."""
 
 FRAMES: Final[Mapping[str, tuple[int, float]]] = {
     "plus": (4, 0.0),
@@ -205,8 +201,7 @@ class VehicleFile:
     @property
     def coefficients(self) -> dict[str, tuple[float, ...]]:
         """Those of effects and sensors, by "group.name"."""
-        known = dict(coefficient_fields())
-        return {one.name: _floats(one.value) for one in self.numbers if one.name in known}
+        return {one.name: _floats(one.value) for one in self.numbers if one.name in COEFFICIENTS}
 
     def build(self, base: mujoco.MjSpec | None = None) -> mujoco.MjSpec:
         """The vehicle alone, without ground; `base` is the spec of `model`, changed in place."""
@@ -376,7 +371,7 @@ class _Reader:
             position=given.get("position", (0.0, 0.0, 0.0)),
             look=look,
             up=up,
-            optics=Optics.read(name, given),
+            optics=Optics(**{key: given[key] for key in rules_of(Optics) if key in given}),
         )
 
     def _rotors(self, table: Any, model: Path | None) -> tuple[PlacedRotor, ...]:
@@ -409,10 +404,9 @@ class _Reader:
         return frame_rotors(frame, given["arm"], given.get("height", 0.0))
 
     def _only_coefficients(self, given: Mapping[str, Any]) -> None:
-        known = dict(coefficient_fields())
         for key in given:
             wanted = f"no {key} for rotors of the model's file"
-            expect(f"rotors.{key}" in known, "rotors", wanted, repr(given[key]))
+            expect(f"rotors.{key}" in COEFFICIENTS, "rotors", wanted, repr(given[key]))
 
     def _check_thrust(self, given: Mapping[str, Any]) -> None:
         """Thrust and reaction are told once each."""
@@ -479,7 +473,7 @@ def _round(length: float) -> float:
     return round(length, 15) + 0.0
 
 
-def _number(name: str, one: Field[Any], given: Any, source: str) -> Number:
+def _number(name: str, limits: Limits, given: Any, source: str) -> Number:
     """A number that is given plainly or with its provenance. Raises `InputError`."""
     told = given if isinstance(given, dict) else {"value": given}
     _check_keys(name, told, ("value", "source", "why", "others"))
@@ -493,11 +487,11 @@ def _number(name: str, one: Field[Any], given: Any, source: str) -> Number:
         expect("value" in other, f"{name}.others[{i}]", "a value", "none")
         where = other.get("source", "")
         expect(isinstance(where, str), f"{name}.others[{i}].source", "a text", repr(where))
-        others.append((checked(f"{name}.others[{i}]", one, other["value"]), where))
+        others.append((check(f"{name}.others[{i}]", limits, other["value"]), where))
     return Number(
         name=name,
-        value=checked(name, one, told["value"]),
-        unit=one.metadata["limits"].unit,
+        value=check(name, limits, told["value"]),
+        unit=limits.unit,
         source=texts["source"] or source,
         why=texts["why"],
         others=tuple(others),

@@ -9,14 +9,15 @@ World frame: x east, y north, z up. Arrays have the leading axes of the world, n
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
-from ..models.coefficients import Limits, checked, coefficient_fields
+from ..models.coefficients import COEFFICIENTS
 from ..models.errors import InputError, expect
+from ..models.fields import Limits, check, limits_of
 from .random import SENSORS
 from .rotations import advanced, between, cross, to_body, to_world, world_z
 from .state import Array, WorldState, clip, component, constant, stack
@@ -74,38 +75,29 @@ class Reading(NamedTuple):
 # ---- settings
 
 
-def _setting(default: Any, *limits: Any) -> Any:
-    return field(default=default, metadata={"limits": Limits(*limits)})
-
-
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """Settings that are no coefficients of a vehicle."""
 
-    rate: float | None = _setting(None, "Hz", 1e-3, 1e6)
+    rate: Annotated[float | None, Limits(1e-3, 1e6, "Hz")] = None
     """Readings per second: the control rate over a whole number. None: the control rate."""
-    delay: float = _setting(0.0, "s", 0.0, 10.0)
+    delay: Annotated[float, Limits(0.0, 10.0, "s")] = 0.0
     """Age of a reading when it is told: a whole number of control periods."""
-    dropout: float = _setting(0.0, "1", 0.0, 0.99)
+    dropout: Annotated[float, Limits(0.0, 0.99)] = 0.0
     """Probability that a reading is lost: the one before stays."""
-    field: tuple[float, ...] = _setting(FIELD, "µT", -100.0, 100.0, 3)
+    field: Annotated[tuple[float, ...], Limits(-100.0, 100.0, "µT", count=3)] = FIELD
     """Magnetic field in the world frame."""
-    altitude: float = _setting(0.0, "m", -1e3, 9e3)
+    altitude: Annotated[float, Limits(-1e3, 9e3, "m")] = 0.0
     """Height of the ground above sea level."""
-    attitude_time: float = _setting(1.0, "s", 1e-3, 1e4)
+    attitude_time: Annotated[float, Limits(1e-3, 1e4, "s")] = 1.0
     """Time constant with which the estimated attitude follows what measures it."""
-    height_time: float = _setting(1.0, "s", 1e-3, 1e4)
+    height_time: Annotated[float, Limits(1e-3, 1e4, "s")] = 1.0
     """The same of height and climb rate, which follow the barometer."""
-    position_time: float = _setting(1.0, "s", 1e-3, 1e4)
+    position_time: Annotated[float, Limits(1e-3, 1e4, "s")] = 1.0
     """The same of position and velocity, which follow motion capture and GPS."""
 
 
-_SETTINGS: Final = {one.name: one for one in fields(Settings)}
-_COEFFICIENTS: Final = {
-    name.removeprefix("sensors."): one
-    for name, one in coefficient_fields()
-    if name.startswith("sensors.")
-}
+_SETTINGS: Final = limits_of(Settings)
 _SAMPLING: Final = ("rate", "delay", "dropout")
 
 
@@ -138,21 +130,23 @@ def checked_sensors(given: Any) -> dict[str, Any]:
     return sensors
 
 
-def _fields(name: str) -> dict[str, Any]:
-    """Fields of all settings of a sensor, by their names."""
+def _limits(name: str) -> dict[str, Limits]:
+    """Limits of all settings of a sensor, by their names."""
     if name == _ESTIMATE:
         names = ("attitude_time", "height_time", "position_time")
         return {one: _SETTINGS[one] for one in names}
     kind = SENSOR_TYPES[name]
-    numbers = {one: _COEFFICIENTS[kind.prefix + one] for one in (*kind.needs, *kind.defaults)}
+    numbers = {
+        one: COEFFICIENTS[f"sensors.{kind.prefix}{one}"] for one in (*kind.needs, *kind.defaults)
+    }
     return numbers | {one: _SETTINGS[one] for one in (*kind.settings, *_SAMPLING)}
 
 
 def _checked_settings(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    known, settings = _fields(name), {}
+    known, settings = _limits(name), {}
     for key, value in given.items():
         expect(key in known, f"sensors.{name}", f"some of {', '.join(known)}", f"{key!r}")
-        number = checked(f"sensors.{name}.{key}", known[key], value)
+        number = check(f"sensors.{name}.{key}", known[key], value)
         settings[key] = list(number) if isinstance(number, tuple) else number
     return settings
 
@@ -165,7 +159,7 @@ def _resolved(
     With `every` and `lag`, control steps between readings and of the delay. Raises `InputError`.
     """
     values: dict[str, Any] = {
-        one: _SETTINGS[one].default for one in _fields(name) if one in _SETTINGS
+        one: getattr(Settings(), one) for one in _limits(name) if one in _SETTINGS
     }
     if name == _ESTIMATE:
         return values | dict(given)

@@ -3,11 +3,12 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ...models.errors import expect
+from ...models.fields import Limits
 from ...sim import Array, Draw, Pose, WorldState, stack
 from ..spec import Metric
 from .flight import (
@@ -20,30 +21,23 @@ from .flight import (
     length,
 )
 from .swarm import APPROACH_WEIGHT, TINY, Swarm, SwarmOptions, ring
-from .task import Outcome, check_number
+from .task import Outcome
 
 
 @dataclass(frozen=True, kw_only=True)
 class CableOptions(SwarmOptions):
     """Options of `rotorgram/Cable-v0`. `center` is the point for the payload."""
 
-    payload_share: float = 0.2
+    payload_share: Annotated[float, Limits(0.001, 10.0)] = 0.2
     """Mass of the payload over that of all vehicles together."""
-    angle: float = 30.0
+    angle: Annotated[float, Limits(5.0, 60.0, "degrees")] = 30.0
     """Angle of the cables to the vertical at the start, degrees. Their length follows from it and
     from `spacing`."""
-    start_band: float = 0.5
+    start_band: Annotated[float, Limits(0.0, 100.0)] = 0.5
     """Largest distance of the payload from the goal along each axis at the start, over the distance
     between neighbouring drones."""
 
     hangs = True
-
-    def check(self) -> None:
-        """Check the options of this task. Raises `InputError`."""
-        super().check()
-        check_number(self, "payload_share", 0.001, 10.0)
-        check_number(self, "angle", 5.0, 60.0, "degrees")
-        check_number(self, "start_band", 0.0, 100.0)
 
 
 class Cable(Swarm):

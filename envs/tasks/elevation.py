@@ -2,11 +2,12 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Literal, get_args
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 
 from ...models.errors import InputError, expect
+from ...models.fields import Limits, NumberOrPair
 from ...sim import (
     Array,
     CollectiveThrust,
@@ -20,7 +21,7 @@ from ...sim import (
     stack,
 )  # fmt: skip
 from ..spec import ArraySpec, Metric
-from .task import Outcome, Task, TaskOptions, check_choice, check_number, finite
+from .task import Outcome, Task, TaskOptions
 
 ERROR_SCALE: Final = 0.5  # |E| at which the reward crosses zero, m
 TERMINATION_REWARD: Final = -20.0
@@ -38,11 +39,11 @@ Observed = Literal["full", "error"]
 class ElevationOptions(TaskOptions):
     """Options of `rotorgram/Elevation-v0`."""
 
-    target: float | tuple[float, float] = 5.0
+    target: Annotated[float | tuple[float, float], NumberOrPair(Limits(unit="m"))] = 5.0
     """Target elevation Y, m: a number, or (low, high) to draw one uniformly for each episode."""
-    start_band: float = 1.0
+    start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 1.0
     """An episode starts at rest, hovering, up to this far above or below the target, m."""
-    flight_band: float = 3.0
+    flight_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 3.0
     """An episode terminates when the craft is further than this from the target, m."""
     actions: ClassVar[tuple[str, ...]] = ("increment", "offset")
 
@@ -53,28 +54,15 @@ class ElevationOptions(TaskOptions):
     """`continuous`: one number in [-1, 1]. `discrete`: 0 decrease, 1 hold, 2 increase."""
     observation: Observed = "full"
     """`full`: E, its rate and the thrust. `error`: E alone, as the paper feeds its network."""
-    thrust_scale: float | None = None
+    thrust_scale: Annotated[float | None, Limits(0.0, FURTHEST, "N", above=True)] = None
     """Thrust per unit of action for each rotor, N. None: 5 % (increment) or 20 % (offset) of the
     rotors' largest thrust, which is 5 N and 20 N for the paper's vehicle."""
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        check_number(self, "start_band", 0.0, FURTHEST, "m")
-        check_number(self, "flight_band", 0.0, FURTHEST, "m")
         wider = self.flight_band > self.start_band
         least = f"more than start_band = {self.start_band:g} m"
         expect(wider, "flight_band", least, f"{self.flight_band!r}")
-        check_choice(self, "action_type", get_args(ActionType))
-        check_choice(self, "observation", get_args(Observed))
-        if self.thrust_scale is not None:
-            check_number(self, "thrust_scale", math.ulp(0.0), FURTHEST, "N")
-        target: Any = self.target
-        pair = target if isinstance(target, tuple | list) else (target, target)
-        values = [value for value in map(finite, pair) if value is not None]
-        right = len(values) == len(pair) == 2 and values[0] <= values[1]
-        expected = "an elevation in m, or a pair (low, high) with low <= high"
-        expect(right, "target", expected, f"{target!r}")
-        object.__setattr__(self, "target", tuple(values) if pair is target else values[0])
 
     @property
     def target_range(self) -> tuple[float, float]:

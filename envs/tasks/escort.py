@@ -2,30 +2,25 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from ...models.fields import Limits
 from ...sim import Array, Draw, Pose, WorldState, stack
 from ..spec import Metric
 from .flight import FURTHEST, MOST_SPEED
 from .swarm import JITTER, Swarm, SwarmOptions, grid, ring
-from .task import check_number
 
 
 @dataclass(frozen=True, kw_only=True)
 class EscortOptions(SwarmOptions):
     """Options of `rotorgram/Escort-v0`."""
 
-    target_speed: float = 1.0
+    target_speed: Annotated[float, Limits(0.0, MOST_SPEED, "m/s")] = 1.0
     """Largest speed of the target, m/s."""
-    target_path: float = 5.0
+    target_path: Annotated[float, Limits(0.01, FURTHEST, "m")] = 5.0
     """Furthest distance of the target from the center along x and y, m."""
-
-    def check(self) -> None:
-        """Check the options of this task. Raises `InputError`."""
-        super().check()
-        check_number(self, "target_speed", 0.0, MOST_SPEED, "m/s")
-        check_number(self, "target_path", 0.01, FURTHEST, "m")
 
 
 class Escort(Swarm):

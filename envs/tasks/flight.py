@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.fields import Limits
 from ...sim import (
     Array,
     WorldState,
@@ -20,7 +20,7 @@ from ...sim import (
     world_z,
 )
 from ..spec import ArraySpec
-from .task import Task, finite
+from .task import Task
 
 ERROR_SCALE: Final = 0.5  # Distance at which the reward for nearness crosses zero, m
 RATE_WEIGHT: Final = 0.02  # Cost of a body rate of 1 rad/s
@@ -38,6 +38,14 @@ MOST_RATE: Final = 100.0  # Body rate past which an observation is clipped, rad/
 
 Number = tuple[str, str, float]
 """Name, unit and largest size of a number of an observation."""
+
+
+Point = Annotated[tuple[float, float, float], Limits(-FURTHEST, FURTHEST, "m", count=3)]
+"""Of an option: x, y, z in MuJoCo's world frame (z up), m."""
+
+
+Sides = Annotated[tuple[float, float, float], Limits(0.0, FURTHEST, "m", count=3)]
+"""Of an option: lengths along x, y and z, m."""
 
 
 class Flight(Task):
@@ -152,12 +160,3 @@ def axes(quaternion: Array) -> tuple[Array, Array]:
     nose = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
     up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
     return stack(nose), stack(up)
-
-
-def check_point(options: Any, name: str) -> None:
-    """Keep an option as a point (x, y, z), m. Raises `InputError`."""
-    given = getattr(options, name)
-    values = [finite(x) for x in given] if isinstance(given, tuple | list) else []
-    right = len(values) == 3 and all(x is not None and abs(x) <= FURTHEST for x in values)
-    expect(right, name, "three numbers (x, y, z) in m", f"{given!r}")
-    object.__setattr__(options, name, tuple(values))

@@ -1,14 +1,13 @@
 """`rotorgram/Formation-v0`: drones take their places in a formation."""
 
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Final, Literal
 
 import numpy as np
 
 from ...sim import Array, Draw, Pose, WorldState
 from ..spec import Metric
 from .swarm import JITTER, Swarm, SwarmOptions, grid, line, ring
-from .task import check_choice
 
 Formed = Literal["ring", "line", "grid"]
 _PLACES: Final = {"ring": ring, "line": line, "grid": grid}
@@ -20,11 +19,6 @@ class FormationOptions(SwarmOptions):
 
     formation: Formed = "ring"
     """`ring`; `line`, along y; or `grid`, nearly a square. All are level."""
-
-    def check(self) -> None:
-        """Check the options of this task. Raises `InputError`."""
-        super().check()
-        check_choice(self, "formation", get_args(Formed))
 
 
 class Formation(Swarm):

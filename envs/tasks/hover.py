@@ -2,9 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 from ...models.errors import expect
+from ...models.fields import Limits
 from ...sim import Array, Draw, Pose, WorldState, component, stack
 from ..spec import Metric
 from .flight import (
@@ -15,12 +16,12 @@ from .flight import (
     RATE_WEIGHT,
     TERMINATION_REWARD,
     Flight,
+    Point,
     at,
     axes,
-    check_point,
     length,
 )
-from .task import Outcome, TaskOptions, check_number
+from .task import Outcome, TaskOptions
 
 HEADING_WEIGHT: Final = 0.2  # Cost of a heading half a turn off
 
@@ -29,27 +30,21 @@ HEADING_WEIGHT: Final = 0.2  # Cost of a heading half a turn off
 class HoverOptions(TaskOptions):
     """Options of `rotorgram/Hover-v0`."""
 
-    goal: tuple[float, float, float] = (0.0, 0.0, 5.0)
+    goal: Point = (0.0, 0.0, 5.0)
     """Position to hold: x, y, z in MuJoCo's world frame (z up), m."""
-    heading: float = 0.0
+    heading: Annotated[float, Limits(-360.0, 360.0, "degrees")] = 0.0
     """Direction of the nose to hold, degrees about z, anticlockwise from x."""
-    start_band: float = 1.0
+    start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 1.0
     """Largest distance of the start from the goal along each axis, m."""
-    start_tilt: float = 30.0
+    start_tilt: Annotated[float, Limits(0.0, 80.0, "degrees")] = 30.0
     """Largest tilt at the start, degrees, about a horizontal axis drawn uniformly."""
-    start_heading: float = 30.0
+    start_heading: Annotated[float, Limits(0.0, 180.0, "degrees")] = 30.0
     """Largest error of the heading at the start, degrees."""
-    flight_band: float = 3.0
+    flight_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 3.0
     """An episode terminates when the craft is further than this from its goal, m."""
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        check_point(self, "goal")
-        check_number(self, "heading", -360.0, 360.0, "degrees")
-        check_number(self, "start_band", 0.0, FURTHEST, "m")
-        check_number(self, "start_tilt", 0.0, 80.0, "degrees")
-        check_number(self, "start_heading", 0.0, 180.0, "degrees")
-        check_number(self, "flight_band", 0.0, FURTHEST, "m")
         least = self.start_band * math.sqrt(3)
         expected = f"more than sqrt(3) · start_band = {least:.4g} m"
         expect(self.flight_band > least, "flight_band", expected, f"{self.flight_band!r}")

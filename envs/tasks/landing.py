@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final, Literal, get_args
+from typing import Annotated, Final, Literal
 
 from ...models.errors import expect
+from ...models.fields import Limits, NumberOrPair
 from ...sim import Array, Draw, Pose, WorldState, component, each, plain, square_root, stack
 from ..spec import Mark, Metric
 from .flight import LEAST_TILT_COSINE, RATE_WEIGHT, Flight, length
-from .task import Outcome, TaskOptions, check_choice, check_number, finite
+from .task import Outcome, TaskOptions
 
 MATCHING_TIME: Final = 0.5  # Progress that 1 m/s less relative speed is worth, over 1 m less way, s
 LANDING_REWARD: Final = 20.0  # Added to the reward of a step that ends with a landing
@@ -28,44 +29,30 @@ class LandingOptions(TaskOptions):
     """Control steps after which an episode is truncated."""
     motion: Motion = "circle"
     """Path of the pad about (0, 0): a `circle`, or a `line` on which it swings to and fro."""
-    pad_path: float = 2.0
+    pad_path: Annotated[float, Limits(0.01, FURTHEST, "m")] = 2.0
     """Radius of the circle, or half the length of the line, m."""
-    pad_speed: float | tuple[float, float] = (0.0, 1.0)
+    pad_speed: Annotated[
+        float | tuple[float, float], NumberOrPair(Limits(0.0, FASTEST_PAD, "m/s"))
+    ] = (0.0, 1.0)
     """Speed of the pad, m/s, on a line the largest: a number, or (low, high) to draw one uniformly
     for each episode."""
-    pad_radius: float = 0.5
+    pad_radius: Annotated[float, Limits(0.01, FURTHEST, "m")] = 0.5
     """A landing's largest horizontal distance of the body's origin from the pad's centre, m."""
-    sink: float = 1.0
+    sink: Annotated[float, Limits(0.01, 100.0, "m/s")] = 1.0
     """A landing's largest vertical speed, m/s."""
-    drift: float = 0.5
+    drift: Annotated[float, Limits(0.01, 100.0, "m/s")] = 0.5
     """A landing's largest horizontal speed relative to the pad, m/s."""
-    tilt: float = 15.0
+    tilt: Annotated[float, Limits(0.1, 90.0, "degrees")] = 15.0
     """A landing's largest tilt, degrees."""
-    start_height: float = 4.0
+    start_height: Annotated[float, Limits(0.1, FURTHEST, "m")] = 4.0
     """Mean height at the start above that of a craft on the ground, m."""
-    start_band: float = 1.0
+    start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 1.0
     """Largest distance of the start from (0, 0, mean height) along each axis, m."""
-    flight_band: float = 10.0
+    flight_band: Annotated[float, Limits(0.1, 10 * FURTHEST, "m")] = 10.0
     """An episode terminates when the craft is further than this from the pad, m."""
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        check_choice(self, "motion", get_args(Motion))
-        check_number(self, "pad_path", 0.01, FURTHEST, "m")
-        speed: Any = self.pad_speed
-        pair = speed if isinstance(speed, tuple | list) else (speed, speed)
-        values = [value for value in map(finite, pair) if value is not None]
-        right = len(values) == len(pair) == 2 and 0 <= values[0] <= values[1] <= FASTEST_PAD
-        expected = f"a speed of 0 to {FASTEST_PAD:g} m/s, or a pair (low, high) with low <= high"
-        expect(right, "pad_speed", expected, f"{speed!r}")
-        object.__setattr__(self, "pad_speed", tuple(values) if pair is speed else values[0])
-        check_number(self, "pad_radius", 0.01, FURTHEST, "m")
-        check_number(self, "sink", 0.01, 100.0, "m/s")
-        check_number(self, "drift", 0.01, 100.0, "m/s")
-        check_number(self, "tilt", 0.1, 90.0, "degrees")
-        check_number(self, "start_height", 0.1, FURTHEST, "m")
-        check_number(self, "start_band", 0.0, FURTHEST, "m")
-        check_number(self, "flight_band", 0.1, 10 * FURTHEST, "m")
         lowest = self.start_height - self.start_band
         expect(lowest >= 0.5, "start_band", "at most start_height - 0.5 m", f"{self.start_band!r}")
         reach = self.pad_path + math.sqrt(2) * self.start_band

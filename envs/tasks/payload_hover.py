@@ -3,9 +3,10 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from ...models.errors import expect
+from ...models.fields import Limits
 from ...sim import (
     Array,
     Draw,
@@ -29,43 +30,36 @@ from .flight import (
     SWING_WEIGHT,
     TERMINATION_REWARD,
     Flight,
+    Point,
     at,
-    check_point,
     length,
 )
-from .task import Outcome, TaskOptions, check_number
+from .task import Outcome, TaskOptions
 
 
 @dataclass(frozen=True, kw_only=True)
 class PayloadHoverOptions(TaskOptions):
     """Options of `rotorgram/PayloadHover-v0`."""
 
-    goal: tuple[float, float, float] = (0.0, 0.0, 4.0)
+    goal: Point = (0.0, 0.0, 4.0)
     """Point at which to hold the payload: x, y, z in MuJoCo's world frame (z up), m."""
-    payload_share: float = 0.1
+    payload_share: Annotated[float, Limits(0.001, 10.0)] = 0.1
     """Mass of the payload over that of the vehicle."""
-    cable: float = 1.0
+    cable: Annotated[float, Limits(0.05, 100.0, "m")] = 1.0
     """Length of the cable, m."""
-    start_band: float = 1.0
+    start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 1.0
     """Largest distance of the payload from the goal along each axis at the start, m."""
-    start_speed: float = 1.0
+    start_speed: Annotated[float, Limits(0.0, 100.0, "m/s")] = 1.0
     """Largest horizontal speed at the start along each axis, m/s, of craft and payload alike."""
-    start_tilt: float = 15.0
+    start_tilt: Annotated[float, Limits(0.0, 80.0, "degrees")] = 15.0
     """Largest tilt at the start, degrees, about a horizontal axis drawn uniformly."""
-    flight_band: float = 3.0
+    flight_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 3.0
     """An episode terminates when the payload is further than this from its goal, m."""
 
     hangs = True
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        check_point(self, "goal")
-        check_number(self, "payload_share", 0.001, 10.0)
-        check_number(self, "cable", 0.05, 100.0, "m")
-        check_number(self, "start_band", 0.0, FURTHEST, "m")
-        check_number(self, "start_speed", 0.0, 100.0, "m/s")
-        check_number(self, "start_tilt", 0.0, 80.0, "degrees")
-        check_number(self, "flight_band", 0.0, FURTHEST, "m")
         least = self.start_band * math.sqrt(3)
         expected = f"more than sqrt(3) · start_band = {least:.4g} m"
         expect(self.flight_band > least, "flight_band", expected, f"{self.flight_band!r}")

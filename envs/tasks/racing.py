@@ -4,13 +4,14 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final
 
 import numpy as np
 
 from ...models.errors import InputError, expect
+from ...models.fields import Limits, read_table
 from ...sim import Array, Draw, Pose, WorldState, clip, component, constant, each, plain, stack
 from ..spec import Mark, Metric
 from .flight import (
@@ -21,9 +22,10 @@ from .flight import (
     LEAST_TILT_COSINE,
     PASSING_REWARD,
     Flight,
+    Point,
     length,
 )
-from .task import Outcome, TaskOptions, check_number, check_whole, finite
+from .task import Outcome, TaskOptions
 
 TRACKS: Final = Path(__file__).parent.parent / "tracks"
 MOST_GATES: Final = 64
@@ -31,15 +33,25 @@ MOST_LAPS: Final = 1000
 _WAY: Final = "a track of ours, a TOML file of gates, or its content as JSON"
 
 
-class Gate(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """Where a race starts."""
+
+    position: Point
+    heading: Annotated[float, Limits(-360.0, 360.0, "degrees")]
+    """Direction of the nose about z, anticlockwise from x."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gate:
     """A square opening that stands upright."""
 
-    position: tuple[float, float, float]
-    """Of its centre, world frame, m."""
-    heading: float
-    """Direction in which it is passed, degrees about z, anticlockwise from x."""
-    size: float
-    """Width and height, m."""
+    position: Point
+    """Of its centre."""
+    heading: Annotated[float, Limits(-360.0, 360.0, "degrees")]
+    """Direction in which it is passed, about z, anticlockwise from x."""
+    size: Annotated[float, Limits(0.01, FURTHEST, "m")]
+    """Width and height."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,23 +63,19 @@ class RacingOptions(TaskOptions):
     track: str = "oval"
     """A track of ours (`oval`, `dive`), or a TOML file with its gates and its start. It is kept as
     JSON, so that it crosses the wire."""
-    laps: int = 1
+    laps: Annotated[int, Limits(1, MOST_LAPS, whole=True)] = 1
     """Rounds of all gates."""
-    start_band: float = 0.5
+    start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 0.5
     """Largest distance of the start from that of the track along each axis, m."""
-    margin: float = 5.0
+    margin: Annotated[float, Limits(0.1, FURTHEST, "m")] = 5.0
     """An episode terminates when the craft is further than this from the line between the gate that
     it has passed, or the start, and the next one, m."""
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
         gates, start = read_track(self.track)
-        rows = [gate._asdict() for gate in gates]
-        content = {"gates": rows, "start": {"position": start.position, "heading": start.heading}}
+        content = {"gates": [asdict(gate) for gate in gates], "start": asdict(start)}
         object.__setattr__(self, "track", json.dumps(content, separators=(",", ":")))
-        check_whole(self, "laps", 1, MOST_LAPS)
-        check_number(self, "start_band", 0.0, FURTHEST, "m")
-        check_number(self, "margin", 0.1, FURTHEST, "m")
 
 
 class Racing(Flight):
@@ -248,7 +256,7 @@ class Racing(Flight):
         return chosen
 
 
-def read_track(given: Any) -> tuple[list[Gate], Gate]:
+def read_track(given: Any) -> tuple[list[Gate], Start]:
     """Gates of a track, and its start, a gate of size 0. Raises `InputError`."""
     expect(isinstance(given, str), "track", _WAY, f"{given!r:.80}")
     try:
@@ -270,26 +278,5 @@ def read_track(given: Any) -> tuple[list[Gate], Gate]:
     expect(not unknown, "track", "gates and start", f"{unknown}")
     rows = content["gates"]
     expect(1 <= len(rows) <= MOST_GATES, "track", f"1 to {MOST_GATES} gates", f"{len(rows)}")
-    gates = [_gate(row, f"gate {i}") for i, row in enumerate(rows, start=1)]
-    return gates, _gate(content.get("start"), "start", sized=False)
-
-
-def _gate(row: Any, what: str, *, sized: bool = True) -> Gate:
-    names = ["position", "heading", *(["size"] if sized else [])]
-    right = isinstance(row, Mapping) and sorted(row) == sorted(names)
-    expect(right, f"track: {what}", " and ".join(names), f"{row!r:.80}")
-    place = row["position"]
-    numbers = [finite(x) for x in place] if isinstance(place, list | tuple) else []
-    right = len(numbers) == 3 and all(x is not None and abs(x) <= FURTHEST for x in numbers)
-    expect(right, f"track: {what}", "a position (x, y, z) in m", f"{place!r:.80}")
-    heading, size = finite(row["heading"]), finite(row.get("size", 0.0))
-    right = heading is not None and abs(heading) <= 360.0
-    expect(right, f"track: {what}", "a heading from -360 to 360 degrees", f"{row['heading']!r:.80}")
-    right = size is not None and (not sized or 0.01 <= size <= FURTHEST)
-    expect(
-        right, f"track: {what}", f"a size from 0.01 to {FURTHEST:g} m", f"{row.get('size')!r:.80}"
-    )
-    assert heading is not None
-    assert size is not None
-    x, y, z = (float(value) for value in place)
-    return Gate((x, y, z), heading, size)
+    gates = [read_table(Gate, row, f"track: gate {i}") for i, row in enumerate(rows, start=1)]
+    return gates, read_table(Start, content.get("start"), "track: start")

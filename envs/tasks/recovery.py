@@ -2,11 +2,12 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Annotated, Final, Literal
 
 import numpy as np
 
 from ...models.errors import expect
+from ...models.fields import Limits
 from ...sim import (
     Array,
     Draw,
@@ -19,8 +20,8 @@ from ...sim import (
     stack,
 )
 from ..spec import Metric
-from .flight import AIR, RATE_WEIGHT, Flight, at, check_point, length
-from .task import Outcome, TaskOptions, check_choice, check_number
+from .flight import AIR, RATE_WEIGHT, Flight, Point, at, length
+from .task import Outcome, TaskOptions
 
 ERROR_SCALE: Final = 1.0  # Distance at which the reward for nearness crosses zero, m
 TILT_WEIGHT: Final = 0.25  # Cost of a tilt of 90°; upside down it is twice as much
@@ -35,20 +36,20 @@ class RecoveryOptions(TaskOptions):
 
     episode_length: int = 400
     """Control steps after which an episode is truncated."""
-    goal: tuple[float, float, float] = (0.0, 0.0, 20.0)
+    goal: Point = (0.0, 0.0, 20.0)
     """Where it is thrown, and has to come back to: x, y, z in MuJoCo's world frame (z up), m."""
-    start_speed: float = 3.0
+    start_speed: Annotated[float, Limits(0.0, 100.0, "m/s")] = 3.0
     """Largest speed at the start, m/s, in a direction drawn uniformly."""
-    spin: float = 10.0
+    spin: Annotated[float, Limits(0.0, 100.0, "rad/s")] = 10.0
     """Largest rate about each body axis at the start, rad/s; no faster than the vehicle's largest
     torque about that axis stops in 0.5 s."""
-    near: float = 0.5
+    near: Annotated[float, Limits(0.01, 1e3, "m")] = 0.5
     """A craft has recovered while it is nearer to the goal than this, m, ..."""
-    slow: float = 0.5
+    slow: Annotated[float, Limits(0.01, 100.0, "m/s")] = 0.5
     """... slower than this, m/s, ..."""
-    upright: float = 15.0
+    upright: Annotated[float, Limits(0.1, 90.0, "degrees")] = 15.0
     """... and tilted by less than this, degrees."""
-    flight_band: float = 15.0
+    flight_band: Annotated[float, Limits(0.1, 1e4, "m")] = 15.0
     """An episode terminates when the craft is further than this from its goal, m."""
     frame: Frame | None = None
     """Frame of the observation; by default that in which the action acts: `body` with the actions
@@ -56,19 +57,11 @@ class RecoveryOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        check_point(self, "goal")
-        check_number(self, "start_speed", 0.0, 100.0, "m/s")
-        check_number(self, "spin", 0.0, 100.0, "rad/s")
-        check_number(self, "near", 0.01, 1e3, "m")
-        check_number(self, "slow", 0.01, 100.0, "m/s")
-        check_number(self, "upright", 0.1, 90.0, "degrees")
-        check_number(self, "flight_band", 0.1, 1e4, "m")
         expected = f"more than near = {self.near:g} m"
         expect(self.flight_band > self.near, "flight_band", expected, f"{self.flight_band!r}")
         if self.frame is None:
             frame = "body" if self.action in ("rotors", "rates") else "world"
             object.__setattr__(self, "frame", frame)
-        check_choice(self, "frame", get_args(Frame))
 
 
 class Recovery(Flight):

@@ -1,11 +1,12 @@
 """What tasks for several drones share: who hears whom by radio, and the room between drones."""
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 
 from ...models.errors import expect
+from ...models.fields import Limits
 from ...sim import Array, Draw, WorldState, constant
 from ..delay import Delay
 from .flight import (
@@ -16,10 +17,10 @@ from .flight import (
     RATE_WEIGHT,
     TERMINATION_REWARD,
     Flight,
-    check_point,
+    Point,
     length,
 )
-from .task import Outcome, TaskOptions, check_number, check_whole
+from .task import Outcome, TaskOptions
 
 MOST_DRONES: Final = 128
 FORGOTTEN: Final = 1.0  # A drone that was not heard for so long is no neighbour any more, s
@@ -36,30 +37,20 @@ class SwarmOptions(TaskOptions):
     action: str = "velocity"
     episode_length: int = 500
     """Control steps after which an episode is truncated."""
-    center: tuple[float, float, float] = (0.0, 0.0, 10.0)
+    center: Point = (0.0, 0.0, 10.0)
     """Middle of starts and goals: x, y, z in MuJoCo's world frame (z up), m."""
-    spacing: float = 3.0
+    spacing: Annotated[float, Limits(2.0, 1e3, "diameters")] = 3.0
     """Distance between neighbouring starts, and goals, over the diameter of the vehicle."""
-    margin: float = 10.0
+    margin: Annotated[float, Limits(0.1, FURTHEST, "m")] = 10.0
     """An episode terminates for a drone that is so much further from its goal than any start, m."""
-    neighbours: int = 7
+    neighbours: Annotated[int, Limits(0, 16, "drones", whole=True)] = 7
     """Drones in the observation of each: the nearest that it hears."""
-    radio_range: float = 100.0
+    radio_range: Annotated[float, Limits(0.0, FURTHEST, "m")] = 100.0
     """Furthest distance at which a drone is heard, m."""
-    radio_delay: int = 0
+    radio_delay: Annotated[int, Limits(0, 100, "control steps", whole=True)] = 0
     """Control steps from what a drone says to where it is heard."""
-    radio_loss: float = 0.0
+    radio_loss: Annotated[float, Limits(0.0, 1.0)] = 0.0
     """Share of messages that are lost, each for itself: of one drone to another in one step."""
-
-    def check(self) -> None:
-        """Check the options that all share. Raises `InputError`."""
-        check_point(self, "center")
-        check_number(self, "spacing", 2.0, 1e3, "diameters")
-        check_number(self, "margin", 0.1, FURTHEST, "m")
-        check_whole(self, "neighbours", 0, 16, " of drones")
-        check_number(self, "radio_range", 0.0, FURTHEST, "m")
-        check_whole(self, "radio_delay", 0, 100, " of control steps")
-        check_number(self, "radio_loss", 0.0, 1.0)
 
 
 class Swarm(Flight):

@@ -6,17 +6,15 @@ functions of `self.xp` (the array API standard: NumPy, or torch on a GPU), and n
 array in place.
 """
 
-import math
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
-from numbers import Real
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Self
 
 import numpy as np
 
 from ...models import MOST_DRAG, scenes_of
 from ...models.errors import expect
+from ...models.fields import Choice, Limits, check, check_fields
 from ...sim import (
     LEVELS,
     Array,
@@ -44,20 +42,21 @@ class TaskOptions:
     """Options that every task has. A wrong one raises `InputError` with one sentence.
 
     Numbers may be of any real type, NumPy's among them; they are kept as Python's float and int.
-    A task with options of its own derives from this and checks them in `check`.
+    A task with options of its own derives from this: annotations say what they may be (see
+    `models.fields`), and `check` what they have to do with each other.
     """
 
-    episode_length: int = 250
+    episode_length: Annotated[int, Limits(1, LONGEST_EPISODE, "control steps", whole=True)] = 250
     """Control steps after which an episode is truncated."""
     action: str = "rotors"
     """What an action sets: one of `sim.LEVELS`."""
-    control_period: float = 0.02
+    control_period: Annotated[float, Limits(1e-6, LONGEST_CONTROL_PERIOD, "s")] = 0.02
     """Time between two actions, s: a multiple of the physics step, at most 1 s. The default is that
     of Unity's `FixedUpdate`."""
-    history: int = 1
+    history: Annotated[int, Limits(1, LONGEST_HISTORY, "observations", whole=True)] = 1
     """The agent observes the last so many observations side by side, the oldest first; at the start
     of an episode all are the first one."""
-    linear_drag: float = 0.0
+    linear_drag: Annotated[float, Limits(0.0, MOST_DRAG, "/s")] = 0.0
     """Acceleration of -linear_drag · velocity, 1/s, as Unity's `Rigidbody.drag`; at most 100. The
     force acts at the body's origin."""
     effects: Mapping[str, Any] = field(default_factory=dict, hash=False)
@@ -79,11 +78,8 @@ class TaskOptions:
     """Whether the task hangs a payload from the vehicle, so that `effects` may not."""
 
     def __post_init__(self) -> None:
-        check_choice(self, "action", self.actions)
-        check_whole(self, "episode_length", 1, LONGEST_EPISODE, " of control steps")
-        check_whole(self, "history", 1, LONGEST_HISTORY, " of observations")
-        check_number(self, "control_period", 1e-6, LONGEST_CONTROL_PERIOD, "s")
-        check_number(self, "linear_drag", 0.0, MOST_DRAG, "/s")
+        check_fields(self)
+        check("action", Choice(self.actions), self.action)
         effects = EffectOptions.from_options(self.effects)
         hung = [name for name in ("payload", "cable") if self.hangs and name in self.effects]
         expected = "a payload that the options of the task describe"
@@ -98,7 +94,7 @@ class TaskOptions:
         object.__setattr__(self, "randomize", drawn.to_options())
 
     def check(self) -> None:
-        """Check the options of a derived class; raise `InputError`."""
+        """Check options that depend on each other, each within its limits. Raises `InputError`."""
 
     @property
     def ideal(self) -> bool:
@@ -251,35 +247,3 @@ def _words(given: Any) -> tuple[str, ...]:
     right = isinstance(texts, list | tuple) and all(isinstance(one, str) for one in texts)
     expect(right, "cameras", "names, with commas between them", f"{given!r:.80}")
     return tuple(word for text in texts for word in text.replace(",", " ").split())
-
-
-def finite(value: Any) -> float | None:
-    """A finite real number as a float; None for everything else, truth values among them."""
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
-        return None
-    with suppress(OverflowError):
-        return number if math.isfinite(number := float(value)) else None
-    return None
-
-
-def check_number(options: Any, name: str, low: float, high: float, unit: str = "") -> None:
-    """Keep an option as a float within bounds. Raises `InputError`."""
-    value, given = finite(getattr(options, name)), getattr(options, name)
-    expected = f"a number from {low:g} to {high:g} {unit}".rstrip()
-    expect(value is not None and low <= value <= high, name, expected, f"{given!r}")
-    object.__setattr__(options, name, value)
-
-
-def check_whole(options: Any, name: str, low: int, high: int, of: str = "") -> None:
-    """Keep an option as an int within bounds. Raises `InputError`."""
-    value, given = finite(getattr(options, name)), getattr(options, name)
-    right = value is not None and value == int(value) and low <= value <= high
-    expect(right, name, f"a whole number{of} from {low} to {high}", f"{given!r}")
-    object.__setattr__(options, name, int(given))
-
-
-def check_choice(options: Any, name: str, allowed: tuple[str, ...]) -> None:
-    """Check an option that is one of some words. Raises `InputError`."""
-    value = getattr(options, name)
-    right = isinstance(value, str) and value in allowed
-    expect(right, name, " or ".join(map(repr, allowed)), f"{value!r}")

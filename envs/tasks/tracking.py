@@ -6,11 +6,12 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 
 from ...models.errors import InputError, expect
+from ...models.fields import Limits
 from ...sim import (
     Array,
     Draw,
@@ -33,10 +34,10 @@ from .flight import (
     RATE_WEIGHT,
     TERMINATION_REWARD,
     Flight,
-    check_point,
+    Point,
     length,
 )
-from .task import Outcome, TaskOptions, check_number, check_whole
+from .task import Outcome, TaskOptions
 
 MOST_SAMPLES: Final = 20_000  # Rows of a file
 MOST_POINTS: Final = 16  # That a minimum-snap trajectory goes through
@@ -55,22 +56,22 @@ class TrackingOptions(TaskOptions):
     """`circle` or `lemniscate`, level and without end; `snap`, a minimum-snap trajectory from rest
     to rest through points; or a CSV file with columns t (s), x, y, z (m, world frame), straight
     between its rows. The rows of a file are kept as JSON, so that they cross the wire."""
-    center: tuple[float, float, float] = (0.0, 0.0, 5.0)
+    center: Point = (0.0, 0.0, 5.0)
     """Middle of a circle, a lemniscate, or the box of points: world frame, m."""
-    radius: float = 2.0
+    radius: Annotated[float, Limits(0.0, FURTHEST, "m")] = 2.0
     """Of the circle, half the length of the lemniscate, or half the width of the box, which is half
     as high, m."""
-    period: float = 10.0
+    period: Annotated[float, Limits(0.1, 1e4, "s")] = 10.0
     """Time of a round, or of all of a `snap`, s."""
-    points: int = 5
+    points: Annotated[int, Limits(2, MOST_POINTS, whole=True)] = 5
     """Points of a `snap`, 2 to 16, which are drawn in the box for each episode."""
-    preview: int = 3
+    preview: Annotated[int, Limits(0, 20, whole=True)] = 3
     """Later points of the trajectory in the observation, 0 to 20."""
-    preview_time: float = 0.2
+    preview_time: Annotated[float, Limits(0.0, 100.0, "s")] = 0.2
     """Time between these, s."""
-    start_band: float = 0.3
+    start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 0.3
     """Largest distance of the start from the trajectory along each axis, m."""
-    flight_band: float = 3.0
+    flight_band: Annotated[float, Limits(0.01, FURTHEST, "m")] = 3.0
     """An episode terminates when the craft is further than this from where it should be, m."""
 
     def check(self) -> None:
@@ -78,14 +79,6 @@ class TrackingOptions(TaskOptions):
         if self.trajectory not in _KINDS:
             rows = json.dumps(read_samples(self.trajectory).tolist(), separators=(",", ":"))
             object.__setattr__(self, "trajectory", rows)
-        check_point(self, "center")
-        check_number(self, "radius", 0.0, FURTHEST, "m")
-        check_number(self, "period", 0.1, 1e4, "s")
-        check_number(self, "preview_time", 0.0, 100.0, "s")
-        check_number(self, "start_band", 0.0, FURTHEST, "m")
-        check_number(self, "flight_band", 0.01, FURTHEST, "m")
-        check_whole(self, "points", 2, MOST_POINTS)
-        check_whole(self, "preview", 0, 20)
 
 
 class Tracking(Flight):

@@ -2,9 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 from ...models.errors import expect
+from ...models.fields import Limits
 from ...sim import Array, Draw, Pose, WorldState, component, each, plain, stack
 from ..spec import Mark, Metric
 from .flight import (
@@ -15,11 +16,12 @@ from .flight import (
     LEAST_TILT_COSINE,
     PASSING_REWARD,
     Flight,
+    Point,
+    Sides,
     at,
-    check_point,
     length,
 )
-from .task import Outcome, TaskOptions, check_number, check_whole
+from .task import Outcome, TaskOptions
 
 MOST_POINTS: Final = 64
 
@@ -30,25 +32,20 @@ class WaypointsOptions(TaskOptions):
 
     episode_length: int = 750
     """Control steps after which an episode is truncated."""
-    points: int = 4
+    points: Annotated[int, Limits(1, MOST_POINTS, whole=True)] = 4
     """Points of an episode, 1 to 64."""
-    center: tuple[float, float, float] = (0.0, 0.0, 5.0)
+    center: Point = (0.0, 0.0, 5.0)
     """Middle of the box in which points and start are drawn: x, y, z in MuJoCo's world frame, m."""
-    box: tuple[float, float, float] = (3.0, 3.0, 1.5)
+    box: Sides = (
+        3.0,
+        3.0,
+        1.5,
+    )
     """From that middle to the sides of the box, along x, y and z, m."""
-    radius: float = 0.3
+    radius: Annotated[float, Limits(1e-3, FURTHEST, "m")] = 0.3
     """A point is reached by a craft that is nearer to it than this at a control step, m."""
-    margin: float = 3.0
+    margin: Annotated[float, Limits(0.1, FURTHEST, "m")] = 3.0
     """An episode terminates when the craft is further outside the box than this, m."""
-
-    def check(self) -> None:
-        """Check the options of this task. Raises `InputError`."""
-        check_whole(self, "points", 1, MOST_POINTS)
-        check_point(self, "center")
-        check_point(self, "box")
-        expect(min(self.box) >= 0, "box", "three numbers of 0 m or more", f"{self.box!r}")
-        check_number(self, "radius", 1e-3, FURTHEST, "m")
-        check_number(self, "margin", 0.1, FURTHEST, "m")
 
 
 class Waypoints(Flight):

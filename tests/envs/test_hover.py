@@ -142,9 +142,9 @@ def test_bounds_are_never_left_and_ends_are_never_both() -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"goal": 5.0}, "goal: expected three numbers"),
-        ({"goal": (0.0, 0.0)}, "goal: expected three numbers"),
-        ({"goal": (0.0, math.nan, 5.0)}, "goal: expected three numbers"),
+        ({"goal": 5.0}, "goal: expected 3 numbers"),
+        ({"goal": (0.0, 0.0)}, "goal: expected 3 numbers"),
+        ({"goal": (0.0, math.nan, 5.0)}, "goal: expected 3 numbers"),
         ({"goal": (0.0, 0.0, 1.9)}, "goal: expected a height of at least 2 m above the ground"),
         ({"heading": "north"}, "heading: expected a number from -360 to 360 degrees, got 'north'"),
         ({"start_tilt": 81.0}, "start_tilt: expected a number from 0 to 80 degrees"),

@@ -206,8 +206,8 @@ def wanted(seen: np.ndarray, rotors: int) -> np.ndarray:
     ("options", "sentence"),
     [
         ({"motion": "spiral"}, "motion: expected 'circle' or 'line', got 'spiral'"),
-        ({"pad_speed": (1.0, 0.5)}, "pad_speed: expected a speed of 0 to 20 m/s, or a pair"),
-        ({"pad_speed": -1.0}, "pad_speed: expected a speed of 0 to 20 m/s"),
+        ({"pad_speed": (1.0, 0.5)}, "pad_speed: expected a number from 0 to 20 m/s, or a pair"),
+        ({"pad_speed": -1.0}, "pad_speed: expected a number from 0 to 20 m/s"),
         ({"pad_path": 0.0}, "pad_path: expected a number from 0.01 to 1000 m, got 0"),
         ({"pad_radius": "wide"}, "pad_radius: expected a number from 0.01 to 1000 m, got 'wide'"),
         ({"sink": 0.0}, "sink: expected a number from 0.01 to 100 m/s"),

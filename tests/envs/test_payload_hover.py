@@ -142,7 +142,7 @@ def test_hovering_without_the_payload_drops_it(share: float, factor: float) -> N
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"goal": (0.0, 0.0)}, "goal: expected three numbers"),
+        ({"goal": (0.0, 0.0)}, "goal: expected 3 numbers"),
         ({"goal": (0.0, 0.0, 1.5)}, "goal: expected a height of at least 1.678 m above the ground"),
         (
             {"effects": {"payload": 2.0}},

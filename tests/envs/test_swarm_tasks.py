@@ -243,7 +243,7 @@ def test_what_orca_cannot_fly_is_one_sentence() -> None:
     [
         ({"spacing": 1.0}, "spacing: expected a number from 2 to 1000 diameters, got 1.0"),
         ({"radio_loss": 1.5}, "radio_loss: expected a number from 0 to 1, got 1.5"),
-        ({"neighbours": 17}, "neighbours: expected a whole number of drones from 0 to 16, got 17"),
+        ({"neighbours": 17}, "neighbours: expected a whole number from 0 to 16 drones, got 17"),
         ({"center": (0, 0, 1)}, "center: expected a height of at least"),
         ({"formation": "star"}, "formation: expected 'ring' or 'line' or 'grid', got 'star'"),
     ],

@@ -67,11 +67,11 @@ def test_defaults() -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"target": "57"}, "target: expected an elevation in m, or a pair .*, got '57'"),
-        ({"target": True}, "target: expected an elevation in m, or a pair .*, got True"),
-        ({"target": None}, "target: expected an elevation in m, or a pair .*, got None"),
-        ({"target": math.nan}, "target: expected an elevation in m, or a pair .*, got nan"),
-        ({"target": 10**400}, "target: expected an elevation in m, or a pair .*, got 1000"),
+        ({"target": "57"}, "target: expected a number in m, or a pair .*, got '57'"),
+        ({"target": True}, "target: expected a number in m, or a pair .*, got True"),
+        ({"target": None}, "target: expected a number in m, or a pair .*, got None"),
+        ({"target": math.nan}, "target: expected a number in m, or a pair .*, got nan"),
+        ({"target": 10**400}, "target: expected a number in m, or a pair .*, got 1000"),
         ({"target": (6.0, 4.0)}, r"target: .* low <= high, got \(6.0, 4.0\)"),
         ({"target": (4.0,)}, r"target: .* a pair \(low, high\) .*, got \(4.0,\)"),
         ({"target": ()}, r"target: .* a pair \(low, high\) .*, got \(\)"),
@@ -86,7 +86,7 @@ def test_defaults() -> None:
         ({"flight_band": [3.0]}, r"flight_band: expected a number .*, got \[3.0\]"),
         (
             {"episode_length": 0},
-            "episode_length: expected a whole number .* from 1 to 2147483648, got 0",
+            "episode_length: expected a whole number from 1 to 2147483648 control steps, got 0",
         ),
         ({"episode_length": 2.5}, "episode_length: expected a whole number .*, got 2.5"),
         ({"episode_length": True}, "episode_length: expected a whole number .*, got True"),

@@ -114,7 +114,7 @@ def test_points_of_others_stay() -> None:
     [
         ({"points": 0}, "points: expected a whole number from 1 to 64, got 0"),
         ({"points": 1.5}, "points: expected a whole number from 1 to 64, got 1.5"),
-        ({"box": (1.0, -1.0, 1.0)}, "box: expected three numbers of 0 m or more, got"),
+        ({"box": (1.0, -1.0, 1.0)}, "box: expected 3 numbers from 0 to 10000 m, got"),
         ({"center": (0.0, 0.0, 2.0)}, "center: expected a height of at least 2.5 m above"),
         ({"radius": 0.0}, "radius: expected a number from 0.001 to 10000 m, got 0.0"),
         ({"margin": "wide"}, "margin: expected a number from 0.1 to 10000 m, got 'wide'"),

@@ -1,0 +1,314 @@
+"""Rules of the fields of a dataclass, and the check of every range in the project.
+
+    @dataclass(frozen=True, kw_only=True)
+    class Options:
+        control_period: Annotated[float, Limits(1e-6, 1.0, "s")] = 0.02
+        laps: Annotated[int, Limits(1, 1000, whole=True)] = 1
+        wind: Annotated[tuple[float, ...], Limits(-100, 100, "m/s", count=3)] = (0.0, 0.0, 0.0)
+        frame: Literal["body", "world"] = "body"
+        shadows: bool = False
+
+        def __post_init__(self) -> None:
+            check_fields(self)
+
+A wrong value raises `InputError`: "control_period: expected a number from 1e-06 to 1 s, got 2.0".
+Imports the standard library alone.
+"""
+
+import inspect
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import KW_ONLY, MISSING, dataclass, fields
+from numbers import Real
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Protocol, TypeVar, Union, get_args, get_origin
+
+from .errors import InputError
+
+T = TypeVar("T")
+
+
+class Rule(Protocol):
+    """What a value may be."""
+
+    @property
+    def expected(self) -> str:
+        """The rule in words, as they stand after "expected"."""
+
+    def read(self, value: Any) -> Any:
+        """The value as it is kept. Raises `ValueError` or `TypeError` for a wrong one."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """A finite number from `low` to `high`, or a tuple of `count` such numbers."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = ""
+    """Empty or "1" for pure numbers."""
+    _: KW_ONLY
+    whole: bool = False
+    above: bool = False
+    """The number is larger than `low`."""
+    count: int | None = 1
+    """None: `least` numbers or more."""
+    least: int = 1
+
+    @property
+    def expected(self) -> str:
+        kind = "whole number" if self.whole else "number"
+        if self.count == 1:
+            numbers = f"a {kind}"
+        elif self.count is None:
+            numbers = f"{self.least} or more {kind}s" if self.least else f"{kind}s"
+        else:
+            numbers = f"{self.count} {kind}s"
+        words = [numbers, self._range()]
+        if self.unit not in ("", "1"):
+            words.append(self.unit if self._is_bounded else f"in {self.unit}")
+        return " ".join(filter(None, words))
+
+    @property
+    def _is_bounded(self) -> bool:
+        return not (math.isinf(self.low) and math.isinf(self.high))
+
+    def _range(self) -> str:
+        low, high = _digits(self.low), _digits(self.high)
+        if not self._is_bounded:
+            return ""
+        if math.isinf(self.low):
+            return f"of at most {high}"
+        if math.isinf(self.high):
+            return f"above {low}" if self.above else f"of at least {low}"
+        return f"above {low}, at most {high}" if self.above else f"from {low} to {high}"
+
+    def read(self, value: Any) -> float | tuple[float, ...]:
+        if self.count == 1:
+            return self._number(value)
+        numbers = tuple(self._number(one) for one in value)
+        right = len(numbers) >= self.least if self.count is None else len(numbers) == self.count
+        if not right:
+            raise ValueError
+        return numbers
+
+    def _number(self, value: Any) -> float:
+        is_real = isinstance(value, Real) and not isinstance(value, bool)
+        if not is_real or not math.isfinite(value):
+            raise TypeError
+        if not self.low <= value <= self.high or (self.above and value == self.low):
+            raise ValueError
+        if not self.whole:
+            return float(value)
+        if value != int(value):
+            raise ValueError
+        return int(value)
+
+
+@dataclass(frozen=True)
+class NumberOrPair:
+    """A number within limits, or a pair (low, high) of them."""
+
+    limits: Limits
+
+    @property
+    def expected(self) -> str:
+        return f"{self.limits.expected}, or a pair (low, high) with low <= high"
+
+    def read(self, value: Any) -> float | tuple[float, ...]:
+        if not isinstance(value, tuple | list):
+            return self.limits._number(value)
+        low, high = (self.limits._number(one) for one in value)
+        if low > high:
+            raise ValueError
+        return low, high
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of some words."""
+
+    words: tuple[str, ...]
+
+    @property
+    def expected(self) -> str:
+        return " or ".join(map(repr, self.words))
+
+    def read(self, value: Any) -> str:
+        if not isinstance(value, str) or value not in self.words:
+            raise ValueError
+        return value
+
+
+@dataclass(frozen=True)
+class Text:
+    """A text; where a largest length is given, of printable characters."""
+
+    longest: int | None = None
+    _: KW_ONLY
+    identifier: bool = False
+    """Letters, digits and _ alone, the first no digit."""
+    empty: bool = False
+    """It may have no character."""
+
+    @property
+    def expected(self) -> str:
+        if self.longest is None:
+            return "a text"
+        if self.identifier:
+            return f"up to {self.longest} letters, digits and _"
+        return f"a text of {int(not self.empty)} to {self.longest} printable characters"
+
+    def read(self, value: Any) -> str:
+        if not isinstance(value, str) or not (value or self.empty):
+            raise ValueError
+        if self.longest is None:
+            return value
+        if len(value) > self.longest or not value.isprintable():
+            raise ValueError
+        if self.identifier and not value.isidentifier():
+            raise ValueError
+        return value
+
+
+@dataclass(frozen=True)
+class Flag:
+    """True or false."""
+
+    expected = "true or false"
+
+    def read(self, value: Any) -> bool:
+        if type(value) is not bool:
+            raise TypeError
+        return value
+
+
+@dataclass(frozen=True)
+class OrNone:
+    """None, or what another rule accepts."""
+
+    rule: Rule
+
+    @property
+    def expected(self) -> str:
+        return f"{self.rule.expected}, or none"
+
+    def read(self, value: Any) -> Any:
+        return None if value is None else self.rule.read(value)
+
+
+def check(name: str, rule: Rule, value: Any, error: type[InputError] = InputError) -> Any:
+    """A value as its rule keeps it. Raises the error with the sentence "name: expected…, got…"."""
+    try:
+        return rule.read(value)
+    except (TypeError, ValueError, OverflowError):
+        raise error(f"{name}: expected {rule.expected}, got {_shortened(value)}") from None
+
+
+def check_fields(instance: Any, where: str = "", error: type[InputError] = InputError) -> None:
+    """Check the fields of a dataclass that have rules; keep numbers as floats, ints and tuples.
+
+    For `__post_init__`, also of a frozen class. `where` stands before the field's name.
+    """
+    for name, rule in rules_of(type(instance)).items():
+        value = check(where + name, rule, getattr(instance, name), error)
+        object.__setattr__(instance, name, value)
+
+
+def read_table(kind: type[T], table: Any, where: str, error: type[InputError] = InputError) -> T:
+    """An instance of a dataclass from its fields by name, as TOML and JSON have them.
+
+    Names of fields stand behind `where` and a dot. Unknown, missing and wrong fields raise.
+    """
+    known = {one.name: one for one in fields(kind) if one.init}  # type: ignore[arg-type]
+    if not isinstance(table, Mapping):
+        names = ", ".join(known)
+        raise error(f"{where}: expected values by name ({names}), got {_shortened(table)}")
+    check_names(table, known, where, error)
+    rules = rules_of(kind)
+    values = {}
+    for name, one in known.items():
+        if name in table:
+            value = table[name]
+            if name in rules:
+                value = check(f"{where}.{name}", rules[name], value, error)
+            values[name] = value
+        elif one.default is MISSING and one.default_factory is MISSING:
+            raise error(f"{where}: expected {name}, got none")
+    return kind(**values)
+
+
+def check_names(
+    table: Iterable[str], known: Iterable[str], where: str, error: type[InputError] = InputError
+) -> None:
+    """Raise the error for the first name that is not known."""
+    names = list(known)
+    for name in table:
+        if name not in names:
+            raise error(f"{where}: expected some of {', '.join(names)}, got {_shortened(name)}")
+
+
+def rules_of(kind: Any) -> Mapping[str, Rule]:
+    """The rules of a dataclass's fields, by name.
+
+    They are those of annotations: `Annotated` with a rule, `Literal`, and the types bool, int,
+    float and str. A class that gives a field another default keeps the rule of its base.
+    """
+    if kind in _RULES:
+        return _RULES[kind]
+    own = {one.name for one in fields(kind)}
+    rules: dict[str, Rule] = {}
+    for base in reversed(kind.__mro__):
+        for name, hint in inspect.get_annotations(base, eval_str=True).items():
+            rule = _rule_of(hint)
+            if name in own and rule is not None and not (name in rules and hint in _PLAIN):
+                rules[name] = rule
+    _RULES[kind] = rules
+    return rules
+
+
+_RULES: dict[Any, Mapping[str, Rule]] = {}
+"""What `rules_of` has found."""
+
+
+def limits_of(kind: Any, prefix: str = "") -> dict[str, Limits]:
+    """The limits of a dataclass's numbers, by the prefix and the name; None is no number."""
+    found = {}
+    for name, rule in rules_of(kind).items():
+        inner = rule.rule if isinstance(rule, OrNone) else rule
+        if isinstance(inner, Limits):
+            found[prefix + name] = inner
+    return found
+
+
+_PLAIN: Mapping[Any, Rule] = {
+    bool: Flag(),
+    int: Limits(whole=True),
+    float: Limits(),
+    str: Text(empty=True),
+}
+
+
+def _rule_of(hint: Any) -> Rule | None:
+    arguments = get_args(hint)
+    if get_origin(hint) in (Union, UnionType) and NoneType in arguments:
+        others = [one for one in arguments if one is not NoneType]
+        rule = _rule_of(others[0]) if len(others) == 1 else None
+        return OrNone(rule) if rule else None
+    if get_origin(hint) is Annotated:
+        rules = [one for one in arguments[1:] if hasattr(one, "expected")]
+        optional = NoneType in get_args(arguments[0])
+        return OrNone(rules[0]) if rules and optional else next(iter(rules), None)
+    if get_origin(hint) is Literal and all(isinstance(word, str) for word in arguments):
+        return Choice(arguments)
+    return _PLAIN.get(hint)
+
+
+def _digits(value: float) -> str:
+    """Six digits; whole numbers have all of them."""
+    return f"{value:d}" if isinstance(value, int) else f"{value:g}"
+
+
+def _shortened(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:79] + "…"
