@@ -16,11 +16,11 @@ class Export(Command):
 
     policy: Positional[Annotated[str, arg(metavar="CHECKPOINT")]]
     """Checkpoint, or folder of a training."""
-    to: Literal["onnx", "c", "csharp", "torchscript"]
+    to: Literal["onnx", "c"]
     """Kind of file."""
     out: Path | None = None
-    """File to write, a new one. Default: policy.onnx, rotorgram_policy.h, RotorgramPolicy.cs or
-    policy.pt in the working directory."""
+    """File to write, a new one. Default: policy.onnx or rotorgram_policy.h in the working
+    directory."""
 
     def run(self) -> int:
         """Write it."""

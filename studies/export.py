@@ -1,7 +1,7 @@
 """Size and time per call of an exported policy, beside the policy in NumPy.
 
 `python studies/export.py` writes `docs/results/export.json`, which `docs/export.md` shows. It
-needs gcc, mcs and mono. One observation at a time, each another one, on one thread: processor time,
+needs gcc. One observation at a time, each another one, on one thread: processor time,
 the least of several rounds in which the targets take turns. The compiled bytes of C are those of
 the code and the constants that gcc -Os makes of a function that calls the policy.
 """
@@ -10,7 +10,6 @@ import json
 import subprocess
 import tempfile
 import time
-import warnings
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -18,9 +17,8 @@ from typing import Any, Final
 
 import numpy as np
 import onnxruntime
-import torch
 from measuring import RESULTS, in_turns, options, write
-from rotorgram.agents.export import TARGETS, c, csharp, metadata, onnx, torchscript
+from rotorgram.agents.export import TARGETS, c, metadata, onnx
 from rotorgram.agents.policies import NetworkPolicy, flat_size
 from rotorgram.envs.registry import env_spec
 
@@ -29,7 +27,7 @@ POLICIES: Final = {
     "64 × 64 tanh, Hover-v0": ("rotorgram/Hover-v0", (64, 64), "tanh", True),
 }
 SEEN: Final = 256  # observations, over and over
-PYTHON_CALLS, COMPILED_WEIGHTS = 5_000, 4e8  # in a round; Mono's clock ticks every 10 ms
+PYTHON_CALLS, COMPILED_WEIGHTS = 5_000, 4e8  # in a round
 
 C_LOOP: Final = """
 #include <stdio.h>
@@ -56,37 +54,6 @@ C_CALL: Final = """
 #include "rotorgram_policy.h"
 void act(const float *observation, float *action);
 void act(const float *observation, float *action) { rotorgram_policy(observation, action); }
-"""
-CSHARP_LOOP: Final = """
-using System;
-using System.Globalization;
-using Rotorgram;
-static class Program
-{
-    static void Main(string[] words)
-    {
-        int calls = int.Parse(words[0]), count = int.Parse(words[1]);
-        var policy = new RotorgramPolicy();
-        var bytes = new byte[4 * RotorgramPolicy.Observations];
-        var seen = new float[count][];
-        var input = Console.OpenStandardInput();
-        for (int i = 0; i < count; i++) {
-            for (int at = 0; at < bytes.Length; at += input.Read(bytes, at, bytes.Length - at)) { }
-            seen[i] = new float[RotorgramPolicy.Observations];
-            Buffer.BlockCopy(bytes, 0, seen[i], 0, bytes.Length);
-        }
-        var action = new float[RotorgramPolicy.Actions];
-        for (int i = 0; i < calls / 10; i++)
-            policy.Act(seen[i % count], action);
-        var process = System.Diagnostics.Process.GetCurrentProcess();
-        double start = process.TotalProcessorTime.TotalSeconds;
-        for (int i = 0; i < calls; i++)
-            policy.Act(seen[i % count], action);
-        process.Refresh();
-        double seconds = process.TotalProcessorTime.TotalSeconds - start;
-        Console.Write((seconds / calls).ToString("R", CultureInfo.InvariantCulture));
-    }
-}
 """
 Clock = Callable[[], float]
 """Runs many calls; seconds of one."""
@@ -124,36 +91,22 @@ def clocks(policy: NetworkPolicy, folder: Path) -> tuple[dict[str, Clock], dict[
     """Of each target, and the bytes of its file."""
     told = metadata(policy.spec, algorithm="a2c", seed=0, env_steps=0)
     files = {}
-    for target, module in {
-        "onnx": onnx,
-        "c": c,
-        "csharp": csharp,
-        "torchscript": torchscript,
-    }.items():
+    for target, module in {"onnx": onnx, "c": c}.items():
         files[target] = folder / TARGETS[target]
         files[target].write_bytes(module.write(policy, told))
     seen = np.random.default_rng(1).uniform(-1, 1, (SEEN, flat_size(policy.spec)))
     rows = seen.astype(np.float32)
     (folder / "loop.c").write_text(C_LOOP)
     (folder / "call.c").write_text(C_CALL)
-    (folder / "Loop.cs").write_text(CSHARP_LOOP)
     calls = int(COMPILED_WEIGHTS / sum(weight.size for weight, _ in policy.layers))
     sizes = [f"-DSEEN={SEEN}", f"-DCALLS={calls}"]
     compiled("gcc", "-std=c99", "-O2", *sizes, "-o", folder / "loop", folder / "loop.c")
     compiled("gcc", "-std=c99", "-Os", "-c", "-o", folder / "call.o", folder / "call.c")
-    compiled(
-        "mcs", "-optimize+", f"-out:{folder / 'loop.exe'}", folder / "Loop.cs", files["csharp"]
-    )
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(files["onnx"], options)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        module = torch.jit.load(files["torchscript"])
     singles = [row[np.newaxis] for row in rows]
     feeds = [{"observation": row} for row in singles]
-    tensors = [torch.from_numpy(row) for row in singles]
-    mono = ["mono", str(folder / "loop.exe"), str(calls), str(SEEN)]
     sections = subprocess.run(["size", folder / "call.o"], capture_output=True, check=True).stdout
     text_and_data = sections.decode().splitlines()[1].split()[:2]
     linked = sum(map(int, text_and_data))
@@ -161,15 +114,11 @@ def clocks(policy: NetworkPolicy, folder: Path) -> tuple[dict[str, Clock], dict[
         "NumPy": lambda: clock(policy.act, list(rows)),
         "onnx": lambda: clock(lambda feed: session.run(None, feed), feeds),
         "c": lambda: said([str(folder / "loop")], rows.tobytes()),
-        "csharp": lambda: said(mono, rows.tobytes()),
-        "torchscript": lambda: clock(module, tensors),
     }, {**{target: path.stat().st_size for target, path in files.items()}, "c, compiled": linked}
 
 
 def main() -> None:
     args = options(__doc__, rounds=15, out=RESULTS / "export.json").parse_args()
-    torch.set_num_threads(1)
-    torch.set_grad_enabled(False)
     policies = {}
     with tempfile.TemporaryDirectory() as folder:
         for i, (name, settings) in enumerate(POLICIES.items()):

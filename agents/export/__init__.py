@@ -1,4 +1,4 @@
-"""A trained policy as one file that flies without rotorgram: ONNX, C, C# or TorchScript.
+"""A trained policy as one file that flies without rotorgram: ONNX or C.
 
 The file has the whole of `NetworkPolicy.act`: normalisation of the observation, layers, activation,
 squashing, mapping to the env's action, clipping to its bounds; or the choice of the largest output.
@@ -9,24 +9,21 @@ import json
 from importlib import import_module
 from typing import Final
 
+import numpy as np
+
 from ...envs.spec import EnvSpec
-from ...models.errors import require
+from ...models.errors import InputError, require
 from ..checkpoints import Checkpoint
-from ..policies import flat_size
+from ..policies import NetworkPolicy, flat_size
 
 FORMAT: Final = 1
 """Version of the metadata and of the names in the files."""
 
-TARGETS: Final = {
-    "onnx": "policy.onnx",
-    "c": "rotorgram_policy.h",
-    "csharp": "RotorgramPolicy.cs",
-    "torchscript": "policy.pt",
-}
+TARGETS: Final = {"onnx": "policy.onnx", "c": "rotorgram_policy.h"}
 """Name of the file of each target, by default."""
 
-_PACKAGES: Final = {"onnx": ("onnx", "export"), "torchscript": ("torch", "train")}
-"""Package that writes the file of a target, and the extra that installs it."""
+_TRIED, _FAR = 256, 100.0
+"""Observations that a policy is tried with, and their largest numbers where they have no bound."""
 
 _SPEC: Final = (
     "env_id", "options", "control_period", "vehicle", "vehicle_hash", "observation", "action"
@@ -36,10 +33,11 @@ _SPEC: Final = (
 def export(checkpoint: Checkpoint, target: str) -> bytes:
     """The content of the file. `target` is one of `TARGETS`.
 
-    Raises `MissingPackage` if a package that writes the file is not installed.
+    Raises `MissingPackage` where ONNX is asked for and not installed, and `InputError` for a policy
+    that diverged: its outputs are not finite for some observation within its bounds.
     """
-    if target in _PACKAGES:
-        require(*_PACKAGES[target], f"--to {target}")
+    if target == "onnx":
+        require("onnx", "export", "--to onnx")
     module = import_module(f"{__name__}.{target}")
     told = metadata(
         checkpoint.spec,
@@ -47,8 +45,20 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
         seed=checkpoint.seed,
         env_steps=checkpoint.position.env_steps,
     )
-    content: bytes = module.write(checkpoint.policy(), told)
+    policy = checkpoint.policy()
+    _check_finite(policy)
+    content: bytes = module.write(policy, told)
     return content
+
+
+def _check_finite(policy: NetworkPolicy) -> None:
+    bounds = [np.abs(array.bounds()).max(axis=0).ravel() for array in policy.spec.observation]
+    largest = np.minimum(np.concatenate(bounds), _FAR)
+    shares = np.random.default_rng(0).uniform(-1.0, 1.0, (_TRIED, largest.size))
+    with np.errstate(over="ignore", invalid="ignore"):
+        outputs = policy.output((shares * largest).astype(np.float32))
+    if not np.isfinite(outputs).all():
+        raise InputError("policy: expected finite actions, got NaN or infinity: training diverged")
 
 
 def metadata(spec: EnvSpec, *, algorithm: str, seed: int, env_steps: int) -> dict[str, str]:
