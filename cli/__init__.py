@@ -43,7 +43,6 @@ COMMANDS: Final = {
     "vehicle": "Vehicle",
     "identify": "Identify",
     "key": "Key",
-    "relay": "Relay",
     "replay": "Replay",
     "dataset": "Dataset",
     "capture": "Capture",

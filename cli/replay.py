@@ -23,8 +23,9 @@ class Replay(Command):
     task. An id in a journal is never imported."""
     vehicle: str | None = None
     """TOML or MJCF file that was flown, or its name. Default: the paper's quadcopter."""
-    backend: Backend = "mujoco"
-    """What stepped the drones."""
+    backend: Backend | None = None
+    """What stepped the drones. Default: what the journal says; an agent's journal does not know it,
+    and mujoco is taken."""
 
     def run(self) -> int:
         """Print the summary and the verdict."""

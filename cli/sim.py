@@ -9,7 +9,7 @@ from ..models.errors import expect
 from ._flags import BackendFlags, parse_address
 
 if TYPE_CHECKING:
-    from ..udp import SharedSimulator, Simulator
+    from ..udp import LinkConfig, SharedSimulator, Simulator
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +38,10 @@ class Sim(BackendFlags):
     """binary, or the paper's text."""
     timeout: float = 120.0
     """Give up when the agent has been silent for so many seconds."""
+    drop: float = 0.0
+    """Lose each datagram, sent or received, with this probability: tries an agent under loss."""
+    drop_seed: int = 0
+    """The same seed loses the same datagrams."""
     key_file: Path | None = None
     """Key that the agent has too (rotorgram key): needed beyond this machine."""
     insecure: bool = False
@@ -66,7 +70,7 @@ class Sim(BackendFlags):
         for name in ("when_lost", "patience"):
             flag = f"--{name.replace('_', '-')}"
             expect(name not in self.given, flag, "it with --agents", f"{getattr(self, name)}")
-        from ..udp import LinkConfig, Simulator
+        from ..udp import Simulator
 
         simulator = Simulator(
             self.env_id,
@@ -74,7 +78,7 @@ class Sim(BackendFlags):
             num_envs=self.num_envs,
             drones=self.drones,
             codec=self.codec,
-            config=LinkConfig(timeout=self.timeout),
+            config=self._link(),
             record=self.record,
             **self._common(),
         )
@@ -89,7 +93,7 @@ class Sim(BackendFlags):
 
     def _run_shared(self) -> int:
         """Simulate one world until all its agents have closed."""
-        from ..udp import LinkConfig, SharedSimulator
+        from ..udp import SharedSimulator
 
         for name in ("server", "num_envs", "codec", "record"):
             flag = f"--{name.replace('_', '-')}"
@@ -106,7 +110,7 @@ class Sim(BackendFlags):
             drones=self.drones,
             when_lost=self.when_lost,
             patience=self.patience,
-            config=LinkConfig(timeout=self.timeout),
+            config=self._link(),
             **self._common(),
         )
         with simulator, self._shown(simulator):
@@ -119,6 +123,11 @@ class Sim(BackendFlags):
                     where = "{}:{}".format(*party.address)
                     print(f"wire to {where}: {party.link.statistics}", flush=True)
         return 0
+
+    def _link(self) -> "LinkConfig":
+        from ..udp import LinkConfig
+
+        return LinkConfig(timeout=self.timeout, drop=self.drop, drop_seed=self.drop_seed)
 
     def _common(self) -> dict[str, Any]:
         """Settings of both simulators."""

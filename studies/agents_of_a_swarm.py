@@ -24,6 +24,7 @@ import time
 import zlib
 from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,18 +41,7 @@ AGENTS, PATIENCE, STOPPED = 8, 1.0, 2.0  # drones and agents; s
 POLICIES = ("hold", "land", "end")
 ANY = ("127.0.0.1", 0)
 
-RELAYS = """
-import json, sys, threading
-from rotorgram.udp.transport.relay import FaultConfig, Relay
-servers, faults = json.loads(sys.argv[1])
-relays = [Relay(("127.0.0.1", 0), tuple(server), FaultConfig(**faults, seed=seed))
-          for seed, server in enumerate(servers)]
-for relay in relays:
-    threading.Thread(target=relay.run, daemon=True).start()
-print(json.dumps([relay.address for relay in relays]), flush=True)
-sys.stdin.read()
-print(json.dumps([relay.counters for relay in relays]), flush=True)
-"""
+RELAYS = (Path(__file__).parents[1] / "tests/relay.py").read_text()
 
 AGENT = """
 import json, sys, zlib

@@ -28,18 +28,7 @@ from rotorgram.udp.protocol.auth import write_key
 FAULTS = {"drop": 0.3, "duplicate": 0.1, "reorder": 0.2, "corrupt": 0.05, "truncate": 0.02}
 PERIOD = 0.01  # s: one physics step for each control step, so that the wire is what is soaked
 
-RELAY = """
-import json, signal, sys
-from rotorgram.udp.transport.relay import FaultConfig, Relay
-signal.signal(signal.SIGINT, signal.default_int_handler)  # in a shell's background it is ignored
-settings = json.loads(sys.argv[1])
-with Relay(("127.0.0.1", 0), tuple(settings["server"]), FaultConfig(**settings["faults"])) as relay:
-    print(relay.address[1], flush=True)
-    try:
-        relay.run()
-    except KeyboardInterrupt:
-        print(json.dumps(relay.counters), flush=True)
-"""
+RELAY = (Path(__file__).parents[1] / "tests/relay.py").read_text()
 
 SIMULATE = """
 import json, sys
@@ -78,8 +67,8 @@ def soak(job: int, steps: int, drones: int, keyed: bool) -> dict[str, Any]:
     remote = RemoteVectorEnv(
         ("127.0.0.1", 0), num_envs=drones, options=options, key_file=key, connect=False
     )
-    relay = launch(RELAY, {"server": remote.address, "faults": {**FAULTS, "seed": job}})
-    settings = {"port": said(relay), "drones": drones, "key": key, "period": PERIOD}
+    relay = launch(RELAY, [[remote.address], {**FAULTS, "seed": job}])
+    settings = {"port": said(relay)[0][1], "drones": drones, "key": key, "period": PERIOD}
     simulator = launch(SIMULATE, settings)
     local = gym.make_vec("rotorgram/Elevation-v0", num_envs=drones, **options)
     dice = np.random.default_rng(job)
@@ -97,8 +86,9 @@ def soak(job: int, steps: int, drones: int, keyed: bool) -> dict[str, Any]:
     remote.close()
     there = said(simulator)
     simulator.wait()
-    relay.send_signal(2)
-    network = said(relay)
+    assert relay.stdin is not None
+    relay.stdin.close()
+    network = said(relay)[0]
     relay.wait()
     return {
         "drones": drones, "key": keyed, "steps": step, "seconds": round(seconds, 1),

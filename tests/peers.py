@@ -1,4 +1,4 @@
-"""Peers for the tests of the wire: simulators in threads and processes, relays between them."""
+"""Peers for the tests of the wire: simulators in threads and processes."""
 
 import socket
 import subprocess
@@ -6,10 +6,9 @@ import sys
 import textwrap
 import threading
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 
 from rotorgram.udp import Simulator
-from rotorgram.udp.transport.relay import FaultConfig, Relay
 
 ANY = ("127.0.0.1", 0)
 ENV_ID = "rotorgram/Elevation-v0"
@@ -54,22 +53,3 @@ def plain_socket(bind: tuple[str, int] = ANY) -> Iterator[socket.socket]:
         sock.bind(bind)
         sock.settimeout(5)
         yield sock
-
-
-@contextmanager
-def running(relay: Relay) -> Iterator[Relay]:
-    """The relay in a thread, which ends with the block."""
-    with relay:
-        thread = threading.Thread(target=relay.run)
-        thread.start()
-        try:
-            yield relay
-        finally:
-            relay.stop()
-            thread.join(5)
-    assert not thread.is_alive()
-
-
-def relaying(server: tuple[str, int], config: FaultConfig) -> AbstractContextManager[Relay]:
-    """A relay to that server, running."""
-    return running(Relay(ANY, server, config))

@@ -1,7 +1,7 @@
 """The wire: simulators (UDP clients) and an agent (UDP server) in lock-step.
 
 `protocol` is free of sockets and clocks; `transport` puts it on sockets; `remote` makes Gymnasium
-envs of it, and `journal` files. Protocol and relay need no Gymnasium.
+envs of it, and `journal` files. The protocol needs no Gymnasium.
 """
 
 from importlib import import_module

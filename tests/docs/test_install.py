@@ -101,7 +101,7 @@ def test_a_missing_package_is_one_sentence(
 
 
 def test_the_base_alone_flies(tmp_path: Path) -> None:
-    """What the base installs: a simulator and the PID meet; a key, a relay, a model's checks."""
+    """What the base installs: a simulator and the PID meet; a key, a model's checks."""
     assert run_without(ALL, "key", tmp_path / "key").returncode == 0
     assert run_without(ALL, "check-model").returncode == 0
     serve = ["serve", "pid", "--episodes", "1", "--listen", "127.0.0.1:0"]

@@ -14,7 +14,8 @@ import pytest
 from fleets import flying
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
-from peers import ANY, Running, relaying
+from peers import ANY, Running
+from relay import FaultConfig, relaying
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.envs.registry import env_spec, options_type
@@ -25,7 +26,6 @@ from rotorgram.rendering.cameras import Cameras
 from rotorgram.training.pairs import socket_pair
 from rotorgram.udp import LinkConfig, Simulator
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
-from rotorgram.udp.transport.relay import FaultConfig
 from test_cameras import BELLY, vehicle_with
 
 LANDING = "rotorgram/Landing-v0"

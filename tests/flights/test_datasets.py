@@ -10,7 +10,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from peers import ANY, Running, relaying
+from peers import ANY, Running
+from relay import FaultConfig, relaying
 from rotorgram.cli import main
 from rotorgram.envs.spec import EnvSpec
 from rotorgram.flights.datasets import (
@@ -22,7 +23,6 @@ from rotorgram.flights.datasets import (
 )
 from rotorgram.models.errors import InputError
 from rotorgram.udp import LinkConfig, RemoteEnv, RemoteVectorEnv, Simulator
-from rotorgram.udp.transport.relay import FaultConfig
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")

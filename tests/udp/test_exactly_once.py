@@ -18,12 +18,12 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from peers import ANY, ENV_ID, launch, relaying
+from peers import ANY, ENV_ID, launch
+from relay import FaultConfig, Relay, relaying
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.spec import component_names
 from rotorgram.udp import RemoteEnv, RemoteVectorEnv
 from rotorgram.udp.protocol.auth import write_key
-from rotorgram.udp.transport.relay import FaultConfig, Relay
 
 BAD = FaultConfig(
     drop=0.3, duplicate=0.1, reorder=0.2, corrupt=0.05, truncate=0.02, reorder_by=0.0006, seed=1

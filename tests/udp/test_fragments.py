@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from links import Pair, agent, hello, layout, lossy, send_command, simulator, state
+from relay import FaultConfig, Faults
 from rotorgram.models.errors import InputError
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.client import largest_datagram
@@ -23,7 +24,6 @@ from rotorgram.udp.protocol.fragments import (
     is_fragment,
 )
 from rotorgram.udp.protocol.messages import MAX_SPEC, Missing, Refuse
-from rotorgram.udp.transport.relay import FaultConfig, Faults
 
 QUAD = ((3,), (3,), (4,), (3,), (1,))
 """Telemetry of `Elevation-v0`."""

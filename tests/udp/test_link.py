@@ -666,3 +666,35 @@ def test_every_message_is_shown_once() -> None:
     assert [d for _, d in seen["simulator"][:60]] == [d for _, d in seen["agent"][:60]]
     assert text.is_text(b"1,close")
     assert isinstance(hello(), Hello)
+
+
+@pytest.mark.parametrize("drop", [-0.1, 1.1, float("nan")])
+def test_a_wrong_probability_of_loss(drop: float) -> None:
+    with pytest.raises(InputError, match=f"^drop: expected a probability from 0 to 1, got {drop}$"):
+        LinkConfig(drop=drop)
+
+
+def test_a_simulator_loses_datagrams_on_purpose_the_same_for_a_seed() -> None:
+    def lost(seed: int) -> list[bool]:
+        link = simulator(config=LinkConfig(timeout=1e6, drop=0.3, drop_seed=seed))
+        link.connect(0.0)
+        sent = []
+        for _ in range(1000):
+            sent.append(bool(link.take_outgoing()))
+            timer = link.next_timer()
+            assert timer is not None
+            link.handle_timer(timer)
+        for number in range(1000):
+            link.receive(b"", 1e4 + number)
+        counters = link.statistics.counters
+        assert abs(counters["malformed"] - 700) < 75  # five standard deviations
+        assert counters["received"] == counters["malformed"]
+        assert (
+            counters["dropped"]
+            == 1001 - sum(sent) - bool(link.take_outgoing()) + 1000 - (counters["malformed"])
+        )
+        return [not came for came in sent]
+
+    assert abs(sum(lost(1)) - 300) < 75
+    assert lost(1) == lost(1)
+    assert lost(1) != lost(2)

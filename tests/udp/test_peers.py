@@ -10,7 +10,6 @@ import socket
 import struct
 import subprocess
 import sys
-import threading
 import time
 import zlib
 from collections.abc import Iterator
@@ -21,11 +20,11 @@ from random import Random
 
 import numpy as np
 import pytest
+from relay import FaultConfig, relaying
 from rotorgram.envs.loop import Loop
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.spec import EnvSpec
 from rotorgram.udp import RemoteEnv
-from rotorgram.udp.transport.relay import FaultConfig, Relay
 
 ENV_ID = "rotorgram/Elevation-v0"
 ROOT = Path(__file__).parents[2]
@@ -103,14 +102,8 @@ def relayed(server: tuple[str, int], config: FaultConfig | None) -> Iterator[tup
     if config is None:
         yield server
         return
-    with Relay(("127.0.0.1", 0), server, config) as relay:
-        thread = threading.Thread(target=relay.run)
-        thread.start()
-        try:
-            yield relay.address
-        finally:
-            relay.stop()
-            thread.join(5)
+    with relaying(server, config) as relay:
+        yield relay.address
 
 
 # The agent in C.

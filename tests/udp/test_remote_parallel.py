@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from peers import ANY, Running, relaying
+from peers import ANY, Running
+from relay import FaultConfig, relaying
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.flights.datasets import RecordedEpisodes
@@ -16,7 +17,6 @@ from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
 from rotorgram.udp.journal.reader import Summary
 from rotorgram.udp.journal.replay import Verification
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
-from rotorgram.udp.transport.relay import FaultConfig
 from swarms import RISE
 
 LOSSY = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.1, seed=3)

@@ -18,7 +18,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
-from peers import ANY, ENV_ID, Running, launch, plain_socket, relaying
+from peers import ANY, ENV_ID, Running, launch, plain_socket
+from relay import FaultConfig, relaying
 from rotorgram.udp import (
     LinkConfig,
     PeerClosed,
@@ -30,7 +31,6 @@ from rotorgram.udp import (
 )
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.auth import message_of, write_key
-from rotorgram.udp.transport.relay import FaultConfig
 
 LOSSY = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.2, seed=2)
 QUICK = LinkConfig(timeout=10)

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from peers import ANY, Running, launch, relaying
+from peers import ANY, Running, launch
+from relay import FaultConfig, relaying
 from rotorgram.envs.loop import Loop
 from rotorgram.models import QUAD_XML, InputError
 from rotorgram.udp import (
@@ -29,7 +30,6 @@ from rotorgram.udp import (
 from rotorgram.udp.journal.replay import Verification
 from rotorgram.udp.protocol.auth import write_key
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
-from rotorgram.udp.transport.relay import FaultConfig
 from rotorgram.udp.transport.shared import Presence
 from swarms import RISE
 

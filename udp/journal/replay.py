@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -158,7 +158,7 @@ class Verification(Recording):
     Args:
         path: The journal.
         vehicle: File or name of the vehicle that was flown; None: the paper's.
-        backend: What stepped the drones.
+        backend: What stepped the drones; None: what the journal says, else `mujoco`.
 
     Attributes:
         notes: Versions that have changed.
@@ -170,9 +170,11 @@ class Verification(Recording):
         path: Path | str,
         *,
         vehicle: Path | str | None = None,
-        backend: Backend = "mujoco",
+        backend: Backend | None = None,
     ) -> None:
         super().__init__(path)
+        if backend is None:
+            backend = cast(Backend, self.about.get("backend", "mujoco"))
         self.notes = _other_versions(self.about)
         self.sessions: list[SessionVerdict] = []
         flying: dict[int, SessionVerdict] = {}  # the last of each slot

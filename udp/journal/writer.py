@@ -1,19 +1,17 @@
 """Writes the journal of a flight: every message once, in an MCAP file. See `docs/journal.md`.
 
-A State or a Command is written as its whole binary message, which is a valid ROS 1 message of
-arrays: the schema fixes their lengths, and any viewer of MCAP reads it. All other messages are
-JSON with the message in it as hexadecimal digits.
+A State or a Command is written as its whole binary message. All other messages are JSON with the
+message in it as hexadecimal digits.
 """
 
 import json
 import logging
 import os
 import platform
-import re
 import sys
 import time
 import weakref
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from errno import EFBIG, EINTR
 from importlib.metadata import PackageNotFoundError, version
@@ -23,33 +21,24 @@ from typing import Any, Final
 
 from mcap.writer import Writer
 
-from ...envs.spec import ArraySpec, EnvSpec
+from ...envs.spec import EnvSpec
 from ..layouts import layout_of
 from ..protocol import binary
-from ..protocol.layout import COMMAND_ARRAYS_AT, STATE_ARRAYS_AT, Layout, Slot
 from ..protocol.messages import Command, Hello, Message, State
 from ..protocol.statistics import Statistics
 
 ABOUT: Final = "rotorgram"  # name of the metadata about the whole file
-FORMAT: Final = "2"  # version of the file's content, beside the protocol's in each datagram
+FORMAT: Final = "3"  # version of the file's content, beside the protocol's in each datagram
 
 _CHUNK: Final = 1 << 16  # bytes; 2 ms to write
 _SECOND: Final = 10**9
 _STATISTICS: Final = 10 * _SECOND
-_SEEDED: Final = binary.COMMAND | 0x100  # a Command whose ROS 1 message has one more array
 _MAX_CHANNELS: Final = 0xFFFF
 _BUFFER: Final = 1 << 20  # bytes; more than a chunk, so that its records reach the file at once
 _PACKAGES: Final = ("rotorgram", "mujoco", "gymnasium", "numpy", "mcap")
 
 _log: Final = logging.getLogger("rotorgram.udp")
 
-_HEADER: Final = """uint8[2] magic
-uint8 version
-uint8 type
-uint32 crc
-uint64 session
-uint64 sequence
-"""
 _EVENT: Final = "rotorgram.Event", '{"type": "object"}'
 _NUMBER: Final = '{"type": "object", "additionalProperties": {"type": "number"}}'
 _NUMBERS: Final = "rotorgram.Statistics", _NUMBER
@@ -69,7 +58,8 @@ class Journal:
             text codec needs them: there all sessions have the same number.
         text_hello: Stands for the Hello that the text codec does not have. An agent gives it the
             session 0.
-        model: MJCF of the vehicle, to keep in the file.
+        about: More metadata of the head, by name.
+        models: MJCF of the vehicles, by the names of the attachments.
 
     Raises:
         FileExistsError: The file exists.
@@ -84,24 +74,26 @@ class Journal:
         side: str,
         slots: Sequence[object] = ("the only agent",),
         text_hello: Hello | None = None,
-        model: str = "",
+        about: Mapping[str, str] | None = None,
+        models: Mapping[str, str] | None = None,
     ) -> None:
         self._statistics, self._slots, self._text_hello = statistics, slots, text_hello
         self._holders: dict[int, object] = {}  # by slot: number of a binary session, or a text one
-        self._channels: dict[tuple[int, int], int] = {}  # by slot and kind: binary's or _SEEDED
+        self._channels: dict[tuple[int, int], int] = {}  # by slot and kind of message
         self._size = self._sessions = 0
         now = self._flushed = self._counted = time.time_ns()
         versions = software()
-        about = {f"version of {name}": number for name, number in versions.items()}
+        head = {f"version of {name}": number for name, number in versions.items()}
+        head |= {"format": FORMAT, "side": side, **(about or {})}
         try:
             file = McapFile(Path(path), f"rotorgram {versions.get('rotorgram', '')}")
         except FileExistsError:
             sentence = f"record: expected a file that does not exist yet, got {path}"
             raise FileExistsError(sentence) from None
         try:
-            file.add_metadata(ABOUT, {"format": FORMAT, "side": side, **about})
-            if model:
-                file.add_attachment("model.xml", "application/xml", model.encode(), now)
+            file.add_metadata(ABOUT, head)
+            for name, model in (models or {}).items():
+                file.add_attachment(name, "application/xml", model.encode(), now)
         except BaseException as error:
             file.abandon()
             Path(path).unlink()
@@ -123,8 +115,7 @@ class Journal:
             elif message.session != self._holders.get(slot):  # no Hello: by text
                 self._begin_by_text(slot, now)
             if isinstance(message, State | Command):
-                seeded = isinstance(message, Command) and message.seeds is not None
-                channel = self._channels[slot, _SEEDED if seeded else datagram[3]]
+                channel = self._channels[slot, datagram[3]]
                 self._pending.append((channel, now, message.sequence, datagram))
             elif not isinstance(message, Hello):
                 self._add_json(f"/slot{slot}/events", _EVENT, _words(message, datagram), now)
@@ -177,8 +168,7 @@ class Journal:
         """Take note of a new session, whose messages may have another layout."""
         self._flush(now)
         self._sessions += 1
-        spec = EnvSpec.from_json(hello.spec)
-        layout = layout_of(spec, hello.worlds)
+        layout = layout_of(EnvSpec.from_json(hello.spec), hello.worlds)
         words = {
             "index": str(self._sessions),
             "slot": str(slot),
@@ -188,10 +178,9 @@ class Journal:
             "spec": hello.spec,
         }
         self._file.add_metadata("session", words)
-        for kind, topic, name, text in _schemas(spec, layout):
-            self._channels[slot, kind] = self._file.channel(
-                f"/slot{slot}/{topic}", "ros1", f"rotorgram/{name}", text
-            )
+        for kind, topic in ((binary.STATE, "state"), (binary.COMMAND, "command")):
+            channel = self._file.channel(f"/slot{slot}/{topic}", "rotorgram")
+            self._channels[slot, kind] = channel
         words = _words(hello, datagram) | {"codec": codec}
         self._add_json(f"/slot{slot}/events", _EVENT, words, now)
 
@@ -202,7 +191,7 @@ class Journal:
     def _add_json(
         self, topic: str, schema: tuple[str, str], words: Mapping[str, Any], now: int
     ) -> None:
-        channel = self._file.channel(topic, "json", *schema)
+        channel = self._file.channel(topic, "json", schema)
         self._pending.append((channel, now, 0, json.dumps(words).encode()))
 
 
@@ -215,55 +204,26 @@ def software() -> dict[str, str]:
     return versions
 
 
-def model_of(stepped: Any) -> str:
-    """The whole MJCF of our tasks' vehicle, its includes resolved; "" for another env."""
+def models_of(stepped: Any) -> tuple[dict[str, str], dict[str, str]]:
+    """Metadata and attachments that describe the vehicles of a registered task; else empty.
+
+    The attachments are the whole MJCF of each different vehicle, its includes resolved. The
+    metadata `models` names the attachment of each drone of a world, in their order.
+    """
     task = getattr(stepped, "task", None)
     if task is None:
-        return ""
+        return {}, {}
     from ...models.scene import build_scene
 
-    return str(build_scene(task.vehicle.path, visual=False).to_xml())
-
-
-# ---- ROS 1 messages
-
-
-def _schemas(spec: EnvSpec, layout: Layout) -> Iterator[tuple[int, str, str, str]]:
-    """Kind, topic, name and text of each ROS 1 message of this layout."""
-    observation = _field_names("observation", spec.observation)
-    telemetry = _field_names("telemetry", spec.telemetry)
-    slots = (*layout.observation_slots, layout.rewards, *layout.flags, *layout.telemetry_slots)
-    named = zip(
-        (*observation, "rewards", "terminated", "truncated", *telemetry), slots, strict=True
-    )
-    text = _schema_text("float64 time\nuint64 nonce\n", STATE_ARRAYS_AT, named)
-    yield binary.STATE, "state", "State", text
-    arrays = [("actions", layout.actions), ("orders", layout.orders), ("seeds", layout.seeds)]
-    for kind, name, count in (binary.COMMAND, "Command", 2), (_SEEDED, "SeededCommand", 3):
-        fixed = "uint32 seed_count\nuint8[4] reserved\n"
-        yield kind, "command", name, _schema_text(fixed, COMMAND_ARRAYS_AT, arrays[:count])
-
-
-def _schema_text(fixed: str, at: int, arrays: Iterable[tuple[str, Slot]]) -> str:
-    text = _HEADER + fixed
-    for name, slot in arrays:
-        if slot.at > at:
-            text += f"uint8[{slot.at - at}] padding{at}\n"
-        count = (slot.end - slot.at) // slot.dtype.itemsize
-        text += f"{slot.dtype.name}[{count}] {name}\n"
-        at = slot.end
-    return text
-
-
-def _field_names(prefix: str, arrays: Iterable[ArraySpec]) -> list[str]:
-    """Names of arrays, made into different ones that ROS 1 allows."""
-    fields: list[str] = []
-    for array in arrays:
-        field = f"{prefix}_{re.sub(r'[^a-zA-Z0-9_]', '_', array.name)}"
-        while field in fields:
-            field += "_"
-        fields.append(field)
-    return fields
+    members = getattr(task.vehicle, "members", (task.vehicle,))
+    names: dict[str, str] = {}  # by hash
+    models: dict[str, str] = {}
+    for vehicle in members:
+        if vehicle.hash not in names:
+            name = f"model{len(names) or ''}.xml"
+            names[vehicle.hash] = name
+            models[name] = str(build_scene(vehicle.path, visual=False).to_xml())
+    return {"models": " ".join(names[vehicle.hash] for vehicle in members)}, models
 
 
 def _words(message: Message, datagram: bytes) -> dict[str, Any]:
@@ -295,31 +255,27 @@ class McapFile:
         Append to it; `flush` takes them."""
         self.size = 0  # bytes of the whole records in the file
         self._path, self._pid = path, os.getpid()
-        self._schemas: dict[str, dict[str, int]] = {}  # ids by name and text
-        self._channels: dict[tuple[str, int], int] = {}  # ids by topic and schema
+        self._schemas: dict[tuple[str, str], int] = {}  # ids by name and text
+        self._channels: dict[str, int] = {}  # ids by topic
         self._file: Any = path.open("xb", buffering=_BUFFER)
         self._writer: Any = Writer(self._file, chunk_size=sys.maxsize, use_summary_offsets=False)
         self._lock = RLock()
         self._broken = self._busy = False
         self._writer.start("", library)
 
-    def channel(self, topic: str, encoding: str, name: str, text: str) -> int:
-        """Id of the channel with this schema: `ros1` or `json`. A file has at most 65,535.
-
-        A second schema of the same name, with another text, is numbered.
-        """
+    def channel(self, topic: str, encoding: str, schema: tuple[str, str] | None = None) -> int:
+        """Id of the channel with this JSON schema (name, text). A file has at most 65,535."""
         with self._lock:
-            schemas = self._schemas.setdefault(name, {})
-            if text not in schemas:
-                name += f"{len(schemas) + 1}" if schemas else ""
-                language = {"ros1": "ros1msg", "json": "jsonschema"}[encoding]
-                schemas[text] = self._writer.register_schema(name, language, text.encode())
-            key = topic, schemas[text]
-            if key not in self._channels:
+            if schema and schema not in self._schemas:
+                name, text = schema
+                number = self._writer.register_schema(name, "jsonschema", text.encode())
+                self._schemas[schema] = number
+            if topic not in self._channels:
                 if len(self._channels) == _MAX_CHANNELS:
                     raise OSError(EFBIG, f"more than {_MAX_CHANNELS} channels")
-                self._channels[key] = self._writer.register_channel(topic, encoding, key[1])
-            return self._channels[key]
+                number = self._schemas[schema] if schema else 0  # 0: none
+                self._channels[topic] = self._writer.register_channel(topic, encoding, number)
+            return self._channels[topic]
 
     def add_metadata(self, name: str, words: Mapping[str, str]) -> None:
         """Write names and values, after all messages before."""

@@ -9,12 +9,13 @@ outstanding at any time, so a sequence number suffices to step the physics once 
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import inf
+from random import Random
 from typing import Final
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError, expect
 from . import binary, text
 from . import messages as m
 from .auth import Key, is_sealed, message_of
@@ -78,10 +79,16 @@ class LinkConfig:
     max_datagram: int | None = None
     """Largest datagram, bytes, a seal not counted, at least 256. None: 65,483 on loopback, 1,200
     elsewhere."""
+    drop: float = 0.0
+    """Probability that a datagram is lost on purpose, sent or received, to try an agent: 0 to 1."""
+    drop_seed: int = 0
+    """The same seed loses the same datagrams, by their order."""
 
     def __post_init__(self) -> None:
-        right = isfinite(self.timeout) and self.timeout > 0
-        expect(right, "timeout", "a number > 0", f"{self.timeout}")
+        if not 0 < self.timeout < inf:
+            raise InputError(f"timeout: expected a number > 0, got {self.timeout}")
+        if not 0 <= self.drop <= 1:
+            raise InputError(f"drop: expected a probability from 0 to 1, got {self.drop}")
         check_largest(self.max_datagram)
 
 
@@ -202,6 +209,7 @@ class Client:
         self._nonce = 0
         self.tap: Tap | None = None
         self._draw_session = draw_session
+        self._dice = Random(config.drop_seed).random if config.drop else None
         self._is_queued = False
         self._assembler = Assembler(layout.command_size)
         self._window = Window()
@@ -264,6 +272,8 @@ class Client:
 
     def receive(self, datagram: bytes, now: float) -> Message | None:
         """Take a datagram from the agent; the message, if it moves the exchange on."""
+        if self._dice and self._is_lost():
+            return None
         self.statistics.counters["received"] += 1
         if self.state is SimulatorState.WAITING and self._is_plain:
             session, sequence = self.hello.session, self.sequence
@@ -482,9 +492,17 @@ class Client:
 
     def _put(self, datagrams: list[bytes], key: Key | None) -> None:
         sealed = [key.seal(datagram) for datagram in datagrams] if key else datagrams
-        self._outgoing += sealed
         if sealed:
             self._asking = sealed[-1]
+        if self._dice:
+            sealed = [datagram for datagram in sealed if not self._is_lost()]
+        self._outgoing += sealed
+
+    def _is_lost(self) -> bool:
+        """Whether the next datagram is lost on purpose."""
+        lost = self._dice is not None and self._dice() < self._config.drop
+        self.statistics.counters["dropped"] += lost
+        return lost
 
     def _encode(self, message: m.Hello | State | m.Close) -> bytes:
         if self._text and isinstance(message, State | m.Close):

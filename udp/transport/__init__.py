@@ -1,1 +1,1 @@
-"""The protocol on sockets: the simulator, the agent's port, and a relay that loses datagrams."""
+"""The protocol on sockets: the simulator, and the agent's port."""

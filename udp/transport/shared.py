@@ -97,6 +97,7 @@ class Party:
     ) -> None:  # fmt: skip
         self.number, self.address, self.rows, self.when_lost = number, address, rows, when_lost
         hello = Hello(session=new_session(), spec=spec.to_json())
+        config = replace(config, drop_seed=config.drop_seed + number)
         largest = largest_datagram(address, config.max_datagram)
         self.link = Client(hello, layout_of(spec), config, largest=largest, key=key)
         self.presence = Presence.COMING

@@ -115,10 +115,19 @@ class Simulator(NotCopied):
             self._journal: Any = None
             if record:
                 from ..journal import Journal
-                from ..journal.writer import model_of
+                from ..journal.writer import models_of
 
-                said, model = self.link.statistics, model_of(self.stepped)
-                journal = Journal(record, said, side="simulator", text_hello=hello, model=model)
+                about, models = models_of(self.stepped)
+                if about:
+                    about["backend"] = backend
+                journal = Journal(
+                    record,
+                    self.link.statistics,
+                    side="simulator",
+                    text_hello=hello,
+                    about=about,
+                    models=models,
+                )
                 self._journal, self.link.tap = journal, journal.tap
             failing.pop_all()
 
