@@ -101,7 +101,8 @@ class Rigid(BaseWorld):
         xp, state, rows = self.xp, self.state, mask[..., None]
         begun = self._begun(mask, pose)
         turn = begun["quaternion"]
-        turn = turn / xp.sqrt(xp.sum(turn * turn, axis=-1, keepdims=True))
+        unit = turn / xp.sqrt(xp.sum(turn * turn, axis=-1, keepdims=True))
+        turn = xp.where(rows, unit, turn)  # the others keep their bits
         parts = (begun["position"], turn, begun["velocity"], begun["body_rates"])
         self._rows = self._as_rows(xp.concat(parts, axis=-1))
         self._show()
