@@ -33,18 +33,19 @@ class Capture(Command):
         from ..flights.capture import capture
         from ..flights.executors import WorkersConfig
         from ..flights.viewpoints import Plan
-        from ..models.errors import expect
+        from ..models.errors import InputError
         from ..rendering.gl import offscreen_context
         from ._progress import bars
 
-        expect(self.out.name, "out", "the name of a folder", repr(str(self.out)))
-        right = self.out.is_dir() or not self.out.exists()
-        expect(right, "out", "a folder, or a new name", f"{self.out}, which is a file")
-        plan, config = Plan.read(self.plan), WorkersConfig(**self.settings(WorkersConfig))
+        if not self.out.name:
+            raise InputError(f"out: expected the name of a folder, got '{self.out}'")
+        if self.out.exists() and not self.out.is_dir():
+            raise InputError(f"out: expected a folder, or a new name, got the file {self.out}")
+        plan = Plan.read(self.plan)
+        config = WorkersConfig(**self.settings(WorkersConfig))
         offscreen_context(16, 16).free()
         self.out.mkdir(parents=True, exist_ok=True)
         with bars() as progress:
             frames = capture(plan, self.out, config, progress)
         print(f"{self.out}: {frames} frames of {len(plan.views())} pictures a drone")
-        print(f"look at: {self.out / 'contact.png'}, {self.out / 'README.md'}")
         return 0

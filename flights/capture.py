@@ -1,6 +1,6 @@
 """Labelled pictures: `rotorgram capture` takes them in workers, and writes them as a data set.
 
-Each frame is one pose of the drones of a world. Workers give its files as bytes; this process
+Each frame is one pose of the drones of a world. Workers return its files as bytes; this process
 writes them, the labels last: a frame that has labels is whole, and is never taken again.
 `docs/capture.md` has the layout.
 """
@@ -13,48 +13,59 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from ..agents.checkpoints import write_whole
 from ..models.cameras import View
-from ..models.errors import expect
+from ..models.errors import InputError
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
+from .coco import write_coco
 from .executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
 from .folders import locked
-from .viewpoints import Plan, Walk
+from .viewpoints import Plan, PoseSequence
+
+if TYPE_CHECKING:
+    from ..rendering.cameras import Cameras
 
 LABELS: Final = "labels"
-_KEPT: Final = {"plan.toml": "plan", "made_of.json": "vehicle, flights and MuJoCo"}
-"""Files that tell of what a folder is."""
 _CHUNK: Final = 64  # frames of a job, at most
 _ENDINGS: Final = {
-    "rgb": ("png",), "depth": ("npy", "png"), "segmentation": ("png",), "flow": ("npy",)
-}  # fmt: skip
-"""Of the files of a picture of each kind."""
-_DEEPEST: Final = 65.535  # m: what 16 bits of millimetres hold
+    "rgb": ("png",),
+    "depth": ("npy", "png"),
+    "segmentation": ("png",),
+    "flow": ("npy",),
+}
+"""File name extensions of each kind of picture."""
+_FARTHEST: Final = 65.535  # m: the largest number of millimetres in 16 bits
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Job:
-    """Some frames of a walk, and the pose before them, if there is one."""
+    """Some consecutive frames of a sequence, and the pose before them, if there is one."""
 
     plan: Plan
-    walk: Walk
-    """Of these poses alone."""
+    poses: PoseSequence
+    """These poses alone."""
     sequence: int
-    """Number of the whole walk."""
+    """Number of the whole sequence."""
     first: int
     """Number of the first frame."""
     before: int
-    """1 if the walk has the pose before, else 0."""
+    """1 if `poses` begins with the pose before the first frame, else 0."""
+
+    @property
+    def name(self) -> str:
+        last = self.first + len(self.poses) - self.before - 1
+        return f"frames {self.first} to {last}"
 
 
 class Frame(NamedTuple):
-    """What a worker made of a pose."""
+    """The pictures and labels of a pose."""
 
     number: int
     files: dict[str, bytes]
@@ -67,49 +78,56 @@ def capture(
 ) -> int:
     """Take all pictures of a plan that the folder does not have yet; the number of its frames.
 
-    Raises `InputError` where the folder is of another plan, `OSError` where it cannot be written,
-    `RunsFailed` where workers fail. What was taken stays.
+    Pictures that are taken stay, also after an error.
+
+    Raises:
+        InputError: The folder is of another plan, vehicle or version of MuJoCo.
+        OSError: It cannot be written.
+        RunsFailed: Workers fail.
     """
-    from .capture_formats import write_formats
-
     with locked(folder):
-        walks, views = plan.walks(), plan.views()
-        for name, content in zip(_KEPT, (plan.text, _made_of(plan, walks, views)), strict=True):
-            _keep(folder / name, content.encode())
-        for left in folder.rglob(".*.tmp"):  # by a run that was killed
-            left.unlink()
-        jobs = {
-            f"frames {job.first} to {job.first + len(job.walk) - job.before - 1}": job
-            for job in _jobs(plan, walks, views, folder, config.jobs or os.cpu_count() or 1)
-        }
+        sequences, views = plan.sequences(), plan.views()
+        _claim(folder / "plan.toml", plan.text, "plan")
+        _claim(
+            folder / "made_of.json",
+            _made_of(plan, sequences, views),
+            "vehicle, flights and MuJoCo",
+        )
+        for unfinished in folder.rglob(".*.tmp"):  # by a run that was killed
+            unfinished.unlink()
+        workers = config.jobs or os.cpu_count() or 1
+        found = _jobs(plan, sequences, views, folder, workers)
+        jobs = {job.name: job for job in found}
         if jobs:
+
+            def keep(_: _Job, frames: list[Frame]) -> None:
+                _write(folder, frames)
+
             with open_executor(config, len(jobs), on_progress) as executor:
-                keep = lambda _, frames: _write(folder, frames)  # noqa: E731
                 run_jobs(executor, _take, jobs, keep, on_progress)
-        write_formats(plan, walks, folder)
-    return sum(map(len, walks))
+        count = sum(map(len, sequences))
+        write_coco(plan, sequences, read_labels(folder, count), folder / "coco.json")
+    return count
 
 
-def _keep(file: Path, content: bytes) -> None:
-    """Write a file that tells of what a folder is, or raise `InputError` if it is of another."""
-    if file.exists():
-        same, what = file.read_bytes() == content, _KEPT[file.name]
-        expect(same, str(file.parent), f"a folder of the same {what}", "one of others")
-    else:
-        write_whole(file, content)
+def _claim(file: Path, text: str, what: str) -> None:
+    """Write a file that identifies the folder, or raise `InputError` if it has another content."""
+    if not file.exists():
+        write_whole(file, text.encode())
+    elif file.read_bytes() != text.encode():
+        raise InputError(f"{file.parent}: expected a folder of the same {what}, got one of others")
 
 
-def _made_of(plan: Plan, walks: Sequence[Walk], views: Sequence[View]) -> str:
+def _made_of(plan: Plan, sequences: Sequence[PoseSequence], views: Sequence[View]) -> str:
     """Hashes of what decides the pictures besides the plan, in JSON."""
-    vehicle, digest = Vehicle.load(plan.vehicle), hashlib.blake2b(digest_size=16)
-    for walk in walks:
-        for name, value in vars(walk).items():
+    digest = hashlib.blake2b(digest_size=16)
+    for sequence in sequences:
+        for name, value in vars(sequence).items():
             digest.update(name.encode())
-            digest.update(
-                value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
-            )
+            content = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+            digest.update(content)
     made = {
-        "vehicle": vehicle.hash,
+        "vehicle": Vehicle.load(plan.vehicle).hash,
         "cameras": hashlib.blake2b(repr(views).encode(), digest_size=16).hexdigest(),
         "poses": digest.hexdigest(),
         "mujoco": mujoco.__version__,
@@ -118,64 +136,72 @@ def _made_of(plan: Plan, walks: Sequence[Walk], views: Sequence[View]) -> str:
 
 
 def _jobs(
-    plan: Plan, walks: Sequence[Walk], views: Sequence[View], folder: Path, workers: int
+    plan: Plan,
+    sequences: Sequence[PoseSequence],
+    views: Sequence[View],
+    folder: Path,
+    workers: int,
 ) -> Iterator[_Job]:
-    """Runs of frames that are not whole."""
-    number, most = 0, -(-sum(map(len, walks)) // (2 * workers))
-    for sequence, walk in enumerate(walks):
-        drones = walk.position.shape[1]
+    """Runs of consecutive frames that are not whole."""
+    first = 0
+    share = -(-sum(map(len, sequences)) // (2 * workers))
+    longest = min(share, _CHUNK)
+    for number, poses in enumerate(sequences):
         missing = [
-            row for row in range(len(walk)) if not _is_whole(folder, number + row, views, drones)
+            row
+            for row in range(len(poses))
+            if not _is_whole(folder, first + row, views, poses.drones)
         ]
         while missing:
-            start, some = missing[0], missing[: min(most, _CHUNK)]
-            count = sum(row == start + i for i, row in enumerate(some))
+            start = missing[0]
+            count = 1
+            while count < min(longest, len(missing)) and missing[count] == start + count:
+                count += 1
             before = min(start, 1)
             yield _Job(
-                plan=plan, walk=walk.part(start - before, start + count), sequence=sequence,
-                first=number + start, before=before,
-            )  # fmt: skip
+                plan=plan,
+                poses=poses.part(start - before, start + count),
+                sequence=number,
+                first=first + start,
+                before=before,
+            )
             missing = missing[count:]
-        number += len(walk)
+        first += len(poses)
 
 
 def _is_whole(folder: Path, number: int, views: Sequence[View], drones: int) -> bool:
-    """Whether a frame's labels and files are there as they were written; by the files' sizes."""
+    """Whether a frame's labels are there, and all its files in their sizes."""
     try:
         pictures = json.loads(label_file(folder, number).read_bytes())["pictures"]
-        told = [(one["camera"], one["kind"], one["width"], one["height"]) for one in pictures]
-        sizes = {folder / file: size for one in pictures for file, size in one["files"].items()}
-        right = all(file.stat().st_size == size for file, size in sizes.items())
+        labelled = [(p["camera"], p["kind"], p["width"], p["height"]) for p in pictures]
+        sizes = {file: size for p in pictures for file, size in p["files"].items()}
+        same_sizes = all((folder / file).stat().st_size == size for file, size in sizes.items())
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return False
-    wanted = [
-        (view.camera.name, view.kind, *view.shape[1::-1])
-        for view in views
-        for _ in range(takers(view, drones))
-    ]
-    files = {
-        folder / picture_name(view, number, drone, drones, end)
-        for view in views
-        for drone in range(takers(view, drones))
-        for end in _ENDINGS[view.kind]
-    }
-    return right and told == wanted and files == sizes.keys()
+    expected, files = [], set()
+    for view in views:
+        height, width = view.shape[:2]
+        for drone in range(pictures_of(view, drones)):
+            expected.append((view.camera.name, view.kind, width, height))
+            for ending in _ENDINGS[view.kind]:
+                files.add(picture_name(view, number, drone, drones, ending))
+    return same_sizes and labelled == expected and files == sizes.keys()
 
 
 def label_file(folder: Path, number: int) -> Path:
-    """Of a frame."""
+    """Path of a frame's labels."""
     return folder / LABELS / f"{number:06}.json"
 
 
-def takers(view: View, drones: int) -> int:
-    """How many drones of a world have pictures of their own; of one that stands, one."""
+def pictures_of(view: View, drones: int) -> int:
+    """Pictures of a view in each frame: one of each drone, or one of a camera that stands."""
     return drones if view.camera.carried else 1
 
 
-def picture_name(view: View, number: int, drone: int, drones: int, end: str) -> str:
+def picture_name(view: View, number: int, drone: int, drones: int, ending: str) -> str:
     """Path of a picture in the folder."""
-    which = f"_{drone}" if takers(view, drones) > 1 else ""
-    return f"{view.kind}/{view.camera.name}/{number:06}{which}.{end}"
+    suffix = f"_{drone}" if pictures_of(view, drones) > 1 else ""
+    return f"{view.kind}/{view.camera.name}/{number:06}{suffix}.{ending}"
 
 
 # ---- in workers
@@ -185,87 +211,114 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
     """The frames of a job."""
     from ..rendering.cameras import Cameras
 
-    plan, walk = job.plan, job.walk
-    drones = walk.position.shape[1]
+    plan, poses = job.plan, job.poses
+    drones = poses.drones
+    everybody = np.ones(drones, bool)
     frames = []
-    with closing(
-        Cameras(
-            Vehicle.load(plan.vehicle), plan.views(), (1, drones), world=walk.world,
-            marks=walk.marks, payload=walk.payload is not None, fine=plan.fine,
-        )
-    ) as cameras:  # fmt: skip
-        everybody = np.ones(drones, bool)
-        for row in range(len(walk)):
-            shown = row >= job.before  # the pose before is not: what flows, flows from there
-            state, due = walk.state(row), dict.fromkeys(cameras.pictures, everybody & shown)
+    opened = Cameras(
+        Vehicle.load(plan.vehicle),
+        plan.views(),
+        (1, drones),
+        world=poses.world,
+        marks=poses.marks,
+        payload=poses.payload is not None,
+        fine=plan.fine,
+    )
+    with closing(opened) as cameras:
+        for row in range(len(poses)):
+            is_frame = row >= job.before  # the pose before serves optical flow alone
             number = job.first + row - job.before
-            dice = {0: np.random.default_rng([plan.seed, 0, number])}  # sources count from 1
-            cameras.take(due, everybody if row == 0 else ~everybody, state, dice.__getitem__)
-            if shown:
-                labels = {"frame": number, "sequence": job.sequence, "source": walk.name,
-                          "world": walk.world, "time": float(walk.times[row])}  # fmt: skip
-                frames.append(_frame(number, cameras, drones, state, labels, plan.least_area))
-                tell(len(frames), len(walk) - job.before, "frames")
+            state = poses.state(row)
+            due = dict.fromkeys(cameras.pictures, everybody & is_frame)
+            begun = everybody & (row == 0)
+            rng = {0: np.random.default_rng([plan.seed, 0, number])}  # sources count from 1
+            cameras.take(due, begun, state, rng.__getitem__)
+            if not is_frame:
+                continue
+            labels = {
+                "frame": number,
+                "sequence": job.sequence,
+                "source": poses.name,
+                "world": poses.world,
+                "time": float(poses.times[row]),
+            }
+            frames.append(_frame(number, cameras, drones, state, labels, plan.least_area))
+            tell(len(frames), len(poses) - job.before, "frames")
     return frames
 
 
 def _frame(
     number: int,
-    cameras: Any,
+    cameras: "Cameras",
     drones: int,
-    state: Mapping[str, np.ndarray],
+    state: Mapping[str, NDArray[np.float64]],
     labels: Mapping[str, Any],
     least_area: int,
 ) -> Frame:
-    """Files and labels of what cameras have just taken."""
+    """Files and labels of the pictures that the cameras have just taken."""
     files: dict[str, bytes] = {}
     pictures = []
     for view in cameras.views:
-        for drone in range(takers(view, drones)):
-            picture = cameras.pictures[view.name][drone]
+        for drone in range(pictures_of(view, drones)):
+            image = cameras.pictures[view.name][drone]
+            encoded = {
+                picture_name(view, number, drone, drones, ending): data
+                for ending, data in _encoded(view.kind, image)
+            }
+            files.update(encoded)
             lens = cameras.lens(view.name, state, drone)
-            name = view.camera.name
-            told: dict[str, Any] = {
-                "camera": name, "kind": view.kind, "drone": drone_names(drones)[drone],
-                "width": view.shape[1], "height": view.shape[0],
-                "matrix": lens.matrix.tolist(), "rotation": lens.rotation.tolist(),
+            height, width = view.shape[:2]
+            picture: dict[str, Any] = {
+                "camera": view.camera.name,
+                "kind": view.kind,
+                "drone": drone_names(drones)[drone],
+                "width": width,
+                "height": height,
+                "matrix": lens.matrix.tolist(),
+                "rotation": lens.rotation.tolist(),
                 "translation": lens.translation.tolist(),
                 "distortion": list(lens.distortion),
-            }  # fmt: skip
-            for end, data in _encoded(view.kind, picture):
-                path = picture_name(view, number, drone, drones, end)
-                files[path] = data
-                told.setdefault("files", {})[path] = len(data)
+                "files": {path: len(data) for path, data in encoded.items()},
+            }
             if view.kind == "segmentation":
-                found = objects_in(picture[..., 0], cameras.objects)
-                told["objects"] = [one for one in found if one["area"] >= least_area]
-            pictures.append(told)
+                found = objects_in(image[..., 0], cameras.objects)
+                picture["objects"] = [thing for thing in found if thing["area"] >= least_area]
+            pictures.append(picture)
     pose = {name: values.tolist() for name, values in state.items()}
     return Frame(number, files, {**labels, "pose": pose, "pictures": pictures})
 
 
-def _encoded(kind: str, picture: np.ndarray) -> Iterator[tuple[str, bytes]]:
+def _encoded(kind: str, image: NDArray[Any]) -> Iterator[tuple[str, bytes]]:
     """Ending and bytes of the files of a picture."""
+    if kind == "rgb":
+        yield "png", _png(image)
+    elif kind == "segmentation":
+        yield "png", _png(image[..., 0].astype(np.uint16))
+    elif kind == "flow":
+        yield "npy", _npy(image)
+    else:
+        depth = image[..., 0]
+        yield "npy", _npy(depth)
+        millimetres = np.rint(1000 * depth.astype(np.float64))
+        near = np.where(depth <= _FARTHEST, millimetres, 0)
+        yield "png", _png(near.astype(np.uint16))
+
+
+def _npy(array: NDArray[Any]) -> bytes:
+    data = io.BytesIO()
+    np.save(data, array)
+    return data.getvalue()
+
+
+def _png(array: NDArray[Any]) -> bytes:
     from PIL import Image
 
-    if kind in ("depth", "flow"):
-        data = io.BytesIO()
-        np.save(data, picture[..., 0] if kind == "depth" else picture)
-        yield "npy", data.getvalue()
-    if kind == "flow":
-        return
-    if kind == "depth":
-        near = picture[..., 0] <= _DEEPEST
-        picture = np.where(near, np.rint(1000 * picture[..., 0].astype(np.float64)), 0)
-    elif kind == "segmentation":
-        picture = picture[..., 0]
-    array = picture if kind == "rgb" else picture.astype(np.uint16)
     data = io.BytesIO()
     Image.fromarray(array).save(data, "PNG")
-    yield "png", data.getvalue()
+    return data.getvalue()
 
 
-def objects_in(numbers: np.ndarray, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+def objects_in(numbers: NDArray[np.int32], names: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Objects of a segmentation picture (H, W): name, box from its mask, area, run lengths.
 
     The box is [left, top, width, height], pixels. Run lengths are COCO's: down each column, those
@@ -275,20 +328,19 @@ def objects_in(numbers: np.ndarray, names: Sequence[str]) -> Iterator[dict[str, 
         if number == 0:
             continue
         mask = numbers == number
-        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        rows = np.flatnonzero(mask.any(axis=1))
+        columns = np.flatnonzero(mask.any(axis=0))
         flat = np.concatenate(([False], mask.ravel(order="F")))
         edges = np.flatnonzero(flat[1:] != flat[:-1])
         runs = np.diff(np.concatenate(([0], edges, [mask.size])))
+        width, height = int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
         yield {
             "number": number,
             "name": names[number],
-            "box": [
-                int(columns[0]), int(rows[0]),
-                int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1,
-            ],
+            "box": [int(columns[0]), int(rows[0]), width, height],
             "area": int(mask.sum()),
             "runs": runs.tolist(),
-        }  # fmt: skip
+        }
 
 
 # ---- files
@@ -304,6 +356,6 @@ def _write(folder: Path, frames: Iterable[Frame]) -> None:
 
 
 def read_labels(folder: Path, count: int) -> list[dict[str, Any]]:
-    """Labels of so many frames in their order; all of them have to be whole."""
+    """Labels of the first `count` frames; all of them have to be whole."""
     files = (label_file(folder, number) for number in range(count))
     return [json.loads(file.read_bytes()) for file in files]

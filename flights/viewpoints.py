@@ -1,342 +1,395 @@
-"""Where the cameras of a data set are: on flights, in journals, at random places.
+"""Poses of the cameras of a data set: on flights, in journals, at random places.
 
-A plan is a TOML file; `docs/capture.md` has its fields. What it says is the same on every machine:
-random places come from its seed, flights from the evaluation episodes' seeds.
+A plan is a TOML file; `docs/capture.md` has its fields. It gives the same poses on every machine:
+random places come from its seed, flights from the seeds of the evaluation episodes.
 """
 
+import math
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import cycle, pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from ..agents import CONTROLLERS
 from ..agents.checkpoints import load
 from ..agents.policies import Policy
 from ..envs.registry import env_spec
 from ..envs.registry import load as load_env
-from ..envs.spec import Discrete, Mark, component_names
+from ..envs.spec import Mark
 from ..models import scenes_of
 from ..models.cameras import View, cameras_of, chosen_views
-from ..models.errors import InputError, expect
-from ..models.fields import Limits, check
+from ..models.errors import InputError
+from ..models.fields import Limits, Text, check_fields, check_names, read_table
 from ..models.frames import pose_in_mujoco_frame
 from ..models.vehicle import Vehicle
 from ..sim.rotations import multiplied
 from .trajectories import Trajectory, flown_trajectories, recorded_trajectories
 
-_KEYS: Final = ("vehicle", "world", "cameras", "seed", "fine", "fps", "least_area", "poses")
-_SOURCES: Final[Mapping[str, Mapping[str, Any]]] = {
-    "random": {
-        "count": None, "center": (0.0, 0.0, 5.0), "size": (10.0, 10.0, 6.0), "tilt": 0.3,
-        "world": "",
-    },
-    "flight": {
-        "env": None, "agent": "geometric", "options": {}, "episodes": 1, "first": 0,
-        "every": 10, "drones": 1, "aside": 0.0, "tilt": 0.0, "world": "",
-    },
-    "journal": {
-        "file": None, "session": None, "drone": 0, "every": 10, "aside": 0.0, "tilt": 0.0,
-        "world": "",
-    },
-}  # fmt: skip
-"""Keys of each source of poses, and their defaults; a `count` and a `file` have to be there, and
-without an `env` it is that of the checkpoint, or Hover."""
-_CAMERAS: Final = ["front", "front_segmentation"]
-MOST_FRAMES: Final = 1_000_000
-_FURTHEST: Final = 1e4  # m
-_MOST_BYTES: Final = 1_000_000  # of a plan
+Floats = NDArray[np.float64]
+
+MAX_FRAMES: Final = 1_000_000
+_FARTHEST: Final = 1e4  # m
+_MAX_BYTES: Final = 1_000_000  # of a plan
+
+_Count = Annotated[int, Limits(1, MAX_FRAMES, whole=True)]
+_Index = Annotated[int, Limits(0, whole=True)]
+_Angle = Annotated[float, Limits(0, math.pi, "rad")]
+
+
+class Stage(NamedTuple):
+    """What pictures of a sequence show besides the pose."""
+
+    drones: int
+    world: str
+    marks: tuple[Mark, ...]
+    payload: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Walk:
-    """T poses of A drones of one world, one after the other: an episode, or random places.
+class PoseSequence:
+    """T poses of A drones of one world: an episode, or random places.
 
     MuJoCo's world frame, m.
     """
 
     name: str
-    """Of its source."""
-    times: np.ndarray
-    """Since its start, shape (T,), s; those of random places are 0."""
-    position: np.ndarray
+    """Name of its source."""
+    times: Floats
+    """Since the start of the episode, shape (T,), s; those of random places are 0."""
+    position: Floats
     """Shape (T, A, 3)."""
-    quaternion: np.ndarray
-    """Shape (T, A, 4)."""
-    velocity: np.ndarray | None = None
-    """Mean of the control step before, m/s, shape (T, A, 3)."""
-    body_rates: np.ndarray | None = None
-    """The same, body frame, rad/s, shape (T, A, 3)."""
-    goal: np.ndarray | None = None
+    quaternion: Floats
+    """From body to world, scalar first, shape (T, A, 4)."""
+    velocity: Floats | None = None
+    """Mean over the control step before, m/s, shape (T, A, 3)."""
+    body_rates: Floats | None = None
+    """Mean over the control step before, body frame, rad/s, shape (T, A, 3)."""
+    goal: Floats | None = None
     """Shape (T, A, 3)."""
-    payload: np.ndarray | None = None
+    payload: Floats | None = None
     """Shape (T, A, 3)."""
-    actions: np.ndarray | None = None
-    """What is flown from there, shape (T, A, n); nan where an episode has ended."""
-    components: tuple[str, ...] = ()
-    """Names of an action's numbers."""
     marks: tuple[Mark, ...] = ()
     world: str = "plain"
-    """What surrounds the drones."""
+    """Surroundings of the drones."""
 
     def __len__(self) -> int:
-        """T."""
         return len(self.times)
 
-    def part(self, first: int, end: int) -> "Walk":
+    @property
+    def drones(self) -> int:
+        """A."""
+        return self.position.shape[1]
+
+    @property
+    def stage(self) -> Stage:
+        """What its pictures show besides the pose."""
+        return Stage(self.drones, self.world, self.marks, self.payload is not None)
+
+    def part(self, first: int, end: int) -> "PoseSequence":
         """The poses from `first` to before `end`."""
         arrays: dict[str, Any] = {
-            k: x[first:end] for k, x in vars(self).items() if isinstance(x, np.ndarray)
+            name: values[first:end]
+            for name, values in vars(self).items()
+            if isinstance(values, np.ndarray)
         }
         return replace(self, **arrays)
 
-    def state(self, row: int) -> dict[str, np.ndarray]:
+    def state(self, row: int) -> dict[str, Floats]:
         """One pose of all drones, as `Cameras.take` has it."""
-        told = {"position": self.position[row], "quaternion": self.quaternion[row]}
-        for name in ("velocity", "body_rates", "goal", "payload"):
-            values = getattr(self, name)
-            if values is not None:
-                told[name] = values[row]
-        return told
+        names = ("position", "quaternion", "velocity", "body_rates", "goal", "payload")
+        arrays = {name: getattr(self, name) for name in names}
+        return {name: values[row] for name, values in arrays.items() if values is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseSource:
+    """A table `[[poses]]` of a plan."""
+
+    world: str = ""
+    """Surroundings; empty: those of the plan."""
+
+    @abstractmethod
+    def sequences(
+        self, name: str, vehicle: str | None, rng: np.random.Generator, scenes: int
+    ) -> list[PoseSequence]:
+        """Its poses, for so many scenes in turn. Raises `InputError`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomPoses(PoseSource):
+    """Evenly in a box, with any heading, tilted up to an angle."""
+
+    count: _Count
+    center: Annotated[tuple[float, ...], Limits(-_FARTHEST, _FARTHEST, "m", count=3)] = (0, 0, 5)
+    size: Annotated[tuple[float, ...], Limits(0, _FARTHEST, "m", count=3)] = (10, 10, 6)
+    tilt: _Angle = 0.3
+
+    def sequences(
+        self, name: str, vehicle: str | None, rng: np.random.Generator, scenes: int
+    ) -> list[PoseSequence]:
+        """One part for each scene, all nearly as long."""
+        shares = rng.uniform(-0.5, 0.5, (self.count, 3))
+        half = rng.uniform(-np.pi, np.pi, self.count) / 2
+        zero = np.zeros(self.count)
+        heading = np.stack((np.cos(half), zero, zero, np.sin(half)), axis=-1)
+        quaternion = multiplied(_tilts((self.count,), self.tilt, rng), heading)
+        position = np.array(self.center) + np.array(self.size) * shares
+        whole = PoseSequence(
+            name=name, times=zero, position=position[:, None], quaternion=quaternion[:, None]
+        )
+        parts = min(scenes, self.count)
+        ends = np.linspace(0, self.count, parts + 1).astype(int).tolist()
+        return [whole.part(first, end) for first, end in pairwise(ends)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _FlightPoses(PoseSource):
+    """Poses of flights, at every so many control steps."""
+
+    every: _Count = 10
+    aside: Annotated[float, Limits(0, _FARTHEST, "m")] = 0.0
+    """Cameras are moved by up to this distance along x and y, and upwards."""
+    tilt: _Angle = 0.0
+    """Cameras are tilted by up to this angle."""
+
+    @property
+    def drones(self) -> int:
+        """Drones of a world."""
+        return 1
+
+    @abstractmethod
+    def trajectories(self, vehicle: str | None) -> list[Trajectory]:
+        """Episode after episode, each with a trajectory of every drone. Raises `InputError`."""
+
+    def sequences(
+        self, name: str, vehicle: str | None, rng: np.random.Generator, scenes: int
+    ) -> list[PoseSequence]:
+        """One sequence for each episode."""
+        flown = self.trajectories(vehicle)
+        found = []
+        for first in range(0, len(flown), self.drones):
+            sequence = _sequence(name, flown[first : first + self.drones], self.every)
+            found.append(_moved(sequence, self.aside, self.tilt, rng))
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlownPoses(_FlightPoses):
+    """Evaluation episodes of a policy."""
+
+    env: Annotated[str, Text()] | None = None
+    """None: the checkpoint's, or Hover."""
+    agent: Annotated[str, Text()] = "geometric"
+    options: Mapping[str, Any] = field(default_factory=dict)
+    episodes: _Count = 1
+    first: _Index = 0
+    drones: _Count = 1
+
+    def trajectories(self, vehicle: str | None) -> list[Trajectory]:
+        """Flown in this process."""
+        env_id = load_env(self.env or "rotorgram/Hover-v0")  # the plan is the user's own
+        options = dict(self.options)
+        policy: Policy | None = None
+        if self.agent in CONTROLLERS:
+            controller = CONTROLLERS[self.agent]
+            options = {**controller.options, **options}
+            policy = controller(env_spec(env_id, options, vehicle, self.drones))
+        elif self.agent != "random":
+            checkpoint = load(Path(self.agent))
+            trained = checkpoint.spec
+            if self.env is None:
+                env_id = checkpoint.env_id
+            if env_id == checkpoint.env_id:
+                options = {**trained.options, **options}
+            spec = env_spec(env_id, options, vehicle, self.drones)
+            if vehicle is None and trained.vehicle_hash != spec.vehicle_hash:
+                raise InputError(
+                    f"plan: vehicle: expected {trained.vehicle}, on which {self.agent} was "
+                    "trained, got none"
+                )
+            policy = checkpoint.policy(spec)
+        episodes = range(self.first, self.first + self.episodes)
+        return flown_trajectories(
+            policy, env_id, options, episodes, vehicle=vehicle, of="final", drones=self.drones
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class JournalPoses(_FlightPoses):
+    """Episodes of one drone of a journal."""
+
+    file: Annotated[str, Text()]
+    session: Annotated[int | None, Limits(1, whole=True)] = None
+    drone: _Index = 0
+
+    def trajectories(self, vehicle: str | None) -> list[Trajectory]:
+        """Read from the journal."""
+        path = Path(self.file)
+        flown = recorded_trajectories(path, session=self.session, drone=self.drone)
+        recorded, own = flown[0].spec.vehicle, Vehicle.load(vehicle).name
+        if recorded != own:
+            raise InputError(
+                f"plan: vehicle: expected {recorded}, which flies in {path}, got {own}"
+            )
+        return flown
+
+
+_SOURCES: Final[Mapping[str, type[PoseSource]]] = {
+    "random": RandomPoses,
+    "flight": FlownPoses,
+    "journal": JournalPoses,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What a data set shows. `Plan.read` checks it."""
+    """Content of a data set of pictures. `Plan.read` reads a file."""
 
     text: str
     """The TOML file."""
-    cameras: tuple[str, ...]
+    cameras: tuple[str, ...] = ("front", "front_segmentation")
     """Words as of the option `cameras` of a task."""
-    poses: tuple[Mapping[str, Any], ...]
-    """Sources of poses."""
+    poses: tuple[PoseSource, ...]
     vehicle: str | None = None
     world: str = "plain"
-    """Its places and flights are in the worlds of `scenes_of` in turn."""
-    seed: int = 0
+    """Flights and places are shared among the scenes of `scenes_of`."""
+    seed: Annotated[int, Limits(0, (1 << 63) - 1, whole=True)] = 0
     fine: bool = True
     """With shadows and smooth edges."""
-    fps: float = 10.0
-    """Of the videos."""
-    least_area: int = 1
-    """Pixels that an object needs to be told of."""
+    least_area: Annotated[int, Limits(1, whole=True)] = 1
+    """Pixels that an object needs to get a label."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "plan: ")
+        scenes_of(self.world)
+        self.views()
 
     @classmethod
     def read(cls, path: Path) -> "Plan":
         """Read a TOML file. Raises `InputError`, or `OSError` where it cannot be read."""
         size = path.stat().st_size
-        expect(size <= _MOST_BYTES, "plan", f"at most {_MOST_BYTES} bytes", f"{size}")
+        if size > _MAX_BYTES:
+            raise InputError(f"plan: expected at most {_MAX_BYTES} bytes, got {size}")
         try:
             text = path.read_text(encoding="utf-8")
             table = tomllib.loads(text)
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise InputError(f"plan: expected a TOML file, got {path.name}: {error}") from None
         except RecursionError:
-            wanted = "a TOML file with tables as in docs/capture.md"
-            raise InputError(f"plan: expected {wanted}, got too many in each other") from None
-        for key in table:
-            expect(key in _KEYS, "plan", f"some of {', '.join(_KEYS)}", repr(key))
-        cameras, poses = table.pop("cameras", _CAMERAS), table.pop("poses", None)
-        right = isinstance(cameras, list) and all(isinstance(one, str) for one in cameras)
-        expect(right and cameras, "plan: cameras", "a list of names", repr(cameras))
-        right = isinstance(poses, list) and all(isinstance(one, dict) for one in poses)
-        expect(right and poses, "plan", "a table [[poses]] or more", "none")
-        plan = cls(
-            text=text, cameras=tuple(cameras),
-            poses=tuple(_source(one, i) for i, one in enumerate(poses, 1)), **table,
-        )  # fmt: skip
-        scenes_of(plan.world)
-        right = type(plan.seed) is int and 0 <= plan.seed < 1 << 63
-        expect(right, "plan: seed", "a whole number from 0", repr(plan.seed))
-        expect(type(plan.fine) is bool, "plan: fine", "true or false", repr(plan.fine))
-        right = type(plan.least_area) is int and plan.least_area >= 1
-        expect(right, "plan: least_area", "a number of pixels", repr(plan.least_area))
-        check("plan: fps", Limits(0.1, 1000, "pictures a second"), plan.fps)
-        for view in plan.views():
-            shape = f"{view.shape[1]}x{view.shape[0]}"
-            right = view.kind != "rgb" or not (view.shape[0] % 2 or view.shape[1] % 2)
-            expect(right, f"plan: {view.name}", "even sizes, which its videos need", shape)
-        return plan
+            raise InputError("plan: expected a TOML file, got tables nested too deeply") from None
+        check_names(table, [name for name in cls.__dataclass_fields__ if name != "text"], "plan")
+        cameras, poses = table.get("cameras", list(cls.cameras)), table.get("poses")
+        if not _is_list_of(str, cameras):
+            raise InputError(f"plan: cameras: expected a list of names, got {cameras!r:.80}")
+        if not _is_list_of(dict, poses):
+            raise InputError(f"plan: expected a table [[poses]] or more, got {poses!r:.80}")
+        table["cameras"] = tuple(cameras)
+        table["poses"] = tuple(_source(one, number) for number, one in enumerate(poses, 1))
+        return cls(text=text, **table)
 
     def views(self) -> tuple[View, ...]:
         """The pictures of each pose. Raises `InputError`."""
         return chosen_views(self.cameras, cameras_of(Vehicle.load(self.vehicle)))
 
-    def walks(self) -> list[Walk]:
+    def sequences(self) -> list[PoseSequence]:
         """All poses. Raises `InputError`."""
-        found: list[Walk] = []
+        found: list[PoseSequence] = []
+        kinds = {kind: word for word, kind in _SOURCES.items()}
         for number, source in enumerate(self.poses, 1):
-            name, dice = f"{number} {source['from']}", np.random.default_rng([self.seed, number])
-            scenes = scenes_of(source["world"] or self.world)
-            if source["from"] == "random":
-                places = _random(name, source, dice)
-                shares = min(len(scenes), len(places))
-                ends = np.linspace(0, len(places), shares + 1).astype(int).tolist()
-                walks = [places.part(first, end) for first, end in pairwise(ends)]
-            else:
-                flies = source["from"] == "flight"
-                flown = _flown(source, self.vehicle) if flies else _recorded(source, self.vehicle)
-                walks = _walks(name, flown, source["every"], source.get("drones", 1))
-                walks = [_moved(walk, source["aside"], source["tilt"], dice) for walk in walks]
-            in_turn = zip(walks, cycle(scenes), strict=False)
-            found += [replace(walk, world=world) for walk, world in in_turn]
-        kinds = dict.fromkeys(walk.components for walk in found if walk.actions is not None)
-        got = " and ".join(f"({', '.join(names)})" for names in kinds)
-        expect(len(kinds) < 2, "plan", "flights with the same actions", got)
+            name = f"{number} {kinds[type(source)]}"
+            rng = np.random.default_rng([self.seed, number])
+            scenes = scenes_of(source.world or self.world)
+            sequences = source.sequences(name, self.vehicle, rng, len(scenes))
+            for sequence, scene in zip(sequences, cycle(scenes), strict=False):
+                found.append(replace(sequence, world=scene))
         count = sum(map(len, found))
-        expect(count <= MOST_FRAMES, "plan", f"at most {MOST_FRAMES} poses", f"{count}")
+        if count > MAX_FRAMES:
+            raise InputError(f"plan: expected at most {MAX_FRAMES} poses, got {count}")
         return found
 
 
-def _source(table: dict[str, Any], number: int) -> dict[str, Any]:
-    """A source of poses with all its keys. Raises `InputError`."""
-    name, kind = f"plan: poses[{number}]", table.get("from")
-    known = _SOURCES.get(kind) if isinstance(kind, str) else None
-    if known is None:
-        raise InputError(f"{name}.from: expected {_words(_SOURCES)}, got {kind!r:.80}")
-    for key in table:
-        expect(key in known or key == "from", name, f"some of {', '.join(known)}", repr(key))
-    source = {**known, **table}
-    for key in ("count", "episodes", "every", "drones"):
-        if key in source:
-            value = source[key]
-            right = type(value) is int and 1 <= value <= MOST_FRAMES
-            expect(right, f"{name}.{key}", f"1 to {MOST_FRAMES}", repr(value))
-    for key in ("first", "drone"):
-        right = key not in source or (type(source[key]) is int and source[key] >= 0)
-        expect(right, f"{name}.{key}", "a whole number from 0", repr(source.get(key)))
-    for key in ("center", "size"):
-        if key in source:
-            least = -_FURTHEST if key == "center" else 0.0
-            check(f"{name}.{key}", Limits(least, _FURTHEST, "m", count=3), source[key])
-    for key, most, unit in (("tilt", np.pi, "rad"), ("aside", _FURTHEST, "m")):
-        check(f"{name}.{key}", Limits(0, most, unit), source.get(key, 0.0))
-    if kind == "random":
-        low = source["center"][2] - source["size"][2] / 2
-        expect(low >= 0, name, "a box above the ground", f"one that begins at {low:g} m")
-    session = source.get("session")
-    right = session is None or (type(session) is int and session >= 1)
-    expect(right, f"{name}.session", "a whole number from 1", repr(session))
-    if source["world"] != "":
-        scenes_of(source["world"])
-    texts = {"env": "the id of a task", "agent": "a controller or a checkpoint",
-             "file": "a journal (.mcap)"}  # fmt: skip
-    for key, expected in texts.items():
-        value = source.get(key) or ""
-        right = isinstance(value, str) and (value != "" or key != "file")
-        expect(right or key not in source, f"{name}.{key}", expected, repr(value))
-    options = source.get("options", {})
-    expect(isinstance(options, dict), f"{name}.options", "options by name", repr(options))
+def _is_list_of(kind: type, values: Any) -> bool:
+    is_list = isinstance(values, list) and len(values) > 0
+    return is_list and all(isinstance(value, kind) for value in values)
+
+
+def _source(table: dict[str, Any], number: int) -> PoseSource:
+    """A source of poses from its table. Raises `InputError`."""
+    name = f"plan: poses[{number}]"
+    word = table.pop("from", None)
+    if not isinstance(word, str) or word not in _SOURCES:
+        words = " or ".join(map(repr, _SOURCES))
+        raise InputError(f"{name}.from: expected {words}, got {word!r:.80}")
+    source = read_table(_SOURCES[word], table, name)
+    if source.world:
+        scenes_of(source.world)
+    if isinstance(source, RandomPoses):
+        lowest = source.center[2] - source.size[2] / 2
+        if lowest < 0:
+            raise InputError(f"{name}: expected a box above the ground, got one from {lowest:g} m")
+    if not isinstance(getattr(source, "options", {}), Mapping):
+        raise InputError(f"{name}.options: expected options by name, got {table['options']!r:.80}")
     return source
 
 
-def _random(name: str, source: Mapping[str, Any], dice: np.random.Generator) -> Walk:
-    """Places evenly in a box, any heading, tilted up to an angle about any level axis."""
-    count, size = source["count"], np.array(source["size"], float)
-    position = np.array(source["center"], float) + size * dice.uniform(-0.5, 0.5, (count, 3))
-    half, zero = dice.uniform(-np.pi, np.pi, count) / 2, np.zeros(count)
-    turned = np.stack((np.cos(half), zero, zero, np.sin(half)), axis=-1)
-    quaternion = multiplied(_tilts((count,), source["tilt"], dice), turned)
-    place, turn = position[:, None], quaternion[:, None]
-    return Walk(name=name, times=zero, position=place, quaternion=turn)
+def _moved(
+    sequence: PoseSequence, aside: float, tilt: float, rng: np.random.Generator
+) -> PoseSequence:
+    """The cameras up to so far aside, m, or higher, and tilted up to an angle more, rad."""
+    shape = sequence.position.shape
+    moves = rng.uniform((-aside, -aside, 0.0), aside, shape)
+    quaternion = multiplied(_tilts(shape[:-1], tilt, rng), sequence.quaternion)
+    return replace(sequence, position=sequence.position + moves, quaternion=quaternion)
 
 
-def _moved(walk: Walk, aside: float, tilt: float, dice: np.random.Generator) -> Walk:
-    """The cameras of a walk up to so far aside, m, or higher, and tilted up to an angle more."""
-    shape = walk.position.shape
-    moves = dice.uniform((-aside, -aside, 0.0), aside, shape)
-    quaternion = multiplied(_tilts(shape[:-1], tilt, dice), walk.quaternion)
-    return replace(walk, position=walk.position + moves, quaternion=quaternion)
-
-
-def _tilts(shape: tuple[int, ...], most: float, dice: np.random.Generator) -> np.ndarray:
+def _tilts(shape: tuple[int, ...], largest: float, rng: np.random.Generator) -> Floats:
     """Rotations by up to an angle, rad, about any level axis, quaternions, (*shape, 4)."""
-    axis, half = dice.uniform(-np.pi, np.pi, shape), most * np.sqrt(dice.uniform(0, 1, shape)) / 2
-    parts = np.cos(half), np.sin(half) * np.cos(axis), np.sin(half) * np.sin(axis), 0.0 * half
-    return np.stack(parts, axis=-1)
+    axis = rng.uniform(-np.pi, np.pi, shape)
+    half = largest * np.sqrt(rng.uniform(0, 1, shape)) / 2
+    x, y = np.sin(half) * np.cos(axis), np.sin(half) * np.sin(axis)
+    return np.stack((np.cos(half), x, y, np.zeros(shape)), axis=-1)
 
 
-def _words(names: Iterable[str]) -> str:
-    return " or ".join(map(repr, names))
+def _sequence(name: str, world: Sequence[Trajectory], every: int) -> PoseSequence:
+    """Every so many steps of the trajectories of the drones of a world."""
+    steps = np.arange(0, max(map(len, world)) + 1, every)
+    spec = world[0].spec
+    drones = [_poses_after(one, steps, name) for one in world]
+    arrays: dict[str, Any] = {
+        key: np.stack([poses[key] for poses in drones], axis=1) for key in drones[0]
+    }
+    times = steps * spec.control_period
+    return PoseSequence(name=name, times=times, marks=spec.marks, **arrays)
 
 
-def _flown(source: Mapping[str, Any], vehicle: str | None) -> list[Trajectory]:
-    agent, options, drones = source["agent"], source["options"], source["drones"]
-    env_id = load_env(source["env"] or "rotorgram/Hover-v0")  # the plan is the user's own
-    controller = CONTROLLERS.get(agent)
-    policy: Policy | None = None
-    if controller is not None:
-        options = {**controller.options, **options}
-        policy = controller(env_spec(env_id, options, vehicle, drones))
-    elif agent != "random":
-        checkpoint = load(Path(agent))
-        env_id, trained = env_id if source["env"] else checkpoint.env_id, checkpoint.spec
-        if env_id == checkpoint.env_id:
-            options = {**trained.options, **options}
-        spec = env_spec(env_id, options, vehicle, drones)
-        right = vehicle is not None or trained.vehicle_hash == spec.vehicle_hash
-        expect(right, "plan: vehicle", f"{trained.vehicle}, on which {agent} was trained", "none")
-        policy = checkpoint.policy(spec)
-    episodes = range(source["first"], source["first"] + source["episodes"])
-    return flown_trajectories(
-        policy, env_id, options, episodes, vehicle=vehicle, of="final", drones=drones
-    )
-
-
-def _recorded(source: Mapping[str, Any], vehicle: str | None) -> list[Trajectory]:
-    path, own = Path(source["file"]), Vehicle.load(vehicle).name
-    flown = recorded_trajectories(path, session=source["session"], drone=source["drone"])
-    name = flown[0].spec.vehicle
-    expect(name == own, "plan: vehicle", f"{name}, which flies in {path}", own)
-    return flown
-
-
-def _walks(name: str, flown: Sequence[Trajectory], every: int, drones: int) -> list[Walk]:
-    """Every so many steps of trajectories, of so many drones of each world."""
-    found = []
-    for first in range(0, len(flown), drones):
-        world = flown[first : first + drones]
-        steps = np.arange(0, max(map(len, world)) + 1, every)
-        told = [_after(one, steps, name) for one in world]
-        stacked: dict[str, Any] = {
-            key: np.stack([one[key] for one in told], axis=1) for key in told[0]
-        }
-        spec = world[0].spec
-        own = () if isinstance(spec.action, Discrete) else component_names(spec.action)
-        found.append(
-            Walk(
-                name=name, times=steps * spec.control_period, marks=spec.marks,
-                components=tuple(own) or ("choice",), **stacked,
-            )
-        )  # fmt: skip
-    return found
-
-
-def _after(one: Trajectory, steps: np.ndarray, name: str) -> dict[str, np.ndarray]:
-    """Fields of a walk of one drone after so many steps; if it is out, it stays where it is."""
-    arrays, rows = one.telemetry, np.minimum(steps, len(one))
+def _poses_after(one: Trajectory, steps: NDArray[np.int_], name: str) -> dict[str, Floats]:
+    """Poses of one drone after so many steps; after its end it stays where it is."""
+    arrays = one.telemetry
     for key in ("position", "attitude"):
-        expect(key in arrays, name, f"telemetry of the {key}", f"{sorted(arrays)}")
+        if key not in arrays:
+            raise InputError(f"{name}: expected telemetry of the {key}, got {sorted(arrays)}")
+    rows = np.minimum(steps, len(one))
     pose = pose_in_mujoco_frame(arrays["position"], arrays["attitude"])
     now, before = pose[rows], pose[np.maximum(rows - 1, 0)]
     turned = np.zeros((len(rows), 3))
     for turn, new, old in zip(turned, now[:, 3:], before[:, 3:], strict=True):
         mujoco.mju_subQuat(turn, new, old)
     seconds = np.where(steps <= len(one), one.spec.control_period, np.inf)[:, None]
-    actions = one.actions.reshape(len(one), -1)
-    told = {
+    poses = {
         "position": now[:, :3],
         "quaternion": now[:, 3:],
         "velocity": (now[:, :3] - before[:, :3]) / seconds,
         "body_rates": turned / seconds,
-        "actions": np.append(actions, np.full((1, actions.shape[1]), np.nan), axis=0)[rows],
     }
     for key in ("goal", "payload"):
         if key in arrays:
             level = np.zeros_like(arrays[key][rows])
-            told[key] = pose_in_mujoco_frame(arrays[key][rows], level)[:, :3]
-    return told
+            poses[key] = pose_in_mujoco_frame(arrays[key][rows], level)[:, :3]
+    return poses

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from rotorgram.flights import capture as capturing
 from rotorgram.flights.capture import capture, label_file, objects_in, read_labels
-from rotorgram.flights.capture_formats import category
-from rotorgram.flights.executors import WorkersConfig
+from rotorgram.flights.coco import category
 from rotorgram.flights.viewpoints import Plan
 from rotorgram.models import InputError
 from rotorgram.training.pairs import socket_pair
+from rotorgram.flights.executors import WorkersConfig
 from test_cameras import BELLY, vehicle_with
 
 Image = pytest.importorskip("PIL.Image")
@@ -51,11 +51,11 @@ def plan_of(folder: Path, text: str = PLAN) -> Plan:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """All files but the lock, and the films, which hold the time."""
+    """All files but the lock."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.suffix != ".mp4" and path.name != ".lock"
+        if path.is_file() and path.name != ".lock"
     }
 
 
@@ -63,8 +63,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_random_places_fill_the_box(tmp_path: Path) -> None:
-    walk, _ = plan_of(tmp_path, PLAN.replace("count = 5", "count = 400")).walks()
-    position, quaternion = walk.position[:, 0], walk.quaternion[:, 0]
+    poses, _ = plan_of(tmp_path, PLAN.replace("count = 5", "count = 400")).sequences()
+    position, quaternion = poses.position[:, 0], poses.quaternion[:, 0]
     assert position.min(axis=0) == pytest.approx([-2, -2, 1], abs=0.1)
     assert position.max(axis=0) == pytest.approx([2, 2, 3], abs=0.1)
     assert np.linalg.norm(quaternion, axis=1) == pytest.approx(1.0)
@@ -73,10 +73,10 @@ def test_random_places_fill_the_box(tmp_path: Path) -> None:
     assert 0.45 < tilts.max() <= 0.5
     headings = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
     assert np.ptp(headings) > 6
-    again, _ = plan_of(tmp_path, PLAN.replace("count = 5", "count = 400")).walks()
-    other, _ = plan_of(tmp_path, PLAN.replace("seed = 7", "seed = 8")).walks()
-    assert (again.position == walk.position).all()
-    assert (other.position[0] != walk.position[0]).all()
+    again, _ = plan_of(tmp_path, PLAN.replace("count = 5", "count = 400")).sequences()
+    other, _ = plan_of(tmp_path, PLAN.replace("seed = 7", "seed = 8")).sequences()
+    assert (again.position == poses.position).all()
+    assert (other.position[0] != poses.position[0]).all()
 
 
 def test_places_and_flights_share_worlds(tmp_path: Path) -> None:
@@ -84,56 +84,67 @@ def test_places_and_flights_share_worlds(tmp_path: Path) -> None:
     path, flight = tmp_path / "plan.toml", 'env = "rotorgram/Hover-v0"\nepisodes = 3\nevery = 500'
     sources = f'[[poses]]\nfrom = "random"\ncount = 8\n[[poses]]\nfrom = "flight"\n{flight}'
     path.write_text(f'world = "gates:1-3"\n{sources}')
-    walks = Plan.read(path).walks()
+    sequences = Plan.read(path).sequences()
     names = ["gates:1", "gates:2", "gates:3"]
-    assert [walk.world for walk in walks] == names * 2
-    assert [len(walk) for walk in walks[:3]] == [2, 3, 3]
+    assert [poses.world for poses in sequences] == names * 2
+    assert [len(poses) for poses in sequences[:3]] == [2, 3, 3]
     path.write_text(sources)
-    alone = Plan.read(path).walks()[0]
+    alone = Plan.read(path).sequences()[0]
     np.testing.assert_array_equal(
-        np.concatenate([walk.position for walk in walks[:3]]), alone.position
+        np.concatenate([poses.position for poses in sequences[:3]]), alone.position
     )
 
 
 def test_a_flight_gives_every_so_many_steps(tmp_path: Path) -> None:
-    _, walk = plan_of(tmp_path).walks()
-    assert walk.times.tolist() == [0.0, 0.8, 1.6]
-    assert walk.goal is not None
-    assert walk.goal.shape == walk.position.shape == (3, 1, 3)
-    assert [mark.shape for mark in walk.marks] == ["disc"]
+    _, poses = plan_of(tmp_path).sequences()
+    assert poses.times.tolist() == [0.0, 0.8, 1.6]
+    assert poses.goal is not None
+    assert poses.goal.shape == poses.position.shape == (3, 1, 3)
+    assert [mark.shape for mark in poses.marks] == ["disc"]
 
 
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (("seed = 7", "seed = -1"), "plan: seed: expected a whole number from 0, got -1"),
-        (("seed = 7", "sed = 7"), "plan: expected some of vehicle, world, .* got 'sed'"),
+        (
+            ("seed = 7", "seed = -1"),
+            "plan: seed: expected a whole number from 0 to 9223372036854775807, got -1",
+        ),
+        (("seed = 7", "sed = 7"), "plan: expected some of cameras, poses, vehicle, .* got 'sed'"),
         (("seed = 7", 'world = "moon"'), "world: expected 'plain' or 'airport' .* got 'moon'"),
-        (("count = 5", "count = 0"), r"plan: poses\[1\].count: expected 1 to 1000000, got 0"),
-        (("count = 5", ""), r"plan: poses\[1\].count: expected 1 to 1000000, got None"),
+        (
+            ("count = 5", "count = 0"),
+            r"plan: poses\[1\].count: expected a whole number from 1 to 1000000, got 0",
+        ),
+        (("count = 5", ""), r"plan: poses\[1\]: expected count, got none"),
         (
             ("tilt = 0.5", "tilt = 4"),
             r"poses\[1\].tilt: expected a number from 0 to 3.14159 rad, got 4",
         ),
-        (("tilt = 0.5", "tip = 4"), r"poses\[1\]: expected some of count, center, size, tilt"),
+        (
+            ("tilt = 0.5", "tip = 4"),
+            r"poses\[1\]: expected some of world, count, center, size, tilt",
+        ),
         (('from = "random"', 'from = "air"'), r"poses\[1\].from: expected 'random' or 'flight'"),
-        (("[4.0, 4.0, 2.0]", "[4.0]"), r"poses\[1\].size: expected 3 numbers from 0 to 1"),
+        (
+            ("[4.0, 4.0, 2.0]", "[4.0]"),
+            r"poses\[1\].size: expected 3 numbers from 0 to 10000 m, got",
+        ),
         (
             ('env = "rotorgram/Landing-v0"', "env = 3"),
-            r"\[2\].env: expected the id of a task, got 3",
+            r"\[2\].env: expected a text, or none, got 3",
         ),
-        (("every = 40", "agent = 5"), r"\[2\].agent: expected a controller or a checkpoint, got 5"),
+        (("every = 40", "agent = 5"), r"\[2\].agent: expected a text, got 5"),
         (("{ episode_length = 100 }", "1"), r"poses\[2\].options: expected options by name, got 1"),
-        (("down@32x24", "down@33x24"), "plan: down: expected even sizes, .* got 33x24"),
-        (("count = 5", "count = 5\nworld = 3"), "world: expected"),
+        (("count = 5", "count = 5\nworld = 3"), "world: expected a text, got 3"),
         (("[0.0, 0.0, 2.0]", "[0.0, 0.0, 0.5]"), r"\[1\]: expected a box above the ground, got"),
-        (
-            ("[0.0, 0.0, 2.0]", "[1e308, 0.0, 2.0]"),
-            r"\[1\].center: expected 3 numbers from",
-        ),
-        (("[4.0, 4.0, 2.0]", "[-4.0, 4.0, 2.0]"), r"\[1\].size: expected 3 numbers from 0"),
+        (("[0.0, 0.0, 2.0]", "[1e308, 0.0, 2.0]"), r"\[1\].center: expected 3 numbers from -10000"),
+        (("[4.0, 4.0, 2.0]", "[-4.0, 4.0, 2.0]"), r"\[1\].size: expected 3 numbers from 0 to"),
         (('from = "random"', 'from = ["random"]'), r"\[1\].from: expected 'random' or 'flight'"),
-        (("seed = 7", "seed = 7\nleast_area = 0"), "plan: least_area: expected a number of pixels"),
+        (
+            ("seed = 7", "seed = 7\nleast_area = 0"),
+            "plan: least_area: expected a whole number of at least 1",
+        ),
         (("seed = 7", "seed = " + "[" * 5000), "plan: expected a TOML file"),
         (("down@32x24", "rear"), "cameras: expected some of front, down"),
         (("seed = 7", "seed ="), "plan: expected a TOML file, got plan.toml"),
@@ -191,12 +202,6 @@ def test_every_file_is_there(captured: Path) -> None:
         ]  # fmt: skip
         for one in frame["pictures"]:
             assert all((captured / file).is_file() for file in one["files"])
-    text = (captured / "README.md").read_text("utf-8")
-    assert "8 frames of Crazyflie 2.x" in text
-    assert "| 5 | 1 random, world `plain` |" in text
-    assert PLAN.strip() in text
-    with Image.open(captured / "contact.png") as sheet:
-        assert sheet.size == (4 * 160, 8 * 160)  # 32x24 is 160x120, the square flow 160x160
 
 
 def test_depth_in_millimetres_is_depth_in_metres(captured: Path) -> None:
@@ -235,73 +240,31 @@ def test_boxes_are_those_of_the_pictures(captured: Path) -> None:
         assert one["area"] == mask.sum()
 
 
-def test_poses_bring_points_to_their_pixels(captured: Path) -> None:
-    """KITTI's [R | t] and P against the lens of the labels, and that against the pad."""
-    lines = []
-    for sequence, count in ((0, 5), (1, 3)):
-        file = captured / "poses" / f"{sequence:03}_down_drone_0.txt"
-        lines += file.read_text().splitlines()
-        assert len(lines) == 5 * sequence + count
-    poses = np.array([[float(x) for x in line.split()] for line in lines]).reshape(8, 3, 4)
-    key, *numbers = (captured / "calib.txt").read_text().splitlines()[0].split()
-    assert key == "P_down_drone_0:"
-    projection = np.array(numbers, float).reshape(3, 4)
-    seen = 0
-    for frame, pose in zip(read_labels(captured, 8), poses, strict=True):
+def test_lenses_bring_points_to_their_pixels(captured: Path) -> None:
+    """The goal through the lens of the labels, against the box of the pad there."""
+    inside = 0
+    for frame in read_labels(captured, 8):
         picture = frame["pictures"][2]
-        pads = [one for one in picture["objects"] if one["name"].startswith("task/disc")]
-        for pad in pads:
-            left, top, width, height = pad["box"]
-            if left == 0 or top == 0 or left + width == 32 or top + height == 24:
-                continue  # a part of it alone
+        for thing in picture["objects"]:
+            left, top, width, height = thing["box"]
+            is_whole = left > 0 and top > 0 and left + width < 32 and top + height < 24
+            if not (is_whole and thing["name"].startswith("task/disc")):
+                continue
             point = np.add(frame["pose"]["goal"][0], (0.0, 0.0, 0.005))
-            there = pose[:, :3].T @ (point - pose[:, 3])
-            pixel = projection @ np.append(there, 1.0)
+            there = np.array(picture["rotation"]) @ point + picture["translation"]
+            pixel = np.array(picture["matrix"]) @ there
             assert pixel[0] / pixel[2] == pytest.approx(left + width / 2, abs=1.0)
             assert pixel[1] / pixel[2] == pytest.approx(top + height / 2, abs=1.0)
-            seen += 1
-    assert seen
+            inside += 1
+    assert inside
 
 
-def test_the_layout_of_lerobot(captured: Path, tmp_path: Path) -> None:
-    parquet: Any = pytest.importorskip("pyarrow.parquet")
-    root = captured / "lerobot"
-    info = json.loads((root / "meta" / "info.json").read_text())
-    # The flight alone: 100 steps, of which 0, 40 and 80 are taken, each with its action.
-    assert (info["total_episodes"], info["total_frames"], info["fps"]) == (1, 3, 10.0)
-    rows = parquet.read_table(
-        root / info["data_path"].format(episode_chunk=0, episode_index=0)
-    ).to_pylist()
-    assert set(rows[0]) | {"observation.images.down"} == set(info["features"])
-    assert [row["index"] for row in rows] == list(range(3))
-    labels = read_labels(captured, 8)
-    assert rows[2]["observation.state"][:3] == pytest.approx(labels[7]["pose"]["position"][0])
-    assert rows[2]["time"] == labels[7]["time"] == 1.6
-    _, walk = plan_of(tmp_path).walks()
-    assert walk.actions is not None
-    assert info["features"]["action"]["names"] == list(walk.components)
-    for row, action in zip(rows, walk.actions[:, 0], strict=True):
-        np.testing.assert_array_equal(row["action"], action.astype(np.float32))
-    assert len({*map(tuple, (row["action"] for row in rows))}) > 1
-    video = info["video_path"].format(
-        episode_chunk=0, video_key="observation.images.down", episode_index=0
-    )
-    ffmpeg: Any = pytest.importorskip("imageio_ffmpeg")
-    assert ffmpeg.count_frames_and_secs(str(root / video))[0] == 3
-    (told,) = (root / "meta" / "episodes_stats.jsonl").read_text().splitlines()
-    spread = json.loads(told)["stats"]
-    assert spread.keys() == info["features"].keys()
-    pictures = [
-        np.asarray(Image.open(captured / "rgb" / "down" / f"{i:06}.png")) / 255 for i in (5, 6, 7)
-    ]
-    own = spread["observation.images.down"]
-    assert np.shape(own["mean"]) == (3, 1, 1)
-    for name in ("mean", "std", "min", "max"):
-        expected = getattr(np, name)(pictures, axis=(0, 1, 2))
-        np.testing.assert_allclose(np.ravel(own[name]), expected, atol=1e-9)
-    places = np.array([row["observation.state"] for row in rows])
-    np.testing.assert_allclose(spread["observation.state"]["std"], places.std(axis=0), atol=1e-6)
-    assert spread["action"]["count"] == [3]
+def test_times_count_the_steps_between_pictures(captured: Path) -> None:
+    """Fault 44: every 40th control step of 0.02 s is 0.8 s apart, in labels and in COCO."""
+    images = json.loads((captured / "coco.json").read_text())["images"]
+    flight = [image["time"] for image in images if image["sequence"] == 1]
+    assert flight == [0.0, 0.8, 1.6]
+    assert [frame["time"] for frame in read_labels(captured, 8)] == [0.0] * 5 + flight
 
 
 def test_it_is_the_same_again_and_goes_on(captured: Path, tmp_path: Path) -> None:
@@ -393,13 +356,6 @@ def test_several_drones_and_a_camera_that_stands(opengl: None, tmp_path: Path) -
     kinds = [kind["name"] for kind in told["categories"]]
     assert kinds == sorted(kinds)
     assert {"drone", "scene/floor"} <= {*kinds}
-    lines = {path.name: len(path.read_text().splitlines()) for path in folder.glob("poses/*.txt")}
-    assert lines == {
-        "000_front_drone_0.txt": 1, "000_tower_drone_0.txt": 1, "001_front_drone_0.txt": 3,
-        "001_front_drone_1.txt": 3, "001_tower_drone_0.txt": 3,
-    }  # fmt: skip
-    episodes = (folder / "lerobot" / "meta" / "episodes.jsonl").read_text().splitlines()
-    assert [json.loads(line)["length"] for line in episodes] == [2, 2]  # not the end
 
 
 def test_a_journal_of_another_vehicle(tmp_path: Path) -> None:
@@ -415,12 +371,16 @@ def test_a_journal_of_another_vehicle(tmp_path: Path) -> None:
     file = "{journal}"
     every = 2
     """
-    (walk,) = plan_of(tmp_path, text).walks()
-    assert len(walk) == 3
-    assert walk.actions is not None
-    assert np.isnan(walk.actions[:, 0]).all(axis=1).tolist() == [False, False, True]
+    (poses,) = plan_of(tmp_path, text).sequences()
+    assert (
+        len(
+            poses,
+        )
+        == 3
+    )
+    assert poses.times.tolist() == [0.0, 0.04, 0.08]
     with pytest.raises(InputError, match=r"plan: vehicle: expected .*, which flies in "):
-        plan_of(tmp_path, 'vehicle = "crazyflie2"\n' + text).walks()
+        plan_of(tmp_path, 'vehicle = "crazyflie2"\n' + text).sequences()
 
 
 def test_a_task_of_a_module_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -438,13 +398,13 @@ def test_a_task_of_a_module_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     every = 50
     options = { episode_length = 100 }
     """
-    (walk,) = plan_of(tmp_path, text).walks()
-    assert walk.times.tolist() == [0.0, 1.0, 2.0]
-    assert walk.velocity is not None
-    assert walk.body_rates is not None
-    assert not walk.velocity[0].any()
-    assert walk.velocity[1:].any()
-    assert walk.body_rates[1:].any()
+    (poses,) = plan_of(tmp_path, text).sequences()
+    assert poses.times.tolist() == [0.0, 1.0, 2.0]
+    assert poses.velocity is not None
+    assert poses.body_rates is not None
+    assert not poses.velocity[0].any()
+    assert poses.velocity[1:].any()
+    assert poses.body_rates[1:].any()
 
 
 def test_a_full_disk_loses_nothing(
