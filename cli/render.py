@@ -9,7 +9,8 @@ from typing import Final, Literal
 from tyro.conf import Positional
 
 from ..flights.palette import DARK_COLORS, agent_color, agent_label
-from ..flights.trajectories import Trajectory, flown_trajectories, recorded_trajectories
+from ..flights.recorded import recorded_trajectories
+from ..flights.trajectories import Trajectory, flown_trajectories
 from ..models.errors import expect
 from ._flags import EnvFlags, check_count
 

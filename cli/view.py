@@ -8,7 +8,8 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from ..flights.trajectories import Trajectory, flown_trajectories, recorded_trajectories
+from ..flights.recorded import recorded_trajectories
+from ..flights.trajectories import Trajectory, flown_trajectories
 from ..models import parse_world
 from ..models.errors import expect
 from ._flags import EnvFlags, check_count

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from rotorgram.agents import PID
 from rotorgram.flights.filming import Film, Shot, film
-from rotorgram.flights.trajectories import fly, recorded_trajectories
+from rotorgram.flights.recorded import recorded_trajectories
+from rotorgram.flights.trajectories import fly
 from rotorgram.training.pairs import socket_pair
 from rotorgram.udp.journal.replay import Verification
 

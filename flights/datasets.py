@@ -7,68 +7,41 @@ import shutil
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 from ..envs import registry
 from ..envs.spaces import action_space, joined, observation_space
 from ..envs.spec import ArraySpec, EnvSpec, component_names
-from ..models.errors import InputError, expect, require
-from ..udp.protocol.messages import MAX_UINT64, Command, State
+from ..models.errors import InputError, require
+from ..udp.journal.reader import Recording
+from .recorded import SessionReader
+from .trajectories import Trajectory
 
 if TYPE_CHECKING:
-    from ..udp.journal.reader import Session
+    import pyarrow as pa
 
 _ROW_GROUP: Final = 1 << 17  # rows of a Parquet file that are written together
 _BATCH: Final = 100  # episodes that Minari gets together
 _MINARI_ID: Final = re.compile(r"([\w-]{2,}/)*[\w-]+-v\d+", re.ASCII)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RecordedEpisode:
-    """A whole episode of one drone, T control steps. Row k of T + 1 is after k steps."""
-
-    journal: str
-    """Name of the file."""
-    session: int
-    """Its session, from 1, as `rotorgram replay` counts."""
-    drone: int
-    """Of the session, from 0."""
-    seed: int | None
-    """Of the reset that began its world; None where that went on with its random numbers."""
-    observations: dict[str, np.ndarray]
-    """By name, shape (T + 1, *shape), of the spec's dtypes: as on the wire."""
-    actions: np.ndarray
-    """Shape (T, *shape), as on the wire; discrete ones int64, shape (T,)."""
-    rewards: np.ndarray
-    """float64, shape (T,)."""
-    terminated: bool
-    """Whether the last step ended it by a crash or the like."""
-    truncated: bool
-    """Whether the last step ended it by the clock."""
-    telemetry: dict[str, np.ndarray]
-    """By name, float64, shape (T + 1, *shape)."""
-
-    def __len__(self) -> int:
-        """T."""
-        return len(self.rewards)
-
-
 class RecordedEpisodes:
     """Whole episodes of journals of one env, in the order in which they ended. Iterated once.
 
-    An episode is whole if its reset, every step and its end are in the journal. One that is not,
-    because it was given up, its simulator was lost or the journal ends before it, is left out.
-    Steps in which a drone is frozen are no steps of its episode.
+    An episode is whole if its reset, every step and its end are in the journal. Others are left
+    out: they were given up, their simulator was lost or the journal ends before them.
 
     Attributes:
-        spec: Of the env.
+        spec: The spec of the env.
         left_out: Episodes with at least one step that are not whole, so far.
+        journal: Name of the file that the last episode comes from.
 
     Raises:
         OSError: A file cannot be read.
@@ -76,133 +49,71 @@ class RecordedEpisodes:
             journal, two have different specs, or the same session.
     """
 
+    spec: EnvSpec
+
     def __init__(self, paths: Sequence[Path]) -> None:
-        expect(paths, "journals", "at least one file", "none")
-        self.spec: EnvSpec
+        if not paths:
+            raise InputError("journals: expected at least one file, got none")
         self.left_out = 0
-        self._episodes = self._read(paths)
-        first = next(self._episodes, None)
-        names = ", ".join(map(str, paths))
+        self.journal = ""
+        self._sessions: dict[int, Path] = {}
+        episodes = self._whole(paths)
+        first = next(episodes, None)
         if first is None:
+            names = ", ".join(map(str, paths))
             got = f"none of {self.left_out}" if self.left_out else "no step of a flight"
             raise InputError(f"{names}: expected a whole episode, got {got}")
-        self._episodes = chain([first], self._episodes)
+        self._episodes = chain([first], episodes)
 
-    def __iter__(self) -> Iterator[RecordedEpisode]:
+    def __iter__(self) -> Iterator[Trajectory]:
         return self._episodes
 
-    def _read(self, paths: Sequence[Path]) -> Iterator[RecordedEpisode]:
-        from ..udp.journal.reader import Recording
-
-        known: dict[int, Path] = {}  # files by session
+    def _whole(self, paths: Sequence[Path]) -> Iterator[Trajectory]:
         for path in paths:
-            flying: dict[int, _Session] = {}  # the last of each slot
-            for item in Recording(path):
-                reader = flying.get(item.session.slot)
-                if reader is None or reader.session is not item.session:
-                    self.left_out += reader.unfinished if reader else 0
-                    self._check(path, item.session.spec)
-                    number = item.session.hello.session  # 0 where it is not known: by text
-                    got = f"session {number:016x} in {known.get(number)} and in {path}"
-                    expect(not number or number not in known, "journals", "each flight once", got)
-                    known[number] = path
-                    reader = flying[item.session.slot] = _Session(path.name, item.session)
-                if isinstance(item.message, Command):
-                    reader.command = item.message
-                elif isinstance(item.message, State):
-                    yield from reader.take(item.message)
-                    self.left_out, reader.left_out = self.left_out + reader.left_out, 0
-            self.left_out += sum(reader.unfinished for reader in flying.values())
+            self.journal = path.name
+            for episode in self._read(path):
+                if episode.ending == "cut off":
+                    self.left_out += 1
+                else:
+                    yield episode
 
-    def _check(self, path: Path, spec: EnvSpec) -> None:
-        """Raises `InputError` unless the spec is that of the others."""
+    def _read(self, path: Path) -> Iterator[Trajectory]:
+        """All episodes of a journal."""
+        flying: dict[int, SessionReader] = {}  # the last session of each slot
+        for item in Recording(path):
+            reader = flying.get(item.session.slot)
+            if reader is None or reader.session is not item.session:
+                if reader is not None:
+                    yield from reader.finish()
+                self._check(path, item.session.spec, item.session.hello.session)
+                reader = SessionReader(item.session, observations=True)
+                flying[item.session.slot] = reader
+            yield from reader.take(item.message)
+        for reader in flying.values():
+            yield from reader.finish()
+
+    def _check(self, path: Path, spec: EnvSpec, session: int) -> None:
+        """Refuse another spec than that of the first session, and a session that was read."""
         first = self.__dict__.setdefault("spec", spec)
         for one in fields(EnvSpec):
             ours, theirs = getattr(first, one.name), getattr(spec, one.name)
-            expected = f"journals of one env, all with the {one.name} {ours!s:.120}"
-            expect(ours == theirs, str(path), expected, str(theirs))
-
-
-class _Session:
-    """Makes episodes of what a journal has of one session."""
-
-    def __init__(self, journal: str, session: "Session") -> None:
-        self.session = session
-        self.command: Command | None = None
-        self.left_out = 0
-        self._journal = journal
-        self._sequence: int | None = None
-        count, self._drones = session.num_envs, len(session.spec.agents)
-        self._rows: list[list[tuple[State, Any]]] = [[] for _ in range(count)]
-        """Of each drone: the States of its episode, each with the actions before it."""
-        self._seeds: list[int | None] = [None] * count
-
-    @property
-    def unfinished(self) -> int:
-        """Drones that have flown a part of an episode."""
-        return sum(len(rows) > 1 for rows in self._rows)
-
-    def take(self, state: State) -> Iterator[RecordedEpisode]:
-        """Episodes that end with a State."""
-        command, before = self.command, self._sequence
-        count, self._sequence = self.session.num_envs, state.sequence
-        everybody = np.ones(count, bool)
-        if before is None:  # drone i takes seed + i: rule 6 of the protocol
-            first = self.session.seed
-            seeds = None if first is None else [(first + i) & MAX_UINT64 for i in range(count)]
-            self._begin(state, everybody, seeds)
-            return
-        if command is None or not before == command.sequence == state.sequence - 1:
-            self._begin(state, everybody, None)  # a gap: nobody knows what was flown
-            for rows in self._rows:
-                rows.clear()
-            return
-        flown = ~(command.resets | command.frozen)
-        ended = flown & (state.terminated | state.truncated)
-        for drone in np.flatnonzero(flown).tolist():
-            if rows := self._rows[drone]:  # else its episode has ended
-                rows.append((state, command.actions))
-                if ended[drone]:
-                    yield self._episode(drone)
-                    rows.clear()
-        if command.resets.any():
-            seeds = None if command.seeds is None else command.seeds.tolist()
-            self._begin(state, command.resets, seeds)
-
-    def _begin(self, state: State, drones: np.ndarray, seeds: Sequence[int] | None) -> None:
-        for drone in np.flatnonzero(drones).tolist():
-            self.left_out += len(self._rows[drone]) > 1
-            self._rows[drone] = [(state, None)]
-            first = drone - drone % self._drones  # of its world: its seed counts
-            self._seeds[drone] = None if seeds is None else seeds[first]
-
-    def _episode(self, drone: int) -> RecordedEpisode:
-        spec, rows = self.session.spec, self._rows[drone]
-        states = [state for state, _ in rows]
-        last = states[-1]
-        return RecordedEpisode(
-            journal=self._journal,
-            session=self.session.index,
-            drone=drone,
-            seed=self._seeds[drone],
-            observations={
-                array.name: np.stack([state.observations[i][drone] for state in states])
-                for i, array in enumerate(spec.observation)
-            },
-            actions=np.stack([actions[drone] for _, actions in rows[1:]]),
-            rewards=np.array([state.rewards[drone] for state in states[1:]]),
-            terminated=bool(last.terminated[drone]),
-            truncated=bool(last.truncated[drone]),
-            telemetry={
-                array.name: np.stack([state.telemetry[i][drone] for state in states])
-                for i, array in enumerate(spec.telemetry)
-            },
-        )
+            if ours != theirs:
+                raise InputError(
+                    f"{path}: expected journals of one env, all with the {one.name} "
+                    f"{ours!s:.120}, got {theirs}"
+                )
+        if session in self._sessions:
+            raise InputError(
+                f"journals: expected each flight once, got session {session:016x} "
+                f"in {self._sessions[session]} and in {path}"
+            )
+        if session:  # 0: by text, where sessions have no number
+            self._sessions[session] = path
 
 
 @contextmanager
 def _removed_on_error(path: Path) -> Iterator[None]:
-    """Half a data set is none. An `OSError` without a file's name gets this one."""
+    """Remove half a data set. An `OSError` without a file's name gets this one."""
     try:
         yield
     except BaseException as error:
@@ -230,19 +141,20 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> tuple[int, int]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    expect(out.suffix == ".parquet", "out", "a file that ends in .parquet", str(out))
-    expect(not out.exists(), "out", "the name of a new file", f"{out}, which is there")
-    expect(out.absolute().parent.is_dir(), "out", "a folder that is there for it", str(out))
+    check_new_file(out, ".parquet")
     metadata = {"env_spec": episodes.spec.to_json()}
     count = steps = waiting = 0
-    batches: list[Any] = []
+    batches: list[pa.Table] = []
     writer: Any = None
     with _removed_on_error(out):
         for episode in episodes:
-            batch = _table(episodes.spec, count, episode).replace_schema_metadata(metadata)
+            table = _table(episodes.spec, count, episodes.journal, episode)
+            batch = table.replace_schema_metadata(metadata)
             writer = writer or pq.ParquetWriter(out, batch.schema, compression="zstd")
             batches.append(batch)
-            count, steps, waiting = count + 1, steps + len(episode), waiting + len(batch)
+            count += 1
+            steps += len(episode)
+            waiting += len(batch)
             if waiting > _ROW_GROUP:
                 writer.write_table(pa.concat_tables(batches))
                 batches, waiting = [], 0
@@ -252,30 +164,40 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> tuple[int, int]:
     return count, steps
 
 
-def _table(spec: EnvSpec, number: int, episode: RecordedEpisode) -> Any:
+def check_new_file(out: Path, *endings: str) -> None:
+    """Raises `InputError` unless it is a new file's name with one of the endings."""
+    if out.suffix.lower() not in endings:
+        raise InputError(f"out: expected a file that ends in {' or '.join(endings)}, got {out}")
+    if out.exists():
+        raise InputError(f"out: expected the name of a new file, got {out}, which exists")
+    if not out.absolute().parent.is_dir():
+        raise InputError(f"out: expected a folder that exists for it, got {out}")
+
+
+def _table(spec: EnvSpec, number: int, journal: str, episode: Trajectory) -> "pa.Table":
     import pyarrow as pa
 
     rows = len(episode) + 1
-    last = np.arange(1, rows) == rows - 1
+    is_last = np.arange(1, rows) == rows - 1
 
-    def same(value: Any, kind: Any) -> Any:
+    def repeated(value: Any, kind: pa.DataType) -> pa.Array:
         return pa.repeat(pa.scalar(value, kind), rows)
 
-    def with_null(values: Any) -> Any:
+    def with_null(values: Any) -> pa.Array:
         array = values if isinstance(values, pa.Array) else pa.array(values)
         return pa.concat_arrays([array, pa.nulls(1, array.type)])
 
     columns = {
-        "episode": same(number, pa.int32()),
+        "episode": repeated(number, pa.int32()),
         "step": pa.array(np.arange(rows, dtype=np.int32)),
-        "journal": same(episode.journal, pa.string()).dictionary_encode(),
-        "session": same(episode.session, pa.int32()),
-        "drone": same(episode.drone, pa.int32()),
-        "seed": same(episode.seed, pa.uint64()),
+        "time": pa.array(episode.times),
+        "journal": repeated(journal, pa.string()).dictionary_encode(),
+        "session": repeated(episode.session, pa.int32()),
+        "drone": repeated(episode.drone, pa.int32()),
+        "seed": repeated(episode.seed, pa.uint64()),
     }
-    several = len(spec.observation) > 1
     for array in spec.observation:
-        stem = f"observation.{array.name}" if several else "observation"
+        stem = f"observation.{array.name}" if len(spec.observation) > 1 else "observation"
         columns |= _columns(stem, array, episode.observations[array.name])
     if isinstance(spec.action, ArraySpec):
         actions = _columns("action", spec.action, episode.actions)
@@ -283,16 +205,15 @@ def _table(spec: EnvSpec, number: int, episode: RecordedEpisode) -> Any:
         actions = {"action": pa.array(episode.actions)}
     columns |= {name: with_null(values) for name, values in actions.items()}
     columns["reward"] = with_null(episode.rewards)
-    columns["terminated"] = with_null(last & episode.terminated)
-    columns["truncated"] = with_null(last & episode.truncated)
+    columns["terminated"] = with_null(is_last & (episode.ending == "terminated"))
+    columns["truncated"] = with_null(is_last & (episode.ending == "truncated"))
     for array in spec.telemetry:
-        flat = episode.telemetry[array.name].reshape(rows, -1)
-        for name, column in zip(component_names(array), flat.T, strict=True):
-            columns[f"telemetry.{name}"] = pa.array(np.ascontiguousarray(column))
+        for name, column in _components(array, episode.telemetry[array.name]):
+            columns[f"telemetry.{name}"] = pa.array(column)
     return pa.table(columns)
 
 
-def _columns(stem: str, array: ArraySpec, values: np.ndarray) -> dict[str, Any]:
+def _columns(stem: str, array: ArraySpec, values: NDArray[Any]) -> "dict[str, pa.Array]":
     """One column for each component of a vector; an array of more axes is one column of lists."""
     import pyarrow as pa
 
@@ -304,6 +225,13 @@ def _columns(stem: str, array: ArraySpec, values: np.ndarray) -> dict[str, Any]:
         f"{stem}.{name}": pa.array(np.ascontiguousarray(column))
         for name, column in zip(names, flat.T, strict=True)
     }
+
+
+def _components(array: ArraySpec, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Name and values of each component of an array over time."""
+    flat = values.reshape(len(values), -1)
+    for name, column in zip(component_names(array), flat.T, strict=True):
+        yield name, np.ascontiguousarray(column)
 
 
 # ---- Minari
@@ -318,17 +246,18 @@ def write_minari(
     makes `recover_environment` work, where `env_of` finds the env. Its metadata has the spec of the
     recorded env: `rotorgram_env_spec`, JSON.
 
-    Raises `InputError`: the id is none, or exists; or while the episodes are read.
+    Raises `InputError`: the id is wrong, or exists; or while the episodes are read.
     """
     require("minari", "dataset", "a data set for Minari")
     require("h5py", "dataset", "a data set for Minari")
     from minari import create_dataset_from_buffers
     from minari.storage.datasets_root_dir import get_dataset_path
 
-    right = _MINARI_ID.fullmatch(dataset_id)
-    expect(right, "out", "an id of Minari as namespace/name-v0", repr(dataset_id))
+    if not _MINARI_ID.fullmatch(dataset_id):
+        raise InputError(f"out: expected an id of Minari as namespace/name-v0, got {dataset_id!r}")
     path = get_dataset_path(dataset_id)
-    expect(not path.exists(), "out", "the id of a new data set", f"{dataset_id}: {path} exists")
+    if path.exists():
+        raise InputError(f"out: expected the id of a new data set, got {dataset_id}: {path} exists")
     spec = episodes.spec
     count = steps = 0
     with _removed_on_error(path), warnings.catch_warnings():
@@ -368,29 +297,26 @@ def env_of(spec: EnvSpec, vehicle: Path | str | None = None) -> Any:
     if here != spec:
         return None
     made = copy.deepcopy(gym.spec(spec.env_id))
-    made.kwargs |= {**spec.options, **({} if vehicle is None else {"vehicle": str(vehicle)})}
+    made.kwargs |= spec.options
+    if vehicle is not None:
+        made.kwargs["vehicle"] = str(vehicle)
     return made
 
 
-def _buffer(spec: EnvSpec, episode: RecordedEpisode) -> Any:
+def _buffer(spec: EnvSpec, episode: Trajectory) -> Any:
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
-    last = np.arange(1, len(episode) + 1) == len(episode)
-    infos = {
-        name: column.tolist()
-        for array in spec.telemetry
-        for name, column in zip(
-            component_names(array),
-            episode.telemetry[array.name].reshape(len(episode) + 1, -1).T,
-            strict=True,
-        )
-    }
+    is_last = np.arange(1, len(episode) + 1) == len(episode)
+    infos = {}
+    for array in spec.telemetry:
+        for name, column in _components(array, episode.telemetry[array.name]):
+            infos[name] = column.tolist()
     return EpisodeBuffer(
         seed=episode.seed,
-        observations=joined(spec, episode.observations),
+        observations=joined(spec, dict(episode.observations)),
         actions=episode.actions,
         rewards=episode.rewards,
-        terminations=last & episode.terminated,
-        truncations=last & episode.truncated,
+        terminations=is_last & (episode.ending == "terminated"),
+        truncations=is_last & (episode.ending == "truncated"),
         infos=infos,
     )

@@ -30,7 +30,8 @@ from ..models.fields import Limits, Text, check_fields, check_names, read_table
 from ..models.frames import pose_in_mujoco_frame
 from ..models.vehicle import Vehicle
 from ..sim.rotations import multiplied
-from .trajectories import Trajectory, flown_trajectories, recorded_trajectories
+from .recorded import recorded_trajectories
+from .trajectories import Trajectory, flown_trajectories
 
 Floats = NDArray[np.float64]
 
@@ -85,7 +86,7 @@ class PoseSequence:
     @property
     def drones(self) -> int:
         """A."""
-        return self.position.shape[1]
+        return int(self.position.shape[1])
 
     @property
     def stage(self) -> Stage:
@@ -285,7 +286,7 @@ class Plan:
         except RecursionError:
             raise InputError("plan: expected a TOML file, got tables nested too deeply") from None
         check_names(table, [name for name in cls.__dataclass_fields__ if name != "text"], "plan")
-        cameras, poses = table.get("cameras", list(cls.cameras)), table.get("poses")
+        cameras, poses = table.get("cameras", list(cls.cameras)), table.get("poses", [])
         if not _is_list_of(str, cameras):
             raise InputError(f"plan: cameras: expected a list of names, got {cameras!r:.80}")
         if not _is_list_of(dict, poses):
@@ -361,23 +362,19 @@ def _sequence(name: str, world: Sequence[Trajectory], every: int) -> PoseSequenc
     """Every so many steps of the trajectories of the drones of a world."""
     steps = np.arange(0, max(map(len, world)) + 1, every)
     spec = world[0].spec
-    drones = [_poses_after(one, steps, name) for one in world]
+    drones = [_poses_after(one, steps) for one in world]
     arrays: dict[str, Any] = {
         key: np.stack([poses[key] for poses in drones], axis=1) for key in drones[0]
     }
-    times = steps * spec.control_period
+    times = steps.astype(np.float64) * spec.control_period
     return PoseSequence(name=name, times=times, marks=spec.marks, **arrays)
 
 
-def _poses_after(one: Trajectory, steps: NDArray[np.int_], name: str) -> dict[str, Floats]:
+def _poses_after(one: Trajectory, steps: NDArray[np.int_]) -> dict[str, Floats]:
     """Poses of one drone after so many steps; after its end it stays where it is."""
     arrays = one.telemetry
-    for key in ("position", "attitude"):
-        if key not in arrays:
-            raise InputError(f"{name}: expected telemetry of the {key}, got {sorted(arrays)}")
     rows = np.minimum(steps, len(one))
-    pose = pose_in_mujoco_frame(arrays["position"], arrays["attitude"])
-    now, before = pose[rows], pose[np.maximum(rows - 1, 0)]
+    now, before = one.pose[rows], one.pose[np.maximum(rows - 1, 0)]
     turned = np.zeros((len(rows), 3))
     for turn, new, old in zip(turned, now[:, 3:], before[:, 3:], strict=True):
         mujoco.mju_subQuat(turn, new, old)

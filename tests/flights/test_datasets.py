@@ -15,7 +15,6 @@ from relay import FaultConfig, relaying
 from rotorgram.cli import main
 from rotorgram.envs.spec import EnvSpec
 from rotorgram.flights.datasets import (
-    RecordedEpisode,
     RecordedEpisodes,
     env_of,
     write_minari,
@@ -186,11 +185,11 @@ def test_episodes_that_are_not_whole_are_left_out(tmp_path: Path) -> None:
             for _ in range(steps):
                 remote.step([0.25])
     episodes = RecordedEpisodes([path])
-    found: list[RecordedEpisode] = list(episodes)
+    found = list(episodes)
     # The reset with seed 0 has no step; those of 3 and 2 steps were given up.
     assert [(one.seed, len(one)) for one in found] == [(8, 5), (None, 5)]
     assert episodes.left_out == 2
-    assert [(one.terminated, one.truncated) for one in found] == [(False, True)] * 2
+    assert [one.ending for one in found] == ["truncated"] * 2
     assert found[0].actions.tolist() == [[0.25]] * 5
     assert found[0].observations["observation"].shape == (6, 3)
     assert found[0].telemetry["position"].shape == (6, 3)
@@ -223,6 +222,7 @@ def test_several_journals_are_one_data_set(tmp_path: Path) -> None:
     assert read["journal"].to_pylist() == ["a.mcap"] * 5 + ["b.mcap"] * 5
     assert read["episode"].to_pylist() == [0] * 5 + [1] * 5
     assert read["seed"].to_pylist() == [0] * 5 + [1] * 5
+    assert read["time"].to_pylist() == [0.0, 0.02, 0.04, 0.06, 0.08] * 2
     assert read["reward"].null_count == read["action.collective"].null_count == 2
     spec = EnvSpec.from_json(pq.read_schema(out).metadata[b"env_spec"].decode())
     assert spec.options["episode_length"] == 4
@@ -259,13 +259,11 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "expected journals of one env, all with the options" in parquet(good, other)
     assert "expected each flight once" in parquet(good, good)
     assert "expected a whole episode, got none of 1" in parquet(short)
-    assert f"expected the name of a new file, got {there}, which is there" in parquet(
-        good, out=there
-    )
+    assert f"expected the name of a new file, got {there}, which exists" in parquet(good, out=there)
     assert there.read_bytes() == b"mine"
     wrong = ("--to", "minari", "--out", "some/flight-v0", "--vehicle", "nobodys.toml")
     assert "vehicle: cannot read nobodys.toml: No such file" in told(good, *wrong)
-    assert "a folder that is there" in parquet(good, out=tmp_path / "no" / "new.parquet")
+    assert "a folder that exists" in parquet(good, out=tmp_path / "no" / "new.parquet")
 
 
 def test_a_write_that_fails_names_the_file_and_leaves_none(tmp_path: Path) -> None:

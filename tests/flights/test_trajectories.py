@@ -11,6 +11,7 @@ import rotorgram.envs  # noqa: F401  # makes the envs known
 from peers import ANY, Running
 from rotorgram.agents.pid import PID
 from rotorgram.envs.registry import env_spec
+from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.trajectories import (
     EpisodeSet,
     Trajectory,
@@ -18,7 +19,6 @@ from rotorgram.flights.trajectories import (
     flown_trajectories,
     fly,
     fly_episodes,
-    recorded_trajectories,
 )
 from rotorgram.training.metrics import Headline
 from rotorgram.training.pairs import socket_pair

@@ -25,7 +25,8 @@ from rotorgram.cli import main
 from rotorgram.envs.registry import env_spec
 from rotorgram.flights import filming
 from rotorgram.flights.filming import Film, Shot, film
-from rotorgram.flights.trajectories import flown_trajectories, recorded_trajectories
+from rotorgram.flights.recorded import recorded_trajectories
+from rotorgram.flights.trajectories import flown_trajectories
 from rotorgram.models import InputError
 from rotorgram.rendering import NoOpenGL
 from rotorgram.training.films import film_comparison

@@ -1,0 +1,187 @@
+"""Trajectories of a journal: one reader for films, logs, plots, pictures and data sets."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..models.errors import InputError
+from ..udp.journal.reader import Recording, Session
+from ..udp.protocol.messages import MAX_UINT64, Command, State
+from .trajectories import Ending, Trajectory
+
+
+def recorded_trajectories(
+    path: Path,
+    episodes: Sequence[int] | None = None,
+    *,
+    session: int | None = None,
+    drone: int | None = 0,
+) -> list[Trajectory]:
+    """Episodes of one drone (of the session, from 0) of one session of a journal; with None those
+    of all drones, one drone after the other.
+
+    Sessions are counted from 1, as `rotorgram replay` does; None is the first with a step in it.
+    Episodes are given by number, None for all. Those of a drone are counted from 0; every episode
+    with a recorded step counts, also one that was given up or cut off by the journal's end.
+
+    Raises:
+        InputError: It is no journal, or has no such session, drone or episode.
+        OSError: It cannot be read.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: expected a journal (.mcap), got no such file")
+    readers: dict[int, SessionReader] = {}
+    flown: dict[int, list[Trajectory]] = {}
+    for item in Recording(path):
+        number = item.session.index
+        if number not in readers:
+            readers[number] = SessionReader(item.session, drone)
+            flown[number] = []
+        if session in (None, number):
+            flown[number] += readers[number].take(item.message)
+    if session is not None and session not in readers:
+        known = f"1 to {len(readers)}" if readers else "a journal with sessions"
+        raise InputError(f"session: expected {known}, got {session} for {path}")
+    chosen = next((number for number in sorted(readers) if readers[number].has_steps), None)
+    if chosen is None:
+        raise InputError(f"{path}: expected an episode with a step in it, got none")
+    last = readers[chosen].session.num_envs - 1
+    if drone is not None and not 0 <= drone <= last:
+        raise InputError(f"drone: expected 0 to {last} in {path}, got {drone}")
+    found = [*flown[chosen], *readers[chosen].finish()]
+    if not found:
+        raise InputError(f"{path}: expected an episode of drone {drone}, got none")
+    found.sort(key=lambda one: (one.drone, one.episode))
+    if episodes is None:
+        return found
+    last = max(one.episode for one in found)
+    for episode in episodes:
+        if not 0 <= episode <= last:
+            raise InputError(f"episode: expected 0 to {last} in {path}, got {episode}")
+    return [one for episode in episodes for one in found if one.episode == episode]
+
+
+class _Row(NamedTuple):
+    """One drone after a State, and the action that led there; None at the start."""
+
+    telemetry: list[NDArray[np.float64]]
+    observations: list[NDArray[Any]]
+    reward: float
+    action: NDArray[Any] | None
+
+
+class SessionReader:
+    """Makes trajectories from the messages of one session.
+
+    A Command that is missing in the journal cuts off all episodes: nobody knows what was flown.
+
+    Args:
+        session: The session of the messages.
+        drone: The one whose trajectories are made; None: all.
+        observations: Whether they get their observations.
+
+    Attributes:
+        has_steps: Whether any drone has flown a step.
+    """
+
+    def __init__(
+        self, session: Session, drone: int | None = None, *, observations: bool = False
+    ) -> None:
+        self.session = session
+        self.has_steps = False
+        self._observations = observations
+        self._drones = len(session.spec.agents)
+        count = session.num_envs
+        self._chosen = np.ones(count, bool) if drone is None else np.arange(count) == drone
+        self._command: Command | None = None
+        self._sequence: int | None = None
+        self._rows: list[list[_Row]] = [[] for _ in range(count)]
+        self._seeds: list[int | None] = [None] * count
+        self._episodes = [0] * count
+
+    def take(self, message: Any) -> Iterator[Trajectory]:
+        """The next message of the session: the episodes that it ends, one after the other."""
+        if isinstance(message, Command):
+            self._command = message
+        elif isinstance(message, State):
+            before, self._sequence = self._sequence, message.sequence
+            yield from self._follow(message, before)
+
+    def finish(self) -> Iterator[Trajectory]:
+        """The episodes that the journal's end cuts off."""
+        for drone in range(len(self._rows)):
+            yield from self._end(drone, "cut off")
+
+    def _follow(self, state: State, before: int | None) -> Iterator[Trajectory]:
+        command = self._command
+        count = self.session.num_envs
+        if before is None:
+            seed = self.session.seed  # drone i takes seed + i: rule 6 of the protocol
+            seeds = None if seed is None else [(seed + i) & MAX_UINT64 for i in range(count)]
+            yield from self._begin(state, np.ones(count, bool), seeds)
+            return
+        if command is None or not before == command.sequence == state.sequence - 1:
+            yield from self.finish()
+            return
+        flown = ~(command.resets | command.frozen)
+        self.has_steps |= bool(flown.any())
+        for drone in np.flatnonzero(flown & self._chosen).tolist():
+            if not self._rows[drone]:
+                continue  # its episode has ended
+            self._rows[drone].append(self._row(state, drone, command.actions[drone]))
+            if state.terminated[drone]:
+                yield from self._end(drone, "terminated")
+            elif state.truncated[drone]:
+                yield from self._end(drone, "truncated")
+        if command.resets.any():
+            seeds = None if command.seeds is None else command.seeds.tolist()
+            yield from self._begin(state, command.resets, seeds)
+
+    def _begin(
+        self, state: State, drones: NDArray[np.bool_], seeds: list[int] | None
+    ) -> Iterator[Trajectory]:
+        for drone in np.flatnonzero(drones & self._chosen).tolist():
+            yield from self._end(drone, "cut off")
+            self._rows[drone] = [self._row(state, drone, None)]
+            first = drone - drone % self._drones  # the first drone's seed counts for its world
+            self._seeds[drone] = None if seeds is None else seeds[first]
+
+    def _row(self, state: State, drone: int, action: NDArray[Any] | None) -> _Row:
+        observations = state.observations if self._observations else ()
+        return _Row(
+            telemetry=[np.array(values[drone]) for values in state.telemetry],
+            observations=[np.array(values[drone]) for values in observations],
+            reward=float(state.rewards[drone]),
+            action=None if action is None else np.array(action),
+        )
+
+    def _end(self, drone: int, ending: Ending) -> Iterator[Trajectory]:
+        """The episode of a drone, if it has a step; a new one has not begun."""
+        rows, self._rows[drone] = self._rows[drone], []
+        if len(rows) < 2:
+            return
+        spec = self.session.spec
+        telemetry = {
+            array.name: np.stack([row.telemetry[i] for row in rows])
+            for i, array in enumerate(spec.telemetry)
+        }
+        observations = {}
+        if self._observations:
+            for i, array in enumerate(spec.observation):
+                observations[array.name] = np.stack([row.observations[i] for row in rows])
+        yield Trajectory(
+            spec=spec,
+            telemetry=telemetry,
+            rewards=np.array([row.reward for row in rows[1:]]),
+            actions=np.stack([row.action for row in rows[1:] if row.action is not None]),
+            ending=ending,
+            episode=self._episodes[drone],
+            observations=observations,
+            session=self.session.index,
+            drone=drone,
+            seed=self._seeds[drone],
+        )
+        self._episodes[drone] += 1
