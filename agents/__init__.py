@@ -40,11 +40,32 @@ CONTROLLERS: Final[dict[str, type[PID] | type[Geometric] | type[Orca]]] = {
 """Agents that need no training, made of an env's spec."""
 
 __all__ = [
-    "CONTROLLERS", "PID", "PRESETS", "A2CConfig", "AlgorithmName", "Checkpoint",
-    "CheckpointError", "Episode", "EpisodeLog", "Geometric", "NetworkPolicy", "Orca", "PPOConfig",
-    "Policy", "ResumeError", "SACConfig", "VPGConfig", "episode_seed", "load", "make_agent",
-    "preset", "resume_agent", "start_agent", "store",
-]  # fmt: skip
+    "CONTROLLERS",
+    "PID",
+    "PRESETS",
+    "A2CConfig",
+    "AlgorithmName",
+    "Checkpoint",
+    "CheckpointError",
+    "Episode",
+    "EpisodeLog",
+    "Geometric",
+    "NetworkPolicy",
+    "Orca",
+    "PPOConfig",
+    "Policy",
+    "ResumeError",
+    "SACConfig",
+    "VPGConfig",
+    "can_resume",
+    "episode_seed",
+    "load",
+    "make_agent",
+    "preset",
+    "resume_agent",
+    "start_agent",
+    "store",
+]
 
 
 def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> "Agent":
@@ -75,11 +96,9 @@ def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> "A
             from .sac import SAC
 
             return SAC(log, config, seed)
-        case "sb3-sac", SACConfig():
-            from .sb3_sac import SB3SAC
-
-            return SB3SAC(log, config, seed)
-        case "sb3-a2c" | "sb3-ppo", A2CConfig() if type(config) is config_type(algorithm):
+        case "sb3-a2c" | "sb3-ppo" | "sb3-sac", A2CConfig() | SACConfig() if type(
+            config
+        ) is config_type(algorithm):
             from .sb3 import SB3Agent
 
             return SB3Agent(log, config, seed)
@@ -140,8 +159,15 @@ def _unfit(error: Exception) -> CheckpointError:
     return CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}")
 
 
+def can_resume(algorithm: str) -> bool:
+    """Whether a training goes on where it stopped; SB3's keep no state, and start anew."""
+    return not algorithm.startswith("sb3-")
+
+
 def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
     """The agent of a checkpoint; the log, a new one of as many drones, resumes where it was.
+
+    An agent that cannot resume starts anew, and the log with it.
 
     Raises:
         CheckpointError: The parts of the checkpoint do not fit together.
@@ -171,6 +197,8 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
         if config.hidden != tuple(len(bias) for _, bias in layers[:-1]):
             raise InputError(f"hidden: expected those of the policy, got {config.hidden}")
         agent = make_agent(kept.algorithm, log, config, kept.seed)
+        if not hasattr(agent, "set_state"):  # SB3's
+            return agent
         agent.set_state(kept.state)
     except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
         raise _unfit(error) from None

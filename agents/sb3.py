@@ -1,28 +1,29 @@
-"""Stable-Baselines3: its A2C and PPO as references, and vector envs as it wants them."""
+"""Stable-Baselines3: its A2C, PPO and SAC as references, and vector envs as it wants them."""
 
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from ..models.errors import expect, require
+from ..models.errors import InputError, require
 from . import learner
 from .checkpoints import Checkpoint
 from .episodes import EpisodeLog
-from .policies import NetworkPolicy
-from .presets import A2CConfig, PPOConfig
+from .policies import ActionMap, NetworkPolicy
+from .presets import A2CConfig, PPOConfig, SACConfig
 
 if TYPE_CHECKING:
     import stable_baselines3 as sb3
     import torch
+    from stable_baselines3.common import callbacks as sb3_callbacks
     from stable_baselines3.common import logger as sb3_logger
     from stable_baselines3.common import vec_env as sb3_vec
 else:
     sb3 = require("stable_baselines3", "train", "sb3-a2c")
     torch = require("torch", "train", "sb3-a2c")
     sb3_logger, sb3_vec = sb3.common.logger, sb3.common.vec_env
+    sb3_callbacks = sb3.common.callbacks
 
 
 class SB3VecEnv(sb3_vec.VecEnv):
@@ -35,8 +36,8 @@ class SB3VecEnv(sb3_vec.VecEnv):
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         mode = env.metadata.get("autoreset_mode")
-        right = mode == AutoresetMode.SAME_STEP
-        expect(right, "env", "a vector env with autoreset SAME_STEP", f"{mode}")
+        if mode != AutoresetMode.SAME_STEP:
+            raise InputError(f"env: expected a vector env with autoreset SAME_STEP, got {mode}")
         self.env = env
         self.render_mode = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
@@ -86,39 +87,38 @@ class SB3VecEnv(sb3_vec.VecEnv):
 
 
 class SB3Agent:
-    """SB3's A2C, or its PPO for a `PPOConfig`, behind the same interface as our own algorithms.
+    """SB3's A2C, PPO or SAC, by the class of its config, behind the interface of ours.
 
-    With all settings from the same config, Adam, and in A2C without clipping of gradients: given
-    the same experience, it makes the same updates as ours. Normalised observations raise
-    `InputError`.
+    All settings come from the same config: given the same experience, SB3 makes the same updates
+    as ours. A training runs from its beginning to its end: a checkpoint has its weights, and no
+    state to go on from.
 
     Attributes:
         model: SB3's own.
+
+    Raises:
+        InputError: Observations are to be normalised; or SAC is to make choices.
     """
 
-    def __init__(self, log: EpisodeLog, config: A2CConfig, seed: int) -> None:
-        right = not config.normalize_observations
-        expect(right, "normalize_observations", "false with SB3", "true")
-        seed_generators(seed)
+    def __init__(self, log: EpisodeLog, config: A2CConfig | SACConfig, seed: int) -> None:
+        if config.normalize_observations:
+            raise InputError("normalize_observations: expected false with SB3, got true")
         self.spec, self._config, self._ahead = log.spec, config, 0.0
         self._rollout = config.rollout_size(log.num_envs)
-        kind, settings = _kind_of(config, self._rollout)
+        torch.set_num_threads(1)  # such small nets lose by a second thread
+        steps = self._rollout // log.num_envs
+        if isinstance(config, SACConfig):
+            kind, settings, policy_settings = _sac(config, steps, log)
+        else:
+            kind, settings, policy_settings = _on_policy(config, steps, log)
+        activation = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}[config.activation]
         self.model = kind(
             "MlpPolicy",
             SB3VecEnv(log),
             learning_rate=self._learning_rate,
-            n_steps=self._rollout // log.num_envs,
             gamma=config.gamma,
-            gae_lambda=config.gae_lambda,
-            ent_coef=config.ent_coef,
-            vf_coef=config.vf_coef,
-            normalize_advantage=config.normalize and self._rollout > 1,
-            policy_kwargs={
-                "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
-                "activation_fn": torch.nn.ReLU if config.activation == "relu" else torch.nn.Tanh,
-                "log_std_init": config.log_std,
-                "optimizer_kwargs": {"eps": 1e-8, "foreach": True},
-            },
+            policy_kwargs={"activation_fn": activation, **policy_settings},
+            seed=learner.seeds_of(seed)[0] % 2**32,
             device="cpu",
             **settings,
         )
@@ -129,17 +129,28 @@ class SB3Agent:
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: learner.OnUpdate) -> None:
         """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
-        model, done = self.model, log.env_steps
         whole = env_steps // self._rollout * self._rollout
-        if done >= whole:
+        if not whole:
             return
-        if done:  # the log is where the training stopped
-            model._last_obs = log.observations
-            model._last_episode_starts = log.position().lengths == 0
-        model.num_timesteps, model.on_update = done, on_update
         self._ahead = self._rollout / whole
-        with suppress(Stopped):
-            model.learn(whole - done, reset_num_timesteps=done == 0)
+
+        def after_update() -> None:
+            self._check_finite()
+            if not on_update():
+                raise _Stopped
+
+        try:
+            self.model.learn(whole, callback=_AfterUpdates(after_update))
+        except _Stopped:
+            pass
+        except ValueError:  # torch's, of a policy that gives NaN
+            self._check_finite()
+            raise
+
+    def _check_finite(self) -> None:
+        parameters = self.model.policy.parameters()
+        if not all(bool(torch.isfinite(parameter).all()) for parameter in parameters):
+            raise learner.diverged(int(self.scalars().get("train/n_updates", 1)))
 
     def _learning_rate(self, left: float) -> float:
         # SB3 counts what is left after the rollout; ours, and so here, before it.
@@ -148,39 +159,39 @@ class SB3Agent:
 
     def actor(self) -> dict[str, np.ndarray]:
         """Weights of the policy, under our names."""
-        weights = arrays_of(self.model.policy)
-        last = len(self._config.hidden)
-        layers = [*(f"mlp_extractor.policy_net.{2 * i}" for i in range(last)), "action_net"]
+        weights = self._weights()
+        hidden, output = "mlp_extractor.policy_net", "action_net"
+        if isinstance(self._config, SACConfig):
+            hidden, output = "actor.latent_pi", "actor.mu"
+        layers = [f"{hidden}.{2 * i}" for i in range(len(self._config.hidden))]
         actor = {
             f"layers.{i}.{kind}": weights[f"{name}.{kind}"]
-            for i, name in enumerate(layers)
+            for i, name in enumerate([*layers, output])
             for kind in ("weight", "bias")
         }
-        return actor | ({"log_std": weights["log_std"]} if "log_std" in weights else {})
+        if "log_std" in weights:
+            actor["log_std"] = weights["log_std"]
+        return actor
 
     def policy(self) -> NetworkPolicy:
-        """The current policy: a copy."""
-        return NetworkPolicy(self.actor(), self.spec, self._config.activation)
+        """The current policy, without exploration: a copy."""
+        squash = isinstance(self._config, SACConfig)
+        return NetworkPolicy(self.actor(), self.spec, self._config.activation, squash=squash)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Weights, optimizer and both generators."""
-        model = self.model
-        state = {f"policy.{name}": array for name, array in arrays_of(model.policy).items()}
-        return state | optimizer_arrays(model.policy.optimizer) | generator_arrays()
+        """Weights of all networks, for `start_from`."""
+        return learner.named("policy.", self._weights())
 
-    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Take over a state."""
-        model = self.model
-        load_arrays(model.policy, state, "policy.")
-        set_optimizer_arrays(model.policy.optimizer, state)
-        model._n_updates = updates_of(model.policy.optimizer) // model.steps_per_count
-        set_generators(state)
+    def _weights(self) -> dict[str, np.ndarray]:
+        parameters = self.model.policy.state_dict()
+        return {name: values.numpy().copy() for name, values in parameters.items()}
 
     def start_from(self, kept: Checkpoint) -> None:
         """As `Learner.start_from`."""
         policy = self.model.policy
-        load_arrays(policy, kept.state, "policy.")
-        if hasattr(policy, "log_std"):
+        weights = learner.part_of(kept.state, "policy.")
+        policy.load_state_dict({name: torch.from_numpy(w.copy()) for name, w in weights.items()})
+        if "log_std" in weights:
             policy.log_std.data.fill_(self._config.log_std)
 
     def scalars(self) -> dict[str, float]:
@@ -189,49 +200,43 @@ class SB3Agent:
         return {name: float(value) for name, value in kept.items() if name.startswith("train/")}
 
 
-class Stopped(Exception):
+class _Stopped(Exception):
     """Ends SB3's loop between an update and the next rollout."""
 
 
-class _Watched:
-    """SB3 has no callback between an update and the next rollout."""
+class _AfterUpdates(sb3_callbacks.BaseCallback):
+    """Calls a function between an update and the next rollout."""
 
-    on_update: learner.OnUpdate
-    steps_per_count = 1
-    """Steps of Adam that SB3 counts as one update."""
+    def __init__(self, after_update: Callable[[], None]) -> None:
+        super().__init__()
+        self._after_update = after_update
 
-    def train(self) -> None:
-        optimizer = self.policy.optimizer  # type: ignore[attr-defined]
-        try:
-            super().train()  # type: ignore[misc]
-        except ValueError:  # torch's, of a policy that gives NaN
-            check_finite(optimizer)
-            raise
-        check_finite(optimizer)
-        if not self.on_update():
-            raise Stopped
+    def _on_step(self) -> bool:
+        return True
 
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps:
+            self._after_update()
 
-class _A2C(_Watched, sb3.A2C):
-    pass
+    def _on_training_end(self) -> None:
+        self._after_update()
 
 
-class _PPO(_Watched, sb3.PPO):
-    """With a learning rate of its own for the critic; counts epochs."""
+class _PPO(sb3.PPO):
+    """With a learning rate of its own for the critic."""
 
     critic_share = 1.0
     """Learning rate of the critic over that of the actor."""
 
     def set_rates(self, config: PPOConfig) -> None:
-        rate, size = config.learning_rate, self.n_steps * self.n_envs
+        rate = config.learning_rate
         self.critic_share = (config.critic_learning_rate or rate) / rate
-        self.steps_per_count = -(-size // self.batch_size)
-        named = list(self.policy.named_parameters())
-        groups: Any = [
-            {"params": [parameter for name, parameter in named if ("value_net." in name) == critic]}
-            for critic in (False, True)
-        ]
-        self.policy.optimizer = torch.optim.Adam(groups, **self.policy.optimizer_kwargs)
+        groups: dict[bool, list[torch.nn.Parameter]] = {False: [], True: []}
+        for name, parameter in self.policy.named_parameters():
+            groups["value_net." in name].append(parameter)
+        settings = self.policy.optimizer_kwargs
+        parts: Any = [{"params": parameters} for parameters in groups.values()]
+        self.policy.optimizer = torch.optim.Adam(parts, **settings)
 
     def _update_learning_rate(self, optimizers: Any) -> None:
         super()._update_learning_rate(optimizers)
@@ -239,100 +244,47 @@ class _PPO(_Watched, sb3.PPO):
         critic["lr"] = actor["lr"] * self.critic_share
 
 
-def _kind_of(config: A2CConfig, rollout: int) -> tuple[Any, dict[str, Any]]:
-    """Class of SB3 that serves a config, and the settings that it alone has."""
+_Made = tuple[type, dict[str, Any], dict[str, Any]]
+"""A class of SB3, its settings, and those of its policy."""
+
+
+def _on_policy(config: A2CConfig, steps: int, log: EpisodeLog) -> _Made:
+    rollout, hidden = steps * log.num_envs, list(config.hidden)
+    settings: dict[str, Any] = {
+        "n_steps": steps,
+        "gae_lambda": config.gae_lambda,
+        "ent_coef": config.ent_coef,
+        "vf_coef": config.vf_coef,
+        "normalize_advantage": config.normalize and rollout > 1,
+    }
+    policy = {
+        "net_arch": {"pi": hidden, "vf": hidden},
+        "log_std_init": config.log_std,
+        "optimizer_kwargs": {"eps": 1e-8, "foreach": True},
+    }
     if not isinstance(config, PPOConfig):
-        return _A2C, {"max_grad_norm": float("inf"), "use_rms_prop": False}
-    return _PPO, {
+        return sb3.A2C, {**settings, "max_grad_norm": float("inf"), "use_rms_prop": False}, policy
+    settings |= {
         "max_grad_norm": config.max_grad_norm,
         "batch_size": -(-rollout // config.minibatches),
         "n_epochs": config.epochs,
         "clip_range": config.clip,
     }
+    return _PPO, settings, policy
 
 
-def arrays_of(module: torch.nn.Module) -> dict[str, np.ndarray]:
-    """Copies of a module's parameters."""
-    return {name: p.detach().numpy().copy() for name, p in module.state_dict().items()}
-
-
-def load_arrays(
-    module: torch.nn.Module, arrays: Mapping[str, np.ndarray], prefix: str = ""
-) -> None:
-    """Set a module's parameters from the arrays whose names begin with a prefix."""
-    given = {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
-    module.load_state_dict({name: torch.from_numpy(a.copy()) for name, a in given.items()})
-
-
-def check_finite(optimizer: torch.optim.Optimizer) -> None:
-    """Raise `Diverged` unless all weights that an optimizer moves are finite numbers."""
-    weights = torch.cat([parameter.detach().flatten() for parameter in parameters_of(optimizer)])
-    if not torch.isfinite(weights).all():
-        raise learner.diverged(updates_of(optimizer))
-
-
-def seed_generators(seed: int) -> int:
-    """Seed what SB3 draws from: torch for actions, NumPy for samples. The seed that they get."""
-    torch_seed, _ = learner.seeds_of(seed)
-    torch.manual_seed(torch_seed)
-    torch.set_num_threads(1)  # such small nets lose by a second thread
-    np.random.seed(torch_seed % 2**32)  # noqa: NPY002
-    return torch_seed
-
-
-def generator_arrays() -> dict[str, np.ndarray]:
-    """States of the global generators."""
-    _, keys, place, *_ = np.random.get_state()  # noqa: NPY002
-    return {"rng.torch": torch.get_rng_state().numpy().copy(),
-            "rng.numpy": np.append(keys, place).astype(np.uint32)}  # fmt: skip
-
-
-def set_generators(arrays: Mapping[str, np.ndarray]) -> None:
-    """Take over what `generator_arrays` gave."""
-    torch.set_rng_state(torch.from_numpy(arrays["rng.torch"].copy()))
-    *keys, place = arrays["rng.numpy"]
-    np.random.set_state(("MT19937", np.array(keys, np.uint32), int(place), 0, 0.0))  # noqa: NPY002
-
-
-def optimizer_arrays(optimizer: torch.optim.Optimizer) -> dict[str, np.ndarray]:
-    """An optimizer's state as arrays named `optimizer.<parameter>.<quantity>`."""
-    return {
-        f"optimizer.{index}.{key}": value.numpy().copy()
-        for index, entries in optimizer.state_dict()["state"].items()
-        for key, value in entries.items()
+def _sac(config: SACConfig, steps: int, log: EpisodeLog) -> _Made:
+    if ActionMap(log.spec.action).discrete:
+        raise InputError("sb3-sac: expected an env of continuous actions, got one of choices")
+    aim = config.target_entropy
+    settings = {
+        "buffer_size": config.buffer_size,
+        "learning_starts": config.learning_starts - 1,  # SB3 learns after more than so many
+        "batch_size": config.batch_size,
+        "tau": config.tau,
+        "train_freq": steps,
+        "gradient_steps": config.gradient_steps,
+        "ent_coef": f"auto_{config.alpha}",
+        "target_entropy": "auto" if aim is None else aim,
     }
-
-
-def set_optimizer_arrays(
-    optimizer: torch.optim.Optimizer, arrays: Mapping[str, np.ndarray]
-) -> None:
-    """Take over what `optimizer_arrays` gave. Raises `ValueError` unless it is whole."""
-    given = {k: v for k, v in arrays.items() if k.startswith("optimizer.")}
-    expected = {
-        f"optimizer.{index}.{key}": () if key == "step" else tuple(parameter.shape)
-        for index, parameter in enumerate(parameters_of(optimizer))
-        for key in ("step", "exp_avg", "exp_avg_sq")
-    }
-    got = {name: array.shape for name, array in given.items()}
-    if got not in (expected, {}):
-        raise ValueError(f"optimizer: expected arrays of shapes {expected}, got {got}")
-    steps = {float(array) for name, array in given.items() if name.endswith(".step")}
-    if len(steps) > 1 or min(steps, default=1) < 1:
-        raise ValueError(f"optimizer: expected one step of 1 or more, got {sorted(steps)}")
-    state: dict[int, dict[str, torch.Tensor]] = {}
-    for name, value in given.items():
-        _, index, key = name.split(".")
-        state.setdefault(int(index), {})[key] = torch.from_numpy(value.copy())
-    groups = optimizer.state_dict()["param_groups"]
-    optimizer.load_state_dict({"state": state, "param_groups": groups})
-
-
-def updates_of(optimizer: torch.optim.Optimizer) -> int:
-    """Number of steps that an Adam optimizer has taken."""
-    states = list(optimizer.state.values())
-    return int(states[0]["step"]) if states else 0
-
-
-def parameters_of(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:
-    """What an optimizer moves, in the order of its state."""
-    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    return sb3.SAC, settings, {"net_arch": list(config.hidden)}

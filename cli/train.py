@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..agents import A2CConfig, AlgorithmName, Episode, load, preset, store
+from ..agents import A2CConfig, AlgorithmName, Episode, can_resume, load, preset, store
 from ..agents.checkpoints import Checkpoint, software_versions, write_whole
 from ..agents.presets import NETWORKS, PPOConfig, PresetName, VPGConfig, find_preset
 from ..flights.folders import locked
@@ -48,7 +48,7 @@ class Train(AgentFlags, BackendFlags):
     """Train an agent: the UDP server.
 
     Starts a simulator process of its own, or waits for one with --listen. Ctrl-C stops at the next
-    update with everything written; --resume goes on to the same numbers.
+    update with everything written; --resume goes on to the same numbers (sb3-… start anew).
     """
 
     algorithm: Positional[AlgorithmName]
@@ -160,6 +160,9 @@ class Train(AgentFlags, BackendFlags):
         from ._env import CHECKPOINT
         from ._progress import bars
 
+        if not can_resume(self.algorithm):
+            stopped = "it starts anew" if self.resume else "--resume starts it anew"
+            print(f"note: {self.algorithm} keeps no state of a training: {stopped}", flush=True)
         flags = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
         go_on = go_on_with(self, f"train {self.algorithm}", folder, *flags)
         keeper = _Keeper(training, folder, self.store_every)

@@ -34,8 +34,6 @@ SMALL: dict[str, dict[str, Any]] = {
     "vpg": {"episodes_per_update": 3},
     "a2c": {"steps_per_update": 64},
     "ppo": {"steps_per_update": 64, "epochs": 2, "minibatches": 3, "normalize_observations": True},
-    "sb3-a2c": {"steps_per_update": 64},
-    "sb3-ppo": {"steps_per_update": 64, "epochs": 2, "minibatches": 2},
 }
 OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
 TOTAL = 768
@@ -215,9 +213,6 @@ def test_parts_that_do_not_fit_are_refused(algorithm: str) -> None:
     kept = checkpoint_of(algorithm, log, trained(algorithm, log, updates=3))
     network, rng = "weights", "rng"
     first, second, steps = "optimizer.first", "optimizer.second", "optimizer.steps"
-    if algorithm.startswith("sb3"):
-        network, rng = "policy.value_net.bias", "rng.torch"
-        first, second, steps = (f"optimizer.0.{k}" for k in ("exp_avg", "exp_avg_sq", "step"))
     changes: list[dict[str, Any]] = [
         {first: None},
         {steps: np.zeros(3, np.float32)},

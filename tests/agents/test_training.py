@@ -116,6 +116,7 @@ def test_progress_tells_of_every_drone() -> None:
 def test_a_run_that_was_stopped_ends_as_if_it_had_not(
     algorithm: str, drones: int, tmp_path: Path
 ) -> None:
+    """SB3's keeps no state, and flies everything again."""
     run, path = run_of(algorithm, drones), tmp_path / "checkpoint.safetensors"
     unbroken = Training(run, env_of(run))
     assert unbroken.train()
@@ -128,7 +129,8 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not(
     assert not is_finished(kept)
     torch.manual_seed(99)  # nothing may depend on what the process did before
     resumed = Training.resume(kept, env_of(run))
-    assert resumed.log.env_steps == stopped.log.env_steps < 1400
+    expected_steps = 0 if algorithm == "sb3-a2c" else stopped.log.env_steps
+    assert resumed.log.env_steps == expected_steps < 1400
     assert resumed.train()
     assert is_finished(resumed.checkpoint())
     for name, expected in unbroken.agent.state().items():
@@ -188,4 +190,21 @@ def test_train_says_where_the_drones_are_too_many(
     assert main([str(a) for a in (*arguments, *settings, "--out", folder)]) == 0
     out = capsys.readouterr().out
     assert out.startswith(note)
-    assert out.count("note: ") == bool(note)
+    anew = f"note: {algorithm} keeps no state of a training: --resume starts it anew\n"
+    assert (anew in out) == algorithm.startswith("sb3-")
+    assert out.replace(anew, "").count("note: ") == bool(note)
+
+
+def test_a_stopped_run_of_sb3_starts_anew_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, words = tmp_path / "run", ["train", "sb3-a2c"]
+    assert main([*words, "--env-steps", "300", "--num-envs", "4", "--out", str(folder)]) == 0
+    path = folder / "checkpoint.safetensors"
+    store(replace(load(path), env_steps=600), path)
+    capsys.readouterr()
+    assert main([*words, "--resume", str(folder)]) == 0
+    out = capsys.readouterr().out
+    assert "note: sb3-a2c keeps no state of a training: it starts anew\n" in out
+    assert "trained 512 of 600 env steps\n" in out  # whole rollouts of 256
+    assert load(path).position.episodes[0].first_step == 0
