@@ -67,7 +67,6 @@ def programs() -> list[tuple[str, str]]:
 PROGRAMS = programs()
 INSTEAD = {
     # page: (what the page says, what is run, why)
-    "README.md": [("10_000", "1_000", "the same, ten times")],
     "docs/effects.md": [
         ("tests/data/racer.xml", (ROOT / "tests/data/racer.xml").as_posix(), "seen from a clone"),
     ],
