@@ -44,6 +44,8 @@ COMMANDS: Final = {
     "identify": "Identify",
     "key": "Key",
     "replay": "Replay",
+    "log": "Log",
+    "plot": "Plot",
     "dataset": "Dataset",
     "capture": "Capture",
 }

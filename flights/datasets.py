@@ -20,6 +20,7 @@ from ..envs import registry
 from ..envs.spaces import action_space, joined, observation_space
 from ..envs.spec import ArraySpec, EnvSpec, component_names
 from ..models.errors import InputError, require
+from ..models.files import check_new_file
 from ..udp.journal.reader import Recording
 from .recorded import SessionReader
 from .trajectories import Trajectory
@@ -162,16 +163,6 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> tuple[int, int]:
             writer.write_table(pa.concat_tables(batches))
         writer.close()
     return count, steps
-
-
-def check_new_file(out: Path, *endings: str) -> None:
-    """Raises `InputError` unless it is a new file's name with one of the endings."""
-    if out.suffix.lower() not in endings:
-        raise InputError(f"out: expected a file that ends in {' or '.join(endings)}, got {out}")
-    if out.exists():
-        raise InputError(f"out: expected the name of a new file, got {out}, which exists")
-    if not out.absolute().parent.is_dir():
-        raise InputError(f"out: expected a folder that exists for it, got {out}")
 
 
 def _table(spec: EnvSpec, number: int, journal: str, episode: Trajectory) -> "pa.Table":

@@ -24,6 +24,8 @@ _SPARE: Final = (
     ("#56B4E9", "#7CC8F2"),
     ("#8C564B", "#C9938A"),
 )
+FLIGHT_COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
+"""Colours of flights and rotors on a light ground, the same palette."""
 DARK_COLORS: Final = [dark for _, dark in (*_COLORS.values(), *_SPARE)]
 
 

@@ -1,0 +1,64 @@
+"""`rotorgram plot`: flights over time, laid over each other, as a figure."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from ._flags import Command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plot(Command):
+    """Draw what flights have over time: position, attitude, rates, rotors, battery, wind, metrics.
+
+    Flights of several journals are laid over each other. A cross is the end of a flight that was
+    terminated.
+    """
+
+    flights: Positional[tuple[Path, ...]]
+    """MCAP files that --record wrote."""
+    out: Path | None = None
+    """PNG, PDF or SVG file to write. Default: the first journal's name with .png."""
+    session: int | None = None
+    """Session of each journal, from 1, as rotorgram replay counts. Default: the first that flew."""
+    drone: int = 0
+    """Drone of each session, from 0."""
+    episode: int = 0
+    """The first episode, from 0."""
+    episodes: int = 1
+    """Number of episodes of each journal."""
+    names: tuple[str, ...] = ()
+    """Names in the legend, one for each flight. Default: the journals' names."""
+
+    def run(self) -> int:
+        """Draw it; say where."""
+        from ..flights.plots import FORMATS, plot_flights
+        from ..flights.recorded import recorded_trajectories
+        from ..models.errors import InputError
+        from ..models.files import check_new_file
+        from ._flags import check_count
+
+        if not self.flights:
+            raise InputError("flights: expected at least one journal, got none")
+        check_count("episodes", self.episodes)
+        out = self.out or Path(self.flights[0].stem + ".png")
+        check_new_file(out, *FORMATS)
+        found = {}
+        for path in self.flights:
+            numbers = range(self.episode, self.episode + self.episodes)
+            for flight in recorded_trajectories(
+                path, numbers, session=self.session, drone=self.drone
+            ):
+                name = path.stem if self.episodes == 1 else f"{path.stem}, episode {flight.episode}"
+                while name in found:
+                    name += " (again)"
+                found[name] = flight
+        if self.names and len(self.names) != len(found):
+            raise InputError(
+                f"names: expected one for each of {len(found)} flights, got {len(self.names)}"
+            )
+        named = dict(zip(self.names or found, found.values(), strict=True))
+        plot_flights(named, out)
+        print(f"{out}: {len(named)} flights" if len(named) > 1 else out)
+        return 0
