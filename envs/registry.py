@@ -89,7 +89,7 @@ def env_spec(env_id: str, options: Any = None, vehicle: Any = None, drones: int 
 
     Raises `InputError`.
     """
-    from .loop import make_task, spec_of
+    from .specification import make_task, spec_of
 
     task = make_task(env_id, options or {}, vehicle, (1, drones))
     return spec_of(canonical_id(env_id), task, drones)

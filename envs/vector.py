@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from ..models.errors import InputError, NotCopied, expect
 from ..sim import Backend, on_host
 from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
-from .loop import Loop, OnHost
+from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
 from .spaces import joined
 
@@ -100,7 +100,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
         self._on_device = tensors
-        self._flown = loop if tensors or loop.world.xp is np else OnHost(loop)
+        self._flown = loop
         self._nobody = self.lost = self.done = self.out = self._flown.done
         self._episodes = np.zeros(num_envs, int)
         self.closed = False

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from rotorgram.envs import ArraySpec, Limits, Metric, Outcome, Task, TaskOptions, register
-from rotorgram.sim import Pose, clip, stack
+from rotorgram.sim import InitialState, clip, stack
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class Landing(Task):
 
     def begin(self, mask, draw):
         height = self.options.start + draw.uniform(-1.0, 1.0)
-        return Pose(position=stack((0.0, 0.0, self.vehicle.rest_height + height)))
+        return InitialState(position=stack((0.0, 0.0, self.vehicle.rest_height + height)))
 
     def observe(self, state):
         height, climb = self.height(state), state.velocity[..., 2]

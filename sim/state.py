@@ -66,7 +66,7 @@ class WorldState:
 
 
 @dataclass(kw_only=True, slots=True)
-class Pose:
+class InitialState:
     """Initial state of worlds. None means level, at rest, or at hover thrust."""
 
     position: Array

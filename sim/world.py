@@ -9,7 +9,7 @@ from ..models.errors import expect, require
 from .effects import EffectOptions
 from .random import Draw, Noise
 from .randomize import CENTER, Randomization
-from .state import Array, Pose, WorldState
+from .state import Array, InitialState, WorldState
 
 if TYPE_CHECKING:
     import mujoco
@@ -55,7 +55,7 @@ class World(Protocol):
     parameters: dict[str, Array]
     xp: Any
 
-    def reset(self, mask: Array, pose: Pose) -> None:
+    def reset(self, mask: Array, pose: InitialState) -> None:
         """Reset the worlds of the mask, bool, shape (W, A), to their rows of `pose`.
 
         Here and in all masks the drones of a world have the same truth value.

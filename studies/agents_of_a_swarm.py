@@ -31,7 +31,7 @@ import numpy as np
 from measuring import RESULTS, free_ports, launch, options, write
 from rotorgram.envs import ArraySpec, LocalVectorEnv, Outcome, Task, TaskOptions, register
 from rotorgram.envs.loop import Loop
-from rotorgram.sim import Pose
+from rotorgram.sim import InitialState
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, SharedSimulator, Simulator
 from rotorgram.udp.protocol.messages import Command, Message, State
 
@@ -78,9 +78,9 @@ class Row(Task):
     def setup(self) -> None:
         self.observation = (ArraySpec(name="observation", shape=(3,)),)
 
-    def begin(self, mask: Any, draw: Any) -> Pose:
+    def begin(self, mask: Any, draw: Any) -> InitialState:
         row = 5.0 * np.arange(self.shape[1]) + draw.uniform(-0.1, 0.1)
-        return Pose(position=np.stack((row, 0.0 * row, 2.0 + 0.0 * row), axis=-1))
+        return InitialState(position=np.stack((row, 0.0 * row, 2.0 + 0.0 * row), axis=-1))
 
     def observe(self, state: Any) -> dict[str, Any]:
         return {"observation": state.position}

@@ -26,7 +26,7 @@ from rotorgram.sim import (
     LEVELS,
     EffectOptions,
     Gains,
-    Pose,
+    InitialState,
     WorldState,
     make_controller,
     make_world,
@@ -75,7 +75,7 @@ def response(name: str, level: str) -> dict[str, float]:
     lag = lag_of(vehicle)
     world = make_world(vehicle, 1, effects=EffectOptions(motor_lag=lag > 0))
     controller: Any = make_controller(level, vehicle, vehicle.timestep, lag=lag)
-    world.reset(np.True_, Pose(position=np.array((0.0, 0.0, 1000.0))))
+    world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, 1000.0))))
     unit, action = controller.ranges()[index][0], np.zeros(4)
     seen = []
     for _ in range(round(time / vehicle.timestep)):

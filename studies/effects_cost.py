@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from measuring import RESULTS, medians, options, write
 from rotorgram.models import Vehicle
-from rotorgram.sim import EffectOptions, Pose, Randomization, World, make_world
+from rotorgram.sim import EffectOptions, InitialState, Randomization, World, make_world
 
 ROOT = Path(__file__).parent.parent
 CASES: dict[str, dict[str, Any]] = {
@@ -38,7 +38,7 @@ EPISODE = 2  # control steps between two resets: short, so that the cases take t
 def steps_per_second(world: World, commands: np.ndarray, seconds: float) -> float:
     """Control steps of all drones per second, resets not counted."""
     every = np.ones(world.shape, bool)[()]
-    pose = Pose(position=np.broadcast_to((0.0, 0.0, 30.0), (*world.shape, 3)))
+    pose = InitialState(position=np.broadcast_to((0.0, 0.0, 30.0), (*world.shape, 3)))
     substeps, taken, steps = world.vehicle.substeps(0.02), 0.0, 0
     while taken < seconds:
         world.reset(every, pose)

@@ -23,7 +23,7 @@ import torch
 from measuring import RESULTS, in_turns, medians, options, write
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.models import Vehicle
-from rotorgram.sim import Pose, make_world
+from rotorgram.sim import InitialState, make_world
 
 OUT = RESULTS / "performance" / "gpu.json"
 TASK = "rotorgram/Hover-v0"
@@ -33,7 +33,9 @@ def of_rigid_world(worlds: int, device: str) -> Callable[[], None]:
     vehicle = Vehicle.load()
     world = make_world(vehicle, worlds, "rigid", device=device, compiled=True)
     place = torch.zeros((worlds, 1, 3), device=device) + 5.0
-    world.reset(torch.ones((worlds, 1), dtype=torch.bool, device=device), Pose(position=place))
+    world.reset(
+        torch.ones((worlds, 1), dtype=torch.bool, device=device), InitialState(position=place)
+    )
     thrust = torch.full((worlds, 1, vehicle.num_rotors), 49.0, device=device)
 
     def fly() -> None:

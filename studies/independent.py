@@ -26,7 +26,7 @@ import numpy as np
 from measuring import write_rows
 from numpy.typing import NDArray
 from rotorgram.models import QUAD_XML, InputError, Vehicle
-from rotorgram.sim import EffectOptions, Pose, make_world
+from rotorgram.sim import EffectOptions, InitialState, make_world
 from scipy.integrate import solve_ivp
 
 Floats = NDArray[np.float64]
@@ -140,7 +140,7 @@ def thrusts(vehicle: Vehicle, seconds: float = SECONDS, seed: int = _SEED) -> Fl
 def ours(vehicle: Vehicle, commands: Floats, effects: dict[str, Any]) -> Flight:
     """The flight of the backend `mujoco` at the vehicle's physics step."""
     world = make_world(vehicle, 1, effects=EffectOptions(**effects))
-    state, start = world.state, Pose(
+    state, start = world.state, InitialState(
         position=np.array((0.0, 0.0, _HEIGHT)),
         velocity=np.array(VELOCITY),
         body_rates=np.array(SPIN),

@@ -29,7 +29,7 @@ from rotorgram.flights.identify import Group, fit, regressed
 from rotorgram.flights.prediction import Airframe, Flight, Floats, Windows, differences, predict
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim.effects import EffectOptions
-from rotorgram.sim.state import Pose
+from rotorgram.sim.state import InitialState
 from rotorgram.sim.world import make_world
 
 START: Final = Path(__file__).with_name("nanodrone.toml")
@@ -168,7 +168,7 @@ def simulated(
         lift = np.array((0.0, 0.0, _UP))
         thrust = [coefficient * windows.inputs(i)[:, some].T ** 2 for i in range(HORIZONS[-1])]
         start = [position + lift, quaternion, velocity, rates, thrust[0]]
-        world.reset(np.ones((count, 1), bool), Pose(**dict(zip(
+        world.reset(np.ones((count, 1), bool), InitialState(**dict(zip(
             ("position", "quaternion", "velocity", "body_rates", "thrust"),
             (array[:, None] for array in start), strict=True))))  # fmt: skip
         substeps = vehicle.substeps(windows.period)

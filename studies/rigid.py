@@ -33,7 +33,7 @@ import torch
 from measuring import RESULTS, in_turns, medians, options, write
 from rotorgram.envs import Loop
 from rotorgram.models import QUAD_XML, Vehicle
-from rotorgram.sim import Pose, make_world
+from rotorgram.sim import InitialState, make_world
 
 OUT = RESULTS / "rigid"
 HERE = Path(__file__).parent
@@ -67,9 +67,11 @@ def distances(file: Path, dtype: str, drones: int = 32) -> dict[str, float]:
     }
     every = torch.ones((drones, 1), dtype=torch.bool)
     kind = getattr(torch, dtype)
-    ours.reset(every, Pose(**{name: torch.tensor(x, dtype=kind) for name, x in pose.items()}))
+    ours.reset(
+        every, InitialState(**{name: torch.tensor(x, dtype=kind) for name, x in pose.items()})
+    )
     height = np.array((0.0, 0.0, 1000.0))
-    theirs.reset(every.numpy(), Pose(**pose | {"position": pose["position"] + height}))
+    theirs.reset(every.numpy(), InitialState(**pose | {"position": pose["position"] + height}))
     for _ in range(round(5 / PERIOD)):
         thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (drones, 1, vehicle.num_rotors))
         ours.step(torch.tensor(thrust, dtype=kind), vehicle.substeps(PERIOD))
@@ -103,10 +105,12 @@ def world(backend: Any, drones: int, steps: int = 2, **settings: Any) -> Callabl
     place = np.broadcast_to((0.0, 0.0, 2000.0), (drones, 1, 3))
     every: Any = np.ones((drones, 1), bool)
     if made.xp is np:
-        made.reset(every, Pose(position=place))
+        made.reset(every, InitialState(position=place))
         return lambda: made.step(thrust, steps)
     put = torch.tensor(thrust, dtype=torch.float32)
-    made.reset(torch.tensor(every), Pose(position=torch.tensor(place.copy(), dtype=torch.float32)))
+    made.reset(
+        torch.tensor(every), InitialState(position=torch.tensor(place.copy(), dtype=torch.float32))
+    )
     return lambda: made.step(put, steps)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import rotorgram.envs  # noqa: F401
 from matplotlib.figure import Figure
 from rotorgram.models import Vehicle
-from rotorgram.sim import Pose, checked_sensors, make_world
+from rotorgram.sim import InitialState, checked_sensors, make_world
 from rotorgram.sim.sensors import Sensors
 
 IRIS: Final = {
@@ -53,7 +53,7 @@ def gyroscope() -> np.ndarray:
     world, every = make_world(Vehicle.load(), _WORLDS, num_threads=1), np.ones((_WORLDS, 1), bool)
     sensors = Sensors(checked_sensors({"imu": IRIS | {"gyro_bias": 0.0}}), world, _PERIOD)
     world.seed(every, range(_WORLDS))
-    world.reset(every, Pose(position=np.tile((0.0, 0.0, 5.0), (_WORLDS, 1, 1))))
+    world.reset(every, InitialState(position=np.tile((0.0, 0.0, 5.0), (_WORLDS, 1, 1))))
     sensors.begin(every)
     readings = np.empty((_SAMPLES, _WORLDS * 3))
     for row in readings:

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 from rotorgram.envs import ArraySpec, Metric, Outcome, Task, TaskOptions, register
-from rotorgram.sim import Pose
+from rotorgram.sim import InitialState
 
 RISE: Final = "swarm/Rise-v0"
 
@@ -29,7 +29,7 @@ class Rise(Task):
 
     def begin(self, mask, draw):
         row = 5.0 * np.arange(self.shape[1]) + draw.uniform(-0.1, 0.1)
-        return Pose(position=np.stack((row, 0.0 * row, 10.0 + 0.0 * row), axis=-1))
+        return InitialState(position=np.stack((row, 0.0 * row, 10.0 + 0.0 * row), axis=-1))
 
     def observe(self, state):
         return {"observation": state.position}

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...models.errors import expect
 from ...models.fields import Limits
-from ...sim import Array, Draw, Pose, WorldState, stack
+from ...sim import Array, Draw, InitialState, WorldState, stack
 from ..spec import Metric
 from .flight import (
     AIR,
@@ -164,7 +164,7 @@ class Cable(Swarm):
         thrust: np.ndarray = even + missing @ np.linalg.pinv(vehicle.allocation).T
         return thrust
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest in equilibrium, the payload off its goal."""
         away = self.options.start_band * self.gap
         turn = draw.uniform(-math.pi, math.pi)[:, :1]  # one for all drones, as what follows
@@ -176,7 +176,7 @@ class Cable(Swarm):
         sine, zero = math.sin(half), 0.0 * azimuth
         position = ball + self._around(turn)
         self.hear(mask, draw, position)
-        return Pose(
+        return InitialState(
             position=position,
             quaternion=stack(
                 (math.cos(half) + zero, -sine * np.sin(azimuth), sine * np.cos(azimuth), zero)

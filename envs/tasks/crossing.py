@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...sim import Array, Draw, Pose, WorldState, constant, stack
+from ...sim import Array, Draw, InitialState, WorldState, constant, stack
 from ..spec import Metric
 from .swarm import JITTER, Swarm, SwarmOptions, ring
 
@@ -75,7 +75,7 @@ class Crossing(Swarm):
         self._turn: Array = 0.0
         self.prepare()
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, on the ring."""
         turn = draw.uniform(-math.pi, math.pi)
         jitter = draw.uniform(-JITTER, JITTER, (3,)) * self.gap
@@ -84,7 +84,7 @@ class Crossing(Swarm):
         self.keep(mask, _turn=turn + 0.0 * jitter[..., 0])
         position = self._opposite(turn + math.pi) + jitter
         self.hear(mask, draw, position)
-        return Pose(position=position)
+        return InitialState(position=position)
 
     def _opposite(self, turn: Array) -> Array:
         """Where drones fly to from a ring turned by an angle, rad: world frame, m, (W, A, 3)."""

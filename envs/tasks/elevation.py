@@ -12,7 +12,7 @@ from ...sim import (
     Array,
     CollectiveThrust,
     Draw,
-    Pose,
+    InitialState,
     WorldState,
     clip,
     component,
@@ -146,7 +146,7 @@ class Elevation(Task):
         self._bounds = None if options.ideal else spec.bounds()
         self.target: Array = 0.0
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Level, at rest, near the target."""
         band = self.options.start_band
         target = draw.uniform(*self.options.target_range, name="target")
@@ -156,7 +156,7 @@ class Elevation(Task):
         self._check(target, start, mask)
         self.target = plain(self.xp.where(mask, target, self.target))
         self._goal = stack((0.0, 0.0, self.target))
-        return Pose(position=stack((0.0, 0.0, start)))
+        return InitialState(position=stack((0.0, 0.0, start)))
 
     def observe(self, state: WorldState) -> dict[str, Array]:
         """E, its rate and the thrust; or E alone."""

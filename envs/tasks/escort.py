@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 
 from ...models.fields import Limits
-from ...sim import Array, Draw, Pose, WorldState, stack
+from ...sim import Array, Draw, InitialState, WorldState, stack
 from ..spec import Metric
 from .flight import FURTHEST, MOST_SPEED
 from .swarm import JITTER, Swarm, SwarmOptions, grid, ring
@@ -83,7 +83,7 @@ class Escort(Swarm):
         speeds = tuple((f"target velocity {axis}", "m/s", MOST_SPEED) for axis in "xyz")
         self.prepare(speeds)
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, in the cells of a grid about the target, by lot."""
         ratio = draw.uniform(0.5, 2.0)
         alpha, beta = (draw.uniform(-math.pi, math.pi) for _ in range(2))
@@ -92,7 +92,7 @@ class Escort(Swarm):
         self.keep(mask, _ratio=ratio, _alpha=alpha, _beta=beta, _time=0.0 * ratio)
         position = self.cells(draw) + self.target()[0]
         self.hear(mask, draw, position)
-        return Pose(position=position)
+        return InitialState(position=position)
 
     def target(self) -> tuple[Array, Array]:
         """Position from the center and velocity of the target: world frame, m, m/s, (W, A, 3)."""

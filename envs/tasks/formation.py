@@ -5,7 +5,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from ...sim import Array, Draw, Pose, WorldState
+from ...sim import Array, Draw, InitialState, WorldState
 from ..spec import Metric
 from .swarm import JITTER, Swarm, SwarmOptions, grid, line, ring
 
@@ -74,11 +74,11 @@ class Formation(Swarm):
         self.reach = float(np.linalg.norm(np.abs(self._slots).max(axis=0) + starts))
         self.prepare()
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, in the cells of a grid by lot."""
         position = self.cells(draw)
         self.hear(mask, draw, position)
-        return Pose(position=position)
+        return InitialState(position=position)
 
     def observe(self, state: WorldState) -> dict[str, Array]:
         """See the table of the class."""

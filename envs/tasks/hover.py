@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 from ...models.errors import expect
 from ...models.fields import Limits
-from ...sim import Array, Draw, Pose, WorldState, component, stack
+from ...sim import Array, Draw, InitialState, WorldState, component, stack
 from ..spec import Metric
 from .flight import (
     AIR,
@@ -99,7 +99,7 @@ class Hover(Flight):
         self.wanted = math.radians(options.heading)
         self.describe(options.flight_band)
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest near the goal, tilted and turned."""
         xp, options = self.xp, self.options
         offset = draw.uniform(-options.start_band, options.start_band, (3,))
@@ -112,7 +112,7 @@ class Hover(Flight):
         c, s = xp.cos(heading), xp.sin(heading)
         quaternion = stack((c * w, c * x - s * y, c * y + s * x, s * w))
         goal = stack([0.0 * tilt + value for value in options.goal])
-        return Pose(position=goal + offset, quaternion=quaternion)
+        return InitialState(position=goal + offset, quaternion=quaternion)
 
     def observe(self, state: WorldState) -> dict[str, Array]:
         """See the table of the class."""

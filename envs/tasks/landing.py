@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 
 from ...models.errors import expect
 from ...models.fields import Limits, NumberOrPair
-from ...sim import Array, Draw, Pose, WorldState, component, each, plain, square_root, stack
+from ...sim import Array, Draw, InitialState, WorldState, component, each, plain, square_root, stack
 from ..spec import Mark, Metric
 from .flight import LEAST_TILT_COSINE, RATE_WEIGHT, Flight, length
 from .task import Outcome, TaskOptions
@@ -147,7 +147,7 @@ class Landing(Flight):
         self._velocity = self._upright = self._potential = 0.0
         self._arrival = self._arrival_upright = self._progress = 0.0
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Level and at rest above the pad's path."""
         xp, options = self.xp, self.options
         offset = draw.uniform(-options.start_band, options.start_band, (3,))
@@ -169,7 +169,7 @@ class Landing(Flight):
         potential = self._potential_of(position, rest)
         self.keep(mask, _velocity=rest, _upright=level, _potential=potential)
         self.keep(mask, _arrival=rest, _arrival_upright=level, _progress=zero)
-        return Pose(position=position)
+        return InitialState(position=position)
 
     def remember(self, state: WorldState, mask: Array) -> None:
         """Move the pad; keep speed and tilt from before contact, and what was won on the way."""

@@ -10,7 +10,7 @@ from ...models.fields import Limits
 from ...sim import (
     Array,
     Draw,
-    Pose,
+    InitialState,
     WorldState,
     component,
     constant,
@@ -138,7 +138,7 @@ class PayloadHover(Flight):
         options, load = self.options, self.options.payload_share * self.vehicle.mass
         return {**options.effects, "payload": load, "cable": options.cable}
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """The payload near its goal, hanging still below a craft that moves and tilts."""
         xp, options = self.xp, self.options
         band, fastest = options.start_band, options.start_speed
@@ -150,7 +150,7 @@ class PayloadHover(Flight):
         x, y, z = options.goal
         above = stack((zero + x, zero + y, zero + z + options.cable))
         carrying = (1.0 + options.payload_share) * constant(self.vehicle.hover_thrust, offset)
-        return Pose(
+        return InitialState(
             position=above + offset,
             quaternion=stack((xp.cos(tilt), sine * xp.cos(azimuth), sine * xp.sin(azimuth), zero)),
             velocity=stack((along, across, zero)),

@@ -12,7 +12,18 @@ import numpy as np
 
 from ...models.errors import InputError, expect
 from ...models.fields import Limits, read_table
-from ...sim import Array, Draw, Pose, WorldState, clip, component, constant, each, plain, stack
+from ...sim import (
+    Array,
+    Draw,
+    InitialState,
+    WorldState,
+    clip,
+    component,
+    constant,
+    each,
+    plain,
+    stack,
+)
 from ..spec import Mark, Metric
 from .flight import (
     AIR,
@@ -172,7 +183,7 @@ class Racing(Flight):
         self._position: Array = 0.0  # before the last step
         self._behind: Array = 0.0  # where the way to the next gate began
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest near the start, the nose along the track."""
         band = self.options.start_band
         offset = draw.uniform(-band, band, (3,))
@@ -183,7 +194,7 @@ class Racing(Flight):
         names = ("_passed", "_time", "_lap", "_lap_began", "_progress", "_passing", "_off")
         self.keep(mask, **dict.fromkeys(names, zero))
         turn = stack((zero + math.cos(half), zero, zero, zero + math.sin(half)))
-        return Pose(position=position, quaternion=turn)
+        return InitialState(position=position, quaternion=turn)
 
     def remember(self, state: WorldState, mask: Array) -> None:
         """Whether the gate was passed, how much nearer it came, and the times of rounds."""

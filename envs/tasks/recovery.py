@@ -11,7 +11,7 @@ from ...models.fields import Limits
 from ...sim import (
     Array,
     Draw,
-    Pose,
+    InitialState,
     WorldState,
     component,
     constant,
@@ -147,7 +147,7 @@ class Recovery(Flight):
         self._least_upright = math.cos(math.radians(options.upright))
         self._time = self._missed = self._lowest = 0.0  # s, s, m
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At the goal, thrown."""
         xp, options, turn = self.xp, self.options, math.pi
         share, a, b = (
@@ -164,7 +164,7 @@ class Recovery(Flight):
         rates = draw.uniform(-1.0, 1.0, (3,))
         zero = 0.0 * share
         self.keep(mask, _time=zero, _missed=zero, _lowest=zero + options.goal[2])
-        return Pose(
+        return InitialState(
             position=stack([zero + value for value in options.goal]),
             quaternion=quaternion,
             velocity=velocity,

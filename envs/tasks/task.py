@@ -21,7 +21,7 @@ from ...sim import (
     Controller,
     Draw,
     EffectOptions,
-    Pose,
+    InitialState,
     Randomization,
     WorldState,
     checked_sensors,
@@ -205,7 +205,7 @@ class Task:
         """
         raise NotImplementedError
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Begin episodes: draw their numbers, shape (W, A, ...), and return the drones' starts.
 
         The mask, bool, shape (W, A), has the worlds that begin one, in the first call all of them.

@@ -16,7 +16,7 @@ from ...sim import (
     Array,
     Draw,
     Gains,
-    Pose,
+    InitialState,
     WorldState,
     clip,
     component,
@@ -255,7 +255,7 @@ class Tracking(Flight):
         fastest = min(Gains.of(vehicle, vehicle.timestep).most_rate[:2])
         _check_within("rad/s of tilt rate", times, np.append(rates, 0.0), 0.0, fastest)
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Near the beginning of the trajectory, or anywhere on a closed one, at its velocity."""
         xp, band = self.xp, self.options.start_band
         share = draw.uniform(0.0, 1.0)
@@ -269,7 +269,7 @@ class Tracking(Flight):
         self.keep(mask, _index=index)
         offset = draw.uniform(-band, band, (3,))
         position, velocity = (self._at(table, 0.0) for table in (self._table, self._rates))
-        return Pose(position=position + offset, velocity=velocity + 0.0 * offset)
+        return InitialState(position=position + offset, velocity=velocity + 0.0 * offset)
 
     def remember(self, state: WorldState, mask: Array) -> None:
         """Go on along the trajectory."""

@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 from ...models.errors import expect
 from ...models.fields import Limits
-from ...sim import Array, Draw, Pose, WorldState, component, each, plain, stack
+from ...sim import Array, Draw, InitialState, WorldState, component, each, plain, stack
 from ..spec import Mark, Metric
 from .flight import (
     AIR,
@@ -112,7 +112,7 @@ class Waypoints(Flight):
         self._time: Array = 0.0
         self._progress = self._passed = self._distance = 0.0
 
-    def begin(self, mask: Array, draw: Draw) -> Pose:
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, somewhere in the box; the points are drawn alike."""
         options, count = self.options, self.options.points
         sides = list(zip(options.center, options.box, strict=True))
@@ -126,7 +126,7 @@ class Waypoints(Flight):
         distance = plain(length(self.xp, points[0] - start))
         zero = 0.0 * distance
         self.keep(mask, _reached=zero, _time=zero, _progress=zero, _passed=zero, _distance=distance)
-        return Pose(position=start)
+        return InitialState(position=start)
 
     def remember(self, state: WorldState, mask: Array) -> None:
         """Count the point that was reached, and how much nearer the craft came."""

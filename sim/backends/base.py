@@ -9,7 +9,7 @@ from ...models.vehicle import Vehicle
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, START, Draw, Noise, NumpyDraw, NumpyNoise, Streams
 from ..randomize import Randomization
-from ..state import Array, Pose, WorldState, constant, plain
+from ..state import Array, InitialState, WorldState, constant, plain
 from ..world import contact_check
 
 _ONLY: Final = np.zeros(1, int)
@@ -74,7 +74,7 @@ class BaseWorld:
                 old = self.parameters.get(name)
                 self.parameters[name] = plain(new if old is None else self.xp.where(mask, new, old))
 
-    def _begun(self, mask: Array, pose: Pose) -> dict[str, Array]:
+    def _begun(self, mask: Array, pose: InitialState) -> dict[str, Array]:
         """The pose's arrays by their names; those of the state for worlds out of the mask."""
         hover = constant(self.vehicle.hover_thrust, self.state.thrust)
         level = constant(_LEVEL, self.state.thrust)

@@ -19,7 +19,7 @@ from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
 from ..effects import EffectOptions, Effects
 from ..randomize import Randomization
 from ..rotations import body_z
-from ..state import Array, Pose, WorldState
+from ..state import Array, InitialState, WorldState
 from ..world import PhysicsError, check_hung, flown_model
 from .base import ArrayWorld
 from .varied import Varied
@@ -102,7 +102,7 @@ class MujocoWorld(ArrayWorld):
         )
         assert np.shares_memory(self.state.position, qpos)
 
-    def reset(self, mask: Array, pose: Pose) -> None:
+    def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`. Raises `InputError` for a payload that would hang in the ground."""
         self._check_process()
         ids = self._ids(mask)
@@ -133,7 +133,7 @@ class MujocoWorld(ArrayWorld):
             state.thrust[here] = self.effects.begin(mask, state, self.parameters)[here]
         if hung is not None:
             self._place_payload(ids, hung)
-        self._apply_thrust(self._thrust)
+        self._apply_thrust(self._thrust, ids)
         # To wake the threads takes longer than a few worlds.
         for some in (ids,) if len(ids) > _FEW else ids[:, None]:
             self._batch.forward(some if self.shape else None)
@@ -237,7 +237,7 @@ class MujocoWorld(ArrayWorld):
         if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
             raise RuntimeError("the threads of an env do not follow into a fork: make another env")
 
-    def _hung(self, pose: Pose) -> np.ndarray | None:
+    def _hung(self, pose: InitialState) -> np.ndarray | None:
         """Where the payload of each world begins, shape (W, 3)."""
         if self._cable is None:
             return None
@@ -254,11 +254,11 @@ class MujocoWorld(ArrayWorld):
         qpos[ids, -7:-4], qpos[ids, -4:] = hung[ids], (1.0, 0.0, 0.0, 0.0)
         qvel[ids, -6:-3], qvel[ids, -3:] = qvel[ids, :3], 0.0
 
-    def _apply_thrust(self, thrust: np.ndarray) -> None:
+    def _apply_thrust(self, thrust: np.ndarray, some: Any = ...) -> None:
         if self._newtons is not None:
-            np.divide(thrust, self._newtons, out=self._ctrl)
+            self._ctrl[some] = thrust[some] / self._newtons
         elif thrust is not self._ctrl:
-            self._ctrl[:] = thrust
+            self._ctrl[some] = thrust[some]
 
     def _describe_warnings(self) -> str:
         counts = self._warnings[:, :, 1]

@@ -12,7 +12,7 @@ from ...models.errors import expect
 from ...models.vehicle import Vehicle
 from ..effects import EffectOptions
 from ..randomize import Randomization
-from ..state import Array, Pose, WorldState, clip, constant
+from ..state import Array, InitialState, WorldState, clip, constant
 from ..world import PhysicsError
 from . import kernel
 from .base import ArrayWorld, BaseWorld
@@ -96,7 +96,7 @@ class Rigid(BaseWorld):
         """New rows after physics steps: see `RigidBody.fly`."""
         raise NotImplementedError
 
-    def reset(self, mask: Array, pose: Pose) -> None:
+    def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`."""
         xp, state, rows = self.xp, self.state, mask[..., None]
         begun = self._begun(mask, pose)

@@ -15,7 +15,7 @@ from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
 from ..effects import EffectOptions, Effects
 from ..randomize import Randomization
 from ..rotations import body_z
-from ..state import Array, Pose, WorldState, constant
+from ..state import Array, InitialState, WorldState, constant
 from ..world import PhysicsError, check_hung, flown_model
 from .tensors import TensorWorld
 from .varied import Varied
@@ -107,7 +107,7 @@ class WarpWorld(TensorWorld):
             payload_velocity=None if self._cable is None else self.qvel[:, None, 6:9],
         )
 
-    def reset(self, mask: Array, pose: Pose) -> None:
+    def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`.
 
         Raises `InputError` for a position beyond `FURTHEST`, or a payload that would hang in the

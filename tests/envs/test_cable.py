@@ -10,7 +10,7 @@ from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.models import InputError, Vehicle
 from rotorgram.models.swarm import swarm_model
-from rotorgram.sim import EffectOptions, Pose, make_world
+from rotorgram.sim import EffectOptions, InitialState, make_world
 
 CABLE = "rotorgram/Cable-v0"
 
@@ -70,7 +70,7 @@ def test_cables_keep_the_momentum() -> None:
     here = np.array([[[-2.5, 0.0, 60.0], [2.5, 0.0, 60.0]]])
     ball = np.array([0.0, 0.0, 60.0 - 2.75**0.5]) + np.zeros((1, 2, 3))
     away = np.array([[[0.0, 0.0, 0.0], [3.0, 1.0, 0.0]]])
-    world.reset(np.ones((1, 2), bool), Pose(position=here, velocity=away, payload=ball))
+    world.reset(np.ones((1, 2), bool), InitialState(position=here, velocity=away, payload=ball))
     state = world.state
     loads = vehicle.mass * np.array([1.0, 1.0, 1.0])  # of both crafts, and of the ball
 

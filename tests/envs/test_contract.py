@@ -19,7 +19,7 @@ from remotes import flying
 from rotorgram.agents import PID
 from rotorgram.envs import LocalVectorEnv, SingleEnv, registry
 from rotorgram.envs.spec import component_names
-from rotorgram.models import QUAD_XML, InputError, Vehicle
+from rotorgram.models import QUAD_XML, Vehicle
 
 DATA = Path(__file__).parents[1] / "data"
 ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
@@ -184,47 +184,6 @@ def test_over_udp(env_id: str, file: Path) -> None:
 def _connected(remote: Any) -> Any:
     remote.connect()
     return remote
-
-
-@pytest.mark.parametrize("backend", ["rigid", "warp"])
-@some
-def test_on_tensors(env_id: str, file: Path, backend: str) -> None:
-    """The contract of a batch of tensors; that it flies as `mujoco` does, others test."""
-    torch = pytest.importorskip("torch")
-    options = options_of(env_id, file) | {"backend": backend, "device": "cpu", "tensors": True}
-    if backend == "rigid" and "Payload" in env_id:
-        with pytest.raises(InputError, match="effects: payload: expected none with the backend"):
-            gym.make_vec(env_id, num_envs=N, **options)
-        return
-    if backend == "warp":
-        pytest.importorskip("warp").config.log_level = 30
-        pytest.importorskip("mujoco_warp")
-    else:  # it has no cable
-        effects = options["effects"].items()
-        kept = {one: value for one, value in effects if one not in ("payload", "cable")}
-        options["effects"] = kept
-    env = gym.make_vec(env_id, num_envs=N, autoreset_mode="Disabled", **options)
-    flights = []
-    for _ in range(2):
-        observation, info = env.reset(seed=2)
-        flight = [(observation, observation.new_zeros(N))]
-        for action in list(actions_of(env.single_action_space, 2))[:8]:
-            everyone = torch.from_numpy(action).expand(N, -1)
-            observation, reward, terminated, truncated, info = env.step(everyone)
-            flight.append((observation, reward))
-            assert terminated.dtype == truncated.dtype == torch.bool
-            assert not bool((terminated & truncated).any())
-            assert {metric.name for metric in env.env_spec.metrics} <= set(info)
-            if bool((terminated | truncated).any()):
-                break
-        flights.append(flight)
-    for (observation, reward), (later, same) in zip(*flights, strict=True):
-        assert env.observation_space.contains(observation.numpy())
-        assert observation.dtype == torch.float32
-        assert bool(torch.isfinite(observation).all())
-        assert bool((observation == later).all())  # and no view
-        assert bool((reward == same).all())
-    env.close()
 
 
 # --- do the tasks suit vehicles of any size? ------------------------------------------------------

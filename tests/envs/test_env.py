@@ -154,7 +154,7 @@ def test_frames_per_second_follow_the_control_period() -> None:
 
 
 @pytest.mark.parametrize("copies", [copy.copy, copy.deepcopy, pickle.dumps])
-@pytest.mark.parametrize("make", [_env, lambda: gym.make_vec(ID, num_envs=2), lambda: Loop(ID)])
+@pytest.mark.parametrize("make", [_env, lambda: gym.make_vec(ID, num_envs=2)])
 def test_a_running_env_is_not_copied(make: Any, copies: Any) -> None:
     """A copy's arrays would no longer be those of its simulator."""
     env = make()

@@ -88,20 +88,6 @@ def test_over_udp() -> None:
             assert here.tobytes() == there.tobytes()
 
 
-def test_torch() -> None:
-    torch = pytest.importorskip("torch")
-    pytest.importorskip("mujoco_warp")
-    env: Any = gym.make_vec(
-        HOVER, num_envs=2, backend="warp", device="cpu", tensors=True, history=3
-    )
-    seen = [env.reset(seed=0)[0].numpy().copy()]
-    seen += [env.step(torch.zeros(2, 4))[0].numpy().copy() for _ in range(5)]
-    usual = [row[:, -19:] for row in seen]  # 15 numbers and 4 rotors
-    assert not (usual[0] == usual[1]).all()
-    for one, other in zip(sides(usual, 3), seen, strict=True):
-        np.testing.assert_array_equal(other, one)
-
-
 def test_the_spec_names_every_number() -> None:
     usual, long = env_spec(ELEVATION), env_spec(ELEVATION, {"history": 3})
     (one,), (three,) = usual.observation, long.observation

@@ -8,8 +8,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from rotorgram.envs import Loop
-from rotorgram.envs.loop import make_task
 from rotorgram.envs.registry import env_spec
+from rotorgram.envs.specification import make_task
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
 

@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from rotorgram.envs import ArraySpec, Loop, Metric, Outcome, Task, TaskOptions, register, registry
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.sim import CollectiveThrust, Pose, make_world, stack
+from rotorgram.sim import CollectiveThrust, InitialState, make_world, stack
 
 ID, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
 HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
@@ -151,8 +151,8 @@ class Careless(Task):
             ArraySpec(name="picture", shape=(2, 2), dtype="uint8"),
         )
 
-    def begin(self, mask: Any, draw: Any) -> Pose:
-        return Pose(position=stack((0.0, 0.0, draw.uniform(3.0, 4.0))))
+    def begin(self, mask: Any, draw: Any) -> InitialState:
+        return InitialState(position=stack((0.0, 0.0, draw.uniform(3.0, 4.0))))
 
     def observe(self, state: Any) -> dict[str, Any]:
         ones = stack((1.0, 2.0, 3.0, state.position[..., 2]))
@@ -168,7 +168,7 @@ class Counting(Careless):
 
     count: Any = 0.0
 
-    def begin(self, mask: Any, draw: Any) -> Pose:
+    def begin(self, mask: Any, draw: Any) -> InitialState:
         self.count = self.xp.where(mask, 0.0, self.count)
         return super().begin(mask, draw)
 
@@ -334,10 +334,10 @@ def test_numbers_of_a_task_that_are_not_finite_go_no_further(num_envs: int, wron
 @pytest.mark.parametrize(
     ("start", "got"),
     [
-        (None, "<class 'NoneType'>"),
-        (np.zeros(3), "<class 'numpy.ndarray'>"),
-        (Pose(position=[0.0, 0.0, 3.0]), r"\(\)"),
-        (Pose(position=np.zeros(2)), r"\(2,\)"),
+        (None, "NoneType"),
+        (np.zeros(3), "ndarray"),
+        (InitialState(position=[0.0, 0.0, 3.0]), r"\(\)"),
+        (InitialState(position=np.zeros(2)), r"\(2,\)"),
     ],
 )
 def test_a_start_that_is_none(num_envs: int, start: Any, got: str) -> None:
@@ -347,6 +347,8 @@ def test_a_start_that_is_none(num_envs: int, start: Any, got: str) -> None:
 
     register("Lost-v0", Lost)
     loop = Loop("Lost-v0", num_envs)
-    sentence = rf"^Lost-v0: expected begin\(\) to return a Pose with a position of .*, got {got}$"
+    sentence = (
+        rf"^Lost-v0: expected begin\(\) to return an InitialState with a position of .*, got {got}$"
+    )
     with pytest.raises(InputError, match=sentence):
         loop.advance(np.zeros((num_envs, 1), np.float32), np.ones(num_envs, bool))

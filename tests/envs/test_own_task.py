@@ -128,21 +128,6 @@ def test_it_is_a_gymnasium_env(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (info["reward_end"][terminated] == -20.0).all()
 
 
-def test_it_flies_on_tensors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The backend warp, and no line of the task is written for it."""
-    pytest.importorskip("mujoco_warp")
-    monkeypatch.syspath_prepend(LANDING.parent)
-    options: dict[str, Any] = {"num_envs": 3, "autoreset_mode": "Disabled", "start": 2.0}
-    env = gym.make_vec(registry.load(ID), backend="warp", device="cpu", tensors=True, **options)
-    env.reset(seed=0)
-    for _ in range(25):
-        observations, _, terminated, _, info = env.step(np.full((3, 1), -0.5, np.float32))
-    assert not terminated.any()
-    # 10 N less on each rotor: -2 m/s² for 0.5 s
-    assert observations[:, 1].tolist() == pytest.approx([-1.0] * 3, abs=1e-4)
-    assert info["height"].tolist() == pytest.approx(observations[:, 0].tolist())
-
-
 def test_an_agent_without_the_file_trains(trained: Path) -> None:
     assert (trained / "checkpoint.safetensors").is_file()
     assert b"Landing-v0" in (trained / "checkpoint.safetensors").read_bytes()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pilot import Pilot, limited
 from rotorgram.envs import Loop
-from rotorgram.envs.loop import make_task
 from rotorgram.envs.registry import env_spec
+from rotorgram.envs.specification import make_task
 from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
 

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from pilot import Pilot, limited
-from rotorgram.envs.loop import make_task
+from rotorgram.envs.specification import make_task
 from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
 

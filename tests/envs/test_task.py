@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rotorgram.envs.loop import make_task
 from rotorgram.envs.registry import env_spec
+from rotorgram.envs.specification import make_task
 from rotorgram.envs.tasks.elevation import ElevationOptions
 from rotorgram.models.errors import InputError
 from rotorgram.sim import WorldState

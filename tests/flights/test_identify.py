@@ -12,7 +12,7 @@ from rotorgram.flights.prediction import Airframe, Flight, Windows, differences,
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim.effects import EffectOptions
-from rotorgram.sim.state import Pose
+from rotorgram.sim.state import InitialState
 from rotorgram.sim.world import make_world
 
 pytest.importorskip("scipy")
@@ -48,7 +48,7 @@ def flown(
     vehicle = Vehicle.load(LIVELY)
     effects = EffectOptions(motor_lag=True, body_drag=True)
     world = make_world(vehicle, 1, effects=effects)
-    world.reset(np.True_, Pose(position=np.array((0.0, 0.0, 50.0))))
+    world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, 50.0))))
     shake = np.broadcast_to(lively, 4)
     rng, mix = np.random.default_rng(3), np.linalg.pinv(vehicle.allocation)
     state, rows, wanted, coefficient = world.state, [], np.zeros(4), 3e-6
@@ -188,7 +188,7 @@ def test_a_prediction_is_the_simulator_s(log: Path) -> None:
     arrays = {name: np.array(value) for name, value in start.items()}
     world = make_world(vehicle, 1, effects=EffectOptions(body_drag=True, rotor_drag=True))
     thrust = 3e-6 * speeds**2
-    world.reset(np.True_, Pose(thrust=thrust, **arrays))
+    world.reset(np.True_, InitialState(thrust=thrust, **arrays))
     world.step(thrust, 100)
     count = 101
     held = {name: np.tile(array, (count, 1)) for name, array in arrays.items()}

@@ -12,7 +12,7 @@ from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.models import InputError, Vehicle
 from rotorgram.models.fleet import Fleet, load_vehicles, members_of
-from rotorgram.sim import LEVELS, EffectOptions, Pose, make_controller, make_world
+from rotorgram.sim import LEVELS, EffectOptions, InitialState, make_controller, make_world
 from rotorgram.sim.control import Gains
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
 
@@ -59,12 +59,12 @@ def test_drones_far_apart_fly_as_each_vehicle_alone() -> None:
     steps = round(2 / fleet.timestep)
     together = make_world(fleet, 1, drones=3)
     everyone = np.ones((1, 3), bool)
-    together.reset(everyone, Pose(position=places, body_rates=rates))
+    together.reset(everyone, InitialState(position=places, body_rates=rates))
     assert together.state.thrust[0] == pytest.approx(fleet.hover_thrust)
     together.step(1.05 * fleet.hover_thrust[None], steps)
     for i, craft in enumerate(fleet.members):
         alone = make_world(craft, 1)
-        alone.reset(np.ones((), bool), Pose(position=places[0, i], body_rates=rates[0, i]))
+        alone.reset(np.ones((), bool), InitialState(position=places[0, i], body_rates=rates[0, i]))
         alone.step(1.05 * craft.hover_thrust, steps)
         assert together.state.position[0, i] == pytest.approx(alone.state.position, abs=1e-9)
         assert together.state.quaternion[0, i] == pytest.approx(alone.state.quaternion, abs=1e-9)

@@ -16,7 +16,7 @@ from rotorgram.sim import (
     LEVELS,
     EffectOptions,
     Gains,
-    Pose,
+    InitialState,
     WorldState,
     make_controller,
     make_world,
@@ -268,7 +268,7 @@ def flown(vehicle: Vehicle, level: str, lag: float, quaternion: Any, time: float
     controller: Any = make_controller(level, vehicle, vehicle.timestep, lag=lag)
     goal = np.array((0.0, 0.0, 50.0))
     start = np.array((0.8, -0.6, 0.5)) if level == "position" else np.zeros(3)
-    world.reset(np.True_, Pose(position=goal + start, quaternion=np.array(quaternion)))
+    world.reset(np.True_, InitialState(position=goal + start, quaternion=np.array(quaternion)))
     seen, state = [], world.state
     for _ in range(round(time / vehicle.timestep)):
         w, x, y, z = state.quaternion
@@ -358,7 +358,7 @@ def test_loops_run_in_every_physics_step_unless_they_see_an_estimate(
 def test_a_touch_in_an_earlier_physics_step_counts() -> None:
     vehicle = Vehicle.load()
     world = make_world(vehicle, 1)
-    world.reset(np.True_, Pose(position=np.array((0.0, 0.0, vehicle.rest_height - 1e-3))))
+    world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, vehicle.rest_height - 1e-3))))
     full = np.full(4, 100.0)
     world.step(full, 1)
     assert world.state.touching

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rotorgram.models import InputError, Vehicle
 from rotorgram.models.library import vehicle_names
-from rotorgram.sim import EffectOptions, Pose, World, make_world
+from rotorgram.sim import EffectOptions, InitialState, World, make_world
 from rotorgram.sim.effects.downwash import Downwash
 
 ROOT = Path(__file__).parents[2]
@@ -69,7 +69,7 @@ def birds(positions: Any, quaternion: Any = (1.0, 0.0, 0.0, 0.0), **effects: Any
     every = np.ones(world.shape, bool)[()]
     turned = np.broadcast_to(quaternion, (1, count, 4))
     place = np.array(positions, float).reshape(*world.shape, 3)
-    world.reset(every, Pose(position=place, quaternion=turned.reshape(*world.shape, 4)))
+    world.reset(every, InitialState(position=place, quaternion=turned.reshape(*world.shape, 4)))
     return world
 
 
@@ -135,7 +135,7 @@ def test_a_batch_of_swarms_is_that_many_swarms() -> None:
     places = dice.uniform(-0.5, 0.5, (3, 4, 3)) + (0.0, 0.0, 1.0) * np.arange(5, 9)[:, None]
     options = EffectOptions(body_drag=True, downwash=True, motor_lag=True)
     batch = make_world(Vehicle.load(BIRD), 3, drones=4, effects=options)
-    batch.reset(np.ones((3, 4), bool), Pose(position=places))
+    batch.reset(np.ones((3, 4), bool), InitialState(position=places))
     alone = [birds(row, body_drag=True, downwash=True, motor_lag=True) for row in places]
     thrust = np.broadcast_to(batch.vehicle.hover_thrust, (3, 4, 4)) * 0.9
     for _ in range(20):

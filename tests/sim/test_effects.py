@@ -17,7 +17,7 @@ from rotorgram.models.library import vehicle_names
 from rotorgram.sim import (
     PARAMETERS,
     EffectOptions,
-    Pose,
+    InitialState,
     Randomization,
     World,
     make_world,
@@ -109,7 +109,7 @@ def begin(world: World, height: float = 50.0, mask: Any = None, **pose: Any) -> 
     mask = np.ones(world.shape, bool)[()] if mask is None else mask
     mask = mask if world.xp is np else world.xp.asarray(mask)
     poses = {name: everywhere(values) for name, values in pose.items()}
-    world.reset(mask, Pose(position=everywhere((0.0, 0.0, height)), **poses))
+    world.reset(mask, InitialState(position=everywhere((0.0, 0.0, height)), **poses))
     return world
 
 

@@ -12,7 +12,7 @@ from rotorgram.envs import LocalVectorEnv, Loop
 from rotorgram.envs.tasks.flight import length
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.models.errors import InputError
-from rotorgram.sim import PhysicsError, Pose, World, make_world, square_root
+from rotorgram.sim import InitialState, PhysicsError, World, make_world, square_root
 from rotorgram.sim.backends import kernel
 from rotorgram.training.settings import CompareConfig
 
@@ -49,7 +49,7 @@ def tumbling(dice: np.random.Generator, count: int = N) -> dict[str, np.ndarray]
 
 def begin(world: World, **pose: np.ndarray) -> None:
     put = {name: torch.tensor(values, dtype=world.dtype) for name, values in pose.items()}  # type: ignore[attr-defined]
-    world.reset(torch.ones(world.shape, dtype=torch.bool), Pose(**put))
+    world.reset(torch.ones(world.shape, dtype=torch.bool), InitialState(**put))
 
 
 def angle(ours: Any, theirs: np.ndarray) -> float:
@@ -72,7 +72,7 @@ def test_flies_as_mujoco_for_five_seconds(name: str, drag: float) -> None:
     ours, theirs = arrays(vehicle), make_world(vehicle, N, num_threads=1)
     substeps = vehicle.substeps(0.02)
     for world in (ours, theirs):
-        world.reset(EVERY, Pose(**pose))
+        world.reset(EVERY, InitialState(**pose))
     for _ in range(250):
         thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (N, 1, vehicle.num_rotors))
         for world in (ours, theirs):
@@ -91,7 +91,7 @@ def test_arrays_and_tensors_fly_the_same(name: str) -> None:
     pose = tumbling(dice)
     worlds = [arrays(vehicle, compiled=choice) for choice in (None, False)]
     for world in worlds:
-        world.reset(EVERY, Pose(**pose))
+        world.reset(EVERY, InitialState(**pose))
     worlds.append(rigid(vehicle))
     begin(worlds[2], **pose)
     for _ in range(5):
@@ -109,7 +109,7 @@ def test_compiled_a_fast_spin_is_exact(dtype: str) -> None:
     """Three and a half turns in a control step of two physics steps: half a turn about z."""
     world = arrays(Vehicle.load(), 1, dtype)
     rates = np.array([[[0.0, 0.0, 7 * np.pi / 0.02]]])
-    world.reset(EVERY[:1], Pose(position=np.full((1, 1, 3), 5.0), body_rates=rates))
+    world.reset(EVERY[:1], InitialState(position=np.full((1, 1, 3), 5.0), body_rates=rates))
     world.step(np.zeros((1, 1, 4)), 2)
     near = 1e-5 if dtype == "float32" else 1e-12
     w, x, y, z = world.state.quaternion[0, 0].tolist()
@@ -122,11 +122,11 @@ def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
     pose = tumbling(dice, many)
     thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (many, 1, 6))
     batch = arrays(vehicle, many, "float32")
-    batch.reset(np.ones((many, 1), bool), Pose(**pose))
+    batch.reset(np.ones((many, 1), bool), InitialState(**pose))
     batch.step(thrust, 2)
     for i in (0, 18):
         alone = arrays(vehicle, 1, "float32")
-        alone.reset(EVERY[:1], Pose(**{name: x[i : i + 1] for name, x in pose.items()}))
+        alone.reset(EVERY[:1], InitialState(**{name: x[i : i + 1] for name, x in pose.items()}))
         alone.step(thrust[i : i + 1], 2)
         for name in ("position", "quaternion", "velocity", "body_rates"):
             one, all_ = getattr(alone.state, name), getattr(batch.state, name)
@@ -163,7 +163,9 @@ def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None
     with pytest.raises(InputError, match=r"^compiled: expected false where no C compiler is found"):
         arrays(vehicle, compiled=True)
     world = arrays(vehicle)
-    world.reset(EVERY, Pose(position=np.full((N, 1, 3), 9.0), velocity=np.full((N, 1, 3), 1.0)))
+    world.reset(
+        EVERY, InitialState(position=np.full((N, 1, 3), 9.0), velocity=np.full((N, 1, 3), 1.0))
+    )
     world.step(np.zeros((N, 1, 4)), 1)
     # v' = -0.123 v - (0, 0, g) over 0.01 s, solved.
     left = np.exp(-0.123 * 0.01)
@@ -293,14 +295,14 @@ def test_touches_the_ground_where_mujoco_does(file: Path) -> None:
     for _ in range(40):
         middle = (low + high) / 2
         place = np.stack((0 * middle, 0 * middle, middle), axis=-1)[:, None]
-        theirs.reset(np.ones((count, 1), bool), Pose(position=place, quaternion=turned))
+        theirs.reset(np.ones((count, 1), bool), InitialState(position=place, quaternion=turned))
         touching = theirs.state.touching[:, 0]
         low, high = np.where(touching, middle, low), np.where(touching, high, middle)
     small = 1e-4 * vehicle.rest_height
     for offset in (small, -small):
         place = np.stack((0 * high, 0 * high, high + offset), axis=-1)[:, None]
         begin(ours, position=place, quaternion=turned)
-        theirs.reset(np.ones((count, 1), bool), Pose(position=place, quaternion=turned))
+        theirs.reset(np.ones((count, 1), bool), InitialState(position=place, quaternion=turned))
         assert ours.state.touching.tolist() == theirs.state.touching.tolist()
         assert bool(ours.state.touching[0]) == (offset < 0)
 

@@ -20,8 +20,8 @@ from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.models import InputError, Vehicle
 from rotorgram.sim import (
     EffectOptions,
+    InitialState,
     PhysicsError,
-    Pose,
     Randomization,
     World,
     constant,
@@ -64,7 +64,7 @@ def near_hover(vehicle: Vehicle, steps: int, *shape: int) -> np.ndarray:
 
 
 def begin(world: World, mask: Any = None, **pose: np.ndarray) -> None:
-    world.reset(np.ones(world.shape, bool) if mask is None else mask, Pose(**pose))
+    world.reset(np.ones(world.shape, bool) if mask is None else mask, InitialState(**pose))
 
 
 # --- flights --------------------------------------------------------------------------------------
@@ -405,13 +405,13 @@ class Falling(Task):
         """See the class."""
         self.observation = (ArraySpec(name="observation", shape=(3,), low=-100.0, high=100.0),)
 
-    def begin(self, mask: Any, draw: Any) -> Pose:
+    def begin(self, mask: Any, draw: Any) -> InitialState:
         """Spheres one radius apart, the first at 10 m, and 3 m higher from one to the next."""
         place = np.zeros((self.shape[1], 3))
         place[:, 0] = 3 * self.vehicle.radius * np.arange(self.shape[1])
         place[:, 2] = 10.0 + 3.0 * np.arange(self.shape[1])
         noise = draw.uniform(-0.1, 0.1, (3,))
-        return Pose(position=noise + constant(place, noise))
+        return InitialState(position=noise + constant(place, noise))
 
     def observe(self, state: Any) -> dict[str, Any]:
         """Positions."""

@@ -18,7 +18,7 @@ from rotorgram.envs import Loop
 from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.sim import EffectOptions, Pose, World, checked_sensors, make_world
+from rotorgram.sim import EffectOptions, InitialState, World, checked_sensors, make_world
 from rotorgram.sim.sensors import Estimator, Sensors, isa_height, isa_pressure
 
 ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
@@ -59,7 +59,7 @@ def sensing(
     shaped = {k: np.broadcast_to(v, (*world.shape, len(v))).copy() for k, v in start.items()}
     made = Sensors(checked_sensors(sensors), world, PERIOD)
     world.seed(every, [100 + i for i in range(worlds)])
-    world.reset(every, Pose(**shaped))
+    world.reset(every, InitialState(**shaped))
     made.begin(every)
     return world, made, every
 
@@ -124,7 +124,7 @@ def test_imu_feels_the_air(tmp_path: Path) -> None:
     vehicle, every = Vehicle.load(file), np.True_
     world = make_world(vehicle, 1, effects=EffectOptions(body_drag=True, wind=(5.0, 0.0, 0.0)))
     sensors = Sensors(checked_sensors({"imu": IMU}), world, PERIOD)
-    world.reset(every, Pose(position=np.array((0.0, 0.0, 5.0))))
+    world.reset(every, InitialState(position=np.array((0.0, 0.0, 5.0))))
     sensors.begin(every)
     world.step(vehicle.hover_thrust, 1)
     sensors.sample(every)
@@ -236,7 +236,7 @@ def test_rangefinder_looks_past_what_is_fixed_to_the_craft(backend: Any, tmp_pat
     world = make_world(Vehicle.load(file), 2, backend)
     position = world.xp.zeros((2, 1, 3), dtype=world.xp.float32)
     position[..., 2] = 3.0
-    world.reset(world.xp.ones((2, 1), dtype=bool), Pose(position=position))
+    world.reset(world.xp.ones((2, 1), dtype=bool), InitialState(position=position))
     np.testing.assert_allclose(world.below(), 3.0, rtol=1e-6)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rotorgram.models import InputError, Vehicle
 from rotorgram.models.swarm import drone_names, swarm_model
-from rotorgram.sim import EffectOptions, Pose, Randomization, World, make_world
+from rotorgram.sim import EffectOptions, InitialState, Randomization, World, make_world
 
 EFFECTS = {"motor_lag": True, "rotor_drag": True, "wind": (3.0, 1.0, 0.0), "gusts": 6.0}
 DRAWN = {"mass": "uniform(0.8, 1.2)", "center_x": "uniform(-0.001, 0.001)"}
@@ -16,7 +16,7 @@ def begun(world: World, apart: float = 5.0) -> np.ndarray:
     position = np.zeros((worlds, drones, 3))
     position[..., 0], position[..., 2] = apart * np.arange(drones), 20.0
     everybody = np.ones(world.shape, bool)
-    world.reset(everybody, Pose(position=position))
+    world.reset(everybody, InitialState(position=position))
     return position
 
 
@@ -33,7 +33,9 @@ def test_drones_that_keep_apart_fly_bit_for_bit_as_alone(name: str | None) -> No
     alone = make_world(vehicle, drones)
     begun(together)
     everybody = np.ones(alone.shape, bool)
-    alone.reset(everybody, Pose(position=together.state.position.reshape(drones, 1, 3).copy()))
+    alone.reset(
+        everybody, InitialState(position=together.state.position.reshape(drones, 1, 3).copy())
+    )
     for thrust in thrusts(vehicle, 50, drones):
         together.step(thrust[None], 2)
         alone.step(thrust[:, None], 2)
@@ -70,7 +72,9 @@ def test_a_collision_keeps_momentum_and_gains_no_energy() -> None:
     position = np.array([[[-1.5, 0.0, 50.0], [1.5, 0.1, 50.05]]])
     velocity = np.array([[[2.0, 0.0, 0.0], [-2.0, 0.0, 0.0]]])
     none = np.zeros((1, 2, vehicle.num_rotors))
-    world.reset(np.ones((1, 2), bool), Pose(position=position, velocity=velocity, thrust=none))
+    world.reset(
+        np.ones((1, 2), bool), InitialState(position=position, velocity=velocity, thrust=none)
+    )
     state, met, time = world.state, False, 0.0
 
     def momentum() -> np.ndarray:
@@ -104,12 +108,12 @@ def test_the_ground_and_another_drone_are_told_apart() -> None:
     position[..., 2] = 20.0
     position[0, 2, 2] = vehicle.rest_height - 1e-4
     position[1, 1] = position[1, 0] + (0.0, 0.0, 0.05)
-    world.reset(np.ones((2, 3), bool), Pose(position=position))
+    world.reset(np.ones((2, 3), bool), InitialState(position=position))
     assert world.state.touching.tolist() == [[False, False, True], [True, True, False]]
     assert world.state.colliding.tolist() == [[False, False, False], [True, True, False]]
     position[1, 1, 2] = 25.0
     only = np.array([[False] * 3, [True] * 3])
-    world.reset(only, Pose(position=position))
+    world.reset(only, InitialState(position=position))
     assert world.state.touching.tolist() == [[False, False, True], [False, False, False]]
     assert not world.state.colliding.any()
 
@@ -140,7 +144,7 @@ def test_what_a_swarm_cannot_have_is_one_sentence() -> None:
     payload = EffectOptions.from_options({"payload": 1.0, "cable": 1.0})
     world, above = make_world(vehicle, 1, drones=2, effects=payload), np.full((1, 2, 3), 5.0)
     with pytest.raises(InputError, match=r"payload: expected one drone in a world, or a task .* 2"):
-        world.reset(np.ones((1, 2), bool), Pose(position=above))
+        world.reset(np.ones((1, 2), bool), InitialState(position=above))
     with pytest.raises(InputError, match=r"expected a timestep of 0.01 as of"):
         swarm_model([vehicle, Vehicle.load("crazyflie2")])
 

@@ -15,7 +15,7 @@ from rotorgram.envs import LocalVectorEnv, Loop
 from rotorgram.envs.loop import OnHost
 from rotorgram.models.errors import InputError, MissingPackage
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.sim import PhysicsError, Pose, World, make_world
+from rotorgram.sim import InitialState, PhysicsError, World, make_world
 
 torch = pytest.importorskip("torch")
 wp = pytest.importorskip("warp")
@@ -62,9 +62,10 @@ def pair(vehicle: Vehicle, **pose: np.ndarray) -> tuple[World, World]:
     ours = make_world(vehicle, N, "warp", device="cpu")
     theirs = make_world(vehicle, N, "mujoco", num_threads=1)
     every = np.ones((N, 1), bool)
-    theirs.reset(every, Pose(**pose))
+    theirs.reset(every, InitialState(**pose))
     ours.reset(
-        torch.from_numpy(every), Pose(**{n: torch.tensor(x).float() for n, x in pose.items()})
+        torch.from_numpy(every),
+        InitialState(**{n: torch.tensor(x).float() for n, x in pose.items()}),
     )
     return ours, theirs
 
@@ -121,7 +122,7 @@ def test_worlds_outside_the_mask_stay_as_they_are() -> None:
         name: getattr(ours.state, name).clone() for name in ("position", "velocity", "thrust")
     }
     ours.step(torch.full((N, 1, 4), 60.0), 2, some)
-    ours.reset(some & False, Pose(position=torch.zeros(N, 1, 3)))
+    ours.reset(some & False, InitialState(position=torch.zeros(N, 1, 3)))
     for name, values in before.items():
         now = getattr(ours.state, name)
         assert torch.equal(now[1:3], values[1:3])
@@ -131,7 +132,9 @@ def test_worlds_outside_the_mask_stay_as_they_are() -> None:
 def test_tensors_share_the_memory_of_the_simulator() -> None:
     world: Any = make_world(Vehicle.load(), 2, "warp", device="cpu")
     assert world.state.position.data_ptr() == world.qpos.data_ptr()
-    world.reset(torch.ones(2, 1, dtype=torch.bool), Pose(position=torch.full((2, 1, 3), 7.0)))
+    world.reset(
+        torch.ones(2, 1, dtype=torch.bool), InitialState(position=torch.full((2, 1, 3), 7.0))
+    )
     assert world.qpos[:, :3].tolist() == [[7.0] * 3] * 2
     assert world.ctrl.tolist() == [[49.0] * 4] * 2
 

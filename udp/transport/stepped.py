@@ -16,9 +16,9 @@ from ..protocol.layout import MAX_DRONES, Layout
 from ..protocol.messages import MAX_UINT64
 
 if TYPE_CHECKING:
-    from ...envs.loop import Loop, OnHost
+    from ...envs.loop import Loop
 
-Stepped: TypeAlias = "Loop | OnHost | _Singles"
+Stepped: TypeAlias = "Loop | _Singles"
 """N drones that take a step of the wire together, with the results of `rotorgram.envs.Loop`."""
 _Some = np.ndarray | None
 
@@ -48,13 +48,12 @@ def make_stepped(
     expect(num_envs % drones == 0, "drones", f"a divisor of num_envs = {num_envs}", f"{drones}")
     if isinstance(env, str):
         if registry.is_known(env):
-            from ...envs.loop import Loop, OnHost
+            from ...envs.loop import Loop
 
             name, chosen = canonical_id(env), cast(Any, backend)
             given = {"tensors": False} if backend == "rigid" else {}
-            loop = Loop(name, num_envs // drones, drones=drones, vehicle=vehicle, backend=chosen,
+            return Loop(name, num_envs // drones, drones=drones, vehicle=vehicle, backend=chosen,
                         options=options, **given)  # fmt: skip
-            return OnHost(loop) if backend == "warp" else loop
         try:
             envs = [gym.make(env, disable_env_checker=True, **options) for _ in range(num_envs)]
         except (gym.error.Error, ImportError) as error:

@@ -1,0 +1,109 @@
+"""What an agent sends, checked; and actions that are late."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...models.errors import InputError
+from ...sim import World
+from .record import Mask, Record, Stage, is_finite
+from .ring import filled, pushed, taken
+
+
+class Actions:
+    """Checks actions of k numbers, or of one choice out of 0 to `choices` - 1.
+
+    Args:
+        shape: (W, A), or () for a single drone.
+        width: k.
+        choices: 0 where an action is k numbers.
+    """
+
+    def __init__(self, shape: tuple[int, ...], width: int, choices: int) -> None:
+        self._shape, self._width, self._choices = (*shape, width), width, choices
+        self._count = math.prod(shape)
+
+    def checked(self, given: Any, flown: Mask | None) -> NDArray[np.float64]:
+        """Actions as controllers take them: shape (W, A, k), finite. Raises `InputError`.
+
+        Numbers are rounded to float32. Actions of drones that do not fly are ignored.
+        """
+        actions = np.asarray(given)
+        if actions.dtype.kind not in "iuf":
+            raise InputError(f"actions: expected real numbers, got {actions.dtype}")
+        if actions.size != self._count * self._width:
+            expected = (self._count, self._width)
+            raise InputError(f"actions: expected shape {expected}, got {actions.shape}")
+        values = actions.reshape(self._shape)
+        if self._choices:
+            right = (values >= 0) & (values < self._choices) & (values % 1 == 0)
+            expected = f"a whole number 0 to {self._choices - 1}"
+            return self._refused(values, right, expected, flown)
+        if values.dtype != np.float32:
+            with np.errstate(over="ignore"):  # an overflow is infinite, and refused as such
+                values = values.astype(np.float32)
+        if is_finite(values):
+            return values.astype(np.float64)
+        return self._refused(values, np.isfinite(values), "finite numbers", flown)
+
+    def neutral(self) -> NDArray[np.float64]:
+        """Actions that change nothing, shape (W, A, k)."""
+        number = (self._choices - 1) // 2 if self._choices else 0
+        return np.full(self._shape, float(number))
+
+    def _refused(
+        self, values: NDArray[Any], right: NDArray[Any], expected: str, flown: Mask | None
+    ) -> NDArray[np.float64]:
+        wrong = ~right.all(axis=-1)
+        refused = wrong if flown is None else wrong & flown
+        if refused.any():
+            first = int(np.flatnonzero(refused)[0])
+            got = values.reshape(self._count, -1)[first].tolist()
+            raise InputError(f"actions: expected {expected}, got {got} for env {first}")
+        return np.where(right, values, 0).astype(np.float64)
+
+
+class Receive(Stage):
+    """The action of an agent arrives; of a drone that begins it is neutral, (W, A, k)."""
+
+    arrays = ("action",)
+
+    def __init__(self, neutral: NDArray[np.float64]) -> None:
+        self._neutral = neutral
+
+    def begin(self, record: Record) -> None:
+        """No action yet."""
+        record.action = self._neutral
+
+    def step(self, record: Record) -> None:
+        """At once, unless a later stage delays it."""
+        record.action = record.received = record.sent
+
+
+class ActionDelay(Stage):
+    """An action takes effect so many control steps late, as drawn for each episode.
+
+    Args:
+        world: Its parameter `action_delay`, control steps.
+        longest: No delay is longer.
+        neutral: Actions that are on their way when an episode begins, (W, A, k).
+    """
+
+    arrays = ("actions_sent",)
+
+    def __init__(self, world: World, longest: int, neutral: NDArray[np.float64]) -> None:
+        self._world = world
+        self._axis = neutral.ndim - 1
+        self._start = filled(neutral, longest + 1, self._axis)
+
+    def begin(self, record: Record) -> None:
+        """Actions on their way change nothing."""
+        record.actions_sent = self._start
+
+    def step(self, record: Record) -> None:
+        """The action that was sent as long ago as the delay."""
+        sent = pushed(record.actions_sent, record.received, self._axis)
+        record.actions_sent = sent
+        record.received = taken(sent, self._world.parameters["action_delay"], self._axis)

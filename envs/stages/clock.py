@@ -1,0 +1,72 @@
+"""The clock: who flies and who begins in a step, and how far each episode is."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ...models.errors import InputError
+from .record import Mask, Record, Stage
+
+
+class Clock(Stage):
+    """Counts the control steps of episodes."""
+
+    arrays = ("steps", "out", "done", "waiting")
+
+    def begin(self, record: Record) -> None:
+        """A new episode."""
+        record.steps = 0 * record.steps
+        record.out = record.done = record.waiting = record.out & False
+
+    def step(self, record: Record) -> None:
+        """Another control step."""
+        record.steps = record.steps + 1
+
+
+def take(record: Record, resets: Any, frozen: Any) -> None:
+    """Set who flies and who begins, from masks of shape (N,), or None.
+
+    Raises:
+        InputError: A mask is not one, or has some drones of a world.
+        gymnasium.error.ResetNeeded: A drone would fly that waits for a reset.
+    """
+    begun = None if resets is None else mask_of(record, resets)
+    idle = begun
+    if frozen is not None:
+        held = mask_of(record, frozen)
+        idle = held if begun is None else begun | held
+    flown = None
+    if idle is not None and idle.any():
+        flown = ~idle
+    if record.anyone_waits:
+        late = record.waiting if flown is None else record.waiting & flown
+        if late.any():
+            first = int(np.flatnonzero(late)[0])
+            raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
+    record.flown = flown
+    record.begun = begun if begun is not None and begun.any() else None
+
+
+def mask_of(record: Record, given: Any) -> Mask:
+    """A mask of shape (N,) as one of shape (W, A), the same for all drones of a world.
+
+    Raises `InputError`.
+    """
+    drones = drones_of(record, given)
+    if drones.ndim and drones.shape[1] > 1 and not (drones == drones[:, :1]).all():
+        raise InputError(
+            f"resets, frozen: expected all {drones.shape[1]} drones of a world or none, "
+            "got some of them"
+        )
+    return drones
+
+
+def drones_of(record: Record, given: Any) -> Mask:
+    """A mask of shape (N,) as one of shape (W, A). Raises `InputError`."""
+    expected = (record.out.size,)
+    dtype, shape = getattr(given, "dtype", None), getattr(given, "shape", None)
+    if dtype != np.bool_ or shape != expected:
+        raise InputError(f"resets, frozen: expected bool of shape {expected}, got {given!r:.80}")
+    mask: Mask = given.reshape(record.shape)[()]
+    return mask

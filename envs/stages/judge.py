@@ -1,0 +1,113 @@
+"""The task: the starts of episodes, its memory, observations, rewards and ends."""
+
+from collections.abc import Mapping
+from math import prod
+from typing import Any
+
+import numpy as np
+
+from ...models.errors import InputError
+from ...sim import InitialState, World
+from ..spec import ArraySpec
+from ..tasks.task import Outcome, Task
+from .record import Record, Stage
+
+
+class Starts(Stage):
+    """The task begins episodes: it draws their numbers and sets `record.start`.
+
+    Raises `InputError` if it gives another thing.
+    """
+
+    def __init__(self, env_id: str, task: Task, world: World) -> None:
+        self._env_id, self._task, self._world = env_id, task, world
+
+    def begin(self, record: Record) -> None:
+        """Other stages follow from the start."""
+        draw = self._world.draw(record.begun, record.chosen)
+        start = self._task.begin(record.begun, draw)
+        expected = (*record.shape, 3)
+        got: Any = type(start).__name__
+        if isinstance(start, InitialState):
+            got = tuple(getattr(start.position, "shape", ()))
+        if got != expected:
+            raise InputError(
+                f"{self._env_id}: expected begin() to return an InitialState with a position of "
+                f"shape {expected}, got {got}"
+            )
+        record.start = start
+
+
+class Memory(Stage):
+    """The task changes its memory of the drones that flew."""
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+
+    def step(self, record: Record) -> None:
+        """Before it observes."""
+        flown = record.flown
+        mask = np.ones(record.shape, bool)[()] if flown is None else flown
+        if mask.any():
+            self._task.remember(record.state, mask)
+
+
+class Judge(Stage):
+    """Observations, terms of the reward, metrics and ends by the task."""
+
+    arrays = ("observations", "terms", "metrics")
+
+    def __init__(self, env_id: str, task: Task) -> None:
+        self._env_id, self._task = env_id, task
+        self._checked = False
+
+    def step(self, record: Record) -> None:
+        """Raises `InputError` if the task gives another thing than its specs say."""
+        observations = self._task.observe(record.measured)
+        outcome = self._task.outcome(record.state)
+        if not self._checked:
+            self._check(observations, outcome, record)
+            self._checked = True
+        record.observations = {
+            array.name: np.asarray(observations[array.name]).reshape(*record.shape, *array.shape)
+            for array in self._task.observation
+        }
+        record.terms, record.metrics = outcome.reward, outcome.metrics
+        record.ended = outcome.terminated
+
+    def _check(self, observations: Any, outcome: Any, record: Record) -> None:
+        task = self._task
+        names = [array.name for array in task.observation]
+        if not isinstance(observations, Mapping):
+            self._refuse(f"observe() to return a dict of {names}", type(observations).__name__)
+        if not observations.keys() >= set(names):
+            self._refuse(f"observe() to return a dict of {names}", list(observations))
+        for array in task.observation:
+            self._check_array(array, observations[array.name], record)
+        if not isinstance(outcome, Outcome):
+            self._refuse("outcome() to return an Outcome", type(outcome).__name__)
+        for metric in task.metrics:
+            if metric.name not in outcome.metrics:
+                self._refuse(f"the metric {metric.name!r}", list(outcome.metrics))
+        each = any(np.ndim(term) for term in outcome.reward.values())
+        if record.shape and not each:
+            self._refuse(
+                "a reward for each drone",
+                f"{outcome.reward}: make an array of it, as 1.0 + 0.0 * state.position[..., 2]",
+            )
+        kind = getattr(outcome.terminated, "dtype", type(outcome.terminated).__name__)
+        if "bool" not in str(kind):
+            self._refuse("terminated as truth values", kind)
+
+    def _check_array(self, array: ArraySpec, values: Any, record: Record) -> None:
+        shape = tuple(getattr(values, "shape", ()))
+        count = prod(record.shape)
+        if prod(shape) != count * array.size:
+            self._refuse(
+                f"observe() to return {array.name} of shape {array.shape} for each of {count} "
+                "drones",
+                f"an array of shape {shape}",
+            )
+
+    def _refuse(self, expected: str, got: Any) -> None:
+        raise InputError(f"{self._env_id}: expected {expected}, got {got}")

@@ -1,0 +1,214 @@
+"""Pictures as observations: which drones take which one when, of the state that a step ended in."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...models import scenes_of
+from ...models.cameras import FARTHEST, View, cameras_of, chosen_views
+from ...models.errors import expect
+from ...models.fleet import members_of
+from ...sim.random import CAMERAS, SCENES, Streams
+from ..spec import ArraySpec
+from ..tasks.task import Task
+from .record import Mask, Record, Stage
+
+if TYPE_CHECKING:
+    from ...rendering.cameras import Cameras
+
+_MOST_THREADS: Final = 16
+_BOUNDS: Final = {"rgb": (0.0, 255.0), "depth": (0.0, FARTHEST), "flow": (-np.inf, np.inf)}
+
+
+def views_of(task: Task, drones: int) -> tuple[View, ...]:
+    """What the option `cameras` of a task chooses. Raises `InputError`."""
+    words = task.options.cameras
+    kinds = dict.fromkeys(members_of(task.vehicle, drones))
+    first, *others = (chosen_views(words, cameras_of(one)) for one in kinds)
+    for views in others:
+        names = [[view.name for view in some] for some in (first, views)]
+        expect(
+            names[0] == names[1], "cameras", f"{', '.join(names[0])} of all vehicles", f"{names[1]}"
+        )
+        for ours, its in zip(first, views, strict=True):
+            a, b = ours.camera, its.camera
+            same = (ours.shape, a.every, a.carried) == (its.shape, b.every, b.carried)
+            same &= a.carried or a == b  # of a world there is one alone
+            expected = "one of the same size and rate on all vehicles, or the same in their world"
+            expect(same, f"camera {ours.name}", expected, "others")
+    return first
+
+
+def arrays_of(views: Sequence[View], objects: Sequence[str]) -> tuple[ArraySpec, ...]:
+    """The arrays of pictures; objects are the names of what a segmentation tells apart."""
+    return tuple(
+        ArraySpec(
+            name=view.name,
+            shape=view.shape,
+            dtype=view.dtype,
+            low=_BOUNDS.get(view.kind, (0.0, 0.0))[0],
+            high=_BOUNDS.get(view.kind, (0.0, len(objects) - 1.0))[1],
+            unit=view.unit,
+            frame=view.frame,
+            categories=tuple(objects) if view.kind == "segmentation" else (),
+        )
+        for view in views
+    )
+
+
+def objects_of_all(scenes: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """Names of the objects of several scenes, each once, in the order in which they come."""
+    return tuple(dict.fromkeys(name for names in scenes for name in names))
+
+
+class _Painter(NamedTuple):
+    """What draws some worlds when they have one scene: it shares nothing with the others."""
+
+    cameras: "Cameras"
+    scene: int
+    objects: np.ndarray
+    """Numbers of its objects among those of all scenes."""
+    worlds: np.ndarray
+    """bool, shape (W,)."""
+
+
+class Pictures(Stage):
+    """The cameras of a loop's drones.
+
+    Threads draw its worlds, as many as there are cores; a world's pictures do not depend on them.
+
+    Args:
+        task: Its options choose the cameras and the scene.
+        shape: (W, A).
+    """
+
+    arrays = ("scenes",)
+
+    def __init__(self, task: Task, shape: tuple[int, int]) -> None:
+        from ...rendering.cameras import Cameras
+
+        self._task, self._shape, self._rows = task, shape, shape[0] * shape[1]
+        self._noise, self._draws = Streams(shape[0], CAMERAS), Streams(shape[0], SCENES)
+        self.views = views_of(task, shape[1])
+        scenes = scenes_of(task.options.world)
+        self._count = len(scenes)
+        self._threads = min(os.cpu_count() or 1, shape[0], _MOST_THREADS)
+        parts = np.arange(shape[0]) % -(-self._threads // len(scenes))
+        cameras = []
+        for number, scene in enumerate(scenes):
+            for part in range(parts.max() + 1):
+                payload = bool(task.effects.get("payload"))
+                drawn = Cameras(
+                    task.vehicle,
+                    self.views,
+                    shape,
+                    world=scene,
+                    marks=task.marks,
+                    payload=payload,
+                )
+                cameras.append((number, drawn, parts == part))
+        names = objects_of_all([drawn.objects for _, drawn, _ in cameras])
+        self._painters = []
+        for number, drawn, worlds in cameras:
+            objects = np.array([names.index(name) for name in drawn.objects], np.int32)
+            self._painters.append(_Painter(drawn, number, objects, worlds))
+        self._goal_moves = any(mark.moves for mark in task.marks)
+        self.specs = arrays_of(self.views, names)
+
+    @cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        """Started with the first picture, so that a process may be forked before."""
+        return ThreadPoolExecutor(self._threads, "cameras")
+
+    def close(self) -> None:
+        """Free what draws. A second call does nothing."""
+        if "_pool" in vars(self):
+            self._pool.shutdown()
+        for painter in self._painters:
+            painter.cameras.close()
+
+    def seed(self, mask: Mask, seeds: Sequence[int | None] | NDArray[Any]) -> None:
+        """Seed noise and scenes."""
+        ids = np.flatnonzero(self._per_drone(mask)[:: self._shape[1]]).tolist()
+        for streams in (self._noise, self._draws):
+            streams.seed(ids, [seeds[world] for world in ids])
+
+    def begin(self, record: Record) -> None:
+        """Draw the scene of each world."""
+        begun = self._per_drone(record.begun).reshape(self._shape).any(axis=1)
+        scenes = np.zeros(self._shape[0], int)
+        if self._count > 1:
+            for world in np.flatnonzero(begun).tolist():
+                scenes[world] = self._draws.of(world).integers(self._count)
+        old = vars(record).get("scenes", scenes)
+        record.scenes = np.where(begun, scenes, old)
+
+    def step(self, record: Record) -> None:
+        """Add all pictures to the observations, shape (W, A, height, width, channels).
+
+        A drone takes one with the first state of an episode, and with every so many control steps
+        of it.
+        """
+        count, state = self._rows, record.state
+        fresh, flown = np.zeros(count, bool), np.ones(count, bool)
+        if record.begun is not None:
+            fresh = self._per_drone(record.begun)
+        if record.flown is not None:
+            flown = self._per_drone(record.flown)
+        steps = self._per_drone(record.steps)
+        due = {}
+        for view in self.views:
+            due[view.name] = fresh | (flown & (steps % view.camera.every == 0))
+        rows = {}
+        for name in ("position", "quaternion", "velocity", "body_rates"):
+            rows[name] = self._per_drone(getattr(state, name))
+        if state.payload is not None:
+            rows["payload"] = self._per_drone(state.payload)
+        if self._goal_moves:
+            rows["goal"] = self._per_drone(self._task.goal(state))
+        pictures = self._taken(due, fresh, rows, record.scenes)
+        for name, picture in pictures.items():
+            record.observations[name] = picture.reshape(*record.shape, *picture.shape[1:])
+
+    def _taken(
+        self,
+        due: dict[str, NDArray[np.bool_]],
+        fresh: NDArray[np.bool_],
+        rows: dict[str, NDArray[Any]],
+        scenes: NDArray[np.int64],
+    ) -> dict[str, NDArray[Any]]:
+        pictures: dict[str, NDArray[Any]] = {
+            view.name: np.empty((self._rows, *view.shape), view.dtype) for view in self.views
+        }
+
+        def paint(painter: _Painter) -> None:
+            worlds = painter.worlds & (scenes == painter.scene)
+            painter.cameras.take(due, fresh, rows, self._noise.of, worlds)
+            drones = np.repeat(worlds, self._shape[1])
+            for view in self.views:
+                picture = painter.cameras.pictures[view.name][drones]
+                if view.kind == "segmentation":
+                    picture = painter.objects[picture]
+                pictures[view.name][drones] = picture
+
+        painters = []
+        for painter in self._painters:
+            if (scenes[painter.worlds] == painter.scene).any():
+                painter.cameras.open()
+                painters.append(painter)
+        if len(painters) > 1:
+            list(self._pool.map(paint, painters))
+        else:
+            paint(painters[0])
+        return pictures
+
+    def _per_drone(self, values: Any) -> NDArray[Any]:
+        """A row for each drone."""
+        array = np.asarray(values)
+        width = array.size // self._rows
+        return array.reshape((self._rows, width) if width > 1 else (self._rows,))

@@ -1,0 +1,173 @@
+"""The record that all stages share, and what a stage is."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...sim import InitialState
+from ...sim.state import Array, WorldState
+from ..state import State
+
+Mask = NDArray[np.bool_]
+Look = Callable[[], WorldState]
+"""Gives the state that a controller sees: the exact one, or the estimate."""
+
+_SMALL = 64  # Up to this many numbers Python's loop is faster than NumPy's call
+
+
+class Record:
+    """Named arrays of W worlds of A drones, shape (W, A, ...); of a single drone (...).
+
+    Stages run in regions, each under a mask of shape (W, A). What a region assigns to names that
+    are kept is merged under its mask when it ends, so no stage writes for other drones. No array is
+    changed in place.
+
+    Attributes:
+        shape: (W, A), or () for a single drone.
+        kept: Names of arrays that keep their values between steps.
+        flown: Drones that fly in this step; None: all.
+        begun: Drones that begin an episode in this step; None: none.
+        sent: Actions of the agent, float64, (W, A, k).
+        action: The last action that was flown, (W, A, k).
+        received: The action that arrives at the controller.
+        thrust: Of each rotor, N, (W, A, R).
+        start: Of the drones that begin.
+        state: At the end of the step.
+        measured: The same, as sensors have it.
+        observations: By name, (W, A, *shape).
+        terms: Of the reward, by name, (W, A).
+        metrics: By name, (W, A).
+        ended: Whether the task ends the episode, (W, A).
+        reward: float64, (W, A).
+        terminated, truncated: (W, A).
+        steps: Control steps of each episode, (W, A).
+        out: Drones whose own episode has ended, (W, A).
+        done: Drones of worlds whose episodes have all ended, (W, A).
+        waiting: Drones that must be reset before they fly, (W, A).
+        landing: Drones that land by themselves, (W, A).
+        leaving: Drones that leave the episode in this step; None: none.
+    """
+
+    sent: NDArray[np.float64]
+    action: NDArray[np.float64]
+    received: NDArray[np.float64]
+    actions_sent: NDArray[np.float64]
+    thrust: Array
+    start: InitialState
+    state: State
+    measured: State
+    observations: dict[str, NDArray[Any]]
+    past_observations: dict[str, NDArray[Any]]
+    history: dict[str, NDArray[Any]]
+    terms: dict[str, Array]
+    metrics: dict[str, Array]
+    ended: Array
+    reward: NDArray[np.float64]
+    terminated: Mask
+    truncated: Mask
+    landing: Mask
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.shape = shape
+        self.kept: tuple[str, ...] = ()
+        nobody = np.zeros(shape, bool)[()]
+        self.flown: Mask | None = None
+        self.begun: Mask | None = None
+        self.leaving: Mask | None = None
+        self.steps: NDArray[np.int64] = np.zeros(shape, np.int64)[()]
+        self.out = self.done = self.terminated = self.truncated = nobody
+        self.waiting = ~nobody
+        self.reward = np.zeros(shape)[()]
+        self._nothing, self._nobody = self.reward, nobody
+        self.anyone_waits, self.anyone_out = True, False
+
+    def run(self, mask: Mask | None, stages: Sequence[Callable[["Record"], None]]) -> None:
+        """Run a region for the drones of a mask, None for all. An error leaves all as it was."""
+        arrays = vars(self)
+        before = arrays.copy()
+        try:
+            for stage in stages:
+                stage(self)
+        except BaseException:
+            arrays.clear()
+            arrays.update(before)
+            raise
+        if mask is None:
+            return
+        for name in self.kept:
+            if name in before and arrays[name] is not before[name]:
+                arrays[name] = merged(mask, arrays[name], before[name])
+
+    def rest(self) -> None:
+        """A drone that does not fly gets no reward and no end."""
+        self.reward = self._nothing
+        self.terminated = self.truncated = self._nobody
+        self.leaving = None
+
+    def lose(self) -> None:
+        """The physics failed: the drones that flew must be reset."""
+        flown = self.flown
+        self.waiting = self.waiting | (True if flown is None else flown)
+        self.anyone_waits = True
+
+    def end(self, drones: Mask) -> None:
+        """End the episodes of some drones; a world is done when all of its drones are out."""
+        self.out = self.out | drones
+        done = self.out
+        if done.ndim and done.shape[1] > 1:
+            done = np.repeat(done.all(axis=1, keepdims=True), done.shape[1], axis=1)
+            self.anyone_out = True
+        self.done = done
+        self.waiting = self.waiting | done
+        self.anyone_waits = bool(self.waiting.any())
+
+
+class Stage:
+    """One concern of the loop. What changes of it is in the record.
+
+    Class attributes:
+        arrays: Names of the record that keep their values between steps. Other names that a stage
+            assigns live until the end of the step.
+    """
+
+    arrays: ClassVar[tuple[str, ...]] = ()
+
+    def seed(self, mask: Mask, seeds: Sequence[int | None] | NDArray[Any]) -> None:
+        """Start new sequences of random numbers for the worlds of a mask; seeds (W,)."""
+
+    def begin(self, record: Record) -> None:
+        """Set the arrays of drones that begin an episode, those of `record.begun`."""
+
+    def step(self, record: Record) -> None:
+        """Compute one control step.
+
+        Stages from `Measure` on run for drones that fly and for drones that begin.
+        """
+
+    def close(self) -> None:
+        """Release threads and memory."""
+
+
+def merged(mask: Mask, new: Any, old: Any) -> Any:
+    """Arrays, or mappings of arrays: the new for the drones of a mask, the old for the others."""
+    if isinstance(new, Mapping):
+        return {name: merged(mask, value, old[name]) for name, value in new.items()}
+    return where(mask, new, old)
+
+
+def where(mask: Mask, new: Array, old: Array) -> Array:
+    """The new values for the drones of a mask, and the old ones for the others."""
+    if not mask.ndim:
+        return new if mask else old
+    axes = max(np.ndim(new), np.ndim(old)) - mask.ndim
+    return np.where(mask.reshape(mask.shape + (1,) * axes), new, old)
+
+
+def is_finite(values: NDArray[Any]) -> bool:
+    """Whether all numbers are finite."""
+    if values.size <= _SMALL and math.isfinite(sum(values.ravel().tolist())):
+        return True
+    return values.dtype.kind != "f" or bool(np.isfinite(values).all())

@@ -1,0 +1,41 @@
+"""Arrays of the last control steps, (W, A, steps, *shape): the oldest step first."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .record import Record, where
+
+Values = NDArray[Any]
+
+
+def filled(values: Values, steps: int, axis: int) -> Values:
+    """Values (W, A, *shape) for each of so many steps; `axis` is that of the steps."""
+    return np.repeat(np.expand_dims(values, axis), steps, axis)
+
+
+def pushed(past: Values, values: Values, axis: int) -> Values:
+    """The past one step later: without its oldest values, and with new ones."""
+    kept = past[(slice(None),) * axis + (slice(1, None),)]
+    return np.concatenate((kept, np.expand_dims(values, axis)), axis)
+
+
+def later(past: Values | None, values: Values, steps: int, record: Record) -> Values:
+    """The past of so many steps one step later; that of drones that begin is the present."""
+    axis = len(record.shape)
+    if past is None:
+        return filled(values, steps, axis)
+    new = pushed(past, values, axis)
+    if record.begun is None:
+        return new
+    return where(record.begun, filled(values, steps, axis), new)
+
+
+def taken(past: Values, age: Any, axis: int) -> Values:
+    """Values of so many steps ago; the age has the shape (W, A), whole numbers."""
+    index = past.shape[axis] - 1 - np.asarray(age).astype(int)
+    if not axis:
+        return past[int(index)]
+    index = index.reshape(index.shape + (1,) * (past.ndim - axis))
+    return np.take_along_axis(past, index, axis).squeeze(axis)

@@ -1,0 +1,42 @@
+"""The state that a task sees."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..sim.state import Array, WorldState
+
+
+@dataclass(kw_only=True, slots=True)
+class State(WorldState):
+    """The state of the drones at the end of a step. Its arrays are read-only and safe to keep."""
+
+    action: NDArray[np.float64]
+    """The agent's last action, within float32, shape (W, A, k); neutral at a start."""
+    steps: Array
+    """Control steps of each episode, whole numbers, shape (W, A)."""
+    time: Array
+    """Time since the start of each episode, s, shape (W, A)."""
+    neighbours: NDArray[np.float64] | None = None
+    """What each drone has heard of its neighbours, see `stages/radio.py`: shape (W, A, k, 7)."""
+
+
+def kept_state(state: WorldState, **others: Any) -> State:
+    """A copy of a world's state, with the other fields of `State`."""
+    values = {}
+    for name in WorldState.__slots__:
+        value = getattr(state, name)
+        if value is not None:
+            values[name] = read_only(value)
+    return State(**values, **others)
+
+
+def read_only(values: Array) -> Array:
+    """A copy that cannot be written; a number or a truth value of a single drone as such."""
+    if not values.ndim:
+        return values[()]
+    copied = values.copy()
+    copied.setflags(write=False)
+    return copied
