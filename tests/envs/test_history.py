@@ -130,6 +130,6 @@ def test_the_pid_reads_the_newest() -> None:
 
 @pytest.mark.parametrize("count", [0, 1001, 2.5, "all", True, None])
 def test_a_wrong_history_gives_one_sentence(count: Any) -> None:
-    expected = r"^history: expected a whole number of observations from 1 to 1000, got "
+    expected = r"^history: expected a whole number from 1 to 1000 observations, got "
     with pytest.raises(InputError, match=expected):
         env_spec(HOVER, {"history": count})
