@@ -1,7 +1,7 @@
 # Everything a user needs: `make demo` and `make test` set themselves up in .venv and run.
 PYTHON ?= python3
 BIN := .venv/bin
-PACKAGES := models sim envs udp agents rendering flights training cli
+PACKAGES := models scenes sim envs udp agents rendering flights training cli
 
 .PHONY: install demo test test-other-processor test-wheel lint types docs clean
 

@@ -10,8 +10,8 @@ from tyro.conf import Positional
 
 from ..flights.recorded import recorded_trajectories
 from ..flights.trajectories import Trajectory, flown_trajectories
-from ..models import parse_world
 from ..models.errors import expect
+from ..scenes import parse_scene
 from ._flags import EnvFlags, check_count
 
 
@@ -44,7 +44,7 @@ class View(EnvFlags):
         from ._env import words_of
 
         check_count("episodes", self.episodes)
-        parse_world(self.world)
+        parse_scene(self.world)
         flights = islice(self._flights(), self.episodes)
         first = next(flights)
         spec, drones = first[0].spec, len(first)

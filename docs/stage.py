@@ -20,6 +20,7 @@ PAGES = ROOT / "build" / "docs"
 API = ROOT / "build" / "api" / "rotorgram"
 ELSEWHERE = {
     "models/README.md": "vehicle.md",
+    "scenes/README.md": "scenes.md",
     "examples/README.md": "examples/index.md",
     "examples/peers/README.md": "examples/peers.md",
 }

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..models import scenes_of
 from ..models.errors import InputError
 from ..models.fleet import Fleet, load_vehicles
 from ..models.swarm import drone_names
+from ..scenes import scenes_of
 from ..sim import Controller
 from ..sim.sensors import readings_of
 from . import registry

@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 
 from ..envs.rendering import moment
-from ..models import parse_world
 from ..models.errors import InputError, expect
 from ..rendering import Camera, Canvas, MetricValue, Moment, Stage
 from ..rendering.film import QUALITY, Overlay, check_film, graph_scale, write_film
+from ..scenes import parse_scene
 from .distances import least
 from .trajectories import Trajectory
 
@@ -128,7 +128,7 @@ class Film:
     """As of `write_film`."""
 
     def __post_init__(self) -> None:
-        parse_world(self.world)
+        parse_scene(self.world)
         expect(0.001 <= self.speed <= 1000, "speed", "0.001 to 1000", f"{self.speed:g}")
         right = self.at is None or 0 <= self.at < math.inf
         expect(right, "at", "a time of 0 s or more", f"{self.at or 0:g}")

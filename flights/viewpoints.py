@@ -23,12 +23,12 @@ from ..agents.policies import Policy
 from ..envs.registry import env_spec
 from ..envs.registry import load as load_env
 from ..envs.spec import Mark
-from ..models import scenes_of
 from ..models.cameras import View, cameras_of, chosen_views
 from ..models.errors import InputError
 from ..models.fields import Limits, Text, check_fields, check_names, read_table
 from ..models.frames import pose_in_mujoco_frame
 from ..models.vehicle import Vehicle
+from ..scenes import scenes_of
 from ..sim.rotations import multiplied
 from .recorded import recorded_trajectories
 from .trajectories import Trajectory, flown_trajectories

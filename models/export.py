@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 from .errors import InputError, expect
 from .files import write_new
 from .library import find_vehicle
-from .scene import read_spec
+from .mjcf import read_spec
 from .vehicle import Vehicle
 from .vehicle_file import read_vehicle_file
 

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from .errors import expect
-from .scene import build_swarm
+from .mjcf import add_ground, swarm_spec
 from .vehicle import Vehicle, hang_payload, owners
 
 SHARED: Final = ("timestep", "gravity", "integrator", "density", "viscosity", "wind", "magnetic")
@@ -37,7 +37,9 @@ def swarm_model(
             ours, its = (getattr(one.model.opt, name) for one in (first, vehicle))
             same, got = np.array_equal(ours, its), f"{its} of {vehicle.name}"
             expect(same, "vehicle", f"a {name} of {ours} as of {first.name}", got)
-    spec = build_swarm([vehicle.path for vehicle in vehicles], names, visual=False)
+    spec = swarm_spec([vehicle.path for vehicle in vehicles], names)
+    add_ground(spec)
+    spec.compiler.discardvisual = True
     crafts = [body for body in spec.worldbody.bodies if body.name.partition("/")[0] in names]
     for name, craft in zip(names, crafts, strict=True):
         if movable or payload:

@@ -21,11 +21,12 @@ from .cameras import Camera, read_cameras
 from .coefficients import PREFIX, Coefficients
 from .errors import InputError, expect
 from .library import find_vehicle
-from .scene import build_scene, free_body
+from .mjcf import free_body, vehicle_spec
 from .vehicle_file import read_vehicle_file
 
 _LEAST_TIMESTEP: Final = 1e-5  # s: a control step of 0.02 s then takes a hundredth of a second
 _MOST_TIMESTEP: Final = 1.0  # s: that of the longest control step
+_FIRST_HEIGHT: Final = 6.0  # m: where most craft touch nothing
 _MOST_HEIGHT: Final = 1e4  # m: above it no craft may touch anything
 _RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves
 _ROUNDED: Final = 1e-5  # of the weight, sideways: what a file's six digits leave
@@ -193,7 +194,7 @@ class Vehicle:
 
     def _spec(self) -> tuple[mujoco.MjSpec, mujoco.MjsBody]:
         """Vehicle and ground to be changed, and the free body in them."""
-        spec = build_scene(self.path, visual=False)
+        spec = vehicle_spec(self.path)
         craft = free_body(spec)
         craft.simple = False  # its inertia is no diagonal matrix once its center has moved
         return spec, craft
@@ -222,7 +223,7 @@ def compile_vehicle(
     actuators.
     """
     try:
-        spec = build_scene(path, visual=False)
+        spec = vehicle_spec(path)
         repair(spec)
         spec.comment = ""
         text = spec.to_xml()
@@ -479,7 +480,7 @@ def find_rest_height(model: mujoco.MjModel, data: Any) -> float:
 
     Raises `InputError` if it touches something at any height, like a wall.
     """
-    low, high = 0.0, max(float(model.stat.extent), 1e-3)
+    low, high = 0.0, _FIRST_HEIGHT
     if not _touches(model, data, low):
         return 0.0
     while _touches(model, data, high):

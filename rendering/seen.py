@@ -11,9 +11,10 @@ import numpy as np
 
 from ..models.cameras import FARTHEST, add_cameras
 from ..models.fleet import members_of
-from ..models.scene import build_swarm
+from ..models.mjcf import swarm_spec
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
+from ..scenes import add_scene
 from .stage import scale_drawing
 
 NOTHING: Final = "nothing"
@@ -42,7 +43,8 @@ def drawn_model(
 ) -> mujoco.MjModel:
     """What is drawn: craft with their cameras, what surrounds them, the task's marks."""
     crafts = members_of(vehicle, len(names))
-    spec = build_swarm([craft.path for craft in crafts], names, world)
+    spec = swarm_spec([craft.path for craft in crafts], names)
+    add_scene(spec, world)
     bodies = [body for body in spec.worldbody.bodies if body.name.partition("/")[0] in names]
     for name, body, craft in zip(names, bodies, crafts, strict=True):
         add_cameras(spec, body, craft, f"{name}/")

@@ -16,7 +16,8 @@ import numpy as np
 from ..models.errors import InputError, expect
 from ..models.fleet import load_vehicles, members_of
 from ..models.frames import pose_in_mujoco_frame
-from ..models.scene import SCENE_PREFIX, attach_craft, build_scene
+from ..models.mjcf import attach_craft, free_body
+from ..scenes.build import SCENE_PREFIX, build_scene
 from .gl import Offscreen
 
 Camera = Literal["chase", "front", "side", "top", "onboard"]
@@ -210,7 +211,7 @@ class Stage:
         self.radius, top = max(radius for radius, _ in sizes), sizes[0][1]
         grid = _grid(drones, _SPACING * self.radius)
         self._offsets = 0.0 * grid if names else grid
-        _free_body(spec).add_camera(  # sees nose, front rotors and horizon
+        free_body(spec).add_camera(  # sees nose, front rotors and horizon
             name=_ONBOARD,
             pos=(0.03 * self.radius, 0.0, top + 0.154 * self.radius),
             xyaxes=(0, -1, 0, 0.30, 0, 0.954),
@@ -405,12 +406,6 @@ def least_distance(positions: np.ndarray) -> float:
     """Least distance between two of some points, shape (A, 3), at least two."""
     apart = np.linalg.norm(positions[:, None] - positions, axis=-1)
     return float(apart[np.triu_indices(len(positions), 1)].min())
-
-
-def _free_body(spec: mujoco.MjSpec) -> Any:
-    """The craft, `MjsBody`. `Vehicle.load` has checked that there is one."""
-    free = mujoco.mjtJoint.mjJNT_FREE
-    return next(body for body in spec.bodies if any(joint.type == free for joint in body.joints))
 
 
 def _size(model: mujoco.MjModel) -> tuple[float, float]:

@@ -28,10 +28,10 @@ import mujoco
 import numpy as np
 from measuring import in_turns, medians, options, write
 from rotorgram.envs import LocalVectorEnv
-from rotorgram.models import SEEDED_WORLDS
 from rotorgram.models.cameras import KINDS, cameras_of, chosen_views
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
+from rotorgram.scenes import SEEDED_SCENES
 from rotorgram.training.pairs import socket_pair
 from rotorgram.udp import RemoteVectorEnv
 from swarm import advanced, timed
@@ -43,7 +43,7 @@ EPISODE = 100_000  # control steps: none ends while it is measured
 
 Step = Callable[[], object]
 Times = dict[str, float]
-WORLDS = ("plain", "airport", *SEEDED_WORLDS)
+WORLDS = ("plain", "airport", *SEEDED_SCENES)
 
 
 OPTICS = {
@@ -265,7 +265,7 @@ def worlds(path: Path) -> None:
     views = chosen_views(["chase@320x240", "front@320x240"], cameras_of(vehicle))
     state = {"position": np.array([[0.0, 0.0, 5.0]]), "quaternion": np.array([[0.9, 0, 0, 0.436]])}
     everybody = np.ones(1, bool)
-    for name in SEEDED_WORLDS:
+    for name in SEEDED_SCENES:
         row = []
         for seed in range(2):
             cameras = Cameras(vehicle, views, world=f"{name}:{seed}", fine=True)

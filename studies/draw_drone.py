@@ -9,7 +9,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported: it choos
 import mujoco
 from measuring import IMAGES, options
 from PIL import Image
-from rotorgram.models import build_scene
+from rotorgram.scenes import build_scene
 
 WIDTH, HEIGHT = 1200, 675
 OVERSAMPLING = 1.5  # drawn larger and reduced: smooth edges of thin arms and discs

@@ -14,10 +14,11 @@ import mujoco
 import numpy as np
 from measuring import options
 from PIL import Image
-from rotorgram.models import InputError, Vehicle, build_scene
+from rotorgram.models import InputError, Vehicle
 from rotorgram.models.checks import examine
 from rotorgram.models.vehicle_file import Number, read_vehicle_file
 from rotorgram.rendering.gl import offscreen_context
+from rotorgram.scenes import build_scene
 from rotorgram.sim.effects import EffectOptions, Effects
 from rotorgram.sim.sensors import SENSOR_TYPES
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import scenes_of
 from ...models.cameras import FARTHEST, View, cameras_of, chosen_views
 from ...models.errors import expect
 from ...models.fleet import members_of
+from ...scenes import scenes_of
 from ...sim.random import CAMERAS, SCENES, Streams
 from ..spec import ArraySpec
 from ..tasks.task import Task

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Self
 
 import numpy as np
 
-from ...models import MOST_DRAG, scenes_of
+from ...models import MOST_DRAG
 from ...models.errors import expect
 from ...models.fields import Choice, Limits, check, check_fields
+from ...scenes import scenes_of
 from ...sim import (
     LEVELS,
     Array,

@@ -16,7 +16,18 @@ from rotorgram.cli import COMMANDS, EXTRAS
 
 ROOT = Path(__file__).parents[2]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-FOLDERS = ("models", "sim", "envs", "udp", "agents", "rendering", "flights", "training", "cli")
+FOLDERS = (
+    "models",
+    "scenes",
+    "sim",
+    "envs",
+    "udp",
+    "agents",
+    "rendering",
+    "flights",
+    "training",
+    "cli",
+)
 IMPORT_NAMES = {"pillow": "PIL", "warp-lang": "warp"}
 
 WITHOUT = """

@@ -14,7 +14,9 @@ import mujoco
 import numpy as np
 import pytest
 import rotorgram.models
-from rotorgram.models import QUAD_XML, InputError, Vehicle, build_scene
+from rotorgram.models import QUAD_XML, InputError, Vehicle
+from rotorgram.models.mjcf import vehicle_spec
+from rotorgram.scenes import build_scene
 
 DATA = Path(__file__).parents[1] / "data"
 ROTORS = ("rotor1", "rotor2", "rotor3", "rotor4")
@@ -155,7 +157,7 @@ def test_a_file_keeps_its_ground_sun_and_sky_and_gets_those_it_lacks(
 
 
 def test_without_what_is_only_looked_at_the_physics_is_the_same() -> None:
-    models = [build_scene(visual=visual).compile() for visual in (True, False)]
+    models = [spec.compile() for spec in (build_scene(), vehicle_spec(QUAD_XML))]
     assert models[0].ngeom > models[1].ngeom
     dice, contacts = np.random.default_rng(0), 0
     data = [mujoco.MjData(model) for model in models]
@@ -369,8 +371,9 @@ def test_a_file_that_is_not_there() -> None:
 
 def test_paths_come_without_mujoco() -> None:
     code = (
-        "import sys, rotorgram.models\n"
-        "assert rotorgram.models.SCENE_XML.is_file()\n"
+        "import sys, rotorgram.models, rotorgram.scenes\n"
+        "assert rotorgram.scenes.SCENE_XML.is_file()\n"
+        "assert rotorgram.scenes.AIRPORT_XML.is_file()\n"
         "assert 'mujoco' not in sys.modules\n"
         "rotorgram.models.Vehicle\n"
         "assert 'mujoco' in sys.modules\n"

@@ -11,7 +11,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from rotorgram.models import AIRPORT_XML, InputError, attach_airport, build_scene
+from rotorgram.models import InputError
+from rotorgram.scenes import AIRPORT_XML, add_airport, build_scene
 
 STEPS = 2_000
 OTHER = """
@@ -35,7 +36,7 @@ def other() -> mujoco.MjSpec:
 
 def with_airport(make: Callable[[], mujoco.MjSpec], discard: bool = False) -> mujoco.MjModel:
     spec = make()
-    attach_airport(spec)
+    add_airport(spec)
     spec.compiler.discardvisual = discard
     return spec.compile()
 
@@ -110,10 +111,11 @@ def test_discardvisual_drops_all_of_it() -> None:
 
 @pytest.mark.parametrize("visual", [True, False])
 def test_a_scene_has_the_airport_that_was_asked_for(visual: bool) -> None:
-    model = build_scene(world="airport", visual=visual).compile()
-    assert model.ngeom == with_airport(build_scene, discard=not visual).ngeom
+    spec = build_scene(scene="airport")
+    spec.compiler.discardvisual = not visual
+    assert spec.compile().ngeom == with_airport(build_scene, discard=not visual).ngeom
     with pytest.raises(InputError, match=r"world: expected 'plain' or 'airport' .* got 'mars'"):
-        build_scene(world="mars")
+        build_scene(scene="mars")
 
 
 def test_only_the_floor_is_hidden() -> None:
@@ -139,9 +141,9 @@ def test_one_sky() -> None:
 
 def test_a_second_airport_is_refused() -> None:
     spec = build_scene()
-    attach_airport(spec)
+    add_airport(spec)
     with pytest.raises(InputError, match="spec: expected a scene without an airport"):
-        attach_airport(spec)
+        add_airport(spec)
 
 
 def corners(model: mujoco.MjModel, geom: int) -> np.ndarray:
@@ -188,8 +190,8 @@ import sys
 try:
     import mujoco
     import numpy as np
-    from rotorgram.models import build_scene
-    spec = build_scene(world="airport")
+    from rotorgram.scenes import build_scene
+    spec = build_scene(scene="airport")
     # 12 m behind the craft and 2 m above it, looking forward: the horizon is the middle row
     spec.worldbody.add_camera(name="eye", pos=[-12, 0, 4], quat=[0.5, 0.5, -0.5, -0.5], fovy=50)
     model = spec.compile()

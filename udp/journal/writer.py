@@ -213,7 +213,8 @@ def models_of(stepped: Any) -> tuple[dict[str, str], dict[str, str]]:
     task = getattr(stepped, "task", None)
     if task is None:
         return {}, {}
-    from ...models.scene import build_scene
+
+    from ...models.mjcf import vehicle_spec
 
     members = getattr(task.vehicle, "members", (task.vehicle,))
     names: dict[str, str] = {}  # by hash
@@ -222,7 +223,7 @@ def models_of(stepped: Any) -> tuple[dict[str, str], dict[str, str]]:
         if vehicle.hash not in names:
             name = f"model{len(names) or ''}.xml"
             names[vehicle.hash] = name
-            models[name] = str(build_scene(vehicle.path, visual=False).to_xml())
+            models[name] = str(vehicle_spec(vehicle.path).to_xml())
     return {"models": " ".join(names[vehicle.hash] for vehicle in members)}, models
 
 

@@ -1,0 +1,173 @@
+"""Specs of vehicles' files: read, bounded in size, with level ground, several craft in one."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree
+
+import mujoco
+
+from .errors import InputError
+from .vehicle_file import read_vehicle_file
+
+MAX_POINTS: Final = 4096  # rows and columns of a height field: 16.8 million points, 0.3 GB
+MAX_ELEMENTS: Final = 10_000  # of a file, each as often as it is repeated: seconds to compile
+MAX_SIZES: Final = {
+    "nuser_body": 100, "nuser_jnt": 100, "nuser_geom": 100, "nuser_site": 100, "nuser_cam": 100,
+    "nuser_tendon": 100, "nuser_actuator": 100, "nuser_sensor": 100, "nuserdata": 1_000_000,
+    "nkey": 1000, "nconmax": 100_000, "njmax": 100_000, "nstack": 10_000_000,
+}  # fmt: skip
+"""Largest attributes of MJCF's element `size`."""
+MAX_MEMORY: Final = 1 << 30  # bytes of MJCF's attribute `memory`
+MAX_LENGTH: Final = 10_000  # numbers of a custom numeric or of a sensor
+_SIDES: Final = ("nrow", "ncol", "width", "height")
+_LENGTHS: Final = ("size", "dim", "num", "nsample", "actdim")
+_LENGTHS_OF: Final = ("numeric", "user", "contact", "general", "plugin")
+_REPEATED: Final = ("replicate", "composite", "flexcomp")
+_UNITS: Final = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40, "P": 1 << 50, "E": 1 << 60}
+_GROUNDS: Final = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+
+
+def read_spec(path: Path) -> mujoco.MjSpec:
+    """The spec of a vehicle's file alone. Raises `InputError`, or `ValueError` if it is no MJCF."""
+    if path.suffix.lower() == ".toml":
+        file = read_vehicle_file(path)
+        return file.build(None if file.model is None else read_spec(file.model))
+    _check_sizes(path)
+    switch_off_log_file()
+    return mujoco.MjSpec.from_file(str(path))
+
+
+def vehicle_spec(path: Path) -> mujoco.MjSpec:
+    """A vehicle's file over level ground, without visual elements."""
+    spec = read_spec(path)
+    add_ground(spec)
+    spec.compiler.discardvisual = True
+    return spec
+
+
+def has_ground(spec: mujoco.MjSpec) -> bool:
+    return any(geom.type in _GROUNDS for geom in spec.worldbody.geoms)
+
+
+def add_ground(spec: mujoco.MjSpec) -> None:
+    """Add a plane at z = 0 to a spec without a plane or a height field."""
+    if not has_ground(spec):
+        plane = mujoco.mjtGeom.mjGEOM_PLANE
+        spec.worldbody.add_geom(name="rotorgram/ground", type=plane, size=(0.0, 0.0, 0.5))
+
+
+def swarm_spec(vehicles: Sequence[Path], names: Sequence[str]) -> mujoco.MjSpec:
+    """One spec with a craft of each vehicle's file, whose parts have its name and a slash before
+    theirs. Options and all else are those of the first vehicle.
+    """
+    spec = read_spec(vehicles[0])
+    spec.delete(free_body(spec))
+    _delete_targeting_cameras(spec)
+    for path, name in zip(vehicles, names, strict=True):
+        attach_craft(spec, path, f"{name}/")
+    return spec
+
+
+def attach_craft(
+    spec: mujoco.MjSpec, vehicle: Path, prefix: str, place: Sequence[float] = (0, 0, 0)
+) -> None:
+    """Add a file's craft, its names with a prefix; step and gravity are those of the spec."""
+    own = read_spec(vehicle)  # it must outlive the call: its craft is a part of it
+    own.option.timestep = spec.option.timestep
+    own.option.gravity = spec.option.gravity
+    _delete_targeting_cameras(own)
+    spec.worldbody.add_frame(pos=place).attach_body(free_body(own), prefix, "")
+
+
+def _delete_targeting_cameras(spec: mujoco.MjSpec) -> None:
+    """Delete the cameras that turn to a body: bodies have other names in a swarm."""
+    modes = mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM
+    for camera in list(spec.cameras):
+        if camera.mode in modes:
+            spec.delete(camera)
+
+
+def free_body(spec: mujoco.MjSpec) -> mujoco.MjsBody:
+    """The first body with a free joint: the craft of a vehicle's spec."""
+    free = mujoco.mjtJoint.mjJNT_FREE
+    return next(body for body in spec.bodies if any(joint.type == free for joint in body.joints))
+
+
+def switch_off_log_file() -> None:
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT; a log file of another name stays on."""
+    config = mujoco.MjLogConfig.get()
+    if config.logto_file and config.logfile == "MUJOCO_LOG.TXT":
+        config.logto_file = False
+        config.set()
+
+
+# ---- the size of what a file describes
+
+
+def _check_sizes(path: Path) -> None:
+    """Raise `InputError` if a file, with what it includes, has too many or too large parts.
+
+    MuJoCo allocates their memory while it reads, and aborts the process if there is too little.
+    """
+    seen, total, waiting = {path}, 0, [(_root(path), 1)]
+    while waiting:
+        element, times = waiting.pop()
+        _check_element(element)
+        if element.tag in _REPEATED:
+            counts = filter(str.isdecimal, element.get("count", "").split())
+            times *= math.prod(map(int, counts))
+        elif element.tag in ("include", "model"):
+            inner = path.parent / element.get("file", "")
+            if inner not in seen:
+                seen.add(inner)
+                waiting.append((_root(inner), times))
+        total += times
+        if total > MAX_ELEMENTS:
+            _refuse(f"at most {MAX_ELEMENTS} elements", f"{total} or more")
+        waiting += [(child, times) for child in element]
+
+
+def _check_element(element: ElementTree.Element) -> None:
+    if element.tag in ("hfield", "texture"):
+        sides = [element.get(side, "0") for side in _SIDES]
+        if any(_whole(side) > MAX_POINTS for side in sides):
+            got = " × ".join(side for side in sides if side != "0")
+            limit = f"at most {MAX_POINTS} × {MAX_POINTS} points"
+            _refuse(f"a height field or texture of {limit}", got)
+    elif element.tag == "size":
+        for name, largest in MAX_SIZES.items():
+            _check_size(element, name, largest)
+        memory = element.get("memory", "0").strip().upper()
+        unit = _UNITS.get(memory[-1:], 1)
+        if _whole(memory.rstrip("".join(_UNITS))) * unit > MAX_MEMORY:
+            _refuse(f"a memory of at most {MAX_MEMORY >> 30}G", memory)
+    elif element.tag in _LENGTHS_OF:
+        for name in _LENGTHS:
+            _check_size(element, name, MAX_LENGTH)
+
+
+def _check_size(element: ElementTree.Element, name: str, largest: int) -> None:
+    text = element.get(name, "0")
+    if _whole(text) > largest:
+        _refuse(f"a {name} of at most {largest} in <{element.tag}>", text)
+
+
+def _whole(text: str) -> int:
+    """A whole number of a text; 0 of another text, which MuJoCo refuses."""
+    try:
+        return int(text.strip())
+    except ValueError:
+        return 0
+
+
+def _refuse(expected: str, got: str) -> None:
+    raise InputError(f"vehicle: expected {expected}, got {got:.80}")
+
+
+def _root(path: Path) -> ElementTree.Element:
+    try:
+        return ElementTree.parse(path).getroot()
+    except (OSError, ElementTree.ParseError):
+        return ElementTree.Element("")  # MuJoCo says what is wrong with it

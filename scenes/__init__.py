@@ -1,0 +1,71 @@
+"""Scenes around vehicles: ground, sky, light, an airport, and three that are drawn from a seed.
+
+Pictures show them; physics does not know them. Importing this package does not import MuJoCo.
+"""
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from ..models.errors import InputError
+
+if TYPE_CHECKING:
+    from .build import add_airport, add_scene, build_scene
+
+__all__ = [
+    "AIRPORT_XML", "MAX_SEEDS", "SCENES", "SCENE_XML", "SEEDED_SCENES", "add_airport", "add_scene",
+    "build_scene", "parse_scene", "scenes_of",
+]  # fmt: skip
+
+SCENE_XML: Final = Path(__file__).parent / "scene.xml"
+"""Ground, sky and light of the scene `plain`."""
+AIRPORT_XML: Final = Path(__file__).parent / "airport.xml"
+"""The airport that `add_airport` adds."""
+SCENES: Final = ("plain", "airport", "forest", "warehouse", "gates")
+SEEDED_SCENES: Final = SCENES[2:]
+"""Those that are drawn from a seed."""
+MAX_SEEDS: Final = 64
+"""Seeds of a scene among which episodes choose."""
+
+
+def parse_scene(text: str) -> tuple[str, int]:
+    """Name and seed of a scene: NAME, or NAME:SEED of one with a seed. Raises `InputError`."""
+    name, colon, number = text.partition(":") if isinstance(text, str) else ("", "", "")
+    is_seed = number.isascii() and number.isdecimal() and len(number) < 10
+    if name not in SCENES or (colon and not (name in SEEDED_SCENES and is_seed)):
+        names = " or ".join(map(repr, SCENES))
+        raise InputError(
+            f"world: expected {names}, the last three with a seed or not, as 'forest:3', "
+            f"got {text!r:.80}"
+        )
+    return name, int(number or 0)
+
+
+def scenes_of(text: str) -> tuple[str, ...]:
+    """The scenes of which each episode has one: those of NAME:FIRST-LAST, or the one of the text.
+
+    Raises `InputError`.
+    """
+    name, _, numbers = text.partition(":") if isinstance(text, str) else (text, "", "")
+    first, dash, last = numbers.partition("-")
+    if not dash:
+        parse_scene(text)
+        return (text,)
+    try:
+        low, high = (parse_scene(f"{name}:{end}")[1] for end in (first, last))
+    except InputError:
+        low, high = 0, -1
+    if not 0 <= high - low < MAX_SEEDS:
+        names = ", ".join(map(repr, SEEDED_SCENES))
+        raise InputError(
+            f"world: expected one of {names} with up to {MAX_SEEDS} seeds, as 'forest:0-7', "
+            f"got {text!r:.80}"
+        )
+    return tuple(f"{name}:{seed}" for seed in range(low, high + 1))
+
+
+def __getattr__(name: str) -> Any:
+    """Import on first use the names that need MuJoCo (PEP 562)."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(".build", __name__), name)

@@ -1,0 +1,87 @@
+"""Add a scene to a vehicle's spec: what it lacks of ground, sky and light, and all around it."""
+
+from pathlib import Path
+from typing import Final
+
+import mujoco
+
+from ..models import QUAD_XML
+from ..models.errors import InputError
+from ..models.mjcf import has_ground, read_spec
+from . import AIRPORT_XML, SCENE_XML, parse_scene
+from .generators import GENERATORS
+from .primitives import SKY, attach, clear
+
+AIRPORT_PREFIX: Final = "airport/"  # of all names that `add_airport` adds
+SCENE_PREFIX: Final = "scene/"  # of all names that `add_scene` adds for the plain scene
+_NEAR, _FAR = 0.25, 1200.0  # m: nearest and furthest distance that is drawn; the hills lie within
+
+# The depth of a directional light's shadow map spans the whole of _FAR, and a map of finer pixels
+# than 12 mm (1024 over the 12 m around the craft) speckles flat ground at this span.
+_SHADOW_PIXELS: Final = 1024
+_SLICES: Final = 40  # of a cylinder: the camera comes near to the pad's ring
+_HAZE: Final = 0.1  # of the distance to the horizon
+_HAZE_COLOUR: Final = (0.80, 0.88, 0.96, 1.0)  # the sky's colour where it meets the ground
+
+
+def build_scene(vehicle: Path | str | None = None, scene: str = "plain") -> mujoco.MjSpec:
+    """A vehicle's file, None for the paper's, in one of `SCENES`, to be compiled.
+
+    Raises `InputError` if there is no such scene or the file is wrong, `ValueError` if MuJoCo
+    cannot read it.
+    """
+    parse_scene(scene)
+    spec = read_spec(Path(vehicle if vehicle is not None else QUAD_XML))
+    add_scene(spec, scene)
+    return spec
+
+
+def add_scene(spec: mujoco.MjSpec, scene: str = "plain") -> None:
+    """Add a scene to the spec of one or several craft, in place: NAME, or NAME:SEED.
+
+    The craft move bit for bit as without it. Raises `InputError`.
+    """
+    name, seed = parse_scene(scene)
+    _add_plain(spec)
+    if name == "airport":
+        add_airport(spec)
+    elif name in GENERATORS:
+        attach(spec, GENERATORS[name](seed))
+    spec.compiler.discardvisual = False
+
+
+def _add_plain(spec: mujoco.MjSpec) -> None:
+    """Add ground, sky and sun of `SCENE_XML`, each unless the spec has its own."""
+    scene = mujoco.MjSpec.from_file(str(SCENE_XML))
+    if has_ground(spec):
+        scene.delete(scene.geom("floor"))
+        scene.visual, scene.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
+    else:
+        spec.visual, spec.stat = scene.visual, scene.stat
+    if any(texture.type == SKY for texture in spec.textures):
+        scene.delete(scene.texture("sky"))
+    if spec.worldbody.lights:
+        scene.delete(scene.light("sun"))
+    spec.attach(scene, prefix=SCENE_PREFIX, frame=spec.worldbody.add_frame())
+
+
+def add_airport(spec: mujoco.MjSpec) -> None:
+    """Put the airport of `AIRPORT_XML` around a scene, in place; compile the spec yourself.
+
+    The origin of the world becomes the centre of a pad on the apron; +x points along runway 09, z
+    up, metres. The scene moves bit for bit as without it: its geoms collide with nothing, and only
+    a rangefinder would see them. `spec.compiler.discardvisual` drops them all.
+
+    Planes of the world body at z = 0 still carry what stands on them, but only geom group 3 draws
+    them. Sky, haze, shadow map, and the near and far end of drawing become the airport's. Raises
+    `InputError` if the scene has an airport already, `ValueError` if it does not compile.
+    """
+    if any(geom.name.startswith(AIRPORT_PREFIX) for geom in spec.geoms):
+        raise InputError("spec: expected a scene without an airport, got one that has it")
+    clear(spec, _NEAR, _FAR, _SLICES)
+    visual = spec.visual
+    visual.map.haze = _HAZE
+    visual.rgba.haze = _HAZE_COLOUR
+    visual.quality.shadowsize = min(visual.quality.shadowsize, _SHADOW_PIXELS)
+    airport = mujoco.MjSpec.from_file(str(AIRPORT_XML))
+    spec.attach(airport, prefix=AIRPORT_PREFIX, frame=spec.worldbody.add_frame())

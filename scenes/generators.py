@@ -1,0 +1,300 @@
+"""Scenes from a seed, as primitives: a forest, a warehouse, a track of gates.
+
+World frame: z up, m. A generator draws all numbers of a scene from one stream, in one order.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final
+
+import numpy as np
+
+from .primitives import Colour, Kind, Light, Material, Pattern, Point, Primitive, Scene
+
+CLEARANCE: Final = 8.0
+"""Half the width of the space about the z axis that no primitive but a gate enters, m."""
+CLEARANCE_HEIGHT: Final = 20.0
+"""Height of that space, m."""
+
+_FOREST: Final = 60.0  # m: half the width of the wood
+_LENGTH, _WIDTH, _HEIGHT = 30.0, 20.0, 24.0  # m: half length, half width and height of the hall
+_GATES: Final = 8
+_OPENING: Final = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
+
+
+class _Builder:
+    """Collects the parts of a scene, and draws its numbers."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.Generator(np.random.PCG64(seed))
+        self.materials: list[Material] = []
+        self.primitives: list[Primitive] = []
+        self.lights: list[Light] = []
+
+    def scene(self, name: str, sky: tuple[Colour, Colour]) -> Scene:
+        return Scene(
+            name=name,
+            materials=tuple(self.materials),
+            primitives=tuple(self.primitives),
+            lights=tuple(self.lights),
+            sky=sky,
+        )
+
+    def uniform(self, low: float, high: float) -> float:
+        return float(self.rng.uniform(low, high))
+
+    def colour(self, base: Colour, by: float = 0.06) -> Colour:
+        """A colour near `base`."""
+        red, green, blue = np.clip(np.array(base) + self.rng.uniform(-by, by, 3), 0.02, 1.0)
+        return float(red), float(green), float(blue)
+
+    def material(
+        self,
+        name: str,
+        colour: Colour,
+        pattern: Pattern = "",
+        repeat: float = 0.5,
+        by: float = 0.06,
+        gloss: float = 0.0,
+    ) -> str:
+        """The name of a new material whose colour is near another one."""
+        colour = self.colour(colour, by)
+        second = colour
+        if pattern:
+            red, green, blue = np.array(colour) * self.rng.uniform(0.82, 0.94)
+            second = float(red), float(green), float(blue)
+        material = Material(
+            name=name, colour=colour, pattern=pattern, second_colour=second, repeat=repeat,
+            gloss=gloss,
+        )  # fmt: skip
+        self.materials.append(material)
+        return name
+
+    def add(
+        self,
+        name: str,
+        kind: Kind,
+        size: Iterable[float],
+        position: Iterable[float],
+        material: str,
+        turn: Point = (0.0, 0.0, 0.0),
+    ) -> None:
+        a, b, c = map(float, size)
+        x, y, z = map(float, position)
+        primitive = Primitive(
+            name=name, kind=kind, size=(a, b, c), position=(x, y, z), turn=turn, material=material
+        )
+        self.primitives.append(primitive)
+
+    def choose(self, words: Sequence[str]) -> str:
+        return words[int(self.rng.integers(len(words)))]
+
+    def sun(self) -> tuple[Colour, Colour]:
+        """Add a sun from a side of its own; returns the colours of its sky."""
+        azimuth, down = self.uniform(0.0, 2 * math.pi), self.uniform(1.0, 2.5)
+        bright = self.uniform(0.6, 0.8)
+        light = Light(
+            name="sun",
+            position=(0.0, 0.0, 60.0),
+            direction=(math.cos(azimuth), math.sin(azimuth), -down),
+            diffuse=(bright, bright, 0.95 * bright),
+            ambient=0.2,
+        )
+        self.lights.append(light)
+        return self.colour((0.40, 0.60, 0.86)), (0.93, 0.95, 0.97)
+
+    def around(self, reach: float, far: float) -> tuple[float, float]:
+        """A place up to `far` from which `reach` does not lead into the clear space."""
+        while True:
+            x, y = (float(value) for value in self.rng.uniform(-far, far, 2))
+            if max(abs(x), abs(y)) > CLEARANCE + reach:
+                return x, y
+
+
+def forest(seed: int) -> Scene:
+    """A wood of 120 m by 120 m: trees, shrubs and rocks."""
+    wood = _Builder(seed)
+    sky = wood.sun()
+    ground = wood.material("ground", (0.36, 0.42, 0.22), "random", 0.1)
+    bark = [wood.material(f"bark_{i}", (0.36, 0.26, 0.17), "random") for i in range(2)]
+    greens = (0.15, 0.33, 0.16), (0.26, 0.43, 0.15), (0.40, 0.47, 0.16), (0.30, 0.38, 0.20)
+    leaves = [wood.material(f"leaves_{i}", green, "random", 0.7) for i, green in enumerate(greens)]
+    stone = wood.material("stone", (0.48, 0.47, 0.45), "random", 0.6)
+    wood.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), ground)
+    for i in range(110):
+        _add_tree(wood, f"tree_{i}", bark, leaves)
+    for i in range(60):
+        wide = wood.uniform(0.4, 1.2)
+        x, y = wood.around(wide, _FOREST)
+        leaf = wood.choose(leaves)
+        size, position = (wide, wide, 0.7 * wide), (x, y, 0.4 * wide)
+        wood.add(f"shrub_{i}/crown", "ellipsoid", size, position, leaf)
+    for i in range(40):
+        sides = wood.rng.uniform(0.3, 1.0, 3)
+        x, y = wood.around(1.0, _FOREST)
+        turn = (0.0, 0.0, wood.uniform(0, math.pi))
+        wood.add(f"rock_{i}/stone", "ellipsoid", sides, (x, y, 0.2 * sides[2]), stone, turn)
+    return wood.scene("forest", sky)
+
+
+def _add_tree(wood: _Builder, name: str, bark: Sequence[str], leaves: Sequence[str]) -> None:
+    x, y = wood.around(3.2, _FOREST)
+    tall, wide = wood.uniform(6.0, 15.0), wood.uniform(1.4, 3.0)
+    kind = int(wood.rng.integers(3))
+    leaf = wood.choose(leaves)
+    trunk = (0.13 + 0.012 * tall, 0.3 * tall, 0)
+    wood.add(f"{name}/trunk", "cylinder", trunk, (x, y, 0.3 * tall), bark[kind % 2])
+    if kind == 0:  # a fir: three storeys, each narrower
+        for storey, (height, width) in enumerate(((0.40, 1.0), (0.62, 0.72), (0.84, 0.42))):
+            size = (wide * width, wide * width, 0.18 * tall)
+            wood.add(f"{name}/crown_{storey}", "ellipsoid", size, (x, y, height * tall), leaf)
+    elif kind == 1:  # round
+        size = (wide, wide, 0.3 * tall)
+        wood.add(f"{name}/crown", "ellipsoid", size, (x, y, 0.72 * tall), leaf)
+    else:  # two balls side by side
+        dx, dy = wood.rng.uniform(-0.3, 0.3, 2) * wide
+        for part, (side, height) in enumerate(((1, 0.62), (-1, 0.80))):
+            position = (x + side * dx, y + side * dy, height * tall)
+            wood.add(f"{name}/crown_{part}", "ellipsoid", (0.7 * wide,) * 3, position, leaf)
+
+
+def warehouse(seed: int) -> Scene:
+    """A hall of 60 m by 40 m, 24 m high. Racks, pallets and barrels stand along its walls."""
+    hall = _Builder(seed)
+    sky = hall.colour((0.55, 0.60, 0.66)), hall.colour((0.62, 0.64, 0.66))
+    floor = hall.material("floor", (0.55, 0.55, 0.53), "checker", 0.25)
+    wall = hall.material("wall", (0.72, 0.72, 0.70), "edge", 0.3, by=0.03)
+    roof = hall.material("roof", (0.50, 0.52, 0.55), "edge", 0.2)
+    steel = hall.material("steel", (0.20, 0.34, 0.62), by=0.15, gloss=0.2)
+    pallet = hall.material("pallet", (0.62, 0.48, 0.30), "random")
+    glass = hall.material("glass", (0.70, 0.84, 0.93), "edge", 0.5)
+    hall.materials.append(Material(name="lamp", colour=(1.0, 0.98, 0.90), emission=0.9))
+    tints = (0.72, 0.53, 0.33), (0.62, 0.44, 0.27), (0.25, 0.45, 0.66), (0.72, 0.24, 0.20)
+    boxes = [hall.material(f"box_{i}", tint, "edge", 1.0, by=0.1) for i, tint in enumerate(tints)]
+    hall.add("ground/floor", "plane", (_LENGTH, _WIDTH, 1), (0, 0, 0), floor)
+    _add_hall(hall, wall, roof, steel, glass)
+    for i, x in enumerate((-15.0, 15.0)):
+        bright = hall.uniform(0.28, 0.42)
+        light = Light(
+            name=f"light_{i}",
+            position=(x, 0.0, 22.0),
+            direction=(-x / 30, hall.uniform(-0.4, 0.4), -1.0),
+            diffuse=(bright,) * 3,
+            ambient=0.15,
+        )
+        hall.lights.append(light)
+    racks = [(x, y) for y in (-16.5, -11.0, 11.0, 16.5) for x in (-20.0, -7.0, 7.0, 20.0)]
+    for i, (x, y) in enumerate(racks):
+        _add_rack(hall, f"rack_{i}", x, y, steel, boxes)
+    for i in range(20):
+        _add_goods(hall, i, pallet, boxes)
+    return hall.scene("warehouse", sky)
+
+
+def _add_hall(hall: _Builder, wall: str, roof: str, steel: str, glass: str) -> None:
+    """Walls with windows, and a roof with lamps."""
+    middle, right = _HEIGHT / 2, math.pi / 2
+    hall.add("roof/sheet", "plane", (_LENGTH, _WIDTH, 1), (0, 0, _HEIGHT), roof, (math.pi, 0, 0))
+    for name, sign in (("west", -1), ("east", 1)):
+        position, turn = (sign * _LENGTH, 0, middle), (0.0, -sign * right, 0.0)
+        hall.add(f"wall_{name}/sheet", "plane", (middle, _WIDTH, 1), position, wall, turn)
+    for name, sign in (("south", -1), ("north", 1)):
+        place, turn = (0, sign * _WIDTH, middle), (sign * right, 0.0, 0.0)
+        hall.add(f"wall_{name}/sheet", "plane", (_LENGTH, middle, 1), place, wall, turn)
+        for i, x in enumerate(np.linspace(-24.0, 24.0, 7)):
+            window = (x, sign * (_WIDTH - 0.05), 19.0)
+            hall.add(f"wall_{name}/window_{i}", "box", (2.5, 0.04, 1.6), window, glass)
+    for i, x in enumerate(np.linspace(-25.0, 25.0, 6)):
+        hall.add(f"truss_{i}/beam", "box", (0.15, _WIDTH, 0.3), (x, 0, 23.4), steel)
+        for j, y in enumerate((-11.0, 0.0, 11.0)):
+            hall.add(f"lamp_{3 * i + j}/tube", "box", (0.2, 1.2, 0.08), (x, y, 22.9), "lamp")
+
+
+def _add_rack(
+    hall: _Builder, name: str, x: float, y: float, steel: str, boxes: Sequence[str]
+) -> None:
+    for j, (dx, dy) in enumerate(((-4.0, -0.6), (-4.0, 0.6), (4.0, -0.6), (4.0, 0.6))):
+        hall.add(f"{name}/post_{j}", "box", (0.07, 0.07, 3.6), (x + dx, y + dy, 3.6), steel)
+    for level in range(3):
+        deck = 0.3 + 2.3 * level
+        hall.add(f"{name}/shelf_{level}", "box", (4.0, 0.7, 0.05), (x, y, deck), steel)
+        for slot, dx in enumerate((-3.0, -1.0, 1.0, 3.0)):
+            half = hall.rng.uniform((0.5, 0.4, 0.4), (0.9, 0.6, 0.9))
+            tint = hall.choose(boxes)
+            if hall.rng.random() < 0.85:  # else the slot is empty
+                position = (x + dx, y, deck + 0.06 + half[2])
+                hall.add(f"{name}/box_{4 * level + slot}", "box", half, position, tint)
+
+
+def _add_goods(hall: _Builder, number: int, pallet: str, boxes: Sequence[str]) -> None:
+    """A barrel, or a box on a pallet; the first six stand in the middle."""
+    if number < 6:
+        x, y = hall.around(1.0, _WIDTH - 6.5)
+    else:
+        x = hall.uniform(-28, 28)
+        y = float(hall.rng.choice((-13.7, 13.7))) + hall.uniform(-0.3, 0.3)
+    tint = hall.choose(boxes)
+    if number % 2:
+        hall.add(f"barrel_{number}/drum", "cylinder", (0.4, 0.6, 0), (x, y, 0.6), tint)
+        return
+    half = hall.rng.uniform((0.3, 0.3, 0.2), (0.6, 0.6, 0.6))
+    hall.add(f"pallet_{number}/deck", "box", (0.6, 0.6, 0.07), (x, y, 0.08), pallet)
+    hall.add(f"pallet_{number}/box", "box", half, (x, y, 0.16 + half[2]), tint)
+
+
+def gates(seed: int) -> Scene:
+    """A ring of 8 gates, 5 m wide inside, with barriers, cones and stands around it."""
+    track = _Builder(seed)
+    sky = track.sun()
+    grass = track.material("grass", (0.36, 0.50, 0.26), "checker", 0.08)
+    steel = track.material("steel", (0.30, 0.31, 0.33), gloss=0.2)
+    stand = track.material("stand", (0.60, 0.61, 0.63), "edge", 0.5)
+    tints = (0.90, 0.30, 0.10), (0.10, 0.42, 0.80), (0.92, 0.80, 0.12), (0.75, 0.12, 0.45)
+    paint = [track.material(f"paint_{i}", tint, "checker", 1.0) for i, tint in enumerate(tints)]
+    track.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), grass)
+    for i in range(_GATES):
+        _add_gate(track, i, paint, steel)
+    for i in range(40):
+        x, y = track.around(1.5, 40.0)
+        tint = track.choose(paint)
+        turn = (0.0, 0.0, track.uniform(0, math.pi))
+        if i % 2:
+            track.add(f"barrier_{i}/block", "box", (1.2, 0.25, 0.45), (x, y, 0.45), tint, turn)
+        else:
+            track.add(f"cone_{i}/body", "ellipsoid", (0.3, 0.3, 0.8), (x, y, 0.1), tint)
+    for i in range(4):
+        away, angle = track.uniform(34.0, 44.0), math.pi * (i / 2 + 0.25)
+        for row in range(4):
+            distance, height = away + 1.5 * row, 0.4 * (row + 1)
+            position = (distance * math.cos(angle), distance * math.sin(angle), height)
+            size, turn = (0.75, 9.0, height), (0.0, 0.0, angle)
+            track.add(f"stand_{i}/row_{row}", "box", size, position, stand, turn)
+    return track.scene("gates", sky)
+
+
+def _add_gate(track: _Builder, number: int, paint: Sequence[str], steel: str) -> None:
+    half, bar = _OPENING / 2, 0.25
+    angle = 2 * math.pi * number / _GATES + track.uniform(-0.15, 0.15)
+    radius, height = track.uniform(15.0, 20.0), track.uniform(5.0, 12.0)
+    heading = angle + math.pi / 2 + track.uniform(-0.3, 0.3)  # anticlockwise round the ring
+    tint, turn = track.choose(paint), (0.0, 0.0, heading)
+    x, y = radius * math.cos(angle), radius * math.sin(angle)
+    foot = (height - half - 2 * bar) / 2
+    for part, sign in (("left", 1), ("right", -1)):
+        aside = sign * (half + bar)
+        side_x, side_y = x - aside * math.sin(heading), y + aside * math.cos(heading)
+        name, size = f"gate_{number}/frame_{part}", (0.15, bar, half + 2 * bar)
+        track.add(name, "box", size, (side_x, side_y, height), tint, turn)
+        name, size = f"gate_{number}/post_{part}", (0.1, foot, 0)
+        track.add(name, "cylinder", size, (side_x, side_y, foot), steel)
+    for part, sign in (("top", 1), ("bottom", -1)):
+        position = (x, y, height + sign * (half + bar))
+        track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, turn)
+
+
+GENERATORS: Final[dict[str, Callable[[int], Scene]]] = {
+    "warehouse": warehouse,
+    "forest": forest,
+    "gates": gates,
+}
+"""The function that draws each scene from a seed."""
