@@ -213,7 +213,7 @@ def test_a_simulator_that_cannot_draw_says_so_before_it_greets() -> None:
     [
         ({"cameras": "rear"}, "cameras: expected some of chase, portrait, front, down, each with"),
         ({"cameras": 3}, "cameras: expected names, with commas between them, got 3"),
-        ({"cameras": "front", "world": "moon"}, "world: expected a text"),
+        ({"cameras": "front", "world": "moon"}, "world: expected 'plain' or 'airport'"),
         (
             {"cameras": "front", "world": "plain:0-2"},
             "world: expected one of .* up to 64 seeds, as",
