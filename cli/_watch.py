@@ -11,9 +11,8 @@ import numpy as np
 from ..envs.rendering import moments
 from ..rendering.live import MOST_DRONES, LiveView, Pace, open_surface
 from ..rendering.stage import Stage
-from ..udp.protocol.messages import Command, Message, State
-from ..udp.transport.shared import SharedSimulator
-from ..udp.transport.simulator import Observer, Simulator
+from ..udp.protocol.messages import Command, State
+from ..udp.transport.driver import Driver, Observer
 
 if TYPE_CHECKING:
     from .sim import Sim
@@ -28,16 +27,16 @@ class Watcher:
     would take the simulator for lost. If the view is closed or fails, the simulator goes on.
     """
 
-    def __init__(self, live: LiveView, simulator: Simulator | SharedSimulator) -> None:
+    def __init__(self, live: LiveView, simulator: Driver) -> None:
         self._live: LiveView | None = live
         self._loop: Any = simulator.stepped  # the command flies registered tasks alone
         self._steps = np.zeros(live.stage.drones, np.int64)
         self._episodes = np.zeros(live.stage.drones, np.int64)
 
-    def __call__(self, cause: Message | None, state: State) -> None:
+    def __call__(self, cause: Command | None, state: State) -> None:
         """See one State, and what led to it; episodes count in which something was flown."""
         count, live = len(self._steps), self._live
-        resets = cause.resets[:count] if isinstance(cause, Command) else True
+        resets = True if cause is None else cause.resets[:count]
         self._episodes += resets & (self._steps > 0)
         self._steps = self._loop.steps[:count]
         if live is None or not live.wants or not self._is_open(live):
@@ -64,14 +63,14 @@ class Realtime:
     def __init__(self, control_period: float) -> None:
         self._pace = Pace(control_period)
 
-    def __call__(self, cause: Message | None, state: State) -> None:
+    def __call__(self, cause: Command | None, state: State) -> None:
         """Wait until the next step may be taken."""
         time.sleep(self._pace.wait(time.monotonic()) or 0.0)
         self._pace.stepped(time.monotonic())
 
 
 @contextmanager
-def watched(simulator: Simulator | SharedSimulator, command: "Sim") -> Iterator[None]:
+def watched(simulator: Driver, command: "Sim") -> Iterator[None]:
     """Show a simulator, or hold it to real time, during the block, as the command says."""
     observers: list[Observer] = []
     with ExitStack() as opened:
@@ -87,7 +86,7 @@ def watched(simulator: Simulator | SharedSimulator, command: "Sim") -> Iterator[
         if command.realtime:
             observers.append(Realtime(simulator.spec.control_period))
 
-        def observe(cause: Message | None, state: State) -> None:
+        def observe(cause: Command | None, state: State) -> None:
             for observer in observers:
                 observer(cause, state)
 

@@ -119,9 +119,9 @@ class Sim(BackendFlags):
             try:
                 print(simulator.run())
             finally:
-                for party in simulator.parties:
-                    where = "{}:{}".format(*party.address)
-                    print(f"wire to {where}: {party.link.statistics}", flush=True)
+                for link in simulator.links:
+                    where = "{}:{}".format(*link.address)
+                    print(f"wire to {where}: {link.client.statistics}", flush=True)
         return 0
 
     def _link(self) -> "LinkConfig":

@@ -179,7 +179,7 @@ def fly_eight(kills: int, dice: random.Random) -> dict[str, Any]:
         while simulator.episodes < wanted:
             assert thread.is_alive(), "the simulator failed"
             time.sleep(0.01)
-        present = [party.presence.value for party in simulator.parties]
+        present = [link.participation.value for link in simulator.links]
     finally:
         simulator.stop()
         thread.join(60)

@@ -162,11 +162,10 @@ class Pair:
         while len(self.steps) < steps:
             self._send()
             timer = self.client.next_timer()
-            assert timer is not None or self._flying, "nothing will ever happen"
-            if self._flying and (timer is None or self._flying[0][0] <= timer):
+            assert timer < inf or self._flying, "nothing will ever happen"
+            if self._flying and self._flying[0][0] <= timer:
                 self._arrive()
             else:
-                assert timer is not None
                 self.now = max(self.now, timer)
                 assert self.client.handle_timer(self.now), "silent"
 

@@ -12,8 +12,7 @@ from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Ref
 
 if TYPE_CHECKING:
     from .remote import LOST, RemoteEnv, RemoteVectorEnv
-    from .transport.shared import SharedSimulator
-    from .transport.simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, Simulator
+    from .transport.simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, SharedSimulator, Simulator
 
 __all__ = [
     "DEFAULT_AGENT",
@@ -38,6 +37,5 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     is_remote = name == "LOST" or name.startswith("Remote")
-    transport = ".transport.shared" if name == "SharedSimulator" else ".transport.simulator"
-    module = import_module(".remote" if is_remote else transport, __name__)
+    module = import_module(".remote" if is_remote else ".transport.simulator", __name__)
     return getattr(module, name)

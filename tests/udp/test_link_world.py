@@ -9,6 +9,7 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
+from math import inf
 
 import numpy as np
 import pytest
@@ -139,7 +140,7 @@ class World:
         while not until():
             self._send()
             assert self.now < end, f"not in {most} s"
-            timers = [(t, p) for p in self.physics if (t := p.link.next_timer()) is not None]
+            timers = [(t, p) for p in self.physics if (t := p.link.next_timer()) < inf]
             first = min((timer for timer, _ in timers), default=float("inf"))
             first = min(first, self.agent.next_timer() or float("inf"))
             if self._flying and self._flying[0][0] <= first:

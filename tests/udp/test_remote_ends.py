@@ -31,8 +31,7 @@ from rotorgram.udp import (
 from rotorgram.udp import __main__ as udp_main
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.messages import Close, Hello, Welcome
-from rotorgram.udp.transport import simulator as simulators
-from rotorgram.udp.transport import sockets
+from rotorgram.udp.transport import driver, sockets
 
 # ---- silence and ends
 
@@ -379,7 +378,7 @@ def test_a_simulator_of_our_own_waits_as_long_as_its_agent_lives(
 
     class Made(Simulator):
         def run(self) -> str:
-            made.append(self.config.timeout)
+            made.append(self.link.config.timeout)
             return ""
 
     monkeypatch.setattr(udp_main, "Simulator", Made)
@@ -397,15 +396,14 @@ def test_a_pause_of_its_own_does_not_end_a_simulator(  # fault 25
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now = [0.0]
-    monkeypatch.setattr(simulators, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(driver, "time", SimpleNamespace(monotonic=lambda: now[0]))
     with plain_socket() as nobody, Simulator(server=nobody.getsockname(), bind=ANY) as simulator:
-        simulator.link.connect(0.0)
-        welcome = Welcome(session=1, nonce=1)
-        answers = iter([None, welcome])
 
-        def receive(_: float) -> Welcome | None:  # the process was stopped meanwhile
+        def receive(_: float, *, strangers: bool) -> None:  # the process was stopped meanwhile
             now[0] += 1e4
-            return next(answers)
+            if now[0] > 3e4:
+                simulator.stop()
+            raise TimeoutError
 
-        monkeypatch.setattr(simulator, "_receive", receive)
-        assert simulator._wait() is welcome
+        monkeypatch.setattr(simulator._port, "receive", receive)
+        assert simulator.run() == "the simulator was stopped"

@@ -29,8 +29,8 @@ from rotorgram.udp import (
 )
 from rotorgram.udp.journal.replay import Verification
 from rotorgram.udp.protocol.auth import write_key
+from rotorgram.udp.protocol.party import Participation
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
-from rotorgram.udp.transport.shared import Presence
 from swarms import RISE
 
 LOSSY = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.1, seed=3)
@@ -232,10 +232,10 @@ def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> No
     loss, *later = running.simulator.absences
     assert (loss.agent, loss.episode) == (1, 1)
     assert 20 <= loss.step < LONG - 1
-    assert loss.presence in (Presence.SILENT, Presence.COMING)
+    assert loss.participation in (Participation.SILENT, Participation.COMING)
     expected = in_process(3, 3, calm, (1, loss.step, policy), episode_length=LONG)
     assert [seen[i][0] for i in (0, 2)] == [expected[i][0] for i in (0, 2)]
-    assert all(loss.agent != 1 or loss.presence is not Presence.LEFT for loss in later)
+    assert all(loss.agent != 1 or loss.participation is not Participation.LEFT for loss in later)
 
 
 def test_an_agent_that_comes_back_to_land_where_the_vehicle_cannot_ends_nobodys_flight(
@@ -271,7 +271,7 @@ def test_one_that_is_started_anew_before_the_others_come_flies_the_first_episode
     agents, seen = free_ports(2), {}
     with shared(agents, 2, episode_length=60) as running:
         first = launch(VICTIM, agents[0][1], "end")
-        while running.simulator.parties[0].presence is not Presence.READY:
+        while running.simulator.links[0].participation is not Participation.READY:
             assert running.thread.is_alive()
         first.kill()
         again = launch(VICTIM, agents[0][1], "end")
@@ -307,7 +307,7 @@ def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:
         victim.kill()
         victim.communicate()
     loss = running.simulator.absences[0]
-    assert (loss.agent, loss.episode, loss.presence) == (1, 1, Presence.SILENT)
+    assert (loss.agent, loss.episode, loss.participation) == (1, 1, Participation.SILENT)
     expected = in_process(2, 3, calm, (1, loss.step, "hold"), episode_length=LONG)
     assert seen[0][0] == expected[0][0]
 
@@ -338,8 +338,8 @@ def test_one_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
         in_threads([impatient, lambda: fly_one(agents[1], 1, 2, seen, calm)])
         running.join()
         waits, closes = running.simulator.absences
-        assert waits == (0, 1, 5, Presence.WAITING)
-        assert closes == (0, 2, 1, Presence.LEFT)
+        assert waits == (0, 1, 5, Participation.WAITING)
+        assert closes == (0, 2, 1, Participation.LEFT)
     expected = in_process(2, 2, calm, (0, 5, "hold"), episode_length=LONG)
     assert seen[1][0] == expected[1][0]
     assert starts == [expected[0][0][0][0], expected[0][1][0][0]]
@@ -477,7 +477,7 @@ def test_an_agent_that_does_not_come_is_named() -> None:
         result = running.join()
         env.close()
     assert isinstance(result, PeerSilent)
-    expected = f"no answer from the agent at 127.0.0.1:{nowhere[1]} for 1 s, and the world begins"
+    expected = f"no answer from the agent at 127.0.0.1:{nowhere[1]} for 1 s, Hello sent "
     assert str(result).startswith(expected)
 
 
@@ -492,9 +492,10 @@ def test_who_is_waited_for_is_told_soon(caplog: pytest.LogCaptureFixture) -> Non
             other.reset()
         first.join(60)
     where = f"127.0.0.1:{late[1]}"
-    assert (
-        caplog.messages[0] == f"no answer from the agent at {where} for 1 s; asking for 60 s in all"
+    expected = (
+        rf"no answer from the agent at {where} for 1 s, Hello sent \d+ times; asking for 60 s"
     )
+    assert re.match(expected, caplog.messages[0])
 
 
 def test_an_agent_that_refuses_is_named() -> None:

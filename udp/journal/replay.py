@@ -13,7 +13,8 @@ from ...models import Backend
 from ...models.errors import InputError
 from ...models.fleet import load_vehicles
 from ..protocol.messages import Command, State
-from ..transport.stepped import Stepped, make_stepped, reset_all
+from ..protocol.party import first_seeds
+from ..transport.stepped import Steppable, make_stepped
 from .reader import Item, Recording, Session, count_of, printable
 from .writer import software
 
@@ -55,7 +56,7 @@ class SessionVerdict:
     """Reason if it cannot be repeated, or not to its end."""
     notes: list[str] = field(default_factory=list)
     """Other things that have changed."""
-    _loop: "Stepped | None" = None
+    _loop: "Steppable | None" = None
     _sequence: int | None = None
     _command: Command | None = None
     _known: bool = False  # whether the simulated drones are where the recorded ones were
@@ -100,7 +101,10 @@ class SessionVerdict:
         if self._loop is None:
             self._loop = self._make()
             if seed is not None:
-                reset_all(self._loop, self.session.layout, seed)
+                actions, drones = self.session.layout.actions, self.session.num_envs
+                nothing = np.zeros(actions.shape, actions.dtype)
+                everyone = np.ones(drones, bool)
+                self._loop.advance(nothing, everyone, first_seeds(seed, drones), None)
                 self._known = True
         elif command is None or not self._sequence == command.sequence == sequence - 1:
             number = command.sequence if command else "none"
@@ -110,7 +114,7 @@ class SessionVerdict:
             self._known = True
         self._sequence = sequence
 
-    def _make(self) -> Stepped:
+    def _make(self) -> Steppable:
         """The drones. Raises `InputError` unless their arrays are those of the recorded spec."""
         spec = self.session.spec
         if not is_known(spec.env_id):
@@ -215,7 +219,7 @@ class Verification(Recording):
         return printable(lines)
 
 
-def _difference(recorded: State, loop: Stepped) -> Difference | None:
+def _difference(recorded: State, loop: Steppable) -> Difference | None:
     """The first number of the first drone that differs in any bit; None if none does."""
     pairs = [pair for pair in _arrays(recorded, loop) if pair[1].tobytes() != pair[2].tobytes()]
     differences = (
@@ -228,7 +232,7 @@ def _difference(recorded: State, loop: Stepped) -> Difference | None:
     return next(differences, None)
 
 
-def _arrays(recorded: State, loop: Stepped) -> Iterator[tuple[list[str], np.ndarray, np.ndarray]]:
+def _arrays(recorded: State, loop: Steppable) -> Iterator[tuple[list[str], np.ndarray, np.ndarray]]:
     """Names of the numbers of one drone, the recorded array and the replayed one."""
     yield ["reward"], recorded.rewards, loop.rewards
     yield ["terminated"], recorded.terminated, loop.terminated

@@ -44,7 +44,9 @@ _NUMBERS: Final = struct.Struct("<QQ")  # session, sequence: the end of the head
 _HELLO_BODY: Final = struct.Struct("<BB2xII4x")
 _WELCOME_BODY: Final = struct.Struct("<QQBB6x")
 _STATE_BODY: Final = struct.Struct("<dQ")
+_STATE_HEAD: Final = struct.Struct("<QQdQ")  # numbers and body
 _COMMAND_BODY: Final = struct.Struct("<I4x")
+_COMMAND_HEAD: Final = struct.Struct("<QQI4x")  # numbers and body
 _MISSING_BODY: Final = struct.Struct("<BxHH")
 _EXTENSION: Final = struct.Struct("<HH")
 _LENGTH: Final = struct.Struct("<H")
@@ -60,18 +62,18 @@ def encode(message: Message, layout: Layout | None = None) -> bytes:
 
     Raises `InputError` if a number, an array or the whole does not fit.
     """
-    kind = type(message)
-    start, crc, encoder, laid_out = _ENCODERS[kind]
+    if isinstance(message, State):
+        return encode_state(message, _expect(layout))
+    if isinstance(message, Command):
+        return encode_command(message, _expect(layout))
+    name = type(message).__name__
+    kind, encoder = _ENCODERS[type(message)]
     try:
-        numbers = _NUMBERS.pack(message.session, getattr(message, "sequence", 0))
-        body = encoder(message, layout or _expect(layout)) if laid_out else encoder(message)
-        rest = numbers + body
+        data = frame(kind, message.session, getattr(message, "sequence", 0), encoder(message))
     except struct.error as error:
-        raise InputError(f"{kind.__name__}: {error}") from None
-    if len(rest) + 8 > MAX_MESSAGE:
-        got = len(rest) + 8
-        raise InputError(f"{kind.__name__}: expected at most {MAX_MESSAGE} bytes, got {got}")
-    data: bytes = start + zlib.crc32(rest, crc).to_bytes(4, "little") + rest
+        raise InputError(f"{name}: {error}") from None
+    if len(data) > MAX_MESSAGE:
+        raise InputError(f"{name}: expected at most {MAX_MESSAGE} bytes, got {len(data)}")
     return data
 
 
@@ -107,12 +109,10 @@ def decode(datagram: bytes, layout: Layout | None = None) -> Message:
         raise DecodeError(f"type: expected 1 to {len(_MESSAGES)}, got {kind}")
     message, _, decoder = _MESSAGES[kind]
     try:
-        if message in _LAID_OUT:
-            whole: Message = decoder(datagram, session, sequence, _expect(layout))
-        else:
-            numbers = {"sequence": sequence} if kind in _NUMBERED else {}
-            whole = message(session=session, **numbers, **decoder(datagram[HEADER_SIZE:]))
-        return whole
+        if kind in _DUE:
+            return _DUE[kind][2](datagram, session, sequence, _expect(layout))
+        numbers = {"sequence": sequence} if kind in _NUMBERED else {}
+        return message(session=session, **numbers, **decoder(datagram[HEADER_SIZE:]))
     except (ValueError, struct.error) as error:
         raise DecodeError(f"{message.__name__.lower()}: {error}") from None
 
@@ -131,8 +131,7 @@ def decode_due(
     if zlib.crc32(datagram[8:], crc) != int.from_bytes(datagram[4:8], "little"):
         return None
     try:
-        message: Message = decoder(datagram, session, sequence, layout)
-        return message
+        return decoder(datagram, session, sequence, layout)
     except (ValueError, struct.error):
         return None
 
@@ -148,32 +147,42 @@ def peek(datagram: bytes) -> tuple[int, int, int]:
 # ---- State and Command
 
 
-def _encode_state(m: State, layout: Layout) -> bytes:
+def encode_state(m: State, layout: Layout) -> bytes:
+    """The bytes of a State, whole. Raises `InputError` as `encode`."""
     slots = layout.state_slots
     arrays = (*m.observations, m.rewards, m.terminated, m.truncated, *m.telemetry)
     if len(arrays) != len(slots):
         raise InputError(f"State: expected {len(slots)} arrays, got {len(arrays)}")
-    pieces = [_STATE_BODY.pack(m.time, m.nonce)]
+    try:
+        pieces = [_STATE_HEAD.pack(m.session, m.sequence, m.time, m.nonce)]
+    except struct.error as error:
+        raise InputError(f"State: {error}") from None
     for (shape, dtype, _, pad), array in zip(slots, arrays, strict=True):
         if array.shape != shape or (array.dtype is not dtype and array.dtype != dtype):
             raise _misfit("State", shape, dtype, array)
         pieces += (pad, array.tobytes())
-    body = b"".join(pieces)
+    rest = b"".join(pieces)
     numbers = layout.state_numbers
-    if numbers is None or not _adds_up(numbers.unpack_from(body)):
-        _expect_finite_state(_HEADERLESS + body, m.time, layout)
-    return body
+    # NaN and infinity stay in a sum. Huge numbers may overflow, so a second look decides.
+    if numbers is None or not isfinite(sum(numbers.unpack_from(rest, _BODY_AT))):
+        _expect_finite_state(_START + rest, m.time, layout)
+    crc = zlib.crc32(rest, _STATE_CRC)
+    return _STATE_START + crc.to_bytes(4, "little") + rest
 
 
 def _decode_state(data: bytes, session: int, sequence: int, layout: Layout) -> State:
-    _expect_size(data, layout.state_size)
+    if len(data) != layout.state_size:
+        raise _wrong_size(data, layout.state_size)
     time, nonce = _STATE_BODY.unpack_from(data, HEADER_SIZE)
     numbers = layout.state_numbers
-    if numbers is None or not _adds_up(numbers.unpack_from(data, HEADER_SIZE)):
+    if numbers is None or not isfinite(sum(numbers.unpack_from(data, HEADER_SIZE))):
         _expect_finite_state(data, time, layout)
     terminated, truncated = layout.flags
-    _expect_flags(data[terminated.at : truncated.end], b"\0\1")
-    arrays = [np.ndarray(shape, dtype, data, at) for shape, dtype, at, _ in layout.state_slots]
+    if wrong := data[terminated.at : truncated.end].translate(None, b"\0\1"):
+        raise _wrong_flags(wrong, 1)
+    arrays = []
+    for shape, dtype, at, _ in layout.state_slots:
+        arrays.append(np.ndarray(shape, dtype, data, at))
     first = len(layout.observation)
     return State(
         session=session,
@@ -188,50 +197,63 @@ def _decode_state(data: bytes, session: int, sequence: int, layout: Layout) -> S
     )
 
 
-def _encode_command(m: Command, layout: Layout) -> bytes:
+def encode_command(m: Command, layout: Layout) -> bytes:
+    """The bytes of a Command, whole. Raises `InputError` as `encode`."""
     arrays = [(layout.actions, m.actions), (layout.orders, m.orders)]
+    count = 0
     if m.seeds is not None:
         arrays.append((layout.seeds, m.seeds))
-    pieces = [_COMMAND_BODY.pack(0 if m.seeds is None else layout.drones)]
+        count = layout.drones
+    try:
+        pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, count)]
+    except struct.error as error:
+        raise InputError(f"Command: {error}") from None
     end = COMMAND_ARRAYS_AT
     for slot, array in arrays:
         if array.shape != slot.shape or array.dtype != slot.dtype:  # numbers are never converted
             raise _misfit("Command", slot.shape, slot.dtype, array)
         pieces += (bytes(slot.at - end), array.tobytes())
         end = slot.end
-    body = b"".join(pieces)
-    _check_command(_HEADERLESS + body, layout)
-    return body
+    rest = b"".join(pieces)
+    _check_command(_START + rest, layout)
+    crc = zlib.crc32(rest, _COMMAND_CRC)
+    return _COMMAND_START + crc.to_bytes(4, "little") + rest
 
 
 def _decode_command(data: bytes, session: int, sequence: int, layout: Layout) -> Command:
     (count,) = _COMMAND_BODY.unpack_from(data, HEADER_SIZE)
     if count not in (0, layout.drones):
         raise InputError(f"seeds: expected 0 or {layout.drones}, got {count}")
-    _expect_size(data, layout.seeds.end if count else layout.orders.end)
+    slots = [layout.actions, layout.orders, layout.seeds][: 3 if count else 2]
+    if len(data) != slots[-1].end:
+        raise _wrong_size(data, slots[-1].end)
     _check_command(data, layout)
+    arrays = []
+    for slot in slots:
+        arrays.append(np.ndarray(slot.shape, slot.dtype, data, slot.at))
     return Command(
         session=session,
         sequence=sequence,
-        actions=layout.actions.view(data),
-        orders=layout.orders.view(data),
-        seeds=layout.seeds.view(data) if count else None,
+        actions=arrays[0],
+        orders=arrays[1],
+        seeds=arrays[2] if count else None,
     )
 
 
 def _check_command(data: bytes, layout: Layout) -> None:
     actions, orders = layout.actions, layout.orders
-    _expect_flags(data[orders.at : orders.end], b"\0\1\2")
+    if wrong := data[orders.at : orders.end].translate(None, b"\0\1\2"):
+        raise _wrong_flags(wrong, 2)
     if layout.choices:
         numbers = actions.view(data)
-        wrong = (numbers < 0) | (numbers >= layout.choices)
-        if wrong.any():
+        beyond = (numbers < 0) | (numbers >= layout.choices)
+        if beyond.any():
             raise InputError(
-                f"action: expected a choice 0 to {layout.choices - 1}, got {numbers[wrong][0]}"
+                f"action: expected a choice 0 to {layout.choices - 1}, got {numbers[beyond][0]}"
             )
         return
     quick = layout.command_numbers
-    if quick is None or not _adds_up(quick.unpack_from(data, COMMAND_ARRAYS_AT)):
+    if quick is None or not isfinite(sum(quick.unpack_from(data, COMMAND_ARRAYS_AT))):
         _expect_finite("action", data, (actions,))
 
 
@@ -240,11 +262,6 @@ def _misfit(what: str, shape: tuple[int, ...], dtype: np.dtype, array: np.ndarra
         f"{what}: expected {dtype.name} of shape {shape}, "
         f"got {array.dtype.name} of shape {array.shape}"
     )
-
-
-def _adds_up(numbers: tuple[Any, ...]) -> bool:
-    """Whether all are finite for sure: NaN and infinity stay in a sum. Huge ones may overflow."""
-    return isfinite(sum(numbers))
 
 
 def _expect_finite_state(data: bytes, time: float, layout: Layout) -> None:
@@ -267,17 +284,12 @@ def _expect(layout: Layout | None) -> Layout:
     return layout
 
 
-def _expect_size(data: bytes, size: int) -> None:
-    if len(data) != size:
-        raise InputError(f"expected {size} bytes, got {len(data)}")
+def _wrong_size(data: bytes, size: int) -> InputError:
+    return InputError(f"expected {size} bytes, got {len(data)}")
 
 
-def _expect_flags(flags: bytes, allowed: bytes) -> None:
-    if wrong := flags.translate(None, allowed):
-        raise InputError(f"flags: expected 0 to {len(allowed) - 1}, got {wrong[0]}")
-
-
-_HEADERLESS: Final = bytes(HEADER_SIZE)
+def _wrong_flags(wrong: bytes, most: int) -> InputError:
+    return InputError(f"flags: expected 0 to {most}, got {wrong[0]}")
 
 
 # ---- all others: the body of a message, and its fields
@@ -315,7 +327,8 @@ def _encode_nothing(m: messages.Wait | messages.Unknown | messages.Alive) -> byt
 
 
 def _decode_nothing(body: bytes) -> dict[str, Any]:
-    _expect_size(body, 0)
+    if body:
+        raise _wrong_size(body, 0)
     return {}
 
 
@@ -337,7 +350,8 @@ def _encode_reason(m: messages.Refuse | messages.Close) -> bytes:
 def _decode_reason(body: bytes) -> dict[str, Any]:
     (size,) = _LENGTH.unpack_from(body)
     expect(size <= MAX_TEXT, "reason", f"at most {MAX_TEXT} bytes", f"{size}")
-    _expect_size(body, _LENGTH.size + size)
+    if len(body) != _LENGTH.size + size:
+        raise _wrong_size(body, _LENGTH.size + size)
     return {"reason": body[_LENGTH.size :].decode()}
 
 
@@ -363,15 +377,12 @@ def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
     return tuple(extensions)
 
 
-_LAID_OUT: Final = (State, Command)
-"""Messages that mean something with a layout only: their codecs take it, and whole datagrams."""
-
-_MESSAGES: Final[dict[int, tuple[Callable[..., Any], Callable[..., bytes], Callable[..., Any]]]] = {
+_MESSAGES: Final[dict[int, tuple[type[Message], Callable[..., bytes], Callable[..., Any]]]] = {
     HELLO: (messages.Hello, _encode_hello, _decode_hello),
     _WELCOME: (messages.Welcome, _encode_welcome, _decode_welcome),
     REFUSE: (messages.Refuse, _encode_reason, _decode_reason),
-    STATE: (State, _encode_state, _decode_state),
-    COMMAND: (Command, _encode_command, _decode_command),
+    STATE: (State, encode_state, _decode_state),
+    COMMAND: (Command, encode_command, _decode_command),
     CLOSE: (messages.Close, _encode_reason, _decode_reason),
     _WAIT: (messages.Wait, _encode_nothing, _decode_nothing),
     UNKNOWN: (messages.Unknown, _encode_nothing, _decode_nothing),
@@ -379,15 +390,17 @@ _MESSAGES: Final[dict[int, tuple[Callable[..., Any], Callable[..., bytes], Calla
     MISSING: (messages.Missing, _encode_missing, _decode_missing),
 }
 
-_STARTS: Final = {kind: MAGIC + bytes((VERSION, kind)) for kind in _MESSAGES}
-"""First four bytes of a message. The CRC-32 goes on from theirs."""
+_ENCODERS: Final = {message: (kind, encoder) for kind, (message, encoder, _) in _MESSAGES.items()}
 
-_ENCODERS: Final = {
-    message: (_STARTS[kind], zlib.crc32(_STARTS[kind]), encoder, message in _LAID_OUT)
-    for kind, (message, encoder, _) in _MESSAGES.items()
-}
+# The start and body position of the two messages of a step; the CRC-32 goes on from the start's.
+_STATE_START: Final = MAGIC + bytes((VERSION, STATE))
+_COMMAND_START: Final = MAGIC + bytes((VERSION, COMMAND))
+_STATE_CRC: Final = zlib.crc32(_STATE_START)
+_COMMAND_CRC: Final = zlib.crc32(_COMMAND_START)
+_START: Final = bytes(8)  # in the place of a start, for a look at arrays by their offset
+_BODY_AT: Final = HEADER_SIZE - len(_START)
 
 _DUE: Final = {
-    kind: (_STARTS[kind], zlib.crc32(_STARTS[kind]), _MESSAGES[kind][2])
-    for kind in (STATE, COMMAND)
+    STATE: (_STATE_START, _STATE_CRC, _decode_state),
+    COMMAND: (_COMMAND_START, _COMMAND_CRC, _decode_command),
 }

@@ -38,6 +38,12 @@ from .transitions import SIMULATOR, SimulatorState, Way
 
 Address = tuple[str, int]  # IPv4 host and port
 
+
+def address_text(address: Address) -> str:
+    """An address as it is written: host:port."""
+    return f"{address[0]}:{address[1]}"
+
+
 Tap = Callable[[int, Message, bytes], None]
 """Sees every message once, when it is first sent or taken: the number of its slot (0 at the
 simulator), the message, and its bytes in the binary codec, whole and not sealed."""
@@ -55,6 +61,7 @@ _LATEST: Final = 10.0
 """Longest such wait, s; a quarter of the timeout, if that is less. A Command that was lost is asked
 for again before an agent takes the simulator for lost (30 s)."""
 _TOO_EARLY: Final = 1.5  # by so much round trips are taken for longer when answers come twice
+_SOON: Final = 0.25  # an agent that has waited for a State for less needs no Alive, s
 _AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING, Way.RECEIVED, Command]
 
 
@@ -108,6 +115,8 @@ class RoundTrips:
         self._sent_at = 0.0
         self._is_repeat = self._was_repeated = self._came_twice = self._says_alive = False
         self._in_a_row = 0  # messages in a row that were repeated, and then answered twice
+        self.interval = _FIRST_RESEND
+        """Wait for an answer before the first resend, s."""
 
     def sent(self, now: float, *, first: bool = False) -> None:
         """Something was sent that wants an answer, for the first time or again."""
@@ -125,14 +134,19 @@ class RoundTrips:
         """
         seconds = now - self._sent_at
         self._says_alive |= alive
-        if self._smoothed is None:
+        smoothed = self._smoothed
+        if smoothed is None:
             self._smoothed, self._variation = seconds, seconds / 2
-        elif self._says_alive and not alive and seconds > self._smoothed:
-            return
-        elif not (self._is_repeat and seconds < self._smoothed / 2):
-            seconds = min(seconds, 2 * self.wait(0))
-            self._variation += (abs(self._smoothed - seconds) - self._variation) / 4
-            self._smoothed += (seconds - self._smoothed) / 8
+        else:
+            waited = self._says_alive and not alive and seconds > smoothed
+            too_soon = self._is_repeat and seconds < smoothed / 2
+            if waited or too_soon:
+                return
+            seconds = min(seconds, 2 * self.interval)
+            self._variation += (abs(smoothed - seconds) - self._variation) / 4
+            self._smoothed = smoothed + (seconds - smoothed) / 8
+        margin = max(_GRANULARITY, 4 * self._variation)
+        self.interval = min(self._smoothed + margin, _LONGEST_RESEND)
 
     def answered_again(self) -> None:
         """The answer to the last message came a second time.
@@ -146,16 +160,14 @@ class RoundTrips:
         self._in_a_row += 1
         if self._in_a_row > 1:
             self._smoothed = min(_TOO_EARLY * self._smoothed, _LONGEST_RESEND)
+            margin = max(_GRANULARITY, 4 * self._variation)
+            self.interval = min(self._smoothed + margin, _LONGEST_RESEND)
 
     def wait(self, tries: int) -> float:
         """Wait for an answer before the next resend, s, after so many tries without any."""
-        if self._smoothed is None:
-            wait = _FIRST_RESEND
-        else:
-            wait = self._smoothed + max(_GRANULARITY, 4 * self._variation)
-        if tries > _PATIENCE:
-            wait *= 2.0 ** min(tries - _PATIENCE, 16)
-        return min(wait, _LONGEST_RESEND)
+        if tries <= _PATIENCE:
+            return self.interval
+        return min(self.interval * 2.0 ** min(tries - _PATIENCE, 16), _LONGEST_RESEND)
 
 
 class Client:
@@ -175,6 +187,9 @@ class Client:
     Attributes:
         sequence: Number of the State sent last: they count from 1.
         sends: How often the outstanding message was sent.
+        asked_at: When it was sent first.
+        resend_at: When it is sent again; infinite if nothing is outstanding, as `deadline`.
+        deadline: When the agent is given up.
         tap: None at first.
     """
 
@@ -200,9 +215,10 @@ class Client:
         self.sends = self._tries = 0
         self._stretch = 1.0  # of the next wait, by the Alives for this State
         self.statistics = Statistics()
-        self._config = config
+        self.config = config
         self._largest = largest
-        self._text = by_text
+        self.by_text = by_text
+        self.is_keyed = key is not None
         self._is_plain = not by_text and key is None
         self._key = key
         self._session_key: Key | None = None
@@ -218,7 +234,8 @@ class Client:
         self._asking = b""  # the datagram that was sent last and wants an answer
         self._outgoing: list[bytes] = []
         self._round_trips = RoundTrips()
-        self._sent_at = self._resend_at = self._deadline = 0.0
+        self.asked_at = self._answered_at = 0.0
+        self.resend_at = self.deadline = inf
 
     def connect(self, now: float) -> None:
         """Say Hello, until a Welcome or a Refuse comes. With the text codec there is none."""
@@ -255,9 +272,13 @@ class Client:
         self._send(state, now)
         return state
 
-    def alive(self) -> list[bytes]:
-        """Datagrams of an Alive, maybe none. May be called from another thread than the others."""
-        if self._text or self.state is not SimulatorState.READY or not self.sequence:
+    def alive(self, now: float) -> list[bytes]:
+        """Datagrams of an Alive, if the agent has waited for a State for a while; else none.
+
+        May be called from another thread than the others.
+        """
+        waits = self.state is SimulatorState.READY and now > self._answered_at + _SOON
+        if self.by_text or not waits or not self.sequence:
             return []
         alive = binary.encode(m.Alive(session=self.hello.session, sequence=self.sequence))
         return [self._session_key.seal(alive) if self._session_key else alive]
@@ -286,7 +307,7 @@ class Client:
         """Whatever comes: `receive` knows only the Command that is waited for."""
         try:
             plain = datagram if self._key is None else self._open(datagram)
-            if self._text:
+            if self.by_text:
                 message: Message = text.decode_command(plain, self.layout, self.hello.session)
             else:
                 if is_fragment(plain):
@@ -315,21 +336,20 @@ class Client:
             return None
         return self._take(message, state, plain, now)
 
-    def next_timer(self) -> float | None:
-        """When `handle_timer` wants to be called; None if never."""
-        return min(self._resend_at, self._deadline) if self._transfer else None
+    def next_timer(self) -> float:
+        """When `handle_timer` wants to be called; infinite if never."""
+        return min(self.resend_at, self.deadline)
 
     def handle_timer(self, now: float) -> bool:
         """Resend what is due. False once the agent has been silent for the whole timeout."""
-        timer = self.next_timer()
-        if timer is None or now < timer:
+        if now < self.next_timer():
             return True
-        if now >= self._deadline:
+        if now >= self.deadline:
             if self.state is SimulatorState.CLOSING:
                 self._end()
                 return True
-            self._transfer = None
-            self.close(f"no answer from the agent for {self._config.timeout:g} s", now)
+            self._forget_transfer()
+            self.close(f"no answer from the agent for {self.config.timeout:g} s", now)
             return False
         self.statistics.counters["resent"] += 1
         self.sends += 1
@@ -341,12 +361,12 @@ class Client:
         else:
             self._put(self._transfer.probe(), self._transfer_key)
         closing = self.state is SimulatorState.CLOSING
-        self._resend_at = now + (CLOSE_INTERVAL if closing else self._round_trips.wait(self._tries))
+        self.resend_at = now + (CLOSE_INTERVAL if closing else self._round_trips.wait(self._tries))
         return True
 
     def pardon(self, seconds: float) -> None:
         """Move the deadline: this process was stopped for so long, and the agent could not know."""
-        self._deadline += seconds
+        self.deadline += seconds
 
     def take_outgoing(self) -> list[bytes]:
         """Datagrams to send to the agent, each once."""
@@ -361,13 +381,16 @@ class Client:
         """A message that may come now."""
         if isinstance(message, Command):
             self.state, self._transfer = state, None
-            self._record(message, plain)
-            self.statistics.round_trips.add(now - self._sent_at)
+            self.resend_at = self.deadline = inf
+            self._answered_at = now
+            if self.tap:
+                self._record(message, plain)
+            self.statistics.round_trips.add(now - self.asked_at)
             self._round_trips.answered(now)
             return message
         was_closing = self.state is SimulatorState.CLOSING
         if isinstance(message, m.Missing | m.Wait | m.Alive):
-            self._deadline = now + self._config.timeout  # the agent is there: this is no silence
+            self.deadline = now + self.config.timeout  # the agent is there: this is no silence
             if isinstance(message, m.Missing):
                 self._resend_missing(message, now)
             elif isinstance(message, m.Alive):  # others are late
@@ -375,7 +398,7 @@ class Client:
                 self._progress(now)
                 self._stretch *= _LATER
                 wait = self._round_trips.wait(1) * self._stretch
-                self._resend_at = now + min(wait, _LATEST, self._config.timeout / 4)
+                self.resend_at = now + min(wait, _LATEST, self.config.timeout / 4)
             elif not self._is_queued:
                 self._is_queued = True
                 self.statistics.notice("every slot of the agent is taken; waiting for a free one")
@@ -388,7 +411,7 @@ class Client:
         if isinstance(message, m.Unknown):
             self._begin_again(now)
             return None
-        self._transfer = None
+        self._forget_transfer()
         if isinstance(message, m.Welcome):
             self.statistics.counters["sessions"] += 1
             self._nonce = message.nonce
@@ -439,7 +462,7 @@ class Client:
     def _progress(self, now: float) -> None:
         """The agent is there and works on the outstanding message."""
         self._tries = 1
-        self._resend_at = now + self._round_trips.wait(1)
+        self.resend_at = now + self._round_trips.wait(1)
 
     def _resend_missing(self, missing: m.Missing, now: float) -> None:
         """Send again what the agent lacks of the outstanding message."""
@@ -473,10 +496,14 @@ class Client:
 
     def _send(self, message: m.Hello | State | m.Close, now: float) -> None:
         """Send a message and repeat it until it is answered."""
-        data = self._encode(message)
-        self._record(message, data)
-        self._transfer = transfer = Transfer(data, self._largest, self._window)
         kind = type(message)
+        if kind is State and not self.by_text:
+            data = binary.encode_state(message, self.layout)
+        else:
+            data = self._encode(message)
+        if self.tap:
+            self._record(message, data)
+        self._transfer = transfer = Transfer(data, self._largest, self._window)
         self._transfer_key = self._key if kind is m.Hello else self._session_key
         self.state = SIMULATOR[self.state, Way.SENT, kind]
         self.sequence = 0 if isinstance(message, m.Hello) else message.sequence
@@ -485,9 +512,9 @@ class Client:
         self._round_trips.sent(now, first=True)
         self._put(transfer.start(), self._transfer_key)
         closing = kind is m.Close
-        self._sent_at = now
-        self._resend_at = now + (CLOSE_INTERVAL if closing else self._round_trips.wait(1))
-        self._deadline = now + (CLOSE_LINGER if closing else self._config.timeout)
+        self.asked_at = now
+        self.resend_at = now + (CLOSE_INTERVAL if closing else self._round_trips.wait(1))
+        self.deadline = now + (CLOSE_LINGER if closing else self.config.timeout)
         self.statistics.counters["sent"] += 1
 
     def _put(self, datagrams: list[bytes], key: Key | None) -> None:
@@ -500,21 +527,26 @@ class Client:
 
     def _is_lost(self) -> bool:
         """Whether the next datagram is lost on purpose."""
-        lost = self._dice is not None and self._dice() < self._config.drop
+        lost = self._dice is not None and self._dice() < self.config.drop
         self.statistics.counters["dropped"] += lost
         return lost
 
     def _encode(self, message: m.Hello | State | m.Close) -> bytes:
-        if self._text and isinstance(message, State | m.Close):
+        if self.by_text and isinstance(message, State | m.Close):
             return text.encode(message)
         return binary.encode(message, self.layout)
 
     def _record(self, message: Message, data: bytes) -> None:
         if self.tap:
-            self.tap(0, message, binary.encode(message, self.layout) if self._text else data)
+            self.tap(0, message, binary.encode(message, self.layout) if self.by_text else data)
 
     def _end(self) -> None:
-        self.state, self._transfer = SimulatorState.CLOSED, None
+        self.state = SimulatorState.CLOSED
+        self._forget_transfer()
+
+    def _forget_transfer(self) -> None:
+        self._transfer = None
+        self.resend_at = self.deadline = inf
 
     def _drop(self, cause: str, reason: str, now: float) -> None:
         self.statistics.drop(cause, f"from the agent: {reason}", now)

@@ -54,10 +54,12 @@ class Statistics:
         self.round_trips = Durations()
         """From the first sending of a message to the answer that counts."""
         self.last_error = ""  # why the last unexpected datagram was dropped; "" if none was
-        self._notices: list[str] = []
+        self.notices: list[str] = []
+        """Sentences for the log, until `take_notices`."""
         self._next_notice: dict[str, float] = {}
         self._unsaid: Counter[str] = Counter()
-        self._next_report: float | None = None
+        self.report_at = 0.0
+        """When the next report of all numbers is due; 0 before the first call."""
 
     def drop(self, cause: str, reason: str, now: float) -> None:
         """Count a datagram that changes nothing; say so if it is time to."""
@@ -67,26 +69,26 @@ class Statistics:
         self.last_error = one_line(f"{cause} {reason}")
         if now >= self._next_notice.get(cause, now):
             more = f" ({self._unsaid.pop(cause)} more before)" if self._unsaid[cause] else ""
-            self._notices.append(f"dropped a datagram: {self.last_error}{more}")
+            self.notices.append(f"dropped a datagram: {self.last_error}{more}")
             self._next_notice[cause] = now + NOTICE_INTERVAL
         else:
             self._unsaid[cause] += 1
 
     def notice(self, sentence: str) -> None:
         """Keep a notice for the log."""
-        self._notices.append(one_line(sentence))
+        self.notices.append(one_line(sentence))
 
     def take_notices(self) -> list[str]:
         """Sentences for the log, each once."""
-        notices, self._notices = self._notices, []
+        notices, self.notices = self.notices, []
         return notices
 
     def report_due(self, now: float) -> bool:
         """Whether a minute has passed since the last report, or since the first call."""
-        is_due = self._next_report is not None and now >= self._next_report
-        if is_due or self._next_report is None:
-            self._next_report = now + REPORT_INTERVAL
-        return is_due
+        is_first, is_due = not self.report_at, now >= self.report_at
+        if is_first or is_due:
+            self.report_at = now + REPORT_INTERVAL
+        return is_due and not is_first
 
     def numbers(self) -> dict[str, float]:
         """All of it as numbers by name, round trips in milliseconds: for logs of training."""

@@ -21,14 +21,14 @@ from ...models.errors import InputError, expect
 from ..layouts import layout_of
 from ..protocol import text
 from ..protocol.auth import Key, read_keys
-from ..protocol.client import Address
+from ..protocol.client import Address, address_text
 from ..protocol.errors import PeerClosed, PeerSilent
 from ..protocol.fragments import check_largest
 from ..protocol.layout import Layout
 from ..protocol.messages import POLICIES, WHEN_LOST, Close, Extension, Hello, State
 from ..protocol.server import Event, Server
 from ..protocol.transitions import AgentState
-from .sockets import LONGEST_WAIT, PAUSE, Port, address_text, log_notices
+from .sockets import LONGEST_WAIT, PAUSE, Port, log_notices
 
 _log: Final = logging.getLogger("rotorgram.udp")
 

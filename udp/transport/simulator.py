@@ -1,38 +1,31 @@
-"""The simulator: a UDP client that steps envs by the commands of an agent."""
+"""Simulators: UDP clients that step envs by the Commands of one agent, or of several."""
 
-import signal
-import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from math import inf
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, cast
 
 import gymnasium as gym
 import numpy as np
 
-from ...models.errors import NotCopied, expect
+from ...envs.spec import EnvSpec
+from ...models.errors import InputError
 from ..layouts import layout_of
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
-from ..protocol.errors import LinkError, PeerSilent, Refused
-from ..protocol.messages import Close, Command, Hello, Message, Refuse, State, Welcome
-from ..protocol.transitions import SimulatorState
-from .sockets import LONGEST_WAIT, PAUSE, address_text, log_notices, open_socket, resolve
-from .stepped import Stepped, make_stepped, reset_all
+from ..protocol.messages import POLICIES, Hello
+from ..protocol.party import Absence, AgentLink, OneAgent, SeveralAgents, SwarmWorld
+from .driver import Driver
+from .sockets import Port, resolve
+from .stepped import make_stepped
 
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
 
-ALIVE_EVERY: Final = 0.5  # period of the message Alive while a long step is computed, s
-COMPLAIN_AFTER: Final = 1.0  # A wait for the agent that is told, once, s
 
-Observer = Callable[[Message | None, State], None]
-"""Called with the message that moved the drones, a Command or the Welcome that resets them all, and
-the State after it: valid during the call only. None, by text: the reset before the first State."""
-
-
-class Simulator(NotCopied):
+class Simulator(Driver):
     """Simulated drones that an agent flies over UDP.
 
     Args:
@@ -50,10 +43,8 @@ class Simulator(NotCopied):
         options: Options of the env, by name.
 
     Attributes:
-        address: Address of this side.
-        spec: Spec of the env.
-        stepped: The loop or the envs.
-        observer: Called for every State once it is sent, while the agent thinks; None at first.
+        link: The exchange with the agent, with its statistics.
+        Others: As `Driver`.
 
     Raises:
         InputError: An option, an address, the key file or the env's spaces are not what they
@@ -78,295 +69,195 @@ class Simulator(NotCopied):
         record: Path | str | None = None,
         **options: Any,
     ) -> None:
-        expect(codec in ("binary", "text"), "codec", "'binary' or 'text'", f"{codec!r}")
-        self._text = codec == "text"
+        if codec not in ("binary", "text"):
+            raise InputError(f"codec: expected 'binary' or 'text', got {codec!r}")
         key = Key(read_keys(key_file)[0], "simulator") if key_file else None
-        anywhere = insecure or key is not None
-        self.server = resolve(server, insecure=anywhere)
-        expect(self.server[1], "server", "the port of the agent, 1 to 65535", "0")
-        self.config = config or LinkConfig()
-        self.observer: Observer | None = None
-        self._keyed = key is not None
-        self._trouble = ""
-        self._stopped = False
-        self._began_at: float | None = None  # when the step began that is being computed
+        insecure = insecure or key is not None
+        server = resolve(server, insecure=insecure)
+        if not server[1]:
+            raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
+        count = drones if num_envs is None else num_envs
         with ExitStack() as failing:  # closes what is open if a later step fails
-            self.stepped: Stepped = make_stepped(
-                env, drones if num_envs is None else num_envs, drones=drones, vehicle=vehicle,
-                backend=backend, options=options,
-            )  # fmt: skip
-            failing.callback(self.stepped.close)
-            self.spec = self.stepped.spec
-            worlds = self.stepped.num_envs // drones
-            hello = Hello(session=new_session(), spec=self.spec.to_json(), worlds=worlds)
-            self.link = Client(
-                hello,
-                layout_of(self.spec, worlds),
-                self.config,
-                largest=largest_datagram(self.server, self.config.max_datagram),
-                by_text=self._text,
-                key=key,
+            stepped = make_stepped(
+                env, count, drones=drones, vehicle=vehicle, backend=backend, options=options
             )
-            self._socket = open_socket(bind, insecure=anywhere, peer=self.server)
-            failing.callback(self._socket.close)
-            self.address: Address = self._socket.getsockname()
-            another = self.server != self.address
-            expect(another, "server", "the address of the agent", "that of this side")
-            self._journal: Any = None
+            failing.callback(stepped.close)
+            worlds = stepped.num_envs // drones
+            layout = layout_of(stepped.spec, worlds)
+            hello = Hello(session=new_session(), spec=stepped.spec.to_json(), worlds=worlds)
+            config = config or LinkConfig()
+            largest = largest_datagram(server, config.max_datagram)
+            by_text = codec == "text"
+            client = Client(hello, layout, config, largest=largest, by_text=by_text, key=key)
+            link = AgentLink(0, server, client, np.arange(layout.drones))
+            port = Port(bind, insecure=insecure, only=server)
+            failing.callback(port.close)
+            if port.address == server:
+                raise InputError("server: expected the address of the agent, got that of this side")
+            rules = OneAgent(stepped, layout, stepped.spec.control_period, [link])
+            super().__init__(stepped, rules, port)
             if record:
-                from ..journal import Journal
-                from ..journal.writer import models_of
-
-                about, models = models_of(self.stepped)
-                if about:
-                    about["backend"] = backend
-                journal = Journal(
-                    record,
-                    self.link.statistics,
-                    side="simulator",
-                    text_hello=hello,
-                    about=about,
-                    models=models,
-                )
-                self._journal, self.link.tap = journal, journal.tap
+                self._record(record, hello, backend)
             failing.pop_all()
 
-    def run(self) -> str:
-        """Fly until the agent closes; the reason that it gave. A simulator runs once.
+    def _record(self, path: Path | str, hello: Hello, backend: str) -> None:
+        from ..journal import Journal
+        from ..journal.writer import models_of
 
-        The agent is told at once when the run ends, also by an error of the env. In the main
-        thread Ctrl-C ends it after the step that is being computed; a second one at once.
-
-        Raises:
-            PeerSilent: Nothing came from the agent within `config.timeout`.
-            Refused: The agent turned this simulator away, with a reason.
-            LinkError: The agent went on after an episode's end without a reset.
-            KeyboardInterrupt: Ctrl-C.
-        """
-        if self.link.state is SimulatorState.CLOSED or self.link.sends:
-            raise ValueError("run: expected one call for each Simulator, got another")
-        return run_to_the_end(self._fly, self._end, self._say_alive, self.stop)
-
-    def stop(self) -> None:
-        """Make `run` tell the agent and return, after the step that is being computed.
-
-        May be called from another thread and in a signal handler, any number of times.
-        """
-        self._stopped = True
-
-    def close(self) -> None:
-        """Close the socket, the envs and the record. Not while it runs: see `stop`."""
-        self._socket.close()
-        self.stepped.close()
-        if self._journal:
-            self._journal.close()
-
-    def __enter__(self) -> "Simulator":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    # ---- the exchange
-
-    def _fly(self) -> str:
-        """Until the agent closes: its reason. Empty if this side was stopped."""
-        link = self.link
-        link.connect(time.monotonic())
-        self._flush()
-        if self._text:  # the agent says nothing before the first State
-            reset_all(self.stepped, link.layout, link.hello.session)
-            self._send_state(None)
-        while not self._stopped:
-            message = self._wait()
-            if message is None or self._stopped:
-                break
-            if isinstance(message, Close):
-                if self._text and not link.statistics.round_trips.count:
-                    raise Refused(
-                        f"the agent at {address_text(self.server)} closed before its first "
-                        "command: it has no free slot, has a key, or flies no text"
-                    )
-                return message.reason or "the agent closed"
-            self._began_at = time.monotonic()
-            if isinstance(message, Welcome):
-                seed = message.session if message.seed is None else message.seed
-                reset_all(self.stepped, link.layout, seed)
-            elif isinstance(message, Command):
-                self._step(message)
-            self._began_at = None
-            self._send_state(message)
-        return ""
-
-    def _step(self, command: Command) -> None:
-        orders = command.orders
-        try:
-            if np.count_nonzero(orders):  # of few drones faster than `any`
-                self.stepped.advance(command.actions, command.resets, command.seeds, command.frozen)
-            else:
-                self.stepped.advance(command.actions, None, None, None)
-        except gym.error.ResetNeeded as error:
-            raise LinkError(
-                f"an action came after the end of an episode: expected a reset ({error})"
-            ) from None
-
-    def _send_state(self, cause: Message | None) -> None:
-        stepped, link = self.stepped, self.link
-        state = link.send_state(
-            link.sequence * self.spec.control_period,
-            tuple(stepped.observations.values()),
-            stepped.rewards,
-            stepped.terminated,
-            stepped.truncated,
-            tuple(stepped.telemetry.values()),
-            time.monotonic(),
+        about, models = models_of(self.stepped)
+        if about:
+            about["backend"] = backend
+        self._journal = Journal(
+            path,
+            self.link.statistics,
+            side="simulator",
+            text_hello=hello,
+            about=about,
+            models=models,
         )
-        self._flush()
-        if self.observer is not None:
-            self.observer(cause, state)
-
-    def _wait(self) -> Message | None:
-        """Wait for the message that moves the exchange on. None if this side was stopped."""
-        link = self.link
-        if self._journal:
-            self._journal.write()
-        complain_at: float | None = time.monotonic() + COMPLAIN_AFTER
-        while not self._stopped:
-            timer = link.next_timer()
-            assert timer is not None
-            before = time.monotonic()
-            left = timer - before
-            if left <= 0:
-                sends = link.sends  # of what was not answered, not of the Close that follows
-                if not link.handle_timer(before):
-                    raise PeerSilent(self._silence(sends, self.config.timeout))
-                if complain_at and before > complain_at and (self._trouble or not link.sequence):
-                    told = self._silence(link.sends, COMPLAIN_AFTER)
-                    link.statistics.notice(f"{told}; asking for {self.config.timeout:g} s in all")
-                    complain_at = None
-                self._flush()
-                continue
-            message = self._receive(left)
-            if isinstance(message, Command):
-                return message  # nothing is due before its State
-            self._flush()
-            if isinstance(message, Refuse):
-                raise Refused(f"the agent at {address_text(self.server)} refused: {message.reason}")
-            if message is not None:
-                return message
-            pause = time.monotonic() - before - min(left, LONGEST_WAIT)
-            if pause > PAUSE:
-                link.pardon(pause)
-        return None
-
-    def _receive(self, timeout: float) -> Message | None:
-        try:
-            datagram, _ = self._socket.receive(timeout)
-        except TimeoutError:
-            return None
-        except OSError as error:  # nothing listens there yet: the timer says when to ask again
-            if self._socket.fileno() < 0:
-                raise
-            self._note_trouble("receiving", error)
-            return None
-        self._trouble = ""
-        return self.link.receive(datagram, time.monotonic())
-
-    def _end(self, reason: str) -> None:
-        """Tell the agent, until it has answered or will not."""
-        self.link.close(reason, time.monotonic())
-        self._flush()
-        while self._socket.fileno() >= 0 and (timer := self.link.next_timer()) is not None:
-            left = timer - time.monotonic()
-            if left > 0:
-                self._receive(left)
-            else:
-                self.link.handle_timer(time.monotonic())
-            self._flush()
-        if self._journal:
-            self._journal.close()
-
-    def _flush(self) -> None:
-        """Send what is due, before any wait."""
-        for datagram in self.link.take_outgoing():
-            self._send(datagram)
-        log_notices(self.link.statistics, time.monotonic())
-
-    def _send(self, datagram: bytes) -> None:
-        try:
-            self._socket.send(datagram)
-        except OSError as error:  # a full buffer or a network that is down: as good as lost
-            self.link.statistics.counters["unsent"] += 1
-            self._note_trouble("sending", error)
-
-    def _note_trouble(self, what: str, error: OSError) -> None:
-        refused = isinstance(error, ConnectionError)
-        self._trouble = (
-            "nothing listens on that port" if refused else f"{what} failed: {error.strerror}"
-        )
-
-    def _say_alive(self, finished: threading.Event) -> None:
-        """In a thread: tell the agent of a long step that it is being computed."""
-        while not finished.wait(ALIVE_EVERY):
-            began_at = self._began_at
-            if began_at is not None and time.monotonic() - began_at > ALIVE_EVERY / 2:
-                for datagram in self.link.alive():
-                    self._send(datagram)
-
-    def _silence(self, sends: int, seconds: float) -> str:
-        what = "Hello" if self.link.sequence == 0 else f"State {self.link.sequence}"
-        locked = self._keyed and what == "Hello"
-        key = "; an agent with another key does not answer" if locked else ""
-        why = f"; {self._trouble}" if self._trouble else ""
-        last = self.link.statistics.last_error
-        dropped = f"; last datagram dropped: {last}" if last else ""
-        return (
-            f"no answer from the agent at {address_text(self.server)} "
-            f"for {seconds:g} s, {what} sent {sends} times{why}{key}{dropped}"
-        )
+        self.link.tap = self._journal.tap
 
 
-def run_to_the_end(
-    fly: Callable[[], str],
-    end: Callable[[str], None],
-    say_alive: Callable[[threading.Event], None],
-    stop: Callable[[], None],
-) -> str:
-    """The reason for which `fly` ended, `say_alive` beside it in a thread: `end` gets it, or what
-    went wrong. Ctrl-C calls `stop`, and is raised at the end.
+class SharedSimulator(Driver):
+    """One world of several drones, each flown by one of several agents over UDP.
+
+    Every agent is an ordinary one (`RemoteEnv`, `RemoteParallelEnv`, …): its Hello names its own
+    drones, its States have their rows. The world steps when all agents that fly have answered, so
+    its numbers are those of the world in process with the same actions, bit for bit. The rules are
+    those of `SeveralAgents`.
+
+    Args:
+        env: Id of a registered task for several drones.
+        agents: Their addresses (host, port), which share the drones evenly in their order; or, by
+            address, the names of the drones of each.
+        drones: Of the world: `drone_0` and so on.
+        when_lost: Policy of agents that state none: `hold` (the action that changes nothing),
+            `land` (`Loop.land`) or `end` (rotors stand still).
+        patience: Longest wait for a Command, s.
+        bind: Address of this side; port 0 takes a free one.
+        config: Times of the exchange. `timeout`: longest wait for an agent that is to come, or to
+            come back, s.
+        Others: As `Simulator`.
+
+    Attributes:
+        absences, episodes, steps, seed: As `SeveralAgents`.
+        Others: As `Driver`.
+
+    Raises:
+        InputError: An argument is not what it should be.
+        OSError: The port is in use.
     """
-    reason, finished = "the simulator was stopped", threading.Event()
-    heart = threading.Thread(target=say_alive, args=(finished,), daemon=True)
-    with _deferred_interrupt(stop) as interrupted:
-        heart.start()
-        try:
-            return fly() or reason
-        except Exception as error:
-            reason = f"{type(error).__name__}: {error}"
-            raise
-        finally:
-            finished.set()
-            end(reason)
-            if interrupted:
-                raise KeyboardInterrupt
+
+    def __init__(
+        self,
+        env: str,
+        agents: Sequence[Address] | Mapping[Address, Sequence[str]],
+        *,
+        drones: int,
+        when_lost: str = "hold",
+        patience: float = 10.0,
+        bind: Address = DEFAULT_SIMULATOR,
+        vehicle: Path | str | None = None,
+        backend: str = "mujoco",
+        config: LinkConfig | None = None,
+        key_file: Path | str | None = None,
+        insecure: bool = False,
+        **options: Any,
+    ) -> None:
+        if not (isinstance(patience, int | float) and 0 < patience < inf):
+            raise InputError(f"patience: expected seconds > 0, got {patience!r}")
+        if when_lost not in POLICIES:
+            raise InputError(f"when_lost: expected one of {', '.join(POLICIES)}, got {when_lost!r}")
+        key = Key(read_keys(key_file)[0], "simulator") if key_file else None
+        insecure = insecure or key is not None
+        config = config or LinkConfig()
+        with ExitStack() as failing:
+            stepped = make_stepped(
+                env, drones, drones=drones, vehicle=vehicle, backend=backend, options=options
+            )
+            failing.callback(stepped.close)
+            if not hasattr(stepped, "retire"):
+                raise InputError(f"env: expected a registered task for several drones, got {env!r}")
+            spec = stepped.spec
+            links: list[AgentLink] = []
+            for address, names in _shares(agents, spec.agents):
+                there = resolve(address, insecure=insecure)
+                if not there[1]:
+                    raise InputError("agents: expected the port of each agent, 1 to 65535, got 0")
+                links.append(_shared_link(len(links), there, spec, names, config, key))
+            addresses = [link.address for link in links]
+            if len(set(addresses)) < len(addresses):
+                raise InputError(f"agents: expected a different address of each, got {addresses}")
+            port = Port(bind, insecure=insecure)
+            failing.callback(port.close)
+            port.keep(addresses)
+            if port.address in addresses:
+                raise InputError(
+                    f"agents: expected addresses of agents, got that of this side, {port.address}"
+                )
+            self._shared = SeveralAgents(
+                cast(SwarmWorld, stepped),
+                layout_of(spec),
+                spec.control_period,
+                links,
+                when_lost=when_lost,
+                patience=patience,
+            )
+            super().__init__(stepped, self._shared, port)
+            failing.pop_all()
+
+    @property
+    def absences(self) -> list[Absence]:
+        """Every `Absence` so far."""
+        return self._shared.absences
+
+    @property
+    def episodes(self) -> int:
+        """Episodes begun so far."""
+        return self._shared.episodes
+
+    @property
+    def steps(self) -> int:
+        """Control steps of the running episode."""
+        return self._shared.steps
+
+    @property
+    def seed(self) -> int | None:
+        """Seed of the running episode; None: the streams of the episode before went on."""
+        return self._shared.seed
 
 
-@contextmanager
-def _deferred_interrupt(stop: Callable[[], None]) -> Iterator[list[bool]]:
-    """Have Ctrl-C call `stop`, and only a second one interrupt. The list says whether it came."""
-    came: list[bool] = []
-    is_main = threading.current_thread() is threading.main_thread()
-    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield came
-        return
+def _shared_link(
+    number: int,
+    address: Address,
+    spec: EnvSpec,
+    names: tuple[str, ...],
+    config: LinkConfig,
+    key: Key | None,
+) -> AgentLink:
+    """The link to the agent of these drones of a world."""
+    own = replace(spec, agents=names)
+    hello = Hello(session=new_session(), spec=own.to_json())
+    config = replace(config, drop_seed=config.drop_seed + number)
+    largest = largest_datagram(address, config.max_datagram)
+    client = Client(hello, layout_of(own), config, largest=largest, key=key)
+    rows = np.array([spec.agents.index(name) for name in names])
+    return AgentLink(number, address, client, rows)
 
-    def note(*_: object) -> None:
-        came.append(True)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        stop()
 
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield came
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+def _shares(
+    agents: Sequence[Address] | Mapping[Address, Sequence[str]], names: tuple[str, ...]
+) -> list[tuple[Address, tuple[str, ...]]]:
+    """Drones of each agent. Raises `InputError` unless every drone has one."""
+    if isinstance(agents, Mapping):
+        shares = [(address, tuple(own)) for address, own in agents.items()]
+        given = sorted(name for _, own in shares for name in own)
+        if not all(own for _, own in shares) or given != sorted(names):
+            got = ", ".join(given) or "none"
+            raise InputError(f"agents: expected each of {', '.join(names)} once, got {got}")
+        return shares
+    count, drones = len(agents), len(names)
+    if not count or drones % count:
+        raise InputError(f"agents: expected a divisor of {drones} drones, got {count} agents")
+    size = drones // count
+    return [(address, names[i * size : (i + 1) * size]) for i, address in enumerate(agents)]

@@ -22,7 +22,7 @@ from contextlib import suppress
 from typing import Any, Final
 
 from ...models.errors import InputError
-from ..protocol.client import Address
+from ..protocol.client import Address, address_text
 from ..protocol.statistics import Statistics
 
 LONGEST_WAIT: Final = 0.1
@@ -47,11 +47,6 @@ _SENTENCES: Final = {
     errno.EACCES: "ports below 1024 need more rights: choose a higher one",
     errno.EINVAL: "a loopback address reaches this machine only: bind another one",
 }
-
-
-def address_text(address: Address) -> str:
-    """An address as it is written: host:port."""
-    return f"{address[0]}:{address[1]}"
 
 
 def resolve(address: Address, *, insecure: bool, way_out: str = _WAY_OUT) -> Address:
@@ -169,15 +164,17 @@ class Port:
     """The agent's port: a socket for all senders and, if the system can, one for each simulator.
 
     Those are connected, so that the system sorts the datagrams, each socket has a buffer of its
-    own, and no other sender can fill the one of a simulator. `address` is listened on.
+    own, and no other sender can fill the one of a simulator. `address` is listened on. With `only`
+    there is one socket for this only peer, resolved.
 
     Raises:
         InputError, OSError: As `open_socket`.
     """
 
-    def __init__(self, address: Address, *, insecure: bool) -> None:
-        self._everybody = open_socket(address, insecure=insecure)
+    def __init__(self, address: Address, *, insecure: bool, only: Address | None = None) -> None:
+        self._everybody = open_socket(address, insecure=insecure, peer=only)
         self.address: Address = self._everybody.getsockname()
+        self._only = only
         self._own: dict[Address, Socket] = {}
         self._simulators = selectors.DefaultSelector()
         self._all = selectors.DefaultSelector()
@@ -208,6 +205,8 @@ class Port:
         Raises:
             TimeoutError, OSError: As `Socket.receive`; a wait may end early.
         """
+        if self._only:
+            return self._everybody.receive(timeout)
         if strangers or self._missing or not self._own:
             return _receive_any(self._all, timeout)
         now = time.monotonic()
@@ -222,6 +221,9 @@ class Port:
 
     def send(self, datagram: bytes, address: Address) -> None:
         """Send a datagram. Raises `OSError`."""
+        if self._only:
+            self._everybody.send(datagram)
+            return
         if sock := self._own.get(address):
             with suppress(ConnectionError):  # an earlier datagram found nobody: this was not sent
                 sock.send(datagram)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import Any, Protocol, cast
 
 import gymnasium as gym
 import numpy as np
@@ -12,15 +12,17 @@ from ...envs import registry
 from ...envs.spaces import action_space, observation_space
 from ...envs.spec import ArraySpec, Discrete, EnvSpec, canonical_id, component_names
 from ...models.errors import InputError, expect
-from ..protocol.layout import MAX_DRONES, Layout
-from ..protocol.messages import MAX_UINT64
+from ..protocol.layout import MAX_DRONES
+from ..protocol.party import World
 
-if TYPE_CHECKING:
-    from ...envs.loop import Loop
 
-Stepped: TypeAlias = "Loop | _Singles"
-"""N drones that take a step of the wire together, with the results of `rotorgram.envs.Loop`."""
-_Some = np.ndarray | None
+class Steppable(World, Protocol):
+    """What a simulator steps: the loop of a registered task, or Gymnasium envs."""
+
+    spec: EnvSpec
+    num_envs: int
+
+    def close(self) -> None: ...
 
 
 def make_stepped(
@@ -31,7 +33,7 @@ def make_stepped(
     vehicle: Path | str | None = None,
     backend: str = "mujoco",
     options: Mapping[str, Any],
-) -> Stepped:
+) -> Steppable:
     """N drones of an env. Raises `InputError` if its spaces or an argument are not right.
 
     Args:
@@ -66,17 +68,10 @@ def make_stepped(
         envs = [env]
     ours = vehicle is not None or backend != "mujoco" or drones > 1
     expect(not ours, "vehicle, backend, drones", f"none for {env!r}, which is no task of ours")
-    return _Singles(envs, options)
+    return GymnasiumBatch(envs, options)
 
 
-def reset_all(stepped: Stepped, layout: Layout, seed: int) -> None:
-    """A simulator's own first reset: drone i takes seed + i, modulo 2^64."""
-    actions, count = layout.actions, layout.drones
-    seeds = np.array([(seed + i) & MAX_UINT64 for i in range(count)], np.uint64)
-    stepped.advance(np.zeros(actions.shape, actions.dtype), np.ones(count, bool), seeds, None)
-
-
-class _Singles:
+class GymnasiumBatch:
     """Gymnasium envs, one after the other."""
 
     def __init__(self, envs: Sequence[gym.Env[Any, Any]], options: Mapping[str, Any]) -> None:
@@ -89,7 +84,7 @@ class _Singles:
         self.terminated, self.truncated = np.zeros(n, bool), np.zeros(n, bool)
         self._waiting = np.ones(n, bool)  # for a reset
 
-    def advance(self, actions: np.ndarray, resets: _Some, seeds: _Some, frozen: _Some) -> None:
+    def advance(self, actions: np.ndarray, resets: Any, seeds: Any, frozen: Any) -> None:
         none = np.zeros(self.num_envs, bool)
         resets, frozen = none if resets is None else resets, none if frozen is None else frozen
         waiting = self._waiting & ~resets & ~frozen

@@ -1,0 +1,675 @@
+"""The rules of a simulator: what its world does with the messages of its agents.
+
+Free of sockets and clocks, as `client`: a driver hands in datagrams and the time, and then calls
+`step` and `answer`. `OneAgent` commands every drone; `SeveralAgents` share the drones of one world.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from math import inf
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...models.errors import InputError
+from .client import Address, Client, address_text
+from .errors import LinkError, PeerSilent, Refused
+from .layout import Layout
+from .messages import (
+    FLY,
+    FREEZE,
+    MAX_UINT64,
+    POLICIES,
+    RESET,
+    WHEN_LOST,
+    Close,
+    Command,
+    Message,
+    Refuse,
+    State,
+    Welcome,
+)
+
+Array = NDArray[Any]
+Mask = NDArray[np.bool_]
+
+COMPLAIN_AFTER: Final = 1.0  # silence of an agent before the log says so, once a message, s
+_NO_RESET: Final = "an action came after the end of an episode: expected a reset"
+
+
+class World(Protocol):
+    """N drones that take a step of the wire together: see `rotorgram.envs.Loop`."""
+
+    rewards: NDArray[np.float64]
+    terminated: Mask
+    truncated: Mask
+
+    @property
+    def observations(self) -> Mapping[str, Array]: ...
+    @property
+    def telemetry(self) -> Mapping[str, NDArray[np.float64]]: ...
+    def advance(
+        self,
+        actions: Array,
+        resets: Mask | None,
+        seeds: NDArray[np.uint64] | None,
+        frozen: Mask | None,
+    ) -> None: ...
+
+
+class SwarmWorld(World, Protocol):
+    """One world whose drones can be lost."""
+
+    @property
+    def out(self) -> Mask:
+        """Drones whose episode has ended while others fly on, shape (N,)."""
+
+    def land(self, drones: Mask) -> None: ...
+    def retire(self, drones: Mask) -> None: ...
+
+
+class Participation(Enum):
+    """What an agent does in the running episode."""
+
+    COMING = "coming"
+    """It has not welcomed this simulator yet, or not again after it was started anew."""
+    READY = "ready"
+    """It has, and gets its first State with the next episode."""
+    FLYING = "flying"
+    """The world waits for its Commands."""
+    WAITING = "waiting"
+    """It asked for a reset, and waits for it."""
+    SILENT = "silent"
+    """The world waited for its Command in vain, and still asks for it."""
+    LATE = "late"
+    """It came back, and was told that its episode was truncated."""
+    LEFT = "left"
+    """It closed, or was silent for too long."""
+
+
+class Absence(NamedTuple):
+    """An agent whose drones are flown by its policy until the end of an episode."""
+
+    agent: int
+    """Its number, from 0."""
+    episode: int
+    """Number of the episode, from 1 at the first State."""
+    step: int
+    """Control steps that its drones flew in that episode by its Commands."""
+    participation: Participation
+    """`WAITING`: it asked for a reset while others flew on."""
+
+
+@dataclass(eq=False)
+class AgentLink:
+    """One agent of a simulator."""
+
+    number: int
+    """From 0."""
+    address: Address
+    client: Client
+    """The exchange with it, with its statistics."""
+    rows: Array
+    """Rows of its drones in the world's arrays, shape (n,)."""
+    when_lost: str = "hold"
+    """Its policy, one of `POLICIES`."""
+    participation: Participation = Participation.COMING
+    command: Command | None = None
+    """The Command that the next step or reset takes."""
+    patient_until: float = 0.0
+    seed: int | None = None
+    """Of its Welcome."""
+    trouble: str = ""
+    """Why datagrams do not reach it, as far as the transport knows."""
+    shown: tuple[Any, ...] = ()
+    """Observations and telemetry of its last State."""
+    in_flight: Mask = field(init=False)
+    """Its drones that were flying when it was lost."""
+    complained: float = -inf
+    """When the message was sent whose missing answer is in the log."""
+
+    def __post_init__(self) -> None:
+        self.in_flight = np.zeros(len(self.rows), bool)
+
+    @property
+    def name(self) -> str:
+        """For sentences."""
+        return f"the agent at {address_text(self.address)}"
+
+    @property
+    def order(self) -> int | None:
+        """The order of its Command for all its drones; None if they differ."""
+        assert self.command is not None
+        orders = self.command.orders
+        return int(orders[0]) if (orders == orders[0]).all() else None
+
+    def silence(self, seconds: float, sends: int) -> str:
+        """A sentence about an answer that did not come."""
+        client = self.client
+        message = f"State {client.sequence}" if client.sequence else "Hello"
+        words = f"no answer from {self.name} for {seconds:g} s, {message} sent {sends} times"
+        if self.trouble:
+            words += f"; {self.trouble}"
+        if client.is_keyed and not client.sequence:
+            words += "; an agent with another key does not answer"
+        if last := client.statistics.last_error:
+            words += f"; last datagram dropped: {last}"
+        return words
+
+
+class WorldRules:
+    """Base of the rules: the links, their timers and their ends.
+
+    Attributes:
+        links: The agents.
+        reason: Why the flight has ended; None before.
+        cause: The Command of the last step; None: a reset of all drones.
+        moved: Whether the world has moved since the driver looked.
+    """
+
+    def __init__(
+        self, world: World, layout: Layout, period: float, links: Sequence[AgentLink]
+    ) -> None:
+        self.links = list(links)
+        self.reason: str | None = None
+        self.cause: Command | None = None
+        self.moved = False
+        self._world, self._layout, self._period = world, layout, period
+
+    def start(self, now: float) -> None:
+        """Say Hello to every agent."""
+        for link in self.links:
+            link.client.connect(now)
+
+    def receive(self, link: AgentLink, datagram: bytes, now: float) -> None:
+        """Take a datagram of an agent. Raises `LinkError` where the flight cannot go on."""
+        raise NotImplementedError
+
+    def step(self, now: float) -> bool:
+        """Move the world if it is time to. Whether another call may move it again at once."""
+        raise NotImplementedError
+
+    def answer(self, now: float) -> None:
+        """Send the States after a step."""
+        raise NotImplementedError
+
+    def next_timer(self) -> float:
+        """When `handle_timers` wants to be called; infinite if never."""
+        return min([link.client.next_timer() for link in self.links])
+
+    def handle_timers(self, now: float) -> None:
+        """Resend what is due. Raises `PeerSilent` where the flight cannot go on."""
+        for link in self.links:
+            client = link.client
+            if now < client.next_timer():
+                continue
+            sends = client.sends
+            if not client.handle_timer(now):
+                self._lose_silent(link, link.silence(client.config.timeout, sends))
+            elif now > client.asked_at + COMPLAIN_AFTER and link.complained != client.asked_at:
+                self._complain(link)
+
+    def pardon(self, seconds: float) -> None:
+        """Move all deadlines: this process was stopped, and the agents could not know."""
+        for link in self.links:
+            link.client.pardon(seconds)
+            link.patient_until += seconds
+
+    def close(self, reason: str, now: float) -> None:
+        """End every exchange."""
+        for link in self.links:
+            link.client.close(reason, now)
+
+    def state(self) -> State:
+        """The State of the whole world, for observers."""
+        raise NotImplementedError
+
+    def _world_state(self, sequence: int, steps: int) -> State:
+        world = self._world
+        return State(
+            session=0,
+            sequence=sequence,
+            time=steps * self._period,
+            observations=tuple(world.observations.values()),
+            rewards=world.rewards,
+            terminated=world.terminated,
+            truncated=world.truncated,
+            telemetry=tuple(world.telemetry.values()),
+        )
+
+    def _reset_all(self, seeds: NDArray[np.uint64] | None) -> None:
+        actions = self._layout.actions
+        nothing = np.zeros(actions.shape, actions.dtype)
+        self._world.advance(nothing, np.ones(self._layout.drones, bool), seeds, None)
+        self.cause, self.moved = None, True
+
+    def _lose_silent(self, link: AgentLink, why: str) -> None:
+        raise NotImplementedError
+
+    def _complain(self, link: AgentLink) -> None:
+        client = link.client
+        if link.trouble or not client.sequence:
+            link.complained = client.asked_at
+            words = link.silence(COMPLAIN_AFTER, client.sends)
+            client.statistics.notice(f"{words}; asking for {client.config.timeout:g} s in all")
+
+
+def first_seeds(seed: int, drones: int) -> NDArray[np.uint64]:
+    """Seeds of a simulator's own first reset: drone i takes seed + i, modulo 2^64."""
+    return np.array([(seed + i) & MAX_UINT64 for i in range(drones)], np.uint64)
+
+
+class OneAgent(WorldRules):
+    """One agent commands every drone, each by its own order."""
+
+    def __init__(
+        self, world: World, layout: Layout, period: float, links: Sequence[AgentLink]
+    ) -> None:
+        super().__init__(world, layout, period, links)
+        (self._link,) = self.links
+        self._client = self._link.client
+        self._message: Command | Welcome | None = None
+        self._answers = False
+        self._all_fly = bytes(layout.drones)  # orders
+
+    def start(self, now: float) -> None:
+        """Say Hello; by text, where the agent says nothing before it, send the first State."""
+        super().start(now)
+        if self._client.by_text:
+            session = self._client.hello.session
+            self._message = Welcome(session=session, nonce=0)
+
+    def receive(self, link: AgentLink, datagram: bytes, now: float) -> None:
+        """Take a datagram. Raises `Refused`."""
+        message = self._client.receive(datagram, now)
+        if message is None or self.reason is not None:
+            return
+        if isinstance(message, Command | Welcome):
+            self._message = message
+        elif isinstance(message, Refuse):
+            raise Refused(f"{link.name} refused: {message.reason}")
+        elif isinstance(message, Close):
+            if self._client.by_text and not self._client.statistics.round_trips.count:
+                raise Refused(
+                    f"{link.name} closed before its first command: it has no free slot, has a key, "
+                    "or flies no text"
+                )
+            self.reason = message.reason or "the agent closed"
+
+    def step(self, now: float) -> bool:
+        """Follow the last message."""
+        message = self._message
+        if message is None:
+            return False
+        self._message = None
+        self._answers = True
+        if isinstance(message, Welcome):
+            seed = message.session if message.seed is None else message.seed
+            self._reset_all(first_seeds(seed, self._layout.drones))
+            return False
+        if message.orders.tobytes() == self._all_fly:
+            self._world.advance(message.actions, None, None, None)
+        else:
+            self._world.advance(message.actions, message.resets, message.seeds, message.frozen)
+        self.cause, self.moved = message, True
+        return False
+
+    def answer(self, now: float) -> None:
+        """Send the State after a step. Raises `InputError` if it is not finite."""
+        if not self._answers:
+            return
+        self._answers = False
+        world, client = self._world, self._client
+        client.send_state(
+            client.sequence * self._period,
+            tuple(world.observations.values()),
+            world.rewards,
+            world.terminated,
+            world.truncated,
+            tuple(world.telemetry.values()),
+            now,
+        )
+
+    def next_timer(self) -> float:
+        """When `handle_timers` wants to be called; infinite if never."""
+        client = self._client
+        return min(client.resend_at, client.deadline)
+
+    def state(self) -> State:
+        """The State that was sent last."""
+        sequence = self._client.sequence
+        return self._world_state(sequence, sequence - 1)
+
+    def _lose_silent(self, link: AgentLink, why: str) -> None:
+        raise PeerSilent(why)
+
+
+class SeveralAgents(WorldRules):
+    """One world, in which each agent owns some of the drones.
+
+    The world begins when all agents have come, and steps when all that fly have answered. It begins
+    another episode when all that take part have asked for a reset. An agent that asks while others
+    fly waits, and its drones do meanwhile what its policy says; so do those of an agent that was
+    silent for `patience`, was started anew or closed. An agent that comes back takes part again
+    from the next episode on.
+
+    Attributes:
+        absences: Every `Absence`: with the seeds and the actions they determine each number.
+        episodes: Begun so far; a reset before anything was flown begins the same episode again.
+        steps: Control steps of the running episode.
+        seed: Of the running episode; None: the streams of the episode before went on.
+    """
+
+    def __init__(
+        self,
+        world: SwarmWorld,
+        layout: Layout,
+        period: float,
+        links: Sequence[AgentLink],
+        *,
+        when_lost: str,
+        patience: float,
+    ) -> None:
+        super().__init__(world, layout, period, links)
+        self.absences: list[Absence] = []
+        self.episodes = self.steps = 0
+        self.seed: int | None = None
+        self._swarm = world
+        self._when_lost, self._patience = when_lost, patience
+        self._due: list[tuple[AgentLink, bool, bool]] = []  # States: to whom, again, cut
+        self._last_reason = ""
+
+    def state(self) -> State:
+        """The State of the world after the last step or reset, counted from 1 in an episode."""
+        return self._world_state(self.steps + 1, self.steps)
+
+    # ---- episodes and steps
+
+    def step(self, now: float) -> bool:
+        """Step or begin the world if it is time to."""
+        flying = self._who(Participation.FLYING)
+        if all(link.participation is Participation.LEFT for link in self.links):
+            self.reason = self._last_reason
+            return False
+        if not self.episodes:
+            if len(self._who(Participation.READY)) < len(self.links):
+                return False
+            self._begin(first=True)
+            return True
+        if again := self._started_anew():
+            if any(link.participation is Participation.COMING for link in again):
+                return False
+            for link in again:
+                link.participation = Participation.FLYING
+                self._queue(link)
+            return True
+        if not flying:
+            if not self._who(Participation.WAITING, Participation.READY):
+                return False
+            self._begin()
+            return True
+        if any(link.command is None for link in flying):
+            return False
+        if not any(self._close_wrong(link, flying, now) for link in flying):
+            self._follow(flying)
+        return True
+
+    def _follow(self, flying: list[AgentLink]) -> None:
+        """Do what the Commands of all flying agents say."""
+        resetting = [link for link in flying if link.order == RESET]
+        if len(resetting) == len(flying):
+            self._begin()
+        elif self.steps == 0 and resetting:
+            for link in resetting:  # its episode has just begun: the same start again
+                self._queue(link)
+        else:
+            self._fly(flying)
+
+    @property
+    def _is_first_start(self) -> bool:
+        """Whether the first episode has begun, and nothing was flown."""
+        return self.episodes == 1 and self.steps == 0
+
+    def _started_anew(self) -> list[AgentLink]:
+        """Agents that were started anew before the last one came: the first step waits for them."""
+        if not self._is_first_start:
+            return []
+        lost = {absence.agent for absence in self.absences}
+        coming = self._who(Participation.COMING, Participation.READY)
+        return [link for link in coming if link.number not in lost]
+
+    def _begin(self, *, first: bool = False) -> None:
+        """Begin an episode for all that take part."""
+        joining = self._who(Participation.FLYING, Participation.WAITING, Participation.READY)
+        seeds = self._first_seeds(joining) if first else self._next_seeds(joining)
+        self.seed = None if seeds is None else int(seeds[0])
+        self._reset_all(seeds)
+        self.episodes += first or self.steps > 0
+        self.steps = 0
+        # Absences of a start that nobody flew are noted again.
+        self.absences = [absence for absence in self.absences if absence.episode < self.episodes]
+        for link in self.links:
+            if link not in joining:
+                self._let_go(link)
+        for link in joining:
+            link.participation = Participation.FLYING
+            self._queue(link)
+
+    def _first_seeds(self, joining: list[AgentLink]) -> NDArray[np.uint64]:
+        """As a simulator of one agent, by the agent of the first drone."""
+        link = min(joining, key=_first_row)
+        seed = link.client.hello.session if link.seed is None else link.seed
+        return first_seeds(seed, self._layout.drones)
+
+    def _next_seeds(self, joining: list[AgentLink]) -> NDArray[np.uint64] | None:
+        """The seed of the first drone whose agent asked for this reset; None if it gave none."""
+        asked = [link for link in joining if link.command is not None]
+        if not asked:
+            return None
+        link = min(asked, key=_first_row)
+        assert link.command is not None
+        if link.command.seeds is None:
+            return None
+        return np.full(self._layout.drones, link.command.seeds[link.rows.argmin()], np.uint64)
+
+    def _fly(self, flying: list[AgentLink]) -> None:
+        """Fly the world for one control period, if any agent flies in it."""
+        layout, flown = self._layout, False
+        actions = np.zeros(layout.actions.shape, layout.actions.dtype)
+        if layout.choices:
+            actions += (layout.choices - 1) // 2  # hold
+        staying = []
+        for link in flying:
+            assert link.command is not None
+            if link.order == RESET:
+                self._lose(link, Participation.WAITING)
+            else:
+                staying.append(link)
+                actions[link.rows] = link.command.actions
+                flown |= link.order == FLY
+        if flown:
+            self._world.advance(actions, None, None, None)
+            self.steps += 1
+            orders = np.full(layout.drones, FLY, np.uint8)
+            self.cause = Command(session=0, sequence=self.steps, actions=actions, orders=orders)
+            self.moved = True
+        for link in staying:
+            self._queue(link, again=link.order == FREEZE)
+
+    def _close_wrong(self, link: AgentLink, flying: list[AgentLink], now: float) -> bool:
+        """Close the link to an agent whose Command the world cannot follow; whether it did."""
+        out, wrong = self._out(link), ""
+        nobody_flies = all(other.order in (FREEZE, RESET) for other in flying)
+        if link.order is None:
+            wrong = f"orders: expected the same for all {len(link.rows)} drones, got different ones"
+        elif link.order == FLY and out.all():
+            wrong = _NO_RESET
+        elif link.order == FREEZE and not (nobody_flies or out.all()):
+            wrong = "orders: expected no frozen drone in a world that others fly on in, got some"
+        if wrong:
+            self._dismiss(link, wrong, now)
+        return bool(wrong)
+
+    def _dismiss(self, link: AgentLink, wrong: str, now: float) -> None:
+        link.client.close(wrong, now)
+        self._lose(link, Participation.LEFT, wrong)
+
+    def _lose(self, link: AgentLink, participation: Participation, why: str = "") -> None:
+        """The policy of an agent flies its drones for the rest of the episode."""
+        was, link.participation = link.participation, participation
+        if participation is not Participation.WAITING:
+            link.command = None
+        flew = False
+        if was is Participation.FLYING:
+            link.in_flight = ~self._out(link)
+            flew = bool(link.in_flight.any())
+        if flew:
+            self._let_go(link)
+        if participation is Participation.LEFT:
+            self._last_reason = why
+        if why and flew:
+            notice = f"{link.name} is lost ({why}): {link.when_lost}"
+            link.client.statistics.notice(notice)
+
+    def _let_go(self, link: AgentLink) -> None:
+        """Leave its drones to its policy."""
+        absence = Absence(link.number, self.episodes, self.steps, link.participation)
+        self.absences.append(absence)
+        mask = np.zeros(self._layout.drones, bool)
+        mask[link.rows] = True
+        if link.when_lost == "land":
+            self._swarm.land(mask)
+        elif link.when_lost == "end":
+            self._swarm.retire(mask)
+
+    def _out(self, link: AgentLink) -> Mask:
+        """Which of its drones are out, shape (n,)."""
+        out: Mask = self._swarm.out[link.rows]
+        return out
+
+    def _who(self, *wanted: Participation) -> list[AgentLink]:
+        return [link for link in self.links if link.participation in wanted]
+
+    # ---- States
+
+    def _queue(self, link: AgentLink, *, again: bool = False, cut: bool = False) -> None:
+        """Send an agent the State of its drones with the next `answer`.
+
+        `again`: nothing has happened to them. `cut`: its episode was truncated. The arrays of both
+        are those of its last State: the world may be in another episode.
+        """
+        link.command = None
+        self._due.append((link, again, cut))
+
+    def answer(self, now: float) -> None:
+        """Send the States that are due."""
+        due, self._due = self._due, []
+        for link, again, cut in due:
+            self._send(link, again, cut, now)
+
+    def _send(self, link: AgentLink, again: bool, cut: bool, now: float) -> None:
+        world, rows, client = self._world, link.rows, link.client
+        nothing = np.zeros(len(rows), bool)
+        rewards: Array = np.zeros(len(rows))
+        terminated = truncated = nothing
+        if cut:
+            truncated = link.in_flight
+        elif not again:
+            rewards = world.rewards[rows]
+            terminated, truncated = world.terminated[rows], world.truncated[rows]
+            link.shown = (
+                tuple(array[rows] for array in world.observations.values()),
+                tuple(array[rows] for array in world.telemetry.values()),
+            )
+        observations, telemetry = link.shown
+        link.patient_until = now + self._patience
+        time = client.sequence * self._period
+        client.send_state(time, observations, rewards, terminated, truncated, telemetry, now)
+
+    # ---- timers and messages
+
+    def next_timer(self) -> float:
+        """When `handle_timers` wants to be called; infinite if never."""
+        flying = self._who(Participation.FLYING)
+        patience = [link.patient_until for link in flying if link.command is None]
+        return min([super().next_timer(), *patience])
+
+    def handle_timers(self, now: float) -> None:
+        """Resend what is due, and lose agents that were silent for too long."""
+        for link in self._who(Participation.FLYING):
+            if link.command is None and now >= link.patient_until:
+                self._lose(link, Participation.SILENT, f"no Command for {self._patience:g} s")
+        super().handle_timers(now)
+
+    def _lose_silent(self, link: AgentLink, why: str) -> None:
+        if not self.episodes:
+            raise PeerSilent(f"{why}, and the world begins when all have come")
+        self._lose(link, Participation.LEFT, why)
+        if len(self._who(Participation.LEFT)) == len(self.links):
+            raise PeerSilent(f"{why}, and no other is left")
+
+    def receive(self, link: AgentLink, datagram: bytes, now: float) -> None:
+        """Take a datagram of an agent. Before the world has begun, raises `LinkError`."""
+        session = link.client.hello.session
+        message = link.client.receive(datagram, now)
+        if link.client.hello.session != session:  # its answer was Unknown
+            if self._is_first_start and link.participation is Participation.FLYING:
+                link.participation = Participation.COMING  # the first step waits for it
+            else:
+                self._lose(link, Participation.COMING, "it was started anew")
+        elif message is not None and link.participation is not Participation.LEFT:
+            self._take(link, message, now)
+
+    def _take(self, link: AgentLink, message: Message, now: float) -> None:
+        """Take in a message that moves the exchange with an agent on."""
+        if isinstance(message, Command):
+            link.command = message
+            if link.participation in (Participation.SILENT, Participation.LATE):
+                self._take_late(link, now)
+        elif isinstance(message, Welcome):
+            link.participation, link.seed = Participation.READY, message.seed
+            self._take_policy(link, message)
+        elif isinstance(message, Refuse | Close):
+            if self.episodes:
+                self._lose(link, Participation.LEFT, message.reason or "the agent closed")
+            elif isinstance(message, Refuse):
+                raise Refused(f"{link.name} refused: {message.reason}")
+            else:
+                reason = message.reason or "no reason"
+                raise LinkError(f"{link.name} closed before the world began: {reason}")
+
+    def _take_policy(self, link: AgentLink, welcome: Welcome) -> None:
+        link.when_lost = self._when_lost
+        for extension in welcome.extensions:
+            if extension.number == WHEN_LOST:
+                policy = extension.value.decode("ascii", "replace")
+                if policy in POLICIES:  # else of another version: this side's policy stays
+                    link.when_lost = policy
+        if link.when_lost != "land":
+            return
+        try:
+            self._swarm.land(np.zeros(self._layout.drones, bool))
+        except InputError as error:
+            if not self.episodes:
+                raise
+            link.when_lost = self._when_lost  # one agent does not end the flight of others
+            notice = f"{link.name} cannot have land ({error}): {link.when_lost}"
+            link.client.statistics.notice(notice)
+
+    def _take_late(self, link: AgentLink, now: float) -> None:
+        """A Command of an agent that does not take part in the running episode."""
+        if link.order == RESET:
+            link.participation = Participation.WAITING
+        elif link.order == FREEZE:
+            self._queue(link, again=True)
+        elif link.participation is Participation.SILENT and link.in_flight.any():
+            link.participation = Participation.LATE
+            self._queue(link, cut=True)
+        else:
+            self._dismiss(link, _NO_RESET, now)
+
+
+def _first_row(link: AgentLink) -> int:
+    return int(link.rows.min())

@@ -1,0 +1,232 @@
+"""Drives the rules of a simulator: waits on its socket, steps its world, sends its States."""
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+import gymnasium as gym
+
+from ...models.errors import NotCopied
+from ..protocol.client import Address, Client
+from ..protocol.errors import LinkError
+from ..protocol.messages import Command, State
+from ..protocol.party import AgentLink, WorldRules
+from .sockets import LONGEST_WAIT, PAUSE, Port, log_notices
+from .stepped import Steppable
+
+_ALIVE_EVERY: Final = 0.5  # period of the message Alive while an agent waits for a State, s
+
+Observer = Callable[[Command | None, State], None]
+"""Called with the Command that moved the drones, or None where all of them were reset, and the
+State after it: valid during the call only."""
+
+
+class Driver(NotCopied):
+    """A simulator on a socket, for one agent or several.
+
+    Attributes:
+        address: Address of this side.
+        spec: Spec of the env.
+        stepped: The loop or the envs.
+        links: The agents.
+        observer: Called for every State of the world once the agents have it; None at first.
+    """
+
+    def __init__(self, stepped: Steppable, rules: WorldRules, port: Port) -> None:
+        self.stepped, self.spec = stepped, stepped.spec
+        self.address: Address = port.address
+        self.observer: Observer | None = None
+        self._rules, self._port = rules, port
+        self._by_address = {link.address: link for link in rules.links}
+        self._stopped = self._ran = False
+        self._journal: Any = None
+
+    @property
+    def links(self) -> list[AgentLink]:
+        """The agents."""
+        return self._rules.links
+
+    @property
+    def link(self) -> Client:
+        """The exchange with the first agent."""
+        return self._rules.links[0].client
+
+    def run(self) -> str:
+        """Fly until every agent has closed; the reason that the last one gave. Runs once.
+
+        The agents are told at once when the run ends, also by an error of the env. In the main
+        thread Ctrl-C ends it after the step that is being computed; a second one at once.
+
+        Raises:
+            PeerSilent: Nothing came from an agent within the timeout, and no other is left.
+            Refused: An agent turned this simulator away, with a reason.
+            LinkError: An agent closed before a shared world began, or the only one went on after
+                an episode's end without a reset.
+            KeyboardInterrupt: Ctrl-C.
+        """
+        if self._ran:
+            name = type(self).__name__
+            raise ValueError(f"run: expected one call for each {name}, got another")
+        self._ran = True
+        reason, finished = "the simulator was stopped", threading.Event()
+        heart = threading.Thread(target=self._say_alive, args=(finished,), daemon=True)
+        with _deferred_interrupt(self.stop) as interrupted:
+            heart.start()
+            try:
+                return self._fly() or reason
+            except Exception as error:
+                reason = f"{type(error).__name__}: {error}"
+                raise
+            finally:
+                finished.set()
+                self._end(reason)
+                if interrupted:
+                    raise KeyboardInterrupt
+
+    def stop(self) -> None:
+        """Make `run` tell the agents and return, after the step that is being computed.
+
+        May be called from another thread and in a signal handler, any number of times.
+        """
+        self._stopped = True
+
+    def close(self) -> None:
+        """Close the socket, the envs and the record. Not while it runs: see `stop`."""
+        self._port.close()
+        self.stepped.close()
+        if self._journal:
+            self._journal.close()
+
+    def __enter__(self) -> "Driver":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _fly(self) -> str:
+        """Until all agents have closed: why the last one did. Empty if this side was stopped."""
+        rules = self._rules
+        rules.start(time.monotonic())
+        while not self._stopped:
+            try:
+                again = rules.step(time.monotonic())
+            except gym.error.ResetNeeded as error:
+                raise LinkError(
+                    f"an action came after the end of an episode: expected a reset ({error})"
+                ) from None
+            rules.answer(time.monotonic())
+            self._flush()
+            if rules.moved:
+                rules.moved = False
+                if self.observer is not None:
+                    self.observer(rules.cause, rules.state())
+                if self._journal:
+                    self._journal.write()
+            if rules.reason is not None:
+                return rules.reason
+            if not again:
+                self._exchange()
+        return ""
+
+    def _exchange(self) -> None:
+        """Wait for one datagram or timer, and take it in."""
+        rules, before = self._rules, time.monotonic()
+        left = min(rules.next_timer() - before, LONGEST_WAIT)
+        if left <= 0:
+            rules.handle_timers(before)
+            return
+        try:
+            datagram, address = self._port.receive(left, strangers=False)
+        except OSError as error:
+            self._note(error)
+            now = time.monotonic()
+            if now - before - left > PAUSE:
+                rules.pardon(now - before - left)
+            return
+        link = self._by_address.get(address)
+        if link:
+            link.trouble = ""
+            rules.receive(link, datagram, time.monotonic())
+
+    def _end(self, reason: str) -> None:
+        """Tell the agents, until they have answered or will not."""
+        rules = self._rules
+        rules.close(reason, time.monotonic())
+        self._flush()
+        while any(link.client.next_timer() < float("inf") for link in rules.links):
+            if self._port.closed:
+                break
+            before = time.monotonic()
+            left = min(link.client.next_timer() for link in rules.links) - before
+            try:
+                datagram, address = self._port.receive(max(left, 0.0), strangers=False)
+                if link := self._by_address.get(address):
+                    link.client.receive(datagram, time.monotonic())
+            except OSError:  # nothing came, or an earlier datagram found nobody
+                pass
+            for each in rules.links:
+                each.client.handle_timer(time.monotonic())
+            self._flush()
+        if self._journal:
+            self._journal.close()
+
+    def _flush(self) -> None:
+        """Send what is due, before any wait."""
+        for link in self._rules.links:
+            client = link.client
+            for datagram in client.take_outgoing():
+                self._send(link, datagram)
+            statistics, now = client.statistics, time.monotonic()
+            if statistics.notices or now >= statistics.report_at:
+                log_notices(statistics, now)
+
+    def _send(self, link: AgentLink, datagram: bytes) -> None:
+        try:
+            self._port.send(datagram, link.address)
+        except OSError as error:  # a full buffer or a network that is down: as good as lost
+            link.client.statistics.counters["unsent"] += 1
+            link.trouble = _words(error, "sending")
+
+    def _note(self, error: OSError) -> None:
+        """Nothing came. Raises the error if this side was closed."""
+        if self._port.closed:
+            raise error
+        if len(self.links) == 1 and not isinstance(error, TimeoutError):
+            self.links[0].trouble = _words(error, "receiving")
+
+    def _say_alive(self, finished: threading.Event) -> None:
+        """In a thread: tell agents that wait for a State that it will come."""
+        while not finished.wait(_ALIVE_EVERY):
+            for link in self._rules.links:
+                for datagram in link.client.alive(time.monotonic()):
+                    self._send(link, datagram)
+
+
+def _words(error: OSError, what: str) -> str:
+    if isinstance(error, ConnectionError):
+        return "nothing listens on that port"
+    return f"{what} failed: {error.strerror}"
+
+
+@contextmanager
+def _deferred_interrupt(stop: Callable[[], None]) -> Iterator[list[bool]]:
+    """Have Ctrl-C call `stop`, and only a second one interrupt. The list says whether it came."""
+    came: list[bool] = []
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield came
+        return
+
+    def note(*_: object) -> None:
+        came.append(True)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        stop()
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield came
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
