@@ -24,7 +24,7 @@ from rotorgram.models import InputError
 from rotorgram.rendering import Moment, Stage, live
 from rotorgram.rendering.live import Aim, Lines, LiveView, Pace, lines_over
 from rotorgram.udp import RemoteEnv, Simulator
-from rotorgram.udp.protocol.messages import Command, Message, State, Welcome
+from rotorgram.udp.protocol.messages import Command, State
 
 ELEVATION = "rotorgram/Elevation-v0"
 
@@ -345,7 +345,7 @@ def simulator_of(*heights: float, rotors: int = 4) -> Any:
     spec = env_spec(ELEVATION, {}, HEXA if rotors == 6 else None)
     loop = SimpleNamespace(spec=spec, telemetry=telemetry)
 
-    def advance(cause: Message | None = None) -> Message | None:
+    def advance(cause: Command | None = None) -> Command | None:
         """Steps and rewards as `Loop` has them after a Command; otherwise as after a reset."""
         flies = cause.orders == 0 if isinstance(cause, Command) else np.zeros(drones, bool)
         keeps = ~cause.resets if isinstance(cause, Command) else flies
@@ -397,8 +397,8 @@ def test_a_watcher_counts_steps_and_episodes_of_each_drone() -> None:
     view = RecordingView(Stage("plain", 2))
     simulator = simulator_of(4.0, 6.0, 8.0)
     watcher = Watcher(view, simulator)  # type: ignore[arg-type]
-    causes: list[Message] = [
-        Welcome(session=1, nonce=1),
+    causes: list[Command | None] = [
+        None,
         command("r", "r", "r"),  # as an agent begins: nothing was flown yet
         command("s", "s", "s"),
         command("s", "f", "s"),

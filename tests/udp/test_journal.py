@@ -463,7 +463,7 @@ def test_text_simulators_one_after_another_are_sessions_of_their_own(tmp_path: P
             simulator = Simulator(server=remote.address, bind=ANY, codec="text", config=QUICK)
             running = Running(simulator)
             fly(remote, 20, seed=seed)
-            simulator._socket.close()  # gone without a word
+            simulator._port.close()  # gone without a word
             running.join()
             if seed == 1:
                 with pytest.raises(PeerSilent):

@@ -111,7 +111,7 @@ def decode(datagram: bytes, layout: Layout | None = None) -> Message:
     try:
         if kind in _DUE:
             return _DUE[kind][2](datagram, session, sequence, _expect(layout))
-        numbers = {"sequence": sequence} if kind in _NUMBERED else {}
+        numbers: dict[str, Any] = {"sequence": sequence} if kind in _NUMBERED else {}
         return message(session=session, **numbers, **decoder(datagram[HEADER_SIZE:]))
     except (ValueError, struct.error) as error:
         raise DecodeError(f"{message.__name__.lower()}: {error}") from None
@@ -400,7 +400,7 @@ _COMMAND_CRC: Final = zlib.crc32(_COMMAND_START)
 _START: Final = bytes(8)  # in the place of a start, for a look at arrays by their offset
 _BODY_AT: Final = HEADER_SIZE - len(_START)
 
-_DUE: Final = {
+_DUE: Final[dict[int, tuple[bytes, int, Callable[..., State | Command]]]] = {
     STATE: (_STATE_START, _STATE_CRC, _decode_state),
     COMMAND: (_COMMAND_START, _COMMAND_CRC, _decode_command),
 }

@@ -497,7 +497,7 @@ class Client:
     def _send(self, message: m.Hello | State | m.Close, now: float) -> None:
         """Send a message and repeat it until it is answered."""
         kind = type(message)
-        if kind is State and not self.by_text:
+        if isinstance(message, State) and not self.by_text:
             data = binary.encode_state(message, self.layout)
         else:
             data = self._encode(message)

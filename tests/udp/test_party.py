@@ -1,0 +1,257 @@
+"""The rules of a world that several agents fly, without sockets and on a fake clock."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from links import HERE, NONCE, hello, layout
+from rotorgram.udp.protocol import binary
+from rotorgram.udp.protocol.client import Client, LinkConfig
+from rotorgram.udp.protocol.errors import LinkError, PeerSilent, Refused
+from rotorgram.udp.protocol.messages import (
+    FLY,
+    FREEZE,
+    RESET,
+    WHEN_LOST,
+    Close,
+    Extension,
+    State,
+)
+from rotorgram.udp.protocol.party import AgentLink, Participation, SeveralAgents
+from rotorgram.udp.protocol.server import Server
+
+PATIENCE, TIMEOUT = 10.0, 60.0
+
+
+class World:
+    """Two drones; it notes what is done to it."""
+
+    def __init__(self) -> None:
+        self.height = np.zeros((2, 1), np.float32)
+        self.rewards = np.zeros(2)
+        self.terminated = self.truncated = self.out = np.zeros(2, bool)
+        self.telemetry: dict[str, Any] = {}
+        self.flown: list[list[float]] = []
+        self.seeds: list[list[int] | None] = []
+        self.landed = self.retired = np.zeros(2, bool)
+
+    @property
+    def observations(self) -> dict[str, Any]:
+        return {"height": self.height}
+
+    def advance(self, actions: Any, resets: Any, seeds: Any, frozen: Any) -> None:
+        if resets is not None:
+            assert resets.all()
+            self.seeds.append(None if seeds is None else seeds.tolist())
+            self.height = np.zeros((2, 1), np.float32)
+            self.landed = self.retired = np.zeros(2, bool)
+            return
+        self.flown.append(actions[:, 0].tolist())
+        self.height = self.height + actions
+
+    def land(self, drones: Any) -> None:
+        self.landed = self.landed | drones
+
+    def retire(self, drones: Any) -> None:
+        self.retired = self.retired | drones
+
+
+class Swarm:
+    """Both sides of a world of two drones, each flown by an agent of its own."""
+
+    def __init__(self, *policies: str) -> None:
+        self.now = 0.0
+        self.world = World()
+        self.policies = policies or ("hold", "hold")
+        config = LinkConfig(timeout=TIMEOUT)
+        links = []
+        for i in range(2):
+            client = Client(hello(70 + i), layout(), config, draw_session=lambda i=i: 80 + i)
+            links.append(AgentLink(i, ("127.0.0.1", 1000 + i), client, np.array([i])))
+        self.rules = SeveralAgents(
+            self.world, layout(2), 0.1, links, when_lost="hold", patience=PATIENCE
+        )
+        self.agents = [self.agent(i) for i in range(2)]
+        self.states: list[list[State]] = [[], []]
+        self.closed = ["", ""]
+        self.rules.start(0.0)
+
+    def agent(self, number: int, refusal: str = "") -> Server:
+        policy = Extension(number=WHEN_LOST, value=self.policies[number].encode())
+        return Server(lambda _: refusal or layout(), draw_nonce=lambda: NONCE, extensions=(policy,))
+
+    def pump(self) -> None:
+        """Carry datagrams until nothing moves."""
+        moving = True
+        while moving:
+            moving = self.rules.step(self.now)
+            self.rules.answer(self.now)
+            for link, agent in zip(self.rules.links, self.agents, strict=True):
+                for datagram in link.client.take_outgoing():
+                    event = agent.receive(datagram, HERE, self.now)
+                    if event and isinstance(event.message, State):
+                        self.states[link.number].append(event.message)
+                    elif event:
+                        self.closed[link.number] = event.message.reason
+                    moving = True
+                for datagram, _ in agent.take_outgoing():
+                    self.rules.receive(link, datagram, self.now)
+                    moving = True
+
+    def say(self, number: int, order: int, value: float = 0.0, seed: int | None = None) -> None:
+        seeds = None if seed is None else np.array([seed], np.uint64)
+        actions, orders = np.full((1, 1), value, np.float32), np.array([order], np.uint8)
+        self.agents[number].send_command(0, actions, orders, seeds, self.now)
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass, with every timer at its time."""
+        until = self.now + seconds
+        while self.rules.next_timer() <= until:
+            self.now = max(self.now, self.rules.next_timer())
+            self.rules.handle_timers(self.now)
+            self.pump()
+        self.now = until
+
+    def never_answered(self) -> None:
+        """Let time pass in which every datagram is lost."""
+        while True:
+            self.now = self.rules.next_timer()
+            self.rules.handle_timers(self.now)
+
+    def restart(self, number: int) -> None:
+        """Another agent takes the place of one that was killed."""
+        self.agents[number] = self.agent(number)
+
+    @property
+    def participations(self) -> list[Participation]:
+        return [link.participation for link in self.rules.links]
+
+
+def begun(*policies: str) -> Swarm:
+    """A world in which both have flown a step."""
+    swarm = Swarm(*policies)
+    swarm.pump()
+    for number in (0, 1):
+        swarm.say(number, FLY, number + 1.0)
+    swarm.pump()
+    assert swarm.world.flown == [[1.0, 2.0]]
+    return swarm
+
+
+def test_the_world_steps_when_all_have_answered() -> None:
+    swarm = begun()
+    assert swarm.world.seeds == [[70, 71]]  # the session of the first drone's agent, and one more
+    assert [[s.observations[0].item() for s in states] for states in swarm.states] == [
+        [0.0, 1.0], [0.0, 2.0]
+    ]  # fmt: skip
+    swarm.say(0, FLY, 5.0)
+    swarm.pump()
+    assert len(swarm.world.flown) == 1
+    swarm.say(1, FLY, 6.0)
+    swarm.pump()
+    assert swarm.world.flown[1:] == [[5.0, 6.0]]
+    assert swarm.rules.state().time == pytest.approx(0.2)
+
+
+def test_all_have_to_ask_for_a_reset() -> None:
+    swarm = begun()
+    swarm.say(1, RESET, seed=9)
+    swarm.pump()
+    assert swarm.world.seeds == [[70, 71]]
+    swarm.say(0, RESET, seed=5)
+    swarm.pump()
+    assert swarm.world.seeds == [[70, 71], [5, 5]]
+    assert swarm.rules.absences == []
+
+
+@pytest.mark.parametrize("policy", ["hold", "land", "end"])
+def test_the_policy_flies_the_drones_of_a_silent_agent(policy: str) -> None:
+    swarm = begun("hold", policy)
+    swarm.say(0, FLY, 1.0)
+    swarm.pump()
+    swarm.wait(PATIENCE - 0.1)
+    assert swarm.participations[1] is Participation.FLYING
+    swarm.wait(0.2)
+    assert swarm.participations[1] is Participation.SILENT
+    assert swarm.world.flown[1:] == [[1.0, 0.0]]
+    assert swarm.world.landed.tolist() == [False, policy == "land"]
+    assert swarm.world.retired.tolist() == [False, policy == "end"]
+    (absence,) = swarm.rules.absences
+    assert absence == (1, 1, 1, Participation.SILENT)
+    swarm.say(1, FLY, 7.0)  # it comes back, and is told that its episode was truncated
+    swarm.pump()
+    last = swarm.states[1][-1]
+    assert (last.truncated.tolist(), last.rewards.tolist()) == ([True], [0.0])
+    assert last.observations[0].item() == 2.0  # of its last State
+    swarm.say(1, RESET)
+    swarm.say(0, RESET, seed=3)
+    swarm.pump()
+    assert swarm.world.seeds[1:] == [[3, 3]]
+    assert swarm.participations == [Participation.FLYING] * 2
+
+
+def test_an_agent_that_came_back_does_not_hide_the_seeds_of_the_others() -> None:  # fault 50
+    swarm = begun()
+    swarm.restart(0)
+    swarm.wait(1.0)  # its State is answered with Unknown; it begins a new session
+    assert swarm.participations[0] is Participation.READY
+    swarm.say(1, RESET, seed=9)
+    swarm.pump()
+    assert swarm.world.seeds[1:] == [[9, 9]]
+    assert swarm.rules.seed == 9
+    assert swarm.participations == [Participation.FLYING] * 2
+
+
+@pytest.mark.parametrize(
+    ("order", "reason"),
+    [(FLY, "an action came after the end of an episode: expected a reset"),
+     (FREEZE, "orders: expected no frozen drone in a world that others fly on in, got some")],
+)  # fmt: skip
+def test_a_command_that_the_world_cannot_follow_closes_one_link(order: int, reason: str) -> None:
+    swarm = begun()
+    if order == FLY:
+        swarm.world.out = np.array([False, True])
+    swarm.say(0, FLY, 1.0)
+    swarm.say(1, order)
+    swarm.pump()
+    assert swarm.participations == [Participation.FLYING, Participation.LEFT]
+    assert len(swarm.world.flown) == 2
+    swarm.agents[0].close("enough", swarm.now)
+    swarm.pump()
+    assert swarm.rules.reason == "enough"
+    assert swarm.closed == ["", reason]
+
+
+def test_before_the_world_begins_a_refusal_and_silence_end_it() -> None:
+    swarm = Swarm()
+    swarm.agents[1] = swarm.agent(1, "another vehicle")
+    with pytest.raises(Refused, match=r"^the agent at 127.0.0.1:1001 refused: another vehicle$"):
+        swarm.pump()
+    silent = Swarm()
+    with pytest.raises(PeerSilent, match="and the world begins when all have come"):
+        silent.never_answered()
+
+
+def test_an_agent_that_closes_before_the_world_begins_ends_it() -> None:
+    swarm = Swarm()
+    link, server = swarm.rules.links[0], swarm.agents[0]
+    for datagram in link.client.take_outgoing():
+        server.receive(datagram, HERE, 0.0)
+    for datagram, _ in server.take_outgoing():
+        swarm.rules.receive(link, datagram, 0.0)
+    assert link.participation is Participation.READY
+    bye = binary.encode(Close(session=70, sequence=0, reason="no more"))
+    with pytest.raises(LinkError, match=r"1000 closed before the world began: no more$"):
+        swarm.rules.receive(link, bye, 0.0)
+
+
+def test_time_that_this_process_was_stopped_counts_for_nobody() -> None:
+    swarm = begun()
+    swarm.say(0, FLY, 1.0)
+    swarm.pump()
+    swarm.now += 1000.0
+    swarm.rules.pardon(1000.0)
+    swarm.rules.handle_timers(swarm.now)
+    assert swarm.participations == [Participation.FLYING] * 2
+    swarm.wait(PATIENCE)
+    assert swarm.participations[1] is Participation.SILENT
