@@ -60,7 +60,6 @@ EXTRAS: Final = {
     "ray": ("ray",),
     "dataset": ("mcap", "pyarrow", "minari", "h5py", "PIL"),
     "identify": ("pyulog", "pandas", "pyarrow", "scipy"),
-    "gpu": ("torch", "mujoco_warp", "warp"),
     "export": ("onnx", "onnxruntime"),
 }  # fmt: skip
 """Import names of the packages of each extra, as pyproject.toml lists them."""

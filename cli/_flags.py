@@ -74,7 +74,7 @@ class BackendFlags(EnvFlags):
     """A command that chooses what steps the drones."""
 
     backend: Backend = "mujoco"
-    """What steps the drones: mujoco, rigid (without contact, fast) or warp (for a GPU)."""
+    """What steps the drones: mujoco, or rigid (without contact, fast)."""
 
 
 @dataclass(frozen=True, kw_only=True)

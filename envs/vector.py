@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from ..models.errors import InputError, NotCopied, expect
-from ..sim import Backend, on_host
+from ..sim import Backend
 from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
 from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
@@ -29,11 +29,6 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
     gives reward 0. With SAME_STEP the observation is that of the next episode, and `info` has
     `final_obs` and `final_info` where one ended. With DISABLED a reset with a mask begins the next.
 
-    A step gives NumPy arrays, whatever the backend. With `tensors`, those of `rigid` and `warp` are
-    torch tensors on the world's device, and nothing is copied: `info` then holds the metrics and
-    the terms of the reward alone, and `telemetry` copies the rest to the host on access. Actions
-    may be of either kind.
-
     Args:
         env_id: Of a registered task.
         num_envs: N.
@@ -41,15 +36,10 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         render_mode: None, `rgb_array` (N pictures) or `human` (a window shows sixteen of them).
         autoreset_mode: `AutoresetMode`, or its value.
         vehicle: As of `Vehicle.load`: a file or a name; None is the paper's.
-        backend: `mujoco`, `rigid` or `warp`.
+        backend: `mujoco` or `rigid`.
         num_threads: Threads that step `mujoco`; 0 takes one for each processor.
-        device: Of `rigid` and `warp`; None takes a GPU if there is one, but for the arrays of
-            `rigid`, which are computed on the CPU.
         dtype: Of `rigid`: `float32`, or `float64`.
-        compiled: Of `rigid`: None compiles arrays where there is a C compiler; True has torch
-            compile tensors.
-        tensors: Give torch tensors, with `rigid` and `warp`.
-        gradients: Of `rigid`: compute tensors that have derivatives, which `loop` gives.
+        compiled: Of `rigid`: None compiles where there is a C compiler.
         options: Of the task, by name.
 
     Raises:
@@ -71,23 +61,15 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         vehicle: Path | str | None = None,
         backend: Backend = "mujoco",
         num_threads: int | None = None,
-        device: str | None = None,
         dtype: str | None = None,
         compiled: bool | None = None,
-        tensors: bool = False,
-        gradients: bool = False,
         **options: Any,
     ) -> None:
         self.closed = True  # nothing is open yet
         settings: dict[str, Any] = {
-            "num_threads": num_threads, "device": device, "dtype": dtype, "compiled": compiled
+            "num_threads": num_threads, "dtype": dtype, "compiled": compiled
         }  # fmt: skip
-        right = not tensors or backend != "mujoco"
-        expect(right, "tensors", "False with the backend mujoco", repr(tensors))
         given = {name: value for name, value in settings.items() if value is not None}
-        expect(not gradients or backend == "rigid", "gradients", f"False with {backend}", "True")
-        if backend == "rigid":
-            given["tensors"] = tensors or gradients or device not in (None, "cpu")
         right = type(drones) is int and drones >= 1
         expect(right, "drones", "1 or more", repr(drones))
         right = type(num_envs) is int and num_envs % drones == 0
@@ -99,15 +81,13 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
-        self._on_device = tensors
-        self._flown = loop
-        self._nobody = self.lost = self.done = self.out = self._flown.done
+        self._nobody = self.lost = self.done = self.out = loop.done
         self._episodes = np.zeros(num_envs, int)
         self.closed = False
 
     @property
     def loop(self) -> Loop:
-        """The loop that it steps: its world, its task and, on `rigid`, what has derivatives."""
+        """The loop that it steps: its world and its task."""
         return self._loop
 
     def reset(
@@ -121,10 +101,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
                 By the names of the task's `choices`: numbers, one or shape (N,), in place of those
                 that the seed gives.
         """
-        given = {
-            name: on_host(value) if hasattr(value, "detach") else value
-            for name, value in (options or {}).items()
-        }
+        given = dict(options or {})
         mask = checked_mask(given.pop("reset_mask", None), self.num_envs)
         chosen = {name: self._choice(name, value) for name, value in given.items()}
         seeds = checked_seeds(seed, self.num_envs)
@@ -149,13 +126,13 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         chosen: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """As `AdvancingVectorEnv.advance`; `chosen` as of `Loop.advance`."""
-        loop = self._flown
+        loop = self._loop
         loop.advance(actions, resets, seeds, frozen, chosen)
         self.observations = joined(loop.spec, loop.observations)
         self.rewards, self.terminated = loop.rewards, loop.terminated
         self.truncated, self.done, self.out = loop.truncated, loop.done, loop.out
         if self.render_mode is not None:
-            self._episodes = self._episodes + (0 if resets is None else on_host(resets))
+            self._episodes = self._episodes + (0 if resets is None else resets)
             if self.render_mode == "human":
                 self.render()
 
@@ -164,24 +141,9 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         """By name, float64, shape (N, *shape)."""
         return self._loop.telemetry
 
-    def _shaped(self, actions: Any) -> Any:
-        if not self._on_device or isinstance(actions, list | tuple | np.ndarray):
-            return super()._shaped(actions)
-        if tuple(getattr(actions, "shape", ())) != self.action_space.shape:
-            raise InputError(
-                f"actions: expected a tensor of shape {self.action_space.shape}, "
-                f"got {actions!r:.80}"
-            )
-        return actions
-
-    def _info(self, mask: Any) -> dict[str, Any]:
-        loop = self._loop
-        told = {f"reward_{name}": term for name, term in loop.reward_terms.items()}
-        if not self._on_device:
-            told = {name: on_host(term) for name, term in told.items()}
-            return super()._info(mask) | told | {f"_{name}": mask for name in told}
-        told, which = loop.metrics | told, loop.ours(mask)
-        return told | {f"_{name}": which for name in told}
+    def _info(self, mask: np.ndarray) -> dict[str, Any]:
+        terms = {f"reward_{name}": term for name, term in self._loop.reward_terms.items()}
+        return super()._info(mask) | terms | {f"_{name}": mask for name in terms}
 
     def _choice(self, name: str, value: Any) -> np.ndarray:
         if name not in self._loop.task.choices:

@@ -19,10 +19,9 @@ __all__ = [
 
 QUAD_XML: Final = Path(__file__).parent / "quad.xml"
 """The paper's vehicle."""
-Backend = Literal["mujoco", "rigid", "warp"]
+Backend = Literal["mujoco", "rigid"]
 """What steps vehicles. `mujoco`: threads of this machine, float64. `rigid`: the rigid body alone,
-no contact, in compiled C or in torch. `warp`: MuJoCo Warp, float32. Tensors of the last two take a
-GPU if there is one."""
+no contact, in NumPy or in compiled C."""
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
 MAX_DRONES: Final = 1024
 """Most drones of a world."""

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
+
 from ..models.errors import expect
 from .effects import EffectOptions
 from .random import Draw
@@ -101,7 +103,7 @@ class Randomization:
         kind, numbers = self._kinds[name]
         return round(PARAMETERS[name].high if kind == "normal" else max(numbers))
 
-    def draw(self, draw: Draw, xp: Any) -> dict[str, Array]:
+    def draw(self, draw: Draw) -> dict[str, Array]:
         """Values by name, shape (W, A)."""
         drawn = {}
         for name in self.names:
@@ -113,15 +115,15 @@ class Randomization:
                 spare = 0.5 if name in WHOLE else 0.0  # what is rounded to the ends
                 values = clip(draw.uniform(numbers[0] - spare, numbers[1] + spare), *numbers)
             elif kind == "loguniform":
-                low, high = (xp.log(xp.asarray(x)) for x in numbers)
-                values = xp.exp(draw.uniform(float(low), float(high)))
+                low, high = np.log(numbers)
+                values = np.exp(draw.uniform(float(low), float(high)))
             else:
                 share = draw.uniform(0.0, 1.0)
                 values = numbers[0] + 0.0 * share
                 for index in range(1, len(numbers)):
-                    values = xp.where(share >= index / len(numbers), numbers[index], values)
+                    values = np.where(share >= index / len(numbers), numbers[index], values)
             values = clip(values, limits.low, limits.high)
-            drawn[name] = xp.round(values) if name in WHOLE else values
+            drawn[name] = np.round(values) if name in WHOLE else values
         return drawn
 
 

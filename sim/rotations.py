@@ -1,6 +1,6 @@
-"""Vectors turned by unit quaternions, scalar first, for any leading axes: NumPy or torch."""
+"""Vectors turned by unit quaternions, scalar first, for any leading axes."""
 
-from typing import Any
+import numpy as np
 
 from .state import Array, component, stack
 
@@ -50,14 +50,14 @@ def between(a: Array, b: Array) -> Array:
     return multiplied(stack((w, -x, -y, -z)), b)
 
 
-def advanced(xp: Any, quaternion: Array, angle: Array) -> Array:
+def advanced(quaternion: Array, angle: Array) -> Array:
     """Attitudes turned by rotation vectors in the body frame, rad, shape (..., 3); normalised."""
     x, y, z = (0.5 * component(angle, i) for i in range(3))
-    half = xp.sqrt(x * x + y * y + z * z)
-    share = xp.sin(half) / (half + 1e-30)  # 1 or 0 where nothing turns: x, y, z are 0 then
-    turned = multiplied(quaternion, stack((xp.cos(half), share * x, share * y, share * z)))
+    half = np.sqrt(x * x + y * y + z * z)
+    share = np.sin(half) / (half + 1e-30)  # 1 or 0 where nothing turns: x, y, z are 0 then
+    turned = multiplied(quaternion, stack((np.cos(half), share * x, share * y, share * z)))
     w, x, y, z = (component(turned, i) for i in range(4))
-    return turned / stack((xp.sqrt(w * w + x * x + y * y + z * z),))
+    return turned / stack((np.sqrt(w * w + x * x + y * y + z * z),))
 
 
 def _turned(quaternion: Array, vector: Array, sign: float) -> Array:

@@ -20,7 +20,7 @@ from ..models.errors import InputError, expect
 from ..models.fields import Limits, check, limits_of
 from .random import SENSORS
 from .rotations import advanced, between, cross, to_body, to_world, world_z
-from .state import Array, WorldState, clip, component, constant, stack
+from .state import Array, WorldState, clip, component, stack
 
 if TYPE_CHECKING:
     from ..models.vehicle import Vehicle
@@ -218,7 +218,7 @@ def specific_force(world: "World") -> Array:
     the thrusts and the forces of the air of its last physics step.
     """
     state = world.state
-    gravity = constant(np.array((0.0, 0.0, world.vehicle.gravity)), state.position)
+    gravity = np.array((0.0, 0.0, world.vehicle.gravity))
     return to_body(state.quaternion, world.acceleration() + gravity)
 
 
@@ -303,18 +303,16 @@ class Imu(Sensor):
 
     def begin(self, mask: Array, normal: Array) -> None:
         """Bias and error of scale."""
-        bias, scale = (constant(self._both(name), normal) for name in ("bias", "scale"))
+        bias, scale = self._both("bias"), self._both("scale")
         self._bias = _chosen(mask, bias * normal[..., :6], self._bias)
         self._scale = _chosen(mask, scale * normal[..., 6:], self._scale)
 
     def read(self, world: "World", normal: Array) -> Array:
         """Rates and specific force, as the class has them."""
-        exact = world.xp.concat((world.state.body_rates, specific_force(world)), axis=-1)
-        white, step, high = (
-            constant(x, normal) for x in (self._white, self._step, self._both("range"))
-        )
-        reading = (1 + self._scale) * exact + self._bias + white * normal[..., :6]
-        self._bias = self._bias + step * normal[..., 6:]
+        exact = np.concat((world.state.body_rates, specific_force(world)), axis=-1)
+        high = self._both("range")
+        reading = (1 + self._scale) * exact + self._bias + self._white * normal[..., :6]
+        self._bias = self._bias + self._step * normal[..., 6:]
         return clip(reading, -high, high)
 
 
@@ -332,7 +330,7 @@ class Magnetometer(Sensor):
 
     def read(self, world: "World", normal: Array) -> Array:
         """Field and noise."""
-        field = constant(np.array(self.values["field"]), normal) + 0.0 * normal
+        field = np.array(self.values["field"]) + 0.0 * normal
         noise = self.values["noise"] * normal
         return clip(to_body(world.state.quaternion, field) + noise, -1e3, 1e3)
 
@@ -409,9 +407,9 @@ class Gps(Sensor):
     def read(self, world: "World", normal: Array) -> Array:
         """Position and velocity of the body's origin."""
         level, vertical, speed = (self.values[name] for name in self.needs)
-        sigma = constant(np.array((level, level, vertical, speed, speed, speed)), normal)
-        exact = world.xp.concat((world.state.position, world.state.velocity), axis=-1)
-        low, high = (constant(np.array(end), normal) for end in self.bounds())
+        sigma = np.array((level, level, vertical, speed, speed, speed))
+        exact = np.concat((world.state.position, world.state.velocity), axis=-1)
+        low, high = (np.array(end) for end in self.bounds())
         return clip(exact + sigma * normal, low, high)
 
 
@@ -431,11 +429,11 @@ class MotionCapture(Sensor):
 
     def read(self, world: "World", normal: Array) -> Array:
         """Position and quaternion of the body."""
-        state, xp = world.state, world.xp
+        state = world.state
         position = state.position + self.values["noise"] * normal[..., :3]
         angle = self.values["angle_noise"] * normal[..., 3:]
-        turned = advanced(xp, state.quaternion, angle)
-        return xp.concat((clip(position, -FURTHEST, FURTHEST), turned), axis=-1)
+        turned = advanced(state.quaternion, angle)
+        return np.concat((clip(position, -FURTHEST, FURTHEST), turned), axis=-1)
 
 
 SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
@@ -494,7 +492,7 @@ class _Channel:
         """After a control step of the drones of a mask; so many steps are behind each drone."""
         due = mask if self._every == 1 else mask & (steps % self._every == 0)
         fresh = due
-        if self._world.xp is not np or np.any(due):
+        if np.any(due):
             normal = self._noise.normal(due)
             reading = self.sensor.read(self._world, normal[..., :-1])
             fresh = due & (component(normal, -1) >= self._lost)
@@ -518,7 +516,7 @@ class Sensors:
     """
 
     def __init__(self, sensors: Mapping[str, Any], world: "World", period: float) -> None:
-        self._world, xp = world, world.xp
+        self._world = world
         settings = {
             name: _resolved(name, given, world.vehicle, period)
             for name, given in sensors.items()
@@ -533,7 +531,7 @@ class Sensors:
             altitude = settings.get("barometer", {}).get("altitude", 0.0)
             field = settings.get("magnetometer", {}).get("field", FIELD)
             gravity = world.vehicle.gravity
-            self._estimator = Estimator(estimate, xp, period, gravity, altitude, field)
+            self._estimator = Estimator(estimate, period, gravity, altitude, field)
         self._replaces = sensors.get("observe") == _ESTIMATE
         self._steps: Array = 0
 
@@ -585,7 +583,6 @@ class Estimator:
 
     Args:
         times: Time constants, by the names of `Settings`, s.
-        xp: Namespace of the arrays.
         period: Time of a step, s.
         gravity: m/s².
         altitude: Of the ground above sea level, m.
@@ -595,13 +592,12 @@ class Estimator:
     def __init__(
         self,
         times: Mapping[str, float],
-        xp: Any,
         period: float,
         gravity: float,
         altitude: float,
         field: Any,
     ) -> None:
-        self._times, self._xp, self._period, self._gravity = times, xp, period, gravity
+        self._times, self._period, self._gravity = times, period, gravity
         self._altitude, self._north = altitude, math.atan2(field[1], field[0])
         self.position: Array = 0.0
         self.velocity: Array = 0.0
@@ -619,10 +615,8 @@ class Estimator:
         """A control step of the drones of a mask."""
         imu, period = channels["imu"].value, self._period
         rates, force = imu[..., :3], imu[..., 3:]
-        turned = advanced(
-            self._xp, self.quaternion, rates * period + self._correction(force, channels)
-        )
-        gravity = constant(np.array((0.0, 0.0, self._gravity)), force)
+        turned = advanced(self.quaternion, rates * period + self._correction(force, channels))
+        gravity = np.array((0.0, 0.0, self._gravity))
         acceleration = to_world(turned, force) - gravity
         position = self.position + period * self.velocity + 0.5 * period**2 * acceleration
         velocity = self.velocity + period * acceleration
@@ -634,16 +628,16 @@ class Estimator:
 
     def _correction(self, force: Array, channels: Mapping[str, _Channel]) -> Array:
         """Rotation vector in the body frame that pulls the attitude to what measures it, rad."""
-        xp, up, time = self._xp, world_z(self.quaternion), self._times["attitude_time"]
+        up, time = world_z(self.quaternion), self._times["attitude_time"]
         angle = (1 - math.exp(-self._period / time)) / self._gravity * cross(force, up)
         if channel := channels.get("magnetometer"):
             field = to_world(self.quaternion, channel.value)
-            off = self._north - xp.atan2(component(field, 1), component(field, 0))
-            off = xp.atan2(xp.sin(off), xp.cos(off)) * self._gain(channel, "attitude_time")
+            off = self._north - np.atan2(component(field, 1), component(field, 0))
+            off = np.atan2(np.sin(off), np.cos(off)) * self._gain(channel, "attitude_time")
             angle = angle + stack((off,)) * up
         if channel := channels.get("motion_capture"):
             error = between(self.quaternion, channel.value[..., 3:])
-            sign = 2.0 * self._gain(channel, "attitude_time") * xp.sign(component(error, 0))
+            sign = 2.0 * self._gain(channel, "attitude_time") * np.sign(component(error, 0))
             angle = angle + stack((sign,)) * error[..., 1:]
         return angle
 
@@ -681,7 +675,7 @@ class Estimator:
     def reading(self) -> Array:
         """Position, velocity, quaternion and rates, shape (W, A, 13)."""
         parts = (self.position, self.velocity, self.quaternion, self.body_rates)
-        return self._xp.concat(parts, axis=-1)
+        return np.concat(parts, axis=-1)
 
     def seen(self, state: WorldState) -> WorldState:
         """A state with the estimate in place of what is estimated."""
@@ -700,8 +694,4 @@ def _chosen(mask: Array, new: Array, old: Array) -> Array:
         return new if mask else old
     if getattr(new, "ndim", 0) > mask.ndim:
         mask = mask[..., None]
-    if isinstance(mask, np.ndarray):
-        return np.where(mask, new, old)
-    import torch
-
-    return torch.where(mask, new, old)
+    return np.where(mask, new, old)

@@ -4,23 +4,20 @@ A single drone has neither axis: code that counts axes from the last, as `positi
 both.
 
 Frames: world x, y, z with z up, right-handed; body x forward, y left, z up. SI units, quaternions
-scalar first. Arrays are NumPy's, or torch's where the backend runs on another device.
+scalar first.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-_PLAIN = (np.ndarray, float)
 _NUMBERS = (float, int)
 
 Array = Any
-"""A NumPy array or a torch tensor. Code for both uses operators and the namespace of the array
-API standard that its task or controller has as `xp`."""
+"""A NumPy array; of a single drone also a number."""
 
 
 @dataclass(kw_only=True, slots=True)
@@ -88,9 +85,7 @@ def clip(array: Array, low: Any, high: Any) -> Array:
     """The nearest numbers within bounds: numbers, or arrays of the same kind."""
     if isinstance(array, float):  # a single drone's number, NumPy's among them
         return low if array < low else high if array > high else array
-    if isinstance(array, np.ndarray):
-        return np.minimum(np.maximum(array, low), high)  # a third of the time of NumPy's clip
-    return array.clip(low, high)
+    return np.minimum(np.maximum(array, low), high)  # a third of the time of NumPy's clip
 
 
 def component(array: Array, index: int) -> Array:
@@ -103,14 +98,14 @@ def each(values: Array) -> Array:
     return values if isinstance(values, _NUMBERS) else values[..., None]
 
 
-def kept(mask: Array, new: Any, old: Any, xp: Any) -> Any:
+def kept(mask: Array, new: Any, old: Any) -> Any:
     """Lists of arrays: the new for the worlds of a mask, None for all, and the old for the others.
 
     Of a single drone, whose numbers are Python's, all are new; so they are where there is no old.
     """
     if mask is None or old is None or old[0] is None or isinstance(new[0], float):
         return new
-    return [xp.where(mask, a, b) for a, b in zip(new, old, strict=True)]
+    return [np.where(mask, a, b) for a, b in zip(new, old, strict=True)]
 
 
 def plain(array: Array) -> Array:
@@ -118,14 +113,11 @@ def plain(array: Array) -> Array:
     return array.item() if getattr(array, "ndim", 1) == 0 else array
 
 
-def square_root(array: Array, xp: Any) -> Array:
-    """Of numbers; of one below 0, as rounding may leave it, 0. The derivative at 0 is 0."""
+def square_root(array: Array) -> Array:
+    """Of numbers; of one below 0, as rounding may leave it, 0."""
     if isinstance(array, float):
         return math.sqrt(array) if array > 0.0 else 0.0
-    if xp is np:
-        return np.sqrt(np.maximum(array, 0.0))
-    none = array <= 0.0
-    return xp.where(none, 0.0, xp.sqrt(xp.where(none, 1.0, array)))
+    return np.sqrt(np.maximum(array, 0.0))
 
 
 def stack(parts: Sequence[Any]) -> Array:
@@ -138,35 +130,7 @@ def stack(parts: Sequence[Any]) -> Array:
             break
     else:
         return np.array(parts)  # an eighth of the time of NumPy's stack
-    if isinstance(like, np.ndarray):
-        array = np.empty((*like.shape, len(parts)), np.result_type(*parts))
-        for index, part in enumerate(parts):  # a third of the time of NumPy's stack
-            array[..., index] = part
-        return array
-    import torch
-
-    return torch.stack([p if hasattr(p, "ndim") else torch.full_like(like, p) for p in parts], -1)
-
-
-def constant(values: Any, like: Array) -> Array:
-    """An array of the vehicle or the task as an array of the same kind as `like`."""
-    if isinstance(like, _PLAIN):
-        return values
-    values = np.asarray(values, np.float64)
-    return _tensor(values.tobytes(), values.shape, like.dtype, like.device)
-
-
-@lru_cache(maxsize=256)
-def _tensor(raw: bytes, shape: tuple[int, ...], dtype: Any, device: Any) -> Array:
-    import torch
-
-    array = np.frombuffer(raw).reshape(shape)
-    return torch.tensor(array, dtype=dtype, device=device)
-
-
-def on_host(array: Array) -> np.ndarray:
-    """A number, array or tensor as a NumPy array; the memory may be shared. Tensors: float64."""
-    if isinstance(array, np.ndarray | np.generic | float | int):
-        return np.asarray(array)
-    copied: np.ndarray = array.detach().cpu().numpy()
-    return copied.astype(np.float64) if copied.dtype.kind == "f" else copied
+    array = np.empty((*like.shape, len(parts)), np.result_type(*parts))
+    for index, part in enumerate(parts):  # a third of the time of NumPy's stack
+        array[..., index] = part
+    return array

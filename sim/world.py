@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
 
 from ..models import BACKENDS, MAX_DRONES, Backend
-from ..models.errors import expect, require
+from ..models.errors import expect
 from .effects import EffectOptions
 from .random import Draw, Noise
 from .randomize import CENTER, Randomization
@@ -16,17 +16,8 @@ if TYPE_CHECKING:
 
     from ..models.vehicle import Vehicle
 
-_WORLDS: Final = {"mujoco": "MujocoWorld", "rigid": "make_rigid", "warp": "WarpWorld"}
-_PACKAGES: Final = {  # and the extra that has them
-    "mujoco": ("", ()),
-    "rigid": ("train", ("torch",)),
-    "warp": ("gpu", ("torch", "warp", "mujoco_warp")),
-}
-_SETTINGS: Final = {
-    "mujoco": ("num_threads",),
-    "rigid": ("device", "dtype", "compiled", "tensors"),
-    "warp": ("device",),
-}
+_CLASSES: Final = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
+"""Backends by name: a class in the module of that name in `backends`."""
 
 MAX_WORLDS: Final = 1 << 16  # Most worlds of a batch
 CONTACT_CHECK: Final = 0.02
@@ -46,14 +37,16 @@ class World(Protocol):
         shape: (W, A), the leading axes of all arrays; () for a single drone.
         state: As the last step or reset left it.
         parameters: What was drawn for each drone's episode, by name, shape (W, A).
-        xp: Namespace of the array API standard for the state's arrays.
+
+    Class attributes:
+        settings: Names of the backend's own arguments of `make_world`.
     """
 
     vehicle: "Vehicle"
     shape: tuple[int, ...]
     state: WorldState
     parameters: dict[str, Array]
-    xp: Any
+    settings: ClassVar[tuple[str, ...]]
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """Reset the worlds of the mask, bool, shape (W, A), to their rows of `pose`.
@@ -73,13 +66,6 @@ class World(Protocol):
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """Seed the streams of the worlds of a mask, seeds (W,); None leaves its stream."""
-
-    def checked(self, actions: Array, width: int, choices: int, flown: Array | None) -> Array:
-        """Actions as this backend's arrays, shape (N, k), where those are not NumPy's.
-
-        They are out of so many choices, or numbers where `choices` is 0; those of drones that are
-        not `flown`, bool, shape (N,), are ignored. Raises `InputError`.
-        """
 
     def draw(self, mask: Array, chosen: Any = None) -> Draw:
         """A `Draw` for the worlds of the mask; `chosen` as in `random.NumpyDraw`."""
@@ -143,20 +129,13 @@ def make_world(
     randomize: Randomization | None = None,
     **settings: Any,
 ) -> World:
-    """W worlds of so many drones each; `warp` has one alone.
+    """W worlds of so many drones each.
 
-    Settings are `num_threads` of `mujoco`, `device` of the others, `dtype`, `compiled` and
-    `tensors` of `rigid`: without the last it has NumPy arrays.
-
-    Raises:
-        InputError: The backend, the number or a setting is not what it should be.
-        MissingPackage: The backend's package is not installed.
+    Settings are `num_threads` of `mujoco`, `dtype` and `compiled` of `rigid`. Raises `InputError`.
     """
     expect(backend in BACKENDS, "backend", " or ".join(BACKENDS), f"{backend!r}")
     for name, count, most in ("num_envs", num_worlds, MAX_WORLDS), ("drones", drones, MAX_DRONES):
         expect(type(count) is int and 1 <= count <= most, name, f"1 to {most}", f"{count!r}")
-    if drones > 1:
-        expect(backend != "warp", "drones", f"1 with the backend {backend}", f"{drones}")
     if getattr(vehicle, "members", ()):
         expect(backend == "mujoco", "vehicle", f"one with the backend {backend}", vehicle.name)
         acting = [
@@ -165,17 +144,13 @@ def make_world(
         ]
         expected = "none with several vehicles"
         expect(not acting, "effects and randomize", expected, ", ".join(acting))
-    known = _SETTINGS[backend]
+    module = import_module(f".backends.{backend}", __package__)
+    world_class = getattr(module, _CLASSES[backend])
+    known = world_class.settings
     those = f"{' or '.join(known)}, the setting{'s' * (len(known) > 1)} of the backend {backend}"
     for name, value in settings.items():
         expect(name in known, name, those, f"{name}={value!r}")
-    if drones > 1:
-        settings["drones"] = drones
-    extra, packages = _PACKAGES[backend]
-    for package in packages if settings.get("tensors", True) else ():
-        require(package, extra, f"the backend {backend}")
-    module = import_module(f".backends.{backend}", __package__)
-    world: World = getattr(module, _WORLDS[backend])(
-        vehicle, num_worlds, effects=effects, randomize=randomize, **settings
+    world: World = world_class(
+        vehicle, num_worlds, drones=drones, effects=effects, randomize=randomize, **settings
     )
     return world

@@ -11,7 +11,7 @@ of a flight near the origin.
 
 Speed: control steps of 4,096 drones, per second and per second of a processor (which a busy machine
 disturbs less), in turn, medians: of the world alone for `mujoco`
-and `rigid`, arrays and tensors; the same for one env, `Loop.advance` of Hover. With PYTHON of an
+and `rigid`; the same for one env, `Loop.advance` of Hover. With PYTHON of an
 environment that has Crazyflow (pip install crazyflow): its own step benchmark at the same rates, in
 a process of its own.
 
@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from measuring import RESULTS, in_turns, medians, options, write
 from rotorgram.envs import Loop
 from rotorgram.models import QUAD_XML, Vehicle
@@ -56,7 +55,7 @@ def accuracy() -> None:
 
 def distances(file: Path, dtype: str, drones: int = 32) -> dict[str, float]:
     vehicle, dice = Vehicle.load(file), np.random.default_rng(0)
-    ours = make_world(vehicle, drones, "rigid", device="cpu", dtype=dtype)
+    ours = make_world(vehicle, drones, "rigid", dtype=dtype)
     theirs = make_world(vehicle, drones, num_threads=1)
     turned = dice.normal(size=(drones, 1, 4))
     pose = {
@@ -65,20 +64,17 @@ def distances(file: Path, dtype: str, drones: int = 32) -> dict[str, float]:
         "velocity": dice.normal(size=(drones, 1, 3)),
         "body_rates": dice.normal(size=(drones, 1, 3)),
     }
-    every = torch.ones((drones, 1), dtype=torch.bool)
-    kind = getattr(torch, dtype)
-    ours.reset(
-        every, InitialState(**{name: torch.tensor(x, dtype=kind) for name, x in pose.items()})
-    )
+    every = np.ones((drones, 1), bool)
+    ours.reset(every, InitialState(**pose))
     height = np.array((0.0, 0.0, 1000.0))
-    theirs.reset(every.numpy(), InitialState(**pose | {"position": pose["position"] + height}))
+    theirs.reset(every, InitialState(**pose | {"position": pose["position"] + height}))
     for _ in range(round(5 / PERIOD)):
         thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (drones, 1, vehicle.num_rotors))
-        ours.step(torch.tensor(thrust, dtype=kind), vehicle.substeps(PERIOD))
+        ours.step(thrust, vehicle.substeps(PERIOD))
         theirs.step(thrust, vehicle.substeps(PERIOD))
-    q, p = ours.state.quaternion.double().numpy(), theirs.state.quaternion
+    q, p = ours.state.quaternion.astype(np.float64), theirs.state.quaternion
     apart = np.minimum(np.linalg.norm(q - p, axis=-1), np.linalg.norm(q + p, axis=-1))
-    away = ours.state.position.double().numpy() + height - theirs.state.position
+    away = ours.state.position.astype(np.float64) + height - theirs.state.position
     return {
         "position_m": float(np.linalg.norm(away, axis=-1).max()),
         "attitude_rad": float(4 * np.arcsin(apart / 2).max()),
@@ -103,15 +99,8 @@ def world(backend: Any, drones: int, steps: int = 2, **settings: Any) -> Callabl
     made = make_world(vehicle, drones, backend, **settings)
     thrust = vehicle.hover_thrust * dice.uniform(0.999, 1.001, (drones, 1, vehicle.num_rotors))
     place = np.broadcast_to((0.0, 0.0, 2000.0), (drones, 1, 3))
-    every: Any = np.ones((drones, 1), bool)
-    if made.xp is np:
-        made.reset(every, InitialState(position=place))
-        return lambda: made.step(thrust, steps)
-    put = torch.tensor(thrust, dtype=torch.float32)
-    made.reset(
-        torch.tensor(every), InitialState(position=torch.tensor(place.copy(), dtype=torch.float32))
-    )
-    return lambda: made.step(put, steps)
+    made.reset(np.ones((drones, 1), bool), InitialState(position=place))
+    return lambda: made.step(thrust, steps)
 
 
 def env(backend: Any, drones: int, **settings: Any) -> Callable[[], None]:
@@ -119,7 +108,6 @@ def env(backend: Any, drones: int, **settings: Any) -> Callable[[], None]:
     loop = Loop(HOVER, drones, backend=backend, **settings)
     actions: Any = np.random.default_rng(0).uniform(-0.1, 0.1, (drones, 4)).astype(np.float32)
     loop.advance(actions, np.ones(drones, bool), range(drones))
-    actions = actions if loop.world.xp is np else torch.tensor(actions)
 
     def fly() -> None:
         loop.advance(actions, loop.done if loop.done.any() else None)
@@ -131,17 +119,13 @@ def sizes(args: Namespace) -> None:
     """Processor microseconds of `Loop.advance` of Hover, by the number of drones."""
     ways: dict[str, tuple[Any, dict[str, Any]]] = {
         "mujoco": ("mujoco", {}),
-        "rigid, arrays": ("rigid", {"tensors": False}),
-        "rigid, arrays without a compiler": ("rigid", {"tensors": False, "compiled": False}),
-        "rigid, tensors": ("rigid", {"device": "cpu"}),
+        "rigid, arrays": ("rigid", {}),
+        "rigid, arrays without a compiler": ("rigid", {"compiled": False}),
     }
     table = {}
     for drones in (64, 128, 1024, 4096):
         flights = {name: env(kind, drones, **given) for name, (kind, given) in ways.items()}
-        with torch.no_grad():
-            rates = in_turns(
-                flights, args.repeats, lambda fly, n=drones: rate(fly, n, args.seconds)[1]
-            )
+        rates = in_turns(flights, args.repeats, lambda fly, n=drones: rate(fly, n, args.seconds)[1])
         row = {name: round(drones / median * 1e6) for name, median in medians(rates).items()}
         print(drones, row, flush=True)
         table[str(drones)] = row
@@ -153,24 +137,20 @@ def speed(args: Namespace) -> None:
     firsts = {}
     for name, (make, backend, settings) in {
         "world mujoco": (world, "mujoco", {}),
-        "world rigid": (world, "rigid", {"tensors": False}),
-        "world rigid, one physics step": (world, "rigid", {"tensors": False, "steps": 1}),
-        "world rigid tensors": (world, "rigid", {"device": "cpu"}),
+        "world rigid": (world, "rigid", {}),
+        "world rigid, one physics step": (world, "rigid", {"steps": 1}),
         "env mujoco": (env, "mujoco", {}),
-        "env rigid": (env, "rigid", {"tensors": False}),
-        "env rigid tensors": (env, "rigid", {"device": "cpu"}),
+        "env rigid": (env, "rigid", {}),
     }.items():
         start = time.perf_counter()
-        with torch.no_grad():
-            ways[name] = make(backend, args.drones, **settings)
-            ways[name]()
+        ways[name] = make(backend, args.drones, **settings)
+        ways[name]()
         firsts[name] = round(time.perf_counter() - start, 2)
     rates: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
     told: dict[str, Any] = {}
     for _ in range(args.repeats):
         for name, fly in ways.items():
-            with torch.no_grad():
-                rates[name].append(rate(fly, args.drones, args.seconds))
+            rates[name].append(rate(fly, args.drones, args.seconds))
         if args.crazyflow:
             words = [str(HERE / "rigid_crazyflow.py"), str(args.drones), str(args.seconds)]
             said = subprocess.run([args.crazyflow, *words], capture_output=True, check=True).stdout
@@ -184,7 +164,7 @@ def speed(args: Namespace) -> None:
     for name, median in clock.items():
         print(f"{name:32} {median:14,} control steps/s, {processor[name]:14,} of a processor's")
     write(OUT / "speed.json", {
-        "drones": args.drones, "repeats": args.repeats, "threads": torch.get_num_threads(),
+        "drones": args.drones, "repeats": args.repeats,
         "medians": clock, "medians_per_processor_second": processor,
         "first_step_s": firsts, "crazyflow": told.get("versions"),
     })  # fmt: skip

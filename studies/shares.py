@@ -33,9 +33,7 @@ def microseconds(fly: Callable[[], None], times: int) -> float:
 
 
 def simulate(backend: Any, drones: int) -> Callable[[], None]:
-    loop = Loop(
-        HOVER, drones, backend=backend, **({"tensors": False} if backend == "rigid" else {})
-    )
+    loop = Loop(HOVER, drones, backend=backend)
     actions = np.zeros((drones, 4), np.float32)
     loop.advance(actions, np.ones(drones, bool), range(drones))
 

@@ -120,7 +120,7 @@ def effects(vehicle: Vehicle) -> list[str]:
     able = []
     for name in SWITCHES:
         try:
-            Effects(vehicle, EffectOptions(**{name: True}), _no_noise, np)
+            Effects(vehicle, EffectOptions(**{name: True}), _no_noise)
         except InputError:
             continue
         able.append(name)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...sim import Array, Draw, InitialState, WorldState, constant, stack
+from ...sim import Array, Draw, InitialState, WorldState, stack
 from ..spec import Metric
 from .swarm import JITTER, Swarm, SwarmOptions, ring
 
@@ -88,9 +88,8 @@ class Crossing(Swarm):
 
     def _opposite(self, turn: Array) -> Array:
         """Where drones fly to from a ring turned by an angle, rad: world frame, m, (W, A, 3)."""
-        xp = self.xp
-        angle = turn + constant(self._angles, turn) + math.pi
-        x, y = self._radius * xp.cos(angle), self._radius * xp.sin(angle)
+        angle = turn + self._angles + math.pi
+        x, y = self._radius * np.cos(angle), self._radius * np.sin(angle)
         cx, cy, cz = self.options.center
         return stack((x + cx, y + cy, 0.0 * x + cz))
 

@@ -16,7 +16,6 @@ from ...sim import (
     WorldState,
     clip,
     component,
-    constant,
     plain,
     stack,
 )  # fmt: skip
@@ -154,7 +153,7 @@ class Elevation(Task):
         if (chosen := draw.chosen("start")) is not None:
             start = chosen
         self._check(target, start, mask)
-        self.target = plain(self.xp.where(mask, target, self.target))
+        self.target = plain(np.where(mask, target, self.target))
         self._goal = stack((0.0, 0.0, self.target))
         return InitialState(position=stack((0.0, 0.0, start)))
 
@@ -171,7 +170,7 @@ class Elevation(Task):
         """Values within the bounds, which only effects or a vehicle that was drawn could leave."""
         if self._bounds is None:
             return values
-        return clip(values, *(constant(bound, values) for bound in self._bounds))
+        return clip(values, *self._bounds)
 
     def outcome(self, state: WorldState) -> Outcome:
         """Nearness to the target; the end at a crash, a flip-over, or outside the band."""

@@ -96,13 +96,13 @@ class Escort(Swarm):
 
     def target(self) -> tuple[Array, Array]:
         """Position from the center and velocity of the target: world frame, m, m/s, (W, A, 3)."""
-        xp, a = self.xp, self.options.target_path
-        slow = self.options.target_speed / (a * xp.sqrt(1.0 + self._ratio * self._ratio))
+        a = self.options.target_path
+        slow = self.options.target_speed / (a * np.sqrt(1.0 + self._ratio * self._ratio))
         fast = self._ratio * slow
         first, second = slow * self._time + self._alpha, fast * self._time + self._beta
         zero = 0.0 * first
-        place = stack((a * xp.sin(first), a * xp.sin(second), zero))
-        return place, stack((a * slow * xp.cos(first), a * fast * xp.cos(second), zero))
+        place = stack((a * np.sin(first), a * np.sin(second), zero))
+        return place, stack((a * slow * np.cos(first), a * fast * np.cos(second), zero))
 
     def remember(self, state: WorldState, mask: Array) -> None:
         """Move the target; listen."""

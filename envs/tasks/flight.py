@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from ...sim import (
     WorldState,
     clip,
     component,
-    constant,
     each,
     plain,
     stack,
@@ -120,11 +119,11 @@ class Flight(Task):
             vectors = (*turned, world_z(quaternion))
         else:
             vectors = tuple(map(self.turned, (to_goal, state.velocity, *axes(quaternion))))
-        thrust = state.thrust / constant(self.vehicle.hover_thrust, state.thrust) - 1.0
+        thrust = state.thrust / self.vehicle.hover_thrust - 1.0
         rest = [x if getattr(x, "ndim", 0) == state.position.ndim else stack((x,)) for x in more]
         parts = (*vectors, state.body_rates, thrust, *rest)
-        low, high = (constant(bound, state.thrust) for bound in self._bounds)
-        return {"observation": clip(self.xp.concat(parts, axis=-1), low, high)}
+        low, high = self._bounds
+        return {"observation": clip(np.concat(parts, axis=-1), low, high)}
 
     def turned(self, vectors: Array) -> Array:
         """World vectors in the world frame turned by the wanted heading, shape (..., 3)."""
@@ -138,7 +137,7 @@ class Flight(Task):
         """Set attributes for the drones of a mask, shape (W, A), and leave those of the others."""
         for name, new in values.items():
             rows = each(mask) if getattr(new, "ndim", 0) > getattr(mask, "ndim", 0) else mask
-            setattr(self, name, plain(self.xp.where(rows, new, getattr(self, name))))
+            setattr(self, name, plain(np.where(rows, new, getattr(self, name))))
 
 
 def at(point: Sequence[float], state: WorldState) -> Array:
@@ -147,11 +146,9 @@ def at(point: Sequence[float], state: WorldState) -> Array:
     return stack([zero + value for value in point])
 
 
-def length(xp: Any, vectors: Array) -> Array:
-    """Sizes of vectors, shape (..., 3); their derivative at 0 is 0."""
-    if xp is np:
-        return np.sqrt(np.sum(vectors * vectors, axis=-1))
-    return xp.linalg.vector_norm(vectors, axis=-1)
+def length(vectors: Array) -> Array:
+    """Sizes of vectors, shape (..., 3)."""
+    return np.sqrt(np.sum(vectors * vectors, axis=-1))
 
 
 def axes(quaternion: Array) -> tuple[Array, Array]:

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Final
 
+import numpy as np
+
 from ...models.errors import expect
 from ...models.fields import Limits
 from ...sim import Array, Draw, InitialState, WorldState, component, stack
@@ -101,15 +103,15 @@ class Hover(Flight):
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest near the goal, tilted and turned."""
-        xp, options = self.xp, self.options
+        options = self.options
         offset = draw.uniform(-options.start_band, options.start_band, (3,))
         tilt = draw.uniform(0.0, math.radians(options.start_tilt)) / 2
         azimuth = draw.uniform(-math.pi, math.pi)
         off = math.radians(options.start_heading)
         heading = (self.wanted + draw.uniform(-off, off)) / 2
         # First tilted about a horizontal axis, then turned about the vertical.
-        w, x, y = xp.cos(tilt), xp.sin(tilt) * xp.cos(azimuth), xp.sin(tilt) * xp.sin(azimuth)
-        c, s = xp.cos(heading), xp.sin(heading)
+        w, x, y = np.cos(tilt), np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth)
+        c, s = np.cos(heading), np.sin(heading)
         quaternion = stack((c * w, c * x - s * y, c * y + s * x, s * w))
         goal = stack([0.0 * tilt + value for value in options.goal])
         return InitialState(position=goal + offset, quaternion=quaternion)
@@ -120,18 +122,17 @@ class Hover(Flight):
 
     def outcome(self, state: WorldState) -> Outcome:
         """Nearness to goal and heading; the end at a crash, a flip-over, or outside the band."""
-        xp = self.xp
-        distance = length(xp, self.goal(state) - state.position)
+        distance = length(self.goal(state) - state.position)
         nose, _ = axes(state.quaternion)
-        off = xp.atan2(component(nose, 1), component(nose, 0)) - self.wanted
-        heading = xp.atan2(xp.sin(off), xp.cos(off)) * (180 / math.pi)
+        off = np.atan2(component(nose, 1), component(nose, 0)) - self.wanted
+        heading = np.atan2(np.sin(off), np.cos(off)) * (180 / math.pi)
         outside = distance > self.options.flight_band
         terminated = outside | state.touching[()] | (state.tilt_cosine < LEAST_TILT_COSINE)
         return Outcome(
             reward={
                 "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
                 "heading": -HEADING_WEIGHT / 180 * abs(heading),
-                "rates": -RATE_WEIGHT * length(xp, state.body_rates),
+                "rates": -RATE_WEIGHT * length(state.body_rates),
                 "termination": terminated * TERMINATION_REWARD + 0.0,
             },
             terminated=terminated,

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
+import numpy as np
+
 from ...models.errors import expect
 from ...models.fields import Limits, NumberOrPair
 from ...sim import Array, Draw, InitialState, WorldState, component, each, plain, square_root, stack
@@ -149,7 +151,7 @@ class Landing(Flight):
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Level and at rest above the pad's path."""
-        xp, options = self.xp, self.options
+        options = self.options
         offset = draw.uniform(-options.start_band, options.start_band, (3,))
         speed = draw.uniform(*options.pad_speeds)
         direction, phase = draw.uniform(-math.pi, math.pi), draw.uniform(-math.pi, math.pi)
@@ -160,9 +162,9 @@ class Landing(Flight):
             mask,
             _phase=phase,
             _rate=speed / options.pad_path,
-            _cosine=xp.cos(direction),
-            _sine=xp.sin(direction),
-            _side=xp.where(side < 0, zero - 1.0, zero + 1.0) if circle else zero,
+            _cosine=np.cos(direction),
+            _sine=np.sin(direction),
+            _side=np.where(side < 0, zero - 1.0, zero + 1.0) if circle else zero,
         )
         position = stack((zero, zero, zero + self._height + options.start_height)) + offset
         rest, level = 0.0 * position, zero + 1.0
@@ -173,10 +175,10 @@ class Landing(Flight):
 
     def remember(self, state: WorldState, mask: Array) -> None:
         """Move the pad; keep speed and tilt from before contact, and what was won on the way."""
-        xp, touching = self.xp, state.touching
+        touching = state.touching
         self.keep(mask, _phase=self._phase + self._rate * self.options.control_period)
-        velocity = xp.where(each(touching), self._velocity, state.velocity)
-        upright = xp.where(touching, self._upright, state.tilt_cosine)
+        velocity = np.where(each(touching), self._velocity, state.velocity)
+        upright = np.where(touching, self._upright, state.tilt_cosine)
         potential = self._potential_of(state.position, velocity)
         self.keep(mask, _arrival=velocity, _arrival_upright=upright)
         self.keep(mask, _progress=potential - self._potential, _potential=potential)
@@ -192,8 +194,8 @@ class Landing(Flight):
         speed = self._relative(self._arrival)
         away = self.goal(state) - state.position
         x, y = component(away, 0), component(away, 1)
-        distance = square_root(x * x + y * y, self.xp)
-        drift = square_root(speed[0] * speed[0] + speed[1] * speed[1], self.xp)
+        distance = square_root(x * x + y * y)
+        drift = square_root(speed[0] * speed[0] + speed[1] * speed[1])
         landed = (
             touching
             & (distance <= options.pad_radius)
@@ -201,13 +203,13 @@ class Landing(Flight):
             & (drift <= options.drift)
             & (self._arrival_upright >= self._least_upright)
         )
-        outside = length(self.xp, away) > options.flight_band
+        outside = length(away) > options.flight_band
         terminated = touching | outside | (state.tilt_cosine < LEAST_TILT_COSINE)
         return Outcome(
             reward={
                 "progress": self._progress,
                 "time": -TIME_COST,
-                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
+                "rates": -RATE_WEIGHT * length(state.body_rates),
                 "landing": landed * LANDING_REWARD,
                 "termination": (terminated > landed) * CRASH_REWARD + 0.0,
             },
@@ -215,7 +217,7 @@ class Landing(Flight):
             metrics={
                 "landed": landed * 1.0,
                 "pad_distance": distance,
-                "relative_speed": length(self.xp, stack(speed)),
+                "relative_speed": length(stack(speed)),
             },
         )
 
@@ -230,7 +232,7 @@ class Landing(Flight):
     def _pad(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Position, m, and velocity, m/s, of the pad's centre, x and y, world frame."""
         path = self.options.pad_path
-        c, s = path * self.xp.cos(self._phase), path * self.xp.sin(self._phase)
+        c, s = path * np.cos(self._phase), path * np.sin(self._phase)
 
         def turned(along: Array, across: Array) -> tuple[Array, Array]:
             across = self._side * across
@@ -250,5 +252,5 @@ class Landing(Flight):
     def _potential_of(self, position: Array, velocity: Array) -> Array:
         """Minus the distance to the goal, m, and what the relative speed counts."""
         away = self._goal() - position
-        speed = length(self.xp, stack(self._relative(velocity)))
-        return -(length(self.xp, away) + MATCHING_TIME * speed)
+        speed = length(stack(self._relative(velocity)))
+        return -(length(away) + MATCHING_TIME * speed)

@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import numpy as np
+
 from ...models.errors import expect
 from ...models.fields import Limits
 from ...sim import (
@@ -13,7 +15,6 @@ from ...sim import (
     InitialState,
     WorldState,
     component,
-    constant,
     each,
     plain,
     square_root,
@@ -140,19 +141,19 @@ class PayloadHover(Flight):
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """The payload near its goal, hanging still below a craft that moves and tilts."""
-        xp, options = self.xp, self.options
+        options = self.options
         band, fastest = options.start_band, options.start_speed
         offset = draw.uniform(-band, band, (3,))
         tilt = draw.uniform(0.0, math.radians(options.start_tilt)) / 2
         azimuth = draw.uniform(-math.pi, math.pi)
         along, across = draw.uniform(-fastest, fastest), draw.uniform(-fastest, fastest)
-        sine, zero = xp.sin(tilt), 0.0 * tilt
+        sine, zero = np.sin(tilt), 0.0 * tilt
         x, y, z = options.goal
         above = stack((zero + x, zero + y, zero + z + options.cable))
-        carrying = (1.0 + options.payload_share) * constant(self.vehicle.hover_thrust, offset)
+        carrying = (1.0 + options.payload_share) * self.vehicle.hover_thrust
         return InitialState(
             position=above + offset,
-            quaternion=stack((xp.cos(tilt), sine * xp.cos(azimuth), sine * xp.sin(azimuth), zero)),
+            quaternion=stack((np.cos(tilt), sine * np.cos(azimuth), sine * np.sin(azimuth), zero)),
             velocity=stack((along, across, zero)),
             thrust=carrying + each(zero),
         )
@@ -166,20 +167,19 @@ class PayloadHover(Flight):
 
     def outcome(self, state: WorldState) -> Outcome:
         """Nearness of the payload, its swing; the end at contact, a flip-over, or too far away."""
-        xp = self.xp
-        distance = length(self.xp, self.goal(state) - state.payload)
+        distance = length(self.goal(state) - state.payload)
         hung = state.position - state.payload
         x, y, z = (component(hung, i) for i in range(3))
-        swing = xp.atan2(square_root(x * x + y * y, xp), z) * (180 / math.pi)
+        swing = np.atan2(square_root(x * x + y * y), z) * (180 / math.pi)
         outside = distance > self.options.flight_band
         flipped = state.tilt_cosine < LEAST_TILT_COSINE
         terminated = outside | plain(state.touching) | flipped
-        moving = length(self.xp, state.payload_velocity - state.velocity)
+        moving = length(state.payload_velocity - state.velocity)
         return Outcome(
             reward={
                 "payload": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
                 "swing": -SWING_WEIGHT * moving,
-                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
+                "rates": -RATE_WEIGHT * length(state.body_rates),
                 "termination": terminated * TERMINATION_REWARD + 0.0,
             },
             terminated=terminated,

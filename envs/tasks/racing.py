@@ -19,7 +19,6 @@ from ...sim import (
     WorldState,
     clip,
     component,
-    constant,
     each,
     plain,
     stack,
@@ -198,30 +197,30 @@ class Racing(Flight):
 
     def remember(self, state: WorldState, mask: Array) -> None:
         """Whether the gate was passed, how much nearer it came, and the times of rounds."""
-        xp, now, before = self.xp, state.position + 0.0, self._position
+        now, before = state.position + 0.0, self._position
         gate = self._gate(self._passed)
         center = gate[..., :3]
         x, y, half = (component(gate, i) for i in (3, 4, 5))
         a, b = before - center, now - center
         ahead, behind = (component(p, 0) * x + component(p, 1) * y for p in (b, a))
         through = (behind < 0.0) & (ahead >= 0.0)
-        share = each(plain(behind / xp.where(through, behind - ahead, -1.0)))
+        share = each(plain(behind / np.where(through, behind - ahead, -1.0)))
         at = a + share * (b - a)
         aside = component(at, 1) * x - component(at, 0) * y
         inside = (abs(aside) <= half) & (abs(component(at, 2)) <= half)
         left = self._passed < self._total
         passing = plain(through & inside & left) * 1.0
-        progress = plain(length(xp, a) - length(xp, b))
+        progress = plain(length(a) - length(b))
         passed, time = self._passed + passing, self._time + self.options.control_period
         whole = (passing > 0.5) & (passed % self._count == 0.0)
         way, come = center - self._behind, now - self._behind
-        along = plain(xp.sum(come * way, axis=-1)) / (plain(xp.sum(way * way, axis=-1)) + 1e-12)
-        off = plain(length(xp, come - each(clip(along, 0.0, 1.0)) * way))
-        behind_now = xp.where(each(passing > 0.5), center, self._behind)
+        along = plain(np.sum(come * way, axis=-1)) / (plain(np.sum(way * way, axis=-1)) + 1e-12)
+        off = plain(length(come - each(clip(along, 0.0, 1.0)) * way))
+        behind_now = np.where(each(passing > 0.5), center, self._behind)
         self.keep(
             mask, _passed=passed, _time=time, _passing=passing, _progress=progress, _off=off,
-            _lap=plain(xp.where(whole, time - self._lap_began, self._lap)),
-            _lap_began=plain(xp.where(whole, time, self._lap_began)),
+            _lap=plain(np.where(whole, time - self._lap_began, self._lap)),
+            _lap_began=plain(np.where(whole, time, self._lap_began)),
             _position=now, _behind=behind_now,
         )  # fmt: skip
 
@@ -245,7 +244,7 @@ class Racing(Flight):
             reward={
                 "progress": self._progress,
                 "passing": PASSING_REWARD * self._passing,
-                "rates": -COURSE_RATE_WEIGHT * length(self.xp, state.body_rates),
+                "rates": -COURSE_RATE_WEIGHT * length(state.body_rates),
                 "termination": (crashed & (left > 0.5)) * COURSE_TERMINATION_REWARD + 0.0,
             },
             terminated=crashed | (left < 0.5),
@@ -258,12 +257,12 @@ class Racing(Flight):
 
     def _gate(self, passed: Array) -> Array:
         """The gate that is due after so many, shape (..., 6); after the last that one."""
-        number = self.xp.where(passed < self._total, passed, 1.0 * self._total - 1.0)
+        number = np.where(passed < self._total, passed, 1.0 * self._total - 1.0)
         number = plain(number) % self._count
-        rows = constant(self._gates, number)
+        rows = self._gates
         chosen = rows[0]
         for index in range(1, self._count):
-            chosen = self.xp.where(each(number >= index), rows[index], chosen)
+            chosen = np.where(each(number >= index), rows[index], chosen)
         return chosen
 
 

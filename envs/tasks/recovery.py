@@ -14,7 +14,6 @@ from ...sim import (
     InitialState,
     WorldState,
     component,
-    constant,
     plain,
     square_root,
     stack,
@@ -149,18 +148,18 @@ class Recovery(Flight):
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At the goal, thrown."""
-        xp, options, turn = self.xp, self.options, math.pi
+        options, turn = self.options, math.pi
         share, a, b = (
             draw.uniform(low, high) for low, high in ((0, 1), (-turn, turn), (-turn, turn))
         )
-        long, short = xp.sqrt(share), xp.sqrt(1.0 - share)
+        long, short = np.sqrt(share), np.sqrt(1.0 - share)
         quaternion = stack((
-            long * xp.cos(b), short * xp.sin(a), short * xp.cos(a), long * xp.sin(b)
+            long * np.cos(b), short * np.sin(a), short * np.cos(a), long * np.sin(b)
         ))  # fmt: skip
         speed = draw.uniform(0.0, options.start_speed)
         climb, azimuth = draw.uniform(-1.0, 1.0), draw.uniform(-turn, turn)
-        level = square_root(1.0 - climb * climb, xp) * speed
-        velocity = stack((level * xp.cos(azimuth), level * xp.sin(azimuth), climb * speed))
+        level = square_root(1.0 - climb * climb) * speed
+        velocity = stack((level * np.cos(azimuth), level * np.sin(azimuth), climb * speed))
         rates = draw.uniform(-1.0, 1.0, (3,))
         zero = 0.0 * share
         self.keep(mask, _time=zero, _missed=zero, _lowest=zero + options.goal[2])
@@ -168,15 +167,15 @@ class Recovery(Flight):
             position=stack([zero + value for value in options.goal]),
             quaternion=quaternion,
             velocity=velocity,
-            body_rates=rates * constant(self.spin, rates),
+            body_rates=rates * self.spin,
         )
 
     def remember(self, state: WorldState, mask: Array) -> None:
         """Time, the last step that was not recovered, and the lowest point."""
-        xp, height = self.xp, component(state.position, 2)
+        height = component(state.position, 2)
         self.keep(mask, _time=self._time + self.options.control_period)
-        self.keep(mask, _missed=xp.where(self._recovered(state), self._missed, self._time))
-        self.keep(mask, _lowest=xp.where(height < self._lowest, height, self._lowest))
+        self.keep(mask, _missed=np.where(self._recovered(state), self._missed, self._time))
+        self.keep(mask, _lowest=np.where(height < self._lowest, height, self._lowest))
 
     def observe(self, state: WorldState) -> dict[str, Array]:
         """See the tables of the class."""
@@ -184,13 +183,13 @@ class Recovery(Flight):
 
     def outcome(self, state: WorldState) -> Outcome:
         """Nearness to the goal, tilt and spin; the end at a crash or outside the band."""
-        distance = length(self.xp, self.goal(state) - state.position)
+        distance = length(self.goal(state) - state.position)
         terminated = (distance > self.options.flight_band) | plain(state.touching)
         return Outcome(
             reward={
                 "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
                 "tilt": TILT_WEIGHT * (state.tilt_cosine - 1.0),
-                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
+                "rates": -RATE_WEIGHT * length(state.body_rates),
                 "termination": terminated * TERMINATION_REWARD + 0.0,
             },
             terminated=terminated,
@@ -209,6 +208,6 @@ class Recovery(Flight):
     def _recovered(self, state: WorldState) -> Array:
         """Whether it is near, slow and upright, bool, shape (W, A)."""
         options = self.options
-        near = length(self.xp, self.goal(state) - state.position) < options.near
-        slow = length(self.xp, state.velocity) < options.slow
+        near = length(self.goal(state) - state.position) < options.near
+        slow = length(state.velocity) < options.slow
         return near & slow & (state.tilt_cosine > self._least_upright)

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...models.errors import expect
 from ...models.fields import Limits
-from ...sim import Array, Draw, WorldState, constant
+from ...sim import Array, Draw, WorldState
 from ..delay import Delay
 from .flight import (
     AIR,
@@ -78,9 +78,6 @@ class Swarm(Flight):
 
         options, vehicle = self.options, self.vehicle
         self.count = self.shape[1] if self.shape else 1
-        right = self.count == 1 or self.xp is np
-        expected = "1 with torch tensors, for the radio between several has NumPy arrays"
-        expect(right, "drones", expected, f"{self.count}")
         lowest = options.center[2] - JITTER * self.gap
         least = vehicle.rest_height + AIR
         expected = f"a height of at least {least + JITTER * self.gap:.4g} m above the ground"
@@ -112,7 +109,7 @@ class Swarm(Flight):
         """
         jitter = draw.uniform(-JITTER, JITTER, (3,)) * self.gap
         lots = draw.uniform(0.0, 1.0)
-        start = jitter + constant(np.array(self.options.center), jitter)
+        start = jitter + np.array(self.options.center)
         if self.count == 1:
             return start
         places = np.argsort(lots, axis=-1, kind="stable")
@@ -138,12 +135,12 @@ class Swarm(Flight):
             return []
         if self.radio is None:
             nothing = 0.0 * state.position[..., :1]
-            return [self.xp.concat([nothing] * (7 * k), axis=-1)]
+            return [np.concat([nothing] * (7 * k), axis=-1)]
         return [self.radio.nearest(state.position, state.velocity, k)]
 
     def ended(self, state: WorldState) -> Array:
         """Whether a drone has touched anything, flipped over, or left for good, bool, (W, A)."""
-        outside = length(self.xp, self.goal(state) - state.position) > self.band
+        outside = length(self.goal(state) - state.position) > self.band
         return outside | state.touching[()] | (state.tilt_cosine < LEAST_TILT_COSINE)
 
     def outcome(self, state: WorldState) -> Outcome:
@@ -151,7 +148,7 @@ class Swarm(Flight):
         band.
         """
         to_goal = self.goal(state) - state.position
-        distance = length(self.xp, to_goal)
+        distance = length(to_goal)
         along = to_goal * (state.velocity - self.goal_velocity())
         closing = along[..., 0] + along[..., 1] + along[..., 2]
         room, ended, near = self.clearance(state), self.ended(state), self.gap / 2
@@ -160,7 +157,7 @@ class Swarm(Flight):
                 "position": (near - distance) / (near + distance),
                 "approach": APPROACH_WEIGHT * closing / (distance + TINY),
                 "room": self.narrowness(room),
-                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
+                "rates": -RATE_WEIGHT * length(state.body_rates),
                 "termination": ended * TERMINATION_REWARD + 0.0,
             },
             terminated=ended,
@@ -177,21 +174,21 @@ class Swarm(Flight):
         Below 0 spheres overlap. A drone alone has the range of its radio.
         """
         if self.radio is None:
-            return self.options.radio_range + 0.0 * length(self.xp, state.velocity)
-        apart = length(np, state.position[:, :, None] - state.position[:, None])
+            return self.options.radio_range + 0.0 * length(state.velocity)
+        apart = length(state.position[:, :, None] - state.position[:, None])
         apart[:, np.arange(self.count), np.arange(self.count)] = np.inf
         return (apart - (self._radii[:, None] + self._radii)).min(axis=-1)
 
     def narrowness(self, room: Array) -> Array:
         """Reward for a clearance, (W, A): 0 from a diameter on, `-ROOM_WEIGHT` where it is 0."""
         radius = self._radii if self.shape else self.vehicle.radius
-        narrow = 1.0 - room / (2 * constant(radius, room))
+        narrow = 1.0 - room / (2 * radius)
         return -ROOM_WEIGHT * narrow * (narrow > 0)
 
     def slots_at(self, slots: np.ndarray, state: WorldState) -> Array:
         """Offsets of each drone, shape (A, 3), from the center, in the world: (W, A, 3)."""
         places = np.array(self.options.center) + (slots if self.shape else slots[0])
-        return constant(places, state.position) + 0.0 * state.position
+        return places + 0.0 * state.position
 
 
 class Radio:
@@ -253,7 +250,7 @@ class Radio:
         passed = np.where(known[..., None], time, 0.0)
         there = self._heard[..., :3] + self._heard[..., 3:] * passed - position[:, :, None]
         moves = self._heard[..., 3:] - velocity[:, :, None]
-        distance = np.where(known, length(np, there), np.inf)
+        distance = np.where(known, length(there), np.inf)
         order = np.argsort(distance, axis=-1, kind="stable")[..., :count, None]
         told = np.concatenate((there, moves, np.ones_like(there[..., :1])), axis=-1)
         told = np.where(known[..., None], told, 0.0)
@@ -264,7 +261,7 @@ class Radio:
         return numbers.reshape(worlds, drones, 7 * count)
 
     def _in_range(self, receivers: np.ndarray, senders: np.ndarray) -> np.ndarray:
-        apart = length(np, senders[:, None] - receivers[:, :, None])
+        apart = length(senders[:, None] - receivers[:, :, None])
         return np.asarray(apart <= self._options.radio_range)
 
     def _chances(self) -> np.ndarray:

@@ -1,16 +1,13 @@
 """Base of tasks. One class serves every backend, one drone or thousands, in process or over UDP.
 
 A task is written for arrays with any leading axes: W worlds and the A drones of each, or none for a
-single drone. It counts axes from the last (`position[..., 2]`), uses operators, `stack` and the
-functions of `self.xp` (the array API standard: NumPy, or torch on a GPU), and never changes an
-array in place.
+single drone. It counts axes from the last (`position[..., 2]`), uses operators, `stack` and NumPy's
+functions, and never changes an array in place.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Self
-
-import numpy as np
 
 from ...models import MOST_DRAG
 from ...models.errors import expect
@@ -151,7 +148,6 @@ class Task:
         options: As given.
         vehicle: As given.
         shape: (W, A), or () for a single drone.
-        xp: Namespace of the array API standard.
         controller: Turns actions into thrusts: that of the option `action`, unless `setup` sets
             another.
         observation: Specs of one drone's observation; set by `setup`.
@@ -168,10 +164,8 @@ class Task:
     observation: tuple[ArraySpec, ...]
     marks: tuple[Mark, ...] = ()
 
-    def __init__(
-        self, options: Any, vehicle: "Vehicle", shape: tuple[int, ...] = (), xp: Any = np
-    ) -> None:
-        self.options, self.vehicle, self.shape, self.xp = options, vehicle, shape, xp
+    def __init__(self, options: Any, vehicle: "Vehicle", shape: tuple[int, ...] = ()) -> None:
+        self.options, self.vehicle, self.shape = options, vehicle, shape
         self.controller = of_level = self._of_level()
         self.setup()
         ignored = self.controller is not of_level and options.actions is TaskOptions.actions
@@ -210,7 +204,7 @@ class Task:
         """Begin episodes: draw their numbers, shape (W, A, ...), and return the drones' starts.
 
         The mask, bool, shape (W, A), has the worlds that begin one, in the first call all of them.
-        Keep the values of the others: `self.xp.where(mask, new, self.old)`.
+        Keep the values of the others: `np.where(mask, new, self.old)`.
         """
         raise NotImplementedError
 
@@ -218,7 +212,7 @@ class Task:
         """Change the memory of episodes, such as gates that were passed. Optional.
 
         Called after a step, before `observe`. The mask, bool, shape (W, A), has the drones that
-        flew; keep the values of the others: `self.xp.where(mask, new, self.old)`.
+        flew; keep the values of the others: `np.where(mask, new, self.old)`.
         """
 
     def observe(self, state: WorldState) -> dict[str, Array]:

@@ -20,7 +20,6 @@ from ...sim import (
     WorldState,
     clip,
     component,
-    constant,
     each,
     plain,
     stack,
@@ -257,15 +256,15 @@ class Tracking(Flight):
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Near the beginning of the trajectory, or anywhere on a closed one, at its velocity."""
-        xp, band = self.xp, self.options.start_band
+        band = self.options.start_band
         share = draw.uniform(0.0, 1.0)
-        index = xp.floor(share * len(self._table)) if self._closed else 0.0 * share
+        index = np.floor(share * len(self._table)) if self._closed else 0.0 * share
         index = plain(index)
         for number in range(len(self._points)):
             place = draw.uniform(-1.0, 1.0, (3,))
             new = stack([m + half * place[..., i] for i, (m, half) in enumerate(self._box)])
             rows = each(mask) if new.ndim > 1 else mask
-            self._points[number] = xp.where(rows, new, self._points[number])
+            self._points[number] = np.where(rows, new, self._points[number])
         self.keep(mask, _index=index)
         offset = draw.uniform(-band, band, (3,))
         position, velocity = (self._at(table, 0.0) for table in (self._table, self._rates))
@@ -283,15 +282,15 @@ class Tracking(Flight):
 
     def outcome(self, state: WorldState) -> Outcome:
         """Nearness to where it should be; the end at contact, a flip-over, or too far away."""
-        distance = length(self.xp, self.goal(state) - state.position)
+        distance = length(self.goal(state) - state.position)
         outside = distance > self.options.flight_band
         flipped = state.tilt_cosine < LEAST_TILT_COSINE
         terminated = outside | plain(state.touching) | flipped
-        speed = length(self.xp, self._at(self._rates, 0.0))
+        speed = length(self._at(self._rates, 0.0))
         return Outcome(
             reward={
                 "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
-                "rates": -RATE_WEIGHT * length(self.xp, state.body_rates),
+                "rates": -RATE_WEIGHT * length(state.body_rates),
                 "termination": terminated * TERMINATION_REWARD + 0.0,
             },
             terminated=terminated,
@@ -307,8 +306,8 @@ class Tracking(Flight):
         index = self._index + ahead
         last = float(len(table))
         index = index % last if self._closed else clip(index, 0.0, last - 1.0)
-        rows = constant(table, index)
-        row = rows[int(index) if isinstance(index, float) else self.xp.astype(index, self.xp.int64)]
+        rows = table
+        row = rows[int(index) if isinstance(index, float) else np.astype(index, np.int64)]
         if not self._points:
             return row
         parts = [each(component(row, k)) * point for k, point in enumerate(self._points)]

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Final
 
+import numpy as np
+
 from ...models.errors import expect
 from ...models.fields import Limits
 from ...sim import Array, Draw, InitialState, WorldState, component, each, plain, stack
@@ -122,15 +124,15 @@ class Waypoints(Flight):
         )
         rows = each(mask) if start.ndim > 1 else mask
         both = zip(points, self._points, strict=True)
-        self._points = [self.xp.where(rows, new, old) for new, old in both]
-        distance = plain(length(self.xp, points[0] - start))
+        self._points = [np.where(rows, new, old) for new, old in both]
+        distance = plain(length(points[0] - start))
         zero = 0.0 * distance
         self.keep(mask, _reached=zero, _time=zero, _progress=zero, _passed=zero, _distance=distance)
         return InitialState(position=start)
 
     def remember(self, state: WorldState, mask: Array) -> None:
         """Count the point that was reached, and how much nearer the craft came."""
-        distance = plain(length(self.xp, self.goal(state) - state.position))
+        distance = plain(length(self.goal(state) - state.position))
         left = self._reached < self.options.points
         passed = (distance < self.options.radius) & left
         self.keep(
@@ -140,7 +142,7 @@ class Waypoints(Flight):
             _reached=self._reached + passed,
             _time=self._time + self.options.control_period,
         )
-        self.keep(mask, _distance=plain(length(self.xp, self.goal(state) - state.position)))
+        self.keep(mask, _distance=plain(length(self.goal(state) - state.position)))
 
     def observe(self, state: WorldState) -> dict[str, Array]:
         """See the table of the class."""
@@ -159,7 +161,7 @@ class Waypoints(Flight):
             reward={
                 "progress": self._progress,
                 "passing": PASSING_REWARD * self._passed,
-                "rates": -COURSE_RATE_WEIGHT * length(self.xp, state.body_rates),
+                "rates": -COURSE_RATE_WEIGHT * length(state.body_rates),
                 "termination": (crashed & (left > 0.5)) * COURSE_TERMINATION_REWARD + 0.0,
             },
             terminated=crashed | finished,
@@ -174,5 +176,5 @@ class Waypoints(Flight):
         """A point by its number from 0, the last for any larger one, shape (..., 3)."""
         chosen = self._points[0]
         for number, point in enumerate(self._points[1:], start=1):
-            chosen = self.xp.where(each(index >= number), point, chosen)
+            chosen = np.where(each(index >= number), point, chosen)
         return chosen

@@ -1,4 +1,4 @@
-"""What backends share: effects, draws and noise, and the streams of NumPy's numbers."""
+"""What backends share: effects, and the streams of random numbers."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -9,7 +9,7 @@ from ...models.vehicle import Vehicle
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, START, Draw, Noise, NumpyDraw, NumpyNoise, Streams
 from ..randomize import Randomization
-from ..state import Array, InitialState, WorldState, constant, plain
+from ..state import Array, InitialState, WorldState, plain
 from ..world import contact_check
 
 _ONLY: Final = np.zeros(1, int)
@@ -17,9 +17,8 @@ _LEVEL: Final = np.array((1.0, 0.0, 0.0, 0.0))
 
 
 class BaseWorld:
-    """Base of all worlds. A derived class sets `state`, and says what draws numbers."""
+    """Base of all worlds: a seed gives the same draws on each. A derived class sets `state`."""
 
-    xp: Any
     state: WorldState
 
     def __init__(
@@ -35,7 +34,7 @@ class BaseWorld:
         self._drawn = () if randomize is None else randomize.names
         self._noises: list[Noise] = []
         self._starts, self._draws = self._source(START), self._source(RANDOMIZATION)
-        acting = Effects(vehicle, self._options, self.noise, self.xp, self._drawn)
+        acting = Effects(vehicle, self._options, self.noise, self._drawn)
         self.effects = acting if acting.works else None
         self._on_rotors = acting.on_rotors
         self._check = contact_check(vehicle.timestep)
@@ -44,52 +43,13 @@ class BaseWorld:
         """As `World.seed`."""
         ids = self._ids(mask).tolist()
         given = [seeds[i] for i in ids]
-        for one in (self._starts, self._draws, *self._noises):
+        sources: list[Any] = [self._starts, self._draws, *self._noises]
+        for one in sources:
             one.seed(ids, given)
 
     def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
         """As `World.draw`."""
         return self._drawing(self._starts, mask, chosen or {})
-
-    def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
-        """As `World.noise`."""
-        raise NotImplementedError
-
-    def _source(self, use: int | tuple[int, ...]) -> Any:
-        """What draws the numbers of a use."""
-        raise NotImplementedError
-
-    def _drawing(self, source: Any, mask: Array, chosen: Mapping[str, Array]) -> Draw:
-        raise NotImplementedError
-
-    def _ids(self, mask: Array) -> Any:
-        """The worlds of a mask."""
-        raise NotImplementedError
-
-    def _draw_parameters(self, mask: Array) -> None:
-        """Draw the parameters of the worlds of a mask."""
-        if self._randomize is not None:
-            draw = self._drawing(self._draws, mask, {})
-            for name, new in self._randomize.draw(draw, self.xp).items():
-                old = self.parameters.get(name)
-                self.parameters[name] = plain(new if old is None else self.xp.where(mask, new, old))
-
-    def _begun(self, mask: Array, pose: InitialState) -> dict[str, Array]:
-        """The pose's arrays by their names; those of the state for worlds out of the mask."""
-        hover = constant(self.vehicle.hover_thrust, self.state.thrust)
-        level = constant(_LEVEL, self.state.thrust)
-        usual = {"position": 0.0, "quaternion": level, "velocity": 0.0, "body_rates": 0.0}
-        begun = {}
-        for name, default in (usual | {"thrust": hover}).items():
-            given, old = getattr(pose, name), getattr(self.state, name)
-            begun[name] = self.xp.where(mask[..., None], default if given is None else given, old)
-        return begun
-
-
-class ArrayWorld(BaseWorld):
-    """Base of worlds of NumPy arrays: on all of them a seed gives the same draws."""
-
-    xp: Any = np
 
     def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
         """As `World.noise`."""
@@ -105,3 +65,25 @@ class ArrayWorld(BaseWorld):
     def _ids(self, mask: Array) -> np.ndarray:
         """The worlds of a mask; of a single one it is always true."""
         return np.flatnonzero(mask[:, 0]) if self.shape else _ONLY
+
+    def _draw_parameters(self, mask: Array) -> None:
+        """Draw the parameters of the worlds of a mask."""
+        if self._randomize is not None:
+            draw = self._drawing(self._draws, mask, {})
+            for name, new in self._randomize.draw(draw).items():
+                old = self.parameters.get(name)
+                self.parameters[name] = plain(new if old is None else np.where(mask, new, old))
+
+    def _begun(self, mask: Array, pose: InitialState) -> dict[str, Array]:
+        """The pose's arrays by their names; those of the state for worlds out of the mask."""
+        usual: dict[str, Any] = {
+            "position": 0.0,
+            "quaternion": _LEVEL,
+            "velocity": 0.0,
+            "body_rates": 0.0,
+        }
+        begun = {}
+        for name, default in (usual | {"thrust": self.vehicle.hover_thrust}).items():
+            given, old = getattr(pose, name), getattr(self.state, name)
+            begun[name] = np.where(mask[..., None], default if given is None else given, old)
+        return begun

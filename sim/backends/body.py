@@ -2,8 +2,8 @@
 
 Every component is a vector of its own, shape (W,), or a number that counts for all worlds, and a
 number 0.0 costs nothing: a craft whose rotors are parallel and whose center of mass is its origin
-needs a third of the operations of any craft. Vectors are NumPy's, torch's, whose flights have
-derivatives, since nothing is changed in place, or the variables of a C function (`kernel.py`).
+needs a third of the operations of any craft. Vectors are NumPy's, or the variables of a C function
+(`kernel.py`).
 
 Frames: world, z up, and the body's. Position and velocity are those of the body's origin.
 """
@@ -17,7 +17,7 @@ import numpy as np
 
 from ...models.vehicle import Vehicle, craft_bodies
 from ..randomize import CENTER
-from ..state import Array, constant
+from ..state import Array
 
 Vector = tuple[Any, Any, Any]
 
@@ -82,7 +82,7 @@ class Varying(NamedTuple):
 
 
 class Lanes(np.ndarray):
-    """Numbers of W worlds, with the methods of torch's tensors that a motion needs."""
+    """Numbers of W worlds, with the methods that a motion needs."""
 
     def add(self, other: Any, *, alpha: float) -> Any:
         """Itself and `alpha` times another."""
@@ -123,8 +123,8 @@ class RigidBody:
 
     varying: Varying
 
-    def __init__(self, vehicle: Vehicle, xp: Any = np) -> None:
-        model, rotors, self._xp = vehicle.model, vehicle.rotors, xp
+    def __init__(self, vehicle: Vehicle) -> None:
+        model, rotors = vehicle.model, vehicle.rotors
         self._step, self._gravity, self._drag = (
             vehicle.timestep, vehicle.gravity, vehicle.linear_drag
         )  # fmt: skip
@@ -153,7 +153,7 @@ class RigidBody:
         if isinstance(more, float) or not far.any():
             easier, inertia = easier / more, own + far
         else:
-            parts = (constant(own, more), more), (constant(far, more), 1.0 + 0.0 * more)
+            parts = (own, more), (far, 1.0 + 0.0 * more)
             inertia = sum(part * share[:, None, None] for part, share in parts)
         shift: Vector = tuple(parameters.get(name, 0.0) for name in CENTER)
         varying = Varying(
@@ -167,7 +167,7 @@ class RigidBody:
             scale=more**0.5,
         )
         if not isinstance(inertia, np.ndarray) or inertia.ndim == 3:
-            turn, gyroscopic = _euler_of_each(inertia, self._xp)
+            turn, gyroscopic = _euler_of_each(inertia)
             varying = varying._replace(turn=turn, gyroscopic=gyroscopic)
         self.varying = mapped(varying, _lanes)
 
@@ -351,10 +351,10 @@ def _euler(inertia: np.ndarray) -> tuple[Any, Any]:
     return _sparse(inverse), found
 
 
-def _euler_of_each(inertia: Any, xp: Any) -> tuple[Any, Any]:
+def _euler_of_each(inertia: Any) -> tuple[Any, Any]:
     """The same of inertias (W, 3, 3): vectors."""
-    cross, turn = constant(_CROSS, inertia), xp.linalg.inv(inertia)
-    products = -xp.einsum("wil,ljm,wmk->ijkw", turn, cross, inertia)
+    turn = np.linalg.inv(inertia)
+    products = -np.einsum("wil,ljm,wmk->ijkw", turn, _CROSS, inertia)
     pairs = [(j, k) for j in range(3) for k in range(3)]
     rows = [[turn[:, i, j] for j in range(3)] for i in range(3)]
     return rows, [[(j, k, axis[j, k]) for j, k in pairs] for axis in products]

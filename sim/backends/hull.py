@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from ...models.vehicle import Vehicle, craft_bodies
-from ..state import Array, clip, constant
+from ..state import Array, clip
 
 _ROUNDED: Final = 1e-6  # m: what is no margin of a contact
 
@@ -22,9 +22,9 @@ class Hull:
         ground: Height at which a level craft of no depth would touch, m: 0 but for margins.
     """
 
-    def __init__(self, vehicle: Vehicle, xp: Any) -> None:
+    def __init__(self, vehicle: Vehicle) -> None:
         shapes = _shapes(vehicle.model)
-        self._xp, self._reach, self.ground = xp, -np.inf, 0.0
+        self._reach, self.ground = -np.inf, 0.0
         self._apart = 2 * vehicle.radius
         if not shapes:
             return
@@ -33,7 +33,7 @@ class Hull:
         self._shapes = centers, radii[:, None], columns, flat[..., None], rounded[..., None]
         sizes = np.linalg.norm(flat, axis=1) + np.linalg.norm(rounded, axis=1)
         self._reach = float((np.linalg.norm(centers, axis=1) + radii + sizes).max())
-        margin = vehicle.rest_height - float(self._depth(np.array([[0.0], [0.0], [-1.0]]), np)[0])
+        margin = vehicle.rest_height - float(self._depth(np.array([[0.0], [0.0], [-1.0]]))[0])
         self.ground = margin if abs(margin) > _ROUNDED else 0.0
 
     def touches(self, height: Array, quaternion: Any) -> Array:
@@ -44,7 +44,7 @@ class Hull:
             return near
         w, x, y, z = quaternion
         down = (2 * (w * y - x * z), -2 * (y * z + w * x), 2 * (x * x + y * y) - 1)
-        depth: Array = self._depth(self._xp.stack(down), self._xp)
+        depth: Array = self._depth(np.stack(down))
         return height < depth
 
     def collides(self, position: Array) -> Array:
@@ -59,13 +59,13 @@ class Hull:
         overlaps: Array = (square < self._apart**2).sum(-1) > 1  # with itself too
         return overlaps
 
-    def _depth(self, down: Array, xp: Any) -> Array:
+    def _depth(self, down: Array) -> Array:
         """How far the craft reaches along unit vectors, body frame, (3, W): m, (W,)."""
-        centers, radii, axes, flat, rounded = (constant(x, down) for x in self._shapes)
+        centers, radii, axes, flat, rounded = self._shapes
         along = (axes @ down).reshape(-1, 3, down.shape[1])
         straight, round_ = flat * abs(along), rounded * along
-        sizes = xp.sum(straight, axis=1) + xp.sqrt(xp.sum(round_ * round_, axis=1))
-        return xp.max(centers @ down + radii + sizes, axis=0)
+        sizes = np.sum(straight, axis=1) + np.sqrt(np.sum(round_ * round_, axis=1))
+        return np.max(centers @ down + radii + sizes, axis=0)
 
 
 def _shapes(model: mujoco.MjModel) -> list[tuple[Any, ...]]:

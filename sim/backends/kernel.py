@@ -106,7 +106,7 @@ class _Lines:
 
 
 class Variable:
-    """A number of the C function. Its methods are those of torch's tensors."""
+    """A number of the C function. Its methods are those of `body.Lanes`."""
 
     shape = ()
     __array_ufunc__ = None  # NumPy's numbers leave operators to it

@@ -21,14 +21,14 @@ from ..randomize import Randomization
 from ..rotations import body_z
 from ..state import Array, InitialState, WorldState
 from ..world import PhysicsError, check_hung, flown_model
-from .base import ArrayWorld
+from .base import BaseWorld
 from .varied import Varied
 
 _FEW: Final = 8
 _SEEN: Final = np.array(SURROUNDINGS, np.uint8)
 
 
-class MujocoWorld(ArrayWorld):
+class MujocoWorld(BaseWorld):
     """W worlds of A drones over ground of their own: `World`. Drones of a world may collide.
 
     MuJoCo answers a bad state with a reset and a line in MUJOCO_LOG.TXT. Here it raises
@@ -38,6 +38,8 @@ class MujocoWorld(ArrayWorld):
     A single world has no leading axes: NumPy's scalars are ten times faster than its arrays of one.
     So many threads step the worlds; 0 takes one for each processor.
     """
+
+    settings = ("num_threads",)
 
     def __init__(
         self,
@@ -62,7 +64,7 @@ class MujocoWorld(ArrayWorld):
         self._batch = batch = Batch(model, num_worlds, threads)
         self._cable = options.cable if options.payload else None
         self._least_height = options.cable + payload_radius(options.payload)
-        self._varied = Varied(batch.model, drawn, np)
+        self._varied = Varied(batch.model, drawn)
         self._owner = None if threads == 1 else os.getpid()
         self._initial = batch.state[0].copy()
         # Live views of simulator memory, made once.

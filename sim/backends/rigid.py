@@ -1,9 +1,9 @@
-"""The rigid body of a vehicle: no contact, in NumPy's arrays or torch's tensors.
+"""The rigid body of a vehicle: no contact, in NumPy's arrays or compiled.
 
 It flies as `mujoco` does until a part touches the ground, or another drone, of which it tells.
 """
 
-from typing import Any, Final
+from typing import Final
 
 import mujoco
 import numpy as np
@@ -12,10 +12,10 @@ from ...models.errors import expect
 from ...models.vehicle import Vehicle
 from ..effects import EffectOptions
 from ..randomize import Randomization
-from ..state import Array, InitialState, WorldState, clip, constant
+from ..state import Array, InitialState, WorldState, clip
 from ..world import PhysicsError
 from . import kernel
-from .base import ArrayWorld, BaseWorld
+from .base import BaseWorld
 from .body import RigidBody, motion
 from .hull import Hull
 
@@ -23,100 +23,88 @@ DTYPES: Final = ("float32", "float64")
 _LEVEL: Final = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # rows of a craft at rest
 
 
-def make_rigid(
-    vehicle: Vehicle,
-    num_worlds: int,
-    *,
-    drones: int = 1,
-    effects: EffectOptions | None = None,
-    randomize: Randomization | None = None,
-    tensors: bool = True,
-    device: str | None = None,
-    dtype: str = "float32",
-    compiled: bool | None = None,
-) -> "Rigid":
-    """W worlds of so many drones in torch tensors; or in NumPy arrays, on the CPU alone.
-
-    `device` is `cpu`, `cuda`, `cuda:1`...; with tensors None takes a CUDA device if there is one.
-    """
-    shape, right = (num_worlds, drones), compiled is None or type(compiled) is bool
-    expect(right, "compiled", "true or false", repr(compiled))
-    expect(dtype in DTYPES, "dtype", " or ".join(DTYPES), repr(dtype))
-    if not tensors:
-        expect(device in (None, "cpu"), "device", "cpu without tensors", repr(device))
-        return RigidWorld(vehicle, shape, effects, randomize, dtype, compiled)
-    from .rigid_tensors import RigidTensorWorld
-
-    return RigidTensorWorld(vehicle, shape, effects, randomize, dtype, compiled, device)
-
-
-class Rigid(BaseWorld):
+class RigidWorld(BaseWorld):
     """W worlds of A drones over level ground: `World`, without contact.
 
     A craft that reaches the ground is `touching`, and flies on through it: a task ends an episode
     there. So it is with two crafts whose spheres overlap, of `Vehicle.radius` about their origins:
-    earlier than their geoms would meet. A step makes new arrays for the state.
+    earlier than their geoms would touch. A step makes new arrays for the state.
+
+    Args:
+        dtype: `float32` or `float64`.
+        compiled: Fly by a C function (`kernel.py`). None: where there is a C compiler.
     """
 
-    dtype: Any
+    settings = ("dtype", "compiled")
 
     def __init__(
         self,
         vehicle: Vehicle,
-        shape: tuple[int, int],
-        effects: EffectOptions | None,
-        randomize: Randomization | None,
-        *base: Any,
+        num_worlds: int,
+        *,
+        drones: int = 1,
+        effects: EffectOptions | None = None,
+        randomize: Randomization | None = None,
+        dtype: str = "float32",
+        compiled: bool | None = None,
     ) -> None:
+        expect(
+            compiled is None or type(compiled) is bool, "compiled", "true or false", repr(compiled)
+        )
+        expect(dtype in DTYPES, "dtype", " or ".join(DTYPES), repr(dtype))
+        found = kernel.compiler()
+        expected = "false where no C compiler is found (cc, gcc, clang or the variable CC)"
+        expect(found or not compiled, "compiled", expected, "true")
         payload = 0.0 if effects is None else effects.payload
         expected = "none with the backend rigid, which has no cable: fly it with mujoco"
         expect(not payload, "effects: payload", expected, f"{payload:g} kg")
-        super().__init__(vehicle, shape, effects, randomize, *base)
+        shape = (num_worlds, drones)
+        super().__init__(vehicle, shape, effects, randomize)
         _check_forces(vehicle)
-        self._body, self._hull = RigidBody(vehicle, self.xp), Hull(vehicle, self.xp)
+        self.dtype = np.dtype(dtype)
+        self._body, self._hull = RigidBody(vehicle), Hull(vehicle)
         self._at_once = None if self.effects is None else 1  # physics steps of a call
-        thrust = self._zeros(*shape, vehicle.num_rotors)
-        self._low, self._high = (
-            constant(x, thrust) for x in (vehicle.thrust_low, vehicle.thrust_high)
-        )
+        thrust = np.zeros((*shape, vehicle.num_rotors), self.dtype)
         self._nothing = self._acting = thrust  # mean over the last physics step
         self._wrench: Array = None  # force and torque of effects over it, (6, W A)
-        self._rows = self._zeros(13, shape[0] * shape[1]) + constant(_LEVEL, thrust)[:, None]
+        self._rows = np.repeat(_LEVEL.astype(self.dtype)[:, None], num_worlds * drones, axis=1)
         nobody = thrust[..., 0] > 0
         self.state = WorldState(
             **self._shown(), command=thrust, thrust=thrust, touching=nobody,
             colliding=nobody if shape[1] > 1 else None,
         )  # fmt: skip
 
-    def _zeros(self, *shape: int) -> Array:
-        """Zeros of this dtype."""
-        raise NotImplementedError
-
-    def _flown(self, rows: Array, thrust: Array, wrench: Array, steps: int) -> Array:
-        """New rows after physics steps: see `RigidBody.fly`."""
-        raise NotImplementedError
+        self._varying: np.ndarray | None = None
+        self._function: kernel.Fly | None = None
+        if found and compiled is not False:
+            ones = np.ones(num_worlds * drones)
+            self._vary(dict.fromkeys(self._drawn, ones))
+            pushed = self.effects is not None and self.effects.on_body
+            self._function = kernel.compiled(
+                self._body, vehicle.num_rotors, self.dtype, wrench=pushed
+            )
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`."""
-        xp, state, rows = self.xp, self.state, mask[..., None]
+        state, rows = self.state, mask[..., None]
         begun = self._begun(mask, pose)
         turn = begun["quaternion"]
-        unit = turn / xp.sqrt(xp.sum(turn * turn, axis=-1, keepdims=True))
-        turn = xp.where(rows, unit, turn)  # the others keep their bits
+        unit = turn / np.sqrt(np.sum(turn * turn, axis=-1, keepdims=True))
+        turn = np.where(rows, unit, turn)  # the others keep their bits
         parts = (begun["position"], turn, begun["velocity"], begun["body_rates"])
-        self._rows = self._as_rows(xp.concat(parts, axis=-1))
+        self._rows = self._as_rows(np.concat(parts, axis=-1))
         self._show()
         state.thrust = self._typed(begun["thrust"])
-        state.command = xp.where(rows, state.thrust, state.command)
+        state.command = np.where(rows, state.thrust, state.command)
         self._draw_parameters(mask)
         if self.parameters:
             self._vary({name: values.reshape(-1) for name, values in self.parameters.items()})
         if self.effects is not None:
             thrust = self.effects.begin(mask, state, self.parameters)
-            state.thrust = self._typed(xp.where(rows, thrust, state.thrust))
-        self._acting = xp.where(rows, state.thrust, self._acting)
+            state.thrust = self._typed(np.where(rows, thrust, state.thrust))
+        self._acting = np.where(rows, state.thrust, self._acting)
         if self._wrench is not None:
-            self._wrench = xp.where(mask.reshape(-1), 0.0 * self._wrench, self._wrench)
+            self._wrench = np.where(mask.reshape(-1), 0.0 * self._wrench, self._wrench)
         self._tell(mask, self._contacts())
 
     def step(
@@ -147,34 +135,41 @@ class Rigid(BaseWorld):
                     state.thrust = self._kept(mask, self._typed(end), state.thrust)
                 wrench = None if push is None else self._as_rows(push)
             if not self._on_rotors:  # as MuJoCo clamps controls
-                acting = clip(acting, self._low, self._high)
+                acting = clip(acting, self.vehicle.thrust_low, self.vehicle.thrust_high)
             new = self._flown(self._rows, self._as_rows(acting), wrench, at_once)
-            self._rows = new if mask is None else self.xp.where(mask.reshape(-1), new, self._rows)
+            self._rows = new if mask is None else np.where(mask.reshape(-1), new, self._rows)
             self._show()
         self._acting = self._kept(mask, acting, self._acting)
         if wrench is not None:
             old = 0.0 * wrench if self._wrench is None else self._wrench
-            new = wrench if mask is None else self.xp.where(mask.reshape(-1), wrench, old)
+            new = wrench if mask is None else np.where(mask.reshape(-1), wrench, old)
             self._wrench = new
 
     def acceleration(self) -> Array:
         """As `World.acceleration`."""
         push = self._body.push(self._as_rows(self._acting), self._wrench)
         linear, _ = self._body.acceleration(motion(self._rows), push)
-        return self.xp.stack(list(linear), axis=-1).reshape(*self.shape, 3)
+        return np.stack(list(linear), axis=-1).reshape(*self.shape, 3)
 
     def below(self) -> Array:
         """As `World.below`: the ground is the only surface."""
         height = self.state.position[..., 2] - self._hull.ground
-        cosine, where = self.state.tilt_cosine, self.xp.where
-        seen, one = (cosine > 0) & (height >= 0), 1.0 + 0.0 * cosine
-        return where(seen, height / where(seen, cosine, one), self.xp.inf * one)
+        cosine = self.state.tilt_cosine
+        seen = (cosine > 0) & (height >= 0)
+        return np.where(seen, height / np.where(seen, cosine, 1.0), np.inf)
 
     def close(self) -> None:
         """Nothing is to be released."""
 
     def _vary(self, parameters: dict[str, Array]) -> None:
         self._body.vary(parameters)
+        self._varying = kernel.packed(self._body, self.dtype)
+
+    def _flown(self, rows: Array, thrust: Array, wrench: Array, steps: int) -> np.ndarray:
+        """New rows after physics steps: see `RigidBody.fly`."""
+        if self._function is None:
+            return np.array(self._body.fly(rows, thrust, wrench, steps), self.dtype)
+        return self._function(rows, thrust, wrench, self._varying, steps)
 
     def _shown(self) -> dict[str, Array]:
         """The rows as arrays of the state."""
@@ -191,14 +186,14 @@ class Rigid(BaseWorld):
             setattr(self.state, name, values)
 
     def _typed(self, values: Array) -> Array:
-        return self.xp.astype(values, self.dtype, copy=False)
+        return np.astype(values, self.dtype, copy=False)
 
     def _as_rows(self, values: Array) -> Array:
         """Vectors (W, A, k) as rows (k, W A) of this dtype, one after the other in memory."""
-        return self.xp.asarray(self._typed(values).reshape(-1, values.shape[-1]).T, order="C")
+        return np.asarray(self._typed(values).reshape(-1, values.shape[-1]).T, order="C")
 
     def _kept(self, mask: Array | None, new: Array, old: Array) -> Array:
-        return new if mask is None else self.xp.where(mask[..., None], new, old)
+        return new if mask is None else np.where(mask[..., None], new, old)
 
     def _contacts(self) -> list[Array]:
         """Which crafts touch anything and, of several, which another, bool, (W, A)."""
@@ -213,59 +208,15 @@ class Rigid(BaseWorld):
         """Set what `_contacts` found, for the worlds of a mask."""
         for name, new in zip(("touching", "colliding"), found, strict=False):
             old = getattr(self.state, name)
-            setattr(self.state, name, new if mask is None else self.xp.where(mask, new, old))
+            setattr(self.state, name, new if mask is None else np.where(mask, new, old))
 
     def _refuse_bad(self) -> None:
         if abs(self._rows).max() < mujoco.mjMAXVAL:  # not of NaN
             return
-        bad = ~self.xp.all(abs(self._rows) < mujoco.mjMAXVAL, axis=0)
-        worlds = self.xp.any(bad.reshape(self.shape), axis=1)
+        bad = ~np.all(abs(self._rows) < mujoco.mjMAXVAL, axis=0)
+        worlds = np.any(bad.reshape(self.shape), axis=1)
         ids = worlds.nonzero()[0].flatten().tolist()
         raise PhysicsError(f"the rigid body has bad states in envs {ids[:5]}: reset the env")
-
-
-class RigidWorld(Rigid, ArrayWorld):
-    """`Rigid` in NumPy arrays: a seed gives the draws that it gives `mujoco`.
-
-    A step is a C function where there is a C compiler (`kernel.py`), unless `compiled` is False.
-    """
-
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        shape: tuple[int, int],
-        effects: EffectOptions | None,
-        randomize: Randomization | None,
-        dtype: str,
-        compiled: bool | None,
-    ) -> None:
-        found = kernel.compiler()
-        expected = "false where no C compiler is found (cc, gcc, clang or the variable CC)"
-        expect(found or not compiled, "compiled", expected, "true")
-        self.dtype = np.dtype(dtype)
-        super().__init__(vehicle, shape, effects, randomize)
-        self._varying: np.ndarray | None = None
-        self._function: kernel.Fly | None = None
-        if found and compiled is not False:
-            one = np.ones(shape[0] * shape[1])
-            self._vary(dict.fromkeys(self._drawn, one))
-            pushed = self.effects is not None and self.effects.on_body
-            self._function = kernel.compiled(
-                self._body, vehicle.num_rotors, self.dtype, wrench=pushed
-            )
-
-    def _zeros(self, *shape: int) -> np.ndarray:
-        return np.zeros(shape, self.dtype)
-
-    def _flown(self, rows: Array, thrust: Array, wrench: Array, steps: int) -> np.ndarray:
-        if self._function is None:
-            new = self._body.fly(rows, thrust, wrench, steps)
-            return np.array(new, self.dtype)
-        return self._function(rows, thrust, wrench, self._varying, steps)
-
-    def _vary(self, parameters: dict[str, Array]) -> None:
-        super()._vary(parameters)
-        self._varying = kernel.packed(self._body, self.dtype)
 
 
 def _check_forces(vehicle: Vehicle) -> None:

@@ -1,14 +1,14 @@
 """Drawn parameters of the compiled model: which of its fields they change, and to what."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import mujoco
 import numpy as np
 
 from ...models.vehicle import body_axes, owners, payload_body
 from ..randomize import CENTER
-from ..state import Array, constant, stack
+from ..state import Array, stack
 
 _FIELDS: Final = {
     "mass": ("body_mass", "body_inertia", "dof_damping"),  # Unity's drag goes with the mass
@@ -26,8 +26,8 @@ class Varied:
         fields: Their names; empty if nothing that is drawn is of the model.
     """
 
-    def __init__(self, model: mujoco.MjModel, drawn: Sequence[str], xp: Any) -> None:
-        self._names, self._xp = [name for name in drawn if name in _FIELDS], xp
+    def __init__(self, model: mujoco.MjModel, drawn: Sequence[str]) -> None:
+        self._names = [name for name in drawn if name in _FIELDS]
         self.fields = tuple(dict.fromkeys(f for name in self._names for f in _FIELDS[name]))
         self._base = {name: getattr(model, name).copy() for name in self.fields}
         owner = owners(model)
@@ -45,28 +45,25 @@ class Varied:
 
     def values(self, parameters: Mapping[str, Array]) -> dict[str, Array]:
         """The fields by name, each (N, ...), of N worlds with these parameters, each (N, A)."""
-        where = self._xp.where
+        where = np.where
         given = {name: parameters[name] for name in self._names}
         like = next(iter(given.values()))
-        told = {name: constant(base, like) for name, base in self._base.items()}
         ones = 1.0 + 0.0 * like
-        craft, hung, linear, torque = (
-            constant(1.0 * x, like) > 0.5
-            for x in (self._craft, self._hung, self._linear, self._torque)
-        )
         mass, payload = (given.get(name, ones) for name in ("mass", "payload"))
         inertia = mass * given.get("inertia", ones)
-        loads = where(hung, payload[:, :1], 1.0)
+        loads = where(self._hung, payload[:, :1], 1.0)
         reaction = given.get("reaction", ones)[:, self._of_rotors, None]
         factors = {
-            "body_mass": where(craft, mass[:, self._of_bodies], loads),
-            "body_inertia": where(craft, inertia[:, self._of_bodies], loads)[..., None],
-            "dof_damping": where(linear, mass[:, self._of_dofs], 1.0),
-            "actuator_gear": where(torque, reaction, 1.0),
+            "body_mass": where(self._craft, mass[:, self._of_bodies], loads),
+            "body_inertia": where(self._craft, inertia[:, self._of_bodies], loads)[..., None],
+            "dof_damping": where(self._linear, mass[:, self._of_dofs], 1.0),
+            "actuator_gear": where(self._torque, reaction, 1.0),
         }
-        values = {name: factors[name] * base for name, base in told.items() if name in factors}
-        if "body_ipos" in told:
+        values = {
+            name: factors[name] * base for name, base in self._base.items() if name in factors
+        }
+        if "body_ipos" in self._base:
             shift = stack([given.get(name, 0.0 * ones) for name in CENTER])[:, self._of_bodies]
-            axes = constant(self._axes, like)
-            values["body_ipos"] = told["body_ipos"] + self._xp.einsum("bji,wbj->wbi", axes, shift)
+            moved = np.einsum("bji,wbj->wbi", self._axes, shift)
+            values["body_ipos"] = self._base["body_ipos"] + moved
         return values

@@ -13,7 +13,7 @@ shortest turn of the thrust axis to the wanted one. Of that turn, by an angle θ
 for large-angle rotational maneuvers", Systems & Control Letters 61, 2012; the sin θ of 2010
 vanishes upside down. Wanted angular accelerations are left out.
 
-Array code for NumPy and torch with any leading axes; of a single drone the numbers are Python's.
+Array code with any leading axes; of a single drone the numbers are Python's.
 """
 
 import math
@@ -282,27 +282,25 @@ def _least(parts: list[Any]) -> Any:
 def _root(square: Any) -> Any:
     if isinstance(square, float):
         return math.sqrt(square)
-    return np.sqrt(square) if isinstance(square, np.ndarray) else square.sqrt()
+    return np.sqrt(square)
 
 
 def _larger(a: Any, b: Any) -> Any:
     if isinstance(a, float):
         return max(a, b)
-    return np.maximum(a, b) if isinstance(a, np.ndarray) else a.maximum(b)
+    return np.maximum(a, b)
 
 
 def _smaller(a: Any, b: Any) -> Any:
     if isinstance(a, float):
         return min(a, b)
-    return np.minimum(a, b) if isinstance(a, np.ndarray) else a.minimum(b)
+    return np.minimum(a, b)
 
 
 def _by_name(name: str, angle: Any) -> Any:
     """Of numbers too by NumPy: a batch gets the bits of a single drone."""
-    if isinstance(angle, float | np.ndarray):
-        found = getattr(np, name)(angle)
-        return float(found) if isinstance(angle, float) else found
-    return getattr(angle, name)()
+    found = getattr(np, name)(angle)
+    return float(found) if isinstance(angle, float) else found
 
 
 _sin, _cos = partial(_by_name, "sin"), partial(_by_name, "cos")

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Final
 
-from ..state import Array, WorldState, clip, component, constant, stack
+from ..state import Array, WorldState, clip, component, stack
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
@@ -45,12 +45,8 @@ class CollectiveThrust:
             present = component(state.command, 0) if self._increment else self._hover
             thrust = clip(present + self._per_action * share, self._low, self._high)
             return thrust if isinstance(thrust, float) else stack((thrust,))
-        per_action, hover, low, high = (
-            constant(x, state.thrust)
-            for x in (self._per_action, self._hover, self._low, self._high)
-        )
-        present = state.command if self._increment else hover
-        return clip(present + per_action * stack((share,)), low, high)
+        present = state.command if self._increment else self._hover
+        return clip(present + self._per_action * stack((share,)), self._low, self._high)
 
 
 class RotorThrust:
@@ -66,5 +62,5 @@ class RotorThrust:
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
-        hover, up, down = (constant(x, state.thrust) for x in (self._hover, self._up, self._down))
-        return hover + up * clip(action, 0.0, 1.0) + down * clip(action, -1.0, 0.0)
+        above, below = clip(action, 0.0, 1.0), clip(action, -1.0, 0.0)
+        return self._hover + self._up * above + self._down * below

@@ -11,7 +11,7 @@ the same bits alone and in a batch.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from ...models.errors import expect
 from ..random import GUSTS, Noise
@@ -44,7 +44,6 @@ class Effects:
         vehicle: "Vehicle",
         options: EffectOptions,
         noise: Callable[[int, int], Noise],
-        xp: Any,
         drawn: tuple[str, ...] = (),
     ) -> None:
         """`noise` is that of the world; `drawn` has the names of what `begin` gets."""
@@ -57,8 +56,8 @@ class Effects:
         moved = options.body_drag or options.rotor_drag
         self.on_body = moved or options.ground_effect
         self.works = self.on_rotors or self.on_body
-        self._rotors = RotorEffects(vehicle, options, xp)
-        self._air = AirEffects(vehicle, options, xp)
+        self._rotors = RotorEffects(vehicle, options)
+        self._air = AirEffects(vehicle, options)
         self._mean_wind = options.wind
         self._wind: list[Array] = [0.0, 0.0, 0.0]
         needed = not options.wind_blows or moved
@@ -66,7 +65,7 @@ class Effects:
         self._downwash = Downwash(vehicle) if options.downwash else None
         self._gusts: Gusts | None = None
         if options.gusts:
-            self._gusts = Gusts(options.gusts, options.wind, vehicle.timestep, xp)
+            self._gusts = Gusts(options.gusts, options.wind, vehicle.timestep)
             self._noise = noise(NUMBERS, GUSTS)
 
     def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> Array:
@@ -107,16 +106,3 @@ class Effects:
         if self._downwash is not None and state.position.ndim > 2 and state.position.shape[1] > 1:
             wind = [a + b for a, b in zip(wind, self._downwash.air(state), strict=True)]
         return mean, end, self._air.step(state, mean, root, wind, mask)
-
-    def detach(self) -> None:
-        """End the graph of gradients of torch tensors."""
-        for part in (self._rotors, self._air, self._gusts):
-            if part is not None:
-                vars(part).update({name: _detached(value) for name, value in vars(part).items()})
-
-
-def _detached(value: Any) -> Any:
-    """A tensor, or those of a list, without their graph; anything else as it is."""
-    if isinstance(value, list):
-        return [_detached(one) for one in value]
-    return value.detach() if hasattr(value, "requires_grad") else value

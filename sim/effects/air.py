@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from ...models.errors import expect
-from ..state import Array, WorldState, clip, component, constant, each, kept, square_root, stack
+from ..state import Array, WorldState, clip, component, each, kept, square_root, stack
 from .options import EffectOptions
 from .rotors import split, total
 
@@ -34,8 +34,8 @@ class AirEffects:
       its thrust (Cheeseman and Bennett, ARC R&M 3021, 1955).
     """
 
-    def __init__(self, vehicle: "Vehicle", options: EffectOptions, xp: Any) -> None:
-        self._xp, self._options, self._half = xp, options, 0.5 * vehicle.timestep
+    def __init__(self, vehicle: "Vehicle", options: EffectOptions) -> None:
+        self._options, self._half = options, 0.5 * vehicle.timestep
         told, rotors = vehicle.coefficients, vehicle.rotors
         self._center: Vector = tuple(vehicle.center_of_mass.tolist())
         self._geometry = np.array([(*rotor.position, *rotor.axis) for rotor in rotors])
@@ -79,10 +79,10 @@ class AirEffects:
     def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> None:
         """Begin at the motion of a state; factors (W, A) by parameter."""
         self._factors = factors
-        self._before = kept(mask, _motion(state), self._before, self._xp)
+        self._before = kept(mask, _motion(state), self._before)
         rows = self._geometry.tolist()
         if state.position.ndim > 1:
-            rows = [[constant(x, state.position) for x in self._geometry.T]]
+            rows = [list(self._geometry.T)]
         self._rotors = [(row[:3], row[3:]) for row in rows]
 
     def step(
@@ -102,7 +102,7 @@ class AirEffects:
         now = _motion(state)
         # The middle of the step: half of the last step's change further.
         ahead = [1.5 * new - 0.5 * old for new, old in zip(now, self._before, strict=True)]
-        self._before = kept(mask, now, self._before, self._xp)
+        self._before = kept(mask, now, self._before)
         w: Vector = (ahead[3], ahead[4], ahead[5])
         turn = _turned(state.quaternion, w, self._half)
         through = (ahead[0] - wind[0], ahead[1] - wind[1], ahead[2] - wind[2])
@@ -129,7 +129,7 @@ class AirEffects:
     def _body(self, v: Vector, w: Vector) -> tuple[Vector, Vector]:
         """Drag of the body, body axes: force, and torque about the body's origin."""
         v = _add(v, _cross(w, self._center))
-        speed = square_root(v[0] * v[0] + v[1] * v[1] + v[2] * v[2], self._xp)
+        speed = square_root(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
         factor = self._factors.get("body_drag", 1.0)
         both = zip(self._linear, self._quadratic, v, strict=True)
         x, y, z = (-factor * (linear + quadratic * speed) * u for linear, quadratic, u in both)
@@ -155,7 +155,7 @@ class AirEffects:
             x, y, z = _add(around, _cross(around[3:6], place))
             along = x * axis[0] + y * axis[1] + z * axis[2]
             plane = (x - along * axis[0], y - along * axis[1], z - along * axis[2])
-            root = square_root(thrust, self._xp) if root is None else root
+            root = square_root(thrust) if root is None else root
             speed = root / self._slope
             if "rotor_drag" in self._factors:
                 speed = speed * each(self._factors["rotor_drag"])

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..state import Array, kept, on_host
+from ..state import Array, kept
 
 FOOT: Final = 0.3048  # m
 LOWEST, HIGHEST = 10 * FOOT, 1000 * FOOT  # m: where the low-altitude model is defined
@@ -36,14 +36,12 @@ class Gusts:
         timestep: Physics step, s.
     """
 
-    def __init__(
-        self, wind_speed: float, mean_wind: tuple[float, ...], timestep: float, xp: Any
-    ) -> None:
+    def __init__(self, wind_speed: float, mean_wind: tuple[float, ...], timestep: float) -> None:
         self._sigma = 0.1 * wind_speed
         across = math.hypot(mean_wind[0], mean_wind[1])
         self._along = (1.0, 0.0) if across == 0 else (mean_wind[0] / across, mean_wind[1] / across)
         self._speed = max(LEAST_SPEED, math.hypot(*mean_wind))
-        self._step, self._xp = timestep, xp
+        self._step = timestep
         self._filters: Any = None
         self._state: Any = None
 
@@ -52,9 +50,9 @@ class Gusts:
 
         The factor scales the gusts, one for all or (W, A).
         """
-        feet = np.clip(np.ravel(on_host(height)).astype(np.float64), LOWEST, HIGHEST) / FOOT
+        feet = np.clip(np.ravel(height).astype(np.float64), LOWEST, HIGHEST) / FOOT
         shape = 0.177 + 0.000823 * feet
-        sigma = self._sigma * np.ravel(on_host(factor)).astype(np.float64)
+        sigma = self._sigma * np.ravel(factor).astype(np.float64)
         sigmas = sigma / shape**0.4, sigma + 0.0 * feet
         lengths = FOOT * feet / shape**1.2, FOOT * feet
         r = self._step * self._speed / lengths[0]
@@ -71,14 +69,14 @@ class Gusts:
             a = np.sqrt(q11)
             # In a short step the last is less than what rounding leaves of the difference.
             filters += [e, r, a, q12 / a, np.sqrt(np.maximum(q22 - q12 * q12 / q11, 0.0))]
-        self._filters = kept(mask, self._ours(filters, normal), self._filters, self._xp)
+        self._filters = kept(mask, self._ours(filters, normal), self._filters)
         along, up = self._filters[2:4]
         n = _parts(normal)
         start = [along * n[0]]
         for index, sigma in ((1, along), (3, up)):
             z1, z2 = n[index], n[index + 1]
             start += [math.sqrt(0.5) * sigma * z1, math.sqrt(0.125) * sigma * (z1 + z2)]
-        self._state = kept(mask, start, self._state, self._xp)
+        self._state = kept(mask, start, self._state)
 
     def step(self, mask: Array | None, normal: Array) -> Vector:
         """Advance by a physics step; normal (W, A, 5).
@@ -92,7 +90,7 @@ class Gusts:
                 e * z[i] + a * n[i],
                 e * (z[i + 1] + r * z[i]) + b * n[i] + c * n[i + 1],
             ]
-        self._state = z = kept(mask, new, z, self._xp)
+        self._state = z = kept(mask, new, z)
         (x, y), root, u = self._along, math.sqrt(3), z[0]
         v, w = (root * z[i] + (1 - root) * z[i + 1] for i in (1, 3))
         return x * u - y * v, y * u + x * v, w
@@ -101,9 +99,8 @@ class Gusts:
         """Numbers of each drone, as arrays of the same kind as `like`."""
         if like.ndim == 1:
             return [value.item() for value in values]
-        put = {"dtype": like.dtype, "device": like.device}
         lead = like.shape[:-1]
-        return [self._xp.asarray(value.reshape(lead), **put) for value in values]
+        return [value.reshape(lead) for value in values]
 
 
 def _parts(normal: Array) -> list[Array]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...models.errors import expect
-from ..state import Array, clip, component, constant, each, kept, square_root, stack
+from ..state import Array, clip, component, each, kept, square_root, stack
 from .options import EffectOptions
 
 if TYPE_CHECKING:
@@ -35,8 +35,8 @@ class RotorEffects:
         voltage: At its terminals, V, shape (W, A).
     """
 
-    def __init__(self, vehicle: "Vehicle", options: EffectOptions, xp: Any) -> None:
-        self._options, self._xp, self._step = options, xp, vehicle.timestep
+    def __init__(self, vehicle: "Vehicle", options: EffectOptions) -> None:
+        self._options, self._step = options, vehicle.timestep
         told = vehicle.coefficients
         self._limits = vehicle.thrust_low, vehicle.thrust_high
         if options.motor_lag:
@@ -76,7 +76,7 @@ class RotorEffects:
 
         Gives the thrusts that they do give, (W, A, R), N.
         """
-        xp, options = self._xp, self._options
+        options = self._options
         self._low, self._high = (_of_rotors(x, thrust) for x in self._limits)
         self._scales = []
         if options.efficiency:
@@ -89,11 +89,11 @@ class RotorEffects:
         if options.motor_lag:
             scale = each(factors["time_constant"]) if "time_constant" in factors else 1.0
             self._answers = [self._answer(time * scale) for time in self._times]
-        roots = [square_root(part, xp) for part in split(thrust)]
-        self._roots = kept(mask[..., None], roots, self._roots, xp)
+        roots = [square_root(part) for part in split(thrust)]
+        self._roots = kept(mask[..., None], roots, self._roots)
         if options.battery:
             charge = factors.get("battery_charge", 1.0) + 0.0 * component(thrust, 0)
-            (self.charge,) = kept(mask, [charge], [self.charge], xp)
+            (self.charge,) = kept(mask, [charge], [self.charge])
             self.voltage = self._terminal()
         return _join(self._scaled(split(thrust)))
 
@@ -103,7 +103,7 @@ class RotorEffects:
         Third, the mean of their square roots over it, which is proportional to the mean speed; None
         where the thrusts do not change over it.
         """
-        xp, options = self._xp, self._options
+        options = self._options
         limits = zip(split(command), self._low, self._high, strict=True)
         target = [clip(part, low, high) for part, low, high in limits]
         if options.thrust_curve:
@@ -111,7 +111,7 @@ class RotorEffects:
             target = [h * clip(_polynomial(self._curve, part / h), 0.0, 1.0) for part, h in both]
         if options.battery:
             if not options.motor_lag:
-                (self.voltage,) = kept(mask, [self._loaded(target)], [self.voltage], xp)
+                (self.voltage,) = kept(mask, [self._loaded(target)], [self.voltage])
             share = self.voltage / self._full
             scale = each(share * share)
             target = [part * scale for part in target]
@@ -119,22 +119,22 @@ class RotorEffects:
         middle: Parts | None = None
         if options.motor_lag:
             both = zip(self._roots, target, strict=True)
-            followed = [self._follow(root, square_root(part, xp)) for root, part in both]
+            followed = [self._follow(root, square_root(part)) for root, part in both]
             mean = [one[0] for one in followed]
             roots = [one[1] for one in followed]
             middle = [one[2] for one in followed]
             end = [root * root for root in roots]
-            self._roots = kept(None if mask is None else mask[..., None], roots, self._roots, xp)
+            self._roots = kept(None if mask is None else mask[..., None], roots, self._roots)
         if options.battery:
             used = self._power(mean) / self.voltage * (self._step / self._coulombs)
             left = clip(self.charge - used, 0.0, 1.0)
-            (self.charge,) = kept(mask, [left], [self.charge], xp)
+            (self.charge,) = kept(mask, [left], [self.charge])
             if options.motor_lag:
                 self.voltage = self._terminal()
         if middle is not None:
             for scales in self._scales:
                 both = zip(middle, scales, strict=True)
-                middle = [part * square_root(scale, xp) for part, scale in both]
+                middle = [part * square_root(scale) for part, scale in both]
         speed = None if middle is None else _join(middle)
         return _join(self._scaled(mean)), _join(self._scaled(end)), speed
 
@@ -151,7 +151,7 @@ class RotorEffects:
         """
         ratio = self._step / time
         number = isinstance(ratio, float)
-        gone = -(float(np.expm1(-ratio)) if number else self._xp.expm1(-ratio))
+        gone = -(float(np.expm1(-ratio)) if number else np.expm1(-ratio))
         return gone, gone / ratio, gone * (2 - gone) / (2 * ratio)
 
     def _follow(self, root: Any, wanted: Any) -> tuple[Any, Any, Any]:
@@ -164,8 +164,7 @@ class RotorEffects:
                 answer = self._answers[not rises]
             else:
                 pairs = zip(*self._answers, strict=True)
-                # Of two numbers torch would make float32.
-                answer = tuple(self._xp.where(rises, up, down + 0.0 * off) for up, down in pairs)
+                answer = tuple(np.where(rises, up, down + 0.0 * off) for up, down in pairs)
         gone, first, second = answer
         # The square of: wanted + off · exp(-t / time).
         mean = wanted * wanted + off * (2 * wanted * first + off * second)
@@ -178,18 +177,18 @@ class RotorEffects:
         """Voltage where the rotors give `target` · (voltage / full)² at once."""
         opened = self._open_voltage()
         drop = self._resistance * self._power(target) / self._full**3
-        return 2 * opened / (1 + square_root(1 + 4 * drop * opened, self._xp))
+        return 2 * opened / (1 + square_root(1 + 4 * drop * opened))
 
     def _terminal(self) -> Array:
         """Voltage at the rotors' speeds; where they need more than there is, half the open one."""
         opened = self._open_voltage()
         power = self._power([root * root for root in self._roots])
         rest = opened * opened - 4 * self._resistance * power
-        return 0.5 * (opened + square_root(rest, self._xp))
+        return 0.5 * (opened + square_root(rest))
 
     def _power(self, thrusts: Parts) -> Array:
         """Electrical power of all rotors, W, shape (W, A)."""
-        return self._watts * total([part * square_root(part, self._xp) for part in thrusts])
+        return self._watts * total([part * square_root(part) for part in thrusts])
 
 
 def split(values: Array) -> Parts:
@@ -215,7 +214,7 @@ def _join(parts: Parts) -> Array:
 
 def _of_rotors(values: np.ndarray, like: Array) -> Parts:
     """Numbers of the vehicle's rotors, shape (R,), as parts like those of an array."""
-    return values.tolist() if like.ndim == 1 else [constant(values, like)]
+    return values.tolist() if like.ndim == 1 else [values]
 
 
 def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:

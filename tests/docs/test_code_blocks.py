@@ -70,11 +70,6 @@ INSTEAD = {
     "docs/effects.md": [
         ("tests/data/racer.xml", (ROOT / "tests/data/racer.xml").as_posix(), "seen from a clone"),
     ],
-    "docs/gpu.md": [
-        ('4096, backend="warp", device="cuda"', '8, backend="warp", device="cpu"', "no GPU here"),
-        ("range(250)", "range(2)", "Warp's CPU device is slow"),
-        ("rand(4096, 4", "rand(8, 4", "as many as there are drones"),
-    ],
     "docs/scaling.md": [
         ("0.0.0.0", "127.0.0.1", "a test opens no port to the network"),
     ],

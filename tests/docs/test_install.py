@@ -28,7 +28,7 @@ FOLDERS = (
     "training",
     "cli",
 )
-IMPORT_NAMES = {"pillow": "PIL", "warp-lang": "warp"}
+IMPORT_NAMES = {"pillow": "PIL"}
 
 WITHOUT = """
 import sys
@@ -144,7 +144,7 @@ def imported(*arguments: str) -> set[str]:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_flags_are_checked_before_anything_heavy_is_imported(command: str) -> None:
-    heavy = {"mujoco", "torch", "pandas", "matplotlib", "stable_baselines3", "ray", "warp", "scipy"}
+    heavy = {"mujoco", "torch", "pandas", "matplotlib", "stable_baselines3", "ray", "scipy"}
     assert not imported(command, "--wrong-flag") & heavy
     if command in ("key", "replay", "check-model", "report", "bench"):
         assert not imported(command, "--wrong-flag") & {"gymnasium"}

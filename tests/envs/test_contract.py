@@ -1,7 +1,7 @@
 """The contract of every vehicle in every task: alone, in a batch, over UDP, on every backend.
 
 What a task or a backend promises beyond this has tests of its own: test_env.py, test_vector.py,
-test_remote.py, test_rigid.py, test_warp.py. Here the vehicles vary: those of the tests, and those
+test_remote.py, test_rigid.py. Here the vehicles vary: those of the tests, and those
 of the library.
 """
 

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-TASKS = ("Landing", "Recovery", "PayloadHover")
+TASKS = ["Landing", "Recovery", "PayloadHover"]
 
 
 @pytest.mark.parametrize("name", TASKS)

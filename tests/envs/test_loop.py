@@ -169,11 +169,11 @@ class Counting(Careless):
     count: Any = 0.0
 
     def begin(self, mask: Any, draw: Any) -> InitialState:
-        self.count = self.xp.where(mask, 0.0, self.count)
+        self.count = np.where(mask, 0.0, self.count)
         return super().begin(mask, draw)
 
     def remember(self, state: Any, mask: Any) -> None:
-        self.count = self.count + self.xp.where(mask, 1.0, 0.0)
+        self.count = self.count + np.where(mask, 1.0, 0.0)
 
     def outcome(self, state: Any) -> Outcome:
         climb = 0.0 * state.velocity[..., 2]

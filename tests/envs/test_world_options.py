@@ -41,7 +41,7 @@ def flight(env: Any, seed: int, steps: int = 30) -> list[np.ndarray]:
 
 
 def test_a_delay_gives_what_was_pushed_so_many_steps_ago() -> None:
-    delay, everybody = Delay(2, np), np.ones((3, 1), bool)
+    delay, everybody = Delay(2), np.ones((3, 1), bool)
     delay.begin(everybody, np.full((3, 1), -1.0))
     age = np.array([[0], [1], [2]])
     given = []

@@ -21,7 +21,6 @@ from rotorgram.sim import (
     Randomization,
     World,
     make_world,
-    on_host,
 )  # fmt: skip
 from rotorgram.sim.effects.gusts import Gusts
 from rotorgram.sim.effects.rotors import RotorEffects
@@ -103,11 +102,9 @@ def begin(world: World, height: float = 50.0, mask: Any = None, **pose: Any) -> 
     """Reset the worlds of a mask, level over the origin unless the pose says otherwise."""
 
     def everywhere(values: Any) -> Any:
-        wide = np.broadcast_to(np.array(values, float), (*world.shape, len(values))).copy()
-        return wide if world.xp is np else world.xp.asarray(wide, dtype=world.xp.float32)
+        return np.broadcast_to(np.array(values, float), (*world.shape, len(values))).copy()
 
     mask = np.ones(world.shape, bool)[()] if mask is None else mask
-    mask = mask if world.xp is np else world.xp.asarray(mask)
     poses = {name: everywhere(values) for name, values in pose.items()}
     world.reset(mask, InitialState(position=everywhere((0.0, 0.0, height)), **poses))
     return world
@@ -116,16 +113,13 @@ def begin(world: World, height: float = 50.0, mask: Any = None, **pose: Any) -> 
 def fly(world: World, thrust: Any, steps: int, substeps: int = 1) -> World:
     command = np.broadcast_to(np.array(thrust, float), (*world.shape, 4)).copy()
     for _ in range(steps):
-        world.step(
-            command if world.xp is np else world.xp.asarray(command, dtype=world.xp.float32),
-            substeps,
-        )
+        world.step(command, substeps)
     return world
 
 
 def fly_hovering(world: World) -> World:
     """A physics step of any vehicle with the thrusts of its hover."""
-    world.step(world.xp.asarray(world.vehicle.hover_thrust) + 0 * world.state.command, 1)
+    world.step(world.vehicle.hover_thrust + 0 * world.state.command, 1)
     return world
 
 
@@ -139,7 +133,7 @@ def pushed(world: World, thrust: Any = HOVER) -> tuple[np.ndarray, np.ndarray]:
 
 def states(world: World) -> list[np.ndarray]:
     names = ("position", "quaternion", "velocity", "body_rates", "thrust", "command", "touching")
-    return [on_host(getattr(world.state, name)).copy() for name in names]
+    return [getattr(world.state, name).copy() for name in names]
 
 
 # --- rotors ---------------------------------------------------------------------------------------
@@ -203,7 +197,7 @@ def test_battery_charge_by_integration(tmp_path: Path) -> None:
     vehicle = racer(tmp_path, battery_resistance="0")
     seconds, b = 30.0, 2.7 / 1800 * 80 * 4 * HOVER**1.5 / 12.6**3
     voltage = 1 / (1 / 12.6 + b * seconds)
-    rotors = RotorEffects(vehicle, EffectOptions(battery=True), np)
+    rotors = RotorEffects(vehicle, EffectOptions(battery=True))
     thrust = np.full(4, HOVER)
     rotors.begin(np.True_, thrust, {})
     assert rotors.charge == 1.0
@@ -470,7 +464,7 @@ def gusts(
     height: float = HEIGHT,
 ) -> np.ndarray:
     """Gusts of so many worlds, shape (steps, num, 3)."""
-    air, dice = Gusts(W20, wind, step, np), np.random.default_rng(0)
+    air, dice = Gusts(W20, wind, step), np.random.default_rng(0)
     mask = np.ones((num, 1), bool)
     air.begin(mask, np.full((num, 1), height), dice.standard_normal((num, 1, 5)))
     rows = [air.step(None, dice.standard_normal((num, 1, 5))) for _ in range(steps)]
@@ -834,25 +828,19 @@ def test_drawn_drag_thrust_and_mass_scale_what_they_name(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("num_worlds", [1, 3])
-@pytest.mark.parametrize("backend", ["mujoco", "warp"])
-def test_a_drawn_reaction_one_rotor_and_a_payload(backend: str, num_worlds: int) -> None:
-    if backend == "warp":
-        pytest.importorskip("mujoco_warp")
-    tolerance = 1e-9 if backend == "mujoco" else 2e-5
+def test_a_drawn_reaction_one_rotor_and_a_payload(num_worlds: int) -> None:
     drawn = {"reaction": 2.0, "thrust_2": 0.5}
-    world = fly(begin(world_of(None, num_worlds, backend, drawn)), HOVER, 1)
-    rates = on_host(world.state.body_rates).reshape(-1, 3)
+    world = fly(begin(world_of(None, num_worlds, "mujoco", drawn)), HOVER, 1)
+    rates = world.state.body_rates.reshape(-1, 3)
     # Rotor 2 at (-0.14, -0.12) lacks half of its thrust; of the turns it lacks -0.02 twice.
     lost = 0.5 * HOVER * H
     expected = (lost * 0.12 / 4e-3, -lost * 0.14 / 5e-3, lost * 0.04 / 8e-3)
-    np.testing.assert_allclose(rates, [expected] * num_worlds, rtol=1e-3 + tolerance)
-    given = world_of(None, num_worlds, backend, {"payload": 2.0}, payload=0.1, cable=0.5)
-    heavy = world_of(None, num_worlds, backend, payload=0.2, cable=0.5)
+    np.testing.assert_allclose(rates, [expected] * num_worlds, rtol=1e-3)
+    given = world_of(None, num_worlds, "mujoco", {"payload": 2.0}, payload=0.1, cable=0.5)
+    heavy = world_of(None, num_worlds, payload=0.2, cable=0.5)
     for one in (given, heavy):
         fly(begin(one), HOVER, 10, 4)
-    np.testing.assert_allclose(
-        on_host(given.state.position), on_host(heavy.state.position), atol=tolerance
-    )
+    np.testing.assert_allclose(given.state.position, heavy.state.position, atol=1e-9)
 
 
 def test_a_drawn_strength_of_gusts() -> None:
@@ -1140,101 +1128,6 @@ def test_rotors_that_push_both_ways_lose_efficiency_and_pass_the_ground(tmp_path
     acceleration, _ = pushed(world, -0.8)
     # A reversed rotor has neither ground effect nor drag.
     assert acceleration[2] == pytest.approx(-4 * 0.4 / M - G, rel=1e-9)
-
-
-# --- the backend warp -----------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def warp() -> Any:
-    torch = pytest.importorskip("torch")
-    wp = pytest.importorskip("warp")
-    pytest.importorskip("mujoco_warp")
-    wp.config.log_level = 30
-    return torch
-
-
-FIXED = {
-    "mass": 1.1,
-    "inertia": 0.9,
-    "center_x": 0.01,
-    "center_z": -0.02,
-    "time_constant": 1.5,
-    "wind_y": 1.0,
-}
-
-
-@pytest.mark.parametrize(
-    ("effects", "drawn"),
-    [
-        (EVERYTHING, {**FIXED, "battery_charge": 0.8, "thrust": 1.05, "rotor_drag": 2.0}),
-        ({"payload": 0.1, "cable": 0.5}, {"mass": 0.9}),
-    ],
-    ids=["all", "payload"],
-)
-def test_warp_flies_as_mujoco_does(warp: Any, effects: dict[str, Any], drawn: Any) -> None:
-    pose = {"height": 1.5, "velocity": [1.0, -1.0, 0.5], "body_rates": [0.3, 0.2, 0.1]}
-    ours, theirs = (
-        fly(
-            begin(world_of(None, 3, backend, drawn, **effects), **pose), (1.7, 1.8, 1.7, 1.6), 25, 4
-        )
-        for backend in ("warp", "mujoco")
-    )
-    assert not theirs.state.touching.any()
-    for mine, other in zip(states(ours), states(theirs), strict=True):
-        np.testing.assert_allclose(mine, other, atol=1e-4, rtol=1e-4)
-
-
-def test_warp_draws_other_numbers_of_the_same_distributions(warp: Any) -> None:
-    num = 1000
-    drawn = {"mass": "uniform(0.8, 1.2)", "thrust": "normal(1, 0.05)"}
-    spread = []
-    for backend in ("warp", "mujoco"):
-        world = world_of(None, num, backend, drawn, body_drag=True, gusts=10.0)
-        every = np.ones((num, 1), bool)
-        world.seed(every if backend == "mujoco" else warp.asarray(every), list(range(num)))
-        fly(begin(world), HOVER, 10, 4)
-        rows = [on_host(world.parameters[name])[:, 0] for name in drawn]
-        rows += list(on_host(world.state.velocity)[:, 0].T)
-        spread.append(np.sort(rows, axis=1))
-    ours, theirs = spread
-    for mine, other in zip(ours, theirs, strict=True):
-        assert not np.isin(mine.astype(np.float32), other.astype(np.float32)).all()
-        # Kolmogorov-Smirnov of two samples: 1.95 √(2 / n) is passed once in a thousand times.
-        everywhere = np.concatenate((mine, other))
-        gap = [np.searchsorted(x, everywhere, "right") / num for x in (mine, other)]
-        assert abs(gap[0] - gap[1]).max() < 1.95 * math.sqrt(2 / num)
-
-
-def test_warp_keeps_what_follows_from_a_drawn_mass_for_each_world(warp: Any) -> None:
-    turning, thrusts = {"body_rates": [1.0, 2.0, 3.0]}, [1.0, 1.2, 1.4, 1.6]
-    ours = begin(world_of(None, 3, "warp", {"mass": "uniform(0.5, 3)"}), **turning)
-    fly(ours, thrusts, 50, 4)
-    masses = ours.parameters["mass"][:, 0].tolist()
-    assert max(masses) > 1.05 * min(masses)
-    for index, mass in enumerate(masses):
-        alone = begin(world_of(randomize={"mass": mass}), **turning)
-        fly(alone, thrusts, 50, 4)
-        for name, tolerance in (("velocity", 5e-4), ("quaternion", 5e-5)):
-            mine = on_host(getattr(ours.state, name))[index, 0]
-            np.testing.assert_allclose(mine, getattr(alone.state, name), atol=tolerance)
-
-
-def test_warp_freezes_and_resets_some(warp: Any) -> None:
-    world = world_of(None, 3, "warp", DRAWN, **{**GUSTY, "gusts": 0.0})
-    fly(begin(world), 2.0, 5)
-    before = states(world)
-    drawn = {name: values.clone() for name, values in world.parameters.items()}
-    some = warp.tensor([[True], [False], [False]])
-    world.step(warp.full((3, 1, 4), 3.0), 4, some)
-    begin(world, mask=np.array([[True], [False], [False]]))
-    for now, then in zip(states(world), before, strict=True):
-        assert now[1:].tobytes() == then[1:].tobytes()
-    for name, values in drawn.items():
-        assert warp.equal(world.parameters[name][1:], values[1:])
-    assert world.state.position[0].tolist() != before[0][0].tolist()
-    with pytest.raises(InputError, match=r"^start: expected a height over"):
-        begin(world, height=0.2)
 
 
 # --- the page -------------------------------------------------------------------------------------

@@ -100,27 +100,3 @@ def test_a_world_seeds_its_noises_and_its_starts_stay(worlds: int) -> None:
         numbers = noise.normal().reshape(worlds, size)
         for i in range(worlds):
             np.testing.assert_array_equal(numbers[i], stream(11 + i, 1, size, use)[0])
-
-
-def test_on_a_device_of_torch() -> None:
-    torch = pytest.importorskip("torch")
-    pytest.importorskip("mujoco_warp")
-    from rotorgram.sim.backends.tensors import TorchNoise
-
-    noise, other = (TorchNoise((4, 1, 3), use, torch.device("cpu")) for use in (USE, 1))
-    drawn = []
-    for one, seed in ((noise, 3), (noise, 3), (noise, 4), (other, 3)):
-        one.seed(range(4), [seed] * 4)
-        drawn.append(one.normal())
-    assert drawn[0].dtype == torch.float32
-    assert drawn[0].shape == (4, 1, 3)
-    assert torch.equal(drawn[0], drawn[1])
-    assert not torch.isin(drawn[0], torch.cat((drawn[2], drawn[3]))).any()
-    mask = torch.tensor([[True], [False], [True], [False]])
-    masked = noise.normal(mask)
-    assert (masked[1::2] == 0).all()
-    assert (masked[::2] != 0).all()
-    noise.seed(range(4), [None] * 4)
-    many = torch.stack([noise.normal() for _ in range(4000)])  # 48,000 numbers
-    assert abs(many.mean()) < 5 / 48_000**0.5
-    assert abs(many.std() - 1) < 5 / 96_000**0.5

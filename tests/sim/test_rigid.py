@@ -1,4 +1,4 @@
-"""The backend rigid: MuJoCo's flights without contact, the tasks on it, gradients through it."""
+"""The backend rigid: MuJoCo's flights without contact, and the tasks on it."""
 
 import shutil
 from pathlib import Path
@@ -9,15 +9,11 @@ import numpy as np
 import pytest
 from remotes import flying
 from rotorgram.envs import LocalVectorEnv, Loop
-from rotorgram.envs.tasks.flight import length
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.models.errors import InputError
-from rotorgram.sim import InitialState, PhysicsError, World, make_world, square_root
+from rotorgram.sim import InitialState, PhysicsError, World, make_world
 from rotorgram.sim.backends import kernel
 from rotorgram.training.settings import CompareConfig
-
-torch = pytest.importorskip("torch")
-torch_api: Any = pytest.importorskip("array_api_compat.torch")
 
 ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
 DATA = Path(__file__).parents[1] / "data"
@@ -28,12 +24,8 @@ N = 4
 EVERY = np.ones((N, 1), bool)
 
 
-def rigid(vehicle: Vehicle, num_worlds: int = N, dtype: str = "float64", **rest: Any) -> Any:
-    return make_world(vehicle, num_worlds, "rigid", device="cpu", dtype=dtype, **rest)
-
-
 def arrays(vehicle: Vehicle, num_worlds: int = N, dtype: str = "float64", **rest: Any) -> Any:
-    return make_world(vehicle, num_worlds, "rigid", tensors=False, dtype=dtype, **rest)
+    return make_world(vehicle, num_worlds, "rigid", dtype=dtype, **rest)
 
 
 def tumbling(dice: np.random.Generator, count: int = N) -> dict[str, np.ndarray]:
@@ -48,8 +40,7 @@ def tumbling(dice: np.random.Generator, count: int = N) -> dict[str, np.ndarray]
 
 
 def begin(world: World, **pose: np.ndarray) -> None:
-    put = {name: torch.tensor(values, dtype=world.dtype) for name, values in pose.items()}  # type: ignore[attr-defined]
-    world.reset(torch.ones(world.shape, dtype=torch.bool), InitialState(**put))
+    world.reset(np.ones(world.shape, bool), InitialState(**pose))
 
 
 def angle(ours: Any, theirs: np.ndarray) -> float:
@@ -85,23 +76,20 @@ def test_flies_as_mujoco_for_five_seconds(name: str, drag: float) -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_arrays_and_tensors_fly_the_same(name: str) -> None:
-    """A C function, if there is a compiler, NumPy and torch: but for rounding."""
+def test_compiled_and_numpy_fly_the_same(name: str) -> None:
+    """A C function, if there is a compiler, and NumPy: but for rounding."""
     vehicle, dice = Vehicle.load(FILES[name]), np.random.default_rng(0)
     pose = tumbling(dice)
     worlds = [arrays(vehicle, compiled=choice) for choice in (None, False)]
     for world in worlds:
         world.reset(EVERY, InitialState(**pose))
-    worlds.append(rigid(vehicle))
-    begin(worlds[2], **pose)
     for _ in range(5):
         thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (N, 1, vehicle.num_rotors))
-        for world, values in zip(worlds, (thrust, thrust, torch.tensor(thrust)), strict=True):
-            world.step(values, 2)
+        for world in worlds:
+            world.step(thrust, 2)
     for name in ("position", "quaternion", "velocity", "body_rates"):
         seen = [np.asarray(getattr(world.state, name)) for world in worlds]
         np.testing.assert_allclose(seen[0], seen[1], rtol=1e-10, atol=1e-10)
-        np.testing.assert_allclose(seen[0], seen[2], rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -175,61 +163,31 @@ def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_seed_gives_arrays_the_draws_of_mujoco() -> None:
     ours, theirs = (Loop(HOVER, N, backend=name, **rest) for name, rest in
-                    (("rigid", {"tensors": False}), ("mujoco", {})))  # fmt: skip
+                    (("rigid", {}), ("mujoco", {})))  # fmt: skip
     for loop in (ours, theirs):
         loop.advance(np.zeros((N, 4), np.float32), EVERY[:, 0], range(N))
     np.testing.assert_allclose(ours.world.state.position, theirs.world.state.position, rtol=1e-6)
 
 
-def test_sizes_have_a_derivative_where_they_are_0() -> None:
-    """Of |v| it is v / |v|, of a root 1 / (2 root), and 0 at 0: not NaN."""
-    vectors = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]], requires_grad=True)
-    length(torch_api, vectors).sum().backward()
-    assert vectors.grad.tolist() == [[0.0, 0.0, 0.0], pytest.approx([0.6, 0.8, 0.0])]
-    squares = torch.tensor([-1.0, 0.0, 4.0], requires_grad=True)
-    roots = square_root(squares, torch_api)
-    assert roots.tolist() == [0.0, 0.0, 2.0]
-    roots.sum().backward()
-    assert squares.grad.tolist() == [0.0, 0.0, 0.25]
-
-
 def test_a_free_fall_is_exact() -> None:
     vehicle = Vehicle.load(linear_drag=0.0)
-    world = rigid(vehicle, 1, "float32")
+    world = arrays(vehicle, 1, "float32")
     begin(world, position=np.full((1, 1, 3), 10.0), velocity=np.array([[[1.0, 2.0, 3.0]]]))
-    world.step(torch.zeros(1, 1, 4), 100)  # 1 s
-    expected = torch.tensor((11.0, 12.0, 13.0 - 9.8 / 2))
-    torch.testing.assert_close(world.state.position[0, 0], expected, atol=1e-4, rtol=0)
-    expected = torch.tensor((1.0, 2.0, 3.0 - 9.8))
-    torch.testing.assert_close(world.state.velocity[0, 0], expected, atol=1e-5, rtol=0)
+    world.step(np.zeros((1, 1, 4)), 100)  # 1 s
+    expected = (11.0, 12.0, 13.0 - 9.8 / 2)
+    np.testing.assert_allclose(world.state.position[0, 0], expected, atol=1e-4, rtol=0)
+    expected = (1.0, 2.0, 3.0 - 9.8)
+    np.testing.assert_allclose(world.state.velocity[0, 0], expected, atol=1e-5, rtol=0)
 
 
 def test_a_spin_about_a_principal_axis_keeps_its_rate() -> None:
     """Half a turn about z in 1 s, and the unit quaternion stays one."""
-    world = rigid(Vehicle.load(), 1)
+    world = arrays(Vehicle.load(), 1)
     begin(world, position=np.full((1, 1, 3), 50.0), body_rates=np.array([[[0.0, 0.0, np.pi]]]))
-    world.step(torch.full((1, 1, 4), 49.0, dtype=torch.float64), 100)
-    turned = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
-    torch.testing.assert_close(world.state.quaternion[0, 0], turned, atol=1e-12, rtol=0)
+    world.step(np.full((1, 1, 4), 49.0), 100)
+    turned = (0.0, 0.0, 0.0, 1.0)
+    np.testing.assert_allclose(world.state.quaternion[0, 0], turned, atol=1e-12, rtol=0)
     assert float(world.state.position[0, 0, 2]) == pytest.approx(50.0, abs=1e-12)
-
-
-@pytest.mark.quiet
-@pytest.mark.timeout(300)
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of torch's own modules
-@pytest.mark.skipif(shutil.which("g++") is None, reason="torch needs a compiler")
-def test_compiled_it_flies_the_same() -> None:
-    vehicle, dice = Vehicle.load(), np.random.default_rng(0)
-    worlds = [rigid(vehicle, N, "float32", compiled=choice) for choice in (False, True)]
-    pose = {"position": np.full((N, 1, 3), 5.0), "body_rates": dice.normal(size=(N, 1, 3))}
-    thrust = torch.tensor(dice.uniform(40.0, 60.0, (N, 1, 4)), dtype=torch.float32)
-    for world in worlds:
-        begin(world, **pose)
-        for _ in range(10):
-            world.step(thrust, 2)
-    for name in ("position", "quaternion", "velocity", "body_rates"):
-        one, other = (getattr(world.state, name) for world in worlds)
-        torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
 
 
 EFFECTS = {
@@ -253,14 +211,14 @@ def test_effects_and_drawn_parameters(file: Path, effects: dict[str, Any]) -> No
     """With float64 a seed draws what it draws on mujoco, gusts among it."""
     options = {"effects": effects, "randomize": DRAWN, "linear_drag": 0.2, "flight_band": 10.0}
     options["goal"] = (0, 0, 60)
-    ours = Loop(HOVER, N, vehicle=file, backend="rigid", device="cpu", dtype="float64",
+    ours = Loop(HOVER, N, vehicle=file, backend="rigid", dtype="float64",
                 options=options)  # fmt: skip
     theirs = Loop(HOVER, N, vehicle=file, options=options)
     still = np.zeros((N, ours.vehicle.num_rotors), np.float32)
     for loop in (ours, theirs):
         loop.advance(still, EVERY[:, 0], range(7, 7 + N))
     for name, values in theirs.world.parameters.items():
-        assert ours.world.parameters[name].numpy().tolist() == values.tolist()
+        assert ours.world.parameters[name].tolist() == values.tolist()
     dice = np.random.default_rng(1)
     frozen = np.array([False, True, False, False])
     for step in range(20):
@@ -269,17 +227,17 @@ def test_effects_and_drawn_parameters(file: Path, effects: dict[str, Any]) -> No
             loop.advance(actions, frozen=frozen if step == 3 else None)
         for name in ("position", "velocity", "body_rates", "quaternion", "thrust"):
             one, other = (getattr(loop.world.state, name) for loop in (ours, theirs))
-            np.testing.assert_allclose(one.numpy(), other, atol=1e-9, rtol=0)
+            np.testing.assert_allclose(one, other, atol=1e-9, rtol=0)
 
 
 def test_acceleration_and_below() -> None:
-    world = rigid(Vehicle.load(), 3)
+    world = arrays(Vehicle.load(), 3)
     half = np.sqrt(0.5)
     turned = np.array([[[1.0, 0, 0, 0]], [[half, half, 0, 0]], [[np.cos(0.5), 0, np.sin(0.5), 0]]])
     begin(world, position=np.full((3, 1, 3), 2.0), quaternion=turned)
     # At hover thrust: level it stays, on its side it falls and is pushed along -y.
-    expected = torch.tensor([[0.0, 0.0, 0.0], [0.0, -9.8, -9.8]], dtype=torch.float64)
-    torch.testing.assert_close(world.acceleration()[:2, 0], expected, atol=1e-12, rtol=0)
+    expected = [[0.0, 0.0, 0.0], [0.0, -9.8, -9.8]]
+    np.testing.assert_allclose(world.acceleration()[:2, 0], expected, atol=1e-12, rtol=0)
     assert world.below()[:, 0].tolist() == pytest.approx([2.0, np.inf, 2.0 / np.cos(1.0)])
 
 
@@ -290,7 +248,7 @@ def test_touches_the_ground_where_mujoco_does(file: Path) -> None:
     turned = dice.normal(size=(count, 1, 4))
     turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
     turned[0] = (1.0, 0.0, 0.0, 0.0)
-    ours, theirs = rigid(vehicle, count), make_world(vehicle, count, num_threads=1)
+    ours, theirs = arrays(vehicle, count), make_world(vehicle, count, num_threads=1)
     low, high = np.zeros(count), np.full(count, float(vehicle.model.stat.extent) * 2)
     for _ in range(40):
         middle = (low + high) / 2
@@ -317,7 +275,6 @@ def test_whole_episodes_agree_with_mujoco(env_id: str, size: float, file: Any) -
     theirs = LocalVectorEnv(env_id, N, vehicle=file, autoreset_mode="Disabled")
     ours = LocalVectorEnv(
         env_id, N, vehicle=file, autoreset_mode="Disabled", backend="rigid", dtype="float64",
-        device="cpu",
     )  # fmt: skip
     first, expected = ours.reset(seed=5)[0], theirs.reset(seed=5)[0]
     np.testing.assert_array_equal(first, expected)
@@ -337,29 +294,8 @@ def test_whole_episodes_agree_with_mujoco(env_id: str, size: float, file: Any) -
     assert theirs.terminated.any() or theirs.truncated.any()
 
 
-def test_a_vector_env_gives_numpy_and_tensors_on_request() -> None:
-    """In float64 both draw the same numbers, and compute the same but for rounding."""
-    shared: Any = {"backend": "rigid", "device": "cpu", "dtype": "float64", "episode_length": 2}
-    host, ours = (gym.make_vec(HOVER, num_envs=N, tensors=x, **shared) for x in (False, True))
-    observation, info = host.reset(seed=0)
-    assert (type(observation), observation.dtype) == (np.ndarray, np.float32)
-    assert info["position_error"].shape == (N,)
-    assert {type(value) for value in info.values()} == {np.ndarray}
-    np.testing.assert_allclose(ours.reset(seed=0)[0], observation, atol=1e-6)
-    for _ in range(3):
-        actions = np.full((N, 4), 0.1, np.float32)
-        told, other = ours.step(torch.from_numpy(actions)), host.step(actions)
-        for one, another in zip(told[:4], other[:4], strict=True):
-            np.testing.assert_allclose(one, another, atol=1e-6)
-            assert (type(one), type(another)) == (torch.Tensor, np.ndarray)
-    with pytest.raises(InputError, match="tensors: expected False with the backend mujoco"):
-        LocalVectorEnv(HOVER, 2, tensors=True)
-    with pytest.raises(InputError, match="gradients: expected False with mujoco, got True"):
-        LocalVectorEnv(HOVER, 2, gradients=True)
-
-
 def test_seeds_repeat_starts_in_float32() -> None:
-    env = LocalVectorEnv(HOVER, 50, backend="rigid", device="cpu")
+    env = LocalVectorEnv(HOVER, 50, backend="rigid")
     first, again, other = (env.reset(seed=seed)[0] for seed in (3, 3, 4))
     assert first.tobytes() == again.tobytes()
     assert first.tobytes() != other.tobytes()
@@ -385,81 +321,8 @@ def test_runs_train_on_it_and_are_evaluated_on_mujoco() -> None:
     assert run.training_env["backend"] == "rigid"
     assert "backend" not in config.env
     assert config.content("a2c")["backend"] == "rigid"
-    with pytest.raises(InputError, match="backend: expected mujoco or rigid or warp, got 'unity'"):
+    with pytest.raises(InputError, match="backend: expected mujoco or rigid, got 'unity'"):
         CompareConfig(backend="unity")  # type: ignore[arg-type]
-
-
-# --- gradients ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("effects", [{}, {"motor_lag": True, "body_drag": True}])
-def test_gradients_through_a_rollout_are_those_of_differences(effects: dict[str, Any]) -> None:
-    """Of the reward of eight steps of Hover to the actions of the first and the last."""
-    loop = Loop(HOVER, 2, vehicle=RACER, backend="rigid", device="cpu", dtype="float64",
-                options={"effects": effects})  # fmt: skip
-    task, world = loop.task, loop.world
-    every = torch.ones(2, dtype=torch.bool)
-
-    def total(actions: Any) -> Any:
-        world.detach()  # type: ignore[attr-defined]
-        loop.advance(np.zeros((2, 4)), every, [0, 1])
-        reward = 0.0
-        for action in actions:
-            world.step(task.controller.thrust(action[:, None], world.state), 4)
-            outcome = task.outcome(world.state)
-            reward = reward + sum(term for term in outcome.reward.values()).sum()
-        return reward
-
-    dice = torch.Generator().manual_seed(0)
-    actions = 0.4 * torch.rand(8, 2, 4, generator=dice, dtype=torch.float64) - 0.2
-    actions.requires_grad_(True)
-    total(actions).backward()
-    assert actions.grad is not None
-    for place in ((0, 0, 0), (0, 1, 2), (7, 0, 3)):
-        ends = []
-        for sign in (1, -1):
-            moved = actions.detach().clone()
-            moved[place] += sign * 1e-5
-            ends.append(float(total(moved)))
-        slope = (ends[0] - ends[1]) / 2e-5
-        assert float(actions.grad[place]) == pytest.approx(slope, rel=1e-5, abs=1e-8)
-        assert slope != 0
-    assert not world.state.position.requires_grad  # the last flight had none
-
-
-@pytest.mark.parametrize("env_id", ["rotorgram/Landing-v0", "rotorgram/Waypoints-v0"])
-@pytest.mark.parametrize("effects", [{}, {"motor_lag": True, "battery": True, "rotor_drag": True}])
-def test_gradients_are_numbers_where_nothing_turns_and_no_rotor_pushes(
-    env_id: str, effects: dict[str, Any]
-) -> None:
-    """A root has no slope at 0. Level, all rotors at their least: rates and thrusts are 0."""
-    loop = Loop(env_id, 2, vehicle=RACER, backend="rigid", device="cpu",
-                options={"effects": effects})  # fmt: skip
-    loop.advance(np.zeros((2, 4)), np.ones(2, bool), [0, 1])
-    actions = torch.full((2, 4), -1.0, requires_grad=True)
-    reward = 0.0
-    for _ in range(2):
-        loop.advance(actions)
-        reward = reward + loop.rewards.sum()
-    (slope,) = torch.autograd.grad(reward, actions)
-    assert bool(torch.isfinite(slope).all())
-    # Without effects thrust is in proportion to the action; with a lag it begins as a root.
-    assert bool((slope != 0).all()) == (not effects)
-
-
-def test_actions_keep_their_graph_through_the_loop_until_it_is_detached() -> None:
-    loop = Loop(HOVER, 2, backend="rigid", device="cpu")
-    loop.advance(np.zeros((2, 4)), np.ones(2, bool), [0, 1])
-    actions = torch.full((2, 4), 0.1, requires_grad=True)
-    loop.advance(actions)
-    loop.advance(actions)
-    (slope,) = torch.autograd.grad(loop.rewards.sum(), actions, retain_graph=True)
-    assert bool(torch.isfinite(slope).all())
-    assert float(slope.abs().sum()) > 0
-    loop.world.detach()  # type: ignore[attr-defined]
-    assert not loop.world.state.velocity.requires_grad
-    loop.advance(np.zeros((2, 4)))
-    assert not loop.rewards.requires_grad
 
 
 # --- what is refused ------------------------------------------------------------------------------
@@ -470,9 +333,8 @@ def test_actions_keep_their_graph_through_the_loop_until_it_is_detached() -> Non
     [
         ({"effects": {"payload": 0.1}}, "effects: payload: expected none with the backend rigid"),
         ({"dtype": "float16"}, "dtype: expected float32 or float64, got 'float16'"),
-        ({"device": "gpu"}, "device: expected 'cpu', or a CUDA device that torch finds, got 'gpu'"),
         ({"compiled": 1}, "compiled: expected true or false, got 1"),
-        ({"num_threads": 2}, "num_threads: expected device or dtype or compiled or tensors"),
+        ({"num_threads": 2}, "num_threads: expected dtype or compiled"),
     ],
 )
 def test_wrong_arguments(arguments: dict[str, Any], expected: str) -> None:
@@ -486,14 +348,14 @@ def test_what_mujoco_moves_in_another_way_is_refused(change: str, tmp_path: Path
     (tmp_path / "other.xml").write_text(text)
     vehicle = Vehicle.load(tmp_path / "other.xml")
     if "wind" in change:  # wind without a fluid does nothing
-        rigid(vehicle)
+        arrays(vehicle)
         return
     with pytest.raises(InputError, match=r"vehicle: expected RK4, .* others in racer"):
-        rigid(vehicle)
+        arrays(vehicle)
 
 
 def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
-    loop = Loop(ELEVATION, 2, backend="rigid", device="cpu")
+    loop = Loop(ELEVATION, 2, backend="rigid")
     every, still = np.ones(2, bool), np.zeros((2, 1))
     loop.advance(still, every, [0, 1])
     begin(

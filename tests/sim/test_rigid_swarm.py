@@ -1,6 +1,5 @@
 """The backend rigid with several drones in a world: alone as together, as mujoco, and who meets."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,23 +7,16 @@ import pytest
 from fleets import assert_same, simulate
 from peers import ANY
 from rotorgram.envs import (
-    ArraySpec,
     LocalVectorEnv,
-    Metric,
-    Outcome,
-    Task,
-    TaskOptions,
-    register,
 )
 from rotorgram.envs.parallel import LocalParallelEnv
-from rotorgram.models import InputError, Vehicle
+from rotorgram.models import Vehicle
 from rotorgram.sim import (
     EffectOptions,
     InitialState,
     PhysicsError,
     Randomization,
     World,
-    constant,
     make_world,
 )
 from rotorgram.udp import RemoteVectorEnv
@@ -39,7 +31,7 @@ DRAWN = {
 
 
 def arrays(vehicle: Vehicle, worlds: int, drones: int, dtype: str = "float64", **rest: Any) -> Any:
-    given = {"drones": drones, "tensors": False, "dtype": dtype, **rest}
+    given = {"drones": drones, "dtype": dtype, **rest}
     return make_world(vehicle, worlds, "rigid", **given)
 
 
@@ -116,25 +108,18 @@ def test_flies_as_mujoco_for_five_seconds(name: str) -> None:
     assert abs(ours.acceleration() - theirs.acceleration()).max() < 1e-6
 
 
-@pytest.mark.parametrize("tensors", [False, True])
-def test_every_drone_has_the_draws_that_it_has_on_mujoco(tensors: bool) -> None:
+def test_every_drone_has_the_draws_that_it_has_on_mujoco() -> None:
     """Of mass and the like, and of gusts; float64."""
-    if tensors:
-        torch = pytest.importorskip("torch")
     vehicle, shape = Vehicle.load("crazyflie2"), (2, 3)
     effects = EffectOptions.from_options({**EFFECTS, "gusts": 6.0})
     given: Any = {"drones": 3, "effects": effects, "randomize": Randomization(DRAWN, effects)}
-    device = {"device": "cpu"} if tensors else {}
-    ours = make_world(vehicle, 2, "rigid", tensors=tensors, dtype="float64", **device, **given)
+    ours = make_world(vehicle, 2, "rigid", dtype="float64", **given)
     theirs = make_world(vehicle, 2, **given)
 
-    def like(world: World, values: np.ndarray) -> Any:
-        return torch.tensor(values) if tensors and world is ours else values
-
     for world in (ours, theirs):
-        every = like(world, np.ones(shape, bool))
+        every = np.ones(shape, bool)
         world.seed(every, [7, 8])
-        begin(world, every, **{name: like(world, x) for name, x in tumbling(*shape).items()})
+        begin(world, every, **tumbling(*shape))
     for name in DRAWN:
         drawn = np.asarray(ours.parameters[name])
         assert drawn.tolist() == theirs.parameters[name].tolist()
@@ -142,8 +127,8 @@ def test_every_drone_has_the_draws_that_it_has_on_mujoco(tensors: bool) -> None:
     some = np.array([[True] * 3, [False] * 3])
     for step, thrust in enumerate(near_hover(vehicle, 20, *shape)):
         for world in (ours, theirs):
-            mask = like(world, some) if step == 5 else None
-            world.step(like(world, thrust), 2, mask)
+            mask = some if step == 5 else None
+            world.step(thrust, 2, mask)
     for field in MOVED:
         one, other = (np.asarray(getattr(world.state, field)) for world in (ours, theirs))
         np.testing.assert_allclose(one, other, atol=1e-9, rtol=0, err_msg=field)
@@ -175,20 +160,16 @@ def test_downwash_is_that_of_mujoco_and_of_a_world_alone() -> None:
 # --- who meets ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("tensors", [False, True])
 @pytest.mark.parametrize("name", [None, "crazyflie2"])
-def test_spheres_touch_at_two_radii_and_fly_on(name: str | None, tensors: bool) -> None:
+def test_spheres_touch_at_two_radii_and_fly_on(name: str | None) -> None:
     """Two drones of a world fall side by side and towards each other, ten radii a second each.
 
     Their spheres are one radius apart, and closer by 0.4 radii after every look: they touch at the
     third, and until 4 radii have passed twice. A third drone, and another world, keep apart.
     """
-    if tensors:
-        torch = pytest.importorskip("torch")
     vehicle = Vehicle.load(name, linear_drag=0.0)
     radius, looks = vehicle.radius, round(0.02 / vehicle.timestep)
-    world = make_world(vehicle, 2, "rigid", drones=3, tensors=tensors, dtype="float64",
-                       **({"device": "cpu"} if tensors else {}))  # fmt: skip
+    world = make_world(vehicle, 2, "rigid", drones=3, dtype="float64")
     position, velocity = np.zeros((2, 3, 3)), np.zeros((2, 3, 3))
     position[..., 2] = 1000.0
     position[0, :, 0] = np.array((-1.5, 1.5, 20.0)) * radius
@@ -196,15 +177,12 @@ def test_spheres_touch_at_two_radii_and_fly_on(name: str | None, tensors: bool) 
     velocity[0, :2, 0] = 10 * radius, -10 * radius
     none = np.zeros((2, 3, vehicle.num_rotors))
 
-    def like(values: np.ndarray) -> Any:
-        return torch.tensor(values) if tensors else values
-
     pose = {"position": position, "velocity": velocity, "thrust": none}
-    begin(world, like(np.ones((2, 3), bool)), **{name: like(x) for name, x in pose.items()})
+    begin(world, np.ones((2, 3), bool), **pose)
     state, seen = world.state, []
     assert not state.touching.any()
     for _ in range(14):
-        world.step(like(none), looks)
+        world.step(none, looks)
         assert state.touching.tolist() == state.colliding.tolist()
         assert state.touching[0, 0] == state.touching[0, 1]
         assert not state.touching[1].any()
@@ -377,80 +355,3 @@ def test_over_udp_it_flies_as_in_process() -> None:
         remote.close()
         running.join()
     assert local.out.any()
-
-
-def test_tensors_are_refused_in_one_sentence() -> None:
-    pytest.importorskip("torch")
-    expected = r"^drones: expected 1 with torch tensors, for the radio .* NumPy arrays, got 2$"
-    with pytest.raises(InputError, match=expected):
-        LocalVectorEnv(FORMATION, 2, drones=2, backend="rigid", device="cpu", tensors=True)
-    one = LocalVectorEnv(FORMATION, 2, backend="rigid", device="cpu", tensors=True)
-    assert one.reset(seed=0)[0].shape == (2, 68)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Together(TaskOptions):
-    """Options of the task below."""
-
-    action: str = "offset"
-
-
-class Falling(Task):
-    """Drones in a row, written for NumPy and torch: one that touches is out."""
-
-    Options, drones = Together, 8
-    metrics = (Metric(name="height", unit="m"),)
-
-    def setup(self) -> None:
-        """See the class."""
-        self.observation = (ArraySpec(name="observation", shape=(3,), low=-100.0, high=100.0),)
-
-    def begin(self, mask: Any, draw: Any) -> InitialState:
-        """Spheres one radius apart, the first at 10 m, and 3 m higher from one to the next."""
-        place = np.zeros((self.shape[1], 3))
-        place[:, 0] = 3 * self.vehicle.radius * np.arange(self.shape[1])
-        place[:, 2] = 10.0 + 3.0 * np.arange(self.shape[1])
-        noise = draw.uniform(-0.1, 0.1, (3,))
-        return InitialState(position=noise + constant(place, noise))
-
-    def observe(self, state: Any) -> dict[str, Any]:
-        """Positions."""
-        return {"observation": state.position}
-
-    def outcome(self, state: Any) -> Outcome:
-        """One point a step."""
-        height = state.position[..., 2]
-        return Outcome(
-            reward={"alive": 1.0 + 0.0 * height},
-            terminated=state.touching[()],
-            metrics={"height": height},
-        )
-
-
-register("rigid/Falling-v0", Falling)
-
-
-def test_a_task_of_ones_own_flies_several_drones_in_tensors() -> None:
-    """Two worlds of three: the same starts, flights and ends as arrays, in float64."""
-    pytest.importorskip("torch")
-    shared: Any = {"drones": 3, "backend": "rigid", "dtype": "float64"}
-    host = LocalVectorEnv("rigid/Falling-v0", 6, autoreset_mode="Disabled", **shared)
-    ours = LocalVectorEnv(
-        "rigid/Falling-v0", 6, autoreset_mode="Disabled", device="cpu", tensors=True, **shared
-    )
-    seeds = [5, 5, 5, 6, 6, 6]
-    np.testing.assert_array_equal(*(np.asarray(env.reset(seed=seeds)[0]) for env in (host, ours)))
-    down, outs = np.full((6, 1), -1.0, np.float32), []
-    for step in range(300):
-        some = np.arange(6) < 3 if step == 9 else np.zeros(6, bool)
-        for env in (host, ours):
-            env.advance(down, frozen=some)
-        for one, other in zip(*((e.observations, e.rewards) for e in (host, ours)), strict=True):
-            np.testing.assert_allclose(one, np.asarray(other), atol=1e-9, rtol=0)
-        for name in ("terminated", "out", "done"):
-            assert np.asarray(getattr(ours, name)).tolist() == getattr(host, name).tolist()
-        outs.append(int(host.out.sum()))
-        if host.done.any():
-            break
-    assert outs[-1] > 3
-    assert len(set(outs)) > 4  # one after the other reaches the ground

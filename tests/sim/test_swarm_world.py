@@ -139,8 +139,6 @@ def test_what_a_swarm_cannot_have_is_one_sentence() -> None:
     vehicle = Vehicle.load()
     with pytest.raises(InputError, match=r"^drones: expected 1 to 1024, got 0$"):
         make_world(vehicle, 1, drones=0)
-    with pytest.raises(InputError, match=r"^drones: expected 1 with the backend warp, got 2$"):
-        make_world(vehicle, 1, "warp", drones=2)
     payload = EffectOptions.from_options({"payload": 1.0, "cable": 1.0})
     world, above = make_world(vehicle, 1, drones=2, effects=payload), np.full((1, 2, 3), 5.0)
     with pytest.raises(InputError, match=r"payload: expected one drone in a world, or a task .* 2"):

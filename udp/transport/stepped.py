@@ -53,9 +53,8 @@ def make_stepped(
             from ...envs.loop import Loop
 
             name, chosen = canonical_id(env), cast(Any, backend)
-            given = {"tensors": False} if backend == "rigid" else {}
             return Loop(name, num_envs // drones, drones=drones, vehicle=vehicle, backend=chosen,
-                        options=options, **given)  # fmt: skip
+                        options=options)  # fmt: skip
         try:
             envs = [gym.make(env, disable_env_checker=True, **options) for _ in range(num_envs)]
         except (gym.error.Error, ImportError) as error:
