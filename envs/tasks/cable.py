@@ -206,7 +206,7 @@ class Cable(Swarm):
 
     def ended(self, state: WorldState) -> Array:
         """Whether the flight of all drones of a world is over, bool, (W, A)."""
-        outside = length(np, self._missing(state)) > self.band
+        outside = length(self._missing(state)) > self.band
         down = state.payload[..., 2] < self._radius
         flipped = state.tilt_cosine < LEAST_TILT_COSINE
         one = outside | down | flipped | state.touching
@@ -215,16 +215,16 @@ class Cable(Swarm):
     def outcome(self, state: WorldState) -> Outcome:
         """Nearness, approach and swing of the payload, and room; see the class."""
         missing = self._missing(state)
-        distance, room, ended = length(np, missing), self.clearance(state), self.ended(state)
+        distance, room, ended = length(missing), self.clearance(state), self.ended(state)
         near = self.gap / 2
         closing = np.sum(missing * state.payload_velocity, axis=-1)
         return Outcome(
             reward={
                 "payload": (near - distance) / (near + distance),
                 "approach": APPROACH_WEIGHT * closing / (distance + TINY),
-                "swing": -SWING_WEIGHT * length(np, state.payload_velocity - state.velocity),
+                "swing": -SWING_WEIGHT * length(state.payload_velocity - state.velocity),
                 "room": self.narrowness(room),
-                "rates": -RATE_WEIGHT * length(np, state.body_rates),
+                "rates": -RATE_WEIGHT * length(state.body_rates),
                 "termination": ended * TERMINATION_REWARD + 0.0,
             },
             terminated=ended,

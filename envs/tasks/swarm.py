@@ -203,7 +203,7 @@ class Radio:
     def __init__(self, options: Any, period: float, shape: tuple[int, ...]) -> None:
         worlds, count = shape
         self._options, self._period = options, period
-        self._said = Delay(options.radio_delay, np)  # position, velocity, silent
+        self._said = Delay(options.radio_delay)  # position, velocity, silent
         self._heard = np.zeros((worlds, count, count, 6))  # of receiver and sender
         self._age = np.full((worlds, count, count), np.inf)  # control steps
         self._keys = np.zeros((worlds, count), np.uint64)
