@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PACKAGES := models scenes sim envs udp agents rendering flights training cli
 
-.PHONY: install demo test test-other-processor test-wheel lint types docs clean
+.PHONY: install demo test test-other-processor test-wheel test-libraries lint types docs clean
 
 # What trains, draws, reports and records; Ray, Warp and the tools of `make test` are left out.
 install: .venv/.train,record,render,report
@@ -28,6 +28,17 @@ test-other-processor: .venv/.dev
 # checkout.
 test-wheel: .venv/.dev
 	PYTHON=$(PYTHON) .ci/wheel
+
+# Other people's libraries fly our envs, in an environment of their own: docs/libraries.md.
+test-libraries: .venv-libraries/.made
+	.venv-libraries/bin/python studies/libraries.py docs/libraries.md
+
+.venv-libraries/.made: pyproject.toml
+	$(PYTHON) -m venv .venv-libraries
+	.venv-libraries/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[train,swarm]' \
+	  $(shell grep -E '^(torch|numpy|gymnasium|mujoco|stable_baselines3|pettingzoo)==' constraints.txt) \
+	  torchrl skrl supersuit rl_zoo3
+	@touch $@
 
 lint: .venv/.dev
 	$(BIN)/ruff check
@@ -54,4 +65,4 @@ docs: .venv/.dev
 	@touch $@
 
 clean:
-	rm -rf .venv *.egg-info build dist .cache .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-libraries *.egg-info build dist .cache .pytest_cache .mypy_cache .ruff_cache .hypothesis
