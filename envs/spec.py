@@ -302,7 +302,12 @@ class EnvSpec(_Part):
     def from_json(cls, text: str) -> Self:
         """The reverse of `to_json`. Raises `SpecError`, and nothing else, for any other text."""
         try:
-            content = json.loads(text, parse_float=_finite, parse_constant=_finite)
+            content = json.loads(
+                text,
+                parse_float=_finite,
+                parse_constant=_finite,
+                object_pairs_hook=_without_repeats,
+            )
         except (ValueError, RecursionError) as error:
             raise SpecError(f"spec: expected JSON, got {text[:80]!r}: {error}") from None
         given = cls._fields(content)
@@ -358,6 +363,16 @@ def _finite(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"expected a finite number, got {text:.80}")
     return value
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object. Raises `ValueError` for a name that it has twice."""
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        names = [name for name, _ in pairs]
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"expected each name once, got {repeated[:40]!r} twice")
+    return content
 
 
 def _plain(value: Any) -> Any:
