@@ -40,7 +40,7 @@ class Geometric:
     def __init__(self, spec: EnvSpec) -> None:
         action = spec.action
         names = action.components
-        level = "actions of the level position (--env.action position)"
+        level = "actions of the level position (--action position)"
         expect(names == _ACTION, "geometric", level, f"{', '.join(names) or 'others'}")
         assert isinstance(action, ArraySpec)
         found = re.search(r"approached at (\S+) /s, gravity (\S+) m/s²", action.frame)

@@ -44,7 +44,7 @@ class Orca:
     def __init__(self, spec: EnvSpec) -> None:
         action, seen = spec.action, spec.observation[0]
         right = isinstance(action, ArraySpec) and action.components[:1] == ("velocity x",)
-        level = "actions of the level velocity (--env.action velocity)"
+        level = "actions of the level velocity (--action velocity)"
         expect(right, "orca", level, ", ".join(action.components) or "others")
         assert isinstance(action, ArraySpec)
         found = re.search(r"drones with a radius of (\S+) m", seen.frame)

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from ..agents import CONTROLLERS, PID, Checkpoint, Geometric, Orca, Policy, load
-from ..envs.registry import env_spec, is_known, options_type
+from ..envs.config import EnvConfig
+from ..envs.registry import env_spec, is_known, task_type
 from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
 from ..models import Backend
@@ -51,7 +52,7 @@ def chosen_env(
     if isinstance(checkpoint, type):
         level = checkpoint.options.get("action")
         if level and "action" not in options and is_known(env_id):
-            right, expected = level in options_type(env_id).actions, f"a task flown by {level}"
+            right, expected = level in task_type(env_id).actions, f"a task flown by {level}"
             expect(right, checkpoint.__name__.lower(), expected, f"{env_id}; name one with --env")
         return env_id, {**checkpoint.options, **options}
     if checkpoint is None or ("env" in command.given and env_id != checkpoint.env_id):
@@ -63,8 +64,15 @@ def chosen_env(
     own = getattr(command, "listen", None) is None  # a simulator of our own flies it
     if own and is_known(env[0]):
         drones = chosen_drones(command, checkpoint)
-        _check_vehicle(command, checkpoint, env_spec(*env, command.vehicle, drones))
+        _check_vehicle(command, checkpoint, _spec(command, env, drones))
     return env
+
+
+def _spec(command: EnvFlags, env: tuple[str, dict[str, Any]], drones: int) -> EnvSpec:
+    """The spec of an env with the vehicle of the flags."""
+    env_id, options = env
+    config = EnvConfig.from_keywords(env_id, vehicle=command.vehicle, drones=drones, **options)
+    return env_spec(config)
 
 
 def chosen_drones(command: EnvFlags, checkpoint: Checkpoint | Controller | None) -> int:
@@ -88,7 +96,8 @@ def policy_for(command: EnvFlags, checkpoint: Checkpoint | Controller, spec: Env
 def _check_vehicle(command: EnvFlags, checkpoint: Checkpoint, spec: EnvSpec) -> None:
     """Raise `InputError` for another vehicle than the policy's that the user has not named."""
     trained = checkpoint.spec
-    same_drag = trained.options.get("linear_drag") == spec.options.get("linear_drag")
+    drags = [one.options.get("effects", {}).get("linear_drag") for one in (trained, spec)]
+    same_drag = drags[0] == drags[1]
     other = trained.vehicle_hash != spec.vehicle_hash and same_drag
     right = not other or "vehicle" in command.given
     then, now = (f"{one.vehicle} (model {one.vehicle_hash[:8]})" for one in (trained, spec))
@@ -104,7 +113,7 @@ def pilot_of(
         return None, None, chosen_env(command)
     checkpoint = load_checkpoint(what)
     env = chosen_env(command, checkpoint)
-    spec = env_spec(*env, command.vehicle, chosen_drones(command, checkpoint))
+    spec = _spec(command, env, chosen_drones(command, checkpoint))
     policy = policy_for(command, checkpoint, spec)
     return None if isinstance(checkpoint, type) else checkpoint, policy, env
 

@@ -14,11 +14,13 @@ from typing import Annotated, Any, Final, TypeVar, Union, cast, get_args, get_or
 import tyro
 from tyro.conf import Fixed, Suppress, arg
 
+from ..envs.spec import canonical_id
 from ..flights.folders import LOCK, new_folder
 from ..models import Backend
 from ..models.errors import InputError, expect
 
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
+_PLAIN_FLAGS: Final = ("action", "control_period", "episode_length", "history", "scene", "cameras")
 _WORLD_FLAGS: Final = ("effects", "randomize", "sensors")
 _NO_FLAG: Any = Suppress[Fixed[dict]]  # type: ignore[type-arg]
 
@@ -50,6 +52,24 @@ class EnvFlags(Command):
     vehicle: Annotated[str | None, arg(metavar="FILE")] = None
     """TOML or MJCF file of a multirotor, or the name of one of the library; several with commas
     between them, for the drones of a world in turn. Default: the paper's quadcopter."""
+    config_file: Annotated[Path | None, arg(name="config", metavar="FILE")] = None
+    """TOML file with the env and everything that it is flown with, by the names of these flags and
+    of the task's options. Flags win."""
+    action: str | None = None
+    """Action level: rotors, rates, attitude, velocity, position, offset or increment. Default: the
+    task's."""
+    control_period: float | None = None
+    """Seconds between two actions: a multiple of the physics step. Default: the task's."""
+    episode_length: int | None = None
+    """Control steps after which an episode is truncated. Default: the task's."""
+    history: int = 1
+    """Number of the last observations that are observed side by side."""
+    scene: str = "plain"
+    """Ground and obstacles: plain, airport, forest, warehouse or gates; the last three from a
+    seed, as forest:3, or from one of several for each episode, as forest:0-7."""
+    cameras: tuple[str, ...] = ()
+    """Pictures that are observed: cameras of the vehicle, each NAME, NAME_KIND or
+    NAME@WIDTHxHEIGHT."""
     effects: tuple[str, ...] = ()
     """Effects on the vehicle, each NAME or NAME=VALUE: motor_lag wind=3,0,0. `none` switches off
     those of a checkpoint. docs/effects.md lists them."""
@@ -61,7 +81,8 @@ class EnvFlags(Command):
     drones: int = 1
     """Drones of each world, for a task of several."""
     options: Suppress[Fixed[dict]] = field(default_factory=dict)  # type: ignore[type-arg]
-    """Options of the task. A checkpoint brings those that it was trained with."""
+    """Keywords of `EnvConfig` that were given, but for the vehicle, the drones and the backend. A
+    checkpoint brings those that it was trained with."""
 
     @property
     def env_id(self) -> str:
@@ -103,18 +124,24 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     if not issubclass(kind, EnvFlags):
         return cast(C, replace(tyro.cli(plain, prog=prog, args=words), given=given))
     from ..envs import registry
+    from ..envs.config import KEYWORDS, EnvConfig
 
     parser = ArgumentParser(prog, add_help=False, allow_abbrev=False)
-    parser.add_argument("--env", default=DEFAULT_ENV)
-    env_id = parser.parse_known_args(words)[0].env
+    parser.add_argument("--env")
+    parser.add_argument("--config")
+    early = parser.parse_known_args(words)[0]
+    file = _file_values(kind, early.config) if early.config else {}
+    env_id = early.env or file.get("env") or DEFAULT_ENV
+    if early.env and canonical_id(early.env) != canonical_id(file.get("env", early.env)):
+        file.pop("options")  # they are another task's
     listens = "listen" in given or getattr(kind, "listen", None) is not None
     if listens and ":" not in env_id and not registry.is_known(env_id):
         words, required = _without_requirements(words)
         command = tyro.cli(plain, prog=prog, args=words)
         options = required | _world_options(command, given)
-        return cast(C, replace(command, given=given, options=options))
+        return cast(C, _with_file(command, given, options, file))
     env_id = registry.load(env_id)
-    options_type = registry.options_type(env_id)
+    options_type = registry.task_type(env_id).Options
     raw = _for_tyro(options_type, __doc__=f"Options of {env_id}.")
     typed = make_dataclass(
         kind.__name__,
@@ -126,16 +153,46 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     )
     command = tyro.cli(typed, prog=prog, args=words)
     names = sorted(name.removeprefix("env.") for name in given if name.startswith("env."))
-    options = {name: getattr(command.options, name) for name in names}
-    options |= _world_options(command, given)
-    checked = options_type.from_options(options)
-    chosen = json.loads(json.dumps({name: getattr(checked, name) for name in options}))
-    return cast(C, replace(command, given=given, options=chosen))
+    own = {name: getattr(command.options, name) for name in names}
+    clashing = {name: own.pop(name) for name in names if name in KEYWORDS}
+    options = own | _world_options(command, given) | ({"task": clashing} if clashing else {})
+    command = _with_file(command, given, options, file)
+    checked = EnvConfig.from_keywords(env_id, **command.options).flat_options()
+    chosen = {name: checked.get(name, value) for name, value in command.options.items()}
+    return cast(C, replace(command, options=chosen))
+
+
+def _file_values(kind: type[Any], path: str) -> dict[str, Any]:
+    """Values of a config's file by the names of fields. Raises `InputError`."""
+    from ..envs.config import BackendConfig, read_toml
+
+    options = read_toml(Path(path))
+    values: dict[str, Any] = {}
+    for name in ("env", "env_id"):
+        if name in options:
+            values["env"] = options.pop(name)
+    if "vehicle" in options:
+        values["vehicle"] = ",".join(options.pop("vehicle"))
+    if "drones" in options:
+        values["drones"] = options.pop("drones")
+    if "backend" in options and issubclass(kind, BackendFlags):
+        values["backend"] = BackendConfig.parse(options.pop("backend")).name
+    options.pop("backend", None)
+    return {**values, "options": options}
+
+
+def _with_file(
+    command: Any, given: frozenset[str], options: dict[str, Any], file: Mapping[str, Any]
+) -> Any:
+    """The command with what the file says and no flag does."""
+    added = {name: value for name, value in file.items() if name not in {*given, "options"}}
+    options = {**file.get("options", {}), **options}
+    return replace(command, given=given | added.keys(), options=options, **added)
 
 
 def _world_options(command: Any, given: frozenset[str]) -> dict[str, Any]:
     """Options by name of the flags whose words are NAME or NAME=VALUE. Raises `InputError`."""
-    options: dict[str, Any] = {}
+    options = {name: getattr(command, name) for name in _PLAIN_FLAGS if name in given}
     for flag in given.intersection(_WORLD_FLAGS):
         words = getattr(command, flag)
         values: dict[str, Any] = {}

@@ -17,17 +17,23 @@ from .registry import register
 from .spec import ArraySpec, Discrete, EnvSpec, Mark, Metric
 
 if TYPE_CHECKING:
+    from .config import EnvConfig
     from .loop import Loop
     from .single import SingleEnv
     from .tasks.task import Outcome, Task, TaskOptions
     from .vector import LocalVectorEnv
 
 __all__ = [
-    "ArraySpec", "Discrete", "EnvSpec", "Limits", "LocalVectorEnv", "Loop", "Mark", "Metric",
-    "Outcome", "SingleEnv", "Task", "TaskOptions", "register",
+    "ArraySpec", "Discrete", "EnvConfig", "EnvSpec", "Limits", "LocalVectorEnv", "Loop", "Mark",
+    "Metric", "Outcome", "SingleEnv", "Task", "TaskOptions", "register",
 ]  # fmt: skip
 
-_HOMES: Final = {"Loop": "loop", "LocalVectorEnv": "vector", "SingleEnv": "single"}
+_HOMES: Final = {
+    "EnvConfig": "config",
+    "Loop": "loop",
+    "LocalVectorEnv": "vector",
+    "SingleEnv": "single",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -5,17 +5,16 @@ for one control period: `advance` is that step, the step of the wire.
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sim import Array, Backend, EffectOptions, PhysicsError, Randomization, World, make_world
+from ..sim import Array, PhysicsError, Randomization, World, make_world
 from ..sim.sensors import Sensors
 from .autoreset import Seeds, checked_seeds
-from .spec import canonical_id
+from .config import EnvConfig
 from .specification import make_task, observed, spec_of
 from .stages import clock
 from .stages.actions import ActionDelay, Actions, Receive
@@ -58,7 +57,7 @@ class Stages:
         randomize: Randomization | None,
     ) -> None:
         drawn = () if randomize is None else randomize.names
-        options, controller, vehicle = task.options, task.controller, task.vehicle
+        config, controller, vehicle = task.config, task.controller, task.vehicle
         self._task, self._world = task, world
         self._look = lambda: world.state
         sensing, readings = self._sensors()
@@ -67,9 +66,9 @@ class Stages:
         if randomize is not None and "action_delay" in drawn:
             longest = randomize.most_steps("action_delay")
             self._flying.append(ActionDelay(world, longest, self.actions.neutral()))
-        substeps = vehicle.substeps(options.control_period)
+        substeps = vehicle.substeps(task.control_period)
         # An estimate is computed once in a control step, and so is a thrust that follows from it.
-        often = getattr(controller, "every_step", False) and not options.estimated
+        often = getattr(controller, "every_step", False) and not config.estimated
         self._held = 1 if often else substeps
         parts: list[Stage] = [Control(controller, self._look)]
         if shape[1] > 1:
@@ -77,29 +76,29 @@ class Stages:
         self._flight = Flight(world, parts, substeps, self._held)
         self._flying += [self._flight, clock.Clock()]
         judge = Judge(env_id, task)
-        measure = Measure(world, options.control_period)
+        measure = Measure(world, task.control_period)
         self._observing = [measure, *sensing, Memory(task), judge, *readings]
-        pictures = [Pictures(task, shape)] if options.cameras else []
+        pictures = [Pictures(task, shape)] if config.cameras else []
         self._observing += pictures
         self.pictures = pictures[0].specs if pictures else ()
         if randomize is not None and "observation_delay" in drawn:
             longest = randomize.most_steps("observation_delay")
             self._observing.append(ObservationDelay(world, longest))
-        if options.history > 1:
+        if config.history > 1:
             names = tuple(array.name for array in observed(task))
-            self._observing.append(History(options.history, names, len(world.shape)))
-        self._ends = Ends(env_id, world.shape, options.episode_length)
+            self._observing.append(History(config.history, names, len(world.shape)))
+        self._ends = Ends(env_id, world.shape, task.episode_length)
         self._observing.append(self._ends)
         self._starts = Starts(env_id, task, world)
         self._collect()
 
     def _sensors(self) -> tuple[list[Stage], list[Stage]]:
         """Stages that sample sensors and that add their readings to the observation."""
-        options = self._task.options
-        if not options.sensors:
+        config = self._task.config
+        if not config.sensors:
             return [], []
-        sensors = Sensors(options.sensors, self._world, options.control_period)
-        estimated = options.estimated
+        sensors = Sensors(config.sensors, self._world, self._task.control_period)
+        estimated = config.estimated
         if estimated:
             self._look = sensors.seen
         bounded = observed(self._task) if estimated else ()
@@ -134,10 +133,12 @@ class Loop:
     done when all are out. Masks and seeds have an element for each drone, and those of one world
     are alike; its first one's seed counts.
 
-    The vehicle is a file, None the paper's; options are the task's, by name; settings the
-    backend's: see `sim.make_world`.
+    Args:
+        config: What is flown.
+        num_worlds: W.
 
     Attributes:
+        config: As given, resolved.
         task, world: Their arrays have the leading axes of the world; all others here have one axis
             of N drones, world by world, and are new after each `advance`.
         observations: By name, shape (N, *shape), of the declared dtypes.
@@ -154,30 +155,25 @@ class Loop:
         gymnasium.error.ClosedEnvironmentError: A step or a reset after `close`.
     """
 
-    def __init__(
-        self,
-        env_id: str,
-        num_worlds: int = 1,
-        *,
-        drones: int = 1,
-        vehicle: Path | str | None = None,
-        backend: Backend = "mujoco",
-        options: Mapping[str, Any] | None = None,
-        **settings: Any,
-    ) -> None:
-        draft = make_task(env_id, options or {}, vehicle, (1, drones))
-        chosen = draft.options
-        effects = EffectOptions.from_options(draft.effects)
-        randomize = Randomization(chosen.randomize, effects) if chosen.randomize else None
-        self.num_envs, self.vehicle = num_worlds * drones, draft.vehicle
+    def __init__(self, config: EnvConfig, num_worlds: int = 1) -> None:
+        self.config = config = config.resolve()
+        backend, shape = config.backend, (num_worlds, config.drones)
+        alone = shape == (1, 1) and backend.name == "mujoco"
+        self.task = make_task(config, () if alone else shape)
+        self.num_envs, self.vehicle = num_worlds * config.drones, self.task.vehicle
+        flown = self.task.config
+        randomize = Randomization(flown.randomize, flown.effects) if flown.randomize else None
         self.world: World = make_world(
-            draft.vehicle, num_worlds, backend, drones=drones, effects=effects,
-            randomize=randomize, **settings,
-        )  # fmt: skip
-        self.task = type(draft)(chosen, draft.vehicle, self.world.shape)
-        shape = (num_worlds, drones)
-        self.stages = Stages(canonical_id(env_id), self.task, self.world, shape, randomize)
-        self.spec = spec_of(canonical_id(env_id), self.task, drones, self.stages.pictures)
+            self.vehicle,
+            num_worlds,
+            backend.name,
+            drones=config.drones,
+            effects=flown.effects,
+            randomize=randomize,
+            **backend.settings,
+        )
+        self.stages = Stages(config.env_id, self.task, self.world, shape, randomize)
+        self.spec = spec_of(config, self.task, self.stages.pictures)
         self.record = Record(self.world.shape)
         self.record.kept = self.stages.kept
         self._quantities = quantities_of(self.task)

@@ -1,12 +1,10 @@
 """The drones of one world as PettingZoo's agents: a vector env behind the parallel signature."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..models.errors import NotCopied, expect, require
-from ..sim import Backend
 from .autoreset import AdvancingVectorEnv
 from .rendering import RENDER_MODES
 from .spaces import action_space, observation_space
@@ -123,9 +121,7 @@ class LocalParallelEnv(AdvancingParallelEnv):
         env_id: Of a registered task for several drones.
         drones: How many.
         render_mode: None, `rgb_array` (a picture of the world) or `human` (a window).
-        vehicle: As of `Vehicle.load`: a file or a name; None is the paper's.
-        backend: What steps the world.
-        options: Of the task, by name.
+        keywords: As of `EnvConfig.from_keywords`.
 
     Raises:
         InputError: An option, seed or action is not what it should be; the env is as before.
@@ -139,13 +135,11 @@ class LocalParallelEnv(AdvancingParallelEnv):
         env_id: str,
         drones: int = 2,
         render_mode: str | None = None,
-        *,
-        vehicle: Path | str | None = None,
-        backend: Backend = "mujoco",
-        **options: Any,
+        **keywords: Any,
     ) -> None:
-        world = LocalVectorEnv(env_id, drones, render_mode, drones=drones, vehicle=vehicle,
-                               autoreset_mode="Disabled", backend=backend, **options)  # fmt: skip
+        world = LocalVectorEnv(
+            env_id, drones, render_mode, autoreset_mode="Disabled", drones=drones, **keywords
+        )
         super().__init__(world)
         self.render_mode = render_mode
         self.metadata["render_modes"] = RENDER_MODES

@@ -3,7 +3,7 @@
 import re
 import sys
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import gymnasium
 
@@ -11,7 +11,8 @@ from ..models.errors import InputError, expect
 from .spec import EnvSpec, canonical_id
 
 if TYPE_CHECKING:
-    from .tasks.task import Task, TaskOptions
+    from .config import EnvConfig
+    from .tasks.task import Task
 
 _ID: Final = re.compile(r"([\w.-]+/)?[\w.-]+-v\d+")
 _tasks: Final[dict[str, "str | type[Task]"]] = {}
@@ -79,17 +80,9 @@ def task_type(env_id: str) -> "type[Task]":
     return task
 
 
-def options_type(env_id: str) -> "type[TaskOptions]":
-    """The frozen dataclass of a task's options. Raises `InputError`."""
-    return task_type(env_id).Options
-
-
-def env_spec(env_id: str, options: Any = None, vehicle: Any = None, drones: int = 1) -> EnvSpec:
-    """The spec of an env with these options, this vehicle and so many drones in a world.
-
-    Raises `InputError`.
-    """
+def env_spec(config: "EnvConfig") -> EnvSpec:
+    """The spec of an env. Raises `InputError`."""
     from .specification import make_task, spec_of
 
-    task = make_task(env_id, options or {}, vehicle, (1, drones))
-    return spec_of(canonical_id(env_id), task, drones)
+    config = config.resolve()
+    return spec_of(config, make_task(config, (1, config.drones)))

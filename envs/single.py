@@ -1,12 +1,12 @@
 """One drone behind Gymnasium's single signature: the loop with one world."""
 
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from ..models.errors import InputError, NotCopied
+from .config import EnvConfig
 from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
 from .spaces import action_space, observation_space, telemetry_names
@@ -23,9 +23,10 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
     Render modes: with `rgb_array`, `render()` gives a picture, uint8, shape (360, 480, 3); with
     `human` a window shows the flight in real time. The physics is the same with either.
 
-    The vehicle is a file, None the paper's; options are the task's, by name.
+    Keywords are those of `EnvConfig.from_keywords`.
 
     Attributes:
+        config: The env's `EnvConfig`.
         control_period: Time of a step, s.
 
     Raises:
@@ -42,11 +43,12 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         self,
         env_id: str,
         render_mode: str | None = None,
-        *,
-        vehicle: Path | str | None = None,
-        **options: Any,
+        **keywords: Any,
     ) -> None:
-        self._loop = loop = Loop(env_id, vehicle=vehicle, options=options)
+        self.config = EnvConfig.from_keywords(env_id, **keywords)
+        if self.config.drones > 1:
+            raise InputError(f"drones: expected 1 in a single env, got {self.config.drones}")
+        self._loop = loop = Loop(self.config)
         self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
         self.env_spec = loop.spec
         self.control_period = loop.spec.control_period

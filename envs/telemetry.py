@@ -34,9 +34,9 @@ class Quantity:
 def quantities_of(task: Task) -> tuple[Quantity, ...]:
     """What is told of each drone that flies a task, in the order in which it crosses the wire."""
     quantities = [_POSITION, _ATTITUDE, _thrust(task)]
-    if drawn := Randomization(task.options.randomize, None).names:
+    if drawn := Randomization(task.config.randomize, task.config.effects).names:
         quantities.append(_drawn(drawn))
-    if task.effects.get("payload"):
+    if task.config.effects.payload:
         quantities.append(_PAYLOAD)
     if type(task).goal is not Task.goal:
         quantities.append(_GOAL)

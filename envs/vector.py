@@ -1,15 +1,14 @@
 """Many drones behind Gymnasium's vector signature: the loop with a world for each."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from ..models.errors import InputError, NotCopied, expect
-from ..sim import Backend
+from ..models.errors import InputError, NotCopied
 from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
+from .config import EnvConfig
 from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
 from .spaces import joined
@@ -32,15 +31,9 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
     Args:
         env_id: Of a registered task.
         num_envs: N.
-        drones: Of a world.
         render_mode: None, `rgb_array` (N pictures) or `human` (a window shows sixteen of them).
         autoreset_mode: `AutoresetMode`, or its value.
-        vehicle: As of `Vehicle.load`: a file or a name; None is the paper's.
-        backend: `mujoco` or `rigid`.
-        num_threads: Threads that step `mujoco`; 0 takes one for each processor.
-        dtype: Of `rigid`: `float32`, or `float64`.
-        compiled: Of `rigid`: None compiles where there is a C compiler.
-        options: Of the task, by name.
+        keywords: As of `EnvConfig.from_keywords`: `drones` of each world, `vehicle`, `backend` …
 
     Raises:
         InputError: An option, seed or action is not what it should be; the drones are as before.
@@ -56,28 +49,15 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         num_envs: int = 1,
         render_mode: str | None = None,
         *,
-        drones: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        vehicle: Path | str | None = None,
-        backend: Backend = "mujoco",
-        num_threads: int | None = None,
-        dtype: str | None = None,
-        compiled: bool | None = None,
-        **options: Any,
+        **keywords: Any,
     ) -> None:
         self.closed = True  # nothing is open yet
-        settings: dict[str, Any] = {
-            "num_threads": num_threads, "dtype": dtype, "compiled": compiled
-        }  # fmt: skip
-        given = {name: value for name, value in settings.items() if value is not None}
-        right = type(drones) is int and drones >= 1
-        expect(right, "drones", "1 or more", repr(drones))
-        right = type(num_envs) is int and num_envs % drones == 0
-        expect(right, "num_envs", f"a multiple of drones = {drones}", repr(num_envs))
-        self._loop = loop = Loop(
-            env_id, num_envs // drones, drones=drones, vehicle=vehicle, backend=backend,
-            options=options, **given,
-        )  # fmt: skip
+        self.config = config = EnvConfig.from_keywords(env_id, **keywords)
+        if type(num_envs) is not int or num_envs % config.drones != 0:
+            expected = f"a multiple of drones = {config.drones}"
+            raise InputError(f"num_envs: expected {expected}, got {num_envs!r}")
+        self._loop = loop = Loop(config, num_envs // config.drones)
         self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
@@ -141,7 +121,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         """By name, float64, shape (N, *shape)."""
         return self._loop.telemetry
 
-    def _info(self, mask: np.ndarray) -> dict[str, Any]:
+    def _info(self, mask: Any) -> dict[str, Any]:
         terms = {f"reward_{name}": term for name, term in self._loop.reward_terms.items()}
         return super()._info(mask) | terms | {f"_{name}": mask for name in terms}
 

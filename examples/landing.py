@@ -14,8 +14,6 @@ from rotorgram.sim import InitialState, clip, stack
 class LandingOptions(TaskOptions):
     """Options of `Landing-v0`."""
 
-    action: str = "offset"
-    episode_length: int = 400
     start: Annotated[float, Limits(2.0, 50.0, "m")] = 4.0
     """Mean height at which an episode begins, m above the ground; drawn from ± 1 m of it."""
 
@@ -24,6 +22,8 @@ class Landing(Task):
     """Come down, never faster than 1.5 m/s in the last 0.3 m, and stay down."""
 
     Options = LandingOptions
+    action = "offset"
+    episode_length = 400
     metrics = (Metric(name="height", unit="m", settled=0.05, held=0.1, symbol="h"),)
 
     def setup(self):

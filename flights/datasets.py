@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..envs import registry
+from ..envs.config import EnvConfig
 from ..envs.spaces import action_space, joined, observation_space
 from ..envs.spec import ArraySpec, EnvSpec, component_names
 from ..models.errors import InputError, require
@@ -282,7 +283,9 @@ def env_of(spec: EnvSpec, vehicle: Path | str | None = None) -> Any:
     if not registry.is_known(spec.env_id):
         return None
     try:
-        here = registry.env_spec(spec.env_id, spec.options, vehicle)
+        here = registry.env_spec(
+            EnvConfig.from_keywords(spec.env_id, vehicle=vehicle, **spec.options)
+        )
     except InputError:  # options that this vehicle does not have
         return None
     if here != spec:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ..agents import CONTROLLERS
 from ..agents.checkpoints import load
 from ..agents.policies import Policy
+from ..envs.config import EnvConfig
 from ..envs.registry import env_spec
 from ..envs.registry import load as load_env
 from ..envs.spec import Mark
@@ -201,7 +202,11 @@ class FlownPoses(_FlightPoses):
         if self.agent in CONTROLLERS:
             controller = CONTROLLERS[self.agent]
             options = {**controller.options, **options}
-            policy = controller(env_spec(env_id, options, vehicle, self.drones))
+            policy = controller(
+                env_spec(
+                    EnvConfig.from_keywords(env_id, vehicle=vehicle, drones=self.drones, **options)
+                )
+            )
         elif self.agent != "random":
             checkpoint = load(Path(self.agent))
             trained = checkpoint.spec
@@ -209,7 +214,9 @@ class FlownPoses(_FlightPoses):
                 env_id = checkpoint.env_id
             if env_id == checkpoint.env_id:
                 options = {**trained.options, **options}
-            spec = env_spec(env_id, options, vehicle, self.drones)
+            spec = env_spec(
+                EnvConfig.from_keywords(env_id, vehicle=vehicle, drones=self.drones, **options)
+            )
             if vehicle is None and trained.vehicle_hash != spec.vehicle_hash:
                 raise InputError(
                     f"plan: vehicle: expected {trained.vehicle}, on which {self.agent} was "

@@ -12,6 +12,10 @@ class InputError(ValueError):
     """
 
 
+class UnknownOption(InputError, TypeError):
+    """A keyword, option or setting that does not exist; the message names those that do."""
+
+
 class MissingPackage(ImportError):
     """An optional package is not installed. The message names the `pip install` that brings it."""
 

@@ -35,7 +35,7 @@ def parse_scene(text: str) -> tuple[str, int]:
     if name not in SCENES or (colon and not (name in SEEDED_SCENES and is_seed)):
         names = " or ".join(map(repr, SCENES))
         raise InputError(
-            f"world: expected {names}, the last three with a seed or not, as 'forest:3', "
+            f"scene: expected {names}, the last three with a seed or not, as 'forest:3', "
             f"got {text!r:.80}"
         )
     return name, int(number or 0)
@@ -58,7 +58,7 @@ def scenes_of(text: str) -> tuple[str, ...]:
     if not 0 <= high - low < MAX_SEEDS:
         names = ", ".join(map(repr, SEEDED_SCENES))
         raise InputError(
-            f"world: expected one of {names} with up to {MAX_SEEDS} seeds, as 'forest:0-7', "
+            f"scene: expected one of {names} with up to {MAX_SEEDS} seeds, as 'forest:0-7', "
             f"got {text!r:.80}"
         )
     return tuple(f"{name}:{seed}" for seed in range(low, high + 1))

@@ -1,11 +1,11 @@
 """Worlds: one interface for all backends."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
 
 from ..models import BACKENDS, MAX_DRONES, Backend
-from ..models.errors import expect
+from ..models.errors import InputError, expect
 from .effects import EffectOptions
 from .random import Draw, Noise
 from .randomize import CENTER, Randomization
@@ -119,6 +119,47 @@ def check_hung(height: float, least: float) -> None:
     expect(height > least, "start", expected, f"{height:.4g} m")
 
 
+def _class_of(backend: Backend) -> Any:
+    """The class of a backend's worlds."""
+    return getattr(import_module(f".backends.{backend}", __package__), _CLASSES[backend])
+
+
+def check_world(
+    vehicle: "Vehicle",
+    backend: Backend,
+    drones: int,
+    effects: EffectOptions | None,
+    randomize: Randomization | None,
+    settings: Mapping[str, Any],
+) -> None:
+    """Refuse by name what the backend cannot honour. Raises `InputError`."""
+    if backend not in BACKENDS:
+        raise InputError(f"backend: expected {' or '.join(BACKENDS)}, got {backend!r}")
+    if not (type(drones) is int and 1 <= drones <= MAX_DRONES):
+        raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {drones!r}")
+    if getattr(vehicle, "members", ()):
+        if backend != "mujoco":
+            raise InputError(
+                f"vehicle: expected one with the backend {backend}, got {vehicle.name}"
+            )
+        acting = list((effects or EffectOptions()).to_options())
+        acting += randomize.names if randomize else ()
+        refused = [name for name in acting if name != "linear_drag"]
+        if refused:
+            raise InputError(
+                "effects and randomize: expected none with several vehicles, "
+                f"got {', '.join(refused)}"
+            )
+    known = _class_of(backend).settings
+    for name, value in settings.items():
+        if name not in known:
+            several = "s" * (len(known) > 1)
+            raise InputError(
+                f"{name}: expected {' or '.join(known)}, the setting{several} of the backend "
+                f"{backend}, got {name}={value!r}"
+            )
+
+
 def make_world(
     vehicle: "Vehicle",
     num_worlds: int,
@@ -133,24 +174,10 @@ def make_world(
 
     Settings are `num_threads` of `mujoco`, `dtype` and `compiled` of `rigid`. Raises `InputError`.
     """
-    expect(backend in BACKENDS, "backend", " or ".join(BACKENDS), f"{backend!r}")
-    for name, count, most in ("num_envs", num_worlds, MAX_WORLDS), ("drones", drones, MAX_DRONES):
-        expect(type(count) is int and 1 <= count <= most, name, f"1 to {most}", f"{count!r}")
-    if getattr(vehicle, "members", ()):
-        expect(backend == "mujoco", "vehicle", f"one with the backend {backend}", vehicle.name)
-        acting = [
-            *(effects or EffectOptions()).to_options(),
-            *(randomize.names if randomize else ()),
-        ]
-        expected = "none with several vehicles"
-        expect(not acting, "effects and randomize", expected, ", ".join(acting))
-    module = import_module(f".backends.{backend}", __package__)
-    world_class = getattr(module, _CLASSES[backend])
-    known = world_class.settings
-    those = f"{' or '.join(known)}, the setting{'s' * (len(known) > 1)} of the backend {backend}"
-    for name, value in settings.items():
-        expect(name in known, name, those, f"{name}={value!r}")
-    world: World = world_class(
+    if not (type(num_worlds) is int and 1 <= num_worlds <= MAX_WORLDS):
+        raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
+    check_world(vehicle, backend, drones, effects, randomize, settings)
+    world: World = _class_of(backend)(
         vehicle, num_worlds, drones=drones, effects=effects, randomize=randomize, **settings
     )
     return world

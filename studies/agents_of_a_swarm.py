@@ -23,13 +23,13 @@ import threading
 import time
 import zlib
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from measuring import RESULTS, free_ports, launch, options, write
-from rotorgram.envs import ArraySpec, LocalVectorEnv, Outcome, Task, TaskOptions, register
+from rotorgram.envs import ArraySpec, LocalVectorEnv, Outcome, Task, register
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.sim import InitialState
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, SharedSimulator, Simulator
@@ -62,18 +62,12 @@ except PeerClosed:
 """
 
 
-@dataclass(frozen=True, kw_only=True)
-class Options(TaskOptions):
-    """Of the task below."""
-
-    action: str = "offset"
-    episode_length: int = 200
-
-
 class Row(Task):
     """Drones in a row, 5 m apart and 2 m high. One that rises by 5 cm is out."""
 
-    Options, drones = Options, 128
+    action = "offset"
+    episode_length = 200
+    max_drones = 128
 
     def setup(self) -> None:
         self.observation = (ArraySpec(name="observation", shape=(3,)),)
@@ -102,7 +96,7 @@ class Twin:
     """A world in process that repeats what the simulator does, and compares every bit."""
 
     def __init__(self, simulator: SharedSimulator) -> None:
-        self.simulator, self.loop = simulator, Loop(ENV_ID, drones=AGENTS)
+        self.simulator, self.loop = simulator, Loop(EnvConfig(env_id=ENV_ID, drones=AGENTS))
         self.taken = 0  # absences that were repeated
         self.absent = np.zeros(AGENTS, bool)
         kinds = ("silent", "coming", "late", "waiting", "left")

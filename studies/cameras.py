@@ -209,7 +209,7 @@ def sheet(path: Path) -> None:
     from matplotlib import colormaps, image
 
     scenes: list[tuple[str, str | None, str, dict[str, Any], int]] = [
-        ("rotorgram/Landing-v0", "crazyflie2", "front", {"world": "airport"}, 1),
+        ("rotorgram/Landing-v0", "crazyflie2", "front", {"scene": "airport"}, 1),
         ("rotorgram/Racing-v0", "skydio_x2", "front", {}, 1),
         ("rotorgram/Formation-v0", None, "chase", {}, 6),
     ]

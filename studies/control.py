@@ -19,6 +19,7 @@ import numpy as np
 from measuring import RESULTS, medians, options, write
 from rotorgram.agents import Geometric
 from rotorgram.envs import register
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.envs.tasks.hover import Hover
 from rotorgram.models import QUAD_XML, Vehicle
@@ -104,7 +105,7 @@ class Circle(Hover):
 
     def goal(self, state: WorldState) -> Any:
         """On the circle, at the time of the step."""
-        angle = SPEED * self.steps * self.options.control_period
+        angle = SPEED * self.steps * self.control_period
         return np.array((math.cos(angle), math.sin(angle), 5.0))
 
 
@@ -112,7 +113,7 @@ def tracking(name: str) -> float:
     """Root mean square of the distance from the goal on a circle in the third lap, m."""
     lags = {"motor_lag": True} if lag_of(Vehicle.load(name)) else {}
     options = {"action": "position", "episode_length": 1000, "effects": lags}
-    loop = Loop(CIRCLE, vehicle=name, options=options)
+    loop = Loop(EnvConfig.from_keywords(CIRCLE, vehicle=name, **options))
     policy, errors = Geometric(loop.spec), []
     loop.advance(np.zeros(4), np.ones(1, bool), [0])
     for _ in range(round(3 * PERIOD / 0.02)):
@@ -124,7 +125,7 @@ def tracking(name: str) -> float:
 def cost(num_drones: int, seconds: float, repeats: int) -> dict[str, Any]:
     """Env steps per second of each level, medians, and their ratios to `rotors`."""
     loops = {
-        level: Loop(HOVER, num_drones, options={"action": level, "episode_length": 10**6})
+        level: Loop(EnvConfig(env_id=HOVER, action=level, episode_length=10**6), num_drones)
         for level in LEVELS
     }
     every, rates = np.ones(num_drones, bool), {level: list[float]() for level in LEVELS}

@@ -6,6 +6,7 @@ Run `python studies/draw_cameras.py`; it needs no display.
 from measuring import IMAGES, options
 from PIL import Image, ImageDraw, ImageFont
 from rotorgram.agents import PID
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.flights.filming import moments
 from rotorgram.flights.trajectories import flown_trajectories
@@ -20,7 +21,7 @@ EPISODE, STEP = 1, 20  # on its way to the goal
 
 def draw() -> Image.Image:
     """Two columns; the last picture is of the plain floor."""
-    (flown,) = flown_trajectories(PID(env_spec(ENV)), ENV, {}, [EPISODE])
+    (flown,) = flown_trajectories(PID(env_spec(EnvConfig(env_id=ENV))), ENV, {}, [EPISODE])
     flight = moments(flown)
     views = [("airport", camera) for camera in CAMERAS] + [("plain", "chase")]
     rows = -(-len(views) // COLUMNS)

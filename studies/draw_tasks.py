@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from measuring import IMAGES, options
 from PIL import Image
 from rotorgram.agents import CONTROLLERS
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.flights.filming import moments
 from rotorgram.flights.trajectories import flown_trajectories
@@ -43,7 +44,7 @@ def draw(name: str, scene: Scene) -> Image.Image:
     """A picture of the task by its name without ending."""
     env_id, agent = f"rotorgram/{name}-v0", CONTROLLERS[scene.agent]
     options: dict[str, Any] = agent.options
-    policy = agent(env_spec(env_id, options))
+    policy = agent(env_spec(EnvConfig.from_keywords(env_id, **options)))
     (flown,) = flown_trajectories(policy, env_id, options, [0])
     stage = Stage()
     with Canvas(stage, WIDTH * TIMES, HEIGHT * TIMES) as canvas:

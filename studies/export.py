@@ -20,6 +20,7 @@ import onnxruntime
 from measuring import RESULTS, in_turns, options, write
 from rotorgram.agents.export import TARGETS, c, metadata, onnx
 from rotorgram.agents.policies import NetworkPolicy, flat_size
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 
 POLICIES: Final = {
@@ -61,7 +62,7 @@ Clock = Callable[[], float]
 
 def policy_of(env: str, hidden: tuple[int, ...], activation: str, normalise: bool) -> NetworkPolicy:
     """With random weights: time and size do not depend on them."""
-    spec, rng = env_spec(env), np.random.default_rng(0)
+    spec, rng = env_spec(EnvConfig(env_id=env)), np.random.default_rng(0)
     k = spec.action.size  # type: ignore[union-attr]
     sizes, weights = [flat_size(spec), *hidden, k], {"log_std": np.zeros(k)}
     for i, (inputs, units) in enumerate(pairwise(sizes)):

@@ -25,13 +25,14 @@ FLOOD = """
 import json, random, socket, sys, time
 import numpy as np
 from dataclasses import replace
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.udp.layouts import layout_of
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.messages import Hello, State
 port, seconds = int(sys.argv[1]), float(sys.argv[2])
 dice = random.Random(0)
-spec = env_spec("rotorgram/Elevation-v0", {})
+spec = env_spec(EnvConfig())
 layout, other = layout_of(spec), replace(spec, env_id="other/Env-v0")
 
 def state():

@@ -37,6 +37,7 @@ import json, sys, time
 from contextlib import closing
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.udp import RemoteVectorEnv
 drones, seconds, key, host, port = json.loads(sys.argv[1])
@@ -59,7 +60,7 @@ with closing(RemoteVectorEnv((host, port), env_id=env_id, num_envs=drones, key_f
     seconds, spent = time.perf_counter() - began, time.process_time() - spent
     numbers = env.statistics.numbers()
 
-loop = Loop(env_id, drones, options=options)
+loop = Loop(EnvConfig.from_keywords(env_id, **options), drones)
 loop.advance(np.zeros((drones, 1), np.float32), np.ones(drones, bool),
              np.arange(drones, dtype=np.uint64), None)
 dice, computed = rng(0), time.perf_counter()

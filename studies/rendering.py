@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from measuring import RESULTS, options, write
 from rotorgram.agents import PID
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.flights.filming import Film, Shot, film, moments
 from rotorgram.flights.trajectories import Trajectory, flown_trajectories
@@ -111,7 +112,7 @@ def whole_film(flown: Trajectory) -> dict[str, float]:
 def main() -> None:
     out = RESULTS / "performance" / "rendering.json"
     args = options(__doc__, rounds=5, frames=20, out=out).parse_args()
-    (flown,) = flown_trajectories(PID(env_spec(ENV)), ENV, {}, [EPISODE])
+    (flown,) = flown_trajectories(PID(env_spec(EnvConfig(env_id=ENV))), ENV, {}, [EPISODE])
     flight = moments(flown)
     rates, renderer = pictures(flight, args.rounds, args.frames)
     result = {

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 from measuring import RESULTS, in_turns, medians, options, write
-from rotorgram.envs import Loop
+from rotorgram.envs import EnvConfig, Loop
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.sim import InitialState, make_world
 
@@ -105,7 +105,7 @@ def world(backend: Any, drones: int, steps: int = 2, **settings: Any) -> Callabl
 
 def env(backend: Any, drones: int, **settings: Any) -> Callable[[], None]:
     """A step of Hover: controller, world, observation, reward, ends and resets."""
-    loop = Loop(HOVER, drones, backend=backend, **settings)
+    loop = Loop(EnvConfig.from_keywords(HOVER, backend=backend, **settings), drones)
     actions: Any = np.random.default_rng(0).uniform(-0.1, 0.1, (drones, 4)).astype(np.float32)
     loop.advance(actions, np.ones(drones, bool), range(drones))
 

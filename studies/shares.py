@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from measuring import RESULTS, medians, options, write
 from rotorgram.agents import EpisodeLog, make_agent, preset
-from rotorgram.envs import LocalVectorEnv, Loop
+from rotorgram.envs import EnvConfig, LocalVectorEnv, Loop
 from rotorgram.udp import RemoteVectorEnv, Simulator
 from rotorgram.udp.transport import sockets
 
@@ -33,7 +33,7 @@ def microseconds(fly: Callable[[], None], times: int) -> float:
 
 
 def simulate(backend: Any, drones: int) -> Callable[[], None]:
-    loop = Loop(HOVER, drones, backend=backend)
+    loop = Loop(EnvConfig.from_keywords(HOVER, backend=backend), drones)
     actions = np.zeros((drones, 4), np.float32)
     loop.advance(actions, np.ones(drones, bool), range(drones))
 

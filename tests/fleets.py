@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from peers import ANY, ENV_ID, Running
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.spec import component_names
 from rotorgram.udp import (
@@ -18,7 +19,7 @@ from rotorgram.udp import (
 )
 
 QUICK = LinkConfig(timeout=10)
-SPEC = env_spec(ENV_ID)
+SPEC = env_spec(EnvConfig(env_id=ENV_ID))
 NAMES = [name for array in SPEC.telemetry for name in component_names(array)]
 
 

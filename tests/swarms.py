@@ -1,27 +1,20 @@
 """A task for several drones, for tests."""
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from rotorgram.envs import ArraySpec, Metric, Outcome, Task, TaskOptions, register
+from rotorgram.envs import ArraySpec, Metric, Outcome, Task, register
 from rotorgram.sim import InitialState
 
 RISE: Final = "swarm/Rise-v0"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Options(TaskOptions):
-    """Of the task below."""
-
-    action: str = "offset"
-    episode_length: int = 30
-
-
 class Rise(Task):
     """Drones in a row, 5 m apart. One that is 0.5 m above or below its start is out."""
 
-    Options, drones = Options, 64
+    max_drones = 64
+    action = "offset"
+    episode_length = 30
     metrics = (Metric(name="risen", unit="m"),)
 
     def setup(self):

@@ -31,6 +31,7 @@ from mujoco.batch import Batch
 from ..agents import preset
 from ..agents.checkpoints import software_versions, write_whole
 from ..agents.policies import NetworkPolicy
+from ..envs.config import EnvConfig
 from ..envs.loop import Loop
 from ..envs.registry import env_spec
 from ..models.errors import expect
@@ -287,7 +288,7 @@ def _env(env: Any) -> Slice:
 def _simulate(stack: ExitStack) -> Slice:
     """The simulator's part between a Command and a State."""
     actions, everyone = _actions(_STEPS_AT_ONCE, 1, 1), np.ones(1, bool)
-    loop = stack.enter_context(closing(Loop(ENV_ID)))
+    loop = stack.enter_context(closing(Loop(EnvConfig(env_id=ENV_ID))))
     loop.advance(next(actions), everyone)
 
     def step() -> None:
@@ -300,7 +301,7 @@ def _simulate(stack: ExitStack) -> Slice:
 def _messages() -> tuple[Any, dict[str, State | Command]]:
     """The layout of one drone, and a State and a Command of it by name."""
     action = np.zeros((1, 1), np.float32)
-    with closing(Loop(ENV_ID)) as loop:
+    with closing(Loop(EnvConfig(env_id=ENV_ID))) as loop:
         loop.advance(action, np.ones(1, bool))
         state = State(
             session=1,
@@ -350,7 +351,7 @@ def _policy(drones: int) -> Slice:
         "layers.1.bias": 1, "log_std": 1,
     }  # fmt: skip
     weights = {name: dice.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
-    policy = NetworkPolicy(weights, env_spec(ENV_ID))
+    policy = NetworkPolicy(weights, env_spec(EnvConfig(env_id=ENV_ID)))
     observations = dice.normal(size=(drones, 3)).astype(np.float32)
     noise = policy.draw_noise(dice, drones)
     return _again(lambda: policy.actions.to_envs(policy.sample(observations, noise)), drones)

@@ -142,7 +142,7 @@ _KIND_WORDS: Final = {int: "a whole number", str: "a text", dict: "a table", lis
 def _content(config: BenchmarkConfig) -> dict[str, Any]:
     rows = []
     for row in config.rows:
-        spec = env_spec(**row.env)
+        spec = env_spec(row.flown)
         rows.append({name: getattr(row, name) for name in _ROW} | {
             "hyperparameters": {} if row.controller else asdict(row.run(0).config),
             "bounds": known_bounds(row, config.episodes),

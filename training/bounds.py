@@ -18,10 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..agents.pid import SHARES
+from ..envs.config import EnvConfig as FlownConfig
 from ..envs.loop import Loop
-from ..envs.registry import options_type
 from ..envs.spec import canonical_id
-from ..envs.tasks.elevation import ERROR_SCALE, ElevationOptions
+from ..envs.tasks.elevation import ERROR_SCALE
 from ..envs.tasks.racing import RacingOptions, read_track
 from ..envs.tasks.recovery import Recovery, RecoveryOptions
 from ..envs.tasks.waypoints import WaypointsOptions
@@ -30,6 +30,7 @@ from ..models.vehicle import Vehicle
 from .settings import EnvConfig
 
 _HALVINGS: Final = 24
+RECOVERY: Final = "rotorgram/Recovery-v0"
 
 Floats = npt.NDArray[np.float64]
 
@@ -40,31 +41,29 @@ def known_bounds(config: EnvConfig, episodes: int) -> dict[str, float]:
     """
     if canonical_id(config.env_id) != "rotorgram/Elevation-v0":
         return {}
-    options: Any = options_type(config.env_id).from_options(config.options)
-    loop = Loop(config.env_id, episodes, vehicle=config.vehicle, options=config.options)
+    flown = config.flown
+    loop = Loop(flown, episodes)
     seeds = [evaluation_seed(episode, "final") for episode in range(episodes)]
     loop.advance(np.zeros((episodes, 1), np.float32), np.ones(episodes, bool), seeds)
     starts = np.array(loop.telemetry["metrics"][:, 0])
     loop.close()
-    vehicle = Vehicle.load(config.vehicle, linear_drag=options.linear_drag)
-    return elevation_bounds(options, vehicle, starts)
+    return elevation_bounds(flown, flown.load_vehicle(), starts)
 
 
-def elevation_bounds(
-    options: ElevationOptions, vehicle: Vehicle, starts: Floats
-) -> dict[str, float]:
+def elevation_bounds(config: FlownConfig, vehicle: Vehicle, starts: Floats) -> dict[str, float]:
     """Mean returns of the two flights by name, over episodes that start at E in m, shape (n,)."""
-    steps, period = options.episode_length, options.control_period
+    options: Any = config.task_options
+    steps, period = config.episode_length or 0, config.control_period or 0.0
     # Largest accelerations up and down, m/s², and the largest change of one in a control step.
     up = float(vehicle.thrust_high.sum()) / vehicle.mass - vehicle.gravity
     down = vehicle.gravity - float(vehicle.thrust_low.sum()) / vehicle.mass
-    newtons = options.thrust_scale or SHARES[options.action] * float(vehicle.thrust_high.max())
+    newtons = options.thrust_scale or SHARES[config.action or ""] * float(vehicle.thrust_high.max())
     change = vehicle.num_rotors * newtons / vehicle.mass
-    if options.action == "offset":
+    if config.action == "offset":
         up, down, change = min(up, change), min(down, change), np.inf
     rising = starts > 0
     towards, against = np.where(rising, up, down), np.where(rising, down, up)
-    drag = options.linear_drag
+    drag = config.effects.linear_drag
     left = bang_bang(np.abs(starts), steps, period, towards, against, change, drag)
     return {
         "time-optimal": float(elevation_reward(left).sum(axis=1).mean()),
@@ -205,7 +204,7 @@ def recovery_bounds(
     dice, angles = np.random.default_rng(0), np.radians(np.arange(360.0))
     axes = np.stack((np.cos(angles), np.sin(angles), 0.0 * angles), axis=1)
     turn = max(map(vehicle.turning, axes)) / float(np.cos(np.radians(0.5)))  # between the axes
-    most = Recovery(options, vehicle).spin
+    most = Recovery(FlownConfig.from_keywords(RECOVERY, **options.to_options()), vehicle).spin
     rates = dice.uniform(-most, most, (count, 3))
     tilt = np.arccos(dice.uniform(-1.0, 1.0, count))
     climb = dice.uniform(0.0, options.start_speed, count) * dice.uniform(-1.0, 1.0, count)

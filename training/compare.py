@@ -45,7 +45,7 @@ def compare(config: CompareConfig, folder: Path, command: str, on_progress: OnPr
         InputError: The env names no metric, another process writes to the folder, or there is no
             such Ray cluster; nothing is written.
     """
-    spec = env_spec(**config.env)
+    spec = env_spec(config.flown)
     metric = Headline.of(spec).name
     parts = folder / PARTS
     runs: list[Run | str] = [*config.runs(), *filter(partial(_flies, spec), _CONTROLLERS)]

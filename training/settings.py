@@ -20,7 +20,8 @@ from ..agents.presets import (
     find_preset,
     preset,
 )  # fmt: skip
-from ..envs.registry import env_spec, is_known, options_type, task_type
+from ..envs import config as envs
+from ..envs.registry import env_spec, is_known, task_type
 from ..flights.executors import WorkersConfig
 from ..models import BACKENDS, Backend
 from ..models.errors import InputError, expect
@@ -48,7 +49,7 @@ class EnvConfig:
         expect(self.drones >= 1, "drones", "1 or more", str(self.drones))
         options: dict[str, Any] = dict(self.options)
         if is_known(self.env_id):
-            options = options_type(self.env_id).from_options(options).to_options()
+            options = envs.EnvConfig.from_keywords(self.env_id, **options).flat_options()
         object.__setattr__(self, "options", json.loads(json.dumps(options)))
 
     @property
@@ -56,6 +57,12 @@ class EnvConfig:
         """Keyword arguments of `EnvConfig` and `pairs.socket_pair`, on `mujoco`."""
         env = {"env_id": self.env_id, "options": self.options, "vehicle": self.vehicle}
         return {**env, "drones": self.drones}
+
+    @property
+    def flown(self) -> envs.EnvConfig:
+        """The same as the config of an env, on `mujoco`."""
+        keywords = {"vehicle": self.vehicle, "drones": self.drones, **self.options}
+        return envs.EnvConfig.from_keywords(self.env_id, **keywords)
 
     @property
     def training_env(self) -> dict[str, Any]:
@@ -129,7 +136,7 @@ class _ManyRuns(RunsConfig, EnvConfig):
         EnvConfig.__post_init__(self)
         self._check_counts("seeds", "env_steps", "episodes")
         expect(self.first_seed >= 0, "first_seed", "0 or more", str(self.first_seed))
-        expect(env_spec(**self.env).headline, "env", "one that names a metric", self.env_id)
+        expect(env_spec(self.flown).headline, "env", "one that names a metric", self.env_id)
 
     def _check_counts(self, *names: str) -> None:
         for name in names:
@@ -219,7 +226,7 @@ class BoardRow(EnvConfig):
             object.__setattr__(self, name, value)
         super().__post_init__()
         expect(is_known(self.env_id), "env_id", "a registered id", self.env_id)
-        expect(env_spec(**self.env).headline, "env_id", "one that names a metric", self.env_id)
+        expect(env_spec(self.flown).headline, "env_id", "one that names a metric", self.env_id)
         if not self.controller:
             try:  # wrong names and numbers are told before anything is trained
                 self.run(0)
@@ -241,9 +248,9 @@ class BoardRow(EnvConfig):
         """The env in words: its name, the options that are not the default nor a controller's, the
         vehicle.
         """
-        usual = json.loads(json.dumps(options_type(self.env_id)().to_options()))
+        usual = envs.EnvConfig(env_id=self.env_id).flat_options()
         usual |= self.brought
-        other = {name: value for name, value in self.options.items() if value != usual[name]}
+        other = {name: value for name, value in self.options.items() if value != usual.get(name)}
         words = [self.env_id.rpartition("/")[2]]
         words += [f"{name}={_word(json.dumps(value))}" for name, value in other.items()]
         words += [f"of {self.drones}"] if self.drones > 1 else []

@@ -57,7 +57,7 @@ def sweep(config: SweepConfig, folder: Path, command: str, on_progress: OnProgre
 
     Arguments and errors are those of `compare.compare`.
     """
-    spec = env_spec(**config.env)
+    spec = env_spec(config.flown)
     runs = len(config.runs())
     with open_executor(config, runs, on_progress) as executor, locked(folder):
         if not (folder / CONFIG_FILE).exists():  # a resumed sweep keeps its settings

@@ -27,7 +27,7 @@ _BOUNDS: Final = {"rgb": (0.0, 255.0), "depth": (0.0, FARTHEST), "flow": (-np.in
 
 def views_of(task: Task, drones: int) -> tuple[View, ...]:
     """What the option `cameras` of a task chooses. Raises `InputError`."""
-    words = task.options.cameras
+    words = task.config.cameras
     kinds = dict.fromkeys(members_of(task.vehicle, drones))
     first, *others = (chosen_views(words, cameras_of(one)) for one in kinds)
     for views in others:
@@ -95,14 +95,14 @@ class Pictures(Stage):
         self._task, self._shape, self._rows = task, shape, shape[0] * shape[1]
         self._noise, self._draws = Streams(shape[0], CAMERAS), Streams(shape[0], SCENES)
         self.views = views_of(task, shape[1])
-        scenes = scenes_of(task.options.world)
+        scenes = scenes_of(str(task.config.scene))
         self._count = len(scenes)
         self._threads = min(os.cpu_count() or 1, shape[0], _MOST_THREADS)
         parts = np.arange(shape[0]) % -(-self._threads // len(scenes))
         cameras = []
         for number, scene in enumerate(scenes):
             for part in range(parts.max() + 1):
-                payload = bool(task.effects.get("payload"))
+                payload = task.config.effects.payload > 0
                 drawn = Cameras(
                     task.vehicle,
                     self.views,

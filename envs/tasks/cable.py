@@ -1,15 +1,15 @@
 """`rotorgram/Cable-v0`: drones carry one payload together, each on a cable, to a point."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
 from ...models.errors import expect
 from ...models.fields import Limits
 from ...sim import Array, Draw, InitialState, WorldState, stack
+from ..config import EnvConfig
 from ..spec import Metric
 from .flight import (
     AIR,
@@ -19,6 +19,7 @@ from .flight import (
     SWING_WEIGHT,
     TERMINATION_REWARD,
     length,
+    with_payload,
 )
 from .swarm import APPROACH_WEIGHT, TINY, Swarm, SwarmOptions, ring
 from .task import Outcome
@@ -36,8 +37,6 @@ class CableOptions(SwarmOptions):
     start_band: Annotated[float, Limits(0.0, 100.0)] = 0.5
     """Largest distance of the payload from the goal along each axis at the start, over the distance
     between neighbouring drones."""
-
-    hangs = True
 
 
 class Cable(Swarm):
@@ -92,7 +91,7 @@ class Cable(Swarm):
         Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e"),
         Metric(name="clearance", unit="m", goal="high"),
     )
-    fewest, drones = 2, 32
+    min_drones, max_drones = 2, 32
 
     def setup(self) -> None:
         """See the class."""
@@ -137,12 +136,9 @@ class Cable(Swarm):
             )
         )
 
-    @property
-    def effects(self) -> Mapping[str, Any]:
-        """Those of the options, and the payload's share of each drone on its cable."""
-        options = self.options
-        share = options.payload_share * self.vehicle.mass
-        return {**options.effects, "payload": share, "cable": self._cable}
+    def adjust(self, config: EnvConfig) -> EnvConfig:
+        """The payload's share of each drone, on its cable."""
+        return with_payload(config, self.options.payload_share * self.vehicle.mass, self._cable)
 
     def carrying(self, azimuth: np.ndarray) -> np.ndarray:
         """Thrusts that hold drones at such azimuths from the payload, N, (..., R): rad, (...).

@@ -1,21 +1,12 @@
 """`rotorgram/Crossing-v0`: drones on a ring change to the opposite places without touching."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from ...sim import Array, Draw, InitialState, WorldState, stack
 from ..spec import Metric
 from .swarm import JITTER, Swarm, SwarmOptions, ring
-
-
-@dataclass(frozen=True, kw_only=True)
-class CrossingOptions(SwarmOptions):
-    """Options of `rotorgram/Crossing-v0`."""
-
-    episode_length: int = 1000
-    """Control steps after which an episode is truncated."""
 
 
 class Crossing(Swarm):
@@ -58,7 +49,8 @@ class Crossing(Swarm):
     1000 steps of 0.02 s.
     """
 
-    Options = CrossingOptions
+    Options = SwarmOptions
+    episode_length = 1000
     metrics = (
         Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e"),
         Metric(name="clearance", unit="m", goal="high"),

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from ...sim import (
     Array,
     CollectiveThrust,
     Draw,
+    EffectOptions,
     InitialState,
     WorldState,
     clip,
@@ -44,11 +45,6 @@ class ElevationOptions(TaskOptions):
     """An episode starts at rest, hovering, up to this far above or below the target, m."""
     flight_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 3.0
     """An episode terminates when the craft is further than this from the target, m."""
-    actions: ClassVar[tuple[str, ...]] = ("increment", "offset")
-
-    action: str = "increment"
-    """`increment`: thrust += scale · action (paper, section 2.2).
-    `offset`: thrust = hover + scale · action."""
     action_type: ActionType = "continuous"
     """`continuous`: one number in [-1, 1]. `discrete`: 0 decrease, 1 hold, 2 increase."""
     observation: Observed = "full"
@@ -118,6 +114,8 @@ class Elevation(Task):
     """
 
     Options = ElevationOptions
+    actions = ("increment", "offset")
+    action = "increment"
     metrics = (
         Metric(name="elevation_error", unit="m", settled=0.05, held=0.1, symbol="E", signed=True),
     )
@@ -132,7 +130,7 @@ class Elevation(Task):
         reasons = f"(start_band = {options.start_band:g} m, and {room:g} m of room)"
         expected = f"{least:g} m {reasons} to {FURTHEST:g} m"
         expect(least <= low and high <= FURTHEST, "target", expected, f"{options.target!r}")
-        increment, most = options.action == "increment", float(vehicle.thrust_high.max())
+        increment, most = self.action == "increment", float(vehicle.thrust_high.max())
         usual: Any = self.controller
         scale = options.thrust_scale or usual.newtons
         expected = f"at most {most:g} N, the largest thrust of a rotor"
@@ -142,7 +140,9 @@ class Elevation(Task):
         )
         self._hover = float(vehicle.hover_thrust[0])
         self.observation = (spec := self._observation_spec(),)
-        self._bounds = None if options.ideal else spec.bounds()
+        config = self.config
+        ideal = config.effects == EffectOptions() and not config.randomize
+        self._bounds = None if ideal else spec.bounds()
         self.target: Array = 0.0
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
@@ -198,14 +198,14 @@ class Elevation(Task):
         of a control period T. So the craft may turn back outside it within one period, fly through
         it, and fly on for one period: sqrt((a T / 2)² + 2 a · 2 flight_band) + a T.
         """
-        a, period = self.vehicle.max_acceleration, self.options.control_period
+        a, period = self.vehicle.max_acceleration, self.control_period
         out = math.sqrt(4 * a * self.options.flight_band)
         return float(math.hypot(a * period / 2, out) + a * period)
 
     @property
     def error_bound(self) -> float:
         """Largest |E| of an observation, m: the band and one control period of flight."""
-        return float(self.options.flight_band + self.rate_bound * self.options.control_period)
+        return float(self.options.flight_band + self.rate_bound * self.control_period)
 
     def _observation_spec(self) -> ArraySpec:
         least = self.vehicle.thrust_low[0] / self._hover - 1

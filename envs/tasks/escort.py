@@ -106,7 +106,7 @@ class Escort(Swarm):
 
     def remember(self, state: WorldState, mask: Array) -> None:
         """Move the target; listen."""
-        self.keep(mask, _time=self._time + self.options.control_period)
+        self.keep(mask, _time=self._time + self.control_period)
         super().remember(state, mask)
 
     def observe(self, state: WorldState) -> dict[str, Array]:

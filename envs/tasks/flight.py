@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Final
 
 import numpy as np
 
+from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import (
     Array,
@@ -18,6 +20,7 @@ from ...sim import (
     to_body,
     world_z,
 )
+from ..config import EnvConfig
 from ..spec import ArraySpec
 from .task import Task
 
@@ -45,6 +48,17 @@ Point = Annotated[tuple[float, float, float], Limits(-FURTHEST, FURTHEST, "m", c
 
 Sides = Annotated[tuple[float, float, float], Limits(0.0, FURTHEST, "m", count=3)]
 """Of an option: lengths along x, y and z, m."""
+
+
+def with_payload(config: EnvConfig, mass: float, cable: float) -> EnvConfig:
+    """The config with a payload that the task's options describe. Raises `InputError`."""
+    given = [name for name in ("payload", "cable") if name in config.effects.to_options()]
+    if given:
+        raise InputError(
+            "effects: expected a payload that the options of the task describe, "
+            f"got {' and '.join(given)}"
+        )
+    return replace(config, effects=replace(config.effects, payload=mass, cable=cable))
 
 
 class Flight(Task):

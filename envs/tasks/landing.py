@@ -27,8 +27,6 @@ Motion = Literal["circle", "line"]
 class LandingOptions(TaskOptions):
     """Options of `rotorgram/Landing-v0`."""
 
-    episode_length: int = 400
-    """Control steps after which an episode is truncated."""
     motion: Motion = "circle"
     """Path of the pad about (0, 0): a `circle`, or a `line` on which it swings to and fro."""
     pad_path: Annotated[float, Limits(0.01, FURTHEST, "m")] = 2.0
@@ -126,6 +124,7 @@ class Landing(Flight):
     """
 
     Options = LandingOptions
+    episode_length = 400
     metrics = (
         Metric(name="landed", unit="", goal="high", held=0.9, final=True),
         Metric(name="pad_distance", unit="m"),
@@ -176,7 +175,7 @@ class Landing(Flight):
     def remember(self, state: WorldState, mask: Array) -> None:
         """Move the pad; keep speed and tilt from before contact, and what was won on the way."""
         touching = state.touching
-        self.keep(mask, _phase=self._phase + self._rate * self.options.control_period)
+        self.keep(mask, _phase=self._phase + self._rate * self.control_period)
         velocity = np.where(each(touching), self._velocity, state.velocity)
         upright = np.where(touching, self._upright, state.tilt_cosine)
         potential = self._potential_of(state.position, velocity)

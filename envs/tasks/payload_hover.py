@@ -1,9 +1,8 @@
 """`rotorgram/PayloadHover-v0`: hold a payload on a cable at a point, and damp its swing."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from ...sim import (
     square_root,
     stack,
 )
+from ..config import EnvConfig
 from ..spec import Metric
 from .flight import (
     AIR,
@@ -34,6 +34,7 @@ from .flight import (
     Point,
     at,
     length,
+    with_payload,
 )
 from .task import Outcome, TaskOptions
 
@@ -56,8 +57,6 @@ class PayloadHoverOptions(TaskOptions):
     """Largest tilt at the start, degrees, about a horizontal axis drawn uniformly."""
     flight_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 3.0
     """An episode terminates when the payload is further than this from its goal, m."""
-
-    hangs = True
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
@@ -133,11 +132,10 @@ class PayloadHover(Flight):
             ],
         )
 
-    @property
-    def effects(self) -> Mapping[str, Any]:
-        """Those of the options, and the payload."""
-        options, load = self.options, self.options.payload_share * self.vehicle.mass
-        return {**options.effects, "payload": load, "cable": options.cable}
+    def adjust(self, config: EnvConfig) -> EnvConfig:
+        """The payload on its cable."""
+        mass = self.options.payload_share * self.vehicle.mass
+        return with_payload(config, mass, self.options.cable)
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """The payload near its goal, hanging still below a craft that moves and tilts."""

@@ -68,8 +68,6 @@ class Gate:
 class RacingOptions(TaskOptions):
     """Options of `rotorgram/Racing-v0`."""
 
-    episode_length: int = 1500
-    """Control steps after which an episode is truncated."""
     track: str = "oval"
     """A track of ours (`oval`, `dive`), or a TOML file with its gates and its start. It is kept as
     JSON, so that it crosses the wire."""
@@ -140,6 +138,7 @@ class Racing(Flight):
     """
 
     Options = RacingOptions
+    episode_length = 1500
     metrics = (
         Metric(name="gates_left", unit="", settled=0.5, held=0.5, final=True),
         Metric(name="flight_time", unit="s", final=True),
@@ -211,7 +210,7 @@ class Racing(Flight):
         left = self._passed < self._total
         passing = plain(through & inside & left) * 1.0
         progress = plain(length(a) - length(b))
-        passed, time = self._passed + passing, self._time + self.options.control_period
+        passed, time = self._passed + passing, self._time + self.control_period
         whole = (passing > 0.5) & (passed % self._count == 0.0)
         way, come = center - self._behind, now - self._behind
         along = plain(np.sum(come * way, axis=-1)) / (plain(np.sum(way * way, axis=-1)) + 1e-12)

@@ -33,8 +33,6 @@ Frame = Literal["body", "world"]
 class RecoveryOptions(TaskOptions):
     """Options of `rotorgram/Recovery-v0`."""
 
-    episode_length: int = 400
-    """Control steps after which an episode is truncated."""
     goal: Point = (0.0, 0.0, 20.0)
     """Where it is thrown, and has to come back to: x, y, z in MuJoCo's world frame (z up), m."""
     start_speed: Annotated[float, Limits(0.0, 100.0, "m/s")] = 3.0
@@ -58,9 +56,6 @@ class RecoveryOptions(TaskOptions):
         """Check the options of this task. Raises `InputError`."""
         expected = f"more than near = {self.near:g} m"
         expect(self.flight_band > self.near, "flight_band", expected, f"{self.flight_band!r}")
-        if self.frame is None:
-            frame = "body" if self.action in ("rotors", "rates") else "world"
-            object.__setattr__(self, "frame", frame)
 
 
 class Recovery(Flight):
@@ -126,6 +121,7 @@ class Recovery(Flight):
     """
 
     Options = RecoveryOptions
+    episode_length = 400
     metrics = (
         Metric(name="recovered", unit="", goal="high", held=0.9),
         Metric(name="recovery_time", unit="s"),
@@ -142,6 +138,8 @@ class Recovery(Flight):
         turning = [min(vehicle.turning(axis), vehicle.turning(-axis)) for axis in np.eye(3)]
         self.spin = np.minimum(options.spin, STOP_TIME * np.array(turning))
         self.body = options.frame == "body"
+        if options.frame is None:
+            self.body = self.action in ("rotors", "rates")
         self.describe(options.flight_band)
         self._least_upright = math.cos(math.radians(options.upright))
         self._time = self._missed = self._lowest = 0.0  # s, s, m
@@ -173,7 +171,7 @@ class Recovery(Flight):
     def remember(self, state: WorldState, mask: Array) -> None:
         """Time, the last step that was not recovered, and the lowest point."""
         height = component(state.position, 2)
-        self.keep(mask, _time=self._time + self.options.control_period)
+        self.keep(mask, _time=self._time + self.control_period)
         self.keep(mask, _missed=np.where(self._recovered(state), self._missed, self._time))
         self.keep(mask, _lowest=np.where(height < self._lowest, height, self._lowest))
 

@@ -1,7 +1,7 @@
 """What tasks for several drones share: who hears whom by radio, and the room between drones."""
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 
@@ -34,9 +34,6 @@ JITTER: Final = 0.2  # Of a start, in each axis, over the distance between start
 class SwarmOptions(TaskOptions):
     """Options that the tasks for several drones share."""
 
-    action: str = "velocity"
-    episode_length: int = 500
-    """Control steps after which an episode is truncated."""
     center: Point = (0.0, 0.0, 10.0)
     """Middle of starts and goals: x, y, z in MuJoCo's world frame (z up), m."""
     spacing: Annotated[float, Limits(2.0, 1e3, "diameters")] = 3.0
@@ -68,7 +65,9 @@ class Swarm(Flight):
     A derived class sets `reach` before `prepare`, calls `hear` in `begin`, and has `goal`.
     """
 
-    drones: ClassVar[int] = MOST_DRONES
+    max_drones = MOST_DRONES
+    action = "velocity"
+    episode_length = 500
     reach = 0.0
     """Furthest distance of a start from its goal, m."""
 
@@ -92,7 +91,7 @@ class Swarm(Flight):
         self.describe(self.band, [*more, *told])
         spheres = f"; drones with a radius of {vehicle.radius:.7g} m"
         self.observation = tuple(replace(a, frame=a.frame + spheres) for a in self.observation)
-        period = options.control_period
+        period = self.control_period
         self._radii = np.array([one.radius for one in members_of(vehicle, self.count)])
         self.radio = Radio(options, period, self.shape) if self.count > 1 else None
         self._down: Array = False

@@ -5,119 +5,49 @@ single drone. It counts axes from the last (`position[..., 2]`), uses operators,
 functions, and never changes an array in place.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Self
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from ...models import MOST_DRAG
-from ...models.errors import expect
-from ...models.fields import Choice, Limits, check, check_fields
-from ...scenes import scenes_of
-from ...sim import (
-    LEVELS,
-    Array,
-    Controller,
-    Draw,
-    EffectOptions,
-    InitialState,
-    Randomization,
-    WorldState,
-    checked_sensors,
-    make_controller,
-)
+from ...models.errors import InputError, UnknownOption
+from ...models.fields import check_fields
+from ...sim import LEVELS, Array, Controller, Draw, InitialState, WorldState, make_controller
 from ..spec import ArraySpec, Mark, Metric
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
-
-LONGEST_CONTROL_PERIOD: Final = 1.0  # Longest time between two actions, s
-LONGEST_EPISODE: Final = 1 << 31  # Most control steps of an episode
-LONGEST_HISTORY: Final = 1000  # Most observations side by side
+    from ..config import EnvConfig
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskOptions:
-    """Options that every task has. A wrong one raises `InputError` with one sentence.
+    """Base of the options of a task: derive, add fields, and check them in `check`.
 
-    Numbers may be of any real type, NumPy's among them; they are kept as Python's float and int.
-    A task with options of its own derives from this: annotations say what they may be (see
-    `models.fields`), and `check` what they have to do with each other.
+    Annotations say what they may be (see `models.fields`), and `check` what they have to do with
+    each other. Numbers may be of any real type, NumPy's among them; they are kept as Python's.
     """
-
-    episode_length: Annotated[int, Limits(1, LONGEST_EPISODE, "control steps", whole=True)] = 250
-    """Control steps after which an episode is truncated."""
-    action: str = "rotors"
-    """What an action sets: one of `sim.LEVELS`."""
-    control_period: Annotated[float, Limits(1e-6, LONGEST_CONTROL_PERIOD, "s")] = 0.02
-    """Time between two actions, s: a multiple of the physics step, at most 1 s. The default is that
-    of Unity's `FixedUpdate`."""
-    history: Annotated[int, Limits(1, LONGEST_HISTORY, "observations", whole=True)] = 1
-    """The agent observes the last so many observations side by side, the oldest first; at the start
-    of an episode all are the first one."""
-    linear_drag: Annotated[float, Limits(0.0, MOST_DRAG, "/s")] = 0.0
-    """Acceleration of -linear_drag · velocity, 1/s, as Unity's `Rigidbody.drag`; at most 100. The
-    force acts at the body's origin."""
-    effects: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    """Effects by name, as `sim.EffectOptions` has them; none are on by default."""
-    randomize: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    """What is drawn for each episode: names of `sim.PARAMETERS` to distributions, as texts."""
-    sensors: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    """What the drone measures: by sensor its settings, or true. See `sim/sensors.py`."""
-    cameras: tuple[str, ...] = ()
-    """Pictures that are observed: cameras of the vehicle by name, also as NAME_KIND or
-    NAME@WIDTHxHEIGHT. See `models/cameras.py`."""
-    world: str = "plain"
-    """What the pictures show around the drones: plain, airport, forest, warehouse or gates; the
-    last three from a seed, as forest:3, or from one of several for each episode, as forest:0-7."""
-
-    actions: ClassVar[tuple[str, ...]] = LEVELS
-    """Levels that the task can be flown at; one with a controller of its own may name fewer."""
-    hangs: ClassVar[bool] = False
-    """Whether the task hangs a payload from the vehicle, so that `effects` may not."""
 
     def __post_init__(self) -> None:
         check_fields(self)
-        check("action", Choice(self.actions), self.action)
-        effects = EffectOptions.from_options(self.effects)
-        hung = [name for name in ("payload", "cable") if self.hangs and name in self.effects]
-        expected = "a payload that the options of the task describe"
-        expect(not hung, "effects", expected, " and ".join(hung))
-        object.__setattr__(self, "effects", effects.to_options())
-        object.__setattr__(self, "sensors", checked_sensors(self.sensors))
-        object.__setattr__(self, "cameras", _words(self.cameras))
-        scenes_of(self.world)
         self.check()
-        acting = replace(effects, payload=1.0) if self.hangs else effects
-        drawn = Randomization(self.randomize, acting)
-        object.__setattr__(self, "randomize", drawn.to_options())
 
     def check(self) -> None:
         """Check options that depend on each other, each within its limits. Raises `InputError`."""
 
-    @property
-    def ideal(self) -> bool:
-        """Whether the vehicle flies as its model alone: no effects, nothing drawn."""
-        return not (self.effects or self.randomize)
-
-    @property
-    def estimated(self) -> bool:
-        """Whether controller and observation see the onboard estimate, once a control step."""
-        return bool(self.sensors.get("observe") == "estimate")
-
     def to_options(self) -> dict[str, Any]:
-        """Every option by its name, as a spec has them; of mappings those that are not empty, and
-        of pictures those that there are.
-        """
-        told = {one.name: getattr(self, one.name) for one in fields(self)}
-        unseen = () if self.cameras else ("cameras", "world")
-        return {name: value for name, value in told.items() if value != {} and name not in unseen}
+        """Every option by its name."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
     @classmethod
-    def from_options(cls, options: Mapping[str, Any]) -> Self:
-        """Options by name. An unknown name raises `InputError`, which names those there are."""
+    def from_options(cls, options: Mapping[str, Any], others: Sequence[str] = ()) -> Self:
+        """Options by name. An unknown name raises `UnknownOption`, which names all: the options,
+        and the `others` that are keywords of an env.
+        """
         known = [field.name for field in fields(cls)]
         for name in options:
-            expect(name in known, "options", f"some of {', '.join(known)}", f"{name!r}")
+            if name not in known:
+                names = ", ".join([*known, *others])
+                raise UnknownOption(f"options: expected some of {names}, got {name!r}")
         return cls(**options)
 
 
@@ -141,12 +71,15 @@ class Task:
         Options: Dataclass of the task's options.
         metrics: Measures of how well it is done. The first is the headline.
         choices: Names of draws that a reset's options may choose.
-        drones: Most drones of one world, which it has to keep apart at the start.
-        fewest: Least drones of one world.
+        min_drones, max_drones: Drones of one world; the task separates their starts.
+        actions: Action levels at which the task can be flown.
+        action, control_period, episode_length: Defaults of an `EnvConfig`.
 
     Attributes:
-        options: As given.
-        vehicle: As given.
+        config: The env's, with what `adjust` added.
+        options: The task's own options.
+        action, control_period, episode_length: Those of the config.
+        vehicle: The vehicle of all drones, or a `Fleet`.
         shape: (W, A), or () for a single drone.
         controller: Turns actions into thrusts: that of the option `action`, unless `setup` sets
             another.
@@ -157,39 +90,58 @@ class Task:
     Options: ClassVar[type[TaskOptions]] = TaskOptions
     metrics: ClassVar[tuple[Metric, ...]] = ()
     choices: ClassVar[tuple[str, ...]] = ()
-    drones: ClassVar[int] = 1
-    fewest: ClassVar[int] = 1
+    min_drones: ClassVar[int] = 1
+    max_drones: ClassVar[int] = 1
+    actions: ClassVar[tuple[str, ...]] = LEVELS
 
+    action: str = "rotors"
+    control_period: float = 0.02
+    """s; the default is that of Unity's `FixedUpdate`."""
+    episode_length: int = 250
+    """Control steps."""
     controller: Controller
     observation: tuple[ArraySpec, ...]
     marks: tuple[Mark, ...] = ()
 
-    def __init__(self, options: Any, vehicle: "Vehicle", shape: tuple[int, ...] = ()) -> None:
-        self.options, self.vehicle, self.shape = options, vehicle, shape
+    def __init__(
+        self, config: "EnvConfig", vehicle: "Vehicle", shape: tuple[int, ...] = ()
+    ) -> None:
+        self.config, self.vehicle, self.shape = config, vehicle, shape
+        self.options: Any = config.task_options
+        assert config.action
+        assert config.control_period
+        assert config.episode_length
+        self.action = config.action
+        self.control_period, self.episode_length = config.control_period, config.episode_length
         self.controller = of_level = self._of_level()
         self.setup()
-        ignored = self.controller is not of_level and options.actions is TaskOptions.actions
-        usual = type(options).action
-        right = not ignored or options.action == usual
-        expect(right, "action", f"{usual!r}, for the task has a controller", repr(options.action))
+        self.config = self.adjust(config)
+        task = type(self)
+        ignored = self.controller is not of_level and task.actions is Task.actions
+        if ignored and self.action != task.action:
+            raise InputError(
+                f"action: expected {task.action!r}, for the task has a controller, "
+                f"got {self.action!r}"
+            )
 
     def _of_level(self) -> Controller:
-        """The controller of the option `action`."""
-        options = self.options
-        period = options.control_period if options.estimated else self.vehicle.timestep
-        return make_controller(options.action, self.vehicle, period, lag=self.lag)
+        """The controller of the action level."""
+        period = self.control_period if self.config.estimated else self.vehicle.timestep
+        return make_controller(self.action, self.vehicle, period, lag=self.lag)
 
-    @property
-    def effects(self) -> Mapping[str, Any]:
-        """Effects on the drones by name: those of the options, and what the task adds."""
-        told: Mapping[str, Any] = self.options.effects
-        return told
+    def adjust(self, config: "EnvConfig") -> "EnvConfig":
+        """The config with what the task adds to it, such as a payload; called after `setup`.
+
+        It may add, and never drop. Raises `InputError` for what contradicts the task.
+        """
+        return config
 
     @property
     def lag(self) -> float:
         """Longest time constant of the rotors, s; 0 without the effect `motor_lag`."""
-        told, lags = self.vehicle.coefficients.rotors, self.options.effects.get("motor_lag", False)
-        times = (told.time_constant, told.time_constant_down) if lags else ()
+        rotors = self.vehicle.coefficients.rotors
+        lags = self.config.effects.motor_lag
+        times = (rotors.time_constant, rotors.time_constant_down) if lags else ()
         return max((time for time in times if time), default=0.0)
 
     def setup(self) -> None:
@@ -234,11 +186,3 @@ class Task:
     def goal(self, state: WorldState) -> Array:
         """Positions of the goals, for pictures: world frame, m, shape (W, A, 3). Optional."""
         raise NotImplementedError
-
-
-def _words(given: Any) -> tuple[str, ...]:
-    """Words of a text with commas, or of several texts. Raises `InputError`."""
-    texts = [given] if isinstance(given, str) else given
-    right = isinstance(texts, list | tuple) and all(isinstance(one, str) for one in texts)
-    expect(right, "cameras", "names, with commas between them", f"{given!r:.80}")
-    return tuple(word for text in texts for word in text.replace(",", " ").split())

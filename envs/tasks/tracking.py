@@ -49,8 +49,6 @@ _EXPECTED: Final = "circle, lemniscate, snap, or a CSV file with columns t, x, y
 class TrackingOptions(TaskOptions):
     """Options of `rotorgram/Tracking-v0`."""
 
-    episode_length: int = 600
-    """Control steps after which an episode is truncated."""
     trajectory: str = "circle"
     """`circle` or `lemniscate`, level and without end; `snap`, a minimum-snap trajectory from rest
     to rest through points; or a CSV file with columns t (s), x, y, z (m, world frame), straight
@@ -126,6 +124,7 @@ class Tracking(Flight):
     """
 
     Options = TrackingOptions
+    episode_length = 600
     metrics = (
         Metric(name="tracking_error", unit="m", settled=0.2, held=0.2, symbol="e"),
         Metric(name="reference_speed", unit="m/s"),
@@ -133,7 +132,7 @@ class Tracking(Flight):
 
     def setup(self) -> None:
         """See the class."""
-        options, step = self.options, self.options.control_period
+        options, step = self.options, self.control_period
         middle = np.array(options.center)
         self._closed = options.trajectory in ("circle", "lemniscate")
         self._drawn = options.trajectory == "snap"
@@ -206,7 +205,7 @@ class Tracking(Flight):
         vehicle = self.vehicle
         lift = float(vehicle.allocation[0] @ vehicle.thrust_high) / vehicle.mass
         free = math.sqrt(max(lift**2 - vehicle.gravity**2, 1e-12))
-        return float(len(times) * self.options.control_period * math.sqrt(largest / free))
+        return float(len(times) * self.control_period * math.sqrt(largest / free))
 
     def _asked(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Times, s, shape (L,), and accelerations, m/s², shape (L, 3), that may have to be flown.
@@ -214,7 +213,7 @@ class Tracking(Flight):
         Of a file these are the second differences of its rows. Of a `snap` the acceleration at any
         time, and its change, are largest for points at corners of the box: those are tried.
         """
-        options, step = self.options, self.options.control_period
+        options, step = self.options, self.control_period
         if self._closed:
             after, before = np.roll(self._table, -1, axis=0), np.roll(self._table, 1, axis=0)
             yield np.arange(len(after)) * step, (after - 2 * self._table + before) / step**2

@@ -32,8 +32,6 @@ MOST_POINTS: Final = 64
 class WaypointsOptions(TaskOptions):
     """Options of `rotorgram/Waypoints-v0`."""
 
-    episode_length: int = 750
-    """Control steps after which an episode is truncated."""
     points: Annotated[int, Limits(1, MOST_POINTS, whole=True)] = 4
     """Points of an episode, 1 to 64."""
     center: Point = (0.0, 0.0, 5.0)
@@ -93,6 +91,7 @@ class Waypoints(Flight):
     """
 
     Options = WaypointsOptions
+    episode_length = 750
     metrics = (
         Metric(name="points_left", unit="", settled=0.5, held=0.5, final=True),
         Metric(name="flight_time", unit="s", final=True),
@@ -140,7 +139,7 @@ class Waypoints(Flight):
             _progress=self._distance - distance,
             _passed=passed * 1.0,
             _reached=self._reached + passed,
-            _time=self._time + self.options.control_period,
+            _time=self._time + self.control_period,
         )
         self.keep(mask, _distance=plain(length(self.goal(state) - state.position)))
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from numbers import Real
 from typing import Any, Final, Self
 
+from ...models import MOST_DRAG
 from ...models.errors import expect
 
 MOST_WIND: Final = 100.0  # m/s
@@ -42,12 +43,16 @@ class EffectOptions:
     ball together, of so much for each."""
     cable: float = 1.0
     """Length of each cable, m."""
+    linear_drag: float = 0.0
+    """Acceleration of -linear_drag · velocity, 1/s, as Unity's `Rigidbody.drag`; at most 100. The
+    force acts at the body's origin."""
 
     def __post_init__(self) -> None:
         for name in ("motor_lag", "thrust_curve", "battery", "body_drag", "rotor_drag"):
             self._check(name, "true or false", type(getattr(self, name)) is bool)
         for name in ("ground_effect", "downwash"):
             self._check(name, "true or false", type(getattr(self, name)) is bool)
+        self._keep("linear_drag", 0.0, MOST_DRAG, "/s", 1)
         self._keep("wind", -MOST_WIND, MOST_WIND, "m/s", 3)
         self._keep("efficiency", 0.0, 1.0, "for each rotor")
         self._keep("gusts", 0.0, MOST_WIND, "m/s", 1)

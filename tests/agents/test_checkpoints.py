@@ -115,7 +115,7 @@ def test_a_checkpoint_tells_where_it_comes_from(kept: Checkpoint) -> None:
 
 def test_another_env_is_refused(kept: Checkpoint) -> None:
     for options, sentence in (
-        ({"linear_drag": 0.1}, "an env with options"),
+        ({"effects": {"linear_drag": 0.1}}, "an env with options"),
         ({"target": 8.0}, "an env with options"),
         ({"action_type": "discrete"}, "an env with options"),
     ):

@@ -21,6 +21,7 @@ from rotorgram.agents.export import c as c_target
 from rotorgram.agents.export import onnx as onnx_target
 from rotorgram.agents.policies import NetworkPolicy, flat_size
 from rotorgram.cli import main
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.spec import ArraySpec, Discrete, EnvSpec
 from rotorgram.flights.trajectories import evaluation_seed
@@ -138,12 +139,18 @@ HALF_BOUNDED = spec_of(
     ArraySpec(name="a", shape=(3,), low=(0.0, -np.inf, -np.inf), high=(100.0, 0.5, np.inf))
 )
 CASES: dict[str, Callable[[], NetworkPolicy]] = {
-    "paper": lambda: policy_of(env_spec("rotorgram/Elevation-v0")),
-    "tanh": lambda: policy_of(env_spec("rotorgram/Hover-v0"), (64, 64), "tanh", normalise=True),
-    "squashed": lambda: policy_of(
-        env_spec("rotorgram/Hover-v0", {}, vehicle="crazyflie2"), (32, 32), squash=True
+    "paper": lambda: policy_of(env_spec(EnvConfig(env_id="rotorgram/Elevation-v0"))),
+    "tanh": lambda: policy_of(
+        env_spec(EnvConfig(env_id="rotorgram/Hover-v0")), (64, 64), "tanh", normalise=True
     ),
-    "hexa": lambda: policy_of(env_spec("rotorgram/Hover-v0", {}, vehicle="heavy_hexa")),
+    "squashed": lambda: policy_of(
+        env_spec(EnvConfig.from_keywords("rotorgram/Hover-v0", vehicle="crazyflie2")),
+        (32, 32),
+        squash=True,
+    ),
+    "hexa": lambda: policy_of(
+        env_spec(EnvConfig.from_keywords("rotorgram/Hover-v0", vehicle="heavy_hexa"))
+    ),
     "half bounded": lambda: policy_of(HALF_BOUNDED, (8,), normalise=True),
     "choice": lambda: policy_of(CHOICE, (16, 8), "tanh", normalise=True),
     "linear": lambda: policy_of(spec_of(), ()),
@@ -167,7 +174,7 @@ def test_numbers_are_those_of_the_policy(case: str, runner: str, tmp_path: Path)
 
 @pytest.mark.parametrize("vehicle", vehicle_names())
 def test_every_vehicle_has_its_actions(vehicle: str, tmp_path: Path) -> None:
-    spec = env_spec("rotorgram/Hover-v0", {"action": "rotors"}, vehicle=vehicle)
+    spec = env_spec(EnvConfig.from_keywords("rotorgram/Hover-v0", action="rotors", vehicle=vehicle))
     policy = policy_of(spec, (16,))
     observations = observations_of(spec, 500)
     expected = by_policy(policy, observations)
@@ -217,7 +224,9 @@ def test_what_is_no_number_is_not_made_one(tmp_path: Path) -> None:
 
 def test_the_header_needs_nothing_but_a_compiler(tmp_path: Path) -> None:
     header, program = tmp_path / "rotorgram_policy.h", tmp_path / "policy.c"
-    policy = policy_of(env_spec("rotorgram/Hover-v0"), (64, 64), "tanh", squash=True)
+    policy = policy_of(
+        env_spec(EnvConfig(env_id="rotorgram/Hover-v0")), (64, 64), "tanh", squash=True
+    )
     header.write_bytes(c_target.write(policy, told_of(policy.spec)))
     assert "#include" not in header.read_text()
     program.write_text(
@@ -528,7 +537,12 @@ FLIGHTS: dict[str, tuple[str, str | None, dict[str, Any]]] = {
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_the_c_peer_flies_other_actions(name: str, tmp_path: Path) -> None:
     env, vehicle, options = FLIGHTS[name]
-    policy = policy_of(env_spec(env, options, vehicle=vehicle), (16, 16), "tanh", normalise=True)
+    policy = policy_of(
+        env_spec(EnvConfig.from_keywords(env, **options, vehicle=vehicle)),
+        (16, 16),
+        "tanh",
+        normalise=True,
+    )
     header = tmp_path / "rotorgram_policy.h"
     header.write_bytes(c_target.write(policy, told_of(policy.spec)))
     (theirs,) = flown_by_c(header, [7], env, vehicle, **options)

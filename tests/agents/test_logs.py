@@ -163,7 +163,7 @@ def test_the_values_by_hand(
 ) -> None:
     monkeypatch.setenv("SB3_LOGDIR", str(tmp_path / "sb3"))
     folder = tmp_path / "run"
-    settings = ("--env-steps", 800, "--env.episode-length", 5, *sized(algorithm))
+    settings = ("--env-steps", 800, "--episode-length", 5, *sized(algorithm))
     logged = train(algorithm, folder, *settings)
     assert not (tmp_path / "sb3").exists(), "SB3 is to write nothing"
     table = pd.read_csv(folder / "episodes.csv")

@@ -17,7 +17,7 @@ ENV = "rotorgram/Elevation-v0"
 @pytest.mark.parametrize("mode", ["increment", "offset"])
 @pytest.mark.parametrize("drag", [0.0, 0.5])
 def test_pid_holds_the_target(mode: str, drag: float) -> None:
-    env: Any = gym.make(ENV, action=mode, linear_drag=drag)
+    env: Any = gym.make(ENV, action=mode, effects={"linear_drag": drag})
     policy = PID(env.get_wrapper_attr("env_spec"))
     for seed in range(3):
         policy.reset()

@@ -15,7 +15,7 @@ from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
 
 SHORT = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
-WINDY = {**SHORT, "linear_drag": 0.5}
+WINDY = {**SHORT, "effects": {"linear_drag": 0.5}}
 SMALL: dict[str, dict[str, Any]] = {
     "vpg": {"episodes_per_update": 4},
     "a2c": {"steps_per_update": 40},
@@ -136,11 +136,11 @@ def test_a_curriculum_is_a_chain_of_trainings(
     first, second = str(tmp_path / "first"), str(tmp_path / "second")
     words = ["train", "a2c", "--env-steps", "300", "--set", "steps_per_update=100"]
     assert main([*words, "hidden=[8]", "--out", first]) == 0
-    harder = ["--env.linear-drag", "0.5", "--start-from", first, "--out", second]
+    harder = ["--effects", "linear_drag=0.5", "--start-from", first, "--out", second]
     assert main([*words, *harder]) == 0
     stages = [load(tmp_path / name / "checkpoint.safetensors") for name in ("first", "second")]
     assert [stage.config["hidden"] for stage in stages] == [[8], [8]]
-    assert stages[1].options["linear_drag"] == 0.5
+    assert stages[1].options["effects"] == {"linear_drag": 0.5}
     config = json.loads((tmp_path / "second" / "config.json").read_text())
     assert config["start_from"]["file"] == f"{first}/checkpoint.safetensors"
     assert main(["train", "a2c", "--resume", second, "--start-from", first]) == 1

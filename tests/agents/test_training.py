@@ -145,7 +145,7 @@ def test_what_cannot_be_resumed_is_refused() -> None:
     training.train(lambda: False)
     kept = training.checkpoint()
     with pytest.raises(ResumeError, match="resume: expected an env with options"):
-        Training.resume(kept, env_of(run, linear_drag=0.5))
+        Training.resume(kept, env_of(run, effects={"linear_drag": 0.5}))
     with pytest.raises(
         ResumeError,
         match=r"resume: expected rotorgram quadcopter .*, got Crazyflie 2.* with --vehicle$",
@@ -185,7 +185,7 @@ def test_train_says_where_the_drones_are_too_many(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    arguments = ["train", algorithm, "--env-steps", 600, "--env.episode-length", 5]
+    arguments = ["train", algorithm, "--env-steps", 600, "--episode-length", 5]
     folder = tmp_path / "run"
     assert main([str(a) for a in (*arguments, *settings, "--out", folder)]) == 0
     out = capsys.readouterr().out

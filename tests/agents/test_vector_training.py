@@ -164,7 +164,7 @@ def test_resuming_elsewhere_is_refused() -> None:
     first.reset()
     for _ in range(10):
         first.step(np.full((2, 1), 0.1))
-    for changes in ({"linear_drag": 0.1}, {"episode_length": 5}):
+    for changes in ({"effects": {"linear_drag": 0.1}}, {"episode_length": 5}):
         with pytest.raises(ResumeError, match="does not repeat the episodes"):
             EpisodeLog(vector(2, **changes), 1).resume(first.position())
 

@@ -190,7 +190,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_flags_that_are_set_to_their_default_are_set() -> None:
-    words = ["--env.target", "5", "--num-envs=1", "--no-realtime", "--env.action", "offset"]
+    words = ["--env.target", "5", "--num-envs=1", "--no-realtime", "--action", "offset"]
     command = parse(Sim, "rotorgram sim", words)
     assert command.given == {"env.target", "num_envs", "realtime", "env.action"}
     assert command.options == {"target": 5.0, "action": "offset"}
@@ -421,7 +421,7 @@ def test_an_agent_that_is_late(capsys: pytest.CaptureFixture[str]) -> None:
     ("words", "sentence"),
     [
         (["--vehicle", "nowhere.xml"], "vehicle: cannot read nowhere.xml: No such file"),
-        (["--env.control-period", "0.003"], "control_period: expected a positive multiple of the"),
+        (["--control-period", "0.003"], "control_period: expected a positive multiple of the"),
     ],
 )
 def test_an_error_of_our_own_simulator_is_told_once(
@@ -530,7 +530,7 @@ def test_train_with_many_drones(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "run"
-    settings = ("--env-steps", 1200, "--set", "steps_per_update=100", "--env.episode-length", 60)
+    settings = ("--env-steps", 1200, "--set", "steps_per_update=100", "--episode-length", 60)
     status, out, _ = run(capsys, "train", "a2c", "--out", folder, *settings)
     assert status == 0
     assert "trained 1,200 of 1,200 env steps" in out
@@ -543,7 +543,7 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     status, out, _ = run(capsys, "evaluate", folder / "checkpoint.safetensors", "--episodes", 3)
     assert status == 0
     assert "episodes   3, " in out
-    assert run(capsys, "evaluate", folder, "--episodes", 1, "--env.linear-drag", 0.5)[0] == 0
+    assert run(capsys, "evaluate", folder, "--episodes", 1, "--effects", "linear_drag=0.5")[0] == 0
     for changes, sentence in (
         (["vpg"], "resume: expected a training of vpg"),
         (["a2c", "--seed", 0], "got others by --seed"),  # its own: set all the same
@@ -557,9 +557,9 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "policy: expected weights of shapes" in err
     reference = chosen_env(parse(Serve, "serve", ["x"]), kept)
     assert reference == ("rotorgram/Elevation-v0", kept.options)
-    words = ["x", "--env.episode-length", "1000", "--env.linear-drag=0"]  # the defaults
+    words = ["x", "--episode-length", "1000", "--effects", "linear_drag=0"]  # the defaults
     assert chosen_env(parse(Serve, "serve", words), kept)[1] == {
-        **kept.options, "episode_length": 1000, "linear_drag": 0.0
+        **kept.options, "episode_length": 1000
     }  # fmt: skip
     (folder / "episodes.csv").unlink()  # a result: the checkpoint has the episodes
     assert run(capsys, "train", "a2c", "--resume", folder)[0] == 0
@@ -573,7 +573,7 @@ def test_nothing_that_a_checkpoint_names_is_imported(
     (tmp_path / "evil.py").write_text(f"open({str(imported)!r}, 'w')")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    settings = ("--env-steps", 300, "--set", "steps_per_update=100", "--env.episode-length", 60)
+    settings = ("--env-steps", 300, "--set", "steps_per_update=100", "--episode-length", 60)
     assert run(capsys, "train", "a2c", "--out", folder, *settings)[0] == 0
     kept = load(folder / "checkpoint.safetensors")
     for name, known in (("evil:Evil-v0", False), ("evil:rotorgram/Elevation-v0", True)):
@@ -717,7 +717,7 @@ def test_serve_flies_as_many_drones_as_the_simulator_has(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:  # fault 12
     """A checkpoint of one drone; each episode is bit for bit that of one drone alone."""
-    settings = ("--env-steps", 200, "--set", "steps_per_update=100", "--env.episode-length", 60)
+    settings = ("--env-steps", 200, "--set", "steps_per_update=100", "--episode-length", 60)
     assert run(capsys, "train", "a2c", "--out", tmp_path / "run", *settings)[0] == 0
     told = []
     for drones in (1, 3):
@@ -726,7 +726,7 @@ def test_serve_flies_as_many_drones_as_the_simulator_has(
         server = agent.stdout.readline().split()[5]
         status, out, _ = run(
             capsys, "sim", "--server", server, "--bind", "127.0.0.1:0", "--num-envs", drones,
-            "--env.episode-length", 60,
+            "--episode-length", 60,
         )  # fmt: skip
         assert (status, "the agent closed" in out) == (0, True)
         out, err = agent.communicate(timeout=30)
@@ -793,7 +793,7 @@ def test_ctrl_c_while_nobody_answers(tmp_path: Path) -> None:
 def test_tensorboard_has_the_training_and_the_wire(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    settings = ("--env-steps", 1200, "--env.episode-length", 60)
+    settings = ("--env-steps", 1200, "--episode-length", 60)
     assert run(capsys, "train", "a2c", "--out", tmp_path / "run", *settings)[0] == 0
     board = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
     board.Reload()
@@ -812,7 +812,7 @@ def test_compare_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture
     folder = tmp_path / "out"
     status, out, _ = run(
         capsys, "compare", "--out", folder, "--seeds", 1, "--env-steps", 1100,
-        "--snapshots", 2, "--episodes", 2, "--env.episode-length", 50,
+        "--snapshots", 2, "--episodes", 2, "--episode-length", 50,
     )  # fmt: skip
     assert status == 0
     assert f"report: {folder / 'report.html'}" in out.replace("\n", "")

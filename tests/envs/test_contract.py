@@ -26,7 +26,7 @@ ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
 TASKS = sorted(  # that one drone can fly
     name
     for name in gym.registry
-    if name.startswith("rotorgram/") and registry.task_type(name).fewest == 1
+    if name.startswith("rotorgram/") and registry.task_type(name).min_drones == 1
 )
 FILES = {"quad": QUAD_XML}
 FILES |= {path.stem: path for path in sorted(DATA.glob("*.xml"))}

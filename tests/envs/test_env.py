@@ -20,6 +20,7 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rotorgram.envs import Loop, SingleEnv
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.tasks.elevation import Elevation
 from rotorgram.models.errors import InputError
@@ -27,13 +28,14 @@ from rotorgram.sim import PhysicsError
 
 ID, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
 HEXA = str(Path(__file__).parents[1] / "data" / "hexa.xml")
+DRAG = {"linear_drag": 2.0}
 COMBINATIONS: list[tuple[str, dict[str, Any]]] = [
     (ID, {"action": mode, "action_type": kind, "observation": seen, **rest})
     for mode, kind, seen, rest in itertools.product(
         ("increment", "offset"),
         ("continuous", "discrete"),
         ("full", "error"),
-        ({}, {"target": (4.0, 8.0), "control_period": 0.05, "linear_drag": 2.0, "vehicle": HEXA}),
+        ({}, {"target": (4.0, 8.0), "control_period": 0.05, "effects": DRAG, "vehicle": HEXA}),
     )
 ]
 COMBINATIONS += [
@@ -57,7 +59,7 @@ class Flight:
     """A loop with one drone that begins where it is told; its state can be written."""
 
     def __init__(self, start: float, target: float = 5.0, **options: Any) -> None:
-        self.loop = Loop(ID, options={"target": target, **options})
+        self.loop = Loop(EnvConfig.from_keywords(ID, **{"target": target, **options}))
         chosen = {"start": np.array([start]), "target": np.array([target])}
         every = np.ones(1, bool)
         self.loop.advance(np.zeros((1, 1), np.float32), every, [0], chosen=chosen)
@@ -105,8 +107,7 @@ def test_contract(env_id: str, options: dict[str, Any]) -> None:
     assert all(type(value) is float for value in info.values())
     assert {metric.name for metric in spec.metrics} <= set(info)
     assert env.control_period == spec.control_period
-    assert spec == env_spec(env_id, {k: v for k, v in options.items() if k != "vehicle"},
-                            options.get("vehicle"))  # fmt: skip
+    assert spec == env_spec(EnvConfig.from_keywords(env_id, **options))
     before = observation.copy()
     env.step(env.action_space.sample())
     assert observation.tobytes() == before.tobytes()  # nobody else's memory
@@ -133,12 +134,12 @@ def test_module_prefix_needs_no_import_and_importing_loads_no_simulator() -> Non
 
 
 def test_options_through_make() -> None:
-    env = _env(target=6, observation="error", linear_drag=2.0, episode_length=3)
+    env = _env(target=6, observation="error", effects={"linear_drag": 2.0}, episode_length=3)
     env.reset(seed=1)
     assert env.observation_space.shape == (1,)
     assert env.env_spec.options["target"] == 6.0
     assert [env.step(_a(0))[3] for _ in range(3)] == [False, False, True]
-    with pytest.raises(InputError, match=r"^options: expected some of .*target.*, got 'targt'$"):
+    with pytest.raises(InputError, match=r"^options: expected some of .*target.*, got 'targt'"):
         gym.make(ID, targt=6)
     with pytest.raises(InputError, match=r"^render_mode: expected None, .*, got 'ansi'$"):
         SingleEnv(ID, render_mode="ansi")
@@ -173,7 +174,7 @@ def test_docstring_tables_agree_with_the_spaces() -> None:
     header, *rows = _table("Observation")
     assert header == ["index", "quantity", "unit", "bounds"]
     assert [row[0] for row in rows] == [str(i) for i in range(space.shape[0])]
-    assert [row[2] for row in rows] == list(env_spec(ID).observation[0].unit)
+    assert [row[2] for row in rows] == list(env_spec(EnvConfig(env_id=ID)).observation[0].unit)
     for row, low, high in zip(rows, space.low.tolist(), space.high.tolist(), strict=True):
         bounds = f"-{row[3][1:]} ... {row[3][1:]}" if row[3].startswith("±") else row[3]
         told = [float(part) for part in bounds.split(" ... ")]
@@ -273,7 +274,7 @@ def test_flight_follows_the_formula_of_constant_acceleration(mode: str, period: 
 
 def test_flight_with_drag_follows_the_exponential() -> None:
     drag = 2.0
-    flight = Flight(5.0, action="offset", linear_drag=drag, flight_band=20.0)
+    flight = Flight(5.0, action="offset", effects={"linear_drag": drag}, flight_band=20.0)
     for n in range(1, 101):
         flight.step(1.0)  # hover + 20 N each: 4 m/s2
         fallen = (1 - math.exp(-drag * n * 0.02)) / drag
@@ -308,7 +309,7 @@ OPTIONS = st.fixed_dictionaries(
         "action": st.sampled_from(["increment", "offset"]),
         "observation": st.sampled_from(["full", "error"]),
         "control_period": st.sampled_from([0.01, 0.02, 0.1, 1.0]),
-        "linear_drag": st.sampled_from([0.0, 0.0, 2.0, 100.0]),
+        "effects": st.sampled_from([{}, {}, {"linear_drag": 2.0}, {"linear_drag": 100.0}]),
         "thrust_scale": st.sampled_from([None, 100.0]),
         "flight_band": st.sampled_from([1.01, 3.0, 20.0]),
         "target": st.sampled_from([2.0, 5.0, (2.0, 30.0)]),
@@ -492,7 +493,7 @@ def _errors(gain: float, steps: int, **options: Any) -> np.ndarray:
 def test_increment_on_error_alone_diverges_even_with_drag(drag: float, gain: float) -> None:
     roots = np.roots([1.0, drag, 0.0, 50 * gain])
     assert roots.real.max() > 0.1
-    errors = _errors(gain, 5000, action="increment", linear_drag=drag)
+    errors = _errors(gain, 5000, action="increment", effects={"linear_drag": drag})
     assert len(errors) < 5000
     assert abs(errors[-1]) > 3.0
 
@@ -514,12 +515,14 @@ def test_offset_on_error_alone_oscillates_without_drag() -> None:
 def test_offset_on_error_alone_converges_with_drag(gain: float, drag: float) -> None:
     slowest = -np.roots([1.0, drag, 4 * gain]).real.max()
     assert slowest > 0
-    errors = _errors(gain, round(10 / slowest / 0.02), action="offset", linear_drag=drag)
+    errors = _errors(
+        gain, round(10 / slowest / 0.02), action="offset", effects={"linear_drag": drag}
+    )
     assert np.abs(errors[-10:]).max() < 2e-4  # ten time constants: 0.2 m * e^-10 = 9e-6 m
 
 
 def test_offset_with_the_wrong_sign_diverges() -> None:
-    assert abs(_errors(-0.5, 1000, action="offset", linear_drag=2.0)[-1]) > 3.0
+    assert abs(_errors(-0.5, 1000, action="offset", effects={"linear_drag": 2.0})[-1]) > 3.0
 
 
 def test_increment_on_the_full_observation_can_converge() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from remotes import flying
 from rotorgram.agents import PID
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
 
@@ -89,7 +90,10 @@ def test_over_udp() -> None:
 
 
 def test_the_spec_names_every_number() -> None:
-    usual, long = env_spec(ELEVATION), env_spec(ELEVATION, {"history": 3})
+    usual, long = (
+        env_spec(EnvConfig(env_id=ELEVATION)),
+        env_spec(EnvConfig.from_keywords(ELEVATION, history=3)),
+    )
     (one,), (three,) = usual.observation, long.observation
     assert three.shape == (9,)
     assert three.components[3:] == (
@@ -102,7 +106,7 @@ def test_the_spec_names_every_number() -> None:
     assert three.low == one.low * 3
     assert three.high == one.high * 3
     assert usual.options["history"] == 1
-    assert env_spec(ELEVATION, {"history": 1}) == usual
+    assert env_spec(EnvConfig.from_keywords(ELEVATION, history=1)) == usual
 
 
 def test_the_error_alone_with_its_past() -> None:
@@ -128,8 +132,8 @@ def test_the_pid_reads_the_newest() -> None:
     assert flights[0] == flights[1]
 
 
-@pytest.mark.parametrize("count", [0, 1001, 2.5, "all", True, None])
+@pytest.mark.parametrize("count", [0, 1001, 2.5, "all", True])
 def test_a_wrong_history_gives_one_sentence(count: Any) -> None:
     expected = r"^history: expected a whole number from 1 to 1000 observations, got "
     with pytest.raises(InputError, match=expected):
-        env_spec(HOVER, {"history": count})
+        env_spec(EnvConfig.from_keywords(HOVER, history=count))

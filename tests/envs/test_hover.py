@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from rotorgram.envs import Loop
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.specification import make_task
 from rotorgram.models.errors import InputError
@@ -21,7 +22,7 @@ HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
 
 def test_observation_by_hand() -> None:
     """Turned left by 90 degrees where the nose shall point along y: all is seen from there."""
-    task = make_task(ID, {"goal": (1.0, 2.0, 6.0), "heading": 90.0})
+    task = make_task(EnvConfig.from_keywords(ID, goal=(1.0, 2.0, 6.0), heading=90.0))
     state = state_of(
         quaternion=about((0, 0, 1), 90.0), velocity=(3.0, 4.0, 5.0), body_rates=(0.1, 0.2, 0.3),
         thrust=(49.0, 98.0, 0.0, 24.5),
@@ -30,12 +31,14 @@ def test_observation_by_hand() -> None:
     expected = [2, -1, 1, 4, -3, 5, 1, 0, 0, 0, 0, 1, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
     assert seen == pytest.approx(expected, abs=1e-12)
     # Rolled left by 30 degrees: the thrust points to the right, -y.
-    tilted = make_task(ID, {}).observe(state_of(quaternion=about((1, 0, 0), 30.0)))["observation"]
+    tilted = make_task(EnvConfig(env_id=ID)).observe(state_of(quaternion=about((1, 0, 0), 30.0)))[
+        "observation"
+    ]
     assert tilted[6:12] == pytest.approx([1, 0, 0, 0, -0.5, math.sqrt(3) / 2], abs=1e-12)
 
 
 def test_observations_are_clipped_to_their_bounds() -> None:
-    task = make_task(ID, {})
+    task = make_task(EnvConfig(env_id=ID))
     far = state_of(position=(1e6, 0, 5), velocity=(0, -1e6, 0), body_rates=(0, 0, 1e6))
     seen = task.observe(far)["observation"]
     assert (seen[0], seen[4], seen[14]) == (-6.0, -100.0, 100.0)
@@ -58,14 +61,14 @@ def test_observations_are_clipped_to_their_bounds() -> None:
     ids=str,
 )
 def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:
-    outcome = make_task(ID, {}).outcome(state_of(**change))
+    outcome = make_task(EnvConfig(env_id=ID)).outcome(state_of(**change))
     for name, value in terms.items():
         assert outcome.reward[name] == pytest.approx(value, abs=1e-12)
     assert outcome.terminated == terminated
 
 
 def test_metrics_by_hand() -> None:
-    task = make_task(ID, {"goal": (0.0, 3.0, 9.0), "heading": 170.0})
+    task = make_task(EnvConfig.from_keywords(ID, goal=(0.0, 3.0, 9.0), heading=170.0))
     metrics = task.outcome(state_of(quaternion=about((0, 0, 1), -170.0))).metrics
     assert metrics["position_error"] == pytest.approx(5.0)
     assert metrics["heading_error"] == pytest.approx(20.0)  # 190 to the left of it: past the back
@@ -76,14 +79,16 @@ def test_thrust_below_zero_is_observed(tmp_path: Path) -> None:
     text = Vehicle.load().path.read_text()
     file = tmp_path / "reverse.xml"
     file.write_text(text.replace('ctrlrange="0 100"', 'ctrlrange="-20 100"'))
-    seen = make_task(ID, {}, file).observe(state_of(thrust=(-20.0,) * 4))["observation"]
+    seen = make_task(EnvConfig.from_keywords(ID, vehicle=file)).observe(
+        state_of(thrust=(-20.0,) * 4)
+    )["observation"]
     assert seen[15:] == pytest.approx([-20 / 49 - 1] * 4)
 
 
 @pytest.mark.parametrize("file", [None, HEXA], ids=["paper", "hexa"])
 def test_actions_are_thrusts_between_the_limits(file: Path | None) -> None:
     vehicle = Vehicle.load(file)
-    loop = Loop(ID, vehicle=file)
+    loop = Loop(EnvConfig.from_keywords(ID, vehicle=file))
     every, n = np.ones(1, bool), vehicle.num_rotors
     for action, expected in (
         (0.0, vehicle.hover_thrust),
@@ -150,16 +155,16 @@ def test_bounds_are_never_left_and_ends_are_never_both() -> None:
         ({"start_tilt": 81.0}, "start_tilt: expected a number from 0 to 80 degrees"),
         ({"start_heading": -1.0}, "start_heading: expected a number from 0 to 180 degrees"),
         ({"flight_band": 1.7}, "flight_band: expected more than .* = 1.732 m, got 1.7"),
-        ({"target": 5.0}, "options: expected some of episode_length, .*goal, .*, got 'target'"),
+        ({"target": 5.0}, "options: expected some of goal, .*episode_length, .*, got 'target'"),
     ],
 )
 def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=f"^{sentence}") as caught:
-        env_spec(ID, options)
+        env_spec(EnvConfig.from_keywords(ID, **options))
     assert "\n" not in str(caught.value)
 
 
 def test_a_goal_read_from_json_is_a_tuple() -> None:
-    options = env_spec(ID, {"goal": [1, 2, 3]}).options
+    options = env_spec(EnvConfig.from_keywords(ID, goal=[1, 2, 3])).options
     assert options["goal"] == [1.0, 2.0, 3.0]
-    assert make_task(ID, options).options.goal == (1.0, 2.0, 3.0)
+    assert make_task(EnvConfig.from_keywords(ID, **options)).options.goal == (1.0, 2.0, 3.0)

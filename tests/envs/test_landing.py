@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from pilot import Pilot, limited
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.specification import make_task
 from rotorgram.models import Vehicle
@@ -22,7 +23,7 @@ NOW = np.bool_(True)
 
 def begun(direction: float = 0.5, phase: float = 0.5, side: float = 1.0, **options: Any) -> Any:
     """A task whose pad begins at these shares of its draws, at its largest speed."""
-    task = make_task(ID, options)
+    task = make_task(EnvConfig.from_keywords(ID, **options))
     task.begin(NOW, Shares(MIDDLE, 1.0, direction, phase, side))
     return task
 
@@ -34,7 +35,7 @@ def moved(task: Any, steps: int, **state: Any) -> Any:
 
 
 def test_a_start_is_above_the_middle_of_the_path() -> None:
-    pose = make_task(ID, {}).begin(NOW, Shares((0.0, 0.5, 1.0), 0.5, 0.5, 0.5, 0.5))
+    pose = make_task(EnvConfig(env_id=ID)).begin(NOW, Shares((0.0, 0.5, 1.0), 0.5, 0.5, 0.5, 0.5))
     assert pose.position == pytest.approx([-1.0, 0.0, REST + 5.0])
     assert pose.velocity is None
     assert pose.quaternion is None
@@ -219,11 +220,11 @@ def wanted(seen: np.ndarray, rotors: int) -> np.ndarray:
 )
 def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=f"^{sentence}") as caught:
-        env_spec(ID, options)
+        env_spec(EnvConfig.from_keywords(ID, **options))
     assert "\n" not in str(caught.value)
 
 
 def test_a_speed_read_from_json_is_a_tuple() -> None:
-    options = env_spec(ID, {"pad_speed": [0.5, 2]}).options
+    options = env_spec(EnvConfig.from_keywords(ID, pad_speed=[0.5, 2])).options
     assert options["pad_speed"] == [0.5, 2.0]
-    assert make_task(ID, options).options.pad_speed == (0.5, 2.0)
+    assert make_task(EnvConfig.from_keywords(ID, **options)).options.pad_speed == (0.5, 2.0)

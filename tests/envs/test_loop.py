@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from rotorgram.envs import ArraySpec, Loop, Metric, Outcome, Task, TaskOptions, register, registry
+from rotorgram.envs.config import EnvConfig
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim import CollectiveThrust, InitialState, make_world, stack
@@ -19,7 +20,7 @@ HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
 
 def started(env_id: str = ID, num_envs: int = 2, **options: Any) -> tuple[Loop, np.ndarray]:
     """A loop with running episodes, and actions for it."""
-    loop = Loop(env_id, num_envs, options=options)
+    loop = Loop(EnvConfig.from_keywords(env_id, **options), num_envs)
     actions = np.full((num_envs, len(loop.task.controller.low)), 0.4, np.float32)
     loop.advance(actions, np.ones(num_envs, bool), range(num_envs))
     return loop, actions
@@ -87,7 +88,11 @@ def test_wrong_seeds_are_refused_before_the_others_fly() -> None:
 
 
 def test_a_first_reset_that_is_refused_begins_nothing() -> None:
-    loop, still, some = Loop(ID, 2), np.zeros((2, 1), np.float32), np.array([True, False])
+    loop, still, some = (
+        Loop(EnvConfig(env_id=ID), 2),
+        np.zeros((2, 1), np.float32),
+        np.array([True, False]),
+    )
     with pytest.raises(InputError, match=r"^start: expected at least"):
         loop.advance(still, np.ones(2, bool), chosen={"start": np.full(2, 1e5)})
     loop.advance(still, some, frozen=~some)
@@ -95,10 +100,10 @@ def test_a_first_reset_that_is_refused_begins_nothing() -> None:
 
 
 def test_the_first_reset_may_be_of_some() -> None:
-    loop, every = Loop(ID, 3), np.ones(3, bool)
+    loop, every = Loop(EnvConfig(env_id=ID), 3), np.ones(3, bool)
     still, some = np.zeros((3, 1), np.float32), np.array([False, True, False])
     loop.advance(still, some, [7, 7, 7], frozen=~some)
-    alone = Loop(ID)
+    alone = Loop(EnvConfig(env_id=ID))
     alone.advance(still[:1], every[:1], [7])
     assert shown(loop, 1) == shown(alone, 0)
     with pytest.raises(gym.error.ResetNeeded, match="env 0 first"):
@@ -184,7 +189,7 @@ class Counting(Careless):
 def test_a_tasks_memory_is_that_of_the_drones_that_flew(num_envs: int) -> None:
     register("counting-v0", Counting)
     try:
-        loop = Loop("counting-v0", num_envs)
+        loop = Loop(EnvConfig(env_id="counting-v0"), num_envs)
     finally:
         gym.registry.pop("counting-v0")
     actions, everyone = np.zeros((num_envs, 1), np.float32), np.ones(num_envs, bool)
@@ -203,7 +208,7 @@ def test_a_task_without_a_method_is_told_which() -> None:
     register("unfinished-v0", type("Unfinished", (Task,), {"setup": Careless.setup}))
     try:
         with pytest.raises(InputError, match=r"a task with a method begin\(\), got Unfinished"):
-            Loop("unfinished-v0")
+            Loop(EnvConfig(env_id="unfinished-v0"))
     finally:
         gym.registry.pop("unfinished-v0")
 
@@ -217,7 +222,7 @@ def careless() -> Iterator[str]:
 
 @pytest.mark.parametrize("num_envs", [1, 3])
 def test_what_a_step_gave_stays_as_it_was(careless: str, num_envs: int) -> None:
-    loop = Loop(careless, num_envs, options={"episode_length": 3})
+    loop = Loop(EnvConfig.from_keywords(careless, episode_length=3), num_envs)
     actions = np.ones((num_envs, 1), np.float32)
     loop.advance(actions, np.ones(num_envs, bool), range(num_envs))
     loop.advance(actions)
@@ -247,7 +252,7 @@ def test_a_task_may_give_constants_and_float32(num_envs: int) -> None:
             return outcome
 
     register("Plain-v0", Plain)
-    loop, still = Loop("Plain-v0", num_envs), np.zeros((num_envs, 1), np.float32)
+    loop, still = Loop(EnvConfig(env_id="Plain-v0"), num_envs), np.zeros((num_envs, 1), np.float32)
     loop.advance(still, np.ones(num_envs, bool), chosen={"start": np.full(num_envs, 4.5)})
     loop.advance(still)
     assert loop.rewards.dtype == np.float64
@@ -273,7 +278,7 @@ def test_ids() -> None:
     assert registry.is_known(HOVER)
     assert registry.is_known(f"rotorgram.envs:{ID}")
     with pytest.raises(InputError, match=r"^env: expected a registered id .*, got 'CartPole-v1'"):
-        Loop("CartPole-v1")
+        Loop(EnvConfig(env_id="CartPole-v1"))
     with pytest.raises(InputError, match=r"^env id: expected one that is free, got 'CartPole-v1'"):
         register("CartPole-v1", Careless)
     for wrong in ("landing", "my landing-v0", 3):
@@ -324,7 +329,7 @@ def test_numbers_of_a_task_that_are_not_finite_go_no_further(num_envs: int, wron
             return outcome
 
     register("Broken-v0", Broken)
-    loop = Loop("Broken-v0", num_envs)
+    loop = Loop(EnvConfig(env_id="Broken-v0"), num_envs)
     everybody = np.ones(num_envs, bool)
     with pytest.raises(InputError, match=rf"Broken-v0: expected finite numbers for {wrong}"):
         loop.advance(np.zeros((num_envs, 1), np.float32), everybody)
@@ -346,7 +351,7 @@ def test_a_start_that_is_none(num_envs: int, start: Any, got: str) -> None:
             return start
 
     register("Lost-v0", Lost)
-    loop = Loop("Lost-v0", num_envs)
+    loop = Loop(EnvConfig(env_id="Lost-v0"), num_envs)
     sentence = (
         rf"^Lost-v0: expected begin\(\) to return an InitialState with a position of .*, got {got}$"
     )

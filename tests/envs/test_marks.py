@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 from pictures import at
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.rendering import moment
 from rotorgram.envs.spec import EnvSpec, Mark, SpecError
@@ -37,19 +38,19 @@ def drawn(**fields: Any) -> list[tuple[int, list[float], list[float]]]:
 
 
 def test_tasks_have_their_marks_and_the_wire_keeps_them() -> None:
-    racing = env_spec("rotorgram/Racing-v0", {"track": TRACK})
+    racing = env_spec(EnvConfig.from_keywords("rotorgram/Racing-v0", track=TRACK))
     gate = Mark(shape="gate", size=2.0, position=(4.0, 0.0, 5.0), heading=90.0)
     assert racing.marks == (gate,)
     assert EnvSpec.from_json(racing.to_json()) == racing
-    waypoints = env_spec("rotorgram/Waypoints-v0", {"radius": 0.4})
+    waypoints = env_spec(EnvConfig.from_keywords("rotorgram/Waypoints-v0", radius=0.4))
     assert waypoints.marks == (Mark(shape="ball", size=0.4, moves=True),)
-    (pad,) = env_spec("rotorgram/Landing-v0").marks
+    (pad,) = env_spec(EnvConfig(env_id="rotorgram/Landing-v0")).marks
     assert (pad.shape, pad.size, pad.moves) == ("disc", 0.5, True)
-    assert "marks" not in env_spec("rotorgram/Hover-v0").to_json()
+    assert "marks" not in env_spec(EnvConfig(env_id="rotorgram/Hover-v0")).to_json()
 
 
 def test_a_moment_has_the_marks_of_its_spec() -> None:
-    spec = env_spec("rotorgram/Racing-v0", {"track": TRACK})
+    spec = env_spec(EnvConfig.from_keywords("rotorgram/Racing-v0", track=TRACK))
     telemetry = {array.name: np.zeros(array.shape) for array in spec.telemetry}
     assert moment(spec, telemetry).marks == (Drawn("gate", 2.0, (4.0, 0.0, 5.0), 90.0),)
 

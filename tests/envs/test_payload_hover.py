@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pilot import Pilot, limited
 from rotorgram.envs import Loop
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.specification import make_task
 from rotorgram.models import Vehicle
@@ -22,7 +23,7 @@ AT_GOAL = {"payload": (0.0, 0.0, 4.0), "payload_velocity": (0.0, 0.0, 0.0)}  # t
 
 def test_a_start_by_hand() -> None:
     """Tilted by 7.5° about y, moving along -x, at the thrust that carries 20 kg and 2 kg."""
-    pose = make_task(ID, {}).begin(NOW, Shares((1.0, 0.5, 0.0), 0.5, 0.75, 0.0, 0.5))
+    pose = make_task(EnvConfig(env_id=ID)).begin(NOW, Shares((1.0, 0.5, 0.0), 0.5, 0.75, 0.0, 0.5))
     assert pose.position == pytest.approx([1.0, 0.0, 4.0])
     assert pose.quaternion == pytest.approx(about((0, 1, 0), 7.5), abs=1e-12)
     assert pose.velocity == pytest.approx([-1.0, 0.0, 0.0])
@@ -33,11 +34,11 @@ def test_a_start_by_hand() -> None:
 def test_the_task_hangs_the_payload_itself(vehicle: str) -> None:
     """The world has it, the spec tells it, and what the effects say of it is replaced."""
     options = {"payload_share": 0.2, "cable": 0.7, "effects": {"efficiency": (1.0, 1.0, 0.9, 1.0)}}
-    told = env_spec(ID, options, vehicle)
+    told = env_spec(EnvConfig.from_keywords(ID, **options, vehicle=vehicle))
     assert "payload" in [array.name for array in told.telemetry]
     assert told.options["effects"] == {"efficiency": [1.0, 1.0, 0.9, 1.0]}
-    assert env_spec(ID, told.options, vehicle) == told
-    loop = Loop(ID, vehicle=vehicle, options=options)
+    assert env_spec(EnvConfig.from_keywords(ID, **told.options, vehicle=vehicle)) == told
+    loop = Loop(EnvConfig.from_keywords(ID, vehicle=vehicle, **options))
     loop.advance(np.zeros((1, 4), np.float32), np.ones(1, bool), [0])
     state = loop.world.state
     assert state.position - state.payload == pytest.approx([0.0, 0.0, 0.7])
@@ -46,7 +47,7 @@ def test_the_task_hangs_the_payload_itself(vehicle: str) -> None:
 
 
 def test_observation_by_hand() -> None:
-    task = make_task(ID, {"goal": (1.0, 2.0, 6.0)})
+    task = make_task(EnvConfig.from_keywords(ID, goal=(1.0, 2.0, 6.0)))
     state = state_of(
         position=(0.5, 2.0, 6.0), velocity=(1.0, 2.0, -3.0), body_rates=(0.1, 0.2, 0.3),
         quaternion=about((1, 0, 0), 30.0), thrust=(49.0, 98.0, 0.0, 24.5),
@@ -82,7 +83,7 @@ def test_observation_by_hand() -> None:
     ids=str,
 )
 def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:
-    outcome = make_task(ID, {}).outcome(state_of(**{**AT_GOAL, **change}))
+    outcome = make_task(EnvConfig(env_id=ID)).outcome(state_of(**{**AT_GOAL, **change}))
     for name, value in terms.items():
         assert outcome.reward[name] == pytest.approx(value, abs=1e-12)
     assert outcome.terminated == terminated
@@ -92,7 +93,7 @@ def test_metrics_by_hand() -> None:
     """30° to the side on a cable of 1 m, under a craft at 5 m."""
     payload = (0.5, 0.0, 5.0 - math.sqrt(3) / 2)
     state = state_of(**{**AT_GOAL, "payload": payload})
-    metrics = make_task(ID, {}).outcome(state).metrics
+    metrics = make_task(EnvConfig(env_id=ID)).outcome(state).metrics
     assert metrics["payload_error"] == pytest.approx(math.hypot(0.5, 1 - math.sqrt(3) / 2))
     assert metrics["swing"] == pytest.approx(30.0)
 
@@ -158,5 +159,5 @@ def test_hovering_without_the_payload_drops_it(share: float, factor: float) -> N
 )
 def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=f"^{sentence}") as caught:
-        env_spec(ID, options)
+        env_spec(EnvConfig.from_keywords(ID, **options))
     assert "\n" not in str(caught.value)

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from pilot import Pilot, limited
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.specification import make_task
 from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
@@ -28,7 +29,7 @@ TRACK = json.dumps({
 
 
 def begun(**options: Any) -> Any:
-    task = make_task(ID, {"track": TRACK, **options})
+    task = make_task(EnvConfig.from_keywords(ID, **{"track": TRACK, **options}))
     task.begin(NOW, Shares((0.5, 0.5, 0.5)))
     return task
 
@@ -40,7 +41,7 @@ def moved(task: Any, *position: float, **rest: Any) -> Any:
 
 
 def test_a_start_by_hand() -> None:
-    task = make_task(ID, {"track": TRACK, "start_band": 2.0})
+    task = make_task(EnvConfig.from_keywords(ID, track=TRACK, start_band=2.0))
     pose = task.begin(NOW, Shares((1.0, 0.0, 0.5)))
     assert pose.position.tolist() == [2.0, -2.0, 5.0]
     root = math.sqrt(0.5)
@@ -127,10 +128,10 @@ def test_a_track_of_a_file_crosses_the_wire(tmp_path: Path) -> None:
         "gates = [{ position = [1, 2, 6], heading = -90, size = 3 }]\n"
         "start = { position = [0, 0, 5], heading = 0 }\n"
     )
-    task = make_task(ID, {"track": str(file)})
+    task = make_task(EnvConfig.from_keywords(ID, track=str(file)))
     told = task.options.to_options()["track"]
     file.unlink()
-    again = make_task(ID, {"track": told})
+    again = make_task(EnvConfig.from_keywords(ID, track=told))
     assert again.options.track == told
     assert again.goal(state_of()).tolist() == [1.0, 2.0, 6.0]
 
@@ -158,7 +159,7 @@ START = {"position": [0, 0, 5], "heading": 0}
 def test_wrong_tracks(content: Any, sentence: str) -> None:
     text = content if isinstance(content, str) else json.dumps(content)
     with pytest.raises(InputError) as error:
-        make_task(ID, {"track": text})
+        make_task(EnvConfig.from_keywords(ID, track=text))
     first, _, last = sentence.partition(".*")
     assert str(error.value).startswith(first.strip())
     assert last.strip() in str(error.value)

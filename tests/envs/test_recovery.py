@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from pilot import Pilot, limited
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop, make_task
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.tasks.recovery import RecoveryOptions
@@ -24,14 +25,14 @@ LARGE = 1.95 / math.sqrt(COUNT)  # distance of Kolmogorov and Smirnov that one i
 
 
 def begun(**options: Any) -> Any:
-    task = make_task(ID, options)
+    task = make_task(EnvConfig.from_keywords(ID, **options))
     task.begin(NOW, Shares(*[0.5] * 7))
     return task
 
 
 def test_a_start_by_hand() -> None:
     """The quaternion of Shoemake for (1/4, a = 90°, b = 180°), thrown up and along y."""
-    task = make_task(ID, {"goal": (1.0, 2.0, 30.0)})
+    task = make_task(EnvConfig.from_keywords(ID, goal=(1.0, 2.0, 30.0)))
     pose = task.begin(NOW, Shares(0.25, 0.75, 1.0, 1.0, 0.8, 0.75, (1.0, 0.5, 0.0)))
     assert pose.position.tolist() == [1.0, 2.0, 30.0]
     root = math.sqrt(0.75)
@@ -42,19 +43,19 @@ def test_a_start_by_hand() -> None:
 
 def test_a_slow_turner_spins_slower() -> None:
     """What the largest torque stops in 0.5 s: of the paper's 100 N at arms of 1 m, 200 N·m."""
-    vehicle, task = Vehicle.load(), make_task(ID, {})
+    vehicle, task = Vehicle.load(), make_task(EnvConfig(env_id=ID))
     assert vehicle.turning((1.0, 0.0, 0.0)) == pytest.approx(200.0 / vehicle.inertia[0, 0])
     yaw = 200.0 * abs(vehicle.rotors[0].reaction[2]) / vehicle.inertia[2, 2]
     assert task.spin == pytest.approx([10.0, 10.0, 0.5 * yaw])
-    assert make_task(ID, {"spin": 0.1}).spin.tolist() == [0.1, 0.1, 0.1]
-    tiny = make_task(ID, {"spin": 100.0}, "crazyflie2")
+    assert make_task(EnvConfig.from_keywords(ID, spin=0.1)).spin.tolist() == [0.1, 0.1, 0.1]
+    tiny = make_task(EnvConfig.from_keywords(ID, spin=100.0, vehicle="crazyflie2"))
     assert tiny.spin[:2].tolist() == [100.0, 100.0]
     assert 25.0 < tiny.spin[2] < 35.0
 
 
 @pytest.fixture(scope="module")
 def starts() -> Any:
-    loop = Loop(ID, COUNT, options={"spin": 5.0})
+    loop = Loop(EnvConfig.from_keywords(ID, spin=5.0), COUNT)
     loop.advance(np.zeros((COUNT, 4), np.float32), np.ones(COUNT, bool), list(range(COUNT)))
     state = loop.world.state
     arrays = {
@@ -95,7 +96,7 @@ def test_throws_fill_their_ranges(starts: Any) -> None:
     assert even(speed, 0.0, 3.0)
     for axis in range(3):
         assert even(starts["velocity"][:, axis] / speed, -1.0, 1.0)
-    limits = make_task(ID, {"spin": 5.0}).spin
+    limits = make_task(EnvConfig.from_keywords(ID, spin=5.0)).spin
     for axis in range(3):
         assert even(starts["body_rates"][:, axis], -limits[axis], limits[axis])
     assert (starts["position"] == (0.0, 0.0, 20.0)).all()
@@ -121,7 +122,7 @@ def test_observation_in_the_body_frame_by_hand() -> None:
     seen = begun().observe(state)["observation"]
     expected = [2, 5, -1, 2, -3, 1, 0, 1, 0, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
     assert seen == pytest.approx(expected, abs=1e-12)
-    (spec,) = make_task(ID, {}).observation
+    (spec,) = make_task(EnvConfig(env_id=ID)).observation
     assert spec.components[5:8] == ("velocity z", "up x", "up y")
     assert spec.frame == "body"
 
@@ -131,13 +132,13 @@ def test_observation_in_the_body_frame_by_hand() -> None:
     [("rotors", "body"), ("rates", "body"), ("attitude", "world"), ("position", "world")],
 )
 def test_the_frame_is_by_default_that_of_the_action(action: str, frame: str) -> None:
-    options = env_spec(ID, {"action": action}).options
-    assert options["frame"] == frame
-    assert env_spec(ID, {"action": action, "frame": "world"}).options["frame"] == "world"
+    assert make_task(EnvConfig(env_id=ID, action=action)).body == (frame == "body")
+    task = make_task(EnvConfig(env_id=ID, action=action, task={"frame": "world"}))
+    assert not task.body
     with pytest.raises(
         InputError, match=r"^frame: expected 'body' or 'world', or none, got 'nose'"
     ):
-        env_spec(ID, {"frame": "nose"})
+        env_spec(EnvConfig.from_keywords(ID, frame="nose"))
 
 
 PLACE = {"position": (0.0, 0.0, 20.0)}
@@ -280,5 +281,5 @@ def test_bounds_of_the_papers_vehicle() -> None:
 )
 def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=f"^{sentence}") as caught:
-        env_spec(ID, options)
+        env_spec(EnvConfig.from_keywords(ID, **options))
     assert "\n" not in str(caught.value)

@@ -17,8 +17,9 @@ from gymnasium.utils.env_checker import check_env
 from peers import ANY, Running
 from relay import FaultConfig, relaying
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.parallel import LocalParallelEnv
-from rotorgram.envs.registry import env_spec, options_type
+from rotorgram.envs.registry import env_spec
 from rotorgram.models import InputError
 from rotorgram.models.cameras import cameras_of, chosen_views
 from rotorgram.models.vehicle import Vehicle
@@ -44,21 +45,21 @@ def test_the_checker_of_gymnasium(opengl: None) -> None:
 
 
 def test_a_spec_tells_of_pictures() -> None:
-    spec = env_spec(LANDING, {"cameras": [EYES]})
+    spec = env_spec(EnvConfig.from_keywords(LANDING, cameras=[EYES]))
     down, depth, objects = spec.observation[1:]
     assert objects.categories == ("nothing", "scene/floor", "drone_0", "task/disc_0 of drone_0")
     assert (down.categories, depth.unit) == ((), "m")
     assert down.frame.endswith("m in the body, looks along (0 0 -1), 90 degrees high")
     assert spec.options["cameras"] == EYES.split(",")
     assert type(spec).from_json(spec.to_json()) == spec
-    assert "cameras" not in env_spec(LANDING).options
+    assert "cameras" not in env_spec(EnvConfig(env_id=LANDING)).options
 
 
 def test_the_flight_is_that_without_cameras(opengl: None) -> None:
-    more = {"history": 2, "linear_drag": 0.1}
+    more = {"history": 2, "effects": {"linear_drag": 0.1}}
     with (
         closing(gym.make(HOVER, **more)) as blind,
-        closing(gym.make(HOVER, cameras="front@8x8", world="airport", **more)) as seeing,
+        closing(gym.make(HOVER, cameras="front@8x8", scene="airport", **more)) as seeing,
     ):
         first, second = blind.reset(seed=3)[0], seeing.reset(seed=3)[0]
         seeing.action_space.seed(4)
@@ -127,7 +128,11 @@ def test_drones_of_one_world_see_each_other(opengl: None) -> None:
         LocalParallelEnv("rotorgram/Formation-v0", drones=3, cameras=words, formation="line")
     ) as env:
         seen = env.reset(seed=2)[0]
-        names = env_spec("rotorgram/Formation-v0", {"cameras": [words]}, None, 3)
+        names = env_spec(
+            EnvConfig.from_keywords(
+                "rotorgram/Formation-v0", cameras=[words], vehicle=None, drones=3
+            )
+        )
         objects = names.observation[1].categories
         assert {f"drone_{i}" for i in range(3)} < {*objects}
         assert env.observation_space("drone_1")["front_segmentation"].shape == (48, 48, 1)
@@ -162,19 +167,22 @@ def test_pictures_of_the_backend_rigid(opengl: None) -> None:
 def test_each_episode_has_a_world_of_its_own(opengl: None) -> None:
     """One of those that are told, by the seed; the same alone, in a batch and over UDP."""
     options: dict[str, Any] = {
-        "cameras": "front@32x24,front_segmentation@32x24", "world": "warehouse:0-2",
+        "cameras": "front@32x24,front_segmentation@32x24", "scene": "warehouse:0-2",
         "action": "velocity", "episode_length": 2,
     }  # fmt: skip
     seeds, still = [3, 4, 5, 6], np.zeros((4, 4), np.float32)
     with closing(LocalVectorEnv(HOVER, 4, autoreset_mode="Disabled", **options)) as env:
-        assert env.env_spec.observation == env_spec(HOVER, options).observation
+        assert (
+            env.env_spec.observation
+            == env_spec(EnvConfig.from_keywords(HOVER, **options)).observation
+        )
         names = env.env_spec.observation[2].categories
         first = env.reset(seed=seeds)[0]
         second = env.step(still)[0]
         again = env.reset()[0]
     found = []
     for number in range(3):
-        alone = options | {"world": f"warehouse:{number}"}
+        alone = options | {"scene": f"warehouse:{number}"}
         with closing(LocalVectorEnv(HOVER, 4, autoreset_mode="Disabled", **alone)) as env:
             own, stepped = env.reset(seed=seeds)[0], env.step(still)[0]
             objects = np.array(env.env_spec.observation[2].categories)
@@ -198,7 +206,7 @@ def test_a_simulator_that_cannot_draw_says_so_before_it_greets() -> None:
         agent.bind(("127.0.0.1", 0))
         line = ["sim", "--server", f"127.0.0.1:{agent.getsockname()[1]}", "--env", HOVER]
         done = subprocess.run(
-            [sys.executable, "-m", "rotorgram.cli", *line, "--env.cameras", "front"],
+            [sys.executable, "-m", "rotorgram.cli", *line, "--cameras", "front"],
             env={**os.environ, "MUJOCO_GL": "disable"}, capture_output=True, text=True, check=False,
         )  # fmt: skip
         assert done.returncode == 2
@@ -213,38 +221,38 @@ def test_a_simulator_that_cannot_draw_says_so_before_it_greets() -> None:
     [
         ({"cameras": "rear"}, "cameras: expected some of chase, portrait, front, down, each with"),
         ({"cameras": 3}, "cameras: expected names, with commas between them, got 3"),
-        ({"cameras": "front", "world": "moon"}, "world: expected 'plain' or 'airport'"),
+        ({"cameras": "front", "scene": "moon"}, "scene: expected 'plain' or 'airport'"),
         (
-            {"cameras": "front", "world": "plain:0-2"},
-            "world: expected one of .* up to 64 seeds, as",
+            {"cameras": "front", "scene": "plain:0-2"},
+            "scene: expected one of .* up to 64 seeds, as",
         ),
         (
-            {"cameras": "front", "world": "forest:3-1"},
-            "world: expected one of .* up to 64 seeds, as",
+            {"cameras": "front", "scene": "forest:3-1"},
+            "scene: expected one of .* up to 64 seeds, as",
         ),
         (
-            {"cameras": "front", "world": "forest:0-64"},
-            "world: expected one of .* up to 64 seeds, as",
+            {"cameras": "front", "scene": "forest:0-64"},
+            "scene: expected one of .* up to 64 seeds, as",
         ),
         (
-            {"cameras": "front", "world": "forest:0-x"},
-            "world: expected one of .* up to 64 seeds, as",
+            {"cameras": "front", "scene": "forest:0-x"},
+            "scene: expected one of .* up to 64 seeds, as",
         ),
-        ({"cameras": "front", "world": 3}, "world: expected a text"),
+        ({"cameras": "front", "scene": 3}, "scene: expected 'plain' or 'airport'"),
     ],
 )
 def test_wrong_options(options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        env_spec(HOVER, options)
+        env_spec(EnvConfig.from_keywords(HOVER, **options))
 
 
 def test_words_may_come_one_by_one() -> None:
-    kind = options_type(HOVER)
-    assert kind(cameras="a,b").cameras == kind(cameras=["a", "b"]).cameras == ("a", "b")
+    for words in ("a,b", ["a", "b"]):
+        assert EnvConfig.from_keywords(HOVER, cameras=words).cameras == ("a", "b")
 
 
 def test_a_simulator_without_opengl_says_so_in_a_sentence() -> None:
-    words = ["evaluate", "geometric", "--env", HOVER, "--env.cameras", "front", "--episodes", "1"]
+    words = ["evaluate", "geometric", "--env", HOVER, "--cameras", "front", "--episodes", "1"]
     done = subprocess.run(
         [sys.executable, "-m", "rotorgram.cli", *words],
         env=os.environ | {"MUJOCO_GL": "disable"},

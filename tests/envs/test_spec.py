@@ -9,6 +9,7 @@ import pytest
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.spaces import action_space, info_columns, observation_space
 from rotorgram.envs.spec import (
@@ -42,7 +43,7 @@ def spec_of(**rest: Any) -> EnvSpec:
 
 
 def test_the_elevation_env_by_hand() -> None:
-    spec = env_spec(ID, {"target": (4, 8)})
+    spec = env_spec(EnvConfig.from_keywords(ID, target=(4, 8)))
     assert (spec.env_id, spec.control_period, spec.agents) == (ID, 0.02, ("drone_0",))
     assert spec.options["target"] == [4.0, 8.0]  # as JSON gives it back
     assert [array.name for array in spec.telemetry] == [
@@ -61,7 +62,7 @@ def test_the_elevation_env_by_hand() -> None:
 
 
 def test_the_hover_env_by_hand() -> None:
-    spec = env_spec(HOVER)
+    spec = env_spec(EnvConfig(env_id=HOVER))
     assert spec.observation[0].shape == (19,)
     assert spec.action == ArraySpec(
         name="action", shape=(4,), low=-1.0, high=1.0, components=("F1", "F2", "F3", "F4")
@@ -72,7 +73,7 @@ def test_the_hover_env_by_hand() -> None:
 
 @pytest.mark.parametrize("env_id", [ID, HOVER])
 def test_json_there_and_back(env_id: str) -> None:
-    spec = env_spec(env_id)
+    spec = env_spec(EnvConfig(env_id=env_id))
     text = spec.to_json()
     assert EnvSpec.from_json(text) == spec
     assert EnvSpec.from_json(text).to_json() == text
@@ -238,7 +239,7 @@ def test_a_short_spec_cannot_ask_for_much_memory() -> None:
         spec_of(telemetry=arrays[:1])
 
 
-GOOD = json.loads(env_spec(HOVER).to_json())
+GOOD = json.loads(env_spec(EnvConfig(env_id=HOVER)).to_json())
 JSON = st.recursive(
     st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=9)),
     lambda inner: st.one_of(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.models import InputError
 from swarms import RISE
@@ -10,7 +11,7 @@ HOVER = np.zeros((2, 1), np.float32)
 
 
 def begun(worlds: int = 1, drones: int = 2, **options: int) -> Loop:
-    loop = Loop(RISE, worlds, drones=drones, options=options)
+    loop = Loop(EnvConfig.from_keywords(RISE, drones=drones, **options), worlds)
     rows = worlds * drones
     loop.advance(np.zeros((rows, 1), np.float32), np.ones(rows, bool), range(rows))
     return loop
@@ -77,4 +78,4 @@ def test_half_a_world_cannot_be_reset_or_frozen() -> None:
 def test_a_task_that_is_flown_alone_refuses_more() -> None:
     expected = "drones: expected 1 with rotorgram/Hover-v0, got 2"
     with pytest.raises(InputError, match=expected):
-        Loop("rotorgram/Hover-v0", drones=2)
+        Loop(EnvConfig.from_keywords("rotorgram/Hover-v0", drones=2))

@@ -9,6 +9,7 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 from rotorgram.agents import Orca
 from rotorgram.agents.orca import avoiding, nearest
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.tasks.swarm import Radio, SwarmOptions, grid, line, ring
@@ -233,9 +234,9 @@ def test_eight_drones_cross_without_touching(crossing: LocalVectorEnv) -> None:
 
 def test_what_orca_cannot_fly_is_one_sentence() -> None:
     with pytest.raises(InputError, match="orca: expected a task for several drones, got"):
-        Orca(env_spec("rotorgram/Hover-v0", {"action": "velocity"}))
+        Orca(env_spec(EnvConfig.from_keywords("rotorgram/Hover-v0", action="velocity")))
     with pytest.raises(InputError, match=r"orca: expected actions of the level velocity"):
-        Orca(env_spec(TASKS[0], {"action": "position"}))
+        Orca(env_spec(EnvConfig.from_keywords(TASKS[0], action="position")))
 
 
 @pytest.mark.parametrize(

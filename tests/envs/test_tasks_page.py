@@ -6,10 +6,11 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 import rotorgram.envs  # noqa: F401
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec, task_type
 from rotorgram.envs.tasks.racing import RacingOptions
 from rotorgram.envs.tasks.recovery import RecoveryOptions
-from rotorgram.envs.tasks.tracking import Tracking, TrackingOptions
+from rotorgram.envs.tasks.tracking import Tracking
 from rotorgram.envs.tasks.waypoints import WaypointsOptions
 from rotorgram.models import Vehicle
 from rotorgram.training.bounds import (
@@ -22,6 +23,7 @@ from rotorgram.training.bounds import (
 
 PAGE = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| `([\w-]+)` \| .* \| `(\w+)` \| ([\dR+ ]+) \|", PAGE, re.MULTILINE)
+TRACKING = "rotorgram/Tracking-v0"
 TASKS = sorted(name for name in gym.registry if name.startswith("rotorgram/"))
 
 
@@ -33,7 +35,7 @@ def test_the_table_has_every_task() -> None:
 @pytest.mark.parametrize("vehicle", [None, "heavy_hexa"])
 def test_headline_and_size(name: str, headline: str, size: str, vehicle: str | None) -> None:
     drones = 2 if name == "Cable-v0" else 1
-    spec = env_spec(f"rotorgram/{name}", vehicle=vehicle, drones=drones)
+    spec = env_spec(EnvConfig.from_keywords(f"rotorgram/{name}", vehicle=vehicle, drones=drones))
     assert spec.headline is not None
     assert spec.headline.name == headline
     number, *rotors = size.split(" + ")
@@ -55,8 +57,11 @@ def test_the_bounds_are_those_that_are_computed() -> None:
     recovery = recovery_bounds(RecoveryOptions(), paper)
     for number, unit in (
         (waypoints_time(WaypointsOptions(), paper), "s"),
-        (Tracking(TrackingOptions(), paper).quickest, "s"),
-        (Tracking(TrackingOptions(trajectory="lemniscate"), paper).quickest, "s"),
+        (Tracking(EnvConfig(env_id=TRACKING), paper).quickest, "s"),
+        (
+            Tracking(EnvConfig(env_id=TRACKING, task={"trajectory": "lemniscate"}), paper).quickest,
+            "s",
+        ),
         (racing_time(RacingOptions(), paper), "s"),
         (racing_time(RacingOptions(track="dive"), paper), "s"),
         (landing_time(4.0, 1.0, paper), "s"),

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from pilot import Pilot, limited
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.specification import make_task
 from rotorgram.envs.tasks.tracking import snap_basis
 from rotorgram.models import Vehicle
@@ -22,14 +23,16 @@ HALF = (0.5, 0.5, 0.5)
 
 
 def begun(share: float = 0.0, **options: Any) -> Any:
-    task = make_task(ID, {"trajectory": "circle", "preview": 1, **options})
+    task = make_task(
+        EnvConfig.from_keywords(ID, **{"trajectory": "circle", "preview": 1, **options})
+    )
     task.begin(NOW, Shares(share, HALF))
     return task
 
 
 def test_a_circle_by_hand() -> None:
     """2 m in 10 s: after a quarter it is at the top, as fast as 2 π 2 m / 10 s."""
-    task = make_task(ID, {"center": (1.0, 2.0, 6.0)})
+    task = make_task(EnvConfig.from_keywords(ID, center=(1.0, 2.0, 6.0)))
     pose = task.begin(NOW, Shares(0.25, (1.0, 0.5, 0.5)))
     assert pose.position == pytest.approx([1.3, 4.0, 6.0], abs=1e-9)  # 0.3 m aside
     assert pose.velocity == pytest.approx([-0.4 * math.pi, 0.0, 0.0], abs=1e-9)
@@ -123,7 +126,7 @@ def test_nothing_snaps_less() -> None:
 
 def test_a_snap_by_hand() -> None:
     """Two points, 8 s: in the middle after 4 s; at its end it stays."""
-    task = make_task(ID, {"trajectory": "snap", "points": 2, "period": 8.0})
+    task = make_task(EnvConfig.from_keywords(ID, trajectory="snap", points=2, period=8.0))
     pose = task.begin(NOW, Shares(0.0, (0.0, 0.5, 0.5), (1.0, 1.0, 1.0), HALF))
     assert pose.position == pytest.approx([-2.0, 0.0, 5.0])
     assert pose.velocity == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
@@ -137,16 +140,16 @@ def test_a_file_without_a_column_is_told_its_name(tmp_path: Path) -> None:
     file = tmp_path / "mine.csv"
     file.write_text("0,0,0,5\n1,1,0,5\n")
     with pytest.raises(InputError, match=r"with columns t, x, y, z, got .*: no column 't'$"):
-        make_task(ID, {"trajectory": str(file)})
+        make_task(EnvConfig.from_keywords(ID, trajectory=str(file)))
 
 
 def test_a_file_crosses_the_wire(tmp_path: Path) -> None:
     file = tmp_path / "mine.csv"
     file.write_text("t,x,y,z\n1.0,0,0,5\n2.0,1,0,5\n4.0,1,2,6\n")
-    task = make_task(ID, {"trajectory": str(file)})
+    task = make_task(EnvConfig.from_keywords(ID, trajectory=str(file)))
     told = task.options.to_options()["trajectory"]
     file.unlink()
-    task = make_task(ID, {"trajectory": told})
+    task = make_task(EnvConfig.from_keywords(ID, trajectory=told))
     assert task.options.trajectory == told
     pose = task.begin(NOW, Shares(0.0, HALF))
     assert pose.position.tolist() == [0.0, 0.0, 5.0]
@@ -160,10 +163,10 @@ def test_a_file_crosses_the_wire(tmp_path: Path) -> None:
 def test_the_quickest_circle() -> None:
     """400 N on 20 kg leave √(20² - 9.8²) m/s² aside; a circle of 2 m in T needs 2 (2 π / T)²."""
     quickest = 2 * math.pi * math.sqrt(2.0 / math.sqrt(20.0**2 - 9.8**2))
-    assert make_task(ID, {}).quickest == pytest.approx(quickest, rel=1e-3)
-    make_task(ID, {"period": 1.01 * quickest})
+    assert make_task(EnvConfig(env_id=ID)).quickest == pytest.approx(quickest, rel=1e-3)
+    make_task(EnvConfig.from_keywords(ID, period=1.01 * quickest))
     with pytest.raises(InputError, match=r"period: expected at least 2\.12"):
-        make_task(ID, {"period": 0.96 * quickest})
+        make_task(EnvConfig.from_keywords(ID, period=0.96 * quickest))
 
 
 def test_a_snap_that_the_rotors_cannot_fly() -> None:
@@ -172,21 +175,25 @@ def test_a_snap_that_the_rotors_cannot_fly() -> None:
     With q = 7.513 / T² the thrust is 20 kg · √(2 (4 m q)² + (2 m q + 9.8 m/s²)²): 400 N at
     q = 2.412 /s², T = 1.765 s.
     """
-    make_task(ID, {"trajectory": "snap", "points": 2, "period": 1.78})
+    make_task(EnvConfig.from_keywords(ID, trajectory="snap", points=2, period=1.78))
     with pytest.raises(InputError, match=r"trajectory: expected 0 to 400 N of thrust, which the "):
-        make_task(ID, {"trajectory": "snap", "points": 2, "period": 1.75})
+        make_task(EnvConfig.from_keywords(ID, trajectory="snap", points=2, period=1.75))
 
 
 def test_a_file_that_the_rotors_cannot_fly() -> None:
     """At rest for 0.5 s, then up at 20 m/s: 20 kg · (40 + 9.8) m/s² = 996 N between."""
     with pytest.raises(InputError) as error:
-        make_task(ID, {"trajectory": "[[0,0,0,5],[0.5,0,0,5],[1,0,0,15],[1.5,0,0,25]]"})
+        make_task(
+            EnvConfig.from_keywords(
+                ID, trajectory="[[0,0,0,5],[0.5,0,0,5],[1,0,0,15],[1.5,0,0,25]]"
+            )
+        )
     thrust = "trajectory: expected 0 to 400 N of thrust, which the vehicle has, got 996 at 0.5 s"
     assert str(error.value) == thrust
     # 9.8 m/s² along x, and 0.1 s later against it twice: the thrust turns by 90° in 0.1 s.
     rows = [[0.1 * k, x, 0, 5] for k, x in enumerate((0.0, 0.0, 0.098, 0.098, 0.0))]
     with pytest.raises(InputError) as error:
-        make_task(ID, {"trajectory": json.dumps(rows)})
+        make_task(EnvConfig.from_keywords(ID, trajectory=json.dumps(rows)))
     rate = "trajectory: expected 0 to 11.07 rad/s of tilt rate, which the vehicle has, got 15.71 at"
     assert str(error.value).startswith(rate)
 
@@ -207,7 +214,7 @@ def test_a_file_that_the_rotors_cannot_fly() -> None:
 )
 def test_wrong_options(options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError) as error:
-        make_task(ID, options)
+        make_task(EnvConfig.from_keywords(ID, **options))
     assert str(error.value).startswith(sentence)
 
 

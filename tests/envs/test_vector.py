@@ -12,6 +12,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from mujoco.batch import Batch, SimulationError
 from rotorgram.envs import LocalVectorEnv, Loop
+from rotorgram.envs.config import EnvConfig
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError
 
@@ -21,7 +22,7 @@ N = 7
 FLOWN: list[tuple[str, dict[str, Any]]] = [
     (ID, {"flight_band": 1.5}),
     (ID, {"action": "offset", "flight_band": 1.5, "vehicle": HEXA}),
-    (ID, {"action_type": "discrete", "observation": "error", "linear_drag": 0.5}),
+    (ID, {"action_type": "discrete", "observation": "error", "effects": {"linear_drag": 0.5}}),
     (ID, {"target": (4.0, 9.0), "control_period": 0.05}),
     (ID, {"control_period": 0.01, "target": 2.0, "flight_band": 10.0, "episode_length": 90}),
     (HOVER, {"flight_band": 2.0}),
@@ -179,10 +180,11 @@ def test_wrong_seeds(seed: Any) -> None:
         ({"num_envs": 0}, "num_envs: expected 1 to 65536, got 0"),
         ({"num_envs": 10**9}, "num_envs: expected 1 to 65536, got 1000000000"),
         ({"num_threads": -1}, "num_threads: expected 0 or more, got -1"),
+        ({"device": "cuda"}, "options: expected some of target, .*, got .device"),
         ({"backend": "bullet"}, "backend: expected mujoco or rigid, got 'bullet'"),
         ({"autoreset_mode": "never"}, "autoreset_mode: expected 'NextStep' or 'SameStep'"),
         ({"render_mode": "ansi"}, "render_mode: expected None, 'human' or 'rgb_array', got 'ansi'"),
-        ({"speed": 1}, "options: expected some of episode_length"),
+        ({"speed": 1}, "options: expected some of target"),
     ],
 )
 def test_wrong_arguments(arguments: dict[str, Any], expected: str) -> None:
@@ -219,7 +221,7 @@ def test_a_step_before_a_reset() -> None:
 
 
 def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
-    loop = Loop(ID, 3)
+    loop = Loop(EnvConfig(env_id=ID), 3)
     still, every = np.zeros((3, 1), np.float32), np.ones(3, bool)
     loop.advance(still, every, [0, 1, 2])
     before = loop.observations["observation"].copy()
@@ -235,7 +237,7 @@ def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
 
 def test_an_error_of_the_physics_leaves_no_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Env 1 goes bad in the call in which MuJoCo fails in env 0."""
-    loop, step = Loop(ID, 2), Batch.step
+    loop, step = Loop(EnvConfig(env_id=ID), 2), Batch.step
 
     def failing(batch: Any, *arguments: Any, **named: Any) -> None:
         step(batch, *arguments, **named)

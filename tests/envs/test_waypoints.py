@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from pilot import Pilot, limited
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.specification import make_task
 from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
@@ -19,7 +20,7 @@ NOW = np.bool_(True)
 
 def begun(*places: tuple[float, float, float], **options: Any) -> Any:
     """A task whose start and points lie at these shares of the box from one side to the other."""
-    task = make_task(ID, {"points": len(places) - 1, **options})
+    task = make_task(EnvConfig.from_keywords(ID, **{"points": len(places) - 1, **options}))
     task.begin(NOW, Shares(*places))
     return task
 
@@ -34,7 +35,9 @@ MIDDLE, EAST, ABOVE = (0.5, 0.5, 0.5), (1.0, 0.5, 0.5), (1.0, 0.5, 1.0)
 
 
 def test_starts_and_points_by_hand() -> None:
-    task = make_task(ID, {"points": 2, "center": (1.0, 2.0, 6.0), "box": (2.0, 4.0, 1.0)})
+    task = make_task(
+        EnvConfig.from_keywords(ID, points=2, center=(1.0, 2.0, 6.0), box=(2.0, 4.0, 1.0))
+    )
     pose = task.begin(NOW, Shares((0.0, 0.5, 1.0), EAST, MIDDLE))
     assert pose.position.tolist() == [-1.0, 2.0, 7.0]
     assert pose.quaternion is None
@@ -100,7 +103,7 @@ def test_ends(place: tuple[float, float, float], rest: dict[str, Any], ends: boo
 
 def test_points_of_others_stay() -> None:
     """A batch in which one drone begins again."""
-    task = make_task(ID, {"points": 1}, shape=(2, 1))
+    task = make_task(EnvConfig.from_keywords(ID, points=1), shape=(2, 1))
     both, first = np.ones((2, 1), bool), np.array([[True], [False]])
     place = np.full((2, 1, 3), 0.5)
     task.begin(both, Shares(place, place + 0.5))
@@ -122,7 +125,7 @@ def test_points_of_others_stay() -> None:
 )
 def test_wrong_options(options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence.replace("(", r"\(")):
-        make_task(ID, options)
+        make_task(EnvConfig.from_keywords(ID, **options))
 
 
 @pytest.mark.parametrize("name", [None, "crazyflie2"])

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 import rotorgram.envs  # noqa: F401
 from rotorgram.cli import main
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.delay import Delay
 from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
@@ -126,11 +127,11 @@ def test_options_that_are_on_move_no_other_draw() -> None:
 
 
 def test_without_them_nothing_is_told_of_them() -> None:
-    spec = env_spec(HOVER)
+    spec = env_spec(EnvConfig(env_id=HOVER))
     assert "effects" not in spec.options
     assert "randomize" not in spec.options
     assert "drawn" not in [array.name for array in spec.telemetry]
-    told = env_spec(HOVER, WORLD, str(RACER))
+    told = env_spec(EnvConfig.from_keywords(HOVER, **WORLD, vehicle=str(RACER)))
     assert told.options["effects"]["wind"] == [0.5, 0.0, 0.0]
     assert told.options["randomize"]["observation_delay"] == 1
     drawn = next(array for array in told.telemetry if array.name == "drawn")
@@ -154,7 +155,7 @@ def test_observations_of_a_stronger_craft_stay_within_their_bounds() -> None:
 
 def test_flags(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["evaluate", "pid", "--episodes", "1", "--vehicle", str(RACER)]
-    words += ["--env.episode-length", "20"]
+    words += ["--episode-length", "20"]
     flags = ["--effects", "motor-lag", "wind=0.5,0,0", "body_drag"]
     assert main([*words, *flags, "--randomize", "mass=uniform(0.9,1.1)"]) == 0
     assert "episodes   1, 0 terminated" in capsys.readouterr().out
@@ -185,7 +186,7 @@ def test_a_policy_needs_the_vehicle_that_has_its_effects(
 
 def test_files_of_a_comparison_tell_what_was_drawn(tmp_path: Path) -> None:
     words = ["--agents", "vpg", "--seeds", "1", "--env-steps", "1500", "--episodes", "2"]
-    words += ["--jobs", "1", "--env.episode-length", "50", "--no-film"]
+    words += ["--jobs", "1", "--episode-length", "50", "--no-film"]
     words += ["--randomize", "mass=uniform(0.9,1.1)", "--out", str(tmp_path / "c")]
     assert main(["compare", *words]) == 0
     for name in ("episodes.csv", "evaluations.csv"):

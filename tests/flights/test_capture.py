@@ -111,7 +111,7 @@ def test_a_flight_gives_every_so_many_steps(tmp_path: Path) -> None:
             "plan: seed: expected a whole number from 0 to .*, got -1",
         ),
         (("seed = 7", "sed = 7"), "plan: expected some of cameras, poses, vehicle, .* got 'sed'"),
-        (("seed = 7", 'world = "moon"'), "world: expected 'plain' or 'airport' .* got 'moon'"),
+        (("seed = 7", 'world = "moon"'), "scene: expected 'plain' or 'airport' .* got 'moon'"),
         (
             ("count = 5", "count = 0"),
             r"poses\[1\].count: expected a whole number from 1 to 1000000",

@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from rotorgram.cli import main
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.flights.plots import panels_of, roll_pitch_yaw
 from rotorgram.flights.recorded import recorded_trajectories
@@ -116,7 +117,7 @@ def test_wrong_words_of_log(
 
 def test_columns_of_a_flight_by_hand() -> None:
     """The paper's X right, Y up, Z forward become x forward, y left, z up."""
-    spec = env_spec("rotorgram/Elevation-v0", {})
+    spec = env_spec(EnvConfig(env_id="rotorgram/Elevation-v0"))
     telemetry = {array.name: np.zeros((2, *array.shape)) for array in spec.telemetry}
     telemetry["position"] = np.array([(1.0, 2.0, 3.0), (1.0, 2.5, 3.0)])
     telemetry["attitude"] = np.array([(0.0, 0.0, 0.0), (0.0, 90.0, 0.0)])  # nose right

@@ -10,6 +10,7 @@ import pytest
 import rotorgram.envs  # noqa: F401  # makes the envs known
 from peers import ANY, Running
 from rotorgram.agents.pid import PID
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.trajectories import (
@@ -27,7 +28,7 @@ from rotorgram.udp import RemoteVectorEnv, Simulator
 
 ELEVATION = "rotorgram/Elevation-v0"
 SHORT: dict[str, Any] = {"episode_length": 25}  # half a second
-SPEC = env_spec(ELEVATION, SHORT)
+SPEC = env_spec(EnvConfig.from_keywords(ELEVATION, **SHORT))
 
 
 def same(one: Trajectory, other: Trajectory) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from rotorgram.cli import main
 from rotorgram.envs import Loop
+from rotorgram.envs.config import EnvConfig
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
 
@@ -111,7 +112,7 @@ def test_action_zero_hovers_and_any_other_climbs(files: dict[str, Path], name: s
 def test_acceleration_is_that_of_newton(files: dict[str, Path], name: str) -> None:
     """Thrust in newtons reaches the body in newtons, whatever gear and gain."""
     vehicle = Vehicle.load(files[name])
-    loop = Loop(ELEVATION, vehicle=files[name], options={"action": "offset"})
+    loop = Loop(EnvConfig.from_keywords(ELEVATION, vehicle=files[name], action="offset"))
     still = np.zeros((1, 1), np.float32)
     loop.advance(still, np.ones(1, bool), [0])
     start = loop.telemetry["position"][0, 1]

@@ -17,6 +17,7 @@ from imageio_ffmpeg import (  # type: ignore[import-untyped]
 )
 from pictures import HEIGHT, WIDTH, decoded, ffmpeg_facts, pixels, same
 from PIL import Image
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.flights.filming import Film, Shot, film, grid
 from rotorgram.flights.trajectories import Trajectory
@@ -39,7 +40,7 @@ def trajectory(*elevations: float, ending: Any = "truncated") -> Trajectory:
         "metrics": (5.0 - heights)[:, np.newaxis],
     }
     return Trajectory(
-        spec=env_spec("rotorgram/Elevation-v0", {}),
+        spec=env_spec(EnvConfig(env_id="rotorgram/Elevation-v0")),
         telemetry=telemetry,
         rewards=np.zeros(steps - 1),
         actions=np.zeros((steps - 1, 1)),

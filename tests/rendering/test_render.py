@@ -22,6 +22,7 @@ from PIL import Image
 from rotorgram.agents import PID
 from rotorgram.agents.checkpoints import load
 from rotorgram.cli import main
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.flights import filming
 from rotorgram.flights.filming import Film, Shot, film
@@ -60,7 +61,7 @@ def training(tmp_path_factory: pytest.TempPathFactory) -> Path:
         from rotorgram.cli import main
         import rotorgram.cli.compare, rotorgram.cli.sweep
         status = main(["train", "a2c", "--env-steps", "200", "--out", sys.argv[1],
-                       "--set", "steps_per_update=50", "--env.episode-length", "25"])
+                       "--set", "steps_per_update=50", "--episode-length", "25"])
         drawing = {name for name in sys.modules
                    if name.startswith(("rotorgram.rendering.", "OpenGL", "mujoco.egl"))}
         drawing -= {"rotorgram.rendering.gl"}  # looks at MUJOCO_GL and imports nothing
@@ -105,7 +106,7 @@ def test_gif_pictures_and_names(
     opengl: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "film.gif"
-    settings = ("--env.episode-length", 10, *SMALL)
+    settings = ("--episode-length", 10, *SMALL)
     command = ("render", "pid", "random", "--out", out, "--names", "ours", "theirs", *settings)
     assert run(capsys, *command, "--episodes", 2)[0] == 0
     with Image.open(out) as gif:
@@ -128,7 +129,7 @@ def test_panes_of_the_same_have_names_of_their_own(
     monkeypatch.setattr(filming, "film", lambda out, shots, *_: shown.extend(shots) or 1)
     monkeypatch.setattr(gl, "offscreen_context", lambda *_: SimpleNamespace(free=lambda: None))
     what = ("pid", "pid", "random", "pid", "random")
-    settings = ("--env.episode-length", 10, "--episode", 1, "--out", tmp_path / "film.gif")
+    settings = ("--episode-length", 10, "--episode", 1, "--out", tmp_path / "film.gif")
     assert run(capsys, "render", *what, *settings)[0] == 0
     names = [shot.name for shot in shown]
     assert names == ["PID 1", "PID 2", "random 1", "PID 3", "random 2"]
@@ -239,7 +240,7 @@ def test_a_wrong_mujoco_gl_is_one_sentence_of_what_draws(setting: str, tmp_path:
     }
     assert expected[setting] in draws.stderr
     assert draws.stderr.count("\n") == 1
-    flies = done("evaluate", "pid", "--episodes", 1, "--env.episode-length", 5)
+    flies = done("evaluate", "pid", "--episodes", 1, "--episode-length", 5)
     assert (flies.returncode, flies.stderr.count("Traceback")) == (0, 0)
 
 
@@ -263,7 +264,7 @@ def test_without_libegl_it_says_what_to_install(
     assert (status, SENTENCE in err, err.count("\n")) == (2, True, 1)
     assert "egl: its library is not installed" in err
     assert list(tmp_path.iterdir()) == []
-    assert run(capsys, "evaluate", "pid", "--episodes", 1, "--env.episode-length", 5)[0] == 0
+    assert run(capsys, "evaluate", "pid", "--episodes", 1, "--episode-length", 5)[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -306,7 +307,7 @@ def comparison(training: Path, tmp_path: Path) -> Path:
     folder = tmp_path / "comparison"
     folder.mkdir()
     trained = load(training / "checkpoint.safetensors")
-    spec = env_spec(trained.env_id, trained.options)
+    spec = env_spec(EnvConfig.from_keywords(trained.env_id, **trained.options))
     content = dict.fromkeys(CONFIG_KEYS) | {"preset": "tuned", "seeds": [0, 1, 2], "agents": {}}
     write_config(folder, "rotorgram compare", spec, None, content)
     rows = [

@@ -159,7 +159,7 @@ def test_many_stand_side_by_side() -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ({"world": "moon"}, "world: expected 'plain' or 'airport' .* got 'moon'"),
+        ({"world": "moon"}, "scene: expected 'plain' or 'airport' .* got 'moon'"),
         ({"drones": 0}, "drones: expected 1 or more, got 0"),
         ({"vehicle": "nowhere.xml"}, "vehicle: cannot read nowhere.xml"),
     ],

@@ -19,6 +19,7 @@ from pictures import HEXA, at
 from rotorgram.cli import main
 from rotorgram.cli._watch import Realtime, Watcher
 from rotorgram.envs import SingleEnv
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.models import InputError
 from rotorgram.rendering import Moment, Stage, live
@@ -342,7 +343,7 @@ def simulator_of(*heights: float, rotors: int = 4) -> Any:
         "goal": goal,
         "metrics": np.full((drones, 1), 0.5),
     }
-    spec = env_spec(ELEVATION, {}, HEXA if rotors == 6 else None)
+    spec = env_spec(EnvConfig.from_keywords(ELEVATION, vehicle=HEXA if rotors == 6 else None))
     loop = SimpleNamespace(spec=spec, telemetry=telemetry)
 
     def advance(cause: Command | None = None) -> Command | None:
@@ -539,7 +540,7 @@ def test_view_shows_a_journal_to_its_end(
     total = sum(reward for _, reward, *_ in seen[1:31])
     assert out[1].startswith(f"episode 0: return {total:.1f}, ")
     assert {shown[0].episode for shown in surfaces[0].shown} == {0, 1, 2}
-    assert main(["view", str(journal), "--env.linear-drag", "1"]) == 1
+    assert main(["view", str(journal), "--effects", "linear_drag=1"]) == 1
     assert "expected no options with a journal" in capsys.readouterr().err
 
 
@@ -548,7 +549,7 @@ def test_view_shows_episodes_at_the_speed_that_was_asked_for(
     who: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     surfaces = open_fakes(monkeypatch)
-    words = ["--episodes", "2", "--speed", "8", "--env.episode-length", "80"]
+    words = ["--episodes", "2", "--speed", "8", "--episode-length", "80"]
     began = time.monotonic()
     assert main(["view", who, "--world", "plain", *words]) == 0
     # 81 pictures an episode, 0.02 s / 8 between two; at most 0.1 s are made up for.

@@ -114,7 +114,7 @@ def test_a_scene_has_the_airport_that_was_asked_for(visual: bool) -> None:
     spec = build_scene(scene="airport")
     spec.compiler.discardvisual = not visual
     assert spec.compile().ngeom == with_airport(build_scene, discard=not visual).ngeom
-    with pytest.raises(InputError, match=r"world: expected 'plain' or 'airport' .* got 'mars'"):
+    with pytest.raises(InputError, match=r"scene: expected 'plain' or 'airport' .* got 'mars'"):
         build_scene(scene="mars")
 
 

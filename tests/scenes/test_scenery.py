@@ -163,5 +163,5 @@ def test_names_and_seeds() -> None:
         "forest:9999999999",
         "",
     ):
-        with pytest.raises(InputError, match=r"world: expected 'plain' or .* as 'forest:3', got"):
+        with pytest.raises(InputError, match=r"scene: expected 'plain' or .* as 'forest:3', got"):
             parse_scene(wrong)

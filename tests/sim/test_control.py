@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from rotorgram.cli import main
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.models import QUAD_XML, InputError, Vehicle
 from rotorgram.models.library import vehicle_names
@@ -311,7 +312,9 @@ def test_loops_run_in_every_physics_step_unless_they_see_an_estimate(
     estimate: bool, calls: int
 ) -> None:
     sensors = ESTIMATE if estimate else {}
-    loop = Loop(HOVER, options={"action": "attitude", "sensors": sensors}, vehicle="crazyflie2")
+    loop = Loop(
+        EnvConfig.from_keywords(HOVER, action="attitude", sensors=sensors, vehicle="crazyflie2")
+    )
     controller, looked = loop.task.controller, []
     thrust = controller.thrust
     controller.thrust = lambda action, state: looked.append(1) or thrust(action, state)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from remotes import flying
 from rotorgram.envs import LocalVectorEnv, Loop
+from rotorgram.envs.config import EnvConfig
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.models.errors import InputError
 from rotorgram.sim import InitialState, PhysicsError, World, make_world
@@ -162,8 +163,9 @@ def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_seed_gives_arrays_the_draws_of_mujoco() -> None:
-    ours, theirs = (Loop(HOVER, N, backend=name, **rest) for name, rest in
-                    (("rigid", {}), ("mujoco", {})))  # fmt: skip
+    ours, theirs = (
+        Loop(EnvConfig.from_keywords(HOVER, backend=name), N) for name in ("rigid", "mujoco")
+    )
     for loop in (ours, theirs):
         loop.advance(np.zeros((N, 4), np.float32), EVERY[:, 0], range(N))
     np.testing.assert_allclose(ours.world.state.position, theirs.world.state.position, rtol=1e-6)
@@ -209,11 +211,17 @@ DRAWN = {
 )
 def test_effects_and_drawn_parameters(file: Path, effects: dict[str, Any]) -> None:
     """With float64 a seed draws what it draws on mujoco, gusts among it."""
-    options = {"effects": effects, "randomize": DRAWN, "linear_drag": 0.2, "flight_band": 10.0}
+    options = {
+        "effects": effects | {"linear_drag": 0.2},
+        "randomize": DRAWN,
+        "flight_band": 10.0,
+    }
     options["goal"] = (0, 0, 60)
-    ours = Loop(HOVER, N, vehicle=file, backend="rigid", dtype="float64",
-                options=options)  # fmt: skip
-    theirs = Loop(HOVER, N, vehicle=file, options=options)
+    config = EnvConfig.from_keywords(
+        HOVER, vehicle=file, backend="rigid", dtype="float64", **options
+    )
+    ours = Loop(config, N)
+    theirs = Loop(EnvConfig.from_keywords(HOVER, vehicle=file, **options), N)
     still = np.zeros((N, ours.vehicle.num_rotors), np.float32)
     for loop in (ours, theirs):
         loop.advance(still, EVERY[:, 0], range(7, 7 + N))
@@ -355,7 +363,7 @@ def test_what_mujoco_moves_in_another_way_is_refused(change: str, tmp_path: Path
 
 
 def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
-    loop = Loop(ELEVATION, 2, backend="rigid")
+    loop = Loop(EnvConfig.from_keywords(ELEVATION, backend="rigid"), 2)
     every, still = np.ones(2, bool), np.zeros((2, 1))
     loop.advance(still, every, [0, 1])
     begin(

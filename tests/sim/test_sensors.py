@@ -15,6 +15,7 @@ from gymnasium.utils.env_checker import check_env
 from remotes import flying
 from rotorgram.agents import PID
 from rotorgram.envs import Loop
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
@@ -134,7 +135,7 @@ def test_imu_feels_the_air(tmp_path: Path) -> None:
 def test_imu_within_its_range() -> None:
     settings = IMU | {"gyro_range": 2.0, "accelerometer_range": 5.0}
     assert first("imu", settings, body_rates=(3.0, -3.0, 0.0)) == [2.0, -2.0, 0.0, 0.0, 0.0, 5.0]
-    observed = env_spec(HOVER, {"sensors": {"imu": settings}}).observation[1]
+    observed = env_spec(EnvConfig.from_keywords(HOVER, sensors={"imu": settings})).observation[1]
     assert observed.high == (2.0, 2.0, 2.0, 5.0, 5.0, 5.0)
 
 
@@ -355,7 +356,9 @@ def test_options_are_plain_values_in_one_order() -> None:
     sensors = checked_sensors(given)
     assert list(sensors.items()) == [("imu", {}), ("gps", {**GPS, "delay": 1.0})]
     assert checked_sensors(sensors) == sensors
-    assert env_spec(ELEVATION, {"sensors": {"imu": False}}) == env_spec(ELEVATION)
+    assert env_spec(EnvConfig.from_keywords(ELEVATION, sensors={"imu": False})) == env_spec(
+        EnvConfig(env_id=ELEVATION)
+    )
 
 
 @pytest.mark.parametrize(
@@ -400,7 +403,7 @@ def test_options_are_plain_values_in_one_order() -> None:
 )
 def test_a_wrong_option_gives_one_sentence(sensors: Any, sentence: str) -> None:
     with pytest.raises(InputError, match=f"^{sentence}") as caught:
-        env_spec(HOVER, {"sensors": sensors})
+        env_spec(EnvConfig.from_keywords(HOVER, sensors=sensors))
     assert "\n" not in str(caught.value)
 
 
@@ -441,7 +444,7 @@ def test_a_batch_is_so_many_single_envs(observe: str) -> None:
 
 
 def test_a_frozen_drone_stays_as_it_is() -> None:
-    held, free = (Loop(HOVER, 2, options={"sensors": NOISY}) for _ in range(2))
+    held, free = (Loop(EnvConfig.from_keywords(HOVER, sensors=NOISY), 2) for _ in range(2))
     every, mask, actions = np.ones(2, bool), np.array([True, False]), actions_of(2, 12)
     for loop in (held, free):
         loop.advance(actions[0], every, [1, 2])
@@ -452,7 +455,7 @@ def test_a_frozen_drone_stays_as_it_is() -> None:
         free.advance(action)
         assert bits(held.observations, 0) == before
         assert bits(held.observations, 1) == bits(free.observations, 1)
-    after = Loop(HOVER, 2, options={"sensors": NOISY})
+    after = Loop(EnvConfig.from_keywords(HOVER, sensors=NOISY), 2)
     after.advance(actions[0], every, [1, 2])
     after.advance(actions[0])
     for action in actions[4:]:
@@ -466,7 +469,7 @@ def test_sensors_move_nothing_else(worlds: int) -> None:
     """Physics with contact, starts, and the readings of the other sensors keep their bits."""
     two = {name: NOISY[name] for name in ("imu", "gps")}
     none, some, all_of_them = (
-        Loop(HOVER, worlds, options={"sensors": sensors, "flight_band": 100.0})
+        Loop(EnvConfig.from_keywords(HOVER, sensors=sensors, flight_band=100.0), worlds)
         for sensors in ({}, two, NOISY)
     )
     every, down = np.ones(worlds, bool), np.full((worlds, 4), -0.5, np.float32)

@@ -149,7 +149,7 @@ def made_up(folder: Path, seeds: pd.DataFrame) -> None:
                   "episodes": 20},
         "rows": [
             {name: getattr(row, name) for name in vars(row)}
-            | {"spec": json.loads(env_spec(**row.env).to_json()), "bounds": {"hover": 17.25}}
+            | {"spec": json.loads(env_spec(row.flown).to_json()), "bounds": {"hover": 17.25}}
             for row in config.rows
         ],
     }  # fmt: skip

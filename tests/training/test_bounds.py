@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rotorgram.envs.tasks.elevation import ElevationOptions
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.tasks.racing import RacingOptions
 from rotorgram.envs.tasks.waypoints import WaypointsOptions
 from rotorgram.models.vehicle import Vehicle
@@ -54,19 +54,19 @@ def test_drag_makes_way_and_braking_shorter() -> None:
 
 def test_returns_of_the_papers_task() -> None:
     starts = (np.arange(40) - 19.5) / 20
-    bounds = elevation_bounds(ElevationOptions(), Vehicle.load(), starts)
+    bounds = elevation_bounds(EnvConfig(), Vehicle.load(), starts)
     # (s - |E|) / (s + |E|) with s = 0.5 m, over |E| uniform in 0 to 1 m: log 3 - 1 per step.
     assert bounds["hover"] == pytest.approx(250 * (np.log(3) - 1), rel=0.005)
     assert bounds["time-optimal"] == pytest.approx(232, abs=1)
     # Nothing is better than to be there at once, and thrust without inertia is better than with.
-    free = elevation_bounds(ElevationOptions(thrust_scale=100.0), Vehicle.load(), starts)
+    free = elevation_bounds(EnvConfig(task={"thrust_scale": 100.0}), Vehicle.load(), starts)
     assert bounds["time-optimal"] < free["time-optimal"] < 250
     assert elevation_reward(np.array([0.0, 0.5, -1.5])).tolist() == [1.0, 0.0, -0.5]
 
 
 def test_offsets_limit_the_acceleration_and_not_its_change() -> None:
-    options = ElevationOptions(action="offset", linear_drag=2.0)
-    bounds = elevation_bounds(options, Vehicle.load(linear_drag=2.0), np.array([1.0]))
+    config = EnvConfig(action="offset", effects={"linear_drag": 2.0})
+    bounds = elevation_bounds(config, Vehicle.load(linear_drag=2.0), np.array([1.0]))
     left = flown(1.0, 4.0, 4.0, drag=2.0)  # four rotors, 20 N each, 20 kg
     assert bounds["time-optimal"] == pytest.approx(elevation_reward(left).sum())
 
@@ -106,7 +106,7 @@ def test_the_largest_return_is_nearly_that_of_the_time_optimal_flight(start: flo
         returns.append(float(elevation_reward(sizes).sum()) + 250 - steps)
         slopes = 1 / (0.5 + sizes) ** 2
     best = max(returns)
-    optimal = elevation_bounds(ElevationOptions(), Vehicle.load(), np.array([start]))
+    optimal = elevation_bounds(EnvConfig(), Vehicle.load(), np.array([start]))
     assert best - 0.3 < optimal["time-optimal"] < best + 0.05
 
 

@@ -198,7 +198,7 @@ def test_a_comparison_of_several_drones(tmp_path: Path, monkeypatch: pytest.Monk
     arguments = ["compare", "--env", "rotorgram/Formation-v0", "--vehicle", "crazyflie2"]
     arguments += ["--drones", "2", "--num-envs", "64", "--agents", "ippo", "--seeds", "1"]
     arguments += ["--env-steps", "16384", "--snapshots", "1", "--episodes", "2", "--no-film"]
-    arguments += ["--env.episode-length", "20", "--jobs", "1", "--out", str(folder)]
+    arguments += ["--episode-length", "20", "--jobs", "1", "--out", str(folder)]
     assert main(arguments) == 0
     results = read_results(folder)
     assert sorted(set(results.evaluations["agent"])) == ["ippo", "orca"]

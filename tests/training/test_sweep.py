@@ -44,7 +44,7 @@ CONFIG = SweepConfig(
     seeds=2, env_steps=400, episodes=3, options=OPTIONS,
 )  # fmt: skip
 TIMES = ["seconds", "steps_per_second"]
-FLAGS = ("--env-steps", "300", "--episodes", "1", "--env.episode-length", "40")
+FLAGS = ("--env-steps", "300", "--episodes", "1", "--episode-length", "40")
 
 
 def nothing(*_: object) -> None:

@@ -20,6 +20,7 @@ import gymnasium as gym
 import numpy as np
 from peers import ANY, ENV_ID, launch
 from relay import FaultConfig, Relay, relaying
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.spec import component_names
 from rotorgram.udp import RemoteEnv, RemoteVectorEnv
@@ -29,7 +30,11 @@ BAD = FaultConfig(
     drop=0.3, duplicate=0.1, reorder=0.2, corrupt=0.05, truncate=0.02, reorder_by=0.0006, seed=1
 )
 OPTIONS = {"control_period": 0.01, "target": (4.0, 6.0)}
-NAMES = [n for array in env_spec(ENV_ID, OPTIONS).telemetry for n in component_names(array)]
+NAMES = [
+    n
+    for array in env_spec(EnvConfig.from_keywords(ENV_ID, **OPTIONS)).telemetry
+    for n in component_names(array)
+]
 
 SIMULATE = """
     import json, sys

@@ -32,6 +32,7 @@ from mcap.writer import Writer
 from peers import ANY, ENV_ID, Running
 from relay import FaultConfig, relaying
 from rotorgram.cli.replay import Replay
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.envs.spec import EnvSpec
 from rotorgram.models.errors import InputError
@@ -393,7 +394,7 @@ def test_other_options_and_another_model_are_noticed(
         return path
 
     options = dict(next(iter(Recording(flight.simulator))).session.spec.options)
-    verdict = Verification(other(options=options | {"linear_drag": 0.5}))
+    verdict = Verification(other(options=options | {"effects": {"linear_drag": 0.5}}))
     found = verdict.sessions[0].difference
     assert found is not None
     assert found.sequence == 3  # the resets are at rest; drag slows what moves
@@ -643,7 +644,7 @@ def test_statistics_every_ten_seconds_and_a_clock_that_is_set_back(
     sizes = []
     journal = Journal(path, Statistics(), side="agent")
     close = Close(session=1, sequence=1, reason="x" * 500)
-    hello = Hello(session=1, spec=Loop(ENV_ID, options={}).spec.to_json())
+    hello = Hello(session=1, spec=Loop(EnvConfig(env_id=ENV_ID)).spec.to_json())
     journal.tap(0, hello, binary.encode(hello))
     for _ in range(50):
         now[0] += 5 * 10**8

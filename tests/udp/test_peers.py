@@ -21,6 +21,7 @@ from random import Random
 import numpy as np
 import pytest
 from relay import FaultConfig, relaying
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.spec import EnvSpec
@@ -328,7 +329,7 @@ def fly(loop: Loop, action: float, *, reset: bool = False) -> None:
 
 
 def test_simulator_flies_the_closed_form_and_our_drone(simulator: list[str]) -> None:
-    seen, ours = flights(simulator, None, 250), Loop(ENV_ID, options={})
+    seen, ours = flights(simulator, None, 250), Loop(EnvConfig(env_id=ENV_ID))
     assert len(seen) == 2 * 251
     for i, (action, observation, reward, *ends, info) in enumerate(seen):
         step = i % 251
@@ -478,7 +479,7 @@ class Hand:
         low, high, worlds, size = struct.unpack_from("<BB2xII", got, 24)
         assert (low, high, worlds, len(got)) == (2, 2, 1, 40 + size)
         assert EnvSpec.from_json(got[40:].decode()) == replace(
-            env_spec(ENV_ID, {}), vehicle="point mass", vehicle_hash="0" * 32
+            env_spec(EnvConfig(env_id=ENV_ID)), vehicle="point mass", vehicle_hash="0" * 32
         )
 
     def state(self, sequence: int) -> tuple[float, tuple[float, ...], tuple[float, ...], int, int]:

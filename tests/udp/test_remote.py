@@ -44,7 +44,7 @@ SIMULATE = """
     "options",
     [
         {},
-        {"action_type": "discrete", "observation": "error", "linear_drag": 0.5},
+        {"action_type": "discrete", "observation": "error", "effects": {"linear_drag": 0.5}},
         {"target": (4.0, 6.0), "episode_length": 20, "action": "offset"},
     ],
 )

@@ -18,6 +18,7 @@ import pytest
 from gymnasium import spaces
 from peers import ANY, ENV_ID, Running, launch, plain_socket
 from remotes import QUICK, Broken, flying
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.models import QUAD_XML
 from rotorgram.models.errors import InputError
@@ -139,7 +140,12 @@ WAYPOINTS = [[1.25, -0.5, 0.01 * i] for i in range(40)]
     [
         ({"env_id": ENV_ID}, "Own-v0", {}, f"expected a simulator of {ENV_ID}, got one of Own-v0"),
         ({"options": {"target": 3.0}}, ENV_ID, {}, r"target 3.0, got"),
-        ({"options": {}}, ENV_ID, {"linear_drag": 0.5}, "linear_drag 0.0, got 0.5"),
+        (
+            {"options": {}},
+            ENV_ID,
+            {"effects": {"linear_drag": 0.5}},
+            "expected effects not to be there, got {'linear_drag': 0.5}",
+        ),
         ({"options": {"wind": 1.0}}, "Own-v0", {}, "wind 1.0, got not to be there"),
         ({"options": {"wind": 1.0}}, "Own-v0", {"wind": 2.0}, "wind 1.0, got 2.0"),
         ({"options": {"winds": 1.0}}, ENV_ID, {}, "winds"),
@@ -169,7 +175,7 @@ def test_spaces_in_a_distribution_do_not_differ() -> None:
 
 def test_an_option_that_the_agent_does_not_know_is_refused() -> None:
     """A later version of the env may have more of them."""
-    spec = env_spec(ENV_ID, {})
+    spec = env_spec(EnvConfig(env_id=ENV_ID))
     spec = replace(spec, options={**spec.options, "gusts": 1.0})
     with (
         RemoteEnv(ANY, env_id=ENV_ID, options={}, connect=False, connect_timeout=0.2) as remote,
@@ -462,13 +468,13 @@ def test_text_needs_an_env_that_is_known_here() -> None:
 def test_the_spec_over_the_wire_is_that_of_the_env(tmp_path: Path) -> None:
     with flying(target=3.0) as pair:
         pair.remote.reset()
-        assert pair.remote.env_spec == env_spec(ENV_ID, {"target": 3.0})
+        assert pair.remote.env_spec == env_spec(EnvConfig.from_keywords(ENV_ID, target=3.0))
         assert pair.remote.control_period == 0.02
         assert threading.active_count() < 20
 
 
 def test_a_world_of_two_drones_is_more_than_one_drone() -> None:
-    two = replace(env_spec(ENV_ID), agents=("first", "second"))
+    two = replace(env_spec(EnvConfig(env_id=ENV_ID)), agents=("first", "second"))
     hello = Hello(session=1, spec=two.to_json())
     assert AgentConfig(drones=1).accept(hello) == "expected a simulator of one drone, got one of 2"
     layout = AgentConfig(drones=2).accept(hello)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from peers import ANY, Running, launch
 from relay import FaultConfig, relaying
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.models import QUAD_XML, InputError
 from rotorgram.udp import (
@@ -153,7 +154,7 @@ def in_process(
     lost: tuple[int, int, str] | None = None, first: int = 0, **options: Any,
 ) -> dict[int, list[list[Step]]]:  # fmt: skip
     """The same in one process; `lost`: a drone, a step of the first episode, and its policy."""
-    loop = Loop(RISE, drones=drones, options=options)
+    loop = Loop(EnvConfig.from_keywords(RISE, drones=drones, **options))
     seen: dict[int, list[list[Step]]] = {drone: [] for drone in range(drones)}
     for episode in range(episodes):
         nothing = np.zeros((drones, 1), np.float32)
@@ -545,7 +546,7 @@ def test_a_policy_that_does_not_exist_is_told() -> None:
 
 
 def test_a_landing_drone_comes_down_at_its_speed_and_is_then_out() -> None:
-    loop = Loop(RISE, drones=2, options={"episode_length": 2000})
+    loop = Loop(EnvConfig.from_keywords(RISE, drones=2, episode_length=2000))
     nothing = np.zeros((2, 1), np.float32)
     loop.advance(nothing, np.ones(2, bool), [1, 1])
     start = loop.world.state.position.copy()

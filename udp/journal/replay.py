@@ -122,7 +122,8 @@ class SessionVerdict:
                 f"expected a registered env id, got {spec.env_id!r}: "
                 "--env MODULE:NAME names the module that registers it"
             )
-        count, drag = self.session.num_envs, spec.options.get("linear_drag", 0.0)
+        count = self.session.num_envs
+        drag = spec.options.get("effects", {}).get("linear_drag", 0.0)
         craft = load_vehicles(self.vehicle, len(spec.agents), linear_drag=drag)
         was, now = spec.vehicle_hash, craft.hash
         other = bool(was.strip("0")) and was != now

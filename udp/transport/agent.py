@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 from ...envs import registry
+from ...envs.config import EnvConfig
 from ...envs.spec import EnvSpec, canonical_id, json_values
 from ...models.errors import InputError, expect
 from ..layouts import layout_of
@@ -125,7 +126,7 @@ class AgentConfig:
         """
         options = dict(self.options or {})
         if self.options is not None and registry.is_known(env_id):
-            options = registry.options_type(env_id).from_options(options).to_options()
+            options = EnvConfig.from_keywords(env_id, **options).flat_options()
         return json_values(options)
 
     @cached_property
@@ -138,7 +139,7 @@ class AgentConfig:
         if env_id is None or not registry.is_known(env_id) or self.drones not in (None, 1):
             return None
         try:
-            spec = registry.env_spec(env_id, dict(self.options or {}))
+            spec = registry.env_spec(EnvConfig.from_keywords(env_id, **(self.options or {})))
             text.check_layout(layout_of(spec))
         except (InputError, ImportError):  # the latter without MuJoCo
             return None

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
@@ -50,11 +50,13 @@ def make_stepped(
     expect(num_envs % drones == 0, "drones", f"a divisor of num_envs = {num_envs}", f"{drones}")
     if isinstance(env, str):
         if registry.is_known(env):
+            from ...envs.config import EnvConfig
             from ...envs.loop import Loop
 
-            name, chosen = canonical_id(env), cast(Any, backend)
-            return Loop(name, num_envs // drones, drones=drones, vehicle=vehicle, backend=chosen,
-                        options=options)  # fmt: skip
+            config = EnvConfig.from_keywords(
+                env, drones=drones, vehicle=vehicle, backend=backend, **options
+            )
+            return Loop(config, num_envs // drones)
         try:
             envs = [gym.make(env, disable_env_checker=True, **options) for _ in range(num_envs)]
         except (gym.error.Error, ImportError) as error:

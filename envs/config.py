@@ -1,0 +1,381 @@
+"""The configuration of an env: one immutable record of everything that its numbers depend on.
+
+Defaults come from the task, then from a file, then from flags or keyword arguments.
+"""
+
+import inspect
+import json
+import sys
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from hashlib import blake2b
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Self
+
+from ..models import BACKENDS, MAX_DRONES, Backend
+from ..models.errors import InputError, UnknownOption
+from ..models.fields import Choice, Limits, check, check_fields
+from ..scenes import scenes_of
+from ..sim import EffectOptions, Randomization, checked_sensors
+from . import registry
+from .spec import canonical_id, json_values
+
+if TYPE_CHECKING:
+    from ..models.vehicle import Vehicle
+    from .tasks.task import TaskOptions
+
+VERSION: Final = 1
+"""Version of a config's JSON."""
+DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
+MAX_CONTROL_PERIOD: Final = 1.0  # s
+MAX_EPISODE_LENGTH: Final = 1 << 31  # control steps
+MAX_HISTORY: Final = 1000  # observations side by side
+_MAX_FILE: Final = 1 << 24  # bytes
+_NO_EFFECTS: Final = EffectOptions()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneConfig:
+    """Ground and obstacles around the drones."""
+
+    name: str = "plain"
+    """One of `scenes.SCENES`."""
+    seeds: tuple[int, ...] = ()
+    """Seeds of a generated scene. Of several seeds, each episode draws one."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "seeds", tuple(self.seeds))
+        scenes_of(str(self))
+
+    def __str__(self) -> str:
+        """The text that `parse` reads: `forest`, `forest:3` or `forest:0-7`."""
+        if not self.seeds:
+            return self.name
+        first, last = self.seeds[0], self.seeds[-1]
+        return f"{self.name}:{first}" if first == last else f"{self.name}:{first}-{last}"
+
+    @classmethod
+    def parse(cls, scene: Any) -> Self:
+        """A scene from its text, or from its fields by name. Raises `InputError`."""
+        if isinstance(scene, cls):
+            return scene
+        if isinstance(scene, Mapping):
+            return cls(**known_only("scene", scene, _names(cls)))
+        texts = scenes_of(scene)
+        seeds = [text.partition(":")[2] for text in texts]
+        return cls(
+            name=texts[0].partition(":")[0], seeds=tuple(int(seed) for seed in seeds if seed)
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackendConfig:
+    """What steps the drones."""
+
+    name: Backend = "mujoco"
+    num_threads: int | None = None
+    """Threads of `mujoco`; 0: one for each processor; None: as the backend chooses."""
+    dtype: str | None = None
+    """Of `rigid`: `float32`, the default, or `float64`."""
+    compiled: bool | None = None
+    """Of `rigid`: None compiles where a compiler is found. It changes no number."""
+
+    def __post_init__(self) -> None:
+        if self.name not in BACKENDS:
+            raise InputError(f"backend: expected {' or '.join(BACKENDS)}, got {self.name!r}")
+
+    @classmethod
+    def parse(cls, backend: Any) -> Self:
+        """A backend from its name, or from its fields by name. Raises `InputError`."""
+        if isinstance(backend, cls):
+            return backend
+        if isinstance(backend, Mapping):
+            return cls(**known_only("backend", backend, _names(cls)))
+        return cls(name=backend)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings that are not None, as keyword arguments of `sim.make_world`."""
+        values = {name: value for name, value in asdict(self).items() if value is not None}
+        del values["name"]
+        return values
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConfig:
+    """The task, and everything that it is flown with.
+
+    Where the env id is registered here, fields that are None take the task's defaults, and `task`
+    holds all of its options. Another env of Gymnasium keeps its keyword arguments in `task`.
+
+    Raises `InputError` for a field of a wrong type or out of its range.
+    """
+
+    env_id: str = DEFAULT_ENV
+    """Id of a registered task, without a module."""
+    task: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """Options of the task by name."""
+    vehicle: tuple[str, ...] = ()
+    """Names of the library, or files; several for the drones of a world in turn. None given: the
+    paper's quadcopter."""
+    drones: Annotated[int, Limits(1, MAX_DRONES, whole=True)] = 1
+    """Drones of each world."""
+    scene: SceneConfig = SceneConfig()
+    action: str | None = None
+    """What an action sets: one of `sim.LEVELS`."""
+    control_period: Annotated[float | None, Limits(1e-6, MAX_CONTROL_PERIOD, "s")] = None
+    """Time between two actions, s: a multiple of the physics step, at most 1 s."""
+    episode_length: Annotated[
+        int | None, Limits(1, MAX_EPISODE_LENGTH, "control steps", whole=True)
+    ] = None
+    """Control steps after which an episode is truncated."""
+    history: Annotated[int, Limits(1, MAX_HISTORY, "observations", whole=True)] = 1
+    """Number of the last observations that are observed side by side, the oldest first. A reset
+    fills them with the first observation."""
+    effects: EffectOptions = _NO_EFFECTS
+    randomize: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """Distributions of what is drawn for each episode: names of `sim.PARAMETERS` to texts."""
+    sensors: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """Settings by sensor, or true; see `sim/sensors.py`."""
+    cameras: tuple[str, ...] = ()
+    """Pictures that are observed: cameras of the vehicle as NAME, NAME_KIND or
+    NAME@WIDTHxHEIGHT."""
+    backend: BackendConfig = BackendConfig()
+    vehicle_hash: str = ""
+    """Hash of the vehicle's model; set by `resolve`."""
+    task_hash: str = ""
+    """Hash of the source of a task that is not ours; set by `resolve`."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        self._set(env_id=canonical_id(self.env_id))
+        self._set(scene=SceneConfig.parse(self.scene), backend=BackendConfig.parse(self.backend))
+        self._set(vehicle=_vehicles(self.vehicle), cameras=_words("cameras", self.cameras))
+        self._set(sensors=checked_sensors(self.sensors))
+        if not isinstance(self.effects, EffectOptions):
+            self._set(effects=EffectOptions.from_options(self.effects))
+        self._set(randomize=Randomization(self.randomize, None).to_options())
+        if not isinstance(self.task, Mapping):
+            raise InputError(f"task: expected options by name, got {self.task!r:.80}")
+        options: Mapping[str, Any] = self.task
+        if registry.is_known(self.env_id):
+            task = registry.task_type(self.env_id)
+            defaults = {name: getattr(task, name) for name in _FROM_TASK}
+            self._set(**{k: v for k, v in defaults.items() if getattr(self, k) is None})
+            check("action", Choice(task.actions), self.action)
+            options = task.Options.from_options(options, KEYWORDS).to_options()
+        self._set(task=json_values(options))
+
+    def _set(self, **values: Any) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    # ---- other forms
+
+    @classmethod
+    def from_keywords(cls, env_id: str = DEFAULT_ENV, **keywords: Any) -> Self:
+        """A config from the flat keyword arguments of `gym.make`.
+
+        A keyword that is a field, or a setting of the backend, is that; any other is an option of
+        the task. `task={...}` holds options of the task whatever their names are. Raises
+        `InputError`, which is a `TypeError` too for a name that is not known.
+        """
+        options = {name: value for name, value in keywords.items() if name not in KEYWORDS}
+        nested = options.pop("task", {})
+        given = {name: value for name, value in keywords.items() if name not in options}
+        given = {name: value for name, value in given.items() if value is not None}
+        given.pop("task", None)
+        settings = {name: given.pop(name) for name in _BACKEND_KEYWORDS if name in given}
+        if settings:
+            base = BackendConfig.parse(given.get("backend", BackendConfig()))
+            given["backend"] = replace(base, **settings)
+        if not isinstance(nested, Mapping):
+            raise InputError(f"task: expected options by name, got {nested!r:.80}")
+        return cls(env_id=env_id, task={**options, **nested}, **given)
+
+    def flat_options(self) -> dict[str, Any]:
+        """Keywords of everything but the vehicle, the drones and the backend, as JSON values.
+
+        Every option of the task, and every other field that is not empty.
+        """
+        values: dict[str, Any] = {name: getattr(self, name) for name in _OPTIONS}
+        values["effects"] = self.effects.to_options()
+        if self.cameras:
+            values["scene"] = str(self.scene)
+        values = {name: value for name, value in values.items() if value not in (None, (), {})}
+        hidden = {name: value for name, value in self.task.items() if name in KEYWORDS}
+        shown = {name: value for name, value in self.task.items() if name not in KEYWORDS}
+        return json_values({**values, **shown, **({"task": hidden} if hidden else {})})
+
+    @classmethod
+    def from_toml(cls, path: Path | str, **keywords: Any) -> Self:
+        """A config from a TOML file of keywords, `env_id` among them; keyword arguments win.
+
+        A relative path of a vehicle is looked for beside the file first. Raises `InputError`.
+        """
+        return cls.from_keywords(**read_toml(path) | keywords)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All fields as JSON values, with the version."""
+        content = {one.name: getattr(self, one.name) for one in fields(self)}
+        content |= {"effects": self.effects.to_options()}
+        content |= {"scene": asdict(self.scene), "backend": asdict(self.backend)}
+        return json_values({"version": VERSION, **content})
+
+    @classmethod
+    def from_dict(cls, content: Any) -> Self:
+        """The reverse of `to_dict`. Raises `InputError`."""
+        if not isinstance(content, Mapping):
+            raise InputError(f"config: expected an object, got {content!r:.80}")
+        given = dict(content)
+        version = given.pop("version", None)
+        if version != VERSION:
+            raise InputError(f"config: expected version {VERSION}, got {version!r:.80}")
+        return cls(**known_only("config", given, _names(cls)))
+
+    # ---- checks that need more than one field, and the files
+
+    @property
+    def module(self) -> str | None:
+        """Module that another process imports to know the task; None for ours."""
+        known = registry.is_known(self.env_id)
+        name = registry.task_type(self.env_id).__module__ if known else "__main__"
+        return None if name.startswith("rotorgram.") or name == "__main__" else name
+
+    @property
+    def task_options(self) -> "TaskOptions":
+        """The task's options as its own dataclass."""
+        return registry.task_type(self.env_id).Options.from_options(self.task)
+
+    @property
+    def estimated(self) -> bool:
+        """Whether controller and observation get the onboard estimate, once a control step."""
+        return self.sensors.get("observe") == "estimate"
+
+    def load_vehicle(self) -> "Vehicle":
+        """The vehicle, or a `Fleet` of several. Raises `InputError`."""
+        from ..models.fleet import load_vehicles
+
+        words = ",".join(self.vehicle) or None
+        return load_vehicles(words, self.drones, linear_drag=self.effects.linear_drag)
+
+    def resolve(self) -> Self:
+        """The same with the hashes of its files. Refuses by name what cannot be flown together.
+
+        Raises `InputError`.
+        """
+        from ..sim.world import check_world
+
+        task = registry.task_type(self.env_id)
+        if not task.min_drones <= self.drones <= task.max_drones:
+            most = f" to {task.max_drones}" if task.max_drones > task.min_drones else ""
+            expected = f"{task.min_drones}{most} with {self.env_id}"
+            raise InputError(f"drones: expected {expected}, got {self.drones}")
+        vehicle = self.load_vehicle()
+        vehicle.substeps(self.control_period or 0.0)
+        several = len(self.vehicle) > 1
+        if several and self.sensors:
+            got = ", ".join(self.sensors)
+            raise InputError(f"sensors: expected none with several vehicles, got {got}")
+        randomize = Randomization(self.randomize, None)
+        settings = self.backend.settings
+        check_world(vehicle, self.backend.name, self.drones, self.effects, randomize, settings)
+        resolved = replace(self, vehicle_hash=vehicle.hash, task_hash=source_hash(task))
+        for name in ("vehicle_hash", "task_hash"):
+            was, now = getattr(self, name), getattr(resolved, name)
+            if was and was != now:
+                raise InputError(f"{name}: expected {was}, got {now}")
+        return resolved
+
+    @property
+    def digest(self) -> str:
+        """32 hexadecimal digits of the resolved config, without what changes no number."""
+        resolved = self if self.vehicle_hash else self.resolve()
+        content = resolved.to_dict()
+        content.pop("vehicle")  # its hash is there
+        for name in ("num_threads", "compiled"):
+            content["backend"].pop(name)
+        text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+        return blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+_FROM_TASK: Final = ("action", "control_period", "episode_length")
+_OPTIONS: Final = (
+    "episode_length", "action", "control_period", "history", "effects", "randomize", "sensors",
+    "cameras",
+)  # fmt: skip
+_FLAT: Final = (*_OPTIONS, "scene", "vehicle", "drones", "backend")
+_BACKEND_KEYWORDS: Final = ("num_threads", "dtype", "compiled")
+KEYWORDS: Final = (*_FLAT, *_BACKEND_KEYWORDS)
+"""Keywords that are not options of a task."""
+
+
+def known_only(what: str, given: Mapping[str, Any], known: Sequence[str]) -> dict[str, Any]:
+    """The given values by name. Raises `UnknownOption` for a name that is not known."""
+    for name in given:
+        if name not in known:
+            raise UnknownOption(f"{what}: expected some of {', '.join(known)}, got {name!r}")
+    return dict(given)
+
+
+def read_toml(path: Path | str) -> dict[str, Any]:
+    """Keywords of a config's file. Raises `InputError`."""
+    file = Path(path)
+    try:
+        if file.stat().st_size > _MAX_FILE:
+            raise InputError(f"config: expected at most {_MAX_FILE} bytes, got more in {file}")
+        content = tomllib.loads(file.read_text("utf-8"))
+    except OSError as error:
+        raise InputError(f"config: cannot read {file}: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"config: expected a TOML file, got {file}: {error}") from None
+    if "vehicle" in content:
+        words = _vehicles(content["vehicle"])
+        beside = [file.parent / word for word in words]
+        content["vehicle"] = tuple(
+            str(near) if near.is_file() else word for near, word in zip(beside, words, strict=True)
+        )
+    return content
+
+
+def source_hash(task: type) -> str:
+    """Hash of the source of a task and its bases that are not ours; empty for a task of ours."""
+    digest = blake2b(digest_size=16)
+    found = False
+    for base in task.__mro__:
+        if base.__module__.partition(".")[0] in ("rotorgram", "builtins"):
+            continue
+        try:
+            source = inspect.getsource(sys.modules[base.__module__])
+        except (OSError, TypeError, KeyError):
+            source = base.__qualname__  # typed into an interpreter
+        digest.update(source.encode())
+        found = True
+    return digest.hexdigest() if found else ""
+
+
+def _names(kind: type) -> list[str]:
+    return [one.name for one in fields(kind)]
+
+
+def _vehicles(given: Any) -> tuple[str, ...]:
+    """Names and files of vehicles, of a text with commas between them or of several texts."""
+    if isinstance(given, str | Path):
+        text = str(given)
+        several = isinstance(given, str) and "," in text and not Path(text).exists()
+        return tuple(word.strip() for word in text.split(",")) if several else (text,)
+    if not isinstance(given, list | tuple):
+        raise InputError(f"vehicle: expected names or files, got {given!r:.80}")
+    for word in given:
+        if not isinstance(word, str | Path):
+            raise InputError(f"vehicle: expected names or files, got {given!r:.80}")
+    return tuple(str(word) for word in given)
+
+
+def _words(name: str, given: Any) -> tuple[str, ...]:
+    """Words of a text with commas, or of several texts. Raises `InputError`."""
+    texts = [given] if isinstance(given, str) else given
+    if not isinstance(texts, list | tuple) or not all(isinstance(one, str) for one in texts):
+        raise InputError(f"{name}: expected names, with commas between them, got {given!r:.80}")
+    return tuple(word for text in texts for word in text.replace(",", " ").split())
