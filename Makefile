@@ -3,10 +3,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 PACKAGES := models scenes sim envs udp agents rendering flights training cli
 
-.PHONY: install demo test test-other-processor test-wheel test-libraries lint types docs clean
+.PHONY: install demo test test-other-processor test-wheel test-libraries lint types links docs clean
 
-# What trains, draws, reports and records; Ray, Warp and the tools of `make test` are left out.
-install: .venv/.train,record,render,report
+# What trains, draws, reports and records; Ray and the tools of `make test` are left out.
+install: .venv/.train,record,render,report links
 
 # A short comparison: three agents, three seeds, eight drones; a minute and a half on two cores. Too short
 # and too few seeds to decide the paper's claims: docs/results.md has the long one.
@@ -44,11 +44,14 @@ lint: .venv/.dev
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 
-# mypy does not follow editable installs; .venv/types shows it the packages under their names.
-types: .venv/.dev
+types: .venv/.dev links
+	$(BIN)/mypy
+
+# Editors and mypy do not follow editable installs: .venv/types shows them the packages under their
+# names, and pyproject.toml names that folder.
+links:
 	@mkdir -p .venv/types/rotorgram
 	@for p in $(PACKAGES); do ln -sfn ../../../$$p .venv/types/rotorgram/$$p; done
-	MYPYPATH=.venv/types $(BIN)/mypy
 
 # The pages as a site, in build/site: python -m http.server -d build/site. A warning fails it.
 docs: .venv/.dev
