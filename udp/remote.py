@@ -142,7 +142,10 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         """Fly for one control period. The action is sent in the dtype of its space."""
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
-        actions = _checked_actions(action, self._dtype, self._row)[np.newaxis]
+        fits = type(action) is np.ndarray and action.dtype == self._dtype
+        if not fits or action.shape != self._row:
+            action = _checked_actions(action, self._dtype, self._row)
+        actions = action[np.newaxis]
         self._flying = False  # until the answer is there
         try:
             self._agent.exchange({0: (actions, _FLY, None)})

@@ -4,6 +4,7 @@ import socket
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -138,14 +139,16 @@ class Quiet(sockets.Socket):
 def test_waits_look_for_a_moment_and_seldom_in_vain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fault 17: looking costs the processor."""
     slept: list[float] = []
-    monkeypatch.setattr(sockets, "_sleep", lambda _, timeout: slept.append(timeout))
+    poll = SimpleNamespace(poll=lambda milliseconds: slept.append(milliseconds / 1000))
     with Quiet() as sock:
+        sock._poll = poll
         monkeypatch.setattr(sockets, "time", sock)
         looks = sock.waits(200)
         assert [wait for wait, count in enumerate(looks) if count] == [0, 5, 22, 87, 152]
         assert 50 < max(looks) <= 101
         assert slept == [0.05] * 200
     with Quiet() as sock:
+        sock._poll = poll
         monkeypatch.setattr(sockets, "time", sock)
         sock.pace = 100e-6  # others have the core in between
         assert sock.waits(1) == [1]

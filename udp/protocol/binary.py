@@ -215,7 +215,12 @@ def encode_command(m: Command, layout: Layout) -> bytes:
         pieces += (bytes(slot.at - end), array.tobytes())
         end = slot.end
     rest = b"".join(pieces)
-    _check_command(_START + rest, layout)
+    flags = m.orders.tobytes().translate(None, b"\0\1\2")
+    if flags:
+        raise _wrong_flags(flags, 2)
+    quick = layout.command_numbers
+    if quick is None or not isfinite(sum(quick.unpack_from(rest, _ACTIONS_AT))):
+        _check_actions(_START + rest, layout)
     crc = zlib.crc32(rest, _COMMAND_CRC)
     return _COMMAND_START + crc.to_bytes(4, "little") + rest
 
@@ -227,7 +232,13 @@ def _decode_command(data: bytes, session: int, sequence: int, layout: Layout) ->
     slots = [layout.actions, layout.orders, layout.seeds][: 3 if count else 2]
     if len(data) != slots[-1].end:
         raise _wrong_size(data, slots[-1].end)
-    _check_command(data, layout)
+    orders = layout.orders
+    flags = data[orders.at : orders.end].translate(None, b"\0\1\2")
+    if flags:
+        raise _wrong_flags(flags, 2)
+    quick = layout.command_numbers
+    if quick is None or not isfinite(sum(quick.unpack_from(data, COMMAND_ARRAYS_AT))):
+        _check_actions(data, layout)
     arrays = []
     for slot in slots:
         arrays.append(np.ndarray(slot.shape, slot.dtype, data, slot.at))
@@ -240,21 +251,17 @@ def _decode_command(data: bytes, session: int, sequence: int, layout: Layout) ->
     )
 
 
-def _check_command(data: bytes, layout: Layout) -> None:
-    actions, orders = layout.actions, layout.orders
-    if wrong := data[orders.at : orders.end].translate(None, b"\0\1\2"):
-        raise _wrong_flags(wrong, 2)
-    if layout.choices:
-        numbers = actions.view(data)
-        beyond = (numbers < 0) | (numbers >= layout.choices)
-        if beyond.any():
-            raise InputError(
-                f"action: expected a choice 0 to {layout.choices - 1}, got {numbers[beyond][0]}"
-            )
-        return
-    quick = layout.command_numbers
-    if quick is None or not isfinite(sum(quick.unpack_from(data, COMMAND_ARRAYS_AT))):
+def _check_actions(data: bytes, layout: Layout) -> None:
+    """Raises `InputError` for a choice that does not exist, or numbers that are not finite."""
+    actions = layout.actions
+    if not layout.choices:
         _expect_finite("action", data, (actions,))
+        return
+    numbers = actions.view(data)
+    beyond = (numbers < 0) | (numbers >= layout.choices)
+    if beyond.any():
+        most = layout.choices - 1
+        raise InputError(f"action: expected a choice 0 to {most}, got {numbers[beyond][0]}")
 
 
 def _misfit(what: str, shape: tuple[int, ...], dtype: np.dtype, array: np.ndarray) -> InputError:
@@ -399,6 +406,7 @@ _STATE_CRC: Final = zlib.crc32(_STATE_START)
 _COMMAND_CRC: Final = zlib.crc32(_COMMAND_START)
 _START: Final = bytes(8)  # in the place of a start, for a look at arrays by their offset
 _BODY_AT: Final = HEADER_SIZE - len(_START)
+_ACTIONS_AT: Final = COMMAND_ARRAYS_AT - len(_START)
 
 _DUE: Final[dict[int, tuple[bytes, int, Callable[..., State | Command]]]] = {
     STATE: (_STATE_START, _STATE_CRC, _decode_state),

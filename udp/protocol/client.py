@@ -232,7 +232,7 @@ class Client:
         self._transfer: Transfer | None = None  # of the outstanding message
         self._transfer_key: Key | None = None
         self._asking = b""  # the datagram that was sent last and wants an answer
-        self._outgoing: list[bytes] = []
+        self.outgoing: list[bytes] = []
         self._round_trips = RoundTrips()
         self.asked_at = self._answered_at = 0.0
         self.resend_at = self.deadline = inf
@@ -299,8 +299,9 @@ class Client:
         if self.state is SimulatorState.WAITING and self._is_plain:
             session, sequence = self.hello.session, self.sequence
             message = binary.decode_due(binary.COMMAND, datagram, session, sequence, self.layout)
-            if message is not None:
-                return self._take(message, _AFTER_COMMAND, datagram, now)
+            if isinstance(message, Command):
+                self._take_command(message, datagram, now)
+                return message
         return self._receive_any(datagram, now)
 
     def _receive_any(self, datagram: bytes, now: float) -> Message | None:
@@ -370,7 +371,7 @@ class Client:
 
     def take_outgoing(self) -> list[bytes]:
         """Datagrams to send to the agent, each once."""
-        outgoing, self._outgoing = self._outgoing, []
+        outgoing, self.outgoing = self.outgoing, []
         return outgoing
 
     # ---- what came
@@ -380,13 +381,7 @@ class Client:
     ) -> Message | None:
         """A message that may come now."""
         if isinstance(message, Command):
-            self.state, self._transfer = state, None
-            self.resend_at = self.deadline = inf
-            self._answered_at = now
-            if self.tap:
-                self._record(message, plain)
-            self.statistics.round_trips.add(now - self.asked_at)
-            self._round_trips.answered(now)
+            self._take_command(message, plain, now)
             return message
         was_closing = self.state is SimulatorState.CLOSING
         if isinstance(message, m.Missing | m.Wait | m.Alive):
@@ -424,6 +419,15 @@ class Client:
             self.statistics.counters["sent"] += 1
             self._record(close, data)
         return message
+
+    def _take_command(self, command: Command, plain: bytes, now: float) -> None:
+        self.state, self._transfer = _AFTER_COMMAND, None
+        self.resend_at = self.deadline = inf
+        self._answered_at = now
+        if self.tap:
+            self._record(command, plain)
+        self.statistics.round_trips.add(now - self.asked_at)
+        self._round_trips.answered(now)
 
     def _open(self, datagram: bytes) -> bytes:
         """A datagram without its seal: the session's key, or the shared one for what opens it."""
@@ -510,11 +514,16 @@ class Client:
         self.sends = self._tries = 1
         self._stretch = 1.0
         self._round_trips.sent(now, first=True)
-        self._put(transfer.start(), self._transfer_key)
-        closing = kind is m.Close
+        if transfer.count == 1 and self._is_plain and not self._dice:
+            self.outgoing.append(data)
+        else:
+            self._put(transfer.start(), self._transfer_key)
         self.asked_at = now
-        self.resend_at = now + (CLOSE_INTERVAL if closing else self._round_trips.wait(1))
-        self.deadline = now + (CLOSE_LINGER if closing else self.config.timeout)
+        if kind is m.Close:
+            self.resend_at, self.deadline = now + CLOSE_INTERVAL, now + CLOSE_LINGER
+        else:
+            self.resend_at = now + self._round_trips.interval
+            self.deadline = now + self.config.timeout
         self.statistics.counters["sent"] += 1
 
     def _put(self, datagrams: list[bytes], key: Key | None) -> None:
@@ -523,7 +532,7 @@ class Client:
             self._asking = sealed[-1]
         if self._dice:
             sealed = [datagram for datagram in sealed if not self._is_lost()]
-        self._outgoing += sealed
+        self.outgoing += sealed
 
     def _is_lost(self) -> bool:
         """Whether the next datagram is lost on purpose."""

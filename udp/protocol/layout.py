@@ -67,7 +67,7 @@ class Layout:
         actions: Of the actions in a Command: (N, *shape), or int64 of shape (N,) if discrete.
         orders: uint8, shape (N,).
         seeds: uint64, shape (N,), in a Command that has any; others end before.
-        command_numbers: Reads every float of a Command, as `state_numbers`.
+        command_numbers: Reads every float of a Command, as `state_numbers`; None too if discrete.
         state_size: Bytes of a State.
         command_size: Bytes of a Command with seeds.
 
@@ -113,7 +113,7 @@ class Layout:
         arrays = [actions, ArrayLayout((), "uint8"), ArrayLayout((), "uint64")]
         self.actions, self.orders, self.seeds = _slots(COMMAND_ARRAYS_AT, drones, arrays)
         self.command_size = self.seeds.end
-        self.command_numbers = _numbers("", COMMAND_ARRAYS_AT, [self.actions] if action else [])
+        self.command_numbers = _numbers("", COMMAND_ARRAYS_AT, [self.actions]) if action else None
         if (size := max(self.state_size, self.command_size)) > MAX_MESSAGE:
             most = f"States and Commands of at most {MAX_MESSAGE} bytes"
             raise InputError(f"expected {most}, got {size}")

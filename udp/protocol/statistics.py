@@ -1,7 +1,7 @@
 """Statistics of one side of the wire: counts, round trips, and notices at a bounded rate."""
 
-from collections import Counter
-from math import frexp
+from collections import Counter, deque
+from math import ceil
 from typing import Final
 
 from .messages import one_line
@@ -9,39 +9,34 @@ from .messages import one_line
 NOTICE_INTERVAL: Final = 10.0  # shortest time between two notices of the same cause, s
 REPORT_INTERVAL: Final = 60.0  # time between two reports of all numbers, s
 
-_STEPS: Final = 32  # buckets for each doubling: a quantile is right to 3 %
+_REMEMBERED: Final = 1 << 14
 _QUIET: Final = frozenset({"duplicate", "stale"})
 """Events of every network that loses datagrams: counted, without a notice."""
 
 
 class Durations:
-    """Quantiles of any number of durations in a bounded table of logarithmic buckets."""
+    """The last 16,384 durations, s."""
 
     def __init__(self) -> None:
-        self.count = 0
-        self.longest = 0.0  # s; 0 while there is none
-        self._buckets: Counter[int] = Counter()
+        self._last: deque[float] = deque(maxlen=_REMEMBERED)
+        self.add = self._last.append  # called in every step
 
-    def add(self, seconds: float) -> None:
-        """Count one. Below a nanosecond is a nanosecond: clocks may stand still."""
-        if seconds < 1e-9:
-            seconds = 1e-9
-        mantissa, exponent = frexp(seconds)  # mantissa in [0.5, 1)
-        self._buckets[exponent * _STEPS + int((mantissa - 0.5) * (2 * _STEPS))] += 1
-        self.count += 1
-        if seconds > self.longest:
-            self.longest = seconds
+    @property
+    def count(self) -> int:
+        """Number of durations."""
+        return len(self._last)
+
+    @property
+    def longest(self) -> float:
+        """Longest duration, s; 0 while there is none."""
+        return max(self._last, default=0.0)
 
     def quantile(self, share: float) -> float:
-        """Duration that the given share of all does not exceed, s; 0 if there is none."""
-        wanted, seen = share * self.count, 0
-        for bucket in sorted(self._buckets):
-            seen += self._buckets[bucket]
-            if seen >= wanted:
-                exponent, part = divmod(bucket, _STEPS)
-                upper: float = (0.5 + (part + 1) / (2 * _STEPS)) * 2.0**exponent
-                return min(upper, self.longest)
-        return 0.0
+        """Duration that the given share does not exceed, s; 0 if there is none."""
+        ordered = sorted(self._last)
+        if not ordered:
+            return 0.0
+        return ordered[max(ceil(share * len(ordered)) - 1, 0)]
 
 
 class Statistics:

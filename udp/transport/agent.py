@@ -196,7 +196,7 @@ class Agent:
         """
         if not self.close.alive:
             raise gym.error.ClosedEnvironmentError("expected an open env, got a closed one")
-        self._gather()
+        self._gather(self._pending())
         self.lost = [""] * len(self.lost)
         assert self.config.spec is not None
         return self.config.spec
@@ -210,9 +210,11 @@ class Agent:
         """
         now = time.monotonic()
         for slot, (actions, what, seeds) in orders.items():
-            self.server.send_command(slot, actions, what, seeds, now)
+            session = self.server.slots[slot]
+            assert session is not None
+            session.send_command(actions, what, seeds, now)
         self.lost = [""] * len(self.lost)
-        self._gather()
+        self._gather(self._pending() if None in self.server.slots else list(orders))
 
     def _record(self, path: Path | str) -> Any:
         from ..journal import Journal
@@ -223,49 +225,58 @@ class Agent:
 
     # ---- the exchange
 
-    def _gather(self) -> None:
+    def _gather(self, pending: list[int]) -> None:
         """Send what is due and answer what comes, until it is the agent's turn everywhere."""
         server, config, slots = self.server, self.config, self.server.slots
         _flush(server, self._port)  # before anything else: a simulator waits
         now = time.monotonic()
-        self._deadlines = [
-            now + (config.timeout if session else config.connect_timeout) for session in slots
-        ]
+        deadlines = self._deadlines
+        for slot in pending:
+            deadlines[slot] = now + (config.timeout if slots[slot] else config.connect_timeout)
         if self._journal:
             self._journal.write()
-        pending = self._pending()
         while pending:
-            left = min([self._deadlines[slot] for slot in pending]) - now
+            left = min(map(deadlines.__getitem__, pending)) - now
             if left <= 0:
                 self._give_up(pending, now)
                 now, pending = time.monotonic(), self._pending()
                 continue
-            datagram: bytes | None
+            before = now
             try:
                 datagram, address = self._port.receive(left, strangers=None in slots)
             except (OSError, ValueError):
                 if not self.close.alive:  # another thread has closed the env
                     raise gym.error.ClosedEnvironmentError("the env was closed") from None
-                datagram = None  # nothing came; or (Windows) an earlier datagram found nobody
-            before, now = now, time.monotonic()
-            if (pause := now - before - min(left, LONGEST_WAIT)) > PAUSE:
-                # This process was stopped: what the simulators sent meanwhile was not read.
-                self._deadlines = [deadline + pause for deadline in self._deadlines]
-            if datagram is not None:
-                event = server.receive(datagram, address, now)
-                if event:
-                    self._handle(event, address)
-                    pending = self._pending()
-                if pending:
-                    _flush(server, self._port)
+                # Nothing came; or (Windows) an earlier datagram found nobody.
+                now = time.monotonic()
+                self._pardon(now - before - min(left, LONGEST_WAIT))
+                continue
+            now = time.monotonic()
+            if now - before > PAUSE:
+                self._pardon(now - before - min(left, LONGEST_WAIT))
+            event = server.receive(datagram, address, now)
+            if event and not event.joined and isinstance(event.message, State):
+                self.states[event.slot] = event.message
+                pending.remove(event.slot)
+            elif event:
+                self._handle(event, address)
+                pending = self._pending()
+            if pending:
+                _flush(server, self._port)
+
+    def _pardon(self, pause: float) -> None:
+        """After a pause of this process: what the simulators sent meanwhile was not read."""
+        if pause > PAUSE:
+            for slot in range(len(self._deadlines)):
+                self._deadlines[slot] += pause
 
     def _pending(self) -> list[int]:
         """Slots at which it is not the agent's turn."""
-        return [
-            slot
-            for slot, session in enumerate(self.server.slots)
-            if session is None or session.state is not AgentState.DECIDING
-        ]
+        pending = []
+        for slot, session in enumerate(self.server.slots):
+            if session is None or session.state is not AgentState.DECIDING:
+                pending.append(slot)  # a comprehension is one more call
+        return pending
 
     def _handle(self, event: Event, address: Address) -> None:
         slot, message = event.slot, event.message
@@ -390,9 +401,13 @@ def _leave(pid: int, server: Server, port: Port, journal: Any) -> None:
 
 
 def _flush(server: Server, port: Port) -> None:
-    for datagram, address in server.take_outgoing():
+    outbox = server.outbox
+    datagrams, outbox.datagrams = outbox.datagrams, []
+    for datagram, address in datagrams:
         try:
             port.send(datagram, address)
         except OSError:  # as good as lost: the simulator asks again, or the wait ends in time
-            server.statistics.counters["unsent"] += 1
-    log_notices(server.statistics, time.monotonic())
+            outbox.statistics.counters["unsent"] += 1
+    statistics, now = outbox.statistics, time.monotonic()
+    if statistics.notices or now >= statistics.report_at:
+        log_notices(statistics, now)

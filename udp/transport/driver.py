@@ -4,7 +4,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 import gymnasium as gym
@@ -39,7 +39,7 @@ class Driver(NotCopied):
         self.stepped, self.spec = stepped, stepped.spec
         self.address: Address = port.address
         self.observer: Observer | None = None
-        self._rules, self._port = rules, port
+        self._rules, self._port, self._receive = rules, port, port.receiver()
         self._by_address = {link.address: link for link in rules.links}
         self._stopped = self._ran = False
         self._journal: Any = None
@@ -127,29 +127,23 @@ class Driver(NotCopied):
                     self._journal.write()
             if rules.reason is not None:
                 return rules.reason
-            if not again:
-                self._exchange()
+            if again:
+                continue
+            before = time.monotonic()
+            left = min(rules.next_timer() - before, LONGEST_WAIT)
+            if left <= 0:
+                rules.handle_timers(before)
+                continue
+            try:
+                datagram, address = self._receive(left)
+            except OSError as error:
+                self._note(error, time.monotonic() - before - left)
+                continue
+            link = self._by_address.get(address)
+            if link:
+                link.trouble = ""
+                rules.receive(link, datagram, time.monotonic())
         return ""
-
-    def _exchange(self) -> None:
-        """Wait for one datagram or timer, and take it in."""
-        rules, before = self._rules, time.monotonic()
-        left = min(rules.next_timer() - before, LONGEST_WAIT)
-        if left <= 0:
-            rules.handle_timers(before)
-            return
-        try:
-            datagram, address = self._port.receive(left, strangers=False)
-        except OSError as error:
-            self._note(error)
-            now = time.monotonic()
-            if now - before - left > PAUSE:
-                rules.pardon(now - before - left)
-            return
-        link = self._by_address.get(address)
-        if link:
-            link.trouble = ""
-            rules.receive(link, datagram, time.monotonic())
 
     def _end(self, reason: str) -> None:
         """Tell the agents, until they have answered or will not."""
@@ -162,7 +156,7 @@ class Driver(NotCopied):
             before = time.monotonic()
             left = min(link.client.next_timer() for link in rules.links) - before
             try:
-                datagram, address = self._port.receive(max(left, 0.0), strangers=False)
+                datagram, address = self._receive(max(left, 0.0))
                 if link := self._by_address.get(address):
                     link.client.receive(datagram, time.monotonic())
             except OSError:  # nothing came, or an earlier datagram found nobody
@@ -177,23 +171,27 @@ class Driver(NotCopied):
         """Send what is due, before any wait."""
         for link in self._rules.links:
             client = link.client
-            for datagram in client.take_outgoing():
-                self._send(link, datagram)
+            outgoing, client.outgoing = client.outgoing, []
+            for datagram in outgoing:
+                try:
+                    self._port.send(datagram, link.address)
+                except OSError as error:  # as good as lost
+                    self._note_unsent(link, error)
             statistics, now = client.statistics, time.monotonic()
             if statistics.notices or now >= statistics.report_at:
                 log_notices(statistics, now)
 
-    def _send(self, link: AgentLink, datagram: bytes) -> None:
-        try:
-            self._port.send(datagram, link.address)
-        except OSError as error:  # a full buffer or a network that is down: as good as lost
-            link.client.statistics.counters["unsent"] += 1
-            link.trouble = _words(error, "sending")
+    def _note_unsent(self, link: AgentLink, error: OSError) -> None:
+        """A full buffer or a network that is down: as good as lost."""
+        link.client.statistics.counters["unsent"] += 1
+        link.trouble = _words(error, "sending")
 
-    def _note(self, error: OSError) -> None:
-        """Nothing came. Raises the error if this side was closed."""
+    def _note(self, error: OSError, pause: float) -> None:
+        """Nothing came, and the wait was too long by `pause`, s. Raises `OSError` if closed."""
         if self._port.closed:
             raise error
+        if pause > PAUSE:  # this process was stopped
+            self._rules.pardon(pause)
         if len(self.links) == 1 and not isinstance(error, TimeoutError):
             self.links[0].trouble = _words(error, "receiving")
 
@@ -202,7 +200,8 @@ class Driver(NotCopied):
         while not finished.wait(_ALIVE_EVERY):
             for link in self._rules.links:
                 for datagram in link.client.alive(time.monotonic()):
-                    self._send(link, datagram)
+                    with suppress(OSError):  # as good as lost
+                        self._port.send(datagram, link.address)
 
 
 def _words(error: OSError, what: str) -> str:

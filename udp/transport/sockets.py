@@ -10,15 +10,15 @@ nothing came, or in which another process had the core, lets more of the next wa
 import errno
 import ipaddress
 import logging
-import math
-import os
 import select
 import selectors
 import socket
 import sys
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import suppress
+from functools import partial
+from math import ceil
 from typing import Any, Final
 
 from ...models.errors import InputError
@@ -84,6 +84,10 @@ class Socket(socket.socket):
         self.setblocking(False)
         with suppress(OSError):  # room for the fragments of a large message, if the system has it
             self.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        self._poll: Any = None
+        if hasattr(select, "poll"):
+            self._poll = select.poll()
+            self._poll.register(self.fileno(), select.POLLIN)
         self._asleep = 0  # of the next waits so many sleep at once
         self._row = 1  # and so many after the next wait in which nothing came
 
@@ -97,42 +101,30 @@ class Socket(socket.socket):
         """
         if self._asleep:
             self._asleep -= 1
-        elif came := self._look(min(timeout, _LOOK)):
-            return came
-        if (fileno := self.fileno()) < 0:  # another thread has closed it
-            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
-        _sleep(fileno, min(timeout, LONGEST_WAIT))
-        try:
+        else:
+            begin = now = time.monotonic()
+            until = begin + min(timeout, _LOOK)
+            while now < until:
+                try:
+                    came = self.recvfrom(_MAX_DATAGRAM)
+                except BlockingIOError:
+                    before, now = now, time.monotonic()
+                    if now - before > _LOST:
+                        self._row = _MOST_ASLEEP
+                        break
+                else:
+                    self._row = max(1, self._row // 2)
+                    return came
+            self._asleep = self._row = min(4 * self._row, _MOST_ASLEEP)
+        timeout = min(timeout, LONGEST_WAIT)
+        if self._poll:
+            self._poll.poll(ceil(1e3 * timeout))
+        elif self.fileno() >= 0:  # Windows
+            select.select([self], [], [], timeout)
+        try:  # OSError if another thread has closed it
             return self.recvfrom(_MAX_DATAGRAM)
         except BlockingIOError:
             raise TimeoutError from None
-
-    def _look(self, seconds: float) -> tuple[bytes, Address] | None:
-        """What comes so soon."""
-        begin = now = time.monotonic()
-        while now - begin < seconds:
-            try:
-                came = self.recvfrom(_MAX_DATAGRAM)
-            except BlockingIOError:
-                before, now = now, time.monotonic()
-                if now - before > _LOST:
-                    self._row = _MOST_ASLEEP
-                    break
-            else:
-                self._row = max(1, self._row // 2)
-                return came
-        self._asleep = self._row = min(4 * self._row, _MOST_ASLEEP)
-        return None
-
-
-def _sleep(fileno: int, timeout: float) -> None:
-    """Until a file can be read, or for `timeout`, s."""
-    if hasattr(select, "poll"):
-        poll = select.poll()
-        poll.register(fileno, select.POLLIN)
-        poll.poll(math.ceil(1e3 * timeout))
-    else:  # Windows
-        select.select([fileno], [], [], timeout)
 
 
 def open_socket(bind: Address, *, insecure: bool, peer: Address | None = None) -> Socket:
@@ -205,8 +197,6 @@ class Port:
         Raises:
             TimeoutError, OSError: As `Socket.receive`; a wait may end early.
         """
-        if self._only:
-            return self._everybody.receive(timeout)
         if strangers or self._missing or not self._own:
             return _receive_any(self._all, timeout)
         now = time.monotonic()
@@ -219,15 +209,24 @@ class Port:
         (only,) = self._own.values()
         return only.receive(timeout)
 
+    def receiver(self) -> Callable[[float], tuple[bytes, Address]]:
+        """A function that waits for the next datagram of the peers for so many seconds."""
+        if self._only:
+            return self._everybody.receive
+        return partial(self.receive, strangers=False)
+
     def send(self, datagram: bytes, address: Address) -> None:
         """Send a datagram. Raises `OSError`."""
         if self._only:
             self._everybody.send(datagram)
             return
-        if sock := self._own.get(address):
-            with suppress(ConnectionError):  # an earlier datagram found nobody: this was not sent
+        sock = self._own.get(address)
+        if sock:
+            try:
                 sock.send(datagram)
                 return
+            except ConnectionError:  # an earlier datagram found nobody: this was not sent
+                pass
         self._everybody.sendto(datagram, address)
 
     @property

@@ -34,38 +34,23 @@ def test_quantiles_are_those_of_numpy(name: str) -> None:
     assert table.count == len(samples)
     assert table.longest == samples.max()
     for share in (0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0):
-        # The sample that so large a share does not exceed, and what the buckets may add to it.
         exact = np.quantile(samples, share, method="inverted_cdf")
-        assert exact <= table.quantile(share) <= exact * 1.032
+        assert table.quantile(share) == exact
 
 
 def test_quantiles_of_chosen_numbers() -> None:
     table = durations(np.array([1e-3] * 98 + [0.5, 2.0]))
-    assert table.quantile(0.5) == pytest.approx(1e-3, rel=0.032)
-    assert table.quantile(0.99) == pytest.approx(0.5, rel=0.032)
+    assert table.quantile(0.5) == 1e-3
+    assert table.quantile(0.99) == 0.5
     assert table.quantile(1.0) == 2.0 == table.longest
     assert Durations().quantile(0.5) == Durations().longest == 0.0
 
 
-def test_quantiles_do_not_depend_on_the_order_and_never_fall() -> None:
-    samples = np.random.default_rng(2).lognormal(-7, 1, 999)
-    table, turned = durations(samples), durations(samples[::-1])
-    shares = np.linspace(0, 1, 101).tolist()
-    quantiles = [table.quantile(share) for share in shares]
-    assert quantiles == sorted(quantiles) == [turned.quantile(share) for share in shares]
-
-
-def test_the_table_is_bounded() -> None:
-    # From a nanosecond to three years there are 57 doublings of 32 buckets.
-    table = durations(np.exp(np.random.default_rng(3).uniform(np.log(1e-12), np.log(1e8), 99_999)))
-    assert table.count == 99_999
-    assert len(table._buckets) <= 57 * 32
-
-
-@pytest.mark.parametrize("seconds", [0.0, -1.0, 1e-12])
-def test_a_clock_that_stands_still_or_goes_back(seconds: float) -> None:
-    table = durations(np.array([seconds]))
-    assert table.quantile(0.5) == table.longest == 1e-9
+def test_the_last_durations_count() -> None:
+    table = durations(np.arange(20_000.0))
+    assert table.count == 16_384
+    assert table.longest == 19_999.0
+    assert table.quantile(0.0) == 20_000 - 16_384
 
 
 # ---- notices

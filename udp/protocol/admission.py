@@ -1,0 +1,329 @@
+"""Which simulators an agent takes, and at which slot.
+
+A Hello that fits is welcomed, and takes a slot only when its State 1 has come with the nonce of the
+Welcome: a recorded Hello that is sent again takes none, and neither does a sender that does not
+read. Memory for simulators without a slot is bounded.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple
+
+from ...models.errors import InputError
+from . import binary, text
+from . import messages as m
+from .auth import OVERHEAD, Key, key_id
+from .client import Address, largest_datagram
+from .fragments import Assembler, asks, check_size, is_fragment
+from .layout import Layout
+from .messages import State, one_line
+from .session import Event, Outbox, Session
+from .transitions import AgentState, Way
+
+_MOST: Final = 1024  # simulators remembered between Hello and State 1, in the queue, and after
+_LEAST_ASSEMBLING: Final = 16
+"""Simulators without a slot of which fragments are kept; more, if there are more slots: so many
+may come at the same moment."""
+_TEXT_REMEMBERED: Final = 2.0  # for so long the last line of a closed text simulator is known, s
+_REASON_AT: Final = binary.HEADER_SIZE + 2  # bytes of a Refuse or a Close before its reason
+
+
+class Arrival(NamedTuple):
+    """A datagram that came."""
+
+    datagram: bytes
+    address: Address
+    now: float
+
+
+class Slots:
+    """The sessions of the simulators that an agent flies."""
+
+    def __init__(self, count: int) -> None:
+        self.sessions: list[Session | None] = [None] * count
+        self.of: dict[Address, Session] = {}
+        """By address of the simulator."""
+        self._ended: OrderedDict[int, None] = OrderedDict()  # numbers of sessions that had a slot
+
+    def seat(self, session: Session, state: State, plain: bytes) -> Event:
+        """Give a session its slot: that of an earlier one of its address, or a free one."""
+        earlier = self.of.get(session.peer)
+        slot = self.sessions.index(None) if earlier is None else earlier.slot
+        if earlier:
+            self.free(slot)
+        self.sessions[slot] = session
+        self.of[session.peer] = session
+        return session.join(slot, state, plain)
+
+    def free(self, slot: int) -> None:
+        """Give a slot to the next simulator that comes."""
+        session, self.sessions[slot] = self.sessions[slot], None
+        if session:
+            session.state = AgentState.CLOSED
+            del self.of[session.peer]
+            if not session.is_text:
+                keep(self._ended, session.number, None)
+
+    def takes(self, address: Address) -> bool:
+        """Whether there is a slot for a simulator at this address."""
+        return None in self.sessions or address in self.of
+
+    def has(self, number: int, elsewhere: Address | None = None) -> bool:
+        """Whether a session of that number has a slot (not of this address)."""
+        return any(s and s.number == number and s.peer != elsewhere for s in self.sessions)
+
+    def had(self, number: int) -> bool:
+        """Whether a session of that number has or had a slot."""
+        return number in self._ended or self.has(number)
+
+
+class Admission:
+    """Simulators between their Hello and their slot."""
+
+    def __init__(
+        self,
+        slots: Slots,
+        outbox: Outbox,
+        accept: Callable[[m.Hello], Layout | str],
+        keys: Mapping[bytes, Key],
+        extensions: tuple[m.Extension, ...],
+        draw_nonce: Callable[[], int],
+    ) -> None:
+        self.closed = False
+        self.openings: OrderedDict[tuple[Address, int], Session] = OrderedDict()  # WELCOMED
+        self._slots, self._outbox, self._accept = slots, outbox, accept
+        self._keys, self._extensions, self._draw_nonce = keys, extensions, draw_nonce
+        self._queue: OrderedDict[Address, Session] = OrderedDict()  # QUEUED
+        self._assembling: OrderedDict[tuple[Address, int], Assembler] = OrderedDict()
+        self._ended_text: OrderedDict[Address, tuple[bytes, int, float]] = OrderedDict()
+
+    def close(self, reason: str) -> None:
+        """Turn away all that come, and those that wait."""
+        self.closed = True
+        for queued in self._queue.values():
+            self.refuse(queued.number, reason, queued.peer, queued.room, queued.key)
+            queued.move(Way.SENT, m.Refuse)
+
+    # ---- Hello
+
+    def receive_hello(self, hello: m.Hello, arrival: Arrival, key: Key | None) -> None:
+        """Welcome a simulator, refuse it, or let it wait."""
+        address, size = arrival.address, len(arrival.datagram)
+        opening = self.openings.get((address, hello.session))
+        if self._slots.had(hello.session):
+            self.drop("stale", "", arrival)
+            return
+        if opening and not self.closed:
+            opening.repeat()
+            self.drop("duplicate", "", arrival)
+            return
+        layout = self._fit(hello, address)
+        if isinstance(layout, str):
+            self.refuse(hello.session, layout, address, size, key)
+            self.drop("refused", layout, arrival)
+            return
+        session = Session(self._outbox, address, hello.session, layout, hello, key=key)
+        if self._slots.takes(address):
+            self._queue.pop(address, None)
+            nonce = self._draw_nonce()
+            welcome = m.Welcome(session=hello.session, nonce=nonce, extensions=self._extensions)
+            session.send_welcome(welcome)
+            keep(self.openings, (address, hello.session), session)
+        else:
+            wait = binary.encode(m.Wait(session=session.number))
+            self._outbox.put([wait], address, key)
+            session.move(Way.SENT, m.Wait)
+            session.room = size - len(wait)
+            keep(self._queue, address, session)
+
+    def _fit(self, hello: m.Hello, address: Address) -> Layout | str:
+        """The layout of a simulator that is accepted, or the reason to refuse it."""
+        if self.closed:
+            return "the agent has closed"
+        low, high = hello.versions
+        if not low <= binary.VERSION <= high:
+            return f"expected protocol version {binary.VERSION}, got {low} to {high}"
+        if unknown := [e.number for e in hello.extensions if e.critical]:
+            return f"expected no critical extension of type {unknown[0]}"
+        layout = self._accept(hello)
+        if isinstance(layout, str):
+            return layout
+        try:
+            largest = largest_datagram(address, self._outbox.max_datagram)
+            check_size(layout.command_size, largest)
+        except InputError as error:
+            return str(error)
+        return layout
+
+    def refuse(
+        self, number: int, reason: str, address: Address, size: int, key: Key | None
+    ) -> None:
+        """Refuse a Hello that came in so many bytes, with no more than those."""
+        room = size - _REASON_AT - (OVERHEAD if key else 0)
+        if room >= 0:
+            refuse = m.Refuse(session=number, reason=_cut(reason, room))
+            self._outbox.put([binary.encode(refuse)], address, key)
+
+    # ---- a simulator that was welcomed
+
+    def assemble(
+        self, fragment: bytes, opening: Session | None, arrival: Arrival, key: Key | None
+    ) -> bytes | None:
+        """The Hello or State 1 of a simulator without a slot, once all its fragments are there."""
+        kind, number, sequence = binary.peek(fragment)
+        if kind == binary.HELLO and opening:
+            if asks(fragment):
+                opening.repeat()
+            self.drop("duplicate", "", arrival)
+            return None
+        largest = binary.LONGEST_HELLO
+        if kind != binary.HELLO:
+            if opening is None or sequence > 1:
+                self.disown(fragment, arrival)
+                return None
+            if sequence < 1:
+                self.drop("stale", "", arrival)
+                return None
+            largest, key = opening.layout.state_size, opening.session_key()
+        place = arrival.address, number
+        assembler = self._assembling.get(place) or Assembler(largest)
+        most = max(_LEAST_ASSEMBLING, len(self._slots.sessions))
+        keep(self._assembling, place, assembler, most)
+        whole = assembler.take(fragment)
+        if whole is not None:
+            self._assembling.pop(place, None)
+        elif asks(fragment) and (missing := assembler.missing()):
+            body = binary.encode(missing)[binary.HEADER_SIZE : len(fragment)]  # no more than came
+            reply = binary.frame(binary.MISSING, number, sequence, body)
+            self._outbox.put([reply], arrival.address, key)
+        return whole
+
+    def receive(
+        self, opening: Session, message: m.Message, plain: bytes, arrival: Arrival
+    ) -> Event | None:
+        """Take a message of a session that was welcomed."""
+        if isinstance(message, State):
+            return self._join(opening, message, plain, arrival)
+        if isinstance(message, m.Close):
+            self.forget(opening)
+            opening.move(Way.RECEIVED, m.Close)
+            goodbye = binary.encode(opening.goodbye(""))
+            self._outbox.put([goodbye], arrival.address, opening.session_key())
+            return None
+        self.drop("foreign", type(message).__name__, arrival)
+        return None
+
+    def _join(self, opening: Session, state: State, plain: bytes, arrival: Arrival) -> Event | None:
+        """The first State of a session that was welcomed."""
+        assert opening.welcome is not None
+        assert opening.hello is not None
+        peer = opening.peer
+        if state.sequence != 1 or state.nonce != opening.welcome.nonce:
+            # Its Hello was an old one: this simulator goes on with another agent, or a copy of
+            # its Hello came late.
+            self.forget(opening)
+            self.disown(plain, arrival)
+            return None
+        for key, other in list(self.openings.items()):
+            # It, and what the same address began before it. Later ones stay: if this State came
+            # late, their Hello may still be repeated.
+            if key[0] == peer:
+                self.forget(other)
+            if other is opening:
+                break
+        layout = self._fit(opening.hello, peer)  # another one may have come since its Hello
+        if isinstance(layout, str):
+            reason = _cut(layout, len(plain) - _REASON_AT)
+            close = m.Close(session=opening.number, sequence=1, reason=reason)
+            self._outbox.put([binary.encode(close)], peer, opening.session_key())
+            opening.move(Way.SENT, m.Close)
+            self.drop("refused", layout, arrival)
+            return None
+        if not self._slots.takes(peer) or self._slots.has(opening.number, elsewhere=peer):
+            self.disown(plain, arrival)  # another was quicker
+            return None
+        return self._slots.seat(opening, state, plain)
+
+    def forget(self, opening: Session) -> None:
+        """Forget a session that was welcomed."""
+        del self.openings[opening.peer, opening.number]
+        self._assembling.pop((opening.peer, opening.number), None)
+
+    def disown(self, plain: bytes, arrival: Arrival) -> None:
+        """Tell the simulator of an unknown session to begin another one.
+
+        If it took a slot that was taken meanwhile, it will be told to wait.
+        """
+        datagram, address, _ = arrival
+        _, number, sequence = binary.peek(plain)
+        if is_fragment(plain) and not asks(plain):
+            return  # one answer will do
+        if not sequence:
+            self.drop("malformed", "expected a State from 1 on, got 0", arrival)
+            return
+        if self.closed or self._slots.has(number, elsewhere=address):
+            # Another address has it: no answer of ours may end it.
+            self.drop("foreign", f"session {number:016x}", arrival)
+            return
+        self._outbox.statistics.counters["foreign"] += 1  # mostly after a restart: no notice
+        reply = binary.encode(m.Unknown(session=number, sequence=sequence))
+        if self._keys:  # of use only to the simulator that has sent this State
+            key = self._keys.get(key_id(datagram))
+            if key is None:
+                return
+            reply = key.seal(reply, datagram)
+        self._outbox.put([reply], address, None)
+
+    # ---- text: the first line opens the session
+
+    def receive_first_line(
+        self, message: State | m.Close, layout: Layout, takes_text: bool, arrival: Arrival
+    ) -> Event | None:
+        """A line of a text simulator that has no slot."""
+        datagram, address, now = arrival
+        if isinstance(message, m.Close):
+            self._outbox.statistics.counters["foreign"] += 1
+            return None
+        last, number, until = self._ended_text.get(address, (b"", 0, 0.0))
+        is_late = last == datagram or 1 < number == message.sequence
+        if is_late and now < until:
+            reason = "a copy of the last line of a simulator that has closed"
+        elif self.closed:
+            reason = "the agent has closed"
+        elif not takes_text or address in self._slots.of:
+            reason = "text is not flown here"
+        elif None not in self._slots.sessions:
+            reason = "every slot is taken"
+        else:
+            session = Session(self._outbox, address, 0, layout, None, line=datagram)
+            return self._slots.seat(session, message, b"")
+        self.turn_text_away(message.sequence, "refused", reason, arrival)
+        return None
+
+    def turn_text_away(self, sequence: int, cause: str, reason: str, arrival: Arrival) -> None:
+        """Answer a line that is not flown, with no more bytes than it has."""
+        line = text.encode(m.Close(session=0, sequence=sequence, reason=""))
+        if len(line) <= len(arrival.datagram):
+            self._outbox.put([line], arrival.address, None)
+        self.drop(cause, reason, arrival)
+
+    def remember_text(self, session: Session, sequence: int, now: float) -> None:
+        """Know the last line of a text simulator that has closed, for a while."""
+        keep(self._ended_text, session.peer, (session.line, sequence, now + _TEXT_REMEMBERED))
+
+    def drop(self, cause: str, reason: str, arrival: Arrival) -> None:
+        """Count a datagram that changes nothing."""
+        self._outbox.drop(cause, reason, arrival.address, arrival.now)
+
+
+def keep(table: "OrderedDict[Any, Any]", key: Any, value: Any, most: int = _MOST) -> None:
+    """Put into a table that forgets its oldest entries."""
+    table[key] = value
+    table.move_to_end(key)
+    if len(table) > most:
+        table.popitem(last=False)
+
+
+def _cut(reason: str, room: int) -> str:
+    """A reason that takes at most so many bytes."""
+    return one_line(reason).encode()[:room].decode(errors="ignore")

@@ -1,0 +1,271 @@
+"""The agent's exchange with one simulator: what it receives and sends in which state.
+
+Every change of state goes through the table `AGENT`. `server` opens sessions and finds the session
+of a datagram; `Outbox` takes what they send.
+"""
+
+from typing import Any, Final, NamedTuple
+
+from numpy.typing import NDArray
+
+from . import binary, text
+from . import messages as m
+from .auth import Key
+from .client import Address, Tap, largest_datagram
+from .errors import DecodeError
+from .fragments import Assembler, Transfer, Window, asks
+from .layout import Layout
+from .messages import Command, Message, State, one_line
+from .statistics import Statistics
+from .transitions import AGENT, AgentState, Way
+
+_AFTER_STATE: Final = AGENT[AgentState.EXPECTING, Way.RECEIVED, State]
+
+
+class NoSuchSession(DecodeError):
+    """A message of a session that is not here, or went on with another agent."""
+
+
+class Event(NamedTuple):
+    """The effect of a datagram."""
+
+    slot: int
+    message: State | m.Close
+    joined: bool = False
+    """The State is the first of a new session, which may have taken the slot of another."""
+
+
+class Outbox:
+    """What the sessions of an agent share: datagrams to send, counts, and the tap."""
+
+    def __init__(self, max_datagram: int | None) -> None:
+        self.datagrams: list[tuple[bytes, Address]] = []
+        self.statistics = Statistics()
+        self.tap: Tap | None = None
+        self.max_datagram = max_datagram
+
+    def put(
+        self, datagrams: list[bytes], address: Address, key: Key | None, count: str = "sent"
+    ) -> None:
+        """Take the datagrams of a message, sealed where there is a key."""
+        for datagram in datagrams:
+            self.datagrams.append((key.seal(datagram) if key else datagram, address))
+        self.statistics.counters[count] += 1
+
+    def drop(self, cause: str, reason: str, address: Address, now: float) -> None:
+        """Count a datagram that changes nothing."""
+        host, port = address
+        self.statistics.drop(cause, f"from {host}:{port}: {reason}", now)
+
+
+class Session:
+    """An exchange with one simulator, pinned to its address and codec.
+
+    Attributes:
+        peer: Address of the simulator.
+        number: Session number; 0 with the text codec.
+        hello, welcome: None with the text codec.
+        key: The shared key, and that of the session once it has a slot; None without keys.
+        slot: Its slot; -1 before it has one.
+        sequence: Number of the State that came last.
+        reply: The answer to the last State, or the Welcome.
+        heard_at: When it last said that it computes, or sent a fragment that was missing.
+        room: Bytes that a Refuse may have while it waits for a slot.
+        line: Its last line, by text.
+    """
+
+    def __init__(
+        self,
+        outbox: Outbox,
+        peer: Address,
+        number: int,
+        layout: Layout,
+        hello: m.Hello | None,
+        *,
+        key: Key | None = None,
+        line: bytes = b"",
+    ) -> None:
+        self.peer, self.number, self.layout, self.hello = peer, number, layout, hello
+        self.key, self.line = key, line
+        self.is_text = hello is None
+        self.state = AgentState.NEW
+        self.welcome: m.Welcome | None = None
+        self.slot, self.sequence = -1, 0
+        self.reply: Transfer | None = None
+        self.room = 0
+        self.asked_at = self.heard_at = 0.0
+        self.is_plain = False  # whether it has a slot, and its messages are neither sealed nor text
+        self._outbox = outbox
+        self._assembler: Assembler | None = None
+        self._window = Window()
+        self._largest = largest_datagram(peer, outbox.max_datagram)
+
+    def move(self, way: Way, kind: type[Message]) -> None:
+        """Be in the state that such a message leads to. Raises `KeyError` if it may not."""
+        self.state = AGENT[self.state, way, kind]
+
+    def session_key(self) -> Key | None:
+        """The key of its messages after the Welcome."""
+        if self.slot >= 0 or self.key is None:
+            return self.key
+        assert self.welcome is not None
+        return self.key.for_session(self.number, self.welcome.nonce)
+
+    # ---- what is sent
+
+    def send_welcome(self, welcome: m.Welcome) -> None:
+        """Open the session for its State 1."""
+        self.welcome = welcome
+        self.move(Way.SENT, m.Welcome)
+        self._send(binary.encode(welcome))
+
+    def send_command(
+        self,
+        actions: NDArray[Any],
+        orders: NDArray[Any],
+        seeds: NDArray[Any] | None,
+        now: float,
+    ) -> None:
+        """Answer the last State. Raises `InputError` if it cannot be encoded: nothing was sent."""
+        if self.state is not AgentState.DECIDING:
+            got = self.state.value
+            raise ValueError(f"send_command: expected a session that is deciding, got {got}")
+        command = Command(
+            session=self.number,
+            sequence=self.sequence,
+            actions=actions,
+            orders=orders,
+            seeds=seeds,
+        )
+        layout = self.layout
+        data = text.encode(command) if self.is_text else binary.encode_command(command, layout)
+        self.state = AGENT[self.state, Way.SENT, Command]
+        self.asked_at = self.heard_at = now
+        self.reply = reply = Transfer(data, self._largest, self._window)
+        outbox = self._outbox
+        if reply.count == 1 and self.key is None:  # as `put`
+            outbox.datagrams.append((data, self.peer))
+            outbox.statistics.counters["sent"] += 1
+        else:
+            outbox.put(reply.start(), self.peer, self.key)
+        if self._outbox.tap:
+            self.record(command, data)
+
+    def send_close(self, reason: str) -> None:
+        """End the exchange."""
+        close = self.goodbye(reason)
+        data = text.encode(close) if self.is_text else binary.encode(close)
+        self.move(Way.SENT, m.Close)
+        self._send(data)
+        self.record(close, data)
+
+    def goodbye(self, reason: str) -> m.Close:
+        """A Close of this session."""
+        return m.Close(session=self.number, sequence=self.sequence, reason=one_line(reason))
+
+    def repeat(self) -> None:
+        """Send the last answer again, the same bytes."""
+        assert self.reply is not None
+        self._outbox.put(self.reply.start(), self.peer, self.key, "resent")
+
+    def answer_again(self) -> None:
+        """Answer a State that came again: with Alive, while its Command is not there yet."""
+        if self.state is not AgentState.DECIDING:
+            self.repeat()
+        elif not self.is_text:
+            alive = m.Alive(session=self.number, sequence=self.sequence)
+            self.move(Way.SENT, m.Alive)
+            self._outbox.put([binary.encode(alive)], self.peer, self.key)
+            self._outbox.statistics.counters["sent"] += 1
+
+    def record(self, message: Message, data: bytes) -> None:
+        """Show a message to the tap."""
+        if self._outbox.tap:
+            whole = binary.encode(message, self.layout) if self.is_text else data
+            self._outbox.tap(self.slot, message, whole)
+
+    def _send(self, data: bytes) -> None:
+        """Send a message, and keep its bytes for a repeated State."""
+        self.reply = Transfer(data, self._largest, self._window)
+        self._outbox.put(self.reply.start(), self.peer, self.key)
+
+    # ---- what is received
+
+    def join(self, slot: int, state: State, plain: bytes) -> Event:
+        """Take a slot with the first State."""
+        self.key, self.slot = self.session_key(), slot
+        self.move(Way.RECEIVED, State)
+        self.sequence = state.sequence
+        self.is_plain = self.key is None and not self.is_text
+        self._outbox.statistics.counters["sessions"] += 1
+        for message in (self.hello, self.welcome):
+            if message:
+                self.record(message, binary.encode(message))
+        self.record(state, plain)
+        return Event(slot, state, joined=True)
+
+    def take_state(self, state: State, plain: bytes, now: float) -> Event:
+        """The next State, which is expected."""
+        self.sequence, self.state = state.sequence, _AFTER_STATE
+        self._outbox.statistics.round_trips.add(now - self.asked_at)
+        if self._outbox.tap:
+            self.record(state, plain)
+        return Event(self.slot, state)
+
+    def receive(self, message: Message, plain: bytes, now: float) -> Event | None:
+        """Take a message of a session that has a slot; the event, if the exchange moves on.
+
+        Raises `NoSuchSession` for a State beyond the next one: the simulator went on with another
+        agent, and what opened the session here came late, from before a restart.
+        """
+        is_state = isinstance(message, State)
+        number = getattr(message, "sequence", 0)
+        if is_state and number == self.sequence:
+            self.answer_again()
+            self._drop("duplicate", now)
+            return None
+        if is_state and number > self.sequence + 1 and not self.is_text:
+            raise NoSuchSession(f"State {number}")
+        is_due = number == self.sequence + is_state or isinstance(message, m.Close)
+        if not is_due or (self.state, Way.RECEIVED, type(message)) not in AGENT:
+            self._drop("stale", now)
+            return None
+        if isinstance(message, State):
+            return self.take_state(message, plain, now)
+        if isinstance(message, m.Close):
+            self.record(message, plain)
+            if self.state is not AgentState.CLOSING:
+                self.send_close("")
+            self.move(Way.RECEIVED, m.Close)
+            return Event(self.slot, message)
+        self.move(Way.RECEIVED, type(message))
+        if isinstance(message, m.Alive):
+            self.heard_at = now
+        elif isinstance(message, m.Missing):
+            if self.reply and message.kind == binary.COMMAND:
+                datagrams = self.reply.resend(message)
+                self._outbox.put(datagrams, self.peer, self.key, "resent")
+            else:
+                self._drop("stale", now)
+        return None
+
+    def assemble(self, fragment: bytes, now: float) -> bytes | None:
+        """The State that is due, once all its fragments are there; with a slot."""
+        _, _, sequence = binary.peek(fragment)
+        if sequence > self.sequence + 1:
+            raise NoSuchSession(f"State {sequence}")
+        if sequence <= self.sequence:
+            is_repeat = sequence == self.sequence
+            if is_repeat and asks(fragment):
+                self.answer_again()
+            self._drop("duplicate" if is_repeat else "stale", now)
+            return None
+        self._assembler = self._assembler or Assembler(self.layout.state_size)
+        self.heard_at = now
+        whole = self._assembler.take(fragment)
+        if whole is None and asks(fragment) and (missing := self._assembler.missing()):
+            self._outbox.put([binary.encode(missing)], self.peer, self.key)
+        return whole
+
+    def _drop(self, cause: str, now: float) -> None:
+        self._outbox.drop(cause, "", self.peer, now)
