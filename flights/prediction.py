@@ -1,323 +1,226 @@
-"""Open-loop prediction of recorded flights: thousands of starts at once, in NumPy.
+"""Open-loop prediction of recorded flights: thousands of starts at once, with `sim`'s body.
 
 A start is a measured state of a flight. From there the rotor speeds that were measured, and nothing
-else, move a rigid body with the equations of `sim/effects/air.py`; after each horizon the result is
-compared with what was measured. System identification fits the numbers of an `Airframe` to that.
+else, move the vehicle; after each horizon the result is compared with what was measured. System
+identification fits numbers of the vehicle to that.
 
-Vectors have their component as the first axis and the start as the last, as (3, M): sums over
-components are then sums of contiguous rows. World x, y, z with z up; body x forward, y left, z up;
-quaternions scalar first; SI.
+Vectors have their component as the first axis and the start as the last, as (3, M). World x, y, z
+with z up; body x forward, y left, z up; quaternions scalar first; SI.
 """
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import NDArray
 
+from ..models.coefficients import Drag
 from ..models.vehicle import Vehicle
+from ..sim.backends.body import RigidBody
+from ..sim.effects import EffectOptions
+from ..sim.effects.air import AirEffects
+from ..sim.rotations import between
+from ..sim.state import WorldState
+from .flight_logs import FlightLog
 
-Floats = npt.NDArray[np.float64]
+Floats = NDArray[np.float64]
+Numbers = Mapping[str, float]
+"""Numbers of a vehicle by the names of `NAMES`, in the units of `models/coefficients.py`."""
+States = tuple[Floats, Floats, Floats, Floats]
+"""Position, quaternion, velocity and body rates, (3, M) or (4, M)."""
 
-ENTRIES: Final[Mapping[str, tuple[str, int | tuple[int, int] | None]]] = {
-    "rotors.thrust_coefficient": ("thrust_coefficient", None),
-    "rotors.reaction": ("reaction", None),
-    "rotors.drag": ("drag", None),
-    "rotors.inflow": ("inflow", None),
-    "rotors.lift": ("lift", None),
-    **{f"body.inertia.{axis}": ("inertia", (i, i)) for i, axis in enumerate("xyz")},
-    **{f"drag.linear.{axis}": ("linear", i) for i, axis in enumerate("xyz")},
-    **{f"drag.angular.{axis}": ("angular", i) for i, axis in enumerate("xyz")},
-    **{f"drag.moment.{axis}": ("moment", i) for i, axis in enumerate("xy")},
-}
-"""Numbers of an `Airframe` that can be fitted: its field, and where in it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Flight:
-    """A recorded flight on a uniform grid of N times. Arrays have the time as their first axis."""
-
-    name: str
-    period: float
-    """Between two samples, s."""
-    position: Floats
-    """Of the body's origin, world frame, m, shape (N, 3)."""
-    quaternion: Floats
-    """From body to world, shape (N, 4)."""
-    velocity: Floats
-    """Of the body's origin, world frame, m/s, shape (N, 3)."""
-    body_rates: Floats
-    """Body frame, rad/s, shape (N, 3)."""
-    speeds: Floats
-    """Of the rotors in the vehicle's order, rad/s, shape (N, R)."""
+NAMES: Final = (
+    "rotors.thrust_coefficient", "rotors.reaction", "rotors.drag", "rotors.inflow", "rotors.lift",
+    "body.inertia.x", "body.inertia.y", "body.inertia.z",
+    "drag.linear.x", "drag.linear.y", "drag.linear.z",
+    "drag.angular.x", "drag.angular.y", "drag.angular.z", "drag.moment.x", "drag.moment.y",
+)  # fmt: skip
+"""Numbers that move a vehicle and can be fitted."""
+_ON_ROTORS: Final = NAMES[2:5]
+_AIR: Final = _ON_ROTORS + NAMES[8:]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Airframe:
-    """Numbers of a vehicle that move it. Units as in `models/coefficients.py`."""
+def numbers_of(vehicle: Vehicle) -> dict[str, float]:
+    """The numbers of a vehicle; those of effects that its file lacks are 0.
 
-    mass: float
-    gravity: float
-    center: Floats
-    """Of mass, body frame, m, shape (3,)."""
-    inertia: Floats
-    """About the center of mass, kg·m², shape (3, 3)."""
-    place: Floats
-    """Of the rotors, body frame, m, shape (3, R)."""
-    axis: Floats
-    """Of their thrusts, shape (3, R)."""
-    turn: Floats
-    """Sign of each reaction about the rotor's axis, shape (R,)."""
-    thrust_coefficient: float
-    reaction: float
-    """N·m per N, at least 0."""
-    drag: float
-    inflow: float
-    lift: float
-    linear: Floats
-    angular: Floats
-    moment: Floats
+    Raises `InputError` if it has no thrust coefficient.
+    """
+    coefficients = vehicle.coefficients
+    coefficients.need("rotors.thrust_coefficient", "a prediction from rotor speeds")
+    reactions = [np.linalg.norm(rotor.reaction) for rotor in vehicle.rotors]
+    numbers = dict.fromkeys(NAMES, 0.0)
+    numbers["rotors.reaction"] = float(np.mean(reactions))
+    for i, axis in enumerate("xyz"):
+        numbers[f"body.inertia.{axis}"] = float(vehicle.inertia[i, i])
+    for name, values in coefficients.numbers().items():
+        if name in numbers:
+            numbers[name] = values[0]
+        for axis, value in zip("xyz", values, strict=False):
+            if f"{name}.{axis}" in numbers:
+                numbers[f"{name}.{axis}"] = value
+    return numbers
 
-    @classmethod
-    def of(cls, vehicle: Vehicle) -> Self:
-        """The numbers of a vehicle; those of effects that its file lacks are 0.
 
-        Raises `InputError` if it has no thrust coefficient.
-        """
-        told = vehicle.coefficients
-        (coefficient,) = told.need("rotors.thrust_coefficient", "a prediction from rotor speeds")
-        rotors = vehicle.rotors
-        axis = np.array([rotor.axis for rotor in rotors]).T
-        reaction = (np.array([rotor.reaction for rotor in rotors]).T * axis).sum(axis=0)
-        return cls(
-            mass=vehicle.mass,
-            gravity=vehicle.gravity,
-            center=vehicle.center_of_mass.copy(),
-            inertia=vehicle.inertia.copy(),
-            place=np.array([rotor.position for rotor in rotors]).T,
-            axis=axis,
-            turn=np.sign(reaction),
-            thrust_coefficient=coefficient,
-            reaction=float(np.abs(reaction).mean()),
-            drag=told.rotors.drag or 0.0,
-            inflow=told.rotors.inflow or 0.0,
-            lift=told.rotors.lift or 0.0,
-            linear=np.array(told.drag.linear or (0.0, 0.0, 0.0)),
-            angular=np.array(told.drag.angular or (0.0, 0.0, 0.0)),
-            moment=np.array(told.drag.moment or (0.0, 0.0)),
-        )
-
-    def value(self, name: str) -> float:
-        """The number of an entry."""
-        field, where = ENTRIES[name]
-        array = getattr(self, field)
-        return float(array if where is None else array[where])
-
-    def with_values(self, values: Mapping[str, float]) -> Self:
-        """A copy with other numbers, by the names of `ENTRIES`."""
-        changed: dict[str, Any] = {}
-        for name, value in values.items():
-            field, where = ENTRIES[name]
-            if where is None:
-                changed[field] = value
-            else:
-                changed.setdefault(field, getattr(self, field).copy())[where] = value
-        return replace(self, **changed)
+def inertia_of(vehicle: Vehicle, numbers: Numbers) -> Floats:
+    """The vehicle's inertia, kg·m², (3, 3), with the moments of the numbers."""
+    inertia = np.array(vehicle.inertia)
+    np.fill_diagonal(inertia, [numbers[f"body.inertia.{axis}"] for axis in "xyz"])
+    return inertia
 
 
 @dataclass(frozen=True, kw_only=True)
 class Windows:
-    """M starts of flights, what the rotors did from there on, and what was measured.
+    """M starts of flights, the rotor speeds from there on, and the measured motion.
 
-    `speeds` has shape (H, R, M) for H steps of `period`; the others have one array (K, M) for a
-    start, and for each horizon of `horizons`, in steps.
+    `speeds` has shape (H, R, M) for H steps of `period`.
     """
 
     period: float
     horizons: tuple[int, ...]
+    """Steps after which predictions are compared."""
     speeds: Floats
-    start: tuple[Floats, Floats, Floats, Floats]
-    """Position, quaternion, velocity and body rates."""
-    truth: Mapping[int, tuple[Floats, Floats, Floats, Floats]]
-    flight: npt.NDArray[np.int_]
+    start: States
+    truth: Mapping[int, States]
+    """The measured states by horizon."""
+    flight: NDArray[np.int_]
     """Index of the flight of each start, shape (M,)."""
-    index: npt.NDArray[np.int_]
+    index: NDArray[np.int_]
     """Sample of the flight at which it starts, shape (M,)."""
 
     @classmethod
     def cut(
-        cls, flights: Sequence[Flight], steps: int, stride: int, horizons: Sequence[int] = ()
+        cls, flights: Sequence[FlightLog], steps: int, stride: int, horizons: Sequence[int] = ()
     ) -> Self:
         """Starts at every `stride`-th sample after which the flight has `steps` more."""
-        horizons = tuple(horizons) or (steps,)
         starts = [np.arange(0, len(one.position) - steps, stride) for one in flights]
 
-        def taken(one: Flight, at: npt.NDArray[np.int_]) -> list[Floats]:
-            arrays = (one.position, one.quaternion, one.velocity, one.body_rates)
-            return [array[at].T for array in arrays]
+        def states(shift: int) -> States:
+            def joined(name: str) -> Floats:
+                pairs = zip(flights, starts, strict=True)
+                parts = [getattr(one, name)[at + shift].T for one, at in pairs]
+                return np.concatenate(parts, axis=-1)
 
-        def joined(shift: int) -> Any:
-            parts = [taken(one, at + shift) for one, at in zip(flights, starts, strict=True)]
-            return tuple(np.concatenate(arrays, axis=-1) for arrays in zip(*parts, strict=True))
+            position, quaternion = joined("position"), joined("quaternion")
+            return position, quaternion, joined("velocity"), joined("body_rates")
 
         spans = [at[:, None] + np.arange(steps) for at in starts]
         speeds = np.concatenate([f.speeds[s] for f, s in zip(flights, spans, strict=True)])
+        flight = [np.full(len(at), number) for number, at in enumerate(starts)]
+        horizons = tuple(horizons) or (steps,)
         return cls(
             period=flights[0].period,
             horizons=horizons,
             speeds=np.ascontiguousarray(speeds.transpose(1, 2, 0)),
-            start=joined(0),
-            truth={h: joined(h) for h in horizons},
-            flight=np.concatenate([np.full(len(at), i) for i, at in enumerate(starts)]),
+            start=states(0),
+            truth={horizon: states(horizon) for horizon in horizons},
+            flight=np.concatenate(flight),
             index=np.concatenate(starts),
         )
 
-    def inputs(self, step: int) -> Floats:
-        """Rotor speeds between a sample and the next, (R, M): the mean of both.
 
-        Past the last sample that a prediction may know, those of that one.
-        """
-        after = self.speeds[min(step + 1, len(self.speeds) - 1)]
-        between: Floats = 0.5 * (self.speeds[step] + after)
-        return between
+def mean_speeds(speeds: Floats, step: int) -> Floats:
+    """Rotor speeds between a sample and the next, (R, M): the mean of both.
+
+    After the last sample that a prediction may know, those of that one. `speeds`: (H, R, M).
+    """
+    after = speeds[min(step + 1, len(speeds) - 1)]
+    between_both: Floats = 0.5 * (speeds[step] + after)
+    return between_both
 
 
 def predict(
-    airframes: Airframe | Sequence[Airframe], windows: Windows, speeds: Floats | None = None
-) -> Iterator[tuple[int, tuple[Floats, ...]]]:
-    """Each horizon, and position, quaternion, velocity and body rates there, (K, M) each.
+    vehicle: Vehicle,
+    candidates: Numbers | Sequence[Numbers],
+    windows: Windows,
+    speeds: Floats | None = None,
+) -> Iterator[tuple[int, States]]:
+    """Each horizon, and the states there, of the vehicle with other numbers.
 
-    Of P airframes they are (K, P M), one after the other: much faster than one call for each.
-    `speeds`, (H, R, P M), takes the place of those of the windows. The midpoint rule over each
-    sample's period: of second order, as the effects of the simulator.
+    P candidates are flown at once, much faster than one after the other; arrays then have P M
+    starts, those of the first candidate first. `speeds`, (H, R, P M), replaces those of the
+    windows. A physics step is the period of the samples.
     """
-    several = [airframes] if isinstance(airframes, Airframe) else list(airframes)
-    numbers = _Numbers(several, windows.start[0].shape[-1])
-    position, q, velocity, w = (np.tile(array, len(several)) for array in windows.start)
-    h, center, count = windows.period, numbers.center, len(windows.speeds)
-    down = np.array([0.0, 0.0, -several[0].gravity])[:, None]
-    # The center of mass is what moves without regard to the turning.
-    p = position + rotated(q, center + 0 * position)
-    v = velocity + rotated(q, cross(w, center))
-    for step in range(count):
-        if speeds is None:
-            inputs = np.tile(windows.inputs(step), len(several))
-        else:
-            inputs = 0.5 * (speeds[step] + speeds[min(step + 1, count - 1)])
-        pull, turn = numbers.accelerations(inputs, rotated(conjugate(q), v), w)
-        middle_q = product(q, from_rotation_vector(0.5 * h * w))
-        middle_v = v + 0.5 * h * (rotated(q, pull) + down)
-        middle_w = w + 0.5 * h * turn
-        body_v = rotated(conjugate(middle_q), middle_v)
-        pull, turn = numbers.accelerations(inputs, body_v, middle_w)
-        p = p + h * middle_v
-        v = v + h * (rotated(middle_q, pull) + down)
-        q = product(q, from_rotation_vector(h * middle_w))
-        w = w + h * turn
+    several = [candidates] if isinstance(candidates, Mapping) else list(candidates)
+    starts = windows.start[0].shape[-1]
+    numbers = {name: np.repeat([one[name] for one in several], starts) for name in NAMES}
+    flown = _with_step(vehicle, windows.period)
+    body = RigidBody(flown)
+    own = numbers_of(vehicle)["rotors.reaction"]
+    if own:
+        body.vary({"reaction": numbers["rotors.reaction"] / own})
+    inertias = np.stack([inertia_of(vehicle, one) for one in several])
+    body.set_inertia(np.repeat(inertias, starts, axis=0))
+    air = _Air(flown, numbers)
+    rows = np.tile(np.concatenate(windows.start), len(several))
+    given = np.tile(windows.speeds, len(several)) if speeds is None else speeds
+    for step in range(len(windows.speeds)):
+        thrust = numbers["rotors.thrust_coefficient"] * mean_speeds(given, step) ** 2
+        rows = np.array(body.fly(rows, thrust, air.wrench(rows, thrust)))
         if step + 1 in windows.horizons:
-            shift, swing = rotated(q, center + 0 * p), rotated(q, cross(w, center))
-            yield step + 1, (p - shift, q, v - swing, w)
+            yield step + 1, (rows[:3], rows[3:7], rows[7:10], rows[10:])
 
 
-class _Numbers:
-    """Those of airframes that differ in the numbers of `ENTRIES`, a column for each start."""
+def _with_step(vehicle: Vehicle, period: float) -> Vehicle:
+    """The vehicle with another physics step, s."""
+    model = copy.copy(vehicle.model)
+    model.opt.timestep = period
+    return replace(vehicle, model=model)
 
-    def __init__(self, airframes: Sequence[Airframe], starts: int) -> None:
-        first = airframes[0]
-        self._mass, self.center = first.mass, first.center[:, None]
-        self._axis, self._arm = first.axis, first.place - self.center
-        self._lever = np.cross(self._arm.T, first.axis.T).T
-        self._spin = first.turn * first.axis
 
-        def columns(field: str) -> Floats:
-            return np.repeat(np.stack([getattr(a, field) for a in airframes], -1), starts, -1)
+class _Air:
+    """Force and torque of the air on N bodies with numbers of their own, each of shape (N,)."""
 
-        self._coefficient, self._reaction = columns("thrust_coefficient"), columns("reaction")
-        self._linear, self._angular = columns("linear"), columns("angular")
-        self._moment, self._inertia = columns("moment"), columns("inertia")
-        inverse = np.stack([np.linalg.inv(one.inertia) for one in airframes], -1)
-        self._inverse = np.repeat(inverse, starts, -1)
-        self._drag, self._inflow, self._lift = (columns(f) for f in ("drag", "inflow", "lift"))
-        self._in_air = any(np.any(x) for x in (self._drag, self._inflow, self._lift))
+    def __init__(self, vehicle: Vehicle, numbers: Mapping[str, Floats]) -> None:
+        self._effects: AirEffects | None = None
+        quadratic = vehicle.coefficients.drag.quadratic
+        if quadratic is None and not any(numbers[name].any() for name in _AIR):
+            return
+        on_rotors = any(numbers[name].any() for name in _ON_ROTORS)
+        none = Drag(linear=(0.0, 0.0, 0.0), quadratic=quadratic)
+        rotors = replace(vehicle.coefficients.rotors, drag=0.0)
+        coefficients = replace(vehicle.coefficients, drag=none, rotors=rotors)
+        still = replace(vehicle, coefficients=coefficients)  # the numbers take their place
+        options = EffectOptions(body_drag=True, rotor_drag=on_rotors)
+        self._effects = AirEffects(still, options, np)
+        self._effects.vary({name: values[:, None] for name, values in numbers.items()})
+        self._begun = False
 
-    def accelerations(self, speeds: Floats, v: Floats, w: Floats) -> tuple[Floats, Floats]:
-        """Of the center of mass without gravity, body axes, and of the body rates, (3, N) each.
+    def wrench(self, rows: Floats, thrust: Floats) -> Floats | None:
+        """Of states (13, N) and thrusts (R, N): force, world frame, and torque, body frame, (6, N).
 
-        `speeds` (R, N); `v`: velocity of the center of mass, body axes; `w`: body rates.
+        None where there is no air.
         """
-        force = -self._linear * v
-        torque = -self._angular * w
-        torque[0] += self._moment[0] * v[1]
-        torque[1] -= self._moment[1] * v[0]
-        thrust = self._coefficient * speeds * speeds
-        force += self._axis @ thrust
-        torque += self._lever @ thrust + self._reaction * (self._spin @ thrust)
-        if self._in_air:
-            n, r = self._axis[:, :, None], self._arm[:, :, None]
-            hub = v[:, None] + cross(w[:, None], r)  # (3, R, N)
-            along = (hub * n).sum(axis=0)
-            plane = hub - along * n
-            up = self._lift * (plane * plane).sum(axis=0) - self._inflow * speeds * along
-            push = up * n - self._drag * speeds * plane
-            force += push.sum(axis=1)
-            torque += cross(r, push).sum(axis=1)
-        torque -= cross(w, np.einsum("ijn,jn->in", self._inertia, w))
-        return force / self._mass, np.einsum("ijn,jn->in", self._inverse, torque)
+        if self._effects is None:
+            return None
+        columns, force = rows.T[:, None], thrust.T[:, None]
+        state = WorldState(
+            position=columns[..., :3],
+            quaternion=columns[..., 3:7],
+            velocity=columns[..., 7:10],
+            body_rates=columns[..., 10:],
+            command=force,
+            thrust=force,
+            touching=np.False_,
+        )
+        if not self._begun:
+            self._effects.begin(np.True_, state, {})
+            self._begun = True
+        push: Floats = self._effects.step(state, force, None, [0.0, 0.0, 0.0], None)
+        return push.reshape(-1, 6).T
 
 
-def differences(predicted: Sequence[Floats], truth: Sequence[Floats]) -> tuple[Floats, ...]:
+def differences(predicted: States, truth: States) -> States:
     """Predicted less measured: position, rotation vector, velocity and body rates, (3, M) each."""
-    turn = product(conjugate(truth[1]), predicted[1])
+    turn = between(truth[1].T, predicted[1].T).T
     turn = turn * np.where(turn[0] < 0, -1.0, 1.0)
     size = np.sqrt((turn[1:] ** 2).sum(axis=0))
     angle = 2 * np.arctan2(size, turn[0])
-    rotation = turn[1:] * np.divide(angle, size, out=np.full_like(size, 2.0), where=size > 1e-12)
+    share = np.divide(angle, size, out=np.full_like(size, 2.0), where=size > 1e-12)
     return (
         predicted[0] - truth[0],
-        rotation,
+        turn[1:] * share,
         predicted[2] - truth[2],
         predicted[3] - truth[3],
     )
-
-
-# ---- vectors (3, M) and quaternions (4, M)
-
-
-def cross(a: Floats, b: Floats) -> Floats:
-    """Cross product."""
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    np.subtract(a[1] * b[2], a[2] * b[1], out=out[0])
-    np.subtract(a[2] * b[0], a[0] * b[2], out=out[1])
-    np.subtract(a[0] * b[1], a[1] * b[0], out=out[2])
-    return out
-
-
-def conjugate(q: Floats) -> Floats:
-    """The opposite rotation."""
-    return np.stack((q[0], -q[1], -q[2], -q[3]))
-
-
-def product(a: Floats, b: Floats) -> Floats:
-    """First b, then a."""
-    return np.stack(
-        (
-            a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-            a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-            a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-            a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-        )
-    )
-
-
-def rotated(q: Floats, v: Floats) -> Floats:
-    """A vector turned by a quaternion."""
-    t = 2 * cross(q[1:], v)
-    turned: Floats = v + q[0] * t + cross(q[1:], t)
-    return turned
-
-
-def from_rotation_vector(r: Floats) -> Floats:
-    """Quaternion of a rotation vector, rad."""
-    angle = np.sqrt((r * r).sum(axis=0))
-    return np.concatenate((np.cos(angle / 2)[None], 0.5 * np.sinc(angle / (2 * np.pi)) * r))

@@ -171,6 +171,12 @@ class RigidBody:
             varying = varying._replace(turn=turn, gyroscopic=gyroscopic)
         self.varying = mapped(varying, _lanes)
 
+    def set_inertia(self, inertia: np.ndarray) -> None:
+        """Take another inertia about the center of mass for each world, kg·m², (W, 3, 3)."""
+        turn, gyroscopic = _euler_of_each(inertia, self._xp)
+        varying = self.varying._replace(easier=1.0, turn=turn, gyroscopic=gyroscopic)
+        self.varying = mapped(varying, lambda x: _lanes(x) if x.any() else 0.0)
+
     def fly(self, rows: Any, thrust: Any, wrench: Any = None, steps: int = 1) -> list[Any]:
         """The 13 rows of a state after physics steps, (W,) each, from those of `motion`.
 

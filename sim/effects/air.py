@@ -1,6 +1,7 @@
 """Force and torque of the air: drag of the body, drag, inflow and lift of rotors, ground effect."""
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -75,6 +76,18 @@ class AirEffects:
         self._factors: dict[str, Array] = {}
         self._rotors: list[Any] = []
         self._before: Any = None
+
+    def vary(self, numbers: Mapping[str, Array]) -> None:
+        """Take other coefficients for each drone, (W, A), by their names in a vehicle's file.
+
+        Those of an axis end in its name, as drag.linear.x; for `rotor_drag` and `body_drag`.
+        """
+        self._linear = tuple(numbers[f"drag.linear.{axis}"] for axis in "xyz")
+        self._angular = tuple(numbers[f"drag.angular.{axis}"] for axis in "xyz")
+        self._moment = tuple(numbers[f"drag.moment.{axis}"] for axis in "xy")
+        self._slope = each(np.sqrt(numbers["rotors.thrust_coefficient"]))
+        names = ("rotors.drag", "rotors.inflow", "rotors.lift")
+        self._drag, self._inflow, self._lift = (each(numbers[name]) for name in names)
 
     def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> None:
         """Begin at the motion of a state; factors (W, A) by parameter."""

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rotorgram.cli import main
-from rotorgram.flights.flight_logs import read_log, with_lag
+from rotorgram.flights.flight_logs import FlightLog, read_log, with_lag
 from rotorgram.flights.identify import identify
-from rotorgram.flights.prediction import Airframe, Flight, Windows, differences, predict
+from rotorgram.flights.prediction import Windows, differences, numbers_of, predict
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim.effects import EffectOptions
@@ -192,9 +192,9 @@ def test_a_prediction_is_the_simulator_s(log: Path) -> None:
     world.step(thrust, 100)
     count = 101
     held = {name: np.tile(array, (count, 1)) for name, array in arrays.items()}
-    flight = Flight(name="", period=0.005, speeds=np.tile(speeds, (count, 1)), **held)
+    flight = FlightLog(name="", period=0.005, speeds=np.tile(speeds, (count, 1)), **held)
     windows = Windows.cut([flight], 100, 200)
-    ((_, predicted),) = predict(Airframe.of(vehicle), windows)
+    ((_, predicted),) = predict(vehicle, numbers_of(vehicle), windows)
     state = world.state
     truth = (state.position, state.quaternion, state.velocity, state.body_rates)
     p, r, v, w = differences(predicted, [array[:, None] for array in truth])
@@ -206,15 +206,16 @@ def test_a_prediction_is_the_simulator_s(log: Path) -> None:
 
 
 def test_free_fall_with_linear_drag_falls_as_the_closed_form() -> None:
-    airframe = Airframe.of(Vehicle.load(LIVELY)).with_values({"drag.linear.z": 0.5})
+    vehicle = Vehicle.load(LIVELY)
+    numbers = numbers_of(vehicle) | {"drag.linear.z": 0.5}
     still = np.zeros((501, 3))
     level = np.tile((1.0, 0.0, 0.0, 0.0), (501, 1))
-    flight = Flight(
+    flight = FlightLog(
         name="", period=0.002, position=still, quaternion=level, velocity=still,
         body_rates=still, speeds=np.zeros((501, 4)),
     )  # fmt: skip
     windows = Windows.cut([flight], 500, 600)
-    ((_, (position, _, velocity, _)),) = predict(airframe, windows)
+    ((_, (position, _, velocity, _)),) = predict(vehicle, numbers, windows)
     # m dv/dt = -m g - c v with m = 0.5, c = 0.5: v = -g (1 - e^-t), z = -g (t - 1 + e^-t).
     assert velocity[2, 0] == pytest.approx(-9.81 * (1 - np.exp(-1)), abs=1e-5)
     assert position[2, 0] == pytest.approx(-9.81 * np.exp(-1), abs=1e-5)
@@ -242,13 +243,13 @@ def test_columns_may_have_other_names_units_and_times(short: Path, tmp_path: Pat
     file = tmp_path / "other.csv"
     table.to_csv(file, index=False)
     columns = {"x": "pos_x", "m1_rads": "rpm*0.10471975511965977"}
-    read = read_log(file, vehicle, columns, period=0.005).flight
+    read = read_log(file, vehicle, columns, period=0.005)
     assert read.position.shape == (399, 3)
-    np.testing.assert_allclose(read.position[::2], plain.flight.position[:200], atol=1e-12)
-    np.testing.assert_allclose(read.speeds[::2], plain.flight.speeds[:200])
-    middle = 0.5 * (plain.flight.position[0] + plain.flight.position[1])
+    np.testing.assert_allclose(read.position[::2], plain.position[:200], atol=1e-12)
+    np.testing.assert_allclose(read.speeds[::2], plain.speeds[:200])
+    middle = 0.5 * (plain.position[0] + plain.position[1])
     np.testing.assert_allclose(read.position[1], middle, atol=1e-12)
-    turned = np.abs((read.quaternion[::2] * plain.flight.quaternion[:200]).sum(axis=1))
+    turned = np.abs((read.quaternion[::2] * plain.quaternion[:200]).sum(axis=1))
     np.testing.assert_allclose(turned, 1.0)
 
 
@@ -319,7 +320,7 @@ def ulog(path: Path) -> Path:
 def test_a_ulog_file_comes_in_our_frames(tmp_path: Path) -> None:
     pytest.importorskip("pyulog")
     log = read_log(ulog(tmp_path / "flight.ulg"), Vehicle.load(LIVELY))
-    flight = log.flight
+    flight = log
     assert not log.measured
     # North east down becomes north, west, up; forward right down becomes forward, left, up.
     np.testing.assert_allclose(flight.position[100], (3.0, -2.0, 6.0), atol=1e-6)
