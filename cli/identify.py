@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from ._flags import Command
+
+if TYPE_CHECKING:
+    from ..flights.identify import Identified
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,42 +38,56 @@ class Identify(Command):
 
     def run(self) -> int:
         """Print every estimate, write the file."""
-        from rich.console import Console
-        from rich.table import Table
-
         from ..flights.flight_logs import read_log
         from ..flights.identified_vehicle import identified_toml
-        from ..flights.identify import DEFAULT, SEGMENT, identify
-        from ..models.errors import expect, require
-        from ..models.files import write_new
+        from ..flights.identify import DEFAULT, identify
+        from ..models.errors import InputError, require
+        from ..models.files import check_new_file, write_new
         from ..models.vehicle import Vehicle
 
         require("scipy", "identify", "system identification")
-        expect(self.logs, "logs", "at least one file", "none")
-        right = self.out.suffix.lower() == ".toml" and not self.out.exists()
-        expect(right, "out", "a new file that ends in .toml", str(self.out))
-        there = self.out.absolute().parent.is_dir()
-        expect(there, "out", "a folder that is there for it", str(self.out))
-        expect(1e-4 <= self.period <= 0.1, "period", "0.0001 to 0.1 s", f"{self.period:g}")
+        if not self.logs:
+            raise InputError("logs: expected at least one file, got none")
+        check_new_file(self.out, ".toml")
+        if not 1e-4 <= self.period <= 0.1:
+            raise InputError(f"period: expected 0.0001 to 0.1 s, got {self.period:g}")
         columns = {}
         for text in self.columns:
-            ours, equals, theirs = text.partition("=")
-            expect(ours and equals and theirs, "columns", "OURS=THEIRS", repr(text))
+            ours, _, theirs = text.partition("=")
+            if not (ours and theirs):
+                raise InputError(f"columns: expected OURS=THEIRS, got {text!r}")
             columns[ours] = theirs
         vehicle = Vehicle.load(self.vehicle)
         logs = [read_log(path, vehicle, columns, self.period) for path in self.logs]
+        for log in logs:
+            if log.left_out:
+                print(
+                    f"{log.name}: {log.left_out} samples left out, whose position or attitude "
+                    "contradicts velocity and rates"
+                )
         found = identify(vehicle, logs, window=self.window, names=self.fit or DEFAULT)
-        table = Table("number", "value", "95 % interval", "")
-        for one in found.estimates:
-            told = f"[yellow]kept: {one.kept}" if one.kept else ""
-            interval = "" if one.kept else f"{one.low:.4g} to {one.high:.4g}"
-            table.add_row(one.name, f"{one.value:.5g}", interval, told)
-        Console().print(table)
-        names = ("position", "m"), ("attitude", "rad"), ("velocity", "m/s"), ("rates", "rad/s")
-        pairs = zip(names, found.before, found.after, strict=True)
-        errors = ", ".join(f"{name} {b:.3g} -> {a:.3g} {unit}" for (name, unit), b, a in pairs)
-        print(f"mean error of {found.windows} predictions over {self.window:g} s: {errors}")
-        print(f"intervals: sandwich, clustered over {found.segments} segments of {SEGMENT:g} s")
+        self._show(found)
         write_new(self.out, identified_toml(vehicle, found))
         print(self.out)
         return 0
+
+    def _show(self, found: "Identified") -> None:
+        from rich.console import Console
+        from rich.table import Table
+
+        from ..flights.identify import SEGMENT
+
+        table = Table("number", "value", "95 % interval", "")
+        for one in found.estimates:
+            note = f"[yellow]kept: {one.kept}" if one.kept else ""
+            interval = "" if one.kept else f"{one.low:.4g} to {one.high:.4g}"
+            table.add_row(one.name, f"{one.value:.5g}", interval, note)
+        Console().print(table)
+        names = ("position", "m"), ("attitude", "rad"), ("velocity", "m/s"), ("rates", "rad/s")
+        errors = [
+            f"{name} {before:.3g} -> {after:.3g} {unit}"
+            for (name, unit), before, after in zip(names, found.before, found.after, strict=True)
+        ]
+        window = f"{found.windows} predictions over {self.window:g} s"
+        print(f"mean error of {window}: {', '.join(errors)}")
+        print(f"intervals: sandwich, clustered over {found.segments} segments of {SEGMENT:g} s")

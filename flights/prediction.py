@@ -9,7 +9,7 @@ with z up; body x forward, y left, z up; quaternions scalar first; SI.
 """
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..models.coefficients import Drag
 from ..models.vehicle import Vehicle
+from ..sim.backends import kernel
 from ..sim.backends.body import RigidBody
 from ..sim.effects import EffectOptions
 from ..sim.effects.air import AirEffects
@@ -153,13 +154,26 @@ def predict(
     inertias = np.stack([inertia_of(vehicle, one) for one in several])
     body.set_inertia(np.repeat(inertias, starts, axis=0))
     air = _Air(flown, numbers)
-    rows = np.tile(np.concatenate(windows.start), len(several))
+    fly = _flight(body, vehicle.num_rotors, pushed=air.acts)
+    rows = np.ascontiguousarray(np.tile(np.concatenate(windows.start), len(several)))
     given = np.tile(windows.speeds, len(several)) if speeds is None else speeds
+    given = np.ascontiguousarray(given)
     for step in range(len(windows.speeds)):
         thrust = numbers["rotors.thrust_coefficient"] * mean_speeds(given, step) ** 2
-        rows = np.array(body.fly(rows, thrust, air.wrench(rows, thrust)))
+        rows = fly(rows, thrust, air.wrench(rows, thrust))
         if step + 1 in windows.horizons:
             yield step + 1, (rows[:3], rows[3:7], rows[7:10], rows[10:])
+
+
+def _flight(
+    body: RigidBody, rotors: int, *, pushed: bool
+) -> Callable[[Floats, Floats, Floats | None], Floats]:
+    """New rows (13, N) after a physics step; compiled where there is a C compiler."""
+    if kernel.compiler() is None:
+        return lambda rows, thrust, wrench: np.array(body.fly(rows, thrust, wrench))
+    step = kernel.compiled(body, rotors, np.float64, wrench=pushed)
+    varying = kernel.packed(body, np.float64)
+    return lambda rows, thrust, wrench: step(rows, thrust, wrench, varying, 1)
 
 
 def _with_step(vehicle: Vehicle, period: float) -> Vehicle:
@@ -183,9 +197,14 @@ class _Air:
         coefficients = replace(vehicle.coefficients, drag=none, rotors=rotors)
         still = replace(vehicle, coefficients=coefficients)  # the numbers take their place
         options = EffectOptions(body_drag=True, rotor_drag=on_rotors)
-        self._effects = AirEffects(still, options, np)
+        self._effects = AirEffects(still, options)
         self._effects.vary({name: values[:, None] for name, values in numbers.items()})
         self._begun = False
+
+    @property
+    def acts(self) -> bool:
+        """Whether there is air."""
+        return self._effects is not None
 
     def wrench(self, rows: Floats, thrust: Floats) -> Floats | None:
         """Of states (13, N) and thrusts (R, N): force, world frame, and torque, body frame, (6, N).
@@ -208,7 +227,7 @@ class _Air:
             self._effects.begin(np.True_, state, {})
             self._begun = True
         push: Floats = self._effects.step(state, force, None, [0.0, 0.0, 0.0], None)
-        return push.reshape(-1, 6).T
+        return np.ascontiguousarray(push.reshape(-1, 6).T)
 
 
 def differences(predicted: States, truth: States) -> States:

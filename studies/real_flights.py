@@ -23,10 +23,18 @@ from typing import Final
 
 import numpy as np
 from measuring import RESULTS, options
-from rotorgram.flights.flight_logs import read_log
-from rotorgram.flights.identified_vehicle import vehicle_toml
+from rotorgram.flights.flight_logs import FlightLog, read_log
+from rotorgram.flights.identified_vehicle import Origin, vehicle_toml
 from rotorgram.flights.identify import Group, fit, regressed
-from rotorgram.flights.prediction import Airframe, Flight, Floats, Windows, differences, predict
+from rotorgram.flights.prediction import (
+    Floats,
+    Numbers,
+    Windows,
+    differences,
+    mean_speeds,
+    numbers_of,
+    predict,
+)
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim.effects import EffectOptions
 from rotorgram.sim.state import InitialState
@@ -101,25 +109,25 @@ def main() -> int:
     train, test = (_flights(given.folder / kind, base) for kind in ("train", "test"))
     windows = Windows.cut(test, HORIZONS[-1], given.stride, HORIZONS)
     print(f"{len(train)} training flights; {len(test)} test flights, {len(windows.index)} starts")
-    held = Airframe.of(base)
+    held = numbers_of(base)
     naive = dict.fromkeys(HORIZONS, windows.start)
     rows = [_row("state held", naive, windows, test)]
     _show(rows[-1], "ours")
     cut = Windows.cut(train, HORIZONS[-1], _STRIDE, (10, 25, 50))
     for variant in VARIANTS:
         begun = time.monotonic()
-        airframe = _fitted(variant, held, cut, train)
-        text, vehicle = _vehicle(base, airframe, variant)
+        numbers = _fitted(variant, base, held, cut, train)
+        text, vehicle = _vehicle(base, numbers, variant)
         row = _row(variant.name, simulated(vehicle, windows), windows, test)
-        numpy = dict(predict(_flown(variant, airframe), windows))
+        numpy = dict(predict(base, _flown(variant, numbers), windows))
         ours = _row(variant.name, numpy, windows, test)
         row["numpy"] = ours["errors"][HORIZONS[-1]]
-        row["unseen_kinds"] = _unseen(variant, held, train)
+        row["unseen_kinds"] = _unseen(variant, base, held, train)
         reference = rows[1] if len(rows) > 1 else row
         ratios = np.divide(row["unseen_kinds"], reference["unseen_kinds"])
         row["unseen_score"] = float(ratios[:3].mean())  # 1: as the published physics
         names = [*(FORCES if variant.regressed else ()), *(n for g in variant.groups for n in g)]
-        row["numbers"] = {name: airframe.value(name) for name in names}
+        row["numbers"] = {name: numbers[name] for name in names}
         row["file"] = text
         row["fit_s"] = round(time.monotonic() - begun, 1)
         rows.append(row)
@@ -166,7 +174,10 @@ def simulated(
         count = len(position)
         world = make_world(vehicle, count, effects=effects, num_threads=1)
         lift = np.array((0.0, 0.0, _UP))
-        thrust = [coefficient * windows.inputs(i)[:, some].T ** 2 for i in range(HORIZONS[-1])]
+        thrust = [
+            coefficient * mean_speeds(windows.speeds, i)[:, some].T ** 2
+            for i in range(HORIZONS[-1])
+        ]
         start = [position + lift, quaternion, velocity, rates, thrust[0]]
         world.reset(np.ones((count, 1), bool), InitialState(**dict(zip(
             ("position", "quaternion", "velocity", "body_rates", "thrust"),
@@ -187,40 +198,45 @@ def simulated(
     }
 
 
-def _flights(folder: Path, vehicle: Vehicle) -> list[Flight]:
+def _flights(folder: Path, vehicle: Vehicle) -> list[FlightLog]:
     files = sorted(folder.glob("*.csv"))
     if not files:
         sys.exit(f"{folder}: expected CSV files of flights, got none")
-    return [read_log(file, vehicle).flight for file in files]
+    return [read_log(file, vehicle) for file in files]
 
 
 def _fitted(
-    variant: Variant, held: Airframe, windows: Windows, flights: Sequence[Flight]
-) -> Airframe:
+    variant: Variant,
+    base: Vehicle,
+    held: Numbers,
+    windows: Windows,
+    flights: Sequence[FlightLog],
+) -> Numbers:
     """The numbers of a variant; where rates are constant, forces are fitted with them constant."""
-    start = _flown(variant, regressed(held, flights, FORCES) if variant.regressed else held)
+    begun = regressed(base, flights, FORCES) if variant.regressed else {}
+    start = _flown(variant, {**held, **begun})
     if not variant.groups:
         return held
-    found = fit(start, windows, variant.groups)
-    return found if variant.turns else found.with_values(
-        {f"body.inertia.{axis}": held.value(f"body.inertia.{axis}") for axis in "xyz"}
-    )  # fmt: skip
+    found = fit(base, start, windows, variant.groups)
+    if variant.turns:
+        return found
+    return found | {name: held[name] for name in held if name.startswith("body.inertia")}
 
 
-def _flown(variant: Variant, airframe: Airframe) -> Airframe:
+def _flown(variant: Variant, numbers: Numbers) -> Numbers:
     """With an inertia that nothing turns, where the rates stay constant."""
     if variant.turns:
-        return airframe
-    return airframe.with_values({f"body.inertia.{axis}": 1e3 for axis in "xyz"})
+        return numbers
+    return {**numbers, **{f"body.inertia.{axis}": 1e3 for axis in "xyz"}}
 
 
-def _vehicle(base: Vehicle, airframe: Airframe, variant: Variant) -> tuple[str, Vehicle]:
+def _vehicle(base: Vehicle, numbers: Numbers, variant: Variant) -> tuple[str, Vehicle]:
     """The text of a vehicle file that says these numbers, and its vehicle."""
     names = [*(FORCES if variant.regressed else ()), *(n for g in variant.groups for n in g)]
     said = {name.rpartition(".")[0] if name.count(".") > 1 else name for name in names}
     source = "studies/real_flights.py: fitted on the training flights of arXiv 2512.14450"
-    airframe = _flown(variant, airframe)
-    text = vehicle_toml(base, airframe, None, dict.fromkeys(said, (source, "")))
+    origins = dict.fromkeys(said, Origin(source))
+    text = vehicle_toml(base, _flown(variant, numbers), origins)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "vehicle.toml")
         file.write_text(text, encoding="utf-8")
@@ -235,7 +251,7 @@ def _row(
     name: str,
     predicted: Mapping[int, Sequence[Floats]],
     windows: Windows,
-    flights: Sequence[Flight],
+    flights: Sequence[FlightLog],
 ) -> dict:
     """Mean errors: over all starts, by the formula of the published rows, and of each flight."""
     row: dict = {"name": name, "errors": {}, "published_formula": {}, "flights": {}}
@@ -263,7 +279,9 @@ def published_formula(predicted: Sequence[Floats], windows: Windows, h: int) -> 
     return [float(size.mean()) for size in sizes]
 
 
-def _unseen(variant: Variant, held: Airframe, train: Sequence[Flight]) -> list[float]:
+def _unseen(
+    variant: Variant, base: Vehicle, held: Numbers, train: Sequence[FlightLog]
+) -> list[float]:
     """Errors at the last horizon on each kind of training flights, fitted on the others; mean."""
     kinds = sorted({flight.name.partition("_")[0] for flight in train})
     errors = []
@@ -271,9 +289,9 @@ def _unseen(variant: Variant, held: Airframe, train: Sequence[Flight]) -> list[f
         rest = [one for one in train if not one.name.startswith(kind)]
         left = [one for one in train if one.name.startswith(kind)]
         windows = Windows.cut(rest, HORIZONS[-1], 2 * _STRIDE, (10, 25, 50))
-        airframe = _flown(variant, _fitted(variant, held, windows, rest))
+        numbers = _flown(variant, _fitted(variant, base, held, windows, rest))
         cut = Windows.cut(left, HORIZONS[-1], _STRIDE // 2)
-        for horizon, predicted in predict(airframe, cut):
+        for horizon, predicted in predict(base, numbers, cut):
             errors.append([float(s.mean()) for s in _sizes(predicted, cut.truth[horizon])])
     return [float(x) for x in np.mean(errors, axis=0)]
 

@@ -173,7 +173,7 @@ class RigidBody:
 
     def set_inertia(self, inertia: np.ndarray) -> None:
         """Take another inertia about the center of mass for each world, kg·m², (W, 3, 3)."""
-        turn, gyroscopic = _euler_of_each(inertia, self._xp)
+        turn, gyroscopic = _euler_of_each(inertia)
         varying = self.varying._replace(easier=1.0, turn=turn, gyroscopic=gyroscopic)
         self.varying = mapped(varying, lambda x: _lanes(x) if x.any() else 0.0)
 

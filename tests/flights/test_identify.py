@@ -271,6 +271,68 @@ def test_a_wrong_log_is_refused(short: Path, tmp_path: Path, change: object, sen
         read_log(file, vehicle)
 
 
+def test_a_csv_without_rows_is_one_sentence(tmp_path: Path) -> None:
+    """Fault 54."""
+    names = [
+        *["t", "x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz"],
+        *(f"m{i}_rads" for i in range(1, 5)),
+    ]
+    file = tmp_path / "head.csv"
+    file.write_text(",".join(names) + "\n")
+    with pytest.raises(InputError, match=r"^head\.csv: expected two or more samples, got 0$"):
+        read_log(file, Vehicle.load(LIVELY))
+
+
+@pytest.mark.parametrize("impossible", [1e6, 1e308, -50.0])
+@pytest.mark.parametrize("row", [0, 60, 199])
+@pytest.mark.parametrize("column", ["x", "vz"])
+def test_an_impossible_sample_is_left_out(
+    short: Path, tmp_path: Path, impossible: float, row: int, column: str
+) -> None:
+    """Fault 45: the velocity contradicts a position, or both positions contradict a velocity."""
+    if column == "vz" and impossible < 1e308:
+        impossible *= 10  # -500 m/s moves by 5 m in a sample
+    vehicle, file = Vehicle.load(LIVELY), tmp_path / "log.csv"
+    table = pandas.read_csv(short).head(200)
+    table.to_csv(file, index=False)
+    whole = read_log(file, vehicle)
+    table.loc[row, column] = impossible
+    table.to_csv(file, index=False)
+    read = read_log(file, vehicle)
+    assert (whole.left_out, read.left_out) == (0, 1)
+    lost = {0: 1, 199: 1}.get(row, 0)
+    assert len(read.position) == len(whole.position) - lost
+    shift = 1 if row == 0 else 0
+    same = whole.position[shift : shift + len(read.position)]
+    np.testing.assert_allclose(read.position, same, atol=0.05)
+
+
+def test_a_jump_of_the_attitude_is_left_out(short: Path, tmp_path: Path) -> None:
+    vehicle, file = Vehicle.load(LIVELY), tmp_path / "log.csv"
+    table = pandas.read_csv(short).head(200)
+    table.loc[60, ["qw", "qx", "qy", "qz"]] = (0.0, 1.0, 0.0, 0.0)  # on its head
+    table.to_csv(file, index=False)
+    assert read_log(file, vehicle).left_out == 1
+
+
+def test_a_log_that_jumps_for_good_is_refused(short: Path, tmp_path: Path) -> None:
+    vehicle, file = Vehicle.load(LIVELY), tmp_path / "log.csv"
+    table = pandas.read_csv(short).head(200)
+    table.loc[100:, "x"] += 5.0
+    table.to_csv(file, index=False)
+    with pytest.raises(InputError, match=r"agree with velocities and rates, got a jump at 1 s"):
+        read_log(file, vehicle)
+
+
+def test_rotor_speeds_that_no_rotor_reaches_are_refused(short: Path, tmp_path: Path) -> None:
+    vehicle, file = Vehicle.load(LIVELY), tmp_path / "log.csv"
+    table = pandas.read_csv(short).head(200)
+    table.loc[60, "m1_rads"] = 1e6
+    table.to_csv(file, index=False)
+    with pytest.raises(InputError, match=r"rotor speeds of at most 5000 rad/s, got 1e\+06"):
+        read_log(file, vehicle)
+
+
 def test_a_short_log_and_an_unknown_number_are_refused(short: Path) -> None:
     vehicle = Vehicle.load(LIVELY)
     log = read_log(short, vehicle)
@@ -338,4 +400,4 @@ def test_a_folder_that_is_not_there_is_told_before_anything_is_flown(
 ) -> None:
     out = tmp_path / "none" / "new.toml"
     assert main(["identify", "log.csv", "--vehicle", "paper", "--out", str(out)]) == 1
-    assert "out: expected a folder that is there for it, got " in capsys.readouterr().err
+    assert "out: expected a folder that exists for it, got " in capsys.readouterr().err

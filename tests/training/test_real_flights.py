@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rotorgram.flights.prediction import Flight, Windows
+from rotorgram.flights.flight_logs import FlightLog
+from rotorgram.flights.prediction import Windows
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.models.vehicle_file import read_vehicle_file
 
@@ -19,13 +20,13 @@ ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results" / "real_flights"
 
 
-def flight(count: int, velocity: float, start: float = 0.0) -> Flight:
+def flight(count: int, velocity: float, start: float = 0.0) -> FlightLog:
     """Along x at a constant velocity, level, with rotors at rest."""
     still = np.zeros((count, 3))
     time = 0.01 * np.arange(count)
     position = still.copy()
     position[:, 0] = start + velocity * time
-    return Flight(
+    return FlightLog(
         name=f"flight{velocity:g}",
         period=0.01,
         position=position,
