@@ -235,7 +235,8 @@ class _Raw:
             angle = 2 * np.arccos(np.clip(cosine, 0.0, 1.0))
             near = np.sqrt(squares) <= _POSITION_ERROR
             level = np.abs(angle - turned) <= _ATTITUDE_ERROR
-        return near & level
+        agree: NDArray[np.bool_] = near & level
+        return agree
 
     def grid(self, rows: NDArray[np.int_], period: float) -> Floats:
         """Uniform times from the first sample on. Raises `InputError` for a gap."""
